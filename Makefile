@@ -1,0 +1,20 @@
+# Two commands: `make demo` runs the whole loop and ends in a report; `make test` checks everything. Both set up from nothing.
+OUT ?= demo
+export OMP_WAIT_POLICY ?= passive
+
+.PHONY: demo test setup clean
+
+demo: setup
+	.venv/bin/hil demo --out "$(OUT)" $(ARGS)
+
+test: setup
+	.venv/bin/ruff format --check .
+	.venv/bin/ruff check .
+	.venv/bin/pyright
+	.venv/bin/pytest $(ARGS)
+
+setup:
+	@./setup.sh
+
+clean:
+	rm -rf .venv .venv-blender build

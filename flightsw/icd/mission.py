@@ -1,0 +1,331 @@
+"""The mission file: one YAML read by flight, ground and simulator, checked key by key."""
+
+import dataclasses
+import hashlib
+import math
+import types
+import typing
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+
+class ConfigError(ValueError):
+    """A key of the mission file is missing, unknown or wrong; `path` names it."""
+
+    def __init__(self, path: str, problem: str):
+        super().__init__(f"{path}: {problem}")
+        self.path = path
+
+
+def _require(condition: bool, path: str, problem: str) -> None:
+    if not condition:
+        raise ConfigError(path, problem)
+
+
+def tle_checksum(line: str) -> int:
+    """Return the modulo-10 checksum of a TLE line's first 68 columns (digits, and 1 for each minus)."""
+    return sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
+
+
+def _check_tle(lines: tuple[str, ...], path: str) -> None:
+    _require(len(lines) == 2, path, f"expected two lines, got {len(lines)}")
+    for number, line in enumerate(lines, start=1):
+        where = f"{path}[{number - 1}]"
+        _require(len(line) == 69, where, f"a TLE line has 69 columns, got {len(line)}")
+        _require(line.startswith(f"{number} "), where, f"expected line {number}, got {line[:2]!r}")
+        _require(line[68].isdigit(), where, f"column 69 must be the checksum digit, got {line[68]!r}")
+        expected = tle_checksum(line)
+        _require(
+            expected == int(line[68]),
+            where,
+            f"checksum is {line[68]}, but the line adds up to {expected}: copy the elements again",
+        )
+    _require(
+        lines[0][2:7] == lines[1][2:7],
+        path,
+        f"the lines belong to different objects: {lines[0][2:7]} and {lines[1][2:7]}",
+    )
+
+
+@dataclass(frozen=True)
+class OrbitSection:
+    target_tle: tuple[str, ...]
+    chaser_tle: tuple[str, ...]
+    start_utc: str
+    max_element_age_days: float = 7.0
+
+    def __post_init__(self):
+        _check_tle(self.target_tle, "mission.orbit.target_tle")
+        _check_tle(self.chaser_tle, "mission.orbit.chaser_tle")
+        _require(self.max_element_age_days > 0, "mission.orbit.max_element_age_days", "must be positive")
+        _ = self.start_utc_ns
+
+    @property
+    def start_utc_ns(self) -> int:
+        """First trigger, integer Unix nanoseconds."""
+        try:
+            moment = datetime.fromisoformat(self.start_utc)
+        except ValueError as error:
+            raise ConfigError(
+                "mission.orbit.start_utc", f"expected ISO 8601, got {self.start_utc!r}"
+            ) from error
+        if moment.tzinfo is None:
+            raise ConfigError("mission.orbit.start_utc", "say the time zone: end the time with Z")
+        whole = moment.astimezone(timezone.utc).replace(microsecond=0)
+        return int(whole.timestamp()) * 1_000_000_000 + moment.microsecond * 1000
+
+
+@dataclass(frozen=True)
+class TargetAttitudeSection:
+    """How the target turns: body +z stays on `axis` (GCRS), body x, y turn about it in `spin` mode."""
+
+    mode: Literal["inertial", "spin"] = "inertial"
+    axis: Literal["sun"] | tuple[float, ...] = "sun"
+    period_s: float = 600.0
+
+    def __post_init__(self):
+        path = "mission.target_attitude"
+        if not isinstance(self.axis, str):
+            _require(len(self.axis) == 3, f"{path}.axis", f"expected 3 numbers, got {len(self.axis)}")
+            _require(
+                abs(math.hypot(*self.axis) - 1) < 1e-3,
+                f"{path}.axis",
+                f"expected a unit vector, got length {math.hypot(*self.axis):.4f}",
+            )
+        _require(self.period_s > 0, f"{path}.period_s", f"must be positive, got {self.period_s}")
+
+
+@dataclass(frozen=True)
+class CameraSection:
+    """A pinhole camera (OpenCV axes, pixel centres at .5) and its sensor.
+
+    dn = clip(black_dn + dn_per_radiance_s * exposure_time_s * radiance + noise, 0, white_dn).
+    """
+
+    width: int
+    height: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    channels: int = 1
+    bit_depth: int = 12
+    black_dn: float = 64.0
+    dn_per_radiance_s: float = 4.0e7
+    electrons_per_dn: float = 4.0
+    read_noise_dn: float = 8.0
+
+    def __post_init__(self):
+        path = "mission.camera"
+        for name in ("width", "height"):
+            _require(
+                1 <= getattr(self, name) <= 8192,
+                f"{path}.{name}",
+                f"expected 1 to 8192, got {getattr(self, name)}",
+            )
+        for name in ("fx_px", "fy_px", "dn_per_radiance_s", "electrons_per_dn"):
+            _require(
+                getattr(self, name) > 0, f"{path}.{name}", f"must be positive, got {getattr(self, name)}"
+            )
+        _require(
+            self.read_noise_dn >= 0,
+            f"{path}.read_noise_dn",
+            f"must not be negative, got {self.read_noise_dn}",
+        )
+        _require(self.channels in (1, 3), f"{path}.channels", f"expected 1 or 3, got {self.channels}")
+        _require(8 <= self.bit_depth <= 16, f"{path}.bit_depth", f"expected 8 to 16, got {self.bit_depth}")
+        _require(
+            0 <= self.black_dn < self.white_dn / 2,
+            f"{path}.black_dn",
+            f"expected 0 to half of full scale, got {self.black_dn}",
+        )
+
+    @property
+    def white_dn(self) -> int:
+        """The largest digital number, where a pixel is saturated."""
+        return (1 << self.bit_depth) - 1
+
+    @property
+    def K(self) -> list[list[float]]:
+        """The 3x3 pinhole matrix, px."""
+        return [[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]]
+
+
+@dataclass(frozen=True)
+class BracketSection:
+    exposure_times_ms: tuple[float, ...] = (0.05, 0.1, 0.2)
+    frame_spacing_s: float = 0.5
+    interval_s: float = 27.0
+    count: int = 40
+
+    def __post_init__(self):
+        path = "mission.bracket"
+        _require(
+            1 <= len(self.exposure_times_ms) <= 16,
+            f"{path}.exposure_times_ms",
+            f"expected 1 to 16 exposures, got {len(self.exposure_times_ms)}",
+        )
+        for index, time_ms in enumerate(self.exposure_times_ms):
+            _require(
+                1e-3 <= time_ms <= 60_000,
+                f"{path}.exposure_times_ms[{index}]",
+                f"expected 0.001 to 60000 ms, got {time_ms}",
+            )
+            _require(
+                time_ms / 1e3 <= self.frame_spacing_s,
+                f"{path}.frame_spacing_s",
+                f"{self.frame_spacing_s} s is shorter than an exposure of {time_ms} ms",
+            )
+        _require(self.frame_spacing_s > 0, f"{path}.frame_spacing_s", "must be positive")
+        shortest_s = self.frame_spacing_s * len(self.exposure_times_ms)
+        _require(
+            self.interval_s >= shortest_s,
+            f"{path}.interval_s",
+            f"{self.interval_s} s is shorter than the bracket itself ({shortest_s} s)",
+        )
+        _require(self.count >= 1, f"{path}.count", f"expected at least 1, got {self.count}")
+
+    @property
+    def exposure_times_s(self) -> tuple[float, ...]:
+        return tuple(time_ms / 1e3 for time_ms in self.exposure_times_ms)
+
+
+@dataclass(frozen=True)
+class PoseSection:
+    sigma_position_m: float = 0.02
+    sigma_attitude_deg: float = 0.01
+
+    def __post_init__(self):
+        for name in ("sigma_position_m", "sigma_attitude_deg"):
+            _require(
+                getattr(self, name) >= 0,
+                f"mission.pose.{name}",
+                f"must not be negative, got {getattr(self, name)}",
+            )
+
+
+@dataclass(frozen=True)
+class LinkSection:
+    baud_rate: int = 921_600
+    max_packet_bytes: int = 1100
+    roi_sigma: float = 4.0
+    roi_margin_px: int = 9
+
+    def __post_init__(self):
+        path = "mission.link"
+        _require(
+            1200 <= self.baud_rate <= 12_000_000,
+            f"{path}.baud_rate",
+            f"expected 1200 to 12000000, got {self.baud_rate}",
+        )
+        _require(
+            128 <= self.max_packet_bytes <= 4096,
+            f"{path}.max_packet_bytes",
+            f"expected 128 to 4096, got {self.max_packet_bytes}",
+        )
+        _require(self.roi_sigma > 0, f"{path}.roi_sigma", f"must be positive, got {self.roi_sigma}")
+        _require(
+            self.roi_margin_px >= 0,
+            f"{path}.roi_margin_px",
+            f"must not be negative, got {self.roi_margin_px}",
+        )
+
+
+@dataclass(frozen=True)
+class ReconstructSection:
+    method: str = "obbgs"
+    seed: int = 7
+
+
+@dataclass(frozen=True)
+class Mission:
+    orbit: OrbitSection
+    camera: CameraSection
+    target_attitude: TargetAttitudeSection = field(default_factory=TargetAttitudeSection)
+    bracket: BracketSection = field(default_factory=BracketSection)
+    pose: PoseSection = field(default_factory=PoseSection)
+    link: LinkSection = field(default_factory=LinkSection)
+    reconstruct: ReconstructSection = field(default_factory=ReconstructSection)
+    sha256: str = ""  # of the file's bytes, so a result can be traced to its mission
+
+
+def load_mission(path: str | Path) -> Mission:
+    """Return the mission in a YAML file.
+
+    Raises:
+        ConfigError: the file cannot be read or is not YAML, a key is unknown, missing or of the wrong type, a TLE's
+            checksum is wrong. The message starts with the key's path.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise ConfigError(str(path), f"cannot read the mission file: {error.strerror}") from error
+    try:
+        tree = yaml.safe_load(content)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(str(path), f"is not valid YAML: {' '.join(str(error).split())}") from error
+    return build(Mission, tree, "mission", sha256=hashlib.sha256(content).hexdigest())
+
+
+def build(section: type, tree: Any, path: str, **given: Any) -> Any:
+    """Return the frozen dataclass `section` made from a YAML mapping; `given` fields do not come from the file.
+
+    Raises:
+        ConfigError: names the path of the first key that is wrong.
+    """
+    _require(isinstance(tree, dict), path, f"expected a mapping of keys, got {_describe(tree)}")
+    fields = {f.name: f for f in dataclasses.fields(section) if f.name not in given}
+    for key in tree:
+        _require(key in fields, f"{path}.{key}", f"unknown key; expected one of {', '.join(fields)}")
+    hints = typing.get_type_hints(section)
+    values = dict(given)
+    for name, f in fields.items():
+        if name in tree:
+            values[name] = _convert(tree[name], hints[name], f"{path}.{name}")
+        elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
+            raise ConfigError(f"{path}.{name}", "is missing")
+    return section(**values)
+
+
+def _describe(value: Any) -> str:
+    return "nothing" if value is None else repr(value)
+
+
+def _convert(value: Any, hint: Any, path: str) -> Any:
+    """Return `value` as the type of a field; no silent conversion but int to float and datetime to ISO text."""
+    if dataclasses.is_dataclass(hint):
+        return build(typing.cast(type, hint), value, path)
+    origin = typing.get_origin(hint)
+    if origin is Literal:
+        options = typing.get_args(hint)
+        _require(
+            value in options, path, f"expected one of {', '.join(map(str, options))}, got {_describe(value)}"
+        )
+        return value
+    if origin in (typing.Union, types.UnionType):
+        wanted_list = isinstance(value, list)
+        branches = typing.get_args(hint)
+        return _convert(value, branches[-1] if wanted_list else branches[0], path)
+    if origin is tuple:
+        _require(isinstance(value, list), path, f"expected a list, got {_describe(value)}")
+        item_hint = typing.get_args(hint)[0]
+        return tuple(_convert(item, item_hint, f"{path}[{i}]") for i, item in enumerate(value))
+    if hint is float:
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        _require(number and math.isfinite(value), path, f"expected a number, got {_describe(value)}")
+        return float(value)
+    if hint is int:
+        _require(
+            isinstance(value, int) and not isinstance(value, bool),
+            path,
+            f"expected a whole number, got {_describe(value)}",
+        )
+        return value
+    if isinstance(value, datetime):  # YAML reads an unquoted time stamp as a datetime
+        value = value.replace(tzinfo=value.tzinfo or timezone.utc).isoformat()
+    _require(isinstance(value, str), path, f"expected text, got {_describe(value)}")
+    return value
