@@ -1,0 +1,25 @@
+"""What can go wrong in flight. The sequencer catches FlightError, counts it and goes on."""
+
+
+class FlightError(Exception):
+    """The world misbehaved: a camera, an orbit, a disk or a link."""
+
+
+class OrbitError(FlightError):
+    """The orbital elements cannot be propagated to the asked time."""
+
+
+class CaptureError(FlightError):
+    """The camera did not deliver the exposure it was asked for."""
+
+
+class StoreError(FlightError):
+    """The frame store cannot be read or written."""
+
+
+class LinkError(FlightError):
+    """The link's port cannot be opened or was lost."""
+
+
+class TriageError(FlightError):
+    """A model or a frame cannot be used for triage."""

@@ -1,0 +1,255 @@
+"""One frame on the wire: exposure, time, pose tag and pixels in a container that proves its own integrity."""
+
+import struct
+import zlib
+from dataclasses import dataclass
+
+import imagecodecs
+import numpy as np
+
+MAGIC = b"OBGF"
+VERSION = 1
+SOURCES = ("none", "sgp4", "navigation", "truth")
+# magic, version, header bytes | frame, bracket, index, count, flags | exposure s, mid-exposure UTC ns
+# | height, width, channels, bit depth, codec, NEAR, pose source | black, saturated | quaternion, position, Sun, covariance
+# (lower triangle) | codestream bytes, CRC-32 of the decoded pixels. Byte table: README.md.
+HEADER = struct.Struct(">4sHHIIBBHdqHHBBBBBxfI4d3d3d21dII")
+CRC = struct.Struct(">I")
+FLAG_ECLIPSE, FLAG_POSE_VALID, FLAG_MASKED = 1, 2, 4
+CODEC_JPEG_LS = 1
+MAX_PIXELS = 8192 * 8192
+TRIANGLE = np.tril_indices(6)
+
+
+class PacketError(ValueError):
+    """Bytes from the link are not what they claim to be."""
+
+
+class PacketTooShort(PacketError):
+    """Fewer bytes than the header promises."""
+
+
+class CrcMismatch(PacketError):
+    """A checksum does not fit its bytes."""
+
+
+@dataclass(frozen=True)
+class PoseTag:
+    """The camera's pose in the target's body frame, and the light that fell on the target."""
+
+    quat_body_to_camera: np.ndarray  # [4] w, x, y, z, unit
+    position_body_m: np.ndarray  # [3] camera centre
+    covariance: np.ndarray  # [6, 6] position (m, body) then rotation vector (rad, camera)
+    sun_dir_body: np.ndarray  # [3] unit, target to Sun
+    in_eclipse: bool
+    valid: bool
+    source: str = "sgp4"
+
+    def __post_init__(self):
+        for name, shape in (
+            ("quat_body_to_camera", (4,)),
+            ("position_body_m", (3,)),
+            ("covariance", (6, 6)),
+            ("sun_dir_body", (3,)),
+        ):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"{name} must be {shape} finite numbers, got shape {value.shape}")
+            object.__setattr__(self, name, value)
+        if abs(np.linalg.norm(self.quat_body_to_camera) - 1) > 1e-6:
+            raise ValueError(f"quat_body_to_camera must be a unit quaternion, got {self.quat_body_to_camera}")
+        if self.source not in SOURCES:
+            raise ValueError(f"source must be one of {', '.join(SOURCES)}, got {self.source!r}")
+
+    @property
+    def world_to_camera(self) -> np.ndarray:
+        """[4, 4], x_camera = world_to_camera @ x_body, m, OpenCV axes."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = quat_to_matrix(self.quat_body_to_camera)
+        matrix[:3, 3] = -matrix[:3, :3] @ self.position_body_m
+        return matrix
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One exposure with everything needed to use it."""
+
+    frame_id: int
+    bracket_id: int
+    bracket_index: int
+    bracket_count: int
+    exposure_time_s: float
+    mid_exposure_utc_ns: int
+    pose: PoseTag
+    dn: np.ndarray  # [H, W] or [H, W, 3] uint16
+    bit_depth: int
+    black_dn: float
+    saturated_count: int
+
+    def __post_init__(self):
+        for name, bits in (
+            ("frame_id", 32),
+            ("bracket_id", 32),
+            ("bracket_index", 8),
+            ("bracket_count", 8),
+            ("saturated_count", 32),
+        ):
+            if not 0 <= getattr(self, name) < 1 << bits:
+                raise ValueError(f"{name}={getattr(self, name)} does not fit {bits} bits")
+        if self.dn.dtype != np.uint16 or self.dn.ndim not in (2, 3) or self.dn.shape[2:] not in ((), (3,)):
+            raise ValueError(f"dn must be uint16 [H, W] or [H, W, 3], got {self.dn.dtype} {self.dn.shape}")
+        if not 0 < self.dn.shape[0] * self.dn.shape[1] <= MAX_PIXELS:
+            raise ValueError(f"dn must have 1 to {MAX_PIXELS} pixels, got {self.dn.shape}")
+        if not (np.isfinite(self.exposure_time_s) and self.exposure_time_s > 0):
+            raise ValueError(f"exposure_time_s must be positive, got {self.exposure_time_s}")
+        if not 8 <= self.bit_depth <= 16:
+            raise ValueError(f"bit_depth must be 8 to 16, got {self.bit_depth}")
+
+    @property
+    def world_to_camera(self) -> np.ndarray:
+        """[4, 4], body to camera, m."""
+        return self.pose.world_to_camera
+
+
+def encode_frame(frame: Frame, *, near: int = 0, roi_mask: np.ndarray | None = None) -> bytes:
+    """Return the frame as a container: header, JPEG-LS codestream, CRC-32 over both.
+
+    Args:
+        near: largest error of a pixel, DN; 0 is lossless.
+        roi_mask: [H, W] bool; pixels outside are set to the black level before coding. None keeps all.
+    """
+    if not 0 <= near <= 255:
+        raise ValueError(f"near must be 0 to 255, got {near}")
+    dn, flags = frame.dn, FLAG_ECLIPSE * frame.pose.in_eclipse | FLAG_POSE_VALID * frame.pose.valid
+    if roi_mask is not None:
+        if roi_mask.shape != dn.shape[:2]:
+            raise ValueError(f"roi_mask has shape {roi_mask.shape}, the frame {dn.shape[:2]}")
+        dn = np.where(roi_mask.reshape(roi_mask.shape + (1,) * (dn.ndim - 2)), dn, np.uint16(frame.black_dn))
+        flags |= FLAG_MASKED
+    codestream = bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(dn), level=near))
+    decoded = dn if near == 0 else imagecodecs.jpegls_decode(codestream)
+    pose = frame.pose
+    header = HEADER.pack(
+        MAGIC,
+        VERSION,
+        HEADER.size,
+        frame.frame_id,
+        frame.bracket_id,
+        frame.bracket_index,
+        frame.bracket_count,
+        flags,
+        frame.exposure_time_s,
+        frame.mid_exposure_utc_ns,
+        dn.shape[0],
+        dn.shape[1],
+        1 if dn.ndim == 2 else 3,
+        frame.bit_depth,
+        CODEC_JPEG_LS,
+        near,
+        SOURCES.index(pose.source),
+        frame.black_dn,
+        frame.saturated_count,
+        *pose.quat_body_to_camera,
+        *pose.position_body_m,
+        *pose.sun_dir_body,
+        *pose.covariance[TRIANGLE],
+        len(codestream),
+        _pixel_crc(decoded),
+    )
+    body = header + codestream
+    return body + CRC.pack(zlib.crc32(body))
+
+
+def decode_frame(data: bytes) -> Frame:
+    """Return the frame in a container.
+
+    Raises:
+        PacketTooShort: the bytes end before what the header promises.
+        CrcMismatch: the container or the decoded pixels do not fit their CRC-32.
+        PacketError: not a container, another version, or values out of range.
+    """
+    if len(data) < HEADER.size + CRC.size:
+        raise PacketTooShort(f"a frame has at least {HEADER.size + CRC.size} bytes, got {len(data)}")
+    fields = HEADER.unpack_from(data)
+    magic, version, header_bytes = fields[:3]
+    if magic != MAGIC:
+        raise PacketError(f"expected a frame starting with {MAGIC!r}, got {magic!r}")
+    if version != VERSION or header_bytes != HEADER.size:
+        raise PacketError(f"frame version {version} with {header_bytes} header bytes; this software reads {VERSION}")
+    codestream_bytes, pixel_crc = fields[-2:]
+    if len(data) != HEADER.size + codestream_bytes + CRC.size:
+        raise PacketTooShort(f"the header promises {codestream_bytes} codestream bytes, {len(data)} came in all")
+    if CRC.unpack_from(data, len(data) - CRC.size)[0] != zlib.crc32(data[: -CRC.size]):
+        raise CrcMismatch("the container's CRC-32 does not fit its bytes")
+    return _frame_from(fields, data[HEADER.size : -CRC.size], pixel_crc)
+
+
+def _frame_from(fields: tuple, codestream: bytes, pixel_crc: int) -> Frame:
+    (frame_id, bracket_id, index, count, flags, exposure_s, mid_ns) = fields[3:10]
+    (height, width, channels, bit_depth, codec, _near, source, black_dn, saturated) = fields[10:19]
+    numbers = np.array(fields[19:50])
+    if codec != CODEC_JPEG_LS or channels not in (1, 3) or source >= len(SOURCES) or height * width > MAX_PIXELS:
+        raise PacketError(f"codec {codec}, {channels} channels, pose source {source}, {height}x{width}: out of range")
+    try:
+        dn = imagecodecs.jpegls_decode(codestream)
+    except (imagecodecs.JpeglsError, ValueError, RuntimeError) as error:
+        raise PacketError(f"the JPEG-LS codestream cannot be decoded: {error}") from error
+    expected_shape = (height, width) if channels == 1 else (height, width, channels)
+    if dn.shape != expected_shape or dn.dtype not in (np.uint8, np.uint16):
+        raise PacketError(f"the header says {expected_shape}, the codestream {dn.shape} {dn.dtype}")
+    dn = dn.astype(np.uint16)
+    if _pixel_crc(dn) != pixel_crc:
+        raise CrcMismatch("the decoded pixels do not fit their CRC-32")
+    covariance = np.zeros((6, 6))
+    covariance[TRIANGLE] = numbers[10:31]
+    covariance = covariance + np.tril(covariance, -1).T
+    try:
+        pose = PoseTag(
+            quat_body_to_camera=numbers[0:4],
+            position_body_m=numbers[4:7],
+            covariance=covariance,
+            sun_dir_body=numbers[7:10],
+            in_eclipse=bool(flags & FLAG_ECLIPSE),
+            valid=bool(flags & FLAG_POSE_VALID),
+            source=SOURCES[source],
+        )
+        return Frame(
+            frame_id, bracket_id, index, count, exposure_s, mid_ns, pose, dn, bit_depth, black_dn, saturated
+        )
+    except ValueError as error:
+        raise PacketError(f"frame {frame_id}: {error}") from error
+
+
+
+
+def _pixel_crc(dn: np.ndarray) -> int:
+    return zlib.crc32(np.ascontiguousarray(dn, dtype=">u2").tobytes())
+
+
+def quat_to_matrix(quat: np.ndarray) -> np.ndarray:
+    """Return the rotation [3, 3] of a unit quaternion w, x, y, z."""
+    w, x, y, z = quat / np.linalg.norm(quat)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def matrix_to_quat(matrix: np.ndarray) -> np.ndarray:
+    """Return the unit quaternion [4] w, x, y, z (w not negative) of a rotation [3, 3]; stable at any angle."""
+    m = matrix
+    K = np.array(
+        [
+            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [0, m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+            [0, 0, m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
+            [0, 0, 0, m[2, 2] - m[0, 0] - m[1, 1]],
+        ]
+    )
+    # Bar-Itzhack: the eigenvector of the largest eigenvalue of this symmetric matrix
+    _, vectors = np.linalg.eigh(np.triu(K) + np.triu(K, 1).T)
+    quat = vectors[:, -1]
+    return quat if quat[0] >= 0 else -quat

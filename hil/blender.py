@@ -1,0 +1,259 @@
+"""Drives Blender workers: starts and restarts them, spreads the frames, and keeps every picture by its content."""
+
+import hashlib
+import json
+import logging
+import os
+import queue
+import shutil
+import subprocess
+import tempfile
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from flightsw.icd.frame import PoseTag
+from flightsw.icd.mission import Mission
+from hil import spacecraft
+
+log = logging.getLogger(__name__)
+WORKER = Path(__file__).with_name("blender_worker.py")
+SAMPLES = 16  # with OIDN; more changes little and costs in proportion
+RETRIES = 2  # a crash of Blender costs one frame's time, a second crash on the same frame is a defect
+LIBRARIES = "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
+
+
+class MeshError(ValueError):
+    """The file is not a mesh that can be rendered."""
+
+
+class BlenderError(RuntimeError):
+    """Blender cannot be started, or failed on a frame more than once."""
+
+
+def blender_command() -> list[str]:
+    """Return the command that runs the worker: OBBGS_BLENDER_PYTHON, .venv-blender beside the project, or `blender`.
+
+    Raises:
+        BlenderError: none of them is there.
+    """
+    own = os.environ.get("OBBGS_BLENDER_PYTHON") or str(WORKER.parents[1] / ".venv-blender/bin/python")
+    if Path(own).exists():
+        return [own, str(WORKER)]
+    if installed := shutil.which("blender"):
+        return [installed, "--background", "--factory-startup", "--python", str(WORKER)]
+    raise BlenderError(
+        "Blender is missing: run `make setup`, or put a `blender` (4.5) on the PATH, or point OBBGS_BLENDER_PYTHON at a "
+        "Python 3.11 that has bpy==4.5.15"
+    )
+
+
+class Worker:
+    """One Blender process with one mesh loaded; it is started again when it dies."""
+
+    def __init__(self, mesh: Path, samples: int = SAMPLES, ambient: float | None = None):
+        self.mesh, self.samples, self.ambient = mesh, samples, ambient
+        self.restarts = -1
+        self.facts: dict = {}
+        self._start()
+
+    def _start(self) -> None:
+        self.restarts += 1
+        self._log = tempfile.TemporaryFile("w+")
+        self._process = subprocess.Popen(
+            blender_command(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True
+        )
+        if not self._reply():
+            raise BlenderError(
+                f"Blender did not start: {self._last_words()}. On Debian: apt-get install -y "
+                f"--no-install-recommends {LIBRARIES}"
+            )
+        load = {"op": "load", "mesh": str(self.mesh.resolve()), "samples": self.samples}
+        load["keep_scale"] = sha256(self.mesh) == sha256(spacecraft.SHIPPED)
+        if self.ambient is not None:
+            load["ambient"] = self.ambient
+        reply = self._exchange(load)
+        if reply is None or not reply["ok"]:
+            reason = reply["error"] if reply else self._last_words()
+            self.close()
+            raise MeshError(f"{self.mesh}: not a mesh that Blender can load: {reason}")
+        self.facts = {key: value for key, value in reply.items() if key != "ok"}
+
+    def ask(self, **request) -> dict:
+        """Return the worker's reply; a crash restarts Blender and asks again.
+
+        Raises:
+            BlenderError: Blender refused the request, or died on it every time.
+        """
+        for _ in range(1 + RETRIES):
+            reply = self._exchange(request)
+            if reply is None:
+                log.warning("Blender died (%s); starting it again", self._last_words())
+                self.close()
+                self._start()
+                continue
+            if not reply["ok"]:
+                raise BlenderError(f"Blender refused {request['op']}: {reply['error']}")
+            return reply
+        raise BlenderError(f"Blender died {1 + RETRIES} times on the same request")
+
+    def _exchange(self, request: dict) -> dict | None:
+        assert self._process.stdin
+        try:
+            self._process.stdin.write(json.dumps(request) + "\n")
+            self._process.stdin.flush()
+        except OSError:
+            return None
+        return self._reply()
+
+    def _reply(self) -> dict | None:
+        assert self._process.stdout
+        for line in self._process.stdout:
+            if line.startswith("{"):  # an installed Blender greets on stdout before the worker takes it over
+                return json.loads(line)
+        return None
+
+    def _last_words(self) -> str:
+        self._log.seek(0)
+        lines = [line.strip() for line in self._log.read().splitlines() if line.strip()]
+        return " ".join(lines[-2:])[-300:] or "no message"
+
+    def close(self) -> None:
+        assert self._process.stdin and self._process.stdout
+        try:
+            self._process.stdin.close()
+        except OSError:
+            pass
+        try:
+            self._process.wait(timeout=5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+        self._log.close()
+
+
+class RenderFarm:
+    """True radiance of the mission's target at any pose, rendered once and then read from the cache.
+
+    Raises:
+        MeshError: `mesh` cannot be loaded.
+        BlenderError: Blender is missing or cannot be started.
+    """
+
+    def __init__(self, mission: Mission, mesh: Path, cache: Path, workers: int = 2):
+        if not mesh.is_file():
+            raise MeshError(f"{mesh}: no such file")
+        self.mission, self.mesh, self.cache = mission, mesh, cache
+        cache.mkdir(parents=True, exist_ok=True)
+        self._identity = hashlib.sha256(sha256(mesh).encode() + WORKER.read_bytes()).hexdigest()
+        self._count = workers
+        self._workers: list[Worker] = []
+        self._lock = threading.Lock()
+        self._first = self._worker(0)  # a bad mesh is known at once
+
+    def __enter__(self) -> "RenderFarm":
+        return self
+
+    def __exit__(self, *_) -> None:
+        for worker in self._workers:
+            worker.close()
+
+    @property
+    def facts(self) -> dict:
+        """What the worker found in the mesh: largest_dimension_m, triangles, inverted_meshes."""
+        return self._first.facts
+
+    def path(self, pose: PoseTag) -> Path:
+        """Return where the picture of this pose is kept."""
+        content = json.dumps(self._request(pose), sort_keys=True)
+        return self.cache / (hashlib.sha256((self._identity + content).encode()).hexdigest()[:32] + ".npz")
+
+    def radiance(self, pose: PoseTag) -> np.ndarray:
+        """Return the scene-linear radiance [H, W, C] float16, premultiplied by coverage."""
+        with self._lock:
+            path = self._rendered(self._first, pose)
+        with np.load(path) as arrays:
+            return arrays["radiance"]
+
+    def prerender(self, poses: Sequence[PoseTag], on_rendered: Callable[[], None] = lambda: None) -> int:
+        """Render what is not in the cache yet on all workers; return how many were rendered."""
+        waiting: queue.SimpleQueue[PoseTag] = queue.SimpleQueue()
+        missing = 0
+        for pose in poses:
+            if self.path(pose).exists():
+                on_rendered()
+            else:
+                waiting.put(pose)
+                missing += 1
+        errors: list[Exception] = []
+
+        def work(worker: Worker) -> None:
+            while not errors:
+                try:
+                    pose = waiting.get_nowait()
+                except queue.Empty:
+                    return
+                try:
+                    self._rendered(worker, pose)
+                except (BlenderError, MeshError) as error:
+                    errors.append(error)
+                    return
+                on_rendered()
+
+        threads = []
+        for index in range(min(self._count, missing)):
+            threads.append(threading.Thread(target=work, args=(self._worker(index),), daemon=True))
+            threads[-1].start()
+        for thread in threads:
+            thread.join()
+        if errors:
+            raise errors[0]
+        return missing
+
+    def surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mesh as it is rendered: vertices [V, 3] m in the body frame, faces [F, 3]."""
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "surface.npz"
+            self._first.ask(op="surface", out=str(out))
+            with np.load(out) as arrays:
+                return arrays["vertices"], arrays["faces"]
+
+    def visible(self, points: np.ndarray, centres: np.ndarray) -> np.ndarray:
+        """Return which of the points [N, 3] at least one of the camera centres [M, 3] sees, as bool [N]."""
+        with tempfile.TemporaryDirectory() as folder:
+            given, out = Path(folder) / "points.npz", Path(folder) / "seen.npz"
+            np.savez(given, points=points, centres=centres)
+            self._first.ask(op="visible", points=str(given), out=str(out))
+            with np.load(out) as arrays:
+                return arrays["seen"]
+
+    def _worker(self, index: int) -> Worker:
+        while len(self._workers) <= index:
+            self._workers.append(Worker(self.mesh))
+        return self._workers[index]
+
+    def _request(self, pose: PoseTag) -> dict:
+        camera = self.mission.camera
+        return {
+            "op": "render",
+            "world_to_camera": pose.world_to_camera.tolist(),
+            "K": camera.K,
+            "width": camera.width,
+            "height": camera.height,
+            "channels": camera.channels,
+            "sun_dir_body": pose.sun_dir_body.tolist(),
+            "in_eclipse": pose.in_eclipse,
+        }
+
+    def _rendered(self, worker: Worker, pose: PoseTag) -> Path:
+        path = self.path(pose)
+        if not path.exists():
+            worker.ask(**self._request(pose), out=str(path))
+        return path
+
+
+def sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

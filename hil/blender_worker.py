@@ -1,0 +1,297 @@
+"""Runs inside Blender's own Python: renders scene-linear radiance of one mesh, one JSON request a line.
+
+Only bpy, numpy and the standard library here. Settings and traps were measured with bpy 4.5.15 (Cycles, CPU). Requests
+on stdin, replies on stdout, both one JSON object a line; pixels go to the .npz that the request names.
+"""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+from mathutils.bvhtree import BVHTree
+
+FOREIGN_SIZE_M = 6.0  # a mesh of unknown units is scaled to this largest dimension
+SUN_IRRADIANCE = np.pi  # a white Lambert plate facing the Sun has radiance 1
+SUN_ANGLE_RAD = 0.00925  # the Sun's diameter at 1 au
+EARTHSHINE_RADIANCE = 0.06  # uniform light from all around, share of that plate's radiance
+MAX_METALLIC = 0.3  # a metal under one Sun and a black sky renders black
+MIN_ROUGHNESS = 0.15
+
+
+def load(path, keep_scale):
+    """Load a mesh file into an empty scene and return its facts; the body frame is the file's own (glTF: y-up kept).
+
+    Blender turns glTF's y-up into its z-up on import; the file's coordinates are restored, so that the body frame
+    is what the file says.
+    """
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    suffix = Path(path).suffix.lower()
+    if suffix in (".glb", ".gltf"):
+        bpy.ops.import_scene.gltf(filepath=path)
+        undo = Matrix.Rotation(-np.pi / 2, 4, "X")
+    elif suffix == ".obj":
+        bpy.ops.wm.obj_import(filepath=path, forward_axis="Y", up_axis="Z")
+        undo = Matrix.Identity(4)
+    elif suffix == ".stl":
+        bpy.ops.wm.stl_import(filepath=path)
+        undo = Matrix.Identity(4)
+    else:
+        raise ValueError(f"expected a .glb, .gltf, .obj or .stl file, got {suffix or 'no suffix'}")
+    meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and len(o.data.polygons)]
+    for o in list(bpy.context.scene.objects):
+        if o.type in ("CAMERA", "LIGHT"):
+            bpy.data.objects.remove(o)
+    if not meshes:
+        raise ValueError("the file holds no triangles")
+    bpy.context.view_layer.update()
+    for o in meshes:  # bake every transform, so that world coordinates are the mesh's own
+        o.data = o.data.copy()
+        o.data.transform(undo @ o.matrix_world)
+        o.parent = None
+        o.matrix_world = Matrix.Identity(4)
+    low, high = bounds(meshes)
+    extent = float((high - low).max())
+    if not (np.isfinite(extent) and extent > 0):
+        raise ValueError("the mesh has no extent: is its compression supported?")
+    if not keep_scale:
+        middle = (low + high) / 2
+        fit = Matrix.Scale(FOREIGN_SIZE_M / extent, 4) @ Matrix.Translation(Vector(-middle))
+        for o in meshes:
+            o.data.transform(fit)
+        extent = FOREIGN_SIZE_M
+    inverted = sum(mend_normals(o) for o in meshes)
+    for material in bpy.data.materials:
+        tame(material)
+    bpy.context.view_layer.update()
+    triangles = sum(len(p.vertices) - 2 for o in meshes for p in o.data.polygons)
+    return {"largest_dimension_m": extent, "triangles": triangles, "inverted_meshes": inverted}
+
+
+def bounds(meshes):
+    points = np.concatenate([vertices(o) for o in meshes])
+    return points.min(0), points.max(0)
+
+
+def vertices(o):
+    flat = np.empty(3 * len(o.data.vertices), dtype=np.float64)
+    o.data.vertices.foreach_get("co", flat)
+    return flat.reshape(-1, 3)
+
+
+def mend_normals(o):
+    """Drop stored normals that point against their face's winding (SOHO), and tell whether that was needed."""
+    mesh = o.data
+    if not mesh.has_custom_normals:
+        return 0
+    mesh.calc_loop_triangles()
+    stored = np.empty(3 * len(mesh.loops), dtype=np.float32)
+    mesh.corner_normals.foreach_get("vector", stored)
+    faces = np.empty(3 * len(mesh.polygons), dtype=np.float32)
+    mesh.polygon_normals.foreach_get("vector", faces)
+    starts = np.empty(len(mesh.polygons), dtype=np.int32)
+    mesh.polygons.foreach_get("loop_start", starts)
+    agreement = np.einsum("ij,ij->i", stored.reshape(-1, 3)[starts], faces.reshape(-1, 3))
+    if (agreement < 0).mean() < 0.3:
+        return 0
+    attribute = mesh.attributes.get("custom_normal")
+    if attribute:
+        mesh.attributes.remove(attribute)
+    return 1
+
+
+def tame(material):
+    """Keep a material visible under one Sun: clamp metallic and roughness, remove emission."""
+    if not material.use_nodes:
+        return
+    for node in material.node_tree.nodes:
+        if node.type != "BSDF_PRINCIPLED":
+            continue
+        links = material.node_tree.links
+        for name, limit in (("Metallic", min), ("Roughness", max)):
+            socket = node.inputs[name]
+            bound = MAX_METALLIC if name == "Metallic" else MIN_ROUGHNESS
+            for link in list(socket.links):
+                clamp = material.node_tree.nodes.new("ShaderNodeMath")
+                clamp.operation = "MINIMUM" if limit is min else "MAXIMUM"
+                clamp.inputs[1].default_value = bound
+                source = link.from_socket
+                links.remove(link)
+                links.new(source, clamp.inputs[0])
+                links.new(clamp.outputs[0], socket)
+            socket.default_value = limit(socket.default_value, bound)
+        for link in list(node.inputs["Emission Strength"].links) + list(node.inputs["Emission Color"].links):
+            links.remove(link)
+        node.inputs["Emission Strength"].default_value = 0.0
+
+
+def set_up(samples, ambient):
+    """Prepare Cycles, the Sun, Earth-shine and the camera of an opened scene."""
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    scene.render.threads_mode, scene.render.threads = "FIXED", 1
+    scene.render.film_transparent = True
+    scene.render.use_compositing = scene.render.use_sequencer = False
+    cycles = scene.cycles
+    cycles.device, cycles.samples, cycles.use_adaptive_sampling = "CPU", samples, False
+    cycles.max_bounces = 3
+    cycles.use_denoising, cycles.denoiser = samples > 1, "OPENIMAGEDENOISE"
+    cycles.seed = 0
+    layer = scene.view_layers[0]
+    layer.use_pass_combined = layer.use_pass_z = True
+    world = bpy.data.worlds.new("earthshine")
+    world.use_nodes = True
+    world.node_tree.nodes["Background"].inputs["Color"].default_value = (1, 1, 1, 1)
+    world.node_tree.nodes["Background"].inputs["Strength"].default_value = ambient
+    scene.world = world
+    sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
+    sun.data.energy, sun.data.angle = SUN_IRRADIANCE, SUN_ANGLE_RAD
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(sun)
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+
+
+def place(request):
+    """Put camera and Sun where the request says; see the camera formulas in the notes of the driver."""
+    scene = bpy.context.scene
+    world_to_camera, K = np.array(request["world_to_camera"]), np.array(request["K"])
+    width, height = request["width"], request["height"]
+    scene.render.resolution_x, scene.render.resolution_y = width, height
+    scene.render.resolution_percentage = 100
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = (1.0, fx / fy) if fx >= fy else (fy / fx, 1.0)
+    R, t = world_to_camera[:3, :3], world_to_camera[:3, 3]
+    pose = np.eye(4)
+    pose[:3, :3] = R.T @ np.diag([1.0, -1.0, -1.0])
+    pose[:3, 3] = -R.T @ t
+    camera = scene.camera
+    camera.matrix_world = Matrix(pose.tolist())
+    data = camera.data
+    data.sensor_fit, data.sensor_width = "HORIZONTAL", 36.0
+    data.lens = 36.0 * fx / width
+    data.shift_x = (width / 2 - cx) / width
+    data.shift_y = (cy - height / 2) / width * (fx / fy)
+    range_m = float(np.linalg.norm(t))
+    data.clip_start, data.clip_end = max(range_m / 1000, 0.01), range_m * 10 + 1000
+    sun = scene.objects["sun"]
+    direction = Vector(request["sun_dir_body"])
+    sun.rotation_mode = "QUATERNION"
+    sun.rotation_quaternion = direction.to_track_quat("Z", "Y")
+    sun.data.energy = 0.0 if request.get("in_eclipse") else SUN_IRRADIANCE
+
+
+PASSES = {}
+
+
+def keep_passes():
+    """Read the passes straight from Cycles' result: float32, no file, no view transform."""
+    from cycles import CyclesRender
+
+    original = CyclesRender.render
+
+    def render(self, depsgraph):
+        original(self, depsgraph)
+        result = self.get_result()
+        for p in result.layers[0].passes:
+            flat = np.empty(result.resolution_x * result.resolution_y * p.channels, dtype=np.float32)
+            p.rect.foreach_get(flat)
+            image = flat.reshape(result.resolution_y, result.resolution_x, p.channels)
+            PASSES[p.name] = image[::-1]  # Blender's rows start at the bottom
+
+    CyclesRender.render = render
+
+
+def render(request):
+    """Render one view: premultiplied radiance, alpha and planar depth, written to request["out"] whole or not at all."""
+    place(request)
+    PASSES.clear()
+    bpy.ops.render.render(write_still=False)
+    combined = PASSES["Combined"]
+    alpha = np.clip(combined[..., 3], 0, 1)
+    radiance = np.where(alpha[..., None] > 0, np.maximum(combined[..., :3], 0), 0)  # OIDN leaks outside the alpha
+    if request["channels"] == 1:
+        radiance = radiance @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # Rec. 709 luminance
+        radiance = radiance[..., None]
+    arrays = {"radiance": radiance.astype(np.float16), "alpha": np.round(alpha * 255).astype(np.uint8)}
+    if request.get("depth"):
+        arrays["depth"] = PASSES["Depth"][..., 0].astype(np.float32)
+        arrays["radiance"] = radiance.astype(np.float32)
+    part = request["out"] + f".{os.getpid()}.part"
+    with open(part, "wb") as f:
+        np.savez_compressed(f, **arrays)
+    os.replace(part, request["out"])
+
+
+def surface():
+    """Return the scene's triangles as vertices [V, 3] m and faces [F, 3]."""
+    all_vertices, all_faces, offset = [], [], 0
+    for o in bpy.context.scene.objects:
+        if o.type != "MESH":
+            continue
+        o.data.calc_loop_triangles()
+        faces = np.empty(3 * len(o.data.loop_triangles), dtype=np.int32)
+        o.data.loop_triangles.foreach_get("vertices", faces)
+        all_vertices.append(vertices(o))
+        all_faces.append(faces.reshape(-1, 3) + offset)
+        offset += len(o.data.vertices)
+    return np.concatenate(all_vertices), np.concatenate(all_faces)
+
+
+def visible(request):
+    """Mark the points that at least one camera centre sees, by casting rays from the point towards each camera."""
+    v, f = surface()
+    tree = BVHTree.FromPolygons(v.tolist(), f.tolist())
+    with np.load(request["points"]) as given:
+        points, centres = given["points"], given["centres"]
+    lift_m = 1e-4 * float(np.ptp(v, axis=0).max())
+    seen = np.zeros(len(points), dtype=bool)
+    for i, point in enumerate(points):
+        directions = centres - point
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        for direction in directions:
+            if tree.ray_cast(Vector(point + lift_m * direction), Vector(direction))[0] is None:
+                seen[i] = True
+                break
+    with open(request["out"], "wb") as out:
+        np.savez(out, seen=seen)
+
+
+def answer(request):
+    op = request["op"]
+    if op == "load":
+        facts = load(request["mesh"], request["keep_scale"])
+        set_up(request["samples"], request.get("ambient", EARTHSHINE_RADIANCE))
+        return facts
+    if op == "render":
+        render(request)
+        return {}
+    if op == "surface":
+        v, f = surface()
+        with open(request["out"], "wb") as out:
+            np.savez(out, vertices=v, faces=f)
+        return {}
+    if op == "visible":
+        visible(request)
+        return {}
+    raise ValueError(f"unknown operation {op!r}")
+
+
+def main():
+    replies = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # Blender's own chatter goes to stderr, replies keep the real stdout
+    keep_passes()
+    print(json.dumps({"ready": bpy.app.version_string}), file=replies, flush=True)
+    for line in sys.stdin:
+        try:
+            reply = {"ok": True, **answer(json.loads(line))}
+        except (RuntimeError, ValueError, KeyError, OSError) as error:
+            reply = {"ok": False, "error": f"{type(error).__name__}: {str(error).strip()}"}
+        print(json.dumps(reply), file=replies, flush=True)
+
+
+if __name__ == "__main__":
+    main()
