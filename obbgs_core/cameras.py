@@ -1,0 +1,40 @@
+"""Pinhole cameras: OpenCV axes, pixel centres at +0.5."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """C cameras of one image size; world_to_camera [C, 4, 4] (may carry a gradient), K [C, 3, 3] px."""
+
+    world_to_camera: Tensor
+    K: Tensor
+    width: int
+    height: int
+    near_m: float = 0.01
+
+    def __post_init__(self):
+        count = self.world_to_camera.shape[0]
+        for name, shape in (("world_to_camera", (count, 4, 4)), ("K", (count, 3, 3))):
+            if tuple(getattr(self, name).shape) != shape:
+                raise ValueError(f"{name} must be {list(shape)}, got {list(getattr(self, name).shape)}")
+        if self.width < 1 or self.height < 1 or not self.near_m > 0:
+            raise ValueError(f"width, height and near_m must be positive: {self.width}, {self.height}, {self.near_m}")
+
+    def __len__(self) -> int:
+        return self.world_to_camera.shape[0]
+
+    @property
+    def centres(self) -> Tensor:
+        """Camera centres [C, 3], m, body frame."""
+        R, t = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3:]
+        return -(R.transpose(1, 2) @ t)[..., 0]
+
+    def scaled(self, factor: float) -> "Cameras":
+        """Return the cameras of images resized by `factor` (0.5: half as wide and high, rounded up)."""
+        K = self.K * torch.tensor([[factor], [factor], [1.0]], dtype=self.K.dtype, device=self.K.device)
+        width, height = -int(-self.width * factor // 1), -int(-self.height * factor // 1)
+        return Cameras(self.world_to_camera, K, width, height, self.near_m)
