@@ -1,0 +1,115 @@
+"""Growth and pruning: who is cloned, split or removed, with the optimiser's state carried along."""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from obbgs_core.gaussians import Gaussians
+from obbgs_core.render import Rendered
+from obbgs_core.rotations import quats_to_matrices
+
+SPLIT_SHRINK = 1.6  # a split's halves are this much smaller (Kerbl et al. 2023)
+
+
+@dataclass
+class Growth:
+    """Running screen-space gradients [N], in px or weighted by the pixels each Gaussian covers (Pixel-GS)."""
+
+    count: int
+    pixel_weighted: bool
+    gradient: Tensor = field(init=False)
+    weight: Tensor = field(init=False)
+
+    def __post_init__(self):
+        self.gradient, self.weight = torch.zeros(self.count), torch.zeros(self.count)
+
+    @torch.no_grad()
+    def observe(self, rendered: Rendered, half_size_px: float) -> None:
+        """Add one step's gradients, per unit of normalised device coordinates as the published thresholds are."""
+        for camera, gradient in rendered.screen.means2d.items():
+            pixels = rendered.screen.pixels[camera]
+            weight = pixels if self.pixel_weighted else (pixels > 0).float()
+            self.gradient += gradient.norm(dim=-1) * half_size_px * weight
+            self.weight += weight
+
+    def mean(self) -> Tensor:
+        return self.gradient / self.weight.clamp(min=1e-9)
+
+
+class Adam:
+    """Adam over the Gaussians' parameters whose moments follow the Gaussians when they are split or removed."""
+
+    def __init__(self, gaussians: Gaussians, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
+        self.betas, self.eps, self.steps = betas, eps, 0
+        self.first = {name: torch.zeros_like(t) for name, t in gaussians.tensors().items()}
+        self.second = {name: torch.zeros_like(t) for name, t in gaussians.tensors().items()}
+
+    @torch.no_grad()
+    def step(self, gaussians: Gaussians, rates: dict[str, float]) -> None:
+        """Move every parameter that has a gradient, and drop the gradients."""
+        self.steps += 1
+        b1, b2 = self.betas
+        correction = math.sqrt(1 - b2**self.steps) / (1 - b1**self.steps)
+        for name, parameter in gaussians.tensors().items():
+            if parameter.grad is None:
+                continue
+            first, second = self.first[name], self.second[name]
+            first.lerp_(parameter.grad, 1 - b1)
+            second.mul_(b2).addcmul_(parameter.grad, parameter.grad, value=1 - b2)
+            parameter.addcdiv_(first, second.sqrt().add_(self.eps), value=-rates[name] * correction)
+            parameter.grad = None
+
+    def follow(self, kept: Tensor, added: int) -> None:
+        """Keep the moments of the Gaussians `kept` (index) and start `added` new ones at rest."""
+        for moments in (self.first, self.second):
+            for name, value in moments.items():
+                rest = torch.zeros(added, *value.shape[1:], dtype=value.dtype)
+                moments[name] = torch.cat([value[kept], rest])
+
+
+@torch.no_grad()
+def grow(gaussians: Gaussians, adam: Adam, chosen: Tensor, split_over_m: float, rng: torch.Generator) -> Gaussians:
+    """Return the model with the chosen Gaussians [N] bool cloned (small ones) or split in two (large ones).
+
+    Splitting draws the halves' centres from the Gaussian itself and shrinks them, as in Kerbl et al. 2023.
+    """
+    large = gaussians.scales.max(dim=1).values > split_over_m
+    clones = torch.nonzero(chosen & ~large)[:, 0]
+    splits = torch.nonzero(chosen & large)[:, 0]
+    kept = torch.nonzero(~(chosen & large))[:, 0]
+    parts = [gaussians.select(kept), gaussians.select(clones)]
+    for _ in range(2):
+        half = gaussians.select(splits)
+        noise = torch.randn(len(splits), 3, generator=rng) * half.scales
+        half.means = half.means + (quats_to_matrices(half.quats) @ noise[..., None])[..., 0]
+        half.log_scales = half.log_scales - math.log(SPLIT_SHRINK)
+        parts.append(half)
+    adam.follow(kept, len(clones) + 2 * len(splits))
+    return trainable(Gaussians.concatenate(parts))
+
+
+@torch.no_grad()
+def keep(gaussians: Gaussians, adam: Adam, mask: Tensor) -> Gaussians:
+    """Return the model with only the Gaussians in mask [N]."""
+    index = torch.nonzero(mask)[:, 0]
+    adam.follow(index, 0)
+    return trainable(gaussians.select(index))
+
+
+def trainable(gaussians: Gaussians) -> Gaussians:
+    """Return the same values as leaves that collect gradients."""
+    return Gaussians(**{n: t.detach().clone().requires_grad_() for n, t in gaussians.tensors().items()})
+
+
+@torch.no_grad()
+def outliers(gaussians: Gaussians, spread: float = 4.0, faint: float = 0.1) -> Tensor:
+    """Return which Gaussians [N] the centre-constrained filter removes: far from the robust centre, or faint and far.
+
+    Distance is from the median centre, in units of the median distance; the limit adapts to the target. A faint
+    Gaussian is removed at half of it (Jiang et al. 2025, section 3.6).
+    """
+    distance = (gaussians.means - gaussians.means.median(dim=0).values).norm(dim=1)
+    limit = spread * distance.median().clamp(min=1e-9)
+    return (distance > limit) | ((gaussians.opacities < faint) & (distance > limit / 2))

@@ -1,0 +1,117 @@
+"""The methods as data: what each published method, and ours, does differently. No subclasses."""
+
+import dataclasses
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True)
+class MethodConfig:
+    """Everything that shapes a training run; rates are per step, lengths in units of the target's radius."""
+
+    name: str
+    exposure_aware: bool = False  # False: exposure ignored, as the methods were published
+    loss: str = "l1_ssim"  # l1_ssim | likelihood (sensor model, saturated pixels censored)
+    ssim_weight: float = 0.2
+    edge_weight: float = 0.0  # Sobel
+    frames_per_step: int = 1
+    bracket_steps: bool = False  # the frames of a step are one of each exposure
+    start: str = "random"  # random | hull
+    start_count: int = 100_000
+    steps: int = 30_000
+    pyramid: tuple[tuple[float, float], ...] = ((0.0, 1.0),)  # (from this share of the steps, image scale)
+    sh_degree: int = 3
+    max_gaussians: int = 500_000
+    grow_from: float = 500 / 30_000  # share of the steps
+    grow_until: float = 0.5
+    grow_interval: int = 100
+    grow_grad2d: float = 0.0002  # mean screen gradient, per NDC
+    grow_share: float = 0.0  # > 0: grow this share of the Gaussians, largest gradients first, instead of a threshold
+    pixel_weighted: bool = False  # Pixel-GS
+    obb_interval: int = 0  # > 0: extra growth inside the boxes of the worst tiles, every so many steps
+    obb_mean_centre: bool = False
+    split_over: float = 0.01  # Gaussians larger than this are split, smaller ones cloned
+    prune_opacity: float = 0.005
+    prune_over: float = 0.2  # larger Gaussians are removed
+    opacity_reset_interval: int = 3000  # 0: never
+    outlier_filter: bool = False
+    lr_means: float = 1.6e-4
+    lr_means_end: float = 1.6e-6
+    lr_quats: float = 0.001
+    lr_log_scales: float = 0.005
+    lr_opacity_logits: float = 0.05
+    lr_sh: float = 0.0025
+    chi2_end: float = 0.0  # > 0: stop when the mean squared normalised residual falls to this
+
+    def __post_init__(self):
+        if self.loss not in ("l1_ssim", "likelihood"):
+            raise ValueError(f"loss must be l1_ssim or likelihood, got {self.loss!r}")
+        if self.start not in ("random", "hull"):
+            raise ValueError(f"start must be random or hull, got {self.start!r}")
+        for name in ("steps", "frames_per_step", "start_count", "max_gaussians"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+
+_3DGS = MethodConfig(name="3dgs")
+PRESETS: dict[str, MethodConfig] = {
+    c.name: c
+    for c in (
+        _3DGS,
+        replace(_3DGS, name="pixel-gs", pixel_weighted=True),
+        replace(_3DGS, name="mvgs", frames_per_step=4),
+        replace(
+            _3DGS,
+            name="jiang2025",
+            edge_weight=0.2,
+            frames_per_step=3,
+            bracket_steps=True,
+            pixel_weighted=True,
+            obb_interval=50,
+            outlier_filter=True,
+        ),
+        MethodConfig(
+            name="obbgs",
+            exposure_aware=True,
+            loss="likelihood",
+            ssim_weight=0.0,
+            edge_weight=0.05,
+            frames_per_step=3,
+            bracket_steps=True,
+            start="hull",
+            start_count=6000,
+            steps=1500,
+            pyramid=((0.0, 0.25), (0.15, 0.5), (0.4, 1.0)),
+            sh_degree=0,
+            max_gaussians=20_000,
+            grow_from=0.08,
+            grow_until=0.7,
+            grow_interval=60,
+            grow_share=0.08,
+            pixel_weighted=True,
+            obb_interval=30,
+            prune_opacity=0.02,
+            opacity_reset_interval=0,
+            outlier_filter=True,
+            lr_means=2e-3,
+            lr_means_end=2e-5,
+            lr_quats=0.005,
+            lr_log_scales=0.01,
+            lr_sh=0.02,
+            chi2_end=1.0,
+        ),
+    )
+}
+
+
+def preset(name: str, **changes) -> MethodConfig:
+    """Return a preset with some fields changed.
+
+    Raises:
+        ValueError: no such method or field.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"no method {name!r}; expected one of {', '.join(PRESETS)}")
+    known = {f.name for f in dataclasses.fields(MethodConfig)}
+    if unknown := set(changes) - known:
+        raise ValueError(f"{name} has no setting {', '.join(sorted(unknown))}")
+    return replace(PRESETS[name], **changes)

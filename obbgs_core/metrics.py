@@ -1,0 +1,68 @@
+"""How good a model is: image and geometry measures. Clouds in units where the target's largest dimension is 2."""
+
+import math
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from obbgs_core.gaussians import Gaussians
+from obbgs_core.losses import SSIM_WINDOW, ssim_map
+from obbgs_core.rotations import quats_to_matrices
+
+COMPLETENESS_RADIUS = 0.01
+SOLID_OPACITY = 0.3  # fainter Gaussians are not surface
+
+
+def psnr_db(a: Tensor, b: Tensor) -> float:
+    """Return the peak signal-to-noise ratio of two images in 0..1; capped at 120 dB for identical ones."""
+    return -10 * math.log10(max((a.double() - b.double()).square().mean().item(), 1e-12))
+
+
+def ssim(a: Tensor, b: Tensor) -> float:
+    """Return the mean SSIM of images [H, W, C] in 0..1, Gaussian window, borders of half a window left out."""
+    border = SSIM_WINDOW // 2
+    return ssim_map(a[None], b[None])[..., border:-border, border:-border].mean().item()
+
+
+def cloud_distances(cloud: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """Return how far two clouds [N, 3], [M, 3] lie apart, in their units.
+
+    chamfer: half the mean nearest distance each way, added. hausdorff: the same with the largest distance.
+    accuracy: mean distance cloud to truth. completeness: percentage of true points within 0.01 of the cloud.
+
+    Raises:
+        ValueError: a cloud is empty or not finite.
+    """
+    for name, points in (("cloud", cloud), ("truth", truth)):
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or not np.isfinite(points).all():
+            raise ValueError(f"{name} must be finite points [N, 3] with N > 0, got shape {points.shape}")
+    to_truth, _ = cKDTree(truth).query(cloud)
+    to_cloud, _ = cKDTree(cloud).query(truth)
+    return {
+        "chamfer": 0.5 * float(to_truth.mean()) + 0.5 * float(to_cloud.mean()),
+        "hausdorff": 0.5 * float(to_truth.max()) + 0.5 * float(to_cloud.max()),
+        "accuracy": float(to_truth.mean()),
+        "completeness": 100 * float((to_cloud < COMPLETENESS_RADIUS).mean()),
+    }
+
+
+@torch.no_grad()
+def surface_points(gaussians: Gaussians, count: int, seed: int = 0) -> Tensor:
+    """Return `count` points [count, 3] m spread over the solid Gaussians' discs, in proportion to their area.
+
+    A disc is the Gaussian's one-sigma ellipse across its shortest axis. Empty when no Gaussian is solid.
+    """
+    solid = gaussians.select(torch.nonzero(gaussians.opacities > SOLID_OPACITY)[:, 0])
+    if len(solid) == 0:
+        return torch.zeros(0, 3)
+    generator = torch.Generator().manual_seed(seed)
+    scales, order = solid.scales.sort(dim=1)
+    chosen = torch.multinomial(scales[:, 1] * scales[:, 2], count, replacement=True, generator=generator)
+    angle = 2 * math.pi * torch.rand(count, generator=generator)
+    reach = torch.rand(count, generator=generator).sqrt()
+    local = torch.zeros(count, 3)
+    local.scatter_(1, order[chosen, 1:2], (reach * angle.cos() * scales[chosen, 1])[:, None])
+    local.scatter_(1, order[chosen, 2:3], (reach * angle.sin() * scales[chosen, 2])[:, None])
+    return solid.means[chosen] + (quats_to_matrices(solid.quats[chosen]) @ local[..., None])[..., 0]

@@ -1,0 +1,70 @@
+"""Oriented bounding boxes around the Gaussians behind an image's worst tile (Jiang et al. 2025, section 3.4.2)."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+TILE_ROWS, TILE_COLUMNS = 20, 40  # px, the paper's window and stride
+FEWEST = 4  # Gaussians that define a box
+SURFACE_MARGIN = 0.02  # of the depth: how far behind the visible surface still counts as in front of it
+
+
+@dataclass(frozen=True)
+class Obb:
+    """Centre [3] m, axes [3, 3] (columns, orthonormal), half_extents [3] m."""
+
+    centre: Tensor
+    axes: Tensor
+    half_extents: Tensor
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Return which points [N, 3] lie inside or on the box, as bool [N]."""
+        local = (points - self.centre) @ self.axes
+        return (local.abs() <= self.half_extents * (1 + 1e-5) + 1e-9).all(dim=-1)
+
+
+def fit(points: Tensor, mean_centre: bool = False) -> Obb:
+    """Return the box of points [N, 3]: axes are the eigenvectors of their covariance (1/(n-1)).
+
+    Args:
+        mean_centre: keep the mean as the centre, as the paper does, instead of the middle of min and max.
+
+    Raises:
+        ValueError: fewer than two points.
+    """
+    if len(points) < 2:
+        raise ValueError(f"a box needs at least 2 points, got {len(points)}")
+    mean = points.mean(dim=0)
+    _, axes = torch.linalg.eigh(torch.cov(points.T))
+    local = (points - mean) @ axes
+    low, high = local.min(dim=0).values, local.max(dim=0).values
+    centre = mean if mean_centre else mean + axes @ ((low + high) / 2)
+    return Obb(centre, axes, (high - low) / 2)
+
+
+def worst_tile(error: Tensor) -> tuple[int, int]:
+    """Return the top row and left column, px, of the tile with the largest mean error in error [H, W]."""
+    height, width = error.shape
+    rows, columns = min(TILE_ROWS, height), min(TILE_COLUMNS, width)
+    means = F.avg_pool2d(error[None, None], (rows, columns), (rows, columns))[0, 0]
+    index = int(means.argmax())
+    return index // means.shape[1] * rows, index % means.shape[1] * columns
+
+
+def behind_tile(
+    means: Tensor, means2d: Tensor, depth: Tensor, world_to_camera: Tensor, tile: tuple[int, int]
+) -> Tensor:
+    """Return which Gaussians [N] lie in the frustum through the tile's corners, in front of the visible surface.
+
+    Args:
+        means: [N, 3] m; means2d: [N, 2] px; depth: [H, W] m, 0 where nothing is.
+    """
+    top, left = tile
+    z = means @ world_to_camera[2, :3] + world_to_camera[2, 3]
+    seen = depth[top : top + TILE_ROWS, left : left + TILE_COLUMNS]
+    farthest = seen.max() * (1 + SURFACE_MARGIN)
+    x, y = means2d.unbind(-1)
+    inside = (x >= left) & (x < left + TILE_COLUMNS) & (y >= top) & (y < top + TILE_ROWS)
+    return inside & (z > 0) & (z <= farthest)
