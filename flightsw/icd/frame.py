@@ -7,30 +7,20 @@ from dataclasses import dataclass
 import imagecodecs
 import numpy as np
 
+from flightsw.icd.packet import CrcMismatch, PacketError, PacketTooShort
+
 MAGIC = b"OBGF"
 VERSION = 1
 SOURCES = ("none", "sgp4", "navigation", "truth")
 # magic, version, header bytes | frame, bracket, index, count, flags | exposure s, mid-exposure UTC ns
-# | height, width, channels, bit depth, codec, NEAR, pose source | black, saturated | quaternion, position, Sun, covariance
-# (lower triangle) | codestream bytes, CRC-32 of the decoded pixels. Byte table: README.md.
+# | height, width, channels, bit depth, codec, NEAR, pose source | black, saturated | quaternion, position,
+# Sun, covariance (lower triangle) | codestream bytes, CRC-32 of the decoded pixels. Byte table: README.md.
 HEADER = struct.Struct(">4sHHIIBBHdqHHBBBBBxfI4d3d3d21dII")
 CRC = struct.Struct(">I")
 FLAG_ECLIPSE, FLAG_POSE_VALID, FLAG_MASKED = 1, 2, 4
 CODEC_JPEG_LS = 1
 MAX_PIXELS = 8192 * 8192
 TRIANGLE = np.tril_indices(6)
-
-
-class PacketError(ValueError):
-    """Bytes from the link are not what they claim to be."""
-
-
-class PacketTooShort(PacketError):
-    """Fewer bytes than the header promises."""
-
-
-class CrcMismatch(PacketError):
-    """A checksum does not fit its bytes."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +92,10 @@ class Frame:
             raise ValueError(f"dn must have 1 to {MAX_PIXELS} pixels, got {self.dn.shape}")
         if not (np.isfinite(self.exposure_time_s) and self.exposure_time_s > 0):
             raise ValueError(f"exposure_time_s must be positive, got {self.exposure_time_s}")
+        if not -(1 << 63) <= self.mid_exposure_utc_ns < 1 << 63:
+            raise ValueError(f"mid_exposure_utc_ns={self.mid_exposure_utc_ns} does not fit 64 bits")
+        if not 0 <= self.black_dn < 1 << 16:
+            raise ValueError(f"black_dn must be 0 to 65535, got {self.black_dn}")
         if not 8 <= self.bit_depth <= 16:
             raise ValueError(f"bit_depth must be 8 to 16, got {self.bit_depth}")
 
@@ -175,10 +169,14 @@ def decode_frame(data: bytes) -> Frame:
     if magic != MAGIC:
         raise PacketError(f"expected a frame starting with {MAGIC!r}, got {magic!r}")
     if version != VERSION or header_bytes != HEADER.size:
-        raise PacketError(f"frame version {version} with {header_bytes} header bytes; this software reads {VERSION}")
+        raise PacketError(
+            f"frame version {version} with {header_bytes} header bytes; this software reads {VERSION}"
+        )
     codestream_bytes, pixel_crc = fields[-2:]
     if len(data) != HEADER.size + codestream_bytes + CRC.size:
-        raise PacketTooShort(f"the header promises {codestream_bytes} codestream bytes, {len(data)} came in all")
+        raise PacketTooShort(
+            f"the header promises {codestream_bytes} codestream bytes, {len(data)} came in all"
+        )
     if CRC.unpack_from(data, len(data) - CRC.size)[0] != zlib.crc32(data[: -CRC.size]):
         raise CrcMismatch("the container's CRC-32 does not fit its bytes")
     return _frame_from(fields, data[HEADER.size : -CRC.size], pixel_crc)
@@ -188,14 +186,24 @@ def _frame_from(fields: tuple, codestream: bytes, pixel_crc: int) -> Frame:
     (frame_id, bracket_id, index, count, flags, exposure_s, mid_ns) = fields[3:10]
     (height, width, channels, bit_depth, codec, _near, source, black_dn, saturated) = fields[10:19]
     numbers = np.array(fields[19:50])
-    if codec != CODEC_JPEG_LS or channels not in (1, 3) or source >= len(SOURCES) or height * width > MAX_PIXELS:
-        raise PacketError(f"codec {codec}, {channels} channels, pose source {source}, {height}x{width}: out of range")
+    if (
+        codec != CODEC_JPEG_LS
+        or channels not in (1, 3)
+        or source >= len(SOURCES)
+        or height * width > MAX_PIXELS
+    ):
+        raise PacketError(
+            f"codec {codec}, {channels} channels, pose source {source}, {height}x{width}: out of range"
+        )
+    expected_size = (height, width, channels)
+    if _codestream_size(codestream) != expected_size:  # before decoding: hostile sizes must not take memory
+        raise PacketError(f"the header says {expected_size}, the codestream {_codestream_size(codestream)}")
     try:
         dn = imagecodecs.jpegls_decode(codestream)
     except (imagecodecs.JpeglsError, ValueError, RuntimeError) as error:
         raise PacketError(f"the JPEG-LS codestream cannot be decoded: {error}") from error
     expected_shape = (height, width) if channels == 1 else (height, width, channels)
-    if dn.shape != expected_shape or dn.dtype not in (np.uint8, np.uint16):
+    if dn.shape != expected_shape or dn.dtype != np.uint16:
         raise PacketError(f"the header says {expected_shape}, the codestream {dn.shape} {dn.dtype}")
     dn = dn.astype(np.uint16)
     if _pixel_crc(dn) != pixel_crc:
@@ -220,6 +228,16 @@ def _frame_from(fields: tuple, codestream: bytes, pixel_crc: int) -> Frame:
         raise PacketError(f"frame {frame_id}: {error}") from error
 
 
+def _codestream_size(codestream: bytes) -> tuple[int, int, int] | None:
+    """Return height, width and components that a JPEG-LS codestream announces, None if it announces none."""
+    at = 2  # after the start-of-image marker
+    while at + 10 <= len(codestream) and codestream[at] == 0xFF:
+        marker, length = codestream[at + 1], int.from_bytes(codestream[at + 2 : at + 4], "big")
+        if marker == 0xF7:  # start of a JPEG-LS frame (ISO 14495-1)
+            _, height, width, components = struct.unpack_from(">BHHB", codestream, at + 4)
+            return height, width, components
+        at += 2 + length
+    return None
 
 
 def _pixel_crc(dn: np.ndarray) -> int:
@@ -239,7 +257,7 @@ def quat_to_matrix(quat: np.ndarray) -> np.ndarray:
 
 
 def matrix_to_quat(matrix: np.ndarray) -> np.ndarray:
-    """Return the unit quaternion [4] w, x, y, z (w not negative) of a rotation [3, 3]; stable at any angle."""
+    """Return the unit quaternion [4] w, x, y, z (w not negative) of a rotation [3, 3], at any angle."""
     m = matrix
     K = np.array(
         [

@@ -1,0 +1,290 @@
+"""cfdp-py 0.7.0's state machines with their known defects mended, on a given clock, without a disk.
+
+Each mend overrides a private method, so the version is pinned, and each has a test that fails when the
+mend is not needed or not enough any more.
+"""
+
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from cfdppy.defs import CfdpState
+from cfdppy.filestore import VirtualFilestore
+from cfdppy.handler.dest import (
+    CompletionDisposition,
+    DestHandler,
+    LostSegmentTracker,
+)
+from cfdppy.handler.dest import (
+    TransactionStep as DestStep,
+)
+from cfdppy.handler.source import SourceHandler
+from cfdppy.handler.source import TransactionStep as SourceStep
+from cfdppy.mib import CheckTimerProvider, DefaultFaultHandlerBase
+from cfdppy.user import CfdpUserBase
+from spacepackets.cfdp import ConditionCode
+from spacepackets.cfdp.pdu import EofPdu, FileDataPdu, FinishedPdu, MetadataPdu
+from spacepackets.cfdp.pdu.finished import DeliveryCode, FileStatus, FinishedParams
+from spacepackets.cfdp.tlv import FilestoreResponseStatusCode
+from spacepackets.countdown import Countdown
+
+
+def delivered(finished: FinishedParams) -> bool:
+    """Tell whether a Finished PDU's parameters mean that the whole file is stored on the other side."""
+    return (
+        finished.condition_code == ConditionCode.NO_ERROR
+        and finished.delivery_code == DeliveryCode.DATA_COMPLETE
+        and finished.file_status == FileStatus.FILE_RETAINED
+    )
+
+
+class Clock:
+    """The time that the owner of a transfer last passed in."""
+
+    now_s = 0.0
+
+
+class ClockCountdown(Countdown):
+    """A countdown that reads a Clock where the original reads the machine's time."""
+
+    def __init__(self, clock: Clock, timeout_s: float):
+        self._clock, self._timeout_s, self._start_s = clock, timeout_s, clock.now_s
+
+    def timed_out(self) -> bool:
+        return self._clock.now_s - self._start_s >= self._timeout_s
+
+    def reset(self, new_timeout: Any = None) -> None:
+        self._start_s = self._clock.now_s
+
+
+class OneFile(VirtualFilestore):
+    """A file store that is one file in memory: names from the link reach no disk."""
+
+    def __init__(self, content: bytes, max_bytes: int):
+        self.content = bytearray(content)
+        self._max_bytes = max_bytes
+
+    def read_data(self, file: Path, offset: int | None, read_len: int) -> bytes:
+        start = offset or 0
+        return bytes(self.content[start : start + read_len])
+
+    def write_data(self, file: Path, data: bytes, offset: int | None) -> None:
+        start = offset or 0
+        end = start + len(data)
+        if end > self._max_bytes:
+            raise PermissionError(f"{end} bytes are more than the {self._max_bytes} allowed")
+        if end > len(self.content):
+            self.content.extend(bytes(end - len(self.content)))
+        self.content[start:end] = data
+
+    def calculate_checksum(
+        self, checksum_type: Any, file_path: Path, size_to_verify: int, segment_len: int = 4096
+    ) -> bytes:
+        return zlib.crc32(self.content[:size_to_verify]).to_bytes(4, "big")
+
+    def file_size(self, file: Path) -> int:
+        return len(self.content)
+
+    def file_exists(self, path: Path) -> bool:
+        return True
+
+    def is_directory(self, path: Path) -> bool:
+        return False
+
+    def truncate_file(self, file: Path) -> None:
+        """Keep the content: each transaction has its own file, and data may come before the metadata."""
+
+    def filename_from_full_path(self, path: Path) -> str:
+        return path.name
+
+    def read_from_opened_file(self, bytes_io: Any, offset: int, read_len: int) -> bytes:
+        return self.read_data(Path(), offset, read_len)
+
+    def create_file(self, *_: Any, **__: Any) -> FilestoreResponseStatusCode:
+        return FilestoreResponseStatusCode.NOT_PERFORMED  # there is one file, and it is here
+
+    delete_file = rename_file = replace_file = create_directory = create_file
+    remove_directory = list_directory = create_file
+
+
+class Indications(CfdpUserBase):
+    """Keeps what the handlers say about their one transaction."""
+
+    def __init__(self, vfs: OneFile, accept: Callable[[str, bytes], bool] | None = None):
+        super().__init__(vfs)
+        self.file = vfs
+        self._accept = accept
+        self.dest_name: str | None = None
+        self.finished: Any = None
+
+    def transaction_finished_indication(self, params: Any) -> None:
+        self.finished = params.finished_params
+        if self._accept is None or not delivered(self.finished):
+            return
+        if not self._accept(self.dest_name or "", bytes(self.file.content)):
+            self.finished.condition_code = ConditionCode.FILESTORE_REJECTION
+            self.finished.delivery_code = DeliveryCode.DATA_INCOMPLETE
+            self.finished.file_status = FileStatus.DISCARDED_FILESTORE_REJECTION
+
+    def metadata_recv_indication(self, params: Any) -> None:
+        self.dest_name = params.dest_file_name
+
+    def _ignore(self, *_: Any, **__: Any) -> None:
+        pass
+
+    transaction_indication = eof_sent_indication = file_segment_recv_indication = _ignore
+    report_indication = suspended_indication = resumed_indication = fault_indication = _ignore
+    abandoned_indication = eof_recv_indication = _ignore
+
+
+class Faults(DefaultFaultHandlerBase):
+    """Remembers the first condition that ended a transaction early."""
+
+    def __init__(self):
+        super().__init__()
+        self.condition: ConditionCode | None = None
+
+    def notice_of_cancellation_cb(self, transaction_id: Any, cond: ConditionCode, progress: int) -> None:
+        self.condition = self.condition or cond
+
+    def ignore_cb(self, transaction_id: Any, cond: ConditionCode, progress: int) -> None:
+        pass
+
+    notice_of_suspension_cb = abandoned_cb = notice_of_cancellation_cb
+
+
+class NoCheckTimer(CheckTimerProvider):
+    """Class 2 uses no check timer."""
+
+    def provide_check_timer(self, *_: Any) -> Countdown:
+        raise AssertionError("the check timer belongs to class 1")
+
+
+class Gaps(LostSegmentTracker):
+    """The missing ranges of a file; any range can be taken out, the original refuses partial overlap."""
+
+    def remove_lost_segment(self, segment_to_remove: tuple[int, int]) -> bool:
+        start, end = segment_to_remove
+        kept = []
+        for gap_start, gap_end in self.lost_segments:
+            kept += [
+                (a, b) for a, b in ((gap_start, min(gap_end, start)), (max(gap_start, end), gap_end)) if a < b
+            ]
+        changed = sorted(kept) != sorted(self.lost_segments)
+        self.lost_segments = sorted(kept)
+        return changed
+
+
+class MendedDest(DestHandler):
+    """The receiving state machine of one transaction."""
+
+    clock: Clock
+    cfg: Any
+    user: Indications
+
+    def _common_first_packet_handler(self, pdu: Any) -> bool | None:
+        # the original's default tracker is one object shared by all transactions: files get each other's gaps
+        self._params.acked_params.lost_seg_tracker = Gaps()
+        return super()._common_first_packet_handler(pdu)
+
+    def _handle_eof_without_previous_metadata(self, eof_pdu: EofPdu) -> None:
+        # the original forgets the checksum and then calls the good file damaged; and it throws away data
+        # that came before the metadata, so that one lost packet costs the whole file
+        params = self._params
+        params.acked_params.metadata_missing = True
+        if eof_pdu.condition_code != ConditionCode.NO_ERROR:
+            self._handle_eof_cancel(eof_pdu)
+        elif params.fp.progress < eof_pdu.file_size:
+            params.acked_params.lost_seg_tracker.add_lost_segment((params.fp.progress, eof_pdu.file_size))
+        params.fp.crc32, params.fp.file_size = eof_pdu.file_checksum, eof_pdu.file_size
+        params.fp.progress = eof_pdu.file_size
+        self._prepare_eof_ack_packet()
+        self._eof_ack_pdu_done()
+
+    def _handle_file_data_without_previous_metadata(self, fd_pdu: FileDataPdu) -> None:
+        self._handle_fd_pdu(fd_pdu)
+
+    def _handle_metadata_packet(self, metadata_pdu: MetadataPdu) -> None:
+        super()._handle_metadata_packet(metadata_pdu)
+        if self._params.acked_params.deferred_lost_segment_detection_active:
+            # the original goes back to waiting for file data, and both sides wait for ever
+            self.states.step = DestStep.WAITING_FOR_MISSING_DATA
+
+    def _deferred_lost_segment_handling(self) -> None:
+        super()._deferred_lost_segment_handling()
+        timer = self._params.acked_params.procedure_timer
+        if (
+            timer is not None
+            and not isinstance(timer, ClockCountdown)
+            and self._params.remote_cfg is not None
+        ):
+            timeout_s = self._params.remote_cfg.nak_timer_interval_seconds
+            self._params.acked_params.procedure_timer = ClockCountdown(self.clock, timeout_s)
+
+    def _start_positive_ack_procedure(self) -> None:
+        super()._start_positive_ack_procedure()
+        if self._params.remote_cfg is not None:
+            timeout_s = self._params.remote_cfg.positive_ack_timer_interval_seconds
+            self._params.positive_ack_params.ack_timer = ClockCountdown(self.clock, timeout_s)
+
+    def _handle_transfer_completion(self) -> None:
+        # with nothing missing the original reports success without looking at the checksum
+        params = self._params
+        if params.completion_disposition == CompletionDisposition.COMPLETED:
+            whole = len(self.user.file.content) == params.fp.file_size
+            crc = zlib.crc32(self.user.file.content).to_bytes(4, "big")
+            if not whole or crc != params.fp.crc32:
+                params.finished_params.delivery_code = DeliveryCode.DATA_INCOMPLETE
+                params.finished_params.condition_code = ConditionCode.FILE_CHECKSUM_FAILURE
+        super()._handle_transfer_completion()
+
+    def _handle_positive_ack_procedures(self) -> None:
+        # at the limit the original tells the sender that the file, which is stored, was cancelled
+        ack = self._params.positive_ack_params
+        limit = self._params.remote_cfg.positive_ack_timer_expiration_limit if self._params.remote_cfg else 0
+        if ack.ack_timer is not None and ack.ack_timer.timed_out() and ack.ack_counter + 1 >= limit:
+            self._reset_internal(False)
+        else:
+            super()._handle_positive_ack_procedures()
+
+    def acknowledge_again(self) -> None:
+        """Answer an EOF that came before: its acknowledgement may be lost. The original stays silent."""
+        self._prepare_eof_ack_packet()
+
+    @property
+    def has_seen_eof(self) -> bool:
+        return self.states.step in (
+            DestStep.WAITING_FOR_MISSING_DATA,
+            DestStep.TRANSFER_COMPLETION,
+            DestStep.SENDING_FINISHED_PDU,
+            DestStep.WAITING_FOR_FINISHED_ACK,
+        )
+
+    @property
+    def idle(self) -> bool:
+        return self.states.state == CfdpState.IDLE
+
+
+class MendedSource(SourceHandler):
+    """The sending state machine of one transaction."""
+
+    clock: Clock
+    cfg: Any
+    user: Indications
+
+    def _start_positive_ack_procedure(self) -> None:
+        super()._start_positive_ack_procedure()
+        if self._params.remote_cfg is not None:
+            timeout_s = self._params.remote_cfg.positive_ack_timer_interval_seconds
+            self._params.positive_ack_params.ack_timer = ClockCountdown(self.clock, timeout_s)
+
+    def _check_inserted_packet(self, packet: Any) -> None:
+        if isinstance(packet, FinishedPdu) and self.states.step == SourceStep.WAITING_FOR_EOF_ACK:
+            # Finished says more than the EOF's acknowledgement, which is lost; the original drops it
+            self.states.step = SourceStep.WAITING_FOR_FINISHED
+        super()._check_inserted_packet(packet)
+
+    @property
+    def idle(self) -> bool:
+        return self.states.state == CfdpState.IDLE

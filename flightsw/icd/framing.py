@@ -1,0 +1,143 @@
+"""Packets in a serial byte stream: COBS + CRC-16 between zero bytes; every byte is delivered or counted.
+
+On a wired link this takes the place of the radio's transfer frames; the packets inside stay the same. The
+CRC is CCITT's with the final inversion (CRC-16/GENIBUS): without it a packet followed by zeros fits its CRC
+too, and COBS makes such a zero of a delimiter with its lowest bit flipped.
+"""
+
+from cobs import cobs
+from fastcrc import crc16
+
+from flightsw.icd.packet import HEADER, PacketError, pack_packet, unpack_packet
+
+DELIMITER = b"\0"
+CRC_BYTES = 2
+SEQ_COUNTS = 1 << 14
+
+
+def frame_packet(packet: bytes) -> bytes:
+    """Return a packet as it goes on the wire: COBS of packet and CRC-16, then one zero byte."""
+    return cobs.encode(packet + crc16.genibus(packet).to_bytes(CRC_BYTES, "big")) + DELIMITER
+
+
+def max_frame_bytes(max_packet_bytes: int) -> int:
+    """Return the most bytes that a packet takes on the wire, its delimiter left out."""
+    content = max_packet_bytes + CRC_BYTES
+    return content + content // 254 + 1
+
+
+class Deframer:
+    """Finds packets in a byte stream that may start, break and lie anywhere.
+
+    At all times `packet_bytes + idle_bytes + skipped_bytes + pending_bytes` is the number of bytes fed.
+    """
+
+    def __init__(self, max_packet_bytes: int):
+        self.packet_bytes = 0  # of packets delivered, as framed
+        self.idle_bytes = 0  # delimiters with nothing between them
+        self.skipped_bytes = 0  # damaged, too long or no frame at all
+        self.crc_errors = 0  # runs of bytes between delimiters that are no packet
+        self._max_frame_bytes = max_frame_bytes(max_packet_bytes)
+        self._pending = bytearray()
+        self._too_long = False  # the frame under way is already thrown away
+
+    @property
+    def pending_bytes(self) -> int:
+        """Bytes of a frame still without its delimiter."""
+        return len(self._pending)
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Return the packets that `data` completes; memory is bounded by the longest packet."""
+        *ended, rest = data.split(DELIMITER)
+        packets = []
+        for part in ended:
+            self._collect(part)
+            packet = self._end_frame()
+            if packet is not None:
+                packets.append(packet)
+        self._collect(rest)
+        return packets
+
+    def _collect(self, part: bytes) -> None:
+        if self._too_long or len(self._pending) + len(part) > self._max_frame_bytes:
+            self._too_long = True
+            self.skipped_bytes += len(self._pending) + len(part)
+            self._pending.clear()
+        else:
+            self._pending += part
+
+    def _end_frame(self) -> bytes | None:
+        frame, too_long = bytes(self._pending), self._too_long
+        self._pending.clear()
+        self._too_long = False
+        if not frame and not too_long:
+            self.idle_bytes += 1
+            return None
+        packet = None if too_long else _packet_in(frame)
+        if packet is None:
+            self.skipped_bytes += len(frame) + 1
+            self.crc_errors += 1
+        else:
+            self.packet_bytes += len(frame) + 1
+        return packet
+
+
+def _packet_in(frame: bytes) -> bytes | None:
+    try:
+        content = cobs.decode(frame)
+    except cobs.DecodeError:
+        return None
+    packet, crc = content[:-CRC_BYTES], content[-CRC_BYTES:]
+    if not packet or crc16.genibus(packet) != int.from_bytes(crc, "big"):
+        return None
+    return packet
+
+
+class PacketStream:
+    """Both directions of one application's packets on a wire, with gaps in the other side's count noticed."""
+
+    def __init__(self, packet_type: int, apid: int, max_packet_bytes: int):
+        self.deframer = Deframer(max_packet_bytes)
+        self.max_data_bytes = max_packet_bytes - HEADER.size
+        self.packets_sent = 0
+        self.bytes_sent = 0
+        self.packets_received = 0
+        self.packets_missing = 0  # by gaps in the sequence count
+        self.packets_foreign = 0  # whole, but no packet of the other side's application
+        self._packet_type, self._apid = packet_type, apid
+        self._expected_count: int | None = None
+
+    def encode(self, data: bytes) -> bytes:
+        """Return `data` as the next packet, framed for the wire."""
+        framed = frame_packet(
+            pack_packet(self._packet_type, self._apid, self.packets_sent % SEQ_COUNTS, data)
+        )
+        self.packets_sent += 1
+        self.bytes_sent += len(framed)
+        return framed
+
+    def decode(self, wire_bytes: bytes) -> list[bytes]:
+        """Return the data of the packets that `wire_bytes` completes."""
+        data = []
+        for packet in self.deframer.feed(wire_bytes):
+            try:
+                header, content = unpack_packet(packet)
+            except PacketError:
+                self.packets_foreign += 1
+                continue
+            if header.apid != self._apid or header.packet_type == self._packet_type:
+                self.packets_foreign += 1
+                continue
+            self._count(header.seq_count)
+            data.append(content)
+        return data
+
+    def _count(self, seq_count: int) -> None:
+        self.packets_received += 1
+        if self._expected_count is not None:
+            gap = (seq_count - self._expected_count) % SEQ_COUNTS
+            if gap >= SEQ_COUNTS // 2:  # an older packet: late or sent twice, not missing any more
+                self.packets_missing = max(0, self.packets_missing - 1)
+                return
+            self.packets_missing += gap
+        self._expected_count = (seq_count + 1) % SEQ_COUNTS

@@ -1,0 +1,183 @@
+"""A finished run against the held-out frames and, where a simulator left it, the truth."""
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyParseError
+
+from ground.reconstruct import camera_of, predicted_image, sensor_of, split
+from ground.session import FrameRecord, Session, SessionError, open_session, write_whole
+from obbgs_core.gaussians import Gaussians
+from obbgs_core.metrics import cloud_distances, psnr_db, ssim, surface_points
+from obbgs_core.ply import load_ply
+from obbgs_core.render import render
+from obbgs_core.sensor import Sensor
+
+SURFACE_POINTS = 100_000
+FOREGROUND_MARGIN_PX = 4
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder with its session and models, as evaluation and report need it."""
+
+    folder: Path
+    session: Session
+    held_out: list[FrameRecord]
+    sensor: Sensor
+    gaussians: Gaussians
+    blind: Gaussians | None
+    metrics: dict
+
+
+def open_run(session_dir: Path, name: str) -> Run:
+    """Return a finished run.
+
+    Raises:
+        SessionError: no such session or run.
+    """
+    session = open_session(session_dir)
+    folder = session.path / "runs" / name
+    if not (folder / "metrics.json").is_file():
+        raise SessionError(f"{folder} is not a finished run; make one with `ground reconstruct --name {name}`")
+    training, held_out = split(session)
+    blind = load_ply(folder / "blind.ply") if (folder / "blind.ply").exists() else None
+    return Run(
+        folder,
+        session,
+        held_out or training,
+        sensor_of(session.camera),
+        load_ply(folder / "model.ply"),
+        blind,
+        json.loads((folder / "metrics.json").read_text()),
+    )
+
+
+class Truth:
+    """A simulator's truth folder: clean radiance by frame, and the visible surface.
+
+    Raises:
+        SessionError: it is there but damaged.
+    """
+
+    def __init__(self, session: Session):
+        self.folder = session.path / "truth"
+        try:
+            facts = json.loads((self.folder / "truth.json").read_text())
+            self._radiance = {entry["id"]: entry["radiance"] for entry in facts["frames"]}
+            self.largest_dimension_m = float(facts["largest_dimension_m"])
+            vertices = PlyData.read(str(self.folder / facts["cloud"]))["vertex"]
+        except (OSError, ValueError, KeyError, TypeError, PlyParseError) as error:
+            raise SessionError(f"{self.folder} is damaged: {error}") from error
+        self.cloud_m = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+
+    @staticmethod
+    def exists(session: Session) -> bool:
+        return (session.path / "truth" / "truth.json").is_file()
+
+    def radiance(self, record: FrameRecord) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return scene-linear radiance [H, W, C] and coverage [H, W] in 0..1 of a frame."""
+        with np.load(self.folder / self._radiance[record.id]) as arrays:
+            radiance = torch.from_numpy(arrays["radiance"].astype(np.float32))
+            return radiance, torch.from_numpy(arrays["alpha"].astype(np.float32) / 255)
+
+
+def evaluate(session_dir: Path, name: str) -> dict:
+    """Score a run, add the figures to its metrics.json and return them all.
+
+    Keys: psnr_noisy_db against the frames themselves; with truth also psnr_clean_db (expected image against the
+    noiseless exposure, full scale 1, mean over held-out frames), psnr_clean_<exposure>_db, psnr_clean_foreground_db
+    (the target's bounding box), ssim_clean, psnr_radiance_db (scene-linear, its brightest pixel 1), the same clean PSNR of
+    the blind training (psnr_clean_blind_db), and chamfer, hausdorff, accuracy, completeness of the Gaussians' centres
+    and *_surface of 100,000 points on the model, in units where the target's largest dimension is 2.
+
+    Raises:
+        SessionError: no such session or run, or damaged truth.
+    """
+    run = open_run(session_dir, name)
+    figures: dict[str, float] = {}
+    figures["psnr_noisy_db"] = _mean(
+        psnr_db(_predicted(run, run.gaussians, r), _noisy(run, r)) for r in run.held_out
+    )
+    if Truth.exists(run.session):
+        truth = Truth(run.session)
+        figures |= _clean_figures(run, truth)
+        scale = 2 / truth.largest_dimension_m
+        true_cloud = truth.cloud_m * scale
+        centres = run.gaussians.means.double().numpy() * scale
+        surface = surface_points(run.gaussians, SURFACE_POINTS).double().numpy() * scale
+        figures |= cloud_distances(centres, true_cloud)
+        if len(surface):
+            on_surface = cloud_distances(surface, true_cloud)
+            figures |= {f"{key}_surface": value for key, value in on_surface.items()}
+    metrics = {**run.metrics, **{key: round(value, 5) for key, value in figures.items()}}
+    write_whole(run.folder / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
+    return metrics
+
+
+def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:
+    by_exposure: dict[float, list[float]] = {}
+    foreground, similarity, blind, linear = [], [], [], []
+    for record in run.held_out:
+        clean = clean_image(run, truth, record)
+        predicted = _predicted(run, run.gaussians, record)
+        by_exposure.setdefault(record.exposure_time_s, []).append(psnr_db(predicted, clean))
+        box = bounding_box(truth.radiance(record)[1] > 0, FOREGROUND_MARGIN_PX)
+        foreground.append(psnr_db(predicted[box], clean[box]))
+        similarity.append(ssim(predicted, clean))
+        linear.append(_radiance_psnr_db(run, truth, record))
+        if run.blind is not None:
+            exposure_s = run.metrics["blind_reference_exposure_s"]
+            ignoring = predicted_image(run.blind, run.session, record, run.sensor, exposure_s)
+            blind.append(psnr_db(ignoring, clean))
+    figures = {"psnr_clean_db": _mean(value for values in by_exposure.values() for value in values)}
+    for exposure_s, values in sorted(by_exposure.items()):
+        figures[f"psnr_clean_{exposure_s * 1e3:g}ms_db"] = _mean(values)
+    figures["psnr_clean_foreground_db"] = _mean(foreground)
+    figures["ssim_clean"] = _mean(similarity)
+    figures["psnr_radiance_db"] = _mean(linear)
+    if blind:
+        figures["psnr_clean_blind_db"] = _mean(blind)
+    return figures
+
+
+def clean_image(run: Run, truth: Truth, record: FrameRecord) -> torch.Tensor:
+    """Return the noiseless exposure of a frame [H, W, C] over full scale, clipped as the sensor clips."""
+    radiance, _ = truth.radiance(record)
+    return (run.sensor.expected_dn(radiance, record.exposure_time_s) / run.sensor.white_dn).clamp(0, 1)
+
+
+def bounding_box(mask: torch.Tensor, margin_px: int) -> tuple[slice, slice]:
+    """Return the rows and columns around a mask [H, W] with a margin; the whole image when it is empty."""
+    rows, columns = torch.nonzero(mask.any(dim=1))[:, 0], torch.nonzero(mask.any(dim=0))[:, 0]
+    if len(rows) == 0:
+        return slice(None), slice(None)
+    top, left = max(0, int(rows[0]) - margin_px), max(0, int(columns[0]) - margin_px)
+    return slice(top, int(rows[-1]) + margin_px + 1), slice(left, int(columns[-1]) + margin_px + 1)
+
+
+def _predicted(run: Run, gaussians: Gaussians, record: FrameRecord) -> torch.Tensor:
+    exposure_s = run.metrics.get("reference_exposure_s") or record.exposure_time_s
+    return predicted_image(gaussians, run.session, record, run.sensor, exposure_s)
+
+
+def _noisy(run: Run, record: FrameRecord) -> torch.Tensor:
+    dn = run.session.dn(record).astype(np.float32)
+    return torch.from_numpy(dn.reshape(*dn.shape[:2], -1) / run.sensor.white_dn)
+
+
+def _radiance_psnr_db(run: Run, truth: Truth, record: FrameRecord) -> float:
+    true, _ = truth.radiance(record)
+    with torch.no_grad():
+        ours = render(run.gaussians, camera_of(run.session, record)).radiance[0]
+    brightest = true.max().clamp(min=1e-6)
+    return psnr_db(ours / brightest, true / brightest)
+
+
+def _mean(values) -> float:
+    values = list(values)
+    return math.fsum(values) / len(values)

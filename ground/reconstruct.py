@@ -1,0 +1,254 @@
+"""A session's frames to a run folder: the model, its ONNX renderer, what was done and how it went."""
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import logging
+import math
+import platform
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import torch
+import yaml
+from torch import Tensor
+
+from flightsw.icd.mission import CameraSection
+from ground.session import FrameRecord, Session, SessionError, open_session
+from obbgs_core.cameras import Cameras
+from obbgs_core.export_onnx import export_onnx
+from obbgs_core.gaussians import Gaussians
+from obbgs_core.methods import MethodConfig, preset
+from obbgs_core.optimize import StepInfo, TrainingFrame, TrainResult, train
+from obbgs_core.ply import save_ply
+from obbgs_core.render import native_kernels, render
+from obbgs_core.sensor import Sensor
+
+log = logging.getLogger(__name__)
+HELD_OUT = 8  # every eighth bracket is never trained on
+LOG_EVERY = 10  # steps
+PARITY_VIEWS = 5
+PACKAGES = ("obbgs", "torch", "numpy", "onnxruntime", "plotly")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One step of one of the trainings of a run."""
+
+    label: str  # "known exposure" or "blind to exposure"
+    info: StepInfo
+
+
+def reconstruct(
+    session_dir: Path,
+    name: str = "run",
+    method: str = "obbgs",
+    changes: dict | None = None,
+    seed: int = 7,
+    time_limit_s: float = math.inf,
+    blind_reference: bool = False,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> Path:
+    """Train on a session and return the run folder, written whole or not at all; an older run of the name is replaced.
+
+    Truth is never read here. With `blind_reference` the same training runs a second time with every exposure taken for
+    their geometric mean, so that a report can show what knowing the exposure is worth.
+
+    Raises:
+        SessionError: the session cannot be used, or the name is not a plain folder name.
+        ReconstructionError: the frames do not allow a model (too few, all black).
+        ValueError: no such method or setting.
+    """
+    if not name or Path(name).name != name or name.startswith("."):
+        raise SessionError(f"a run's name is a plain folder name, got {name!r}")
+    config = preset(method, **(changes or {}))
+    session = open_session(session_dir)
+    training, held_out = split(session)
+    sensor = sensor_of(session.camera)
+    frames = [training_frame(session, record) for record in training]
+    folder = session.path / "runs" / name
+    part = folder.with_name(f".{name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    try:
+        handler = _log_to(part / "log")
+        with open(part / "metrics.jsonl", "w") as lines:
+            result = _train("known exposure", frames, sensor, config, seed, time_limit_s, on_progress, lines)
+            blind = None
+            if blind_reference and config.exposure_aware:
+                ignoring = dataclasses.replace(config, exposure_aware=False)
+                label = "blind to exposure"
+                blind = _train(label, frames, sensor, ignoring, seed, time_limit_s, on_progress, lines)
+        exposures_s = sorted({record.exposure_time_s for record in training})
+        white_radiance = (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * exposures_s[0])
+        save_ply(result.gaussians, part / "model.ply", white_radiance)
+        if blind is not None:
+            save_ply(blind.gaussians, part / "blind.ply", white_radiance)
+        camera = session.camera
+        exported = export_onnx(
+            result.gaussians, sensor, part / "model.onnx", camera.width, camera.height, exposures_s
+        )
+        views = (held_out or training)[:: max(1, len(held_out or training) // PARITY_VIEWS)][:PARITY_VIEWS]
+        metrics = {
+            "method": method,
+            "gaussians": len(result.gaussians),
+            "train_seconds": round(result.seconds, 3),
+            "stop_reason": result.stop_reason,
+            "start": result.start,
+            "removed_outliers": result.removed_outliers,
+            "chi2": result.history[-1].chi2,
+            "frames_received": len(session.frames),
+            # frames are numbered without gaps in flight, so a gap here is a frame that never came
+            "frames_captured": session.frames[-1].id - session.frames[0].id + 1,
+            "frames_trained": len(training),
+            "frames_held_out": len(held_out),
+            "exposures_s": exposures_s,
+            "bytes_received": session.bytes_received,
+            "onnx_bytes": exported.size_bytes,
+            "onnx_parity_db": onnx_parity_db(part / "model.onnx", result.gaussians, session, views, sensor),
+            "reference_exposure_s": result.reference_exposure_s,
+        }
+        if blind is not None:
+            metrics |= {
+                "blind_gaussians": len(blind.gaussians),
+                "blind_train_seconds": round(blind.seconds, 3),
+                "blind_reference_exposure_s": blind.reference_exposure_s,
+            }
+        (part / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+        (part / "config.yaml").write_text(yaml.safe_dump(_resolved(session, config, seed), sort_keys=False))
+        log.info("%d Gaussians in %.1f s: %s", len(result.gaussians), result.seconds, result.stop_reason)
+        handler.close()
+        logging.getLogger().removeHandler(handler)
+        shutil.rmtree(folder, ignore_errors=True)
+        part.rename(folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return folder
+
+
+def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
+    """Return the frames to train on and the held-out ones: whole brackets, every eighth; the last if there are fewer.
+
+    Frames in eclipse or with an invalid pose are left out of both.
+
+    Raises:
+        SessionError: no frame is left.
+    """
+    usable = [r for r in session.frames if r.pose_valid and not r.in_eclipse]
+    if not usable:
+        eclipsed = sum(r.in_eclipse for r in session.frames)
+        raise SessionError(
+            f"none of the {len(session.frames)} frames can be used: {eclipsed} in eclipse, the others with stale poses"
+        )
+    if len(usable) < len(session.frames):
+        log.warning("%d frames in eclipse or with stale poses are left out", len(session.frames) - len(usable))
+    brackets = sorted({r.bracket for r in usable})
+    chosen = {b for i, b in enumerate(brackets) if i % HELD_OUT == HELD_OUT - 1}
+    if not chosen and len(brackets) > 1:
+        chosen = {brackets[-1]}
+    return [r for r in usable if r.bracket not in chosen], [r for r in usable if r.bracket in chosen]
+
+
+def sensor_of(camera: CameraSection) -> Sensor:
+    """Return the image model of a session's camera."""
+    return Sensor(
+        camera.black_dn, camera.white_dn, camera.dn_per_radiance_s, camera.electrons_per_dn, camera.read_noise_dn
+    )
+
+
+def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
+    dn = session.dn(record).astype(np.float32)
+    return TrainingFrame(
+        dn=torch.from_numpy(dn.reshape(*dn.shape[:2], session.camera.channels)),
+        exposure_time_s=record.exposure_time_s,
+        world_to_camera=torch.tensor(record.world_to_camera, dtype=torch.float32),
+        K=torch.tensor(session.camera.K),
+        id=record.id,
+    )
+
+
+def camera_of(session: Session, record: FrameRecord) -> Cameras:
+    pose = torch.tensor(record.world_to_camera, dtype=torch.float32)
+    return Cameras(pose[None], torch.tensor(session.camera.K)[None], session.camera.width, session.camera.height)
+
+
+@torch.no_grad()
+def predicted_image(
+    gaussians: Gaussians, session: Session, record: FrameRecord, sensor: Sensor, exposure_time_s: float
+) -> Tensor:
+    """Return the model's image of a frame [H, W, C], expected digital numbers over full scale, 0..1."""
+    radiance = render(gaussians, camera_of(session, record)).radiance[0]
+    return (sensor.expected_dn(radiance, exposure_time_s) / sensor.white_dn).clamp(0, 1)
+
+
+def onnx_parity_db(
+    path: Path, gaussians: Gaussians, session: Session, views: list[FrameRecord], sensor: Sensor
+) -> float:
+    """Return the lowest PSNR of onnxruntime's images against our renderer's over some views."""
+    runtime = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    K = np.array(session.camera.K, dtype=np.float32)
+    worst = math.inf
+    for record in views:
+        feed = {
+            "world_to_camera": record.world_to_camera.astype(np.float32),
+            "K": K,
+            "exposure_time_s": np.array(record.exposure_time_s, dtype=np.float32),
+        }
+        image = np.asarray(runtime.run(["image"], feed)[0])
+        ours = predicted_image(gaussians, session, record, sensor, record.exposure_time_s).numpy()
+        worst = min(worst, -10 * math.log10(max(float(np.mean((image - ours) ** 2)), 1e-12)))
+    return round(worst, 2)
+
+
+def _train(
+    label: str,
+    frames: list[TrainingFrame],
+    sensor: Sensor,
+    config: MethodConfig,
+    seed: int,
+    time_limit_s: float,
+    on_progress: Callable[[Progress], None],
+    lines,
+) -> TrainResult:
+    def on_step(info: StepInfo) -> None:
+        on_progress(Progress(label, info))
+        if info.step % LOG_EVERY == 0 or info.step == info.steps:
+            line = {"training": label, **dataclasses.asdict(info)}
+            lines.write(json.dumps({k: None if v != v else v for k, v in line.items()}) + "\n")
+
+    result = train(frames, sensor, config, seed, on_step, time_limit_s)
+    log.info("%s: start from %s; %s", label, result.start, result.stop_reason)
+    return result
+
+
+def _resolved(session: Session, config: MethodConfig, seed: int) -> dict:
+    """Everything needed to repeat the run."""
+    frames = (session.path / "frames.jsonl").read_bytes()
+    versions = {name: importlib.metadata.version(name) for name in PACKAGES}
+    kernels = native_kernels()
+    return {
+        "method": {k: list(map(list, v)) if k == "pyramid" else v for k, v in dataclasses.asdict(config).items()},
+        "seed": seed,
+        "threads": torch.get_num_threads(),
+        "rasterizer": f"native {kernels[0]}" if kernels else "reference",
+        "session": {
+            "mission_sha256": session.mission_sha256,
+            "frames_jsonl_sha256": hashlib.sha256(frames).hexdigest(),
+            "created_utc": session.created_utc,
+        },
+        "versions": {"python": platform.python_version(), **versions},
+        "machine": platform.machine(),
+    }
+
+
+def _log_to(path: Path) -> logging.FileHandler:
+    handler = logging.FileHandler(path)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    root = logging.getLogger()
+    root.addHandler(handler)
+    return handler

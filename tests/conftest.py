@@ -1,0 +1,58 @@
+"""What several packages' tests need: a mission and frames for it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flightsw.icd.frame import Frame, PoseTag
+from flightsw.icd.mission import Mission, load_mission
+
+SIZE_PX = 48
+
+
+@pytest.fixture
+def small_mission(tmp_path: Path) -> Mission:
+    """The demo's mission with a 48x48 camera."""
+    text = (Path(__file__).parents[1] / "mission.yaml").read_text()
+    path = tmp_path / "small.yaml"
+    path.write_text(
+        text.replace("width: 256", f"width: {SIZE_PX}").replace("height: 256", f"height: {SIZE_PX}")
+    )
+    return load_mission(path)
+
+
+@pytest.fixture
+def make_frame() -> Callable[..., Frame]:
+    """Makes frames of noise: every bit of the codestream counts."""
+
+    def make(frame_id: int = 0, size_px: int = SIZE_PX, channels: int = 1) -> Frame:
+        rng = np.random.default_rng(frame_id)
+        shape = (size_px, size_px) if channels == 1 else (size_px, size_px, channels)
+        quat = rng.normal(size=4)
+        root = rng.normal(size=(6, 6))
+        pose = PoseTag(
+            quat_body_to_camera=quat / np.linalg.norm(quat),
+            position_body_m=rng.normal(size=3) * 400,
+            covariance=root @ root.T,
+            sun_dir_body=np.array([0.6, 0.0, 0.8]),
+            in_eclipse=False,
+            valid=True,
+        )
+        dn = rng.integers(0, 4096, shape, dtype=np.uint16)
+        return Frame(
+            frame_id=frame_id,
+            bracket_id=frame_id // 3,
+            bracket_index=frame_id % 3,
+            bracket_count=3,
+            exposure_time_s=1e-4,
+            mid_exposure_utc_ns=1_784_631_150_000_000_000 + frame_id,
+            pose=pose,
+            dn=dn,
+            bit_depth=12,
+            black_dn=64.0,
+            saturated_count=int((dn == 4095).sum()),
+        )
+
+    return make

@@ -1,0 +1,162 @@
+"""The frame container: exact both ways, and nothing damaged or hostile accepted."""
+
+import dataclasses
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from flightsw.icd.frame import (
+    HEADER,
+    CrcMismatch,
+    Frame,
+    PacketError,
+    PacketTooShort,
+    PoseTag,
+    decode_frame,
+    encode_frame,
+)
+
+finite = st.floats(-1e6, 1e6)
+own_fixture = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+
+
+def assert_equal(a: Frame, b: Frame) -> None:
+    for field in dataclasses.fields(Frame):
+        if field.name not in ("pose", "dn"):
+            assert getattr(a, field.name) == getattr(b, field.name), field.name
+    for field in dataclasses.fields(PoseTag):
+        np.testing.assert_array_equal(getattr(a.pose, field.name), getattr(b.pose, field.name))
+    np.testing.assert_array_equal(a.dn, b.dn)
+
+
+def sealed(body: bytes) -> bytes:
+    """Return the bytes behind a CRC that fits: what only a hostile sender would send."""
+    return body + struct.pack(">I", zlib.crc32(body))
+
+
+@given(
+    frame_id=st.integers(0, 2**32 - 1),
+    mid_ns=st.integers(0, 2**62),
+    exposure_s=st.floats(1e-6, 60),
+    position=st.tuples(finite, finite, finite),
+    shape=st.tuples(st.integers(1, 20), st.integers(1, 20)),
+    channels=st.sampled_from([1, 3]),
+    seed=st.integers(0, 99),
+)
+@settings(deadline=None)
+def test_decode_of_encode_is_the_frame(frame_id, mid_ns, exposure_s, position, shape, channels, seed):
+    rng = np.random.default_rng(seed)
+    quat, root = rng.normal(size=4), rng.normal(size=(6, 6))
+    covariance = root + root.T
+    pose = PoseTag(
+        quat / np.linalg.norm(quat), np.array(position), covariance, np.array([0.0, 0, 1]), True, False
+    )
+    dn = rng.integers(0, 65536, shape if channels == 1 else (*shape, 3), dtype=np.uint16)
+    frame = Frame(frame_id, seed, 1, 3, exposure_s, mid_ns, pose, dn, 16, 64.0, 5)
+    assert_equal(decode_frame(encode_frame(frame)), frame)
+
+
+def test_world_to_camera_puts_the_camera_centre_at_the_origin(make_frame):
+    frame = make_frame(3)
+    centre = np.append(frame.pose.position_body_m, 1.0)
+    np.testing.assert_allclose(frame.world_to_camera @ centre, [0, 0, 0, 1], atol=1e-10)  # 400 m in float64
+
+
+def test_region_of_interest_is_lossless_inside_and_black_outside(make_frame):
+    frame, mask = make_frame(1), np.zeros((48, 48), bool)
+    mask[10:30, 5:40] = True
+    container = encode_frame(frame, roi_mask=mask)
+    decoded = decode_frame(container)
+    np.testing.assert_array_equal(decoded.dn[mask], frame.dn[mask])
+    assert (decoded.dn[~mask] == 64).all()
+    assert len(container) < 0.5 * len(encode_frame(frame))
+    assert decoded.saturated_count == frame.saturated_count
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_near_bounds_the_error_of_every_pixel(make_frame, channels):
+    frame = make_frame(1, channels=channels)
+    error = decode_frame(encode_frame(frame, near=2)).dn.astype(int) - frame.dn
+    assert 0 < np.abs(error).max() <= 2
+
+
+@given(st.data())
+@own_fixture
+def test_a_flipped_bit_is_never_accepted(make_frame, data):
+    container = bytearray(encode_frame(make_frame(2, size_px=12)))
+    bit = data.draw(st.integers(0, 8 * len(container) - 1))
+    container[bit // 8] ^= 1 << bit % 8
+    with pytest.raises(PacketError):
+        decode_frame(bytes(container))
+
+
+@given(st.data())
+@own_fixture
+def test_hostile_container_with_fitting_crc_decodes_or_raises_packet_error(make_frame, data):
+    body = bytearray(encode_frame(make_frame(2, size_px=12))[:-4])
+    for _ in range(data.draw(st.integers(1, 6))):
+        body[data.draw(st.integers(0, len(body) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        frame = decode_frame(sealed(bytes(body)))
+    except PacketError:
+        return
+    assert frame.dn.shape == (12, 12)
+
+
+@given(st.binary(max_size=600))
+def test_random_bytes_raise_packet_error(data):
+    with pytest.raises(PacketError):
+        decode_frame(data)
+    with pytest.raises(PacketError):
+        decode_frame(sealed(b"OBGF" + data))
+
+
+def test_a_codestream_of_another_size_is_refused_before_it_is_decoded(make_frame):
+    body = bytearray(encode_frame(make_frame(1))[:-4])
+    start_of_frame = body.index(b"\xff\xf7", HEADER.size)
+    struct.pack_into(">HH", body, start_of_frame + 5, 65535, 65535)  # 8 GiB of pixels
+    with pytest.raises(PacketError, match=r"the codestream \(65535, 65535, 1\)"):
+        decode_frame(sealed(bytes(body)))
+
+
+def test_pixels_that_do_not_fit_their_crc_are_refused(make_frame):
+    body = bytearray(encode_frame(make_frame(1))[:-4])
+    body[HEADER.size - 1] ^= 1
+    with pytest.raises(CrcMismatch, match="decoded pixels"):
+        decode_frame(sealed(bytes(body)))
+
+
+def test_each_refusal_says_what_is_wrong(make_frame):
+    container = encode_frame(make_frame(1))
+    with pytest.raises(PacketTooShort, match="at least 314 bytes, got 9"):
+        decode_frame(container[:9])
+    with pytest.raises(PacketTooShort, match="codestream bytes"):
+        decode_frame(container[:-1])
+    with pytest.raises(PacketError, match="starting with b'OBGF'"):
+        decode_frame(b"PNG!" + container[4:])
+    with pytest.raises(PacketError, match="version 9"):
+        decode_frame(sealed(container[:4] + b"\0\x09" + container[6:-4]))
+    with pytest.raises(CrcMismatch, match="container"):
+        decode_frame(container[:-1] + bytes([container[-1] ^ 1]))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"exposure_time_s": 0.0},
+        {"exposure_time_s": float("nan")},
+        {"frame_id": 2**32},
+        {"black_dn": -1.0},
+        {"bit_depth": 7},
+        {"mid_exposure_utc_ns": 2**63},
+        {"dn": np.zeros((4, 4), np.uint8)},
+        {"dn": np.zeros((4, 0), np.uint16)},
+    ],
+)
+def test_a_frame_cannot_hold_values_that_the_container_cannot(make_frame, wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        dataclasses.replace(make_frame(1), **wrong)

@@ -1,0 +1,155 @@
+"""The frame store: nothing half there, nothing numbered twice, whatever moment the power goes."""
+
+import hashlib
+import json
+import subprocess
+import sys
+
+import pytest
+
+from flightsw.errors import StoreError
+from flightsw.icd.frame import decode_frame, encode_frame
+from flightsw.store import FrameStore
+
+
+def fill(store: FrameStore, make_frame, count: int) -> None:
+    for _ in range(count):
+        store.put(make_frame(store.next_frame_id))
+
+
+def test_a_stored_frame_comes_back_and_its_index_line_holds_its_digest(tmp_path, make_frame):
+    store = FrameStore(tmp_path)
+    store.put(make_frame(0))
+    container = store.read(0)
+    assert (decode_frame(container).dn == make_frame(0).dn).all()
+    line = json.loads((tmp_path / "index.jsonl").read_text())
+    assert line["sha256"] == hashlib.sha256(container).hexdigest()
+    assert line["size_bytes"] == len(container)
+    assert store.path(0).name == "00000000.obf"
+
+
+def test_numbers_outbox_and_frames_survive_a_restart(tmp_path, make_frame):
+    fill(FrameStore(tmp_path), make_frame, 3)
+    FrameStore(tmp_path).mark_delivered(1)
+    store = FrameStore(tmp_path)
+    assert store.next_frame_id == 3
+    assert [stored.frame_id for stored in store.frames] == [0, 1, 2]
+    assert store.outbox() == [0, 2]
+
+
+def test_a_line_cut_off_in_writing_is_written_again_from_its_container(tmp_path, make_frame):
+    fill(FrameStore(tmp_path), make_frame, 3)
+    index = tmp_path / "index.jsonl"
+    before = index.read_bytes()
+    index.write_bytes(before[:-20])
+    store = FrameStore(tmp_path)
+    assert index.read_bytes() == before
+    assert store.outbox() == [0, 1, 2]
+
+
+def test_a_half_written_container_is_dropped_and_its_number_used_for_the_next(tmp_path, make_frame):
+    fill(FrameStore(tmp_path), make_frame, 2)
+    whole = encode_frame(make_frame(2))
+    (tmp_path / "outbox" / "00000002").touch()
+    (tmp_path / "frames" / "00000002.obf.part").write_bytes(whole[:100])
+    (tmp_path / "frames" / "00000003.obf").write_bytes(whole[:100])
+    store = FrameStore(tmp_path)
+    assert store.next_frame_id == 2
+    assert store.outbox() == [0, 1]
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["00000000.obf", "00000001.obf"]
+
+
+def test_a_number_is_taken_only_once(tmp_path, make_frame):
+    store = FrameStore(tmp_path)
+    store.put(make_frame(0))
+    with pytest.raises(StoreError, match="next free number is 1"):
+        store.put(make_frame(0))
+
+
+def test_one_process_sends_what_another_captures(tmp_path, make_frame):
+    sending, capturing = FrameStore(tmp_path), FrameStore(tmp_path)
+    fill(capturing, make_frame, 2)
+    assert sending.outbox() == [0, 1]
+    sending.read(1)
+    sending.mark_delivered(0)
+    assert capturing.outbox() == [1]
+
+
+def test_damage_in_the_middle_of_the_index_is_reported_not_guessed_at(tmp_path, make_frame):
+    fill(FrameStore(tmp_path), make_frame, 2)
+    index = tmp_path / "index.jsonl"
+    index.write_bytes(b"?" + index.read_bytes())
+    with pytest.raises(StoreError, match="damaged at byte 0"):
+        FrameStore(tmp_path)
+
+
+def test_a_container_that_changed_on_the_disk_is_not_sent(tmp_path, make_frame):
+    store = FrameStore(tmp_path)
+    store.put(make_frame(0))
+    damaged = bytearray(store.path(0).read_bytes())
+    damaged[400] ^= 1
+    store.path(0).write_bytes(damaged)
+    with pytest.raises(StoreError, match="changed on the disk"):
+        store.read(0)
+
+
+def test_a_full_disk_leaves_no_half_line(tmp_path, make_frame, monkeypatch):
+    store = FrameStore(tmp_path)
+    store.put(make_frame(0))
+    before = (tmp_path / "index.jsonl").read_bytes()
+
+    def no_space(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("flightsw.store.os.fsync", no_space)
+        with pytest.raises(StoreError, match="No space left"):
+            store.put(make_frame(1))
+    assert (tmp_path / "index.jsonl").read_bytes() == before
+    store.put(make_frame(1))
+    assert FrameStore(tmp_path).outbox() == [0, 1]
+
+
+def test_transaction_numbers_are_never_given_twice(tmp_path):
+    numbers = [FrameStore(tmp_path).next_transaction() for _ in range(3)]
+    assert numbers == [1, 2, 3]
+    (tmp_path / "transaction").write_text("?")
+    with pytest.raises(StoreError, match="should hold a number"):
+        FrameStore(tmp_path).next_transaction()
+
+
+CAPTURE_UNTIL_KILLED = """
+import sys
+from pathlib import Path
+from flightsw.icd.frame import decode_frame
+from flightsw.store import FrameStore
+import dataclasses
+store, frame = FrameStore(Path(sys.argv[1])), decode_frame(Path(sys.argv[2]).read_bytes())
+while True:
+    store.put(dataclasses.replace(frame, frame_id=store.next_frame_id))
+    print(store.next_frame_id, flush=True)
+"""
+
+
+def test_a_kill_at_any_moment_loses_no_stored_frame(tmp_path, make_frame):
+    (tmp_path / "frame").write_bytes(encode_frame(make_frame(0)))
+    stored = 0
+    for kill_after in (1, 4, 7):
+        process = subprocess.Popen(
+            [sys.executable, "-c", CAPTURE_UNTIL_KILLED, tmp_path / "store", tmp_path / "frame"],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout is not None
+        for _ in range(kill_after):
+            stored = int(process.stdout.readline())
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        store = FrameStore(tmp_path / "store")
+        assert store.next_frame_id >= stored
+        assert (
+            store.outbox() == [frame.frame_id for frame in store.frames] == list(range(store.next_frame_id))
+        )
+        for frame in store.frames:
+            assert decode_frame(store.read(frame.frame_id)).frame_id == frame.frame_id

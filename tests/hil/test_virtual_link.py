@@ -1,0 +1,144 @@
+"""The virtual serial line: rate, back-pressure, and faults that are seeded and counted."""
+
+import os
+import time
+
+import pytest
+import serial
+
+from flightsw.icd.framing import Deframer, frame_packet
+from hil.virtual_link import Faults, VirtualSerial, run_link
+
+PACKETS = [bytes([number % 256]) * (20 + number % 50) for number in range(300)]
+STREAM = b"".join(map(frame_packet, PACKETS))
+
+
+def send(line: VirtualSerial, stream: bytes, quiet_s: float = 0.3) -> bytes:
+    """Send a stream down the line as fast as it takes it; return what arrives until it is quiet."""
+    received, last_s = b"", time.monotonic()
+    with (
+        serial.Serial(line.flight_device, line.baud_rate, timeout=0, write_timeout=0, exclusive=True) as near,
+        serial.Serial(line.ground_device, line.baud_rate, timeout=0, exclusive=True) as far,
+    ):
+        while stream or time.monotonic() - last_s < quiet_s:
+            try:
+                stream = stream[os.write(near.fileno(), stream) :]
+            except BlockingIOError:
+                pass
+            data = far.read(65_536)
+            if data:
+                received, last_s = received + data, time.monotonic()
+            time.sleep(0.001)
+    return received
+
+
+def assert_counts_add_up(line: VirtualSerial) -> None:
+    for lane in line.statistics().values():
+        assert lane.bytes_in + lane.duplicated_bytes == (
+            lane.bytes_out + lane.lost_bytes + lane.cut_bytes + lane.held_bytes
+        )
+
+
+def test_without_faults_every_byte_passes_at_the_line_s_rate():
+    baud_rate = 115_200
+    with VirtualSerial(baud_rate) as line:
+        began_s = time.monotonic()
+        assert send(line, STREAM, quiet_s=0.1) == STREAM
+        seconds = time.monotonic() - began_s - 0.1
+        ideal_s = len(STREAM) * 10 / baud_rate
+        assert seconds > 0.95 * ideal_s  # the burst of 10 ms is all that it may gain
+        assert_counts_add_up(line)
+        assert line.statistics()["down"].packets == len(PACKETS)
+
+
+def test_nobody_reading_holds_the_writer_back_and_loses_nothing():
+    with VirtualSerial(3_000_000) as line:
+        with serial.Serial(line.flight_device, timeout=0, write_timeout=0) as near:
+            end_s, written = time.monotonic() + 1.0, 0
+            while time.monotonic() < end_s:
+                try:
+                    written += os.write(near.fileno(), b"x" * 1000)
+                except BlockingIOError:
+                    time.sleep(0.001)
+            assert written < 200_000  # buffers of both terminals; the line alone would take 300 kB
+        time.sleep(0.1)
+        with serial.Serial(line.ground_device, timeout=0.3) as far:
+            # opening flushes what this terminal held; the rest of the bytes still comes
+            rest = far.read(written)
+        assert rest.strip(b"x") == b""
+        assert_counts_add_up(line)
+
+
+def test_each_fault_happens_about_as_often_as_asked_and_is_counted():
+    faults = Faults(loss=0.1, bit_flip=0.1, duplicate=0.1, reorder=0.1)
+    with VirtualSerial(3_000_000, faults, seed=5) as line:
+        received = send(line, STREAM)
+        lane = line.statistics()["down"]
+        assert_counts_add_up(line)
+    assert len(received) == lane.bytes_out
+    counts = (lane.packets_lost, lane.packets_flipped, lane.packets_duplicated, lane.packets_reordered)
+    assert all(10 <= count <= 60 for count in counts)  # 30 expected of 300, 5 sigma either way
+    deframer = Deframer(200)
+    packets = deframer.feed(received)
+    assert set(packets) <= set(PACKETS)
+    assert deframer.crc_errors > 0
+    # a flipped delimiter joins two packets, a new one splits a packet: either spoils at most two
+    expected = len(PACKETS) - lane.packets_lost + lane.packets_duplicated
+    assert expected - 3 * lane.packets_flipped <= len(packets) <= expected
+
+
+def test_the_same_seed_brings_the_same_faults():
+    def run(seed: int) -> bytes:
+        with VirtualSerial(3_000_000, Faults(loss=0.2, bit_flip=0.2), seed) as line:
+            return send(line, STREAM)
+
+    first = run(1)
+    assert first == run(1)
+    assert first != run(2)
+
+
+def test_a_cut_cable_swallows_bytes_and_a_mended_one_passes_them():
+    with VirtualSerial(3_000_000) as line:
+        line.cut()
+        assert send(line, STREAM[:1000]) == b""
+        assert line.statistics()["down"].cut_bytes == 1000
+        line.mend()
+        assert send(line, STREAM[:1000]) == STREAM[:1000]
+        assert_counts_add_up(line)
+
+
+def test_both_directions_work_at_once():
+    with (
+        VirtualSerial(3_000_000) as line,
+        serial.Serial(line.flight_device, timeout=2) as near,
+        serial.Serial(line.ground_device, timeout=2) as far,
+    ):
+        near.write(b"down")
+        far.write(b"up")
+        assert (far.read(4), near.read(2)) == (b"down", b"up")
+
+
+def test_run_link_names_its_ends_and_returns_its_counts():
+    seen, reports = [], []
+
+    def on_ready(line: VirtualSerial) -> None:
+        seen.append((line.flight_url, line.ground_url))
+        assert send(line, STREAM[:500]) == STREAM[:500]
+
+    statistics = run_link(
+        921_600,
+        Faults(),
+        0,
+        on_ready,
+        should_stop=lambda: bool(reports),
+        on_statistics=reports.append,
+        every_s=0.1,
+    )
+    assert seen[0][0].startswith("serial:///dev/") and seen[0][0].endswith("?baud=921600")
+    assert seen[0][0] != seen[0][1]
+    assert statistics["down"].bytes_out == 500
+
+
+def test_a_fault_s_rate_is_a_probability():
+    with pytest.raises(ValueError, match="bit_flip must be 0 to 1"):
+        Faults(bit_flip=1.5)
