@@ -167,7 +167,9 @@ def with_bracket(mission: Mission, bracket: str | None, count: int | None, inter
         try:
             changes["exposure_times_ms"] = tuple(float(part) for part in bracket.split(","))
         except ValueError as error:
-            raise ConfigError("--bracket", f"expected times in ms such as 0.05,0.1,0.2, got {bracket!r}") from error
+            raise ConfigError(
+                "--bracket", f"expected times in ms such as 0.05,0.1,0.2, got {bracket!r}"
+            ) from error
     if count is not None:
         changes["count"] = count
     if interval is not None:
@@ -203,7 +205,9 @@ def _run(
             link = SerialLink(link_url)  # a port that is not there is known before the first exposure
             if camera_url is not None:
                 capturing.set()
-            thread = _Downlink(FrameStore(store_dir), link, mission, exit_when_empty, capturing, stop, report_sent)
+            thread = _Downlink(
+                FrameStore(store_dir), link, mission, exit_when_empty, capturing, stop, report_sent
+            )
             thread.start()
         try:
             if camera_url is not None:
@@ -218,7 +222,10 @@ def _run(
             if thread.error:
                 raise thread.error
             sent = thread.result
-    result: dict[str, Any] = {"frames_stored": len(store.frames), "outbox": len(FrameStore(store_dir).outbox())}
+    result: dict[str, Any] = {
+        "frames_stored": len(store.frames),
+        "outbox": len(FrameStore(store_dir).outbox()),
+    }
     if camera_url is not None:
         result["capture"] = vars(captured)
     if link_url is not None:
@@ -227,7 +234,9 @@ def _run(
         print(json.dumps(result))
     else:
         if camera_url is not None:
-            print(f"captured {captured.stored} frames, {captured.already_stored} were there, {captured.failed} failed")
+            print(
+                f"captured {captured.stored} frames, {captured.already_stored} were there, {captured.failed} failed"
+            )
         if link_url is not None:
             print(f"delivered {sent.delivered} frames, {sent.segments_resent} segments resent")
         print(f"{result['frames_stored']} frames in {store_dir}, {result['outbox']} still to be delivered")
@@ -236,7 +245,12 @@ def _run(
 
 
 def _capture(
-    mission: Mission, camera_url: str, store: FrameStore, progress: Progress, shots: int, stop: threading.Event
+    mission: Mission,
+    camera_url: str,
+    store: FrameStore,
+    progress: Progress,
+    shots: int,
+    stop: threading.Event,
 ) -> CaptureCounts:
     task = progress.add_task("captured", total=shots)
     camera = open_camera(camera_url)

@@ -125,8 +125,8 @@ def teme_to_gcrs(utc_ns: int) -> np.ndarray:
         ]
     )
     phase = NUTATION_TERMS[:, :5] @ arguments
-    dpsi = np.sin(phase) @ (NUTATION_TERMS[:, 5] + NUTATION_TERMS[:, 6] * T) * 1e-4 * ARCSEC_RAD
-    deps = np.cos(phase) @ (NUTATION_TERMS[:, 7] + NUTATION_TERMS[:, 8] * T) * 1e-4 * ARCSEC_RAD
+    dpsi = float(np.sin(phase) @ (NUTATION_TERMS[:, 5] + NUTATION_TERMS[:, 6] * T)) * 1e-4 * ARCSEC_RAD
+    deps = float(np.cos(phase) @ (NUTATION_TERMS[:, 7] + NUTATION_TERMS[:, 8] * T)) * 1e-4 * ARCSEC_RAD
     epsilon = (84381.448 - 46.8150 * T) * ARCSEC_RAD
     mod_to_tod = _rotation(0, -epsilon - deps) @ _rotation(2, -dpsi) @ _rotation(0, epsilon)
     teme_to_tod = _rotation(2, -dpsi * np.cos(epsilon))

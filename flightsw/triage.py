@@ -50,13 +50,19 @@ class Renderer:
         options.log_severity_level = 3
         try:
             # without custom operator libraries registered, onnxruntime itself refuses any other operator
-            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            self._session = onnxruntime.InferenceSession(
+                str(path), options, providers=["CPUExecutionProvider"]
+            )
         except Exception as error:  # onnxruntime's errors share no base class; the file is from the link
-            raise TriageError(f"{path} is not a model that onnxruntime accepts: {str(error)[:200]}") from error
+            raise TriageError(
+                f"{path} is not a model that onnxruntime accepts: {str(error)[:200]}"
+            ) from error
         inputs = {i.name for i in self._session.get_inputs()}
         outputs = {o.name for o in self._session.get_outputs()}
         if inputs != {"world_to_camera", "K", "exposure_time_s"} or not {"image", "alpha"} <= outputs:
-            raise TriageError(f"{path} takes {sorted(inputs)} and gives {sorted(outputs)}: not a renderer of ours")
+            raise TriageError(
+                f"{path} takes {sorted(inputs)} and gives {sorted(outputs)}: not a renderer of ours"
+            )
         metadata = self._session.get_modelmeta().custom_metadata_map
         try:
             self.width, self.height = int(metadata["width"]), int(metadata["height"])
@@ -142,4 +148,4 @@ def tile_means(image: np.ndarray) -> np.ndarray:
     sums = np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1)
     heights = np.diff(np.append(rows, image.shape[0]))
     widths = np.diff(np.append(columns, image.shape[1]))
-    return sums / (heights[:, None] * widths[None, :])
+    return sums / np.outer(heights, widths)

@@ -17,7 +17,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from flightsw.icd.mission import ConfigError, load_mission
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, help="The ground station: frames in, a 3D model out.")
+app = typer.Typer(
+    add_completion=False, no_args_is_help=True, help="The ground station: frames in, a 3D model out."
+)
 stderr = Console(stderr=True)
 
 SessionDir = Annotated[Path, typer.Option("--session", help="The session folder.")]
@@ -30,7 +32,9 @@ def listen_command(
     link: Annotated[str, typer.Option(help="serial:///dev/ttyUSB0?baud=921600")],
     session: SessionDir,
     mission: Annotated[Path, typer.Option(help="The mission file.")] = Path("mission.yaml"),
-    exit_after: Annotated[int | None, typer.Option(help="Stop when the session holds so many frames.")] = None,
+    exit_after: Annotated[
+        int | None, typer.Option(help="Stop when the session holds so many frames.")
+    ] = None,
     idle_timeout: Annotated[float | None, typer.Option(help="Stop after so many seconds of silence.")] = None,
     json_: AsJson = False,
 ) -> None:
@@ -47,7 +51,9 @@ def listen_command(
         task = progress.add_task("listening", total=None)
 
         def show(now: ListenSummary) -> None:
-            text = f"{now.frames_in_session} frames, {now.bytes_received:,} bytes, {now.crc_errors} CRC errors"
+            text = (
+                f"{now.frames_in_session} frames, {now.bytes_received:,} bytes, {now.crc_errors} CRC errors"
+            )
             progress.update(task, description=f"{text}, {now.segments_resent} segments resent")
 
         summary = listen(link, session, load_mission(mission), exit_after, idle_timeout, show, stop.is_set)
@@ -68,7 +74,9 @@ def reconstruct_command(
     max_gaussians: Annotated[int | None, typer.Option(min=1, help="Largest model.")] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for each training.")] = math.inf,
     seed: Annotated[int, typer.Option(help="Same seed, same model.")] = 7,
-    blind_reference: Annotated[bool, typer.Option(help="Train once more blind to exposure, to compare.")] = False,
+    blind_reference: Annotated[
+        bool, typer.Option(help="Train once more blind to exposure, to compare.")
+    ] = False,
     threads: Annotated[int | None, typer.Option(min=1, help="Cores; default all.")] = None,
     json_: AsJson = False,
 ) -> None:
@@ -76,7 +84,9 @@ def reconstruct_command(
 
     Example: ground reconstruct --session pass-12 --name first --time-limit 120
     """
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # spinning threads cost more than they give; before torch
+    os.environ.setdefault(
+        "OMP_WAIT_POLICY", "passive"
+    )  # spinning threads cost more than they give; before torch
     import torch
 
     from ground.evaluate import evaluate

@@ -43,7 +43,9 @@ def open_run(session_dir: Path, name: str) -> Run:
     session = open_session(session_dir)
     folder = session.path / "runs" / name
     if not (folder / "metrics.json").is_file():
-        raise SessionError(f"{folder} is not a finished run; make one with `ground reconstruct --name {name}`")
+        raise SessionError(
+            f"{folder} is not a finished run; make one with `ground reconstruct --name {name}`"
+        )
     training, held_out = split(session)
     blind = load_ply(folder / "blind.ply") if (folder / "blind.ply").exists() else None
     return Run(
@@ -91,9 +93,9 @@ def evaluate(session_dir: Path, name: str) -> dict:
 
     Keys: psnr_noisy_db against the frames themselves; with truth also psnr_clean_db (expected image against the
     noiseless exposure, full scale 1, mean over held-out frames), psnr_clean_<exposure>_db, psnr_clean_foreground_db
-    (the target's bounding box), ssim_clean, psnr_radiance_db (scene-linear, its brightest pixel 1), the same clean PSNR of
-    the blind training (psnr_clean_blind_db), and chamfer, hausdorff, accuracy, completeness of the Gaussians' centres
-    and *_surface of 100,000 points on the model, in units where the target's largest dimension is 2.
+    (the target's bounding box), ssim_clean, psnr_radiance_db (scene-linear, its brightest pixel 1), the clean PSNR
+    of the blind training (psnr_clean_blind_db), and chamfer, hausdorff, accuracy, completeness of the Gaussians'
+    centres and *_surface of 100,000 points on the model, where the target's largest dimension is 2.
 
     Raises:
         SessionError: no such session or run, or damaged truth.

@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 WAIT_S = 0.02  # longest wait for bytes before timers are looked at again
 SAVE_S = 1.0  # between writes of session.json
 FRAME_NAME = re.compile(r"(\d{8})\.obf", re.ASCII)  # any other name is refused: a name is no path
-LINGER_INTERVALS = 10  # timer intervals to stay, at most, until the last reports are acknowledged
+LINGER_INTERVALS = 4  # of silence before a sender with an open transfer counts as gone
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,6 @@ def listen(
         ingest = _Ingest(link, writer, mission)
         interval_s = timer_s(link.baud_rate)
         last_packet_s = last_save_s = clock_s()
-        complete_since_s: float | None = None
         while not should_stop():
             now_s = clock_s()
             frames_before = ingest.frames_received
@@ -93,10 +92,9 @@ def listen(
                 log.info("no packet for %.1f s", idle_timeout_s)
                 break
             if exit_after is not None and writer.frame_count >= exit_after:
-                # the flight side must hear that its last frames are stored
-                complete_since_s = now_s if complete_since_s is None else complete_since_s
-                lingered_s = now_s - complete_since_s
-                if not ingest.open_transfers or lingered_s > LINGER_INTERVALS * interval_s:
+                # the flight side must hear that its last frames are stored, if it is still there
+                quiet_s = now_s - last_packet_s
+                if not ingest.open_transfers or quiet_s > LINGER_INTERVALS * interval_s:
                     break
         ingest.save()
         on_progress(ingest.summary())

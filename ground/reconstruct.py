@@ -146,7 +146,9 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
             f"none of the {len(session.frames)} frames can be used: {eclipsed} in eclipse, the others with stale poses"
         )
     if len(usable) < len(session.frames):
-        log.warning("%d frames in eclipse or with stale poses are left out", len(session.frames) - len(usable))
+        log.warning(
+            "%d frames in eclipse or with stale poses are left out", len(session.frames) - len(usable)
+        )
     brackets = sorted({r.bracket for r in usable})
     chosen = {b for i, b in enumerate(brackets) if i % HELD_OUT == HELD_OUT - 1}
     if not chosen and len(brackets) > 1:
@@ -157,7 +159,11 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
 def sensor_of(camera: CameraSection) -> Sensor:
     """Return the image model of a session's camera."""
     return Sensor(
-        camera.black_dn, camera.white_dn, camera.dn_per_radiance_s, camera.electrons_per_dn, camera.read_noise_dn
+        camera.black_dn,
+        camera.white_dn,
+        camera.dn_per_radiance_s,
+        camera.electrons_per_dn,
+        camera.read_noise_dn,
     )
 
 
@@ -174,7 +180,9 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
 
 def camera_of(session: Session, record: FrameRecord) -> Cameras:
     pose = torch.tensor(record.world_to_camera, dtype=torch.float32)
-    return Cameras(pose[None], torch.tensor(session.camera.K)[None], session.camera.width, session.camera.height)
+    return Cameras(
+        pose[None], torch.tensor(session.camera.K)[None], session.camera.width, session.camera.height
+    )
 
 
 @torch.no_grad()
@@ -232,7 +240,9 @@ def _resolved(session: Session, config: MethodConfig, seed: int) -> dict:
     versions = {name: importlib.metadata.version(name) for name in PACKAGES}
     kernels = native_kernels()
     return {
-        "method": {k: list(map(list, v)) if k == "pyramid" else v for k, v in dataclasses.asdict(config).items()},
+        "method": {
+            k: list(map(list, v)) if k == "pyramid" else v for k, v in dataclasses.asdict(config).items()
+        },
         "seed": seed,
         "threads": torch.get_num_threads(),
         "rasterizer": f"native {kernels[0]}" if kernels else "reference",

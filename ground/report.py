@@ -33,14 +33,18 @@ STYLE = """
 body { margin: 0; background: #f3f5f8; color: var(--ink); font: 15px/1.55 system-ui, "Segoe UI", Roboto, sans-serif; }
 main { max-width: 1120px; margin: 0 auto; padding: 28px 24px 60px; }
 h1 { font-size: 26px; margin: 0 0 4px; } h2 { font-size: 19px; margin: 0 0 10px; }
-section { background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 20px 22px; margin-top: 20px; }
+section { background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 20px 22px;
+  margin-top: 20px; }
 p.note { color: var(--soft); margin: 4px 0 14px; font-size: 13.5px; }
 .cards { display: grid; grid-template-columns: repeat(4, 1fr); gap: 12px; }
 .card { border: 1px solid var(--line); border-radius: 8px; padding: 12px 14px; }
-.card b { display: block; font-size: 23px; font-variant-numeric: tabular-nums; } .card span { color: var(--soft); font-size: 13px; }
-table { border-collapse: collapse; width: 100%; font-size: 14px; } td, th { text-align: left; padding: 5px 10px; border-bottom: 1px solid var(--line); vertical-align: top; }
+.card b { display: block; font-size: 23px; font-variant-numeric: tabular-nums; }
+.card span { color: var(--soft); font-size: 13px; }
+table { border-collapse: collapse; width: 100%; font-size: 14px; }
+td, th { text-align: left; padding: 5px 10px; border-bottom: 1px solid var(--line); vertical-align: top; }
 td.n { text-align: right; font-variant-numeric: tabular-nums; }
-.grid { display: grid; gap: 6px; } .grid img { width: 100%; display: block; background: #000; border-radius: 3px; image-rendering: pixelated; }
+.grid { display: grid; gap: 6px; }
+.grid img { width: 100%; display: block; background: #000; border-radius: 3px; image-rendering: pixelated; }
 .grid .label { color: var(--soft); font-size: 13px; align-self: center; }
 .grid figure { margin: 0; } .grid figcaption { color: var(--soft); font-size: 12px; text-align: center; }
 .two { display: grid; grid-template-columns: 1fr 1fr; gap: 24px; }
@@ -67,7 +71,9 @@ def write_report(session_dir: Path, name: str) -> Path:
         _link(run),
         _configuration(run),
     ]
-    title = f"Reconstruction of {html.escape(run.session.path.resolve().parent.name)}, run {html.escape(name)}"
+    title = (
+        f"Reconstruction of {html.escape(run.session.path.resolve().parent.name)}, run {html.escape(name)}"
+    )
     page = (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style>'
@@ -91,7 +97,12 @@ def _headline(run: Run, truth: Truth | None) -> str:
         cards.append((f"{m['psnr_clean_db']:.2f} dB", "clean held-out PSNR, exposure known"))
     if "psnr_clean_blind_db" in m:
         gain = m["psnr_clean_db"] - m["psnr_clean_blind_db"]
-        cards.append((f"{m['psnr_clean_blind_db']:.2f} dB", f"the same training blind to exposure ({gain:+.2f} dB gained)"))
+        cards.append(
+            (
+                f"{m['psnr_clean_blind_db']:.2f} dB",
+                f"the same training blind to exposure ({gain:+.2f} dB gained)",
+            )
+        )
     elif "psnr_noisy_db" in m:
         cards.append((f"{m['psnr_noisy_db']:.2f} dB", "held-out PSNR against the noisy frames"))
     if "chamfer" in m:
@@ -100,7 +111,9 @@ def _headline(run: Run, truth: Truth | None) -> str:
     cards.append((f"{m['gaussians']:,}", "Gaussians"))
     cards.append((f"{m['train_seconds']:.0f} s", f"training; {html.escape(m['stop_reason'])}"))
     cards.append((f"{m['frames_received']} / {m['frames_captured']}", "frames received / captured"))
-    cards.append((f"{m['onnx_parity_db']:.0f} dB", f"ONNX renderer against ours, {m['onnx_bytes'] / 1e6:.2f} MB"))
+    cards.append(
+        (f"{m['onnx_parity_db']:.0f} dB", f"ONNX renderer against ours, {m['onnx_bytes'] / 1e6:.2f} MB")
+    )
     body = "".join(f'<div class="card"><b>{value}</b><span>{label}</span></div>' for value, label in cards)
     note = (
         "Clean: against noiseless exposures of views that were never trained on, full scale = 1."
@@ -129,7 +142,9 @@ def _details(m: dict) -> str:
         for key, value in m.items()
         if key.startswith("psnr_clean_") and key.endswith("ms_db")
     ]
-    cells = "".join(f'<tr><td>{html.escape(label)}</td><td class="n">{value:.4g}</td></tr>' for label, value in rows)
+    cells = "".join(
+        f'<tr><td>{html.escape(label)}</td><td class="n">{value:.4g}</td></tr>' for label, value in rows
+    )
     return f'<table style="margin-top:16px">{cells}</table>'
 
 
@@ -142,7 +157,8 @@ def _frames(run: Run) -> str:
         cells.append(f'<div class="label">{exposure_s * 1e3:g} ms</div>')
         for bracket in picked:
             record = next(
-                (r for r in run.session.frames if r.bracket == bracket and r.exposure_time_s == exposure_s), None
+                (r for r in run.session.frames if r.bracket == bracket and r.exposure_time_s == exposure_s),
+                None,
             )
             if record is None:
                 cells.append('<div class="label">missing</div>')
@@ -164,23 +180,33 @@ def _frames(run: Run) -> str:
 def _triples(run: Run, truth: Truth | None) -> str:
     exposures = sorted({r.exposure_time_s for r in run.held_out})
     brackets = sorted({r.bracket for r in run.held_out})
-    views = [brackets[i] for i in np.unique(np.linspace(0, len(brackets) - 1, TRIPLE_VIEWS).round().astype(int))]
+    views = [
+        brackets[i] for i in np.unique(np.linspace(0, len(brackets) - 1, TRIPLE_VIEWS).round().astype(int))
+    ]
     names = ["truth" if truth else "frame", "render", "error"]
     cells = ['<div class="label"></div>', *(f'<div class="label">{n}</div>' for _ in views for n in names)]
     for exposure_s in exposures:
         cells.append(f'<div class="label">{exposure_s * 1e3:g} ms</div>')
         for bracket in views:
-            record = next((r for r in run.held_out if (r.bracket, r.exposure_time_s) == (bracket, exposure_s)), None)
+            record = next(
+                (r for r in run.held_out if (r.bracket, r.exposure_time_s) == (bracket, exposure_s)), None
+            )
             if record is None:
                 cells += ['<div class="label">missing</div>'] * 3
                 continue
             seen_at_s = run.metrics.get("reference_exposure_s") or exposure_s
             render = predicted_image(run.gaussians, run.session, record, run.sensor, seen_at_s)
-            expected = clean_image(run, truth, record) if truth else torch.from_numpy(_noisy_image(run, record))
+            expected = (
+                clean_image(run, truth, record) if truth else torch.from_numpy(_noisy_image(run, record))
+            )
             black = run.sensor.black_dn / run.sensor.white_dn
             box = bounding_box(expected.mean(-1) > black + 0.01, MARGIN_PX)
             error = ((render - expected).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
-            for image in (_tone(expected[box].numpy()), _tone(render[box].numpy()), _heat(error[box].numpy())):
+            for image in (
+                _tone(expected[box].numpy()),
+                _tone(render[box].numpy()),
+                _heat(error[box].numpy()),
+            ):
                 cells.append(f'<figure><img alt="frame {record.id}" src="{_png(image)}"></figure>')
     columns = f"60px repeat({3 * len(views)}, 1fr)"
     grid = f'<div class="grid" style="grid-template-columns: {columns}; align-items: center">{"".join(cells)}</div>'
@@ -218,7 +244,9 @@ def _model(run: Run) -> str:
     frames = sorted(run.session.frames, key=lambda r: r.mid_exposure_utc_ns)
     centres = np.array([r.position_body_m for r in frames])
     ranges_m = np.linalg.norm(centres, axis=1)
-    shown = centres / ranges_m[:, None] * reach_m * 2.2  # true directions at one drawn range: the track is far away
+    shown = (
+        centres / ranges_m[:, None] * reach_m * 2.2
+    )  # true directions at one drawn range: the track is far away
     figure.add_scatter3d(
         x=shown[:, 0],
         y=shown[:, 1],
@@ -271,7 +299,9 @@ def _training(history: list[dict]) -> str:
             )
     figure.update_yaxes(type="log", row=1, col=1)
     figure.update_xaxes(title_text="seconds")
-    figure.update_layout(height=360, margin={"l": 50, "r": 20, "t": 40, "b": 45}, legend={"orientation": "h", "y": -0.2})
+    figure.update_layout(
+        height=360, margin={"l": 50, "r": 20, "t": 40, "b": 45}, legend={"orientation": "h", "y": -0.2}
+    )
     return _section(
         "Training",
         "Running mean over ten logged steps. Steps before 40 % of the way are at reduced resolution, where averaging "
@@ -301,7 +331,9 @@ def _histogram(run: Run) -> str:
     figure.update_xaxes(title_text="digital number")
     figure.update_layout(height=340, margin={"l": 60, "r": 20, "t": 30, "b": 45})
     saturated = sum(r.saturated for r in run.session.frames)
-    note = f"All received frames. {saturated:,} saturated pixels; they count only as a lower bound in training."
+    note = (
+        f"All received frames. {saturated:,} saturated pixels; they count only as a lower bound in training."
+    )
     return _section("Exposure histogram", note, _plot(figure))
 
 
@@ -329,7 +361,12 @@ def _configuration(run: Run) -> str:
 
 def _plot(figure: go.Figure) -> str:
     figure.update_layout(template="plotly_white", font={"family": "system-ui, sans-serif", "color": INK})
-    return plotly.io.to_html(figure, full_html=False, include_plotlyjs=False, config={"displaylogo": False})
+    return plotly.io.to_html(
+        figure,
+        full_html=False,
+        include_plotlyjs=False,
+        config={"displaylogo": False, "displayModeBar": False},
+    )
 
 
 def _noisy_image(run: Run, record: FrameRecord) -> np.ndarray:

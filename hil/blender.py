@@ -1,5 +1,6 @@
 """Drives Blender workers: starts and restarts them, spreads the frames, and keeps every picture by its content."""
 
+import contextlib
 import hashlib
 import json
 import logging
@@ -45,8 +46,8 @@ def blender_command() -> list[str]:
     if installed := shutil.which("blender"):
         return [installed, "--background", "--factory-startup", "--python", str(WORKER)]
     raise BlenderError(
-        "Blender is missing: run `make setup`, or put a `blender` (4.5) on the PATH, or point OBBGS_BLENDER_PYTHON at a "
-        "Python 3.11 that has bpy==4.5.15"
+        "Blender is missing: run `make setup`, put a `blender` (4.5) on the PATH, or point OBBGS_BLENDER_PYTHON "
+        "at a Python 3.11 that has bpy==4.5.15"
     )
 
 
@@ -61,7 +62,7 @@ class Worker:
 
     def _start(self) -> None:
         self.restarts += 1
-        self._log = tempfile.TemporaryFile("w+")
+        self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed with the process)
         self._process = subprocess.Popen(
             blender_command(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True
         )
@@ -122,10 +123,8 @@ class Worker:
 
     def close(self) -> None:
         assert self._process.stdin and self._process.stdout
-        try:
+        with contextlib.suppress(OSError):
             self._process.stdin.close()
-        except OSError:
-            pass
         try:
             self._process.wait(timeout=5)
         except subprocess.TimeoutExpired:

@@ -206,13 +206,15 @@ def keep_passes():
 
 
 def render(request):
-    """Render one view: premultiplied radiance, alpha and planar depth, written to request["out"] whole or not at all."""
+    """Render one view: premultiplied radiance, alpha, planar depth; request["out"] is written whole or not at all."""
     place(request)
     PASSES.clear()
     bpy.ops.render.render(write_still=False)
     combined = PASSES["Combined"]
     alpha = np.clip(combined[..., 3], 0, 1)
-    radiance = np.where(alpha[..., None] > 0, np.maximum(combined[..., :3], 0), 0)  # OIDN leaks outside the alpha
+    radiance = np.where(
+        alpha[..., None] > 0, np.maximum(combined[..., :3], 0), 0
+    )  # OIDN leaks outside the alpha
     if request["channels"] == 1:
         radiance = radiance @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # Rec. 709 luminance
         radiance = radiance[..., None]

@@ -15,7 +15,9 @@ from flightsw.errors import FlightError
 from flightsw.icd.mission import ConfigError, load_mission
 from hil import spacecraft
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, help="The simulated world around flight and ground.")
+app = typer.Typer(
+    add_completion=False, no_args_is_help=True, help="The simulated world around flight and ground."
+)
 MissionFile = Annotated[Path, typer.Option("--mission", help="The mission file.")]
 Mesh = Annotated[Path, typer.Option("--mesh", help="GLB, OBJ or STL; default the shipped spacecraft.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]

@@ -6,9 +6,17 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import TextIO
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from flightsw.icd.mission import Mission, load_mission
@@ -38,18 +46,30 @@ def run_demo(out: Path, mission_path: Path, mesh: Path, console: Console) -> dic
     _clear(out)
     exposures = true_exposures(mission)
     size = f"{mission.camera.width}x{mission.camera.height}"
-    console.print(f"[bold]1/4 Sky[/]   {len(exposures)} exposures of {mesh.name} at {size}, rendered by Blender")
+    console.print(
+        f"[bold]1/4 Sky[/]   {len(exposures)} exposures of {mesh.name} at {size}, rendered by Blender"
+    )
     with RenderFarm(mission, mesh, out / "renders") as farm:
         with _bar(console) as progress:
             task = progress.add_task("render", total=len(exposures))
             farm.prerender([e.pose for e in exposures], lambda: progress.advance(task))
-        console.print(f"[bold]2/4 Pass[/]  flight and ground, a serial line at {mission.link.baud_rate} baud between")
+        console.print(
+            f"[bold]2/4 Pass[/]  flight and ground, a serial line at {mission.link.baud_rate} baud between"
+        )
         link = _fly(out, mission, mission_path, farm, len(exposures), console)
         console.print("[bold]3/4 Truth[/] the simulator's own record, for the evaluation only")
         write_truth(out / "session", mission, farm)
     console.print("[bold]4/4 Model[/] trained with known exposure, and once more blind to it")
     session = out / "session"
-    command = [_tool("ground"), "reconstruct", "--session", str(session), "--name", "demo", "--blind-reference"]
+    command = [
+        _tool("ground"),
+        "reconstruct",
+        "--session",
+        str(session),
+        "--name",
+        "demo",
+        "--blind-reference",
+    ]
     command += ["--method", mission.reconstruct.method, "--seed", str(mission.reconstruct.seed)]
     finished = subprocess.run([*command, "--json"], stdout=subprocess.PIPE, text=True)
     if finished.returncode:
@@ -93,19 +113,19 @@ def _fly(
         open(out / "ground.log", "w") as ground_log,
         open(out / "flight.log", "w") as flight_log,
     ):
-        mission_option = ["--mission", str(mission_path)]
-        ground = subprocess.Popen(
-            [_tool("ground"), "listen", "--link", line.ground_url, "--session", str(session)]
-            + ["--exit-after", str(frames), *mission_option],
-            stdout=ground_log,
-            stderr=subprocess.STDOUT,
-        )
-        flight = subprocess.Popen(
-            [_tool("flightsw"), "capture", "--bracket", bracket, "--count", str(mission.bracket.count)]
-            + ["--camera", camera.url, "--store", str(store), "--link", line.flight_url, *mission_option],
-            stdout=flight_log,
-            stderr=subprocess.STDOUT,
-        )
+        listen = ["listen", "--link", line.ground_url, "--session", str(session), "--exit-after", str(frames)]
+        capture = [
+            "capture",
+            "--bracket",
+            bracket,
+            "--count",
+            str(mission.bracket.count),
+            "--camera",
+            camera.url,
+        ]
+        capture += ["--store", str(store), "--link", line.flight_url]
+        ground = _start("ground", [*listen, "--mission", str(mission_path)], ground_log)
+        flight = _start("flightsw", [*capture, "--mission", str(mission_path)], flight_log)
         try:
             _watch(store, session, flight, ground, frames, console)
         finally:
@@ -115,18 +135,26 @@ def _fly(
                     process.wait(timeout=10)
         for process, log in ((flight, flight_log), (ground, ground_log)):
             if process.returncode:
-                raise DemoError(f"a process of the pass failed: {_last_line(Path(log.name))} (log: {log.name})")
+                raise DemoError(
+                    f"a process of the pass failed: {_last_line(Path(log.name))} (log: {log.name})"
+                )
         down = line.statistics()["down"]
     captured, received = _digests(store / "index.jsonl", "frame_id"), _digests(session / "frames.jsonl", "id")
     if captured != received:
         different = {i for i in captured if captured[i] != received.get(i)}
-        raise DemoError(f"{len(different)} of {len(captured)} frames were lost or altered: {sorted(different)[:5]}")
+        raise DemoError(
+            f"{len(different)} of {len(captured)} frames were lost or altered: {sorted(different)[:5]}"
+        )
     return {
         "frames_captured": len(captured),
         "frames_received": len(received),
         "line_bytes_down": down.bytes_out,
         "line_bytes_lost": down.lost_bytes + down.cut_bytes,
     }
+
+
+def _start(tool: str, arguments: list[str], log: TextIO) -> subprocess.Popen:
+    return subprocess.Popen([_tool(tool), *arguments], stdout=log, stderr=subprocess.STDOUT)
 
 
 def _watch(
@@ -191,7 +219,10 @@ def _summary(f: dict) -> Table:
     for label, value in (
         ("frames captured / received", f"{f['frames_captured']} / {f['frames_received']}, sha256 equal"),
         ("bytes down the line / lost", f"{f['line_bytes_down']:,} / {f['line_bytes_lost']:,}"),
-        ("clean held-out PSNR", f"{f['psnr_clean_db']:.2f} dB ({f['psnr_clean_blind_db']:.2f} dB blind to exposure)"),
+        (
+            "clean held-out PSNR",
+            f"{f['psnr_clean_db']:.2f} dB ({f['psnr_clean_blind_db']:.2f} dB blind to exposure)",
+        ),
         ("Chamfer distance", f"{f['chamfer']:.4f} (largest dimension = 2)"),
         ("Gaussians", f"{f['gaussians']:,}"),
         ("ONNX renderer agrees to", f"{f['onnx_parity_db']:.1f} dB"),

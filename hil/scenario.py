@@ -21,6 +21,8 @@ def true_exposures(mission: Mission) -> list[TrueExposure]:
     The truth is the mission's own orbits and attitude; the simulator adds no navigation error of its own.
     """
     return [
-        TrueExposure(shot.exposure_time_s, shot.mid_exposure_utc_ns, pose_tag(mission, shot.mid_exposure_utc_ns))
+        TrueExposure(
+            shot.exposure_time_s, shot.mid_exposure_utc_ns, pose_tag(mission, shot.mid_exposure_utc_ns)
+        )
         for shot in plan(mission)
     ]

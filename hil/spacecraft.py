@@ -4,10 +4,12 @@ Body axes: +z faces the Sun (as the solar panels do), +y along the panels, +x to
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
 from trimesh.transformations import rotation_matrix, translation_matrix
+from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 SHIPPED = Path(__file__).parent / "assets" / "spacecraft.glb"
@@ -33,19 +35,20 @@ def build() -> trimesh.Scene:
     _boom_and_antennas(parts)
     scene = trimesh.Scene()
     for name, meshes in parts.items():
-        mesh = trimesh.util.concatenate(meshes)
+        mesh: Any = trimesh.util.concatenate(meshes)
         colour, metallic, roughness = MATERIALS[name]
         material = PBRMaterial(
             name=name, baseColorFactor=[*colour, 1.0], metallicFactor=metallic, roughnessFactor=roughness
         )
-        mesh.visual = trimesh.visual.TextureVisuals(material=material)
+        mesh.visual = TextureVisuals(material=material)
         scene.add_geometry(mesh, node_name=name, geom_name=name)
     return scene
 
 
 def write(path: Path) -> None:
     """Write the spacecraft as binary glTF."""
-    path.write_bytes(build().export(file_type="glb", include_normals=True))
+    content: Any = build().export(file_type="glb", include_normals=True)
+    path.write_bytes(content)
 
 
 def _box(size: tuple[float, float, float], centre: tuple[float, float, float]) -> trimesh.Trimesh:
@@ -55,7 +58,9 @@ def _box(size: tuple[float, float, float], centre: tuple[float, float, float]) -
     return mesh
 
 
-def _rod(start: tuple[float, float, float], end: tuple[float, float, float], radius_m: float) -> trimesh.Trimesh:
+def _rod(
+    start: tuple[float, float, float], end: tuple[float, float, float], radius_m: float
+) -> trimesh.Trimesh:
     return trimesh.creation.cylinder(radius=radius_m, segment=[start, end], sections=12)
 
 
@@ -73,7 +78,9 @@ def _bus(parts: dict[str, list[trimesh.Trimesh]]) -> None:
     parts["aluminium"].append(nozzle)
     for x in (-0.6, 0.6):  # star trackers: two baffles on the Sun side, tilted outwards
         baffle = trimesh.creation.cylinder(radius=0.09, height=0.35, sections=20)
-        baffle.apply_transform(translation_matrix((0.55 * x, 0.3, 0.95)) @ rotation_matrix(0.5 * x, (0, 1, 0)))
+        baffle.apply_transform(
+            translation_matrix((0.55 * x, 0.3, 0.95)) @ rotation_matrix(0.5 * x, (0, 1, 0))
+        )
         parts["black_radiator"].append(baffle)
 
 
@@ -89,7 +96,10 @@ def _solar_panel(parts: dict[str, list[trimesh.Trimesh]], side: int) -> None:
         cell_x, cell_y = (width_m - 0.04) / columns, (length_m - 0.04) / rows
         for i in range(columns):
             for j in range(rows):
-                centre = ((i + 0.5) * cell_x - (width_m - 0.04) / 2, y + (j + 0.5) * cell_y - (length_m - 0.04) / 2)
+                centre = (
+                    (i + 0.5) * cell_x - (width_m - 0.04) / 2,
+                    y + (j + 0.5) * cell_y - (length_m - 0.04) / 2,
+                )
                 parts["solar_cell"].append(_box((cell_x - 0.025, cell_y - 0.025, 0.006), (*centre, 0.118)))
 
 
@@ -98,7 +108,7 @@ def _dish(parts: dict[str, list[trimesh.Trimesh]]) -> None:
     radius_m, depth_m = 0.55, 0.18
     r = np.linspace(0.0, radius_m, 12)
     outline = np.stack([r, depth_m * (r / radius_m) ** 2], axis=1)
-    back = outline[::-1] + (0.0, -0.02)
+    back = np.add(outline[::-1], (0.0, -0.02))
     reflector = trimesh.creation.revolve(np.vstack([outline, back]), sections=36)
     trimesh.repair.fix_normals(reflector)
     place = translation_matrix((0.75, 0.0, 0.25)) @ rotation_matrix(np.radians(70), (0, 1, 0))

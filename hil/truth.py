@@ -29,12 +29,16 @@ def write_truth(session: Path, mission: Mission, farm: RenderFarm, points: int =
         farm.radiance(pose)
         name = f"radiance/{record['id']:06d}.npz"
         shutil.copyfile(farm.path(pose), part / name)
-        entries.append({"id": record["id"], "world_to_camera": pose.world_to_camera.tolist(), "radiance": name})
-        centres.setdefault(record["bracket"], pose.position_body_m)  # a bracket's frames stand centimetres apart
+        entries.append(
+            {"id": record["id"], "world_to_camera": pose.world_to_camera.tolist(), "radiance": name}
+        )
+        centres.setdefault(
+            record["bracket"], pose.position_body_m
+        )  # a bracket's frames stand centimetres apart
     vertices, faces = farm.surface()
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.export(part / "mesh.ply")
-    sampled, _ = trimesh.sample.sample_surface(mesh, points, seed=0)
+    sampled = trimesh.sample.sample_surface(mesh, points, seed=0)[0]
     seen = farm.visible(np.asarray(sampled), np.array(list(centres.values())))
     trimesh.PointCloud(np.asarray(sampled)[seen].astype(np.float32)).export(part / "cloud.ply")
     facts = {

@@ -84,5 +84,10 @@ class CameraServer:
         dn = expose(radiance, exposure_time_s, self.mission.camera, rng)
         pixels = np.ascontiguousarray(dn, dtype="<u2").tobytes()
         self.exposures += 1
-        header = {"ok": True, **self._info(), "exposure_time_s": exposure_time_s, "mid_exposure_utc_ns": mid_ns}
+        header = {
+            "ok": True,
+            **self._info(),
+            "exposure_time_s": exposure_time_s,
+            "mid_exposure_utc_ns": mid_ns,
+        }
         return {**header, "nbytes": len(pixels)}, pixels

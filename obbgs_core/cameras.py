@@ -22,7 +22,9 @@ class Cameras:
             if tuple(getattr(self, name).shape) != shape:
                 raise ValueError(f"{name} must be {list(shape)}, got {list(getattr(self, name).shape)}")
         if self.width < 1 or self.height < 1 or not self.near_m > 0:
-            raise ValueError(f"width, height and near_m must be positive: {self.width}, {self.height}, {self.near_m}")
+            raise ValueError(
+                f"width, height and near_m must be positive: {self.width}, {self.height}, {self.near_m}"
+            )
 
     def __len__(self) -> int:
         return self.world_to_camera.shape[0]

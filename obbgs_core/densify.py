@@ -70,7 +70,9 @@ class Adam:
 
 
 @torch.no_grad()
-def grow(gaussians: Gaussians, adam: Adam, chosen: Tensor, split_over_m: float, rng: torch.Generator) -> Gaussians:
+def grow(
+    gaussians: Gaussians, adam: Adam, chosen: Tensor, split_over_m: float, rng: torch.Generator
+) -> Gaussians:
     """Return the model with the chosen Gaussians [N] bool cloned (small ones) or split in two (large ones).
 
     Splitting draws the halves' centres from the Gaussian itself and shrinks them, as in Kerbl et al. 2023.

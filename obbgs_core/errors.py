@@ -13,7 +13,9 @@ class Diverged(ReconstructionError):
     """The loss stopped being a number."""
 
     def __init__(self, step: int, loss: float):
-        super().__init__(f"the loss became {loss} at step {step}; try smaller learning rates or check the poses")
+        super().__init__(
+            f"the loss became {loss} at step {step}; try smaller learning rates or check the poses"
+        )
         self.step, self.loss = step, loss
 
 

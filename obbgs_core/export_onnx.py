@@ -72,7 +72,9 @@ def export_onnx(
                 helper.make_tensor_value_info("exposure_time_s", TensorProto.FLOAT, []),
             ],
             [
-                helper.make_tensor_value_info("image", TensorProto.FLOAT, [height, width, gaussians.sh.shape[2]]),
+                helper.make_tensor_value_info(
+                    "image", TensorProto.FLOAT, [height, width, gaussians.sh.shape[2]]
+                ),
                 helper.make_tensor_value_info("alpha", TensorProto.FLOAT, [height, width]),
                 helper.make_tensor_value_info("depth", TensorProto.FLOAT, [height, width]),
             ],
@@ -83,7 +85,11 @@ def export_onnx(
         opset_imports=[helper.make_opsetid("", OPSET)],
     )
     facts = {**vars(sensor), "width": width, "height": height, "gaussians": len(gaussians)}
-    facts |= {"exposure_min_s": min(exposures_s), "exposure_max_s": max(exposures_s), "format": FORMAT_VERSION}
+    facts |= {
+        "exposure_min_s": min(exposures_s),
+        "exposure_max_s": max(exposures_s),
+        "format": FORMAT_VERSION,
+    }
     helper.set_model_props(model, {name: str(value) for name, value in facts.items()})
     onnx.checker.check_model(model, full_check=True)
     content = model.SerializeToString()
@@ -104,11 +110,13 @@ class _Graph:
         self.constants: list[onnx.TensorProto] = []
         self.prefix, self.count = prefix, 0
 
-    def op(self, kind: str, *inputs: "str | float | np.ndarray", outputs: int = 1, name: str = "", **attributes):
+    def op(
+        self, kind: str, *inputs: "str | float | np.ndarray", outputs: int = 1, name: str = "", **attributes
+    ) -> str:
         names = [self._name(i) for i in inputs]
         results = [name] if name else [self._fresh() for _ in range(outputs)]
         self.nodes.append(helper.make_node(kind, names, results, **attributes))
-        return results[0] if len(results) == 1 else results
+        return results[-1]  # of TopK: the indices
 
     def ints(self, *values: int) -> str:
         return self._name(np.array(values, dtype=np.int64))
@@ -241,7 +249,9 @@ SH_TERMS = [
 
 def _sh_basis(g: _Graph, direction: str, count: int) -> str:
     """Basis [N, count, 1]: all monomials up to degree 3 as one tensor, then one matrix of coefficients."""
-    monomials = sorted({powers for terms in SH_TERMS[:count] for _, *rest in terms for powers in [tuple(rest)]})
+    monomials = sorted(
+        {powers for terms in SH_TERMS[:count] for _, *rest in terms for powers in [tuple(rest)]}
+    )
     axes = [g.op("Gather", direction, g.ints(i), axis=1) for i in range(3)]  # [N, 1]
     columns = []
     for powers in monomials:
@@ -262,7 +272,7 @@ def _composite(g: _Graph, projected: dict[str, str], channels: int, width: int, 
     """Composite every tile that is reached; return the image [H, W, C + 2]: radiance, depth sum, alpha."""
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     count = g.op("Shape", projected["depth"])
-    _, order = g.op("TopK", projected["depth"], count, outputs=2, axis=0, largest=0, sorted=1)
+    order = g.op("TopK", projected["depth"], count, outputs=2, axis=0, largest=0, sorted=1)
     names = ("mean_x", "mean_y", "a", "b", "c", "opacity", "reach_x", "reach_y", "depth")
     s = {name: g.op("Gather", projected[name], order, axis=0) for name in names}
     features = g.op(
@@ -278,14 +288,18 @@ def _composite(g: _Graph, projected: dict[str, str], channels: int, width: int, 
         start = (np.arange(tiles, dtype=np.float32) * TILE)[:, None]  # [tiles, 1]
         low = g.op("Sub", mean, reach)
         high = g.op("Add", mean, reach)
-        reached.append(g.op("And", g.op("Less", low, start + TILE), g.op("Greater", high, start)))  # [tiles, N]
+        reached.append(
+            g.op("And", g.op("Less", low, start + TILE), g.op("Greater", high, start))
+        )  # [tiles, N]
     in_columns, in_rows = reached
     as_numbers = [g.op("Cast", mask, to=TensorProto.FLOAT) for mask in (in_rows, in_columns)]
-    members = g.op("MatMul", as_numbers[0], g.op("Transpose", as_numbers[1], perm=[1, 0]))  # [tiles_y, tiles_x]
+    members = g.op(
+        "MatMul", as_numbers[0], g.op("Transpose", as_numbers[1], perm=[1, 0])
+    )  # [tiles_y, tiles_x]
     active = g.op("NonZero", g.op("Cast", g.op("Greater", members, 0.5), to=TensorProto.INT64))  # [2, A]
     # the first tile is always composited, so that the loop is never empty
     active = g.op("Concat", g._name(np.zeros((2, 1), dtype=np.int64)), active, axis=1)
-    tile_y, tile_x = (g.op("Gather", active, np.array(i, dtype=np.int64), axis=1 - 1) for i in range(2))
+    tile_y, tile_x = (g.op("Gather", active, np.array(i, dtype=np.int64), axis=0) for i in range(2))
     body = _tile_body(splats, features, in_rows, in_columns, channels)
     tiles = g.op("Scan", tile_y, tile_x, body=body, num_scan_inputs=2)  # [A, TILE², C + 2]
     index = g.op("Unsqueeze", g.op("Add", g.op("Mul", tile_y, g.ints(tiles_x)), tile_x), g.ints(1))

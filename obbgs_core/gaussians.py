@@ -24,7 +24,12 @@ class Gaussians:
 
     def __post_init__(self):
         n = self.means.shape[0]
-        for name, shape in (("means", (n, 3)), ("quats", (n, 4)), ("log_scales", (n, 3)), ("opacity_logits", (n,))):
+        for name, shape in (
+            ("means", (n, 3)),
+            ("quats", (n, 4)),
+            ("log_scales", (n, 3)),
+            ("opacity_logits", (n,)),
+        ):
             if tuple(getattr(self, name).shape) != shape:
                 raise ValueError(f"{name} must be {list(shape)}, got {list(getattr(self, name).shape)}")
         if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[2] not in (1, 3):

@@ -12,7 +12,9 @@ from obbgs_core.sensor import Sensor
 
 log = logging.getLogger(__name__)
 BRIGHT_SIGMA = 5.0  # of a 3x3 mean; fainter pixels are sky
-AGREEMENT = 0.92  # share of views that must see light where a voxel projects; the rest may look at shadowed faces
+AGREEMENT = (
+    0.92  # share of views that must see light where a voxel projects; the rest may look at shadowed faces
+)
 COARSE_VOXELS = 64  # along each axis of the first grid; two subdivisions follow
 SUBDIVISIONS = 2
 

@@ -25,7 +25,9 @@ class MethodConfig:
     grow_until: float = 0.5
     grow_interval: int = 100
     grow_grad2d: float = 0.0002  # mean screen gradient, per NDC
-    grow_share: float = 0.0  # > 0: grow this share of the Gaussians, largest gradients first, instead of a threshold
+    grow_share: float = (
+        0.0  # > 0: grow this share of the Gaussians, largest gradients first, instead of a threshold
+    )
     pixel_weighted: bool = False  # Pixel-GS
     obb_interval: int = 0  # > 0: extra growth inside the boxes of the worst tiles, every so many steps
     obb_mean_centre: bool = False

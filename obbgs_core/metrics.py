@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from obbgs_core.gaussians import Gaussians
@@ -38,8 +38,8 @@ def cloud_distances(cloud: np.ndarray, truth: np.ndarray) -> dict[str, float]:
     for name, points in (("cloud", cloud), ("truth", truth)):
         if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or not np.isfinite(points).all():
             raise ValueError(f"{name} must be finite points [N, 3] with N > 0, got shape {points.shape}")
-    to_truth, _ = cKDTree(truth).query(cloud)
-    to_cloud, _ = cKDTree(cloud).query(truth)
+    to_truth, _ = KDTree(truth).query(cloud)
+    to_cloud, _ = KDTree(cloud).query(truth)
     return {
         "chamfer": 0.5 * float(to_truth.mean()) + 0.5 * float(to_cloud.mean()),
         "hausdorff": 0.5 * float(to_truth.max()) + 0.5 * float(to_cloud.max()),

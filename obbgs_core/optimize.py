@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import torch
 import torch.nn.functional as F
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from obbgs_core import hull, obb, sh
@@ -179,7 +179,10 @@ class _Batches:
         frames = [self.frames[i] for i in chosen]
         height, width = self.frames[0].dn.shape[:2]
         cameras = Cameras(
-            torch.stack([f.world_to_camera for f in frames]), torch.stack([f.K for f in frames]), width, height
+            torch.stack([f.world_to_camera for f in frames]),
+            torch.stack([f.K for f in frames]),
+            width,
+            height,
         )
         if factor > 1:
             cameras = cameras.scaled(1 / factor)
@@ -206,8 +209,12 @@ def _usable(frames: list[TrainingFrame], config: MethodConfig) -> tuple[list[Tra
     if len(shapes) > 1:
         raise ReconstructionError(f"all frames must have one size and channel count, got {sorted(shapes)}")
     for f in frames:
-        if not (torch.isfinite(f.dn).all() and torch.isfinite(f.world_to_camera).all() and f.exposure_time_s > 0):
-            raise ReconstructionError(f"frame {f.id} holds a value or a pose that is not finite, or no exposure time")
+        if not (
+            torch.isfinite(f.dn).all() and torch.isfinite(f.world_to_camera).all() and f.exposure_time_s > 0
+        ):
+            raise ReconstructionError(
+                f"frame {f.id} holds a value or a pose that is not finite, or no exposure time"
+            )
     if config.exposure_aware:
         return frames, None
     reference_s = math.exp(sum(math.log(f.exposure_time_s) for f in frames) / len(frames))
@@ -248,7 +255,7 @@ def _at(
     points: Tensor, frames: list[TrainingFrame], sensor: Sensor, opacity: float, config: MethodConfig
 ) -> Gaussians:
     """Return round Gaussians at points, as wide as their neighbours are far, with the radiance seen there."""
-    distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
+    distances, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
     spacing = torch.from_numpy(distances).float()[:, 1:].mean(dim=1).clamp(min=1e-6)
     count, channels = len(points), frames[0].dn.shape[2]
     coefficients = torch.zeros(count, (config.sh_degree + 1) ** 2, channels)
@@ -289,7 +296,9 @@ def _loss(rendered: Rendered, batch: Batch, sensor: Sensor, config: MethodConfig
         visible, truth = predicted.clamp(max=sensor.white_dn), batch.dn
         loss = charbonnier(residual)
         if config.edge_weight:
-            loss = loss + config.edge_weight * sobel_edge_loss(sensor.stabilised(visible), sensor.stabilised(truth))
+            loss = loss + config.edge_weight * sobel_edge_loss(
+                sensor.stabilised(visible), sensor.stabilised(truth)
+            )
         return loss, residual.detach()
     a, b = (predicted - sensor.black_dn) / full_scale, (batch.dn - sensor.black_dn) / full_scale
     loss = (1 - config.ssim_weight) * (a - b).abs().mean() + config.ssim_weight * (1 - ssim(a, b))
@@ -307,7 +316,11 @@ def _worst_boxes(
     if config.loss == "likelihood":
         error = residual.abs().mean(dim=-1)
     else:
-        error = (rendered.radiance * batch.exposure_time_s - batch.dn / batch.dn.max().clamp(min=1)).abs().mean(-1)
+        error = (
+            (rendered.radiance * batch.exposure_time_s - batch.dn / batch.dn.max().clamp(min=1))
+            .abs()
+            .mean(-1)
+        )
     boxes = []
     for i in range(len(batch.cameras)):
         tile = obb.worst_tile(error[i])
@@ -331,7 +344,12 @@ def _rates(config: MethodConfig, share: float, radius: float) -> dict[str, float
 
 
 def _densify(
-    gaussians: Gaussians, adam: Adam, gradient: Tensor, radius: float, config: MethodConfig, rng: torch.Generator
+    gaussians: Gaussians,
+    adam: Adam,
+    gradient: Tensor,
+    radius: float,
+    config: MethodConfig,
+    rng: torch.Generator,
 ) -> Gaussians:
     """Grow where screen gradients are large, within the budget; prune what is faint or far too large."""
     gaussians = grow(gaussians, adam, _chosen(gradient, gaussians, config), config.split_over * radius, rng)

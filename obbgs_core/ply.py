@@ -25,7 +25,7 @@ def save_ply(gaussians: Gaussians, path: Path, white_radiance: float = 1.0) -> N
     columns: dict[str, torch.Tensor] = {}
     for i, axis in enumerate("xyz"):
         columns[axis] = gaussians.means[:, i]
-    for i, axis in enumerate(("nx", "ny", "nz")):
+    for axis in ("nx", "ny", "nz"):
         columns[axis] = torch.zeros(count)
     for i in range(3):
         columns[f"f_dc_{i}"] = f_dc[:, i]
@@ -62,8 +62,12 @@ def load_ply(path: Path) -> Gaussians:
     if not mark or not data.startswith(b"ply\n") or len(counts) != 1 or "radiance_sh_0_0" not in names:
         raise ReconstructionError(f"{path} is not a model written by this software")
     if len(body) != 4 * counts[0] * len(names):
-        raise ReconstructionError(f"{path} should hold {4 * counts[0] * len(names)} bytes of numbers, has {len(body)}")
-    table = dict(zip(names, torch.from_numpy(np.frombuffer(body, "<f4").reshape(-1, len(names)).T.copy()), strict=True))
+        raise ReconstructionError(
+            f"{path} should hold {4 * counts[0] * len(names)} bytes of numbers, has {len(body)}"
+        )
+    table = dict(
+        zip(names, torch.from_numpy(np.frombuffer(body, "<f4").reshape(-1, len(names)).T.copy()), strict=True)
+    )
     radiance = [name for name in names if name.startswith("radiance_sh_")]
     channels = 1 + max(int(name.split("_")[3]) for name in radiance)
     return Gaussians(

@@ -65,9 +65,7 @@ class ScreenGradients:
             self.pixels[camera_index] = pixels
 
 
-def render(
-    gaussians: Gaussians, cameras: Cameras, backend: str = "auto", normals: bool = False
-) -> Rendered:
+def render(gaussians: Gaussians, cameras: Cameras, backend: str = "auto", normals: bool = False) -> Rendered:
     """Render radiance, alpha, depth and (on request) normals of all cameras.
 
     Front-to-back compositing of Kerbl et al. 2023 on a black sky: alpha = min(0.99, opacity·exp(-d²/2)), contributions
@@ -135,7 +133,10 @@ def project(gaussians: Gaussians, cameras: Cameras) -> Projected:
 
     limit_x = FOV_MARGIN * torch.maximum(cx, cameras.width - cx) / fx
     limit_y = FOV_MARGIN * torch.maximum(cy, cameras.height - cy) / fy
-    x, y = torch.maximum(torch.minimum(x, limit_x), -limit_x), torch.maximum(torch.minimum(y, limit_y), -limit_y)
+    x, y = (
+        torch.maximum(torch.minimum(x, limit_x), -limit_x),
+        torch.maximum(torch.minimum(y, limit_y), -limit_y),
+    )
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * x / z, zero, fy / z, -fy * y / z], dim=-1).unflatten(-1, (2, 3))
     RS = quats_to_matrices(gaussians.quats) * gaussians.scales[:, None, :]  # Sigma = RS RS^T
@@ -176,7 +177,9 @@ def _backend(name: str, like: Tensor):
     kernel = name.removeprefix("native").lstrip("-")
     if name.startswith("native") and (not kernel or kernel in native_kernels()):
         if not native_kernels():
-            raise ValueError("the compiled rasterizer is missing: install g++ and python3-dev, then reinstall")
+            raise ValueError(
+                "the compiled rasterizer is missing: install g++ and python3-dev, then reinstall"
+            )
         return functools.partial(_composite_native, kernel)
     raise ValueError(f"backend must be auto, native, reference or gsplat, got {name!r}")
 
@@ -306,7 +309,9 @@ def _composite_gsplat(means2d, conics, opacities, depths, features, cameras, scr
     tiles_x, tiles_y = -(-cameras.width // tile), -(-cameras.height // tile)
     determinant = (conics[:, 0] * conics[:, 2] - conics[:, 1] ** 2).clamp(min=1e-12)
     reach = (2 * torch.log((opacities / MIN_ALPHA).clamp(min=1))).sqrt()
-    radii = torch.stack([(conics[:, 2] / determinant).sqrt() * reach, (conics[:, 0] / determinant).sqrt() * reach], -1)
+    radii = torch.stack(
+        [(conics[:, 2] / determinant).sqrt() * reach, (conics[:, 0] / determinant).sqrt() * reach], -1
+    )
     radii = torch.where(depths[:, None] > 0, radii.ceil(), 0).int()
     _, ids, flat = isect_tiles(means2d[None], radii[None], depths[None], tile, tiles_x, tiles_y)
     offsets = isect_offset_encode(ids, 1, tiles_x, tiles_y)

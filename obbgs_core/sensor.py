@@ -18,7 +18,9 @@ class Sensor:
     read_noise_dn: float
 
     def __post_init__(self):
-        if not (self.white_dn > self.black_dn >= 0 and self.dn_per_radiance_s > 0 and self.electrons_per_dn > 0):
+        if not (
+            self.white_dn > self.black_dn >= 0 and self.dn_per_radiance_s > 0 and self.electrons_per_dn > 0
+        ):
             raise ValueError(f"black, white, gain and electrons must be ordered and positive: {self}")
 
     def expected_dn(self, radiance: Tensor, exposure_time_s: float | Tensor) -> Tensor:

@@ -49,7 +49,9 @@ class HilCamera:
         if len(pixels) != reply["nbytes"]:
             raise CaptureError(f"the camera sent {len(pixels)} of {reply['nbytes']} bytes")
         dn = np.frombuffer(pixels, dtype="<u2").astype(np.uint16).reshape(shape)
-        return Exposure(dn[..., 0] if shape[2] == 1 else dn, reply["exposure_time_s"], reply["mid_exposure_utc_ns"])
+        return Exposure(
+            dn[..., 0] if shape[2] == 1 else dn, reply["exposure_time_s"], reply["mid_exposure_utc_ns"]
+        )
 
     def close(self) -> None:
         self._stream.close()

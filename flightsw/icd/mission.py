@@ -6,7 +6,7 @@ import math
 import types
 import typing
 from dataclasses import dataclass, field
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -75,7 +75,7 @@ class OrbitSection:
             ) from error
         if moment.tzinfo is None:
             raise ConfigError("mission.orbit.start_utc", "say the time zone: end the time with Z")
-        whole = moment.astimezone(timezone.utc).replace(microsecond=0)
+        whole = moment.astimezone(UTC).replace(microsecond=0)
         return int(whole.timestamp()) * 1_000_000_000 + moment.microsecond * 1000
 
 
@@ -326,6 +326,6 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
         )
         return value
     if isinstance(value, datetime):  # YAML reads an unquoted time stamp as a datetime
-        value = value.replace(tzinfo=value.tzinfo or timezone.utc).isoformat()
+        value = value.replace(tzinfo=value.tzinfo or UTC).isoformat()
     _require(isinstance(value, str), path, f"expected text, got {_describe(value)}")
     return value

@@ -334,9 +334,7 @@ class Receiver:
             self.pdus_refused += 1
             return
         if transaction in self._closed:
-            if isinstance(pdu, EofPdu):
-                self._queue.append(_acknowledgement(pdu, Direction.TOWARDS_SENDER))
-                self._queue.append(self._closed[transaction])
+            self._answer_late(pdu, transaction)
             return
         receiving = self._receiving.get(transaction)
         if receiving is None:
@@ -352,9 +350,13 @@ class Receiver:
             receiving.size_bytes = pdu.file_size
         again = isinstance(pdu, EofPdu) and receiving.handler.has_seen_eof
         self._step(transaction, receiving, None if again else pdu)
-        if again and not receiving.handler.idle:
+        if again and transaction in self._closed:
+            self._answer_late(pdu, transaction)
+        elif again:
             receiving.handler.acknowledge_again()
             self._drain(receiving)
+            if receiving.finished_pdu is not None:  # the sender does not seem to know
+                self._queue.append(receiving.finished_pdu)
 
     def next_pdu(self, now_s: float) -> bytes | None:
         """Return what to send next, None when there is nothing to send now."""
@@ -366,6 +368,11 @@ class Receiver:
                 if now_s - receiving.last_sign_s > (TIMER_LIMIT + 2) * self._interval_s:
                     self._receiving.pop(transaction, None)  # not closed: if the sender lives it may go on
         return self._queue.popleft() if self._queue else None
+
+    def _answer_late(self, pdu: Any, transaction: int) -> None:
+        if isinstance(pdu, EofPdu):
+            self._queue.append(_acknowledgement(pdu, Direction.TOWARDS_SENDER))
+            self._queue.append(self._closed[transaction])
 
     def _check(self, pdu: Any, receiving: _Receiving | None) -> None:
         if pdu.direction != Direction.TOWARDS_RECEIVER:

@@ -66,14 +66,18 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="one JSON object a row")
     parser.add_argument("--quick", action="store_true", help="only the smallest size")
     arguments = parser.parse_args()
-    cases = [("reference", 2000, 100, 1, 3.0)] + [(f"native-{k}", 2000, 100, 1, 3.0) for k in native_kernels()]
+    cases = [("reference", 2000, 100, 1, 3.0)] + [
+        (f"native-{k}", 2000, 100, 1, 3.0) for k in native_kernels()
+    ]
     if not arguments.quick:
         for count in (20_000, 100_000):
             cases += [("native", count, width, threads, 3.0) for width in (400, 800) for threads in (1, 2)]
         cases.append(("native", 20_000, 800, 1, 9.0))  # the object covers a tenth of the pixels
     for case in cases:
         row = measure(*case)
-        print(json.dumps(row) if arguments.json else "  ".join(f"{k} {v}" for k, v in row.items()), flush=True)
+        print(
+            json.dumps(row) if arguments.json else "  ".join(f"{k} {v}" for k, v in row.items()), flush=True
+        )
 
 
 if __name__ == "__main__":

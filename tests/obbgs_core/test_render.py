@@ -12,7 +12,9 @@ from obbgs_core.rotations import multiply, quats_to_matrices
 needs_native = pytest.mark.skipif(not native_kernels(), reason="the compiled rasterizer is not installed")
 
 
-def random_gaussians(count: int, channels: int = 3, seed: int = 0, dtype=torch.float32, sh_count: int = 4) -> Gaussians:
+def random_gaussians(
+    count: int, channels: int = 3, seed: int = 0, dtype=torch.float32, sh_count: int = 4
+) -> Gaussians:
     g = torch.Generator().manual_seed(seed)
     return Gaussians(
         means=torch.randn(count, 3, generator=g, dtype=dtype) * 0.5,
@@ -23,7 +25,9 @@ def random_gaussians(count: int, channels: int = 3, seed: int = 0, dtype=torch.f
     )
 
 
-def looking_at_origin(count: int, size: int, dtype=torch.float32, height: int | None = None, seed: int = 1) -> Cameras:
+def looking_at_origin(
+    count: int, size: int, dtype=torch.float32, height: int | None = None, seed: int = 1
+) -> Cameras:
     rng = np.random.default_rng(seed)
     poses = []
     for _ in range(count):
@@ -142,7 +146,10 @@ def test_gaussians_behind_the_camera_or_not_finite_are_not_drawn_and_give_no_nan
     assert torch.isfinite(out.radiance).all() and torch.isfinite(out.depth).all()
     for name in ("means", "sh", "opacity_logits"):
         assert (gradients[name][:2] == 0).all(), name
-    assert all(torch.isfinite(gradients[n][[0, 1, 3, 5]]).all() for n in ("means", "log_scales", "sh", "opacity_logits"))
+    assert all(
+        torch.isfinite(gradients[n][[0, 1, 3, 5]]).all()
+        for n in ("means", "log_scales", "sh", "opacity_logits")
+    )
 
 
 def test_an_empty_model_is_a_black_sky():
@@ -163,7 +170,10 @@ def test_screen_gradients_equal_the_gradient_of_the_projected_means():
 
 def test_projection_matches_opencv():
     cv2 = pytest.importorskip("cv2")
-    gaussians, cameras = random_gaussians(20, dtype=torch.float64), looking_at_origin(1, 64, dtype=torch.float64)
+    gaussians, cameras = (
+        random_gaussians(20, dtype=torch.float64),
+        looking_at_origin(1, 64, dtype=torch.float64),
+    )
     W, K = cameras.world_to_camera[0].numpy(), cameras.K[0].numpy()
     expected, _ = cv2.projectPoints(gaussians.means.numpy(), cv2.Rodrigues(W[:3, :3])[0], W[:3, 3], K, None)
     np.testing.assert_allclose(project(gaussians, cameras).means2d[0].numpy(), expected[:, 0], atol=1e-9)

@@ -59,7 +59,8 @@ def test_frame_table_is_what_encode_frame_writes(make_frame):
         if kind == "x":
             continue
         values = struct.unpack_from(">" + kind, container, int(offset))
-        assert (values if len(values) > 1 else values[0]) == expected.pop(name), name
+        value = values[0] if len(values) == 1 else values
+        assert value == expected.pop(name), name
     assert position == HEADER.size
     assert not expected
 

@@ -1,0 +1,57 @@
+"""The flight command line: help with examples, exit codes, one clear line for what went wrong."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(*arguments: str, tool: str = "flightsw") -> subprocess.CompletedProcess:
+    command = [str(Path(sys.executable).with_name(tool)), *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize(
+    ("tool", "command"),
+    [("flightsw", c) for c in ("capture", "serve", "downlink", "triage", "plan")]
+    + [("ground", c) for c in ("listen", "reconstruct", "evaluate", "report")]
+    + [("hil", c) for c in ("demo", "camera", "link", "target")],
+)
+def test_every_command_has_help_with_an_example(tool, command):
+    done = run(command, "--help", tool=tool)
+    assert done.returncode == 0 and f"Example: {tool} {command}" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["plan", "--mission", "nowhere.yaml"], 2, "nowhere.yaml: cannot read the mission file"),
+        (
+            ["capture", "--camera", "hil:///nowhere.sock", "--store", "{tmp}"],
+            1,
+            "no camera at hil:///nowhere.sock",
+        ),
+        (["capture", "--camera", "ftp://x", "--store", "{tmp}"], 2, "no camera driver for 'ftp://x'"),
+        (
+            ["capture", "--camera", "hil:///x", "--bracket", "0.05,two", "--store", "{tmp}"],
+            2,
+            "--bracket: expected",
+        ),
+        (
+            ["capture", "--camera", "hil:///x", "--bracket", "-1", "--store", "{tmp}"],
+            2,
+            "exposure_times_ms[0]",
+        ),
+        (["downlink", "--link", "serial:///dev/nowhere?baud=9600", "--store", "{tmp}"], 1, "/dev/nowhere"),
+        (["downlink", "--link", "carrier://pigeon", "--store", "{tmp}"], 2, "carrier://pigeon"),
+        (["triage", "--model", "nowhere.onnx", "--frames", "{tmp}"], 1, "nowhere.onnx"),
+        (["frobnicate"], 2, "frobnicate"),
+    ],
+)
+def test_what_goes_wrong_is_one_clear_line_and_an_exit_code(tmp_path, arguments, code, message):
+    done = run(*[a.replace("{tmp}", str(tmp_path / "store")) for a in arguments])
+    assert done.returncode == code, done.stderr
+    assert message in done.stderr and "Traceback" not in done.stderr

@@ -1,0 +1,89 @@
+"""The mission file: what is wrong is named by its path."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from sgp4.io import compute_checksum
+
+from flightsw.icd.mission import ConfigError, Mission, build, load_mission, tle_checksum
+
+TEXT = (Path(__file__).parents[2] / "mission.yaml").read_text()
+TREE = yaml.safe_load(TEXT)
+
+
+def load(tmp_path: Path, text: str) -> Mission:
+    path = tmp_path / "mission.yaml"
+    path.write_text(text)
+    return load_mission(path)
+
+
+def test_the_shipped_mission_loads(tmp_path):
+    mission = load(tmp_path, TEXT)
+    assert mission.camera.white_dn == 4095
+    assert mission.bracket.exposure_times_s == pytest.approx((5e-5, 1e-4, 2e-4))
+    assert mission.orbit.start_utc_ns == 1_784_631_150_000_000_000  # 2026-07-21T10:52:30Z
+    assert len(mission.sha256) == 64
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "path"),
+    [
+        ("width: 256", "width: two", r"mission\.camera\.width: expected a whole number, got 'two'"),
+        ("width: 256", "width: 0", r"mission\.camera\.width: expected 1 to 8192"),
+        ("read_noise_dn: 8.0", "read_noise_dn: 8e-1x", r"mission\.camera\.read_noise_dn: expected a number"),
+        ("black_dn: 64.0", "black_dn: .nan", r"mission\.camera\.black_dn: expected a number"),
+        (
+            "[0.05, 0.1, 0.2]",
+            "[0.05, two]",
+            r"mission\.bracket\.exposure_times_ms\[1\]: expected a number, got 'two'",
+        ),
+        ("[0.05, 0.1, 0.2]", "[]", r"mission\.bracket\.exposure_times_ms: expected 1 to 16"),
+        ("interval_s: 27.0", "interval_s: 1.0", r"mission\.bracket\.interval_s: 1\.0 s is shorter"),
+        ("mode: spin", "mode: wobble", r"mission\.target_attitude\.mode: expected one of inertial, spin"),
+        ("axis: sun", "axis: [1.0, 1.0, 0.0]", r"mission\.target_attitude\.axis: expected a unit vector"),
+        ("baud_rate", "bawd_rate", r"mission\.link\.bawd_rate: unknown key; expected one of baud_rate"),
+        ("  width: 256", "", r"mission\.camera\.width: is missing"),
+        ("12714-4 0  9997", "12714-4 0  9998", r"target_tle\[0\]: checksum is 8, but the line adds up to 7"),
+        ("2 31698", "2 31699", r"mission\.orbit\.target_tle"),
+        ("10:52:30Z", "10:52:30", r"mission\.orbit\.start_utc: say the time zone"),
+        ("10:52:30Z", "25:52:30Z", r"mission\.orbit\.start_utc: expected ISO 8601"),
+    ],
+)
+def test_a_wrong_value_is_named_by_its_path(tmp_path, old, new, path):
+    assert old in TEXT
+    with pytest.raises(ConfigError, match=path):
+        load(tmp_path, TEXT.replace(old, new))
+
+
+@pytest.mark.parametrize("text", ["", "- a list", "orbit: [", "\x00", "orbit: 3"])
+def test_what_is_no_mission_is_refused(tmp_path, text):
+    with pytest.raises(ConfigError):
+        load(tmp_path, text)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ConfigError, match="cannot read the mission file"):
+        load_mission(tmp_path / "nowhere.yaml")
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=8),
+        lambda inner: (
+            st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from([*TREE, "x"]), inner, max_size=4)
+        ),
+    )
+)
+def test_any_tree_gives_a_mission_or_a_config_error(tree):
+    try:
+        assert isinstance(build(Mission, tree, "mission"), Mission)
+    except ConfigError as error:
+        assert error.path.startswith("mission")
+
+
+def test_checksum_matches_sgp4s_own():
+    for line in (*TREE["orbit"]["target_tle"], *TREE["orbit"]["chaser_tle"]):
+        assert tle_checksum(line) == compute_checksum(line) == int(line[68])

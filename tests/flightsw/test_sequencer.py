@@ -1,0 +1,90 @@
+"""The capture sequence with a camera that misbehaves, and the region of interest."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from flightsw.cameras import Exposure
+from flightsw.errors import CaptureError
+from flightsw.icd.frame import decode_frame
+from flightsw.icd.mission import load_mission
+from flightsw.sequencer import capture, plan, region_of_interest
+from flightsw.store import FrameStore
+
+MISSION = load_mission(Path(__file__).parents[1] / "golden" / "mission.yaml")
+
+
+class Sky:
+    """A camera that shows one bright square and fails on chosen exposures."""
+
+    def __init__(self, failing: tuple[int, ...] = ()):
+        self.failing, self.count, self.starts_ns = failing, 0, []
+
+    def expose(self, exposure_time_s: float, start_utc_ns: int) -> Exposure:
+        self.count += 1
+        if self.count - 1 in self.failing:
+            raise CaptureError("the shutter stuck")
+        self.starts_ns.append(start_utc_ns)
+        rng = np.random.default_rng(self.count)
+        dn = 64 + rng.normal(0, 8, (MISSION.camera.height, MISSION.camera.width))
+        dn[20:40, 25:50] += exposure_time_s * 2e7
+        pixels = np.clip(dn.round(), 0, 4095).astype(np.uint16)
+        return Exposure(pixels, exposure_time_s, start_utc_ns + round(exposure_time_s * 5e8))
+
+    def close(self) -> None:
+        pass
+
+
+def test_every_exposure_is_planned_at_its_own_time():
+    shots = list(plan(MISSION))
+    assert len(shots) == 33 and shots[0].start_utc_ns == MISSION.orbit.start_utc_ns
+    assert [s.exposure_time_s for s in shots[:3]] == [5e-5, 1e-4, 2e-4]
+    assert shots[1].start_utc_ns - shots[0].start_utc_ns == 500_000_000
+    assert shots[3].start_utc_ns - shots[0].start_utc_ns == 98_000_000_000
+    assert shots[2].mid_exposure_utc_ns - shots[2].start_utc_ns == 100_000
+
+
+def test_one_bad_frame_is_counted_and_never_ends_the_pass(tmp_path):
+    store = FrameStore(tmp_path)
+    counts = capture(MISSION, Sky(failing=(4, 5)), store)
+    assert (counts.planned, counts.stored, counts.failed) == (33, 31, 2)
+    assert [f.frame_id for f in store.frames] == list(range(31))  # no number is lost to a failed exposure
+
+
+def test_a_restart_takes_only_what_is_missing(tmp_path):
+    counts = capture(MISSION, Sky(failing=(4, 5)), FrameStore(tmp_path))
+    again = capture(MISSION, Sky(), FrameStore(tmp_path))
+    assert (again.already_stored, again.stored) == (counts.stored, 2)
+    store = FrameStore(tmp_path)
+    assert len({(f.bracket_id, f.bracket_index) for f in store.frames}) == 33
+
+
+def test_stopping_is_prompt(tmp_path):
+    store = FrameStore(tmp_path)
+    counts = capture(MISSION, Sky(), store, should_stop=lambda: len(store.frames) >= 5)
+    assert counts.stored == 5
+
+
+def test_the_stored_frame_holds_time_tag_and_pixels(tmp_path):
+    store = FrameStore(tmp_path)
+    mission = dataclasses.replace(MISSION, bracket=dataclasses.replace(MISSION.bracket, count=1))
+    capture(mission, Sky(), store)
+    frame = decode_frame(store.read(2))
+    sky = Sky()
+    for _ in range(2):
+        sky.expose(1e-4, 0)
+    taken = sky.expose(2e-4, 0).dn
+    mask = region_of_interest(taken, mission)
+    assert frame.mid_exposure_utc_ns == MISSION.orbit.start_utc_ns + 10**9 + 100_000
+    assert (frame.bracket_index, frame.bracket_count, frame.exposure_time_s) == (2, 3, 2e-4)
+    np.testing.assert_array_equal(frame.dn[mask], taken[mask])  # lossless inside
+    assert (frame.dn[~mask] == 64).all()
+
+
+def test_region_of_interest_keeps_the_target_with_its_margin_and_drops_the_sky():
+    dn = Sky().expose(1e-4, 0).dn
+    mask = region_of_interest(dn, MISSION)
+    margin = MISSION.link.roi_margin_px
+    assert mask[20 - margin : 40 + margin, 25 - margin : 50 + margin].all()
+    assert not mask[:5].any() and not mask[-5:].any()

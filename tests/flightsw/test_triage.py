@@ -1,0 +1,126 @@
+"""On-board triage on the golden session: what the model has not seen ranks first."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from flightsw.cli import app
+from flightsw.errors import TriageError
+from flightsw.icd.frame import Frame, PoseTag, encode_frame
+from flightsw.icd.mission import load_mission
+from flightsw.triage import TILE_COLUMNS, TILE_ROWS, Renderer, chi2_map, rank_frames, tile_means
+from obbgs_core.export_onnx import export_onnx
+from obbgs_core.gaussians import Gaussians
+from obbgs_core.sensor import Sensor
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+MISSION = load_mission(GOLDEN / "mission.yaml")
+CAMERA = MISSION.camera
+K = np.array(CAMERA.K)
+SENSOR = Sensor(64, 4095, 4e7, 4, 8)
+
+
+@pytest.fixture
+def model(tmp_path) -> Path:
+    """A small bright ball."""
+    g = torch.Generator().manual_seed(0)
+    ball = Gaussians(
+        torch.randn(200, 3, generator=g) * 0.8,
+        torch.randn(200, 4, generator=g),
+        torch.full((200, 3), -1.5),
+        torch.full((200,), 2.0),
+        torch.full((200, 1, 1), 1.5),
+    )
+    path = tmp_path / "model.onnx"
+    export_onnx(ball, SENSOR, path, CAMERA.width, CAMERA.height, CAMERA_EXPOSURES)
+    return path
+
+
+CAMERA_EXPOSURES = (5e-5, 2e-4)
+
+
+def frame_of(renderer: Renderer, frame_id: int, patch_dn: float, seed: int) -> Frame:
+    pose = PoseTag(
+        np.array([1.0, 0, 0, 0]), np.array([0.0, 0, -300]), np.eye(6), np.array([0, 0, 1.0]), False, True
+    )
+    dn = renderer.expected_dn(pose.world_to_camera, K, 1e-4)[..., 0]
+    variance = np.maximum(dn - 64, 0) / 4 + 64
+    dn = dn + np.random.default_rng(seed).normal(size=dn.shape) * np.sqrt(variance)
+    dn[25:35, 45:60] += patch_dn
+    pixels = np.clip(dn.round(), 0, 4095).astype(np.uint16)
+    return Frame(frame_id, 0, 0, 1, 1e-4, 10**18, pose, pixels, 12, 64.0, 0)
+
+
+def test_the_worst_predicted_frame_comes_first_and_noise_scores_one(model, tmp_path):
+    renderer, folder = Renderer(model), tmp_path / "frames"
+    folder.mkdir()
+    for frame_id, patch_dn in enumerate((0.0, 100.0, 20.0)):
+        frame = frame_of(renderer, frame_id, patch_dn, seed=frame_id)
+        (folder / f"{frame_id:08d}.obf").write_bytes(encode_frame(frame))
+    (folder / "00000009.obf").write_bytes(b"not a frame")
+    ranked, unreadable = rank_frames(model, tmp_path, K)
+    assert [r.frame_id for r in ranked] == [1, 2, 0] and unreadable == 1
+    # 800 pixels of pure noise: chi² of a tile is 1 with a standard deviation of 0.05, the worst of 8 tiles below 1.25
+    assert ranked[-1].worst_chi2 < 1.25 and ranked[-1].mean_chi2 == pytest.approx(1, abs=0.1)
+    assert (ranked[0].tile_row_px, ranked[0].tile_column_px) == (TILE_ROWS, TILE_COLUMNS)
+
+
+def test_command_prints_the_ranking(model, tmp_path):
+    from typer.testing import CliRunner
+
+    (tmp_path / "frames").mkdir()
+    frame = frame_of(Renderer(model), 3, 0.0, seed=0)
+    (tmp_path / "frames" / "00000003.obf").write_bytes(encode_frame(frame))
+    arguments = ["triage", "--model", str(model), "--frames", str(tmp_path), "--json"]
+    result = CliRunner().invoke(app, [*arguments, "--mission", str(GOLDEN / "mission.yaml")])
+    assert result.exit_code == 0 and json.loads(result.stdout)["ranked"][0]["frame_id"] == 3
+
+
+def test_a_saturated_pixel_counts_only_when_the_model_is_darker():
+    sensor = {"black_dn": 0.0, "white_dn": 100.0, "electrons_per_dn": 1.0, "read_noise_dn": 1.0}
+    dn = np.full((1, 2, 1), 100.0)
+    chi2 = chi2_map(dn, np.array([[[150.0], [50.0]]]), sensor)
+    assert chi2[0, 0] == 0 and chi2[0, 1] > 40
+
+
+def test_tile_means_cover_ragged_edges():
+    image = np.random.default_rng(0).random((45, 90))
+    tiles = tile_means(image)
+    assert tiles.shape == (3, 3)
+    assert tiles[2, 2] == pytest.approx(image[40:, 80:].mean()) and tiles[0, 1] == pytest.approx(
+        image[:20, 40:80].mean()
+    )
+
+
+def test_hostile_models_are_refused(model, tmp_path):
+    junk = tmp_path / "junk.onnx"
+    junk.write_bytes(b"\x08\x07junk")
+    with pytest.raises(TriageError, match="onnxruntime"):
+        Renderer(junk)
+    with pytest.raises(TriageError, match="No such file"):
+        Renderer(tmp_path / "nowhere.onnx")
+    other = onnx.load(model)
+    other.graph.node[0].op_type, other.graph.node[0].domain = "Evil", "evil.domain"
+    onnx.save(other, junk)
+    with pytest.raises(TriageError, match="onnxruntime"):
+        Renderer(junk)
+    bare = onnx.load(model)
+    del bare.metadata_props[:]
+    onnx.save(bare, junk)
+    with pytest.raises(TriageError, match="metadata"):
+        Renderer(junk)
+
+
+def test_a_folder_without_frames_and_frames_of_another_size_are_named(model, tmp_path):
+    (tmp_path / "frames").mkdir()
+    with pytest.raises(TriageError, match="no stored frames"):
+        rank_frames(model, tmp_path, K)
+    frame = frame_of(Renderer(model), 0, 0.0, seed=0)
+    small = Frame(**{**vars(frame), "dn": np.ascontiguousarray(frame.dn[:40])})
+    (tmp_path / "frames" / "00000000.obf").write_bytes(encode_frame(small))
+    with pytest.raises(TriageError, match="72x40"):
+        rank_frames(model, tmp_path, K)

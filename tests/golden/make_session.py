@@ -1,0 +1,48 @@
+"""Makes tests/golden/session: one small simulated pass, so that most tests need no Blender.
+
+Run on purpose, never to silence a failing test: python tests/golden/make_session.py (needs Blender, about a minute).
+"""
+
+import shutil
+import tempfile
+from pathlib import Path
+
+from flightsw.cameras import open_camera
+from flightsw.icd.frame import decode_frame
+from flightsw.icd.mission import load_mission
+from flightsw.sequencer import capture
+from flightsw.store import FrameStore
+from ground.session import SessionWriter
+from hil import spacecraft
+from hil.blender import RenderFarm
+from hil.scenario import true_exposures
+from hil.truth import write_truth
+from hil.virtual_camera import CameraServer
+
+HERE = Path(__file__).parent
+
+
+def main() -> None:
+    mission = load_mission(HERE / "mission.yaml")
+    session = HERE / "session"
+    shutil.rmtree(session, ignore_errors=True)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        RenderFarm(mission, spacecraft.SHIPPED, Path(folder) / "r") as farm,
+    ):
+        farm.prerender([e.pose for e in true_exposures(mission)])
+        store = FrameStore(Path(folder) / "store")
+        with CameraServer(mission, farm, Path(folder) / "camera.sock", seed=1) as server:
+            camera = open_camera(server.url)
+            print(capture(mission, camera, store))
+            camera.close()
+        writer = SessionWriter(session, mission)
+        for stored in store.frames:
+            container = store.read(stored.frame_id)
+            writer.add(decode_frame(container), container)
+        writer.save({}, sum(stored.size_bytes for stored in store.frames))
+        write_truth(session, mission, farm, points=8000)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""From the golden session to a finished run: figures, files, and every way it can be refused."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+import yaml
+from typer.testing import CliRunner
+
+from ground import cli
+from ground.evaluate import bounding_box, evaluate
+from ground.reconstruct import reconstruct, split
+from ground.report import write_report
+from ground.session import MissingFrames, SessionError, open_session
+from obbgs_core.errors import ReconstructionError, TooFewFrames
+from obbgs_core.methods import PRESETS
+from obbgs_core.ply import load_ply
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "session"
+QUICK = {"steps": 60, "start_count": 1500, "max_gaussians": 2000, "sh_degree": 0}
+
+
+def copy_session(to: Path) -> Path:
+    shutil.copytree(GOLDEN, to / "session")
+    return to / "session"
+
+
+def keep_frames(session: Path, wanted) -> None:
+    lines = [line for line in (session / "frames.jsonl").read_text().splitlines() if wanted(json.loads(line))]
+    (session / "frames.jsonl").write_text("".join(line + "\n" for line in lines))
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> tuple[Path, dict]:
+    """One real, short training of the default method, with its blind twin."""
+    session = copy_session(tmp_path_factory.mktemp("trained"))
+    changes = {"steps": 500, "start_count": 3000, "max_gaussians": 4000}
+    reconstruct(session, "run", "obbgs", changes, blind_reference=True)
+    return session, evaluate(session, "run")
+
+
+def test_knowing_the_exposure_is_worth_4_db_and_the_model_30_db(trained):
+    _, metrics = trained
+    assert metrics["psnr_clean_db"] >= 30
+    assert metrics["psnr_clean_db"] >= metrics["psnr_clean_blind_db"] + 4
+    assert metrics["chamfer"] < 0.1  # a tenth of the target's half size, from 11 views of 72 pixels
+
+
+def test_the_run_folder_holds_what_it_should(trained):
+    session, metrics = trained
+    folder = session / "runs" / "run"
+    assert len(load_ply(folder / "model.ply")) == metrics["gaussians"]
+    assert metrics["frames_received"] == metrics["frames_captured"] == 33
+    assert metrics["onnx_parity_db"] >= 45
+    onnxruntime.InferenceSession(str(folder / "model.onnx"))
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    assert config["method"]["steps"] == 500 and config["seed"] == 7 and "torch" in config["versions"]
+    steps = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert {s["training"] for s in steps} == {"known exposure", "blind to exposure"}
+    assert not list((session / "runs").glob(".*"))
+
+
+def test_the_report_is_one_file_that_needs_no_network(trained):
+    session, _ = trained
+    page = write_report(session, "run").read_text()
+    body = page[page.index("</head>") :]
+    for expected in ("Frames by exposure", "Held-out views", "Model and camera track", "Exposure histogram"):
+        assert expected in body
+    assert "data:image/png;base64," in body and "scatter3d" in body
+    assert 'src="http' not in page and "<link" not in page
+
+
+def test_truth_is_never_read_in_training(trained, tmp_path):
+    session = copy_session(tmp_path)
+    shutil.rmtree(session / "truth")
+    reconstruct(session, "run", "obbgs", QUICK)
+    metrics = evaluate(session, "run")
+    assert "psnr_noisy_db" in metrics and "psnr_clean_db" not in metrics
+    assert write_report(session, "run").exists()
+
+
+def test_the_same_seed_gives_the_same_model(tmp_path):
+    session = copy_session(tmp_path)
+    models = []
+    for name in ("a", "b"):
+        reconstruct(session, name, "obbgs", QUICK)
+        models.append(load_ply(session / "runs" / name / "model.ply"))
+    assert torch.equal(models[0].means, models[1].means) and torch.equal(models[0].sh, models[1].sh)
+
+
+@pytest.mark.parametrize("method", [m for m in PRESETS if m != "obbgs"])
+def test_every_published_method_trains(tmp_path, method):
+    session = copy_session(tmp_path)
+    reconstruct(session, "run", method, QUICK)
+    metrics = evaluate(session, "run")
+    assert math.isfinite(metrics["psnr_clean_db"]) and metrics["gaussians"] > 0
+
+
+def test_whole_brackets_are_held_out():
+    training, held_out = split(open_session(GOLDEN))
+    assert {r.bracket for r in held_out} == {7} and len(held_out) == 3
+    assert not {r.bracket for r in training} & {7} and len(training) == 30
+
+
+def test_one_exposure_missing_still_gives_a_model(tmp_path):
+    session = copy_session(tmp_path)
+    keep_frames(session, lambda frame: frame["bracket_index"] != 2)
+    reconstruct(session, "run", "obbgs", QUICK)
+    assert len(evaluate(session, "run")["exposures_s"]) == 2
+
+
+def test_black_frames_are_named_as_eclipse(tmp_path):
+    import imagecodecs
+
+    session = copy_session(tmp_path)
+    rng = np.random.default_rng(0)
+    for path in (session / "frames").glob("*.png"):
+        dark = np.clip(rng.normal(64, 8, (72, 72)).round(), 0, None).astype(np.uint16)
+        path.write_bytes(bytes(imagecodecs.png_encode(dark)))
+    with pytest.raises(ReconstructionError, match=r"all 30 frames are black \(eclipse"):
+        reconstruct(session, "run", "obbgs", QUICK)
+    assert not list((session / "runs").iterdir())
+
+
+def test_frames_flagged_as_eclipsed_are_left_out_and_too_few_are_named(tmp_path):
+    session = copy_session(tmp_path)
+    lines = [json.loads(line) for line in (session / "frames.jsonl").read_text().splitlines()]
+    for line in lines:
+        line["in_eclipse"] = True
+    (session / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.raises(SessionError, match="33 in eclipse"):
+        reconstruct(session, "run", "obbgs", QUICK)
+    shutil.rmtree(session)
+    session = copy_session(tmp_path)
+    keep_frames(session, lambda frame: frame["id"] < 2)
+    with pytest.raises(TooFewFrames, match="at least 3 frames, got 2"):
+        reconstruct(session, "run", "obbgs", QUICK)
+
+
+def test_an_interrupted_run_leaves_nothing(tmp_path):
+    session = copy_session(tmp_path)
+
+    def interrupt(progress):
+        if progress.info.step == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(session, "run", "obbgs", QUICK, on_progress=interrupt)
+    assert not list((session / "runs").iterdir())
+
+
+def test_a_session_without_frames_is_refused(tmp_path):
+    session = copy_session(tmp_path)
+    keep_frames(session, lambda frame: False)
+    with pytest.raises(MissingFrames, match="holds no frames"):
+        reconstruct(session, "run")
+
+
+@pytest.mark.parametrize(
+    ("change", "arguments", "code", "message"),
+    [
+        (lambda s: None, ["--method", "nerf"], 2, "no method 'nerf'"),
+        (lambda s: None, ["--name", "../x"], 1, "plain folder name"),
+        (lambda s: shutil.rmtree(s), [], 1, "is not a session"),
+        (lambda s: (s / "session.json").write_text('{"schema_version": 99}'), [], 1, "schema version 99"),
+        (lambda s: (s / "frames" / "000003.png").unlink(), [], 1, "pictures are missing: 3"),
+    ],
+)
+def test_the_command_says_what_is_wrong_in_one_line(
+    tmp_path, capsys, monkeypatch, change, arguments, code, message
+):
+    session = copy_session(tmp_path)
+    change(session)
+    monkeypatch.setattr("sys.argv", ["ground", "reconstruct", "--session", str(session), *arguments])
+    with pytest.raises(SystemExit) as exit_info:
+        cli.main()
+    assert exit_info.value.code == code
+    assert message in capsys.readouterr().err
+
+
+def test_the_commands_print_json(trained):
+    session, metrics = trained
+    result = CliRunner().invoke(cli.app, ["evaluate", "--session", str(session), "--json"])
+    assert result.exit_code == 0 and json.loads(result.stdout)["gaussians"] == metrics["gaussians"]
+    result = CliRunner().invoke(cli.app, ["report", "--session", str(session), "--json"])
+    assert Path(json.loads(result.stdout)["report"]).exists()
+
+
+def test_bounding_box_of_an_empty_mask_is_the_whole_image():
+    assert bounding_box(torch.zeros(4, 5, dtype=torch.bool), 2) == (slice(None), slice(None))
+    mask = torch.zeros(20, 20, dtype=torch.bool)
+    mask[5, 7] = True
+    assert bounding_box(mask, 2) == (slice(3, 8), slice(5, 10))

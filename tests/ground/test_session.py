@@ -1,0 +1,170 @@
+"""The session folder: written whole or not at all, read strictly, opened again after a cut."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from flightsw.icd.frame import encode_frame
+from ground.session import MissingFrames, SessionCorrupt, SessionError, SessionWriter, open_session
+
+
+@pytest.fixture
+def session(tmp_path, small_mission, make_frame):
+    """A session folder of three frames."""
+    folder = tmp_path / "session"
+    writer = SessionWriter(folder, small_mission)
+    for number in (2, 0, 1):
+        assert writer.add(make_frame(number), encode_frame(make_frame(number)))
+    writer.save({"crc_errors": 4, "duplicates": 0}, 5000)
+    return folder
+
+
+def edit_line(folder, number, **changes):
+    lines = (folder / "frames.jsonl").read_text().splitlines()
+    lines[number] = json.dumps(json.loads(lines[number]) | changes)
+    (folder / "frames.jsonl").write_text("\n".join(lines) + "\n")
+
+
+def test_a_session_gives_back_what_was_written(session, small_mission, make_frame):
+    opened = open_session(session)
+    assert [record.id for record in opened.frames] == [0, 1, 2]
+    assert opened.camera == small_mission.camera
+    assert opened.tles["target"] == small_mission.orbit.target_tle
+    assert opened.losses == {"crc_errors": 4, "duplicates": 0}
+    assert opened.bytes_received == 5000
+    assert opened.mission_sha256 == small_mission.sha256
+    for record in opened.frames:
+        frame = make_frame(record.id)
+        np.testing.assert_array_equal(opened.dn(record), frame.dn)
+        np.testing.assert_array_equal(record.world_to_camera, frame.world_to_camera)
+        np.testing.assert_array_equal(record.covariance, frame.pose.covariance)
+        assert record.mid_exposure_utc_ns == frame.mid_exposure_utc_ns
+        assert (record.bracket, record.bracket_index) == (frame.bracket_id, frame.bracket_index)
+        assert record.saturated == frame.saturated_count
+        assert record.file == f"frames/{record.id:06d}.png"
+
+
+def test_colour_frames_keep_their_channels(tmp_path, small_mission, make_frame):
+    camera = dataclasses.replace(small_mission.camera, channels=3)
+    mission = dataclasses.replace(small_mission, camera=camera)
+    frame = make_frame(0, channels=3)
+    SessionWriter(tmp_path / "colour", mission).add(frame, encode_frame(frame))
+    opened = open_session(tmp_path / "colour")
+    np.testing.assert_array_equal(opened.dn(opened.frames[0]), frame.dn)
+
+
+def test_a_session_cut_off_at_any_byte_opens_with_the_frames_before(session, small_mission, make_frame):
+    lines = (session / "frames.jsonl").read_bytes()
+    ends = [position + 1 for position, byte in enumerate(lines) if byte == ord("\n")]
+    for length in range(ends[0], len(lines) + 1, 97):
+        (session / "frames.jsonl").write_bytes(lines[:length])
+        whole = sum(end <= length for end in ends)
+        assert len(open_session(session).frames) == whole
+    (session / "frames.jsonl").write_bytes(lines[: ends[1] + 30])
+    writer = SessionWriter(session, small_mission)
+    assert writer.frame_count == 2
+    assert writer.add(make_frame(1), encode_frame(make_frame(1)))
+    assert [record.id for record in open_session(session).frames] == [0, 1, 2]
+
+
+def test_counts_of_several_runs_add_up(session, small_mission):
+    writer = SessionWriter(session, small_mission)
+    writer.save({"crc_errors": 2, "hang_ups": 1}, 100)
+    writer.save({"crc_errors": 3, "hang_ups": 1}, 200)
+    opened = open_session(session)
+    assert opened.losses == {"crc_errors": 7, "duplicates": 0, "hang_ups": 1}
+    assert opened.bytes_received == 5200
+
+
+def test_a_frame_that_came_before_is_not_written_again(session, small_mission, make_frame):
+    before = (session / "frames.jsonl").read_bytes()
+    assert not SessionWriter(session, small_mission).add(make_frame(1), encode_frame(make_frame(1)))
+    assert (session / "frames.jsonl").read_bytes() == before
+
+
+def test_another_frame_of_the_same_number_is_refused(session, small_mission, make_frame):
+    other = dataclasses.replace(make_frame(5), frame_id=1)
+    with pytest.raises(SessionError, match="another frame 1"):
+        SessionWriter(session, small_mission).add(other, encode_frame(other))
+
+
+def test_a_frame_of_another_size_is_refused(session, small_mission, make_frame):
+    frame = make_frame(9, size_px=16)
+    with pytest.raises(SessionError, match=r"shape \(16, 16\)"):
+        SessionWriter(session, small_mission).add(frame, encode_frame(frame))
+
+
+def test_another_mission_s_session_is_not_continued(session, small_mission):
+    with pytest.raises(SessionError, match="another mission"):
+        SessionWriter(session, dataclasses.replace(small_mission, sha256="0" * 64))
+
+
+def test_a_folder_without_a_session_is_a_session_error(tmp_path):
+    with pytest.raises(SessionError, match=r"it has no session\.json"):
+        open_session(tmp_path)
+
+
+def test_another_schema_version_is_a_session_error(session):
+    header = json.loads((session / "session.json").read_text())
+    (session / "session.json").write_text(json.dumps(header | {"schema_version": 2}))
+    with pytest.raises(SessionError, match="schema version 2; this software reads 1"):
+        open_session(session)
+
+
+def test_an_empty_session_is_missing_its_frames(tmp_path, small_mission):
+    SessionWriter(tmp_path / "empty", small_mission)
+    with pytest.raises(MissingFrames, match="holds no frames"):
+        open_session(tmp_path / "empty")
+
+
+def test_missing_pictures_are_named(session):
+    (session / "frames" / "000001.png").unlink()
+    with pytest.raises(MissingFrames, match="1 of 3 pictures are missing: 1") as caught:
+        open_session(session)
+    assert caught.value.ids == (1,)
+
+
+def test_a_damaged_picture_is_corrupt(session):
+    opened = open_session(session)
+    path = session / opened.frames[0].file
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(SessionCorrupt, match=r"000000\.png cannot be read"):
+        opened.dn(opened.frames[0])
+    path.write_bytes((session / "frames" / "000001.png").read_bytes())
+    assert opened.dn(opened.frames[0]).shape == (48, 48)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"exposure_time_s": "short"}, "exposure_time_s is 'short'"),
+        ({"exposure_time_s": float("nan")}, "exposure_time_s is nan"),
+        ({"id": True}, "id is True"),
+        ({"covariance": [[1.0]]}, r"covariance must be \(6, 6\)"),
+        ({"world_to_camera": None}, "world_to_camera"),
+        ({"file": "../../etc/passwd"}, "file is '../../etc/passwd'"),
+        ({"file": "frames/../000001.png"}, "file is"),
+        ({"id": 1}, "frame 1 is there twice"),
+    ],
+)
+def test_a_wrong_value_names_its_line(session, changes, problem):
+    edit_line(session, 2 if "id" not in changes else 0, **changes)
+    with pytest.raises(SessionCorrupt, match=rf"frames.jsonl line \d: .*{problem}"):
+        open_session(session)
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"{", "is not JSON"),
+        (b"[]", "should hold an object"),
+        (b'{"schema_version": 1}', "session.json: 'camera'"),
+        (b'{"schema_version": 1, "camera": {"width": 0}}', "camera"),
+    ],
+)
+def test_a_damaged_header_is_corrupt(session, content, problem):
+    (session / "session.json").write_bytes(content)
+    with pytest.raises(SessionCorrupt, match=problem):
+        open_session(session)

@@ -1,0 +1,228 @@
+"""Boxes, hull, growth, distances and files of the model."""
+
+import math
+
+import numpy as np
+import plyfile
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+
+from obbgs_core import hull, obb, sh
+from obbgs_core.densify import Adam, grow, keep, outliers, trainable
+from obbgs_core.errors import ReconstructionError
+from obbgs_core.gaussians import Gaussians
+from obbgs_core.methods import PRESETS, preset
+from obbgs_core.metrics import cloud_distances, surface_points
+from obbgs_core.ply import load_ply, save_ply
+from obbgs_core.rotations import multiply, quats_to_matrices
+
+
+def model(count: int, sh_count: int = 1, channels: int = 1, seed: int = 0) -> Gaussians:
+    g = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        torch.randn(count, 3, generator=g),
+        torch.randn(count, 4, generator=g),
+        torch.rand(count, 3, generator=g) * 2 - 4,
+        torch.randn(count, generator=g),
+        torch.randn(count, sh_count, channels, generator=g),
+    )
+
+
+@given(st.integers(0, 2**31), st.integers(4, 60))
+def test_a_box_contains_its_points_and_is_tight_along_the_principal_axes(seed, count):
+    rng = np.random.default_rng(seed)
+    points = torch.tensor(
+        rng.normal(size=(count, 3)) * [5, 2, 0.5] @ Rotation.random(rng=rng).as_matrix().T + 3
+    )
+    box = obb.fit(points)
+    assert box.contains(points).all()
+    torch.testing.assert_close(box.axes.T @ box.axes, torch.eye(3, dtype=torch.float64))
+    _, expected = np.linalg.eigh(np.cov(points.numpy().T))
+    np.testing.assert_allclose(np.abs((box.axes.numpy() * expected).sum(0)), 1, atol=1e-6)
+    assert not box.contains(box.centre + 1.01 * box.axes[:, 2] * box.half_extents[2] + 1e-6)
+
+
+def test_the_papers_centre_is_the_mean_and_ours_the_middle():
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [0, 1, 0], [0, 0, 0.5]])
+    torch.testing.assert_close(obb.fit(points, mean_centre=True).centre, points.mean(0))
+    assert (
+        obb.fit(points).contains(points).all()
+        and not obb.fit(points, mean_centre=True).contains(points).all()
+    )
+
+
+def test_the_worst_tile_is_found():
+    error = torch.zeros(100, 120)
+    error[45:50, 85:90] = 1
+    assert obb.worst_tile(error) == (40, 80)
+
+
+def test_gaussians_behind_a_tile_lie_in_its_frustum_and_not_behind_the_surface():
+    means = torch.tensor([[0.0, 0, 5], [0, 0, 9], [2, 0, 5], [0, 0, -5]])
+    means2d = torch.tensor([[60.0, 30], [60, 30], [100, 30], [60, 30]])
+    depth = torch.full((60, 120), 5.0)
+    chosen = obb.behind_tile(means, means2d, depth, torch.eye(4), (20, 40))
+    assert chosen.tolist() == [True, False, False, False]
+
+
+def test_the_hull_of_a_ball_is_its_surface():
+    silhouettes, K = [], torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+    rows, columns = torch.meshgrid(torch.arange(100) + 0.5, torch.arange(100) + 0.5, indexing="ij")
+    radius_px = 100 * 1.0 / math.sqrt(5**2 - 1)  # the outline of a unit ball five metres away
+    mask = (rows - 50) ** 2 + (columns - 50) ** 2 < radius_px**2
+    for rotation in Rotation.random(40, rng=np.random.default_rng(0)).as_matrix():
+        pose = torch.eye(4)
+        pose[:3, :3] = torch.tensor(rotation, dtype=torch.float32)
+        pose[2, 3] = 5.0
+        silhouettes.append(hull.Silhouette(mask, pose, K))
+    assert hull.radius_m(silhouettes) == pytest.approx(1.05 * radius_px / 100 * 5, rel=0.05)
+    points, voxel_m = hull.hull_points(silhouettes, hull.radius_m(silhouettes))
+    distance = points.norm(dim=1)
+    # 40 outlines bound the ball from outside; a pixel is 5 cm, a voxel 0.8 cm; the vote lets corners stand out
+    assert len(points) > 1000 and distance.min() > 0.9 and distance.median() < 1.08
+
+
+def test_views_that_disagree_leave_no_hull():
+    K, rng = torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), np.random.default_rng(0)
+    silhouettes = []
+    for rotation in Rotation.random(20, rng=rng).as_matrix():
+        pose = torch.eye(4)
+        pose[:3, :3], pose[2, 3] = torch.tensor(rotation, dtype=torch.float32), 5.0
+        mask = torch.zeros(100, 100, dtype=torch.bool)
+        row, column = rng.integers(10, 80, 2)
+        mask[row : row + 8, column : column + 8] = True
+        silhouettes.append(hull.Silhouette(mask, pose, K))
+    points, _ = hull.hull_points(silhouettes, 2.0)
+    assert len(points) == 0
+
+
+def test_growth_clones_the_small_splits_the_large_and_carries_the_moments():
+    gaussians = trainable(model(10))
+    with torch.no_grad():
+        gaussians.log_scales[:] = -5
+        gaussians.log_scales[3] = 0.0
+    adam = Adam(gaussians)
+    adam.first["means"][:] = torch.arange(10.0)[:, None]
+    chosen = torch.zeros(10, dtype=torch.bool)
+    chosen[[2, 3]] = True
+    grown = grow(gaussians, adam, chosen, split_over_m=0.5, rng=torch.Generator().manual_seed(0))
+    assert len(grown) == 12  # one clone added, one split into two
+    torch.testing.assert_close(grown.means[9], gaussians.means[2])
+    torch.testing.assert_close(grown.scales[10:], gaussians.scales[[3, 3]] / 1.6)
+    assert adam.first["means"][:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9, 0, 0, 0]
+    kept = keep(grown, adam, torch.arange(12) != 5)
+    assert len(kept) == 11 and adam.second["sh"].shape[0] == 11 and kept.means.requires_grad
+
+
+def test_adam_matches_torch():
+    ours, theirs = trainable(model(5)), trainable(model(5))
+    adam = Adam(ours, eps=1e-8)
+    optimizer = torch.optim.Adam([theirs.means, theirs.sh], lr=0.01, eps=1e-8)
+    for _ in range(5):
+        for gaussians in (ours, theirs):
+            ((gaussians.means**3).sum() + (gaussians.sh - 2).square().sum()).backward()
+        adam.step(ours, dict.fromkeys(ours.tensors(), 0.01))
+        optimizer.step()
+        optimizer.zero_grad()
+    # eps is added before the bias correction here, after it there
+    torch.testing.assert_close(ours.means, theirs.means, atol=1e-5, rtol=1e-5)
+
+
+def test_the_filter_removes_what_is_far_or_faint_and_fairly_far():
+    gaussians = model(300)
+    gaussians.opacity_logits[:] = 2.0
+    gaussians.means[0] = torch.tensor([30.0, 0, 0])
+    gaussians.means[1] = torch.tensor([4.5, 0, 0])
+    gaussians.opacity_logits[1] = -4.0
+    assert torch.nonzero(outliers(gaussians))[:, 0].tolist() == [0, 1]
+
+
+@given(st.integers(0, 1000))
+def test_cloud_distances_match_brute_force(seed):
+    rng = np.random.default_rng(seed)
+    a, b = rng.random((40, 3)), rng.random((60, 3))
+    table = cdist(a, b)
+    ours = cloud_distances(a, b)
+    assert ours["chamfer"] == pytest.approx((table.min(1).mean() + table.min(0).mean()) / 2)
+    assert ours["hausdorff"] == pytest.approx((table.min(1).max() + table.min(0).max()) / 2)
+    assert ours["completeness"] == pytest.approx(100 * (table.min(0) < 0.01).mean())
+
+
+def test_an_empty_cloud_is_refused():
+    with pytest.raises(ValueError, match="cloud must be finite points"):
+        cloud_distances(np.zeros((0, 3)), np.zeros((1, 3)))
+
+
+def test_surface_points_lie_on_the_discs():
+    gaussians = model(1)
+    gaussians.opacity_logits[:] = 5
+    gaussians.log_scales[0] = torch.tensor([0.0, -9.0, -1.0])
+    points = surface_points(gaussians, 5000) - gaussians.means[0]
+    local = points @ quats_to_matrices(gaussians.quats)[0]
+    assert (local[:, 1].abs() < 1e-3).all()  # the shortest axis
+    assert (((local[:, 0] / 1.0) ** 2 + (local[:, 2] / math.exp(-1)) ** 2) <= 1 + 1e-4).all()
+    assert local[:, 0].abs().max() > 0.95
+
+
+@pytest.mark.parametrize(("sh_count", "channels"), [(1, 1), (4, 3)])
+def test_a_ply_is_read_by_others_and_comes_back_exactly(tmp_path, sh_count, channels):
+    gaussians = model(17, sh_count, channels)
+    save_ply(gaussians, tmp_path / "m.ply", white_radiance=2.0)
+    vertex = plyfile.PlyData.read(str(tmp_path / "m.ply"))["vertex"]
+    np.testing.assert_array_equal(vertex["x"], gaussians.means[:, 0].numpy())
+    np.testing.assert_array_equal(vertex["rot_3"], gaussians.quats[:, 3].numpy())
+    shown = 0.5 + sh.C0 * np.asarray(vertex["f_dc_0"])
+    radiance = sh.radiance(gaussians.sh[:, :1], torch.zeros(17, 3))[:, 0].numpy()
+    np.testing.assert_allclose(shown, np.clip(radiance / 2, 0, 1) ** (1 / 2.2), atol=1e-6)
+    again = load_ply(tmp_path / "m.ply")
+    for name, tensor in gaussians.tensors().items():
+        torch.testing.assert_close(getattr(again, name), tensor, rtol=0, atol=0)
+
+
+def test_a_foreign_or_cut_ply_is_refused(tmp_path):
+    save_ply(model(3), tmp_path / "m.ply")
+    content = (tmp_path / "m.ply").read_bytes()
+    for broken in (content[:-5], b"ply\n" + content[10:60], b""):
+        (tmp_path / "b.ply").write_bytes(broken)
+        with pytest.raises(ReconstructionError):
+            load_ply(tmp_path / "b.ply")
+
+
+def test_radiance_is_never_negative_and_starts_where_it_was_asked():
+    wanted = torch.tensor([[0.0005], [0.02], [0.7], [40.0]])
+    coefficients = sh.from_radiance(wanted)[:, None]
+    torch.testing.assert_close(sh.radiance(coefficients, torch.zeros(4, 3)), wanted, rtol=1e-3, atol=1e-6)
+    assert (sh.radiance(torch.full((1, 1, 1), -50.0), torch.zeros(1, 3)) >= 0).all()
+
+
+def test_spherical_harmonics_are_orthonormal():
+    directions = torch.nn.functional.normalize(
+        torch.randn(400_000, 3, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    basis = sh.sh_basis(directions, 16)
+    gram = 4 * math.pi * basis.T @ basis / len(directions)
+    torch.testing.assert_close(gram, torch.eye(16), rtol=0, atol=0.03)  # Monte Carlo: 0.002 times a few
+
+
+@given(st.integers(0, 10_000))
+def test_rotations_match_scipy(seed):
+    rng = np.random.default_rng(seed)
+    a, b = Rotation.random(rng=rng), Rotation.random(rng=rng)
+    qa, qb = (torch.tensor(r.as_quat(scalar_first=True)) for r in (a, b))
+    np.testing.assert_allclose(quats_to_matrices(3 * qa).numpy(), a.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(quats_to_matrices(multiply(qa, qb)).numpy(), (a * b).as_matrix(), atol=1e-12)
+
+
+def test_presets_are_data_and_mistakes_are_named():
+    assert set(PRESETS) == {"3dgs", "pixel-gs", "mvgs", "jiang2025", "obbgs"}
+    assert preset("jiang2025").edge_weight == 0.2 and not preset("jiang2025").exposure_aware
+    with pytest.raises(ValueError, match="no method 'nerf'"):
+        preset("nerf")
+    with pytest.raises(ValueError, match="no setting magic"):
+        preset("3dgs", magic=1)
+    with pytest.raises(ValueError, match="steps must be at least 1"):
+        preset("obbgs", steps=0)

@@ -1,0 +1,67 @@
+"""The image model against simulated sensors and its own invariances."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from obbgs_core.sensor import Sensor, clipped_mean
+
+SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=2e7, electrons_per_dn=4, read_noise_dn=8)
+radiances = st.floats(0, 50)
+
+
+@given(radiances, st.floats(1e-5, 1e-3), st.floats(1.0, 4.0))
+def test_a_longer_exposure_never_darkens(radiance, exposure_s, factor):
+    shorter = SENSOR.expected_dn(torch.tensor(radiance), exposure_s)
+    assert SENSOR.expected_dn(torch.tensor(radiance), exposure_s * factor) >= shorter
+
+
+@given(radiances, st.floats(1e-5, 1e-3), st.floats(0.1, 10.0))
+def test_radiance_up_and_time_down_leaves_the_reading(radiance, exposure_s, factor):
+    a = SENSOR.expected_dn(torch.tensor(radiance, dtype=torch.float64), exposure_s)
+    b = SENSOR.expected_dn(torch.tensor(radiance * factor, dtype=torch.float64), exposure_s / factor)
+    torch.testing.assert_close(a, b)
+
+
+@pytest.mark.parametrize("radiance", [0.0, 0.01, 0.5, 1.8])
+def test_the_residual_of_a_true_prediction_has_mean_0_and_variance_1(radiance):
+    rng = np.random.default_rng(3)
+    signal = 2e7 * 1e-4 * radiance
+    dn = 64 + rng.poisson(signal * 4, 200_000) / 4 + rng.normal(0, 8, 200_000)
+    dn = torch.tensor(np.clip(np.rint(dn), 0, 4095))
+    residual = SENSOR.normalised_residual(torch.tensor(radiance, dtype=torch.float64), 1e-4, dn)
+    assert abs(residual.mean()) < 0.01  # 200,000 samples: the error of the mean is 0.002
+    assert residual.var().item() == pytest.approx(1, abs=0.02)
+
+
+def test_a_saturated_reading_censors_brighter_predictions_only():
+    dn = torch.full((2,), 4095.0)
+    residual = SENSOR.normalised_residual(torch.tensor([5.0, 0.5]), 1e-4, dn)
+    assert residual[0] == 0 and residual[1] < -50
+
+
+def test_saturated_pixels_keep_a_gradient_upwards():
+    radiance = torch.tensor([0.5], requires_grad=True)
+    SENSOR.normalised_residual(radiance, 1e-4, torch.tensor([4095.0])).square().sum().backward()
+    assert radiance.grad is not None and radiance.grad[0] < 0
+
+
+@pytest.mark.parametrize("mean", [-3.0, 0.0, 0.5, 20.0])
+def test_the_mean_of_a_clipped_normal_matches_sampling(mean):
+    samples = np.maximum(np.random.default_rng(0).normal(mean, 2.0, 2_000_000), 0)
+    ours = clipped_mean(torch.tensor(mean, dtype=torch.float64), torch.tensor(2.0, dtype=torch.float64))
+    assert ours.item() == pytest.approx(samples.mean(), abs=0.01)
+
+
+def test_the_stabilised_scale_has_unit_noise_everywhere():
+    rng = np.random.default_rng(1)
+    for signal in (50.0, 400.0, 3000.0):
+        dn = 64 + rng.poisson(signal * 4, 100_000) / 4 + rng.normal(0, 8, 100_000)
+        assert SENSOR.stabilised(torch.tensor(dn)).std().item() == pytest.approx(1, abs=0.03)
+
+
+def test_an_impossible_sensor_is_refused():
+    with pytest.raises(ValueError, match="ordered and positive"):
+        Sensor(100, 50, 1, 1, 1)
