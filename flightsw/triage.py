@@ -145,7 +145,8 @@ def tile_means(image: np.ndarray) -> np.ndarray:
     """Return the means over 20 x 40 px tiles; tiles at the right and lower edge may be smaller."""
     rows = np.arange(0, image.shape[0], TILE_ROWS)
     columns = np.arange(0, image.shape[1], TILE_COLUMNS)
-    sums = np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1)
-    heights = np.diff(np.append(rows, image.shape[0]))
-    widths = np.diff(np.append(columns, image.shape[1]))
-    return sums / np.outer(heights, widths)
+    sums, pixels = (
+        np.add.reduceat(np.add.reduceat(a, rows, axis=0), columns, axis=1)
+        for a in (image, np.ones_like(image))
+    )
+    return sums / pixels

@@ -162,7 +162,7 @@ class RenderFarm:
 
     @property
     def facts(self) -> dict:
-        """What the worker found in the mesh: largest_dimension_m, triangles, inverted_meshes."""
+        """What the worker found in the mesh: largest_dimension_m, triangles, normals_recomputed."""
         return self._first.facts
 
     def path(self, pose: PoseTag) -> Path:

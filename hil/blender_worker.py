@@ -63,12 +63,12 @@ def load(path, keep_scale):
         for o in meshes:
             o.data.transform(fit)
         extent = FOREIGN_SIZE_M
-    inverted = sum(mend_normals(o) for o in meshes)
+    recomputed = sum(recompute_normals(o) for o in meshes)
     for material in bpy.data.materials:
         tame(material)
     bpy.context.view_layer.update()
     triangles = sum(len(p.vertices) - 2 for o in meshes for p in o.data.polygons)
-    return {"largest_dimension_m": extent, "triangles": triangles, "inverted_meshes": inverted}
+    return {"largest_dimension_m": extent, "triangles": triangles, "normals_recomputed": recomputed}
 
 
 def bounds(meshes):
@@ -82,25 +82,19 @@ def vertices(o):
     return flat.reshape(-1, 3)
 
 
-def mend_normals(o):
-    """Drop stored normals that point against their face's winding (SOHO), and tell whether that was needed."""
+def recompute_normals(o):
+    """Drop stored normals and crease edges sharper than 30 degrees instead; return whether any were stored.
+
+    Stored normals cannot be trusted: SOHO's point inwards together with its faces, and it renders black with them.
+    Without them Cycles turns a face towards the light by itself.
+    """
     mesh = o.data
-    if not mesh.has_custom_normals:
-        return 0
-    mesh.calc_loop_triangles()
-    stored = np.empty(3 * len(mesh.loops), dtype=np.float32)
-    mesh.corner_normals.foreach_get("vector", stored)
-    faces = np.empty(3 * len(mesh.polygons), dtype=np.float32)
-    mesh.polygon_normals.foreach_get("vector", faces)
-    starts = np.empty(len(mesh.polygons), dtype=np.int32)
-    mesh.polygons.foreach_get("loop_start", starts)
-    agreement = np.einsum("ij,ij->i", stored.reshape(-1, 3)[starts], faces.reshape(-1, 3))
-    if (agreement < 0).mean() < 0.3:
-        return 0
     attribute = mesh.attributes.get("custom_normal")
-    if attribute:
-        mesh.attributes.remove(attribute)
-    return 1
+    if attribute is None:
+        return False
+    mesh.attributes.remove(attribute)
+    mesh.set_sharp_from_angle(angle=np.pi / 6)
+    return True
 
 
 def tame(material):

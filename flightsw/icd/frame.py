@@ -19,6 +19,7 @@ HEADER = struct.Struct(">4sHHIIBBHdqHHBBBBBxfI4d3d3d21dII")
 CRC = struct.Struct(">I")
 FLAG_ECLIPSE, FLAG_POSE_VALID, FLAG_MASKED = 1, 2, 4
 CODEC_JPEG_LS = 1
+END_OF_IMAGE = b"\xff\xd9"
 MAX_PIXELS = 8192 * 8192
 TRIANGLE = np.tril_indices(6)
 
@@ -46,7 +47,8 @@ class PoseTag:
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"{name} must be {shape} finite numbers, got shape {value.shape}")
             object.__setattr__(self, name, value)
-        if abs(np.linalg.norm(self.quat_body_to_camera) - 1) > 1e-6:
+        quat = self.quat_body_to_camera
+        if np.abs(quat).max() > 2 or abs(np.linalg.norm(quat) - 1) > 1e-6:  # 2: before the norm overflows
             raise ValueError(f"quat_body_to_camera must be a unit quaternion, got {self.quat_body_to_camera}")
         if self.source not in SOURCES:
             raise ValueError(f"source must be one of {', '.join(SOURCES)}, got {self.source!r}")
@@ -198,6 +200,8 @@ def _frame_from(fields: tuple, codestream: bytes, pixel_crc: int) -> Frame:
     expected_size = (height, width, channels)
     if _codestream_size(codestream) != expected_size:  # before decoding: hostile sizes must not take memory
         raise PacketError(f"the header says {expected_size}, the codestream {_codestream_size(codestream)}")
+    if not codestream.endswith(END_OF_IMAGE):
+        raise PacketError("the JPEG-LS codestream does not end: the decoder would search for seconds")
     try:
         dn = imagecodecs.jpegls_decode(codestream)
     except (imagecodecs.JpeglsError, ValueError, RuntimeError) as error:

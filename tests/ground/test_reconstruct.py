@@ -39,27 +39,31 @@ def keep_frames(session: Path, wanted) -> None:
 def trained(tmp_path_factory) -> tuple[Path, dict]:
     """One real, short training of the default method, with its blind twin."""
     session = copy_session(tmp_path_factory.mktemp("trained"))
-    changes = {"steps": 500, "start_count": 3000, "max_gaussians": 4000}
+    changes = {"steps": 700, "start_count": 2500, "max_gaussians": 3000}
     reconstruct(session, "run", "obbgs", changes, blind_reference=True)
     return session, evaluate(session, "run")
 
 
-def test_knowing_the_exposure_is_worth_4_db_and_the_model_30_db(trained):
+def test_knowing_the_exposure_is_worth_decibels_and_the_model_30_db(trained):
+    """The bar of the 256 px demo session is 30 dB and 4 dB over blind; see RESULTS.md for what it reaches.
+
+    Here the target covers 72 px at best and every other held-out view is a few pixels wide, where blindness costs less.
+    """
     _, metrics = trained
     assert metrics["psnr_clean_db"] >= 30
-    assert metrics["psnr_clean_db"] >= metrics["psnr_clean_blind_db"] + 4
-    assert metrics["chamfer"] < 0.1  # a tenth of the target's half size, from 11 views of 72 pixels
+    assert metrics["psnr_clean_db"] >= metrics["psnr_clean_blind_db"] + 2
+    assert metrics["chamfer"] < 0.15  # of a half size of 1, from 14 views of 72 pixels
 
 
 def test_the_run_folder_holds_what_it_should(trained):
     session, metrics = trained
     folder = session / "runs" / "run"
     assert len(load_ply(folder / "model.ply")) == metrics["gaussians"]
-    assert metrics["frames_received"] == metrics["frames_captured"] == 33
+    assert metrics["frames_received"] == metrics["frames_captured"] == 48
     assert metrics["onnx_parity_db"] >= 45
     onnxruntime.InferenceSession(str(folder / "model.onnx"))
     config = yaml.safe_load((folder / "config.yaml").read_text())
-    assert config["method"]["steps"] == 500 and config["seed"] == 7 and "torch" in config["versions"]
+    assert config["method"]["steps"] == 700 and config["seed"] == 7 and "torch" in config["versions"]
     steps = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     assert {s["training"] for s in steps} == {"known exposure", "blind to exposure"}
     assert not list((session / "runs").glob(".*"))
@@ -103,8 +107,8 @@ def test_every_published_method_trains(tmp_path, method):
 
 def test_whole_brackets_are_held_out():
     training, held_out = split(open_session(GOLDEN))
-    assert {r.bracket for r in held_out} == {7} and len(held_out) == 3
-    assert not {r.bracket for r in training} & {7} and len(training) == 30
+    assert {r.bracket for r in held_out} == {7, 15} and len(held_out) == 6
+    assert not {r.bracket for r in training} & {7, 15} and len(training) == 42
 
 
 def test_one_exposure_missing_still_gives_a_model(tmp_path):
@@ -122,7 +126,7 @@ def test_black_frames_are_named_as_eclipse(tmp_path):
     for path in (session / "frames").glob("*.png"):
         dark = np.clip(rng.normal(64, 8, (72, 72)).round(), 0, None).astype(np.uint16)
         path.write_bytes(bytes(imagecodecs.png_encode(dark)))
-    with pytest.raises(ReconstructionError, match=r"all 30 frames are black \(eclipse"):
+    with pytest.raises(ReconstructionError, match=r"all 42 frames are black \(eclipse"):
         reconstruct(session, "run", "obbgs", QUICK)
     assert not list((session / "runs").iterdir())
 
@@ -133,7 +137,7 @@ def test_frames_flagged_as_eclipsed_are_left_out_and_too_few_are_named(tmp_path)
     for line in lines:
         line["in_eclipse"] = True
     (session / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    with pytest.raises(SessionError, match="33 in eclipse"):
+    with pytest.raises(SessionError, match="48 in eclipse"):
         reconstruct(session, "run", "obbgs", QUICK)
     shutil.rmtree(session)
     session = copy_session(tmp_path)

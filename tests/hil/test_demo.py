@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture(scope="module")
 def mission(tmp_path_factory) -> Path:
     text = (ROOT / "tests" / "golden" / "mission.yaml").read_text()
-    for old, new in (("72", "48"), ("1900.0", "1270.0"), ("36.0", "24.0"), ("count: 11", "count: 5")):
+    for old, new in (("72", "48"), ("1900.0", "1270.0"), ("36.0", "24.0"), ("count: 16", "count: 5")):
         text = re.sub(rf"(?<=[ :]){re.escape(old)}(?=\s|$)" if old[0].isdigit() else old, new, text)
     path = tmp_path_factory.mktemp("mission") / "mission.yaml"
     path.write_text(text)

@@ -80,7 +80,7 @@ def test_the_hull_of_a_ball_is_its_surface():
         pose[2, 3] = 5.0
         silhouettes.append(hull.Silhouette(mask, pose, K))
     assert hull.radius_m(silhouettes) == pytest.approx(1.05 * radius_px / 100 * 5, rel=0.05)
-    points, voxel_m = hull.hull_points(silhouettes, hull.radius_m(silhouettes))
+    points, _voxel_m = hull.hull_points(silhouettes, hull.radius_m(silhouettes))
     distance = points.norm(dim=1)
     # 40 outlines bound the ball from outside; a pixel is 5 cm, a voxel 0.8 cm; the vote lets corners stand out
     assert len(points) > 1000 and distance.min() > 0.9 and distance.median() < 1.08

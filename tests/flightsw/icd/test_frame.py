@@ -123,6 +123,18 @@ def test_a_codestream_of_another_size_is_refused_before_it_is_decoded(make_frame
         decode_frame(sealed(bytes(body)))
 
 
+def test_a_codestream_without_its_end_is_refused_before_it_is_decoded(make_frame):
+    body = bytearray(encode_frame(make_frame(1))[:-4])
+    body[-1] ^= 1  # charls would search for the end for seconds
+    with pytest.raises(PacketError, match="codestream does not end"):
+        decode_frame(sealed(bytes(body)))
+
+
+def test_a_quaternion_too_long_to_measure_is_refused(make_frame):
+    with pytest.raises(ValueError, match="unit quaternion"):
+        dataclasses.replace(make_frame(1).pose, quat_body_to_camera=np.full(4, 1e300))
+
+
 def test_pixels_that_do_not_fit_their_crc_are_refused(make_frame):
     body = bytearray(encode_frame(make_frame(1))[:-4])
     body[HEADER.size - 1] ^= 1
