@@ -3,6 +3,7 @@
 The only file that sees TEME, kilometres and Julian dates.
 """
 
+import atexit
 import functools
 import importlib.util
 from dataclasses import dataclass
@@ -159,4 +160,6 @@ def _ephemeris() -> SPK:
     spec = importlib.util.find_spec("skyfield_data")
     if spec is None or spec.origin is None:
         raise OrbitError("the DE421 ephemeris is missing: pip install skyfield-data")
-    return SPK.open(str(Path(spec.origin).parent / "data" / "de421.bsp"))
+    kernel = SPK.open(str(Path(spec.origin).parent / "data" / "de421.bsp"))
+    atexit.register(kernel.close)  # the file stays mapped for as long as the program runs
+    return kernel

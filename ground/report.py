@@ -166,7 +166,7 @@ def _frames(run: Run) -> str:
             image = _noisy_image(run, record)
             range_m = float(np.linalg.norm(record.position_body_m))
             cells.append(
-                f'<figure><img alt="frame {record.id}" src="{_png(_tone(image))}"><figcaption>frame {record.id}, '
+                f'<figure><img alt="frame {record.id}" src="{_png(tone(image))}"><figcaption>frame {record.id}, '
                 f"{range_m:.0f} m, {record.saturated} saturated</figcaption></figure>"
             )
     grid = f'<div class="grid" style="grid-template-columns: 60px repeat({len(picked)}, 1fr)">{"".join(cells)}</div>'
@@ -203,9 +203,9 @@ def _triples(run: Run, truth: Truth | None) -> str:
             box = bounding_box(expected.mean(-1) > black + 0.01, MARGIN_PX)
             error = ((render - expected).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
             for image in (
-                _tone(expected[box].numpy()),
-                _tone(render[box].numpy()),
-                _heat(error[box].numpy()),
+                tone(expected[box].numpy()),
+                tone(render[box].numpy()),
+                heat(error[box].numpy()),
             ):
                 cells.append(f'<figure><img alt="frame {record.id}" src="{_png(image)}"></figure>')
     columns = f"60px repeat({3 * len(views)}, 1fr)"
@@ -374,13 +374,13 @@ def _noisy_image(run: Run, record: FrameRecord) -> np.ndarray:
     return dn.reshape(*dn.shape[:2], -1) / run.sensor.white_dn
 
 
-def _tone(image: np.ndarray) -> np.ndarray:
+def tone(image: np.ndarray) -> np.ndarray:
     """Return the square root of an image in 0..1 as bytes [H, W, 3]."""
     shown = np.sqrt(np.clip(image, 0, 1))
     return np.broadcast_to((255 * shown).round().astype(np.uint8), (*image.shape[:2], 3))
 
 
-def _heat(error: np.ndarray) -> np.ndarray:
+def heat(error: np.ndarray) -> np.ndarray:
     """Return black-red-yellow-white for 0..1, as bytes [H, W, 3]."""
     shown = np.clip(3 * error - np.array([0.0, 1.0, 2.0]), 0, 1)
     return (255 * shown).round().astype(np.uint8)

@@ -1,0 +1,47 @@
+"""Makes docs/demo.png from a finished demo: python docs/make_picture.py demo/session demo"""
+
+import sys
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+
+from ground.evaluate import Truth, bounding_box, clean_image, open_run
+from ground.reconstruct import predicted_image
+from ground.report import ERROR_FULL_SCALE, heat, tone
+
+SIZE_PX = 200
+
+
+def main(session: Path, name: str) -> None:
+    run = open_run(session, name)
+    truth = Truth(run.session)
+    rows = []
+    brackets = sorted({r.bracket for r in run.held_out})
+    for exposure_s in sorted({r.exposure_time_s for r in run.held_out}):
+        cells = []
+        for bracket in (brackets[1], brackets[2]):
+            record = next(r for r in run.held_out if (r.bracket, r.exposure_time_s) == (bracket, exposure_s))
+            clean = clean_image(run, truth, record)
+            render = predicted_image(run.gaussians, run.session, record, run.sensor, exposure_s)
+            box = bounding_box(truth.radiance(record)[1] > 0, 4)
+            error = ((render - clean).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
+            cells += [_fitted(f(i[box].numpy())) for f, i in ((tone, clean), (tone, render), (heat, error))]
+        rows.append(np.hstack(cells))
+    out = Path(__file__).with_name("demo.png")
+    out.write_bytes(bytes(imagecodecs.png_encode(np.vstack(rows), level=9)))
+    print(out)
+
+
+def _fitted(image: np.ndarray) -> np.ndarray:
+    """Return the picture in the middle of a black square, enlarged to fill it by whole pixels."""
+    zoom = max(1, SIZE_PX // max(image.shape[:2]))
+    image = np.repeat(np.repeat(image, zoom, axis=0), zoom, axis=1)[:SIZE_PX, :SIZE_PX]
+    square = np.zeros((SIZE_PX, SIZE_PX, 3), dtype=np.uint8)
+    top, left = (SIZE_PX - image.shape[0]) // 2, (SIZE_PX - image.shape[1]) // 2
+    square[top : top + image.shape[0], left : left + image.shape[1]] = image
+    return square
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2])
