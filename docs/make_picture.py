@@ -26,7 +26,8 @@ def main(session: Path, name: str) -> None:
             render = predicted_image(run.gaussians, run.session, record, run.sensor, exposure_s)
             box = bounding_box(truth.radiance(record)[1] > 0, 4)
             error = ((render - clean).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
-            cells += [_fitted(f(i[box].numpy())) for f, i in ((tone, clean), (tone, render), (heat, error))]
+            cells += [_fitted(tone(image[box].numpy(), run.sensor)) for image in (clean, render)]
+            cells.append(_fitted(heat(error[box].numpy())))
         rows.append(np.hstack(cells))
     out = Path(__file__).with_name("demo.png")
     out.write_bytes(bytes(imagecodecs.png_encode(np.vstack(rows), level=9)))

@@ -19,6 +19,7 @@ UNIX_EPOCH_JD = 2_440_587.5
 DAY_NS = 86_400_000_000_000
 TT_MINUS_UTC_S = 69.184  # 37 leap seconds + 32.184 s; true since 2017-01-01
 EARTH_RADIUS_M = 6_378_137.0  # WGS 84
+SUN_RADIUS_M = 6.957e8  # IAU 2015 nominal
 ARCSEC_RAD = np.pi / 648_000
 
 # The 13 largest terms of the IAU 1980 nutation (D, M, M', F, node; psi, psi per century, eps, eps per century, 1e-4
@@ -56,14 +57,16 @@ def propagate(tle: tuple[str, ...], utc_ns: int) -> OrbitState:
     """Return the SGP4 state of a TLE at a UTC time.
 
     Raises:
-        OrbitError: SGP4 refuses, for example because the orbit has decayed.
+        OrbitError: SGP4 cannot read the elements, or refuses, for example because the orbit has decayed.
     """
     satellite = _satellite(tle)
     jd, fr = _julian_date(utc_ns)
     code, position_km, velocity_km_s = satellite.sgp4(jd, fr)
     if code:
         reason = SGP4_ERRORS.get(code, f"error {code}")
-        raise OrbitError(f"object {satellite.satnum} cannot be propagated to {jd + fr:.5f}: {reason}")
+        raise OrbitError(f"object {satellite.satnum} cannot be propagated to JD {jd + fr:.5f}: {reason}")
+    if not np.isfinite(position_km).all():  # what SGP4 makes of a field that is no number
+        raise OrbitError(f"the elements of object {satellite.satnum} are unreadable: {tle}")
     rotation = teme_to_gcrs(utc_ns)
     return OrbitState(
         position_m=rotation @ np.array(position_km) * 1e3,
@@ -96,12 +99,31 @@ def sun_direction_gcrs(utc_ns: int) -> np.ndarray:
 
 
 def in_eclipse(position_m: np.ndarray, utc_ns: int) -> bool:
-    """Tell whether a spherical Earth hides the Sun's centre from a GCRS position (mid-penumbra)."""
+    """Tell whether the Earth hides more than half of the Sun's disc from a GCRS position [3]."""
+    return sunlit_fraction(position_m, utc_ns) < 0.5
+
+
+def sunlit_fraction(position_m: np.ndarray, utc_ns: int) -> float:
+    """Return the part of the Sun's disc that is seen from a GCRS position [3]: 0 in the umbra, 1 in full sunlight.
+
+    The Earth is a sphere without an atmosphere, which bends light into the umbra for some seconds more.
+
+    Source: Montenbruck and Gill, Satellite Orbits, 3.4.2 (two overlapping circles on the sky).
+    """
     to_sun = sun_position_gcrs(utc_ns) - position_m
-    range_m = np.linalg.norm(position_m)
-    cos_separation = -(position_m @ to_sun) / (range_m * np.linalg.norm(to_sun))
-    earth_rad = np.arcsin(min(1.0, EARTH_RADIUS_M / range_m))
-    return bool(np.arccos(np.clip(cos_separation, -1, 1)) < earth_rad)
+    a = np.arcsin(SUN_RADIUS_M / np.linalg.norm(to_sun))  # apparent radius of the Sun, rad
+    b = np.arcsin(min(1.0, EARTH_RADIUS_M / np.linalg.norm(position_m)))  # and of the Earth
+    c = np.arctan2(np.linalg.norm(np.cross(to_sun, -position_m)), to_sun @ -position_m)  # between their centres
+    if c >= a + b:
+        return 1.0
+    if c <= b - a:
+        return 0.0
+    if c <= a - b:  # annular, far behind the Earth
+        return float(1 - (b / a) ** 2)
+    x = (c**2 + a**2 - b**2) / (2 * c)
+    y = np.sqrt(max(a**2 - x**2, 0.0))
+    hidden = a**2 * np.arccos(np.clip(x / a, -1, 1)) + b**2 * np.arccos(np.clip((c - x) / b, -1, 1)) - c * y
+    return float(1 - hidden / (np.pi * a**2))
 
 
 def teme_to_gcrs(utc_ns: int) -> np.ndarray:
@@ -151,7 +173,10 @@ def _julian_date(utc_ns: int) -> tuple[float, float]:
 
 @functools.lru_cache(maxsize=8)
 def _satellite(tle: tuple[str, ...]) -> Satrec:
-    return Satrec.twoline2rv(*tle)
+    try:
+        return Satrec.twoline2rv(*tle)
+    except ValueError as error:
+        raise OrbitError(f"the elements cannot be read: {error}: {tle}") from error
 
 
 @functools.lru_cache(maxsize=1)

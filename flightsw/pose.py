@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 
+from flightsw.errors import OrbitError
 from flightsw.icd.frame import PoseTag, matrix_to_quat
 from flightsw.icd.mission import Mission
 from flightsw.orbit import in_eclipse, propagate, sun_direction_gcrs
@@ -16,13 +17,17 @@ def pose_tag(mission: Mission, utc_ns: int) -> PoseTag:
     allows. The tag is marked invalid, not refused, when the elements are older than the mission allows.
 
     Raises:
-        OrbitError: an orbit cannot be propagated, or the time is outside the ephemeris.
+        OrbitError: an orbit cannot be propagated, the time is outside the ephemeris, or the camera's roll is
+            undefined: chaser and target coincide, or the target is exactly along the chaser's orbit normal.
     """
     target = propagate(mission.orbit.target_tle, utc_ns)
     chaser = propagate(mission.orbit.chaser_tle, utc_ns)
     line_of_sight = target.position_m - chaser.position_m
     orbit_normal = np.cross(chaser.position_m, chaser.velocity_m_s)
-    gcrs_to_camera = look_along(line_of_sight, down=-orbit_normal)
+    try:
+        gcrs_to_camera = look_along(line_of_sight, down=-orbit_normal)
+    except ValueError as error:
+        raise OrbitError(f"the camera cannot point at the target {line_of_sight} m away: {error}") from error
     gcrs_to_body = target_attitude(mission, utc_ns)
     age_days = max(abs(target.element_age_days), abs(chaser.element_age_days))
     sigma_rad = np.radians(mission.pose.sigma_attitude_deg)

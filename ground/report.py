@@ -18,6 +18,7 @@ from ground.evaluate import Run, Truth, bounding_box, clean_image, open_run
 from ground.reconstruct import predicted_image
 from ground.session import FrameRecord, write_whole
 from obbgs_core import sh
+from obbgs_core.sensor import Sensor
 
 COLUMNS = 6  # brackets shown for each exposure
 TRIPLE_VIEWS = 3
@@ -166,8 +167,8 @@ def _frames(run: Run) -> str:
             image = _noisy_image(run, record)
             range_m = float(np.linalg.norm(record.position_body_m))
             cells.append(
-                f'<figure><img alt="frame {record.id}" src="{_png(tone(image))}"><figcaption>frame {record.id}, '
-                f"{range_m:.0f} m, {record.saturated} saturated</figcaption></figure>"
+                f'<figure><img alt="frame {record.id}" src="{_png(tone(image, run.sensor))}">'
+                f"<figcaption>frame {record.id}, {range_m:.0f} m, {record.saturated} saturated</figcaption></figure>"
             )
     grid = f'<div class="grid" style="grid-template-columns: 60px repeat({len(picked)}, 1fr)">{"".join(cells)}</div>'
     return _section(
@@ -203,8 +204,8 @@ def _triples(run: Run, truth: Truth | None) -> str:
             box = bounding_box(expected.mean(-1) > black + 0.01, MARGIN_PX)
             error = ((render - expected).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
             for image in (
-                tone(expected[box].numpy()),
-                tone(render[box].numpy()),
+                tone(expected[box].numpy(), run.sensor),
+                tone(render[box].numpy(), run.sensor),
                 heat(error[box].numpy()),
             ):
                 cells.append(f'<figure><img alt="frame {record.id}" src="{_png(image)}"></figure>')
@@ -374,9 +375,10 @@ def _noisy_image(run: Run, record: FrameRecord) -> np.ndarray:
     return dn.reshape(*dn.shape[:2], -1) / run.sensor.white_dn
 
 
-def tone(image: np.ndarray) -> np.ndarray:
-    """Return the square root of an image in 0..1 as bytes [H, W, 3]."""
-    shown = np.sqrt(np.clip(image, 0, 1))
+def tone(image: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Return the square root of the signal above black, full scale white, as bytes [H, W, 3]."""
+    black = sensor.black_dn / sensor.white_dn
+    shown = np.sqrt(np.clip((image - black) / (1 - black), 0, 1))
     return np.broadcast_to((255 * shown).round().astype(np.uint8), (*image.shape[:2], 3))
 
 

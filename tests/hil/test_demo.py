@@ -26,7 +26,7 @@ def hil(*arguments: str) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=280)
 
 
-def test_demo_ends_in_a_report_and_renders_nothing_twice(mission, tmp_path):
+def test_demo_ends_in_a_report_with_every_frame_across(mission, tmp_path):
     out = tmp_path / "demo"
     done = hil("demo", "--out", str(out), "--mission", str(mission), "--json")
     assert done.returncode == 0, done.stderr
@@ -53,8 +53,7 @@ def test_demo_ends_in_a_report_and_renders_nothing_twice(mission, tmp_path):
         json.loads(line)["sha256"] for line in (out / "session" / "frames.jsonl").read_text().splitlines()
     ]
     assert sorted(stored) == sorted(arrived)
-    before = {path.name: path.stat().st_mtime_ns for path in (out / "renders").iterdir()}
-    assert len(before) == 15
+    assert len(list((out / "renders").iterdir())) == 15  # kept for the next run
 
 
 def test_a_session_that_is_no_demos_is_never_overwritten(mission, tmp_path):
