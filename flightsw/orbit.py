@@ -113,7 +113,8 @@ def sunlit_fraction(position_m: np.ndarray, utc_ns: int) -> float:
     to_sun = sun_position_gcrs(utc_ns) - position_m
     a = np.arcsin(SUN_RADIUS_M / np.linalg.norm(to_sun))  # apparent radius of the Sun, rad
     b = np.arcsin(min(1.0, EARTH_RADIUS_M / np.linalg.norm(position_m)))  # and of the Earth
-    c = np.arctan2(np.linalg.norm(np.cross(to_sun, -position_m)), to_sun @ -position_m)  # between their centres
+    sine, cosine = np.linalg.norm(np.cross(to_sun, position_m)), -(to_sun @ position_m)
+    c = np.arctan2(sine, cosine)  # angle between their centres
     if c >= a + b:
         return 1.0
     if c <= b - a:

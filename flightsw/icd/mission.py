@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import math
+import re
 import types
 import typing
 from dataclasses import dataclass, field
@@ -26,6 +27,22 @@ def _require(condition: bool, path: str, problem: str) -> None:
         raise ConfigError(path, problem)
 
 
+# The fields of a two-line element set that SGP4 reads: line, first and last column (from 1), name, form.
+DECIMAL = r" *-?\d*\.\d+ *"
+TLE_FIELDS = (
+    (1, 19, 32, "epoch", r"\d\d[ \d]{2}\d\.\d+ *"),
+    (1, 34, 43, "first derivative of mean motion", r"[ +-]*\d?\.\d+ *"),
+    (1, 45, 52, "second derivative of mean motion", r"[ +-]*\d+[ +-]\d"),
+    (1, 54, 61, "drag term", r"[ +-]*\d+[ +-]\d"),
+    (2, 9, 16, "inclination", DECIMAL),
+    (2, 18, 25, "right ascension", DECIMAL),
+    (2, 27, 33, "eccentricity", r"\d{7}"),
+    (2, 35, 42, "argument of perigee", DECIMAL),
+    (2, 44, 51, "mean anomaly", DECIMAL),
+    (2, 53, 63, "mean motion", DECIMAL),
+)
+
+
 def tle_checksum(line: str) -> int:
     """Return the modulo-10 checksum of a TLE line's first 68 columns (digits, and 1 for each minus)."""
     return sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
@@ -35,6 +52,7 @@ def _check_tle(lines: tuple[str, ...], path: str) -> None:
     _require(len(lines) == 2, path, f"expected two lines, got {len(lines)}")
     for number, line in enumerate(lines, start=1):
         where = f"{path}[{number - 1}]"
+        _require(line.isascii(), where, "a TLE line is plain ASCII text")
         _require(len(line) == 69, where, f"a TLE line has 69 columns, got {len(line)}")
         _require(line.startswith(f"{number} "), where, f"expected line {number}, got {line[:2]!r}")
         _require(line[68].isdigit(), where, f"column 69 must be the checksum digit, got {line[68]!r}")
@@ -49,6 +67,12 @@ def _check_tle(lines: tuple[str, ...], path: str) -> None:
         path,
         f"the lines belong to different objects: {lines[0][2:7]} and {lines[1][2:7]}",
     )
+    for number, first, last, name, form in TLE_FIELDS:
+        text = lines[number - 1][first - 1 : last]
+        where = f"{path}[{number - 1}]"
+        _require(
+            re.fullmatch(form, text) is not None, where, f"columns {first}-{last} hold no {name}: {text!r}"
+        )
 
 
 @dataclass(frozen=True)
@@ -67,14 +91,15 @@ class OrbitSection:
     @property
     def start_utc_ns(self) -> int:
         """First trigger, integer Unix nanoseconds."""
+        path = "mission.orbit.start_utc"
         try:
             moment = datetime.fromisoformat(self.start_utc)
         except ValueError as error:
-            raise ConfigError(
-                "mission.orbit.start_utc", f"expected ISO 8601, got {self.start_utc!r}"
-            ) from error
-        if moment.tzinfo is None:
-            raise ConfigError("mission.orbit.start_utc", "say the time zone: end the time with Z")
+            raise ConfigError(path, f"expected ISO 8601, got {self.start_utc!r}") from error
+        _require(moment.tzinfo is not None, path, "say the time zone: end the time with Z")
+        _require(
+            1970 <= moment.year <= 2052, path, f"expected 1970 to 2052, where DE421 ends, got {moment.year}"
+        )
         whole = moment.astimezone(UTC).replace(microsecond=0)
         return int(whole.timestamp()) * 1_000_000_000 + moment.microsecond * 1000
 
@@ -96,7 +121,9 @@ class TargetAttitudeSection:
                 f"{path}.axis",
                 f"expected a unit vector, got length {math.hypot(*self.axis):.4f}",
             )
-        _require(self.period_s > 0, f"{path}.period_s", f"must be positive, got {self.period_s}")
+        _require(
+            0.1 <= self.period_s <= 1e9, f"{path}.period_s", f"expected 0.1 to 1e9 s, got {self.period_s}"
+        )
 
 
 @dataclass(frozen=True)
@@ -180,14 +207,14 @@ class BracketSection:
                 f"{path}.frame_spacing_s",
                 f"{self.frame_spacing_s} s is shorter than an exposure of {time_ms} ms",
             )
-        _require(self.frame_spacing_s > 0, f"{path}.frame_spacing_s", "must be positive")
         shortest_s = self.frame_spacing_s * len(self.exposure_times_ms)
         _require(
             self.interval_s >= shortest_s,
             f"{path}.interval_s",
             f"{self.interval_s} s is shorter than the bracket itself ({shortest_s} s)",
         )
-        _require(self.count >= 1, f"{path}.count", f"expected at least 1, got {self.count}")
+        _require(self.interval_s <= 86_400, f"{path}.interval_s", f"{self.interval_s} s is more than a day")
+        _require(1 <= self.count <= 100_000, f"{path}.count", f"expected 1 to 100000, got {self.count}")
 
     @property
     def exposure_times_s(self) -> tuple[float, ...]:
@@ -229,9 +256,9 @@ class LinkSection:
         )
         _require(self.roi_sigma > 0, f"{path}.roi_sigma", f"must be positive, got {self.roi_sigma}")
         _require(
-            self.roi_margin_px >= 0,
+            0 <= self.roi_margin_px <= 8192,
             f"{path}.roi_margin_px",
-            f"must not be negative, got {self.roi_margin_px}",
+            f"expected 0 to 8192, got {self.roi_margin_px}",
         )
 
 
@@ -239,6 +266,11 @@ class LinkSection:
 class ReconstructSection:
     method: str = "obbgs"
     seed: int = 7
+
+    def __post_init__(self):
+        _require(
+            0 <= self.seed < 1 << 32, "mission.reconstruct.seed", f"expected 0 to 2^32 - 1, got {self.seed}"
+        )
 
 
 @dataclass(frozen=True)
@@ -253,6 +285,17 @@ class Mission:
     sha256: str = ""  # of the file's bytes, so a result can be traced to its mission
 
 
+class _StrictLoader(yaml.SafeLoader):
+    """A safe loader that refuses a key written twice, where YAML would keep the last silently."""
+
+    def construct_mapping(self, node, deep=False):
+        names = [str(key.value) for key, _ in node.value]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            problem = f"key written twice: {', '.join(twice)}"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
+        return super().construct_mapping(node, deep=deep)
+
+
 def load_mission(path: str | Path) -> Mission:
     """Return the mission in a YAML file.
 
@@ -265,8 +308,8 @@ def load_mission(path: str | Path) -> Mission:
     except OSError as error:
         raise ConfigError(str(path), f"cannot read the mission file: {error.strerror}") from error
     try:
-        tree = yaml.safe_load(content)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        tree = yaml.load(content, _StrictLoader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # 2026-13-01 is a ValueError of PyYAML's
         raise ConfigError(str(path), f"is not valid YAML: {' '.join(str(error).split())}") from error
     return build(Mission, tree, "mission", sha256=hashlib.sha256(content).hexdigest())
 
@@ -292,7 +335,7 @@ def build(section: type, tree: Any, path: str, **given: Any) -> Any:
 
 
 def _describe(value: Any) -> str:
-    return "nothing" if value is None else repr(value)
+    return "nothing" if value is None else repr(value)[:80]
 
 
 def _convert(value: Any, hint: Any, path: str) -> Any:
@@ -316,7 +359,7 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
         return tuple(_convert(item, item_hint, f"{path}[{i}]") for i, item in enumerate(value))
     if hint is float:
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        _require(number and math.isfinite(value), path, f"expected a number, got {_describe(value)}")
+        _require(number and abs(value) < 1e300, path, f"expected a number, got {_describe(value)}")
         return float(value)
     if hint is int:
         _require(
@@ -326,6 +369,6 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
         )
         return value
     if isinstance(value, datetime):  # YAML reads an unquoted time stamp as a datetime
-        value = value.replace(tzinfo=value.tzinfo or UTC).isoformat()
+        value = value.isoformat()
     _require(isinstance(value, str), path, f"expected text, got {_describe(value)}")
     return value
