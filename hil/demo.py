@@ -71,6 +71,8 @@ def run_demo(out: Path, mission_path: Path, mesh: Path, console: Console) -> dic
         "--blind-reference",
     ]
     command += ["--method", mission.reconstruct.method, "--seed", str(mission.reconstruct.seed)]
+    if mission.reconstruct.steps:
+        command += ["--steps", str(mission.reconstruct.steps)]
     finished = subprocess.run([*command, "--json"], stdout=subprocess.PIPE, text=True)
     if finished.returncode:
         raise DemoError("the reconstruction failed; its message is above")

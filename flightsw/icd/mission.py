@@ -266,11 +266,13 @@ class LinkSection:
 class ReconstructSection:
     method: str = "obbgs"
     seed: int = 7
+    steps: int = 0  # of training; 0: the method's own number
 
     def __post_init__(self):
         _require(
             0 <= self.seed < 1 << 32, "mission.reconstruct.seed", f"expected 0 to 2^32 - 1, got {self.seed}"
         )
+        _require(self.steps >= 0, "mission.reconstruct.steps", f"must not be negative, got {self.steps}")
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ def mission(tmp_path_factory) -> Path:
     text = (ROOT / "tests" / "golden" / "mission.yaml").read_text()
     for old, new in (("72", "48"), ("1900.0", "1270.0"), ("36.0", "24.0"), ("count: 16", "count: 5")):
         text = re.sub(rf"(?<=[ :]){re.escape(old)}(?=\s|$)" if old[0].isdigit() else old, new, text)
+    text += "  steps: 200\n"  # into the last section, reconstruct
     path = tmp_path_factory.mktemp("mission") / "mission.yaml"
     path.write_text(text)
     return path
