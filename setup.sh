@@ -23,6 +23,8 @@ library libxi6 libXi.so.6
 library libxkbcommon0 libxkbcommon.so.0
 library libsm6 libSM.so.6
 library libgl1 libGL.so.1
+library libaravis-0.8-0 libaravis-0.8.so.0
+needs aravis-tools "command -v arv-fake-gv-camera-0.8"
 if [ ${#missing[@]} -gt 0 ]; then
   install="apt-get install -y --no-install-recommends ${missing[*]}"
   if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then

@@ -1,13 +1,15 @@
-"""flightsw: capture, downlink, serve, triage, plan."""
+"""flightsw: capture, downlink, serve, triage, plan, fsck."""
 
 import dataclasses
 import json
 import logging
+import math
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,25 +19,39 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from flightsw.cameras import open_camera
+from flightsw.commands import ReplayCounter
 from flightsw.downlink import DownlinkProgress, run_downlink
 from flightsw.errors import FlightError
+from flightsw.fsck import fsck
 from flightsw.icd.mission import BracketSection, ConfigError, Mission, load_mission
-from flightsw.link import SerialLink
-from flightsw.pose import pose_tag
+from flightsw.link import Link, open_link
 from flightsw.sequencer import CaptureCounts, capture, plan
-from flightsw.store import FrameStore
+from flightsw.settings import load_settings
+from flightsw.store import FrameStore, open_store
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help="The flight side: what flies.")
 stderr = Console(stderr=True)
 LINGER_S = 0.5  # after the last delivery
+START_NOW_S = 2.0  # from the command to the first trigger of --start now: a camera takes a second to open
 
 MissionFile = Annotated[Path, typer.Option("--mission", help="The mission file.")]
 StoreDir = Annotated[Path, typer.Option("--store", help="The frame store.")]
-BracketMs = Annotated[str | None, typer.Option("--bracket", help="Exposure times, ms, comma separated.")]
+BracketMs = Annotated[
+    str | None, typer.Option("--bracket", help="Exposure times, ms, comma separated, or auto.")
+]
 Count = Annotated[int | None, typer.Option(help="Number of brackets.")]
+Duration = Annotated[
+    float | None, typer.Option("--for", help="Seconds of brackets, instead of --count.", min=0.0)
+]
+Start = Annotated[str | None, typer.Option(help="First trigger: now, or UTC as 2026-07-21T10:52:30Z.")]
 Interval = Annotated[float | None, typer.Option(help="Seconds from one trigger to the next.")]
-CameraUrl = Annotated[str, typer.Option("--camera", help="hil:///path/to/socket or hil://host:port.")]
+CameraUrl = Annotated[
+    str, typer.Option("--camera", help="hil:///path/to/socket, hil://host:port or gige://ID.")
+]
 LinkUrl = Annotated[str, typer.Option("--link", help="serial:///dev/ttyUSB0?baud=921600")]
+KeyFile = Annotated[
+    Path | None, typer.Option("--key", help="The mission's key; without it no command is taken.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
@@ -45,16 +61,20 @@ def capture_command(
     bracket: BracketMs = None,
     count: Count = None,
     interval: Interval = None,
+    duration: Duration = None,
+    start: Start = None,
     mission: MissionFile = Path("mission.yaml"),
     store: StoreDir = Path("store"),
     link: Annotated[str | None, typer.Option(help="Send the frames too, until the outbox is empty.")] = None,
     json_: AsJson = False,
 ) -> None:
-    """Take exposure brackets, tag and store them.
+    """Take exposure brackets, tag and store them; started again, it takes what the store does not hold.
+
+    A simulated camera lives in the mission's time. A real one waits for each exposure's time: --start now on a bench.
 
     Example: flightsw capture --bracket 0.05,0.1,0.2 --count 40 --camera hil:///tmp/camera.sock --store store
     """
-    plan_of = with_bracket(load_mission(mission), bracket, count, interval)
+    plan_of = with_bracket(load_mission(mission), bracket, count, interval, duration, start)
     _run(plan_of, store, camera, link, exit_when_empty=True, as_json=json_)
 
 
@@ -64,13 +84,14 @@ def serve(
     link: LinkUrl,
     mission: MissionFile = Path("mission.yaml"),
     store: StoreDir = Path("store"),
+    key: KeyFile = None,
     json_: AsJson = False,
 ) -> None:
-    """Capture the planned pass and send frames until stopped (SIGTERM or Ctrl-C end it cleanly).
+    """Capture the planned pass, send frames and take commands until stopped (SIGTERM or Ctrl-C end it cleanly).
 
-    Example: flightsw serve --camera hil:///tmp/camera.sock --link serial:///dev/ttyUSB0?baud=921600
+    Example: flightsw serve --camera hil:///tmp/camera.sock --link serial:///dev/ttyUSB0?baud=921600 --key mission.key
     """
-    _run(load_mission(mission), store, camera, link, exit_when_empty=False, as_json=json_)
+    _run(load_mission(mission), store, camera, link, exit_when_empty=False, as_json=json_, key_file=key)
 
 
 @app.command()
@@ -79,13 +100,14 @@ def downlink(
     mission: MissionFile = Path("mission.yaml"),
     store: StoreDir = Path("store"),
     exit_when_empty: Annotated[bool, typer.Option(help="Stop when every frame is confirmed.")] = False,
+    key: KeyFile = None,
     json_: AsJson = False,
 ) -> None:
-    """Send the outbox, oldest frame first, each until the ground confirms it.
+    """Send the outbox, each frame until the ground confirms it, in the mission's or the commanded order.
 
     Example: flightsw downlink --link serial:///dev/ttyUSB0?baud=921600 --store store --exit-when-empty
     """
-    _run(load_mission(mission), store, None, link, exit_when_empty=exit_when_empty, as_json=json_)
+    _run(load_mission(mission), store, None, link, exit_when_empty, as_json=json_, key_file=key)
 
 
 @app.command()
@@ -120,50 +142,80 @@ def triage(
 
 @app.command("plan")
 def plan_command(mission: MissionFile = Path("mission.yaml"), json_: AsJson = False) -> None:
-    """Print each planned bracket: time, range, phase angle, eclipse.
+    """Print the planned pass: each bracket's time, range, light, exposures and expected counts; passes and eclipses.
 
     Example: flightsw plan --mission mission.yaml
     """
-    loaded = load_mission(mission)
-    rows: list[dict[str, Any]] = []
-    for shot in plan(loaded):
-        if shot.bracket_index:
-            continue
-        tag = pose_tag(loaded, shot.mid_exposure_utc_ns)
-        range_m = float(np.linalg.norm(tag.position_body_m))
-        cos_phase = tag.position_body_m @ tag.sun_dir_body / range_m
-        rows.append(
-            {
-                "bracket": shot.bracket_id,
-                "utc": str(np.datetime64(shot.start_utc_ns, "ns"))[:23] + "Z",
-                "range_m": round(range_m, 2),
-                "phase_deg": round(float(np.degrees(np.arccos(np.clip(cos_phase, -1, 1)))), 2),
-                "px_per_m": round(loaded.camera.fx_px / range_m, 2),
-                "eclipse": tag.in_eclipse,
-                "pose_valid": tag.valid,
-            }
-        )
+    from flightsw.planning import pass_plan
+
+    planned = pass_plan(load_mission(mission))
     if json_:
-        print(json.dumps(rows))
+        print(json.dumps(dataclasses.asdict(planned)))
         return
-    print("bracket  UTC                       range m  phase deg  px/m  light    pose")
-    for row in rows:
-        light = "eclipse" if row["eclipse"] else "sunlit "
-        pose = "valid" if row["pose_valid"] else "stale elements"
-        print(
-            f"{row['bracket']:7d}  {row['utc']}  {row['range_m']:7.1f}  {row['phase_deg']:9.1f}  "
-            f"{row['px_per_m']:4.1f}  {light}  {pose}"
+    print(
+        "bracket  UTC                       range m  phase deg  Sun deg  px/m  light    pose   exposures ms -> DN"
+    )
+    for b in planned.brackets:
+        exposures = ", ".join(
+            f"{t:g} -> {dn}" for t, dn in zip(b.exposure_times_ms, b.expected_dn, strict=True)
         )
+        print(
+            f"{b.bracket:7d}  {b.utc}  {b.range_m:7.1f}  {b.phase_deg:9.1f}  {b.sun_deg:7.1f}  {b.px_per_m:4.1f}  "
+            f"{'eclipse' if b.eclipse else 'sunlit '}  {'valid' if b.pose_valid else 'stale'}  {exposures}"
+        )
+    for p in planned.passes:
+        print(
+            f"pass: brackets {p.first_bracket} to {p.last_bracket}, {p.start_utc} to {p.end_utc}, {p.frames} frames, "
+            f"range {p.range_m[0]:.0f} to {p.range_m[1]:.0f} m, phase {p.phase_deg[0]:.0f} to {p.phase_deg[1]:.0f} deg"
+        )
+    for utc, change in planned.shadow:
+        print(f"shadow: the target {change} it at {utc}")
 
 
-def with_bracket(mission: Mission, bracket: str | None, count: int | None, interval: float | None) -> Mission:
-    """Return the mission with the bracket section changed by the command line.
+@app.command("fsck")
+def fsck_command(
+    store: StoreDir = Path("store"),
+    check: Annotated[bool, typer.Option("--check", help="Report only, change nothing.")] = False,
+    json_: AsJson = False,
+) -> None:
+    """Check a frame store and repair it; damaged containers go to quarantine/. Stop `flightsw` first.
+
+    Exits with 1 when the store is damaged and --check leaves it so, or when frames were lost.
+
+    Example: flightsw fsck --store store
+    """
+    report = fsck(store, repair=not check)
+    if json_:
+        print(json.dumps(dataclasses.asdict(report)))
+    else:
+        for problem in report.problems:
+            print(problem)
+        print(
+            f"{report.frames} good frames, {report.waiting} to be delivered, {report.quarantined} quarantined, "
+            f"{report.missing} missing, {len(report.problems)} problems {'found' if check else 'mended'}"
+        )
+    if report.quarantined or report.missing or (check and report.problems):
+        raise typer.Exit(1)
+
+
+def with_bracket(
+    mission: Mission,
+    bracket: str | None,
+    count: int | None,
+    interval: float | None,
+    duration: float | None = None,
+    start: str | None = None,
+) -> Mission:
+    """Return the mission with the bracket section and the first trigger changed by the command line.
 
     Raises:
         ConfigError: a value is not a number or out of range.
     """
     changes: dict[str, Any] = {}
-    if bracket is not None:
+    if bracket == "auto":
+        changes["auto"] = True
+    elif bracket is not None:
+        changes["auto"] = False
         try:
             changes["exposure_times_ms"] = tuple(float(part) for part in bracket.split(","))
         except ValueError as error:
@@ -174,8 +226,17 @@ def with_bracket(mission: Mission, bracket: str | None, count: int | None, inter
         changes["count"] = count
     if interval is not None:
         changes["interval_s"] = interval
+    if duration is not None:
+        if count is not None:
+            raise ConfigError("--for", "says how many brackets, as --count does; give one of them")
+        spacing_s = mission.bracket.interval_s if interval is None else interval
+        changes["count"] = max(1, math.ceil(duration / spacing_s))
     section: BracketSection = dataclasses.replace(mission.bracket, **changes)
-    return dataclasses.replace(mission, bracket=section)
+    orbit = mission.orbit
+    if start is not None:
+        now = datetime.now(UTC) + timedelta(seconds=START_NOW_S)
+        orbit = dataclasses.replace(orbit, start_utc=now.isoformat() if start == "now" else start)
+    return dataclasses.replace(mission, bracket=section, orbit=orbit)
 
 
 def _run(
@@ -185,12 +246,13 @@ def _run(
     link_url: str | None,
     exit_when_empty: bool,
     as_json: bool,
+    key_file: Path | None = None,
 ) -> None:
     """Capture and downlink side by side, whichever are asked for; print what became of every frame."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     signal.signal(signal.SIGINT, lambda *_: stop.set())
-    store = FrameStore(store_dir)
+    store = open_store(store_dir, mission)
     captured = CaptureCounts()
     sent = DownlinkProgress()
     with _progress() as progress:
@@ -202,30 +264,36 @@ def _run(
             def report_sent(now: DownlinkProgress) -> None:
                 progress.update(task, completed=now.delivered, total=now.delivered + now.waiting)
 
-            link = SerialLink(link_url)  # a port that is not there is known before the first exposure
+            counter = ReplayCounter(key_file) if key_file is not None else None
+            link = open_link(link_url)  # a port that is not there is known before the first exposure
             if camera_url is not None:
                 capturing.set()
             thread = _Downlink(
-                FrameStore(store_dir), link, mission, exit_when_empty, capturing, stop, report_sent
+                FrameStore(store_dir), link, mission, counter, exit_when_empty, capturing, stop, report_sent
             )
             thread.start()
         try:
             if camera_url is not None:
                 shots = len(list(plan(mission)))
-                captured = _capture(mission, camera_url, store, progress, shots, stop)
+                note = thread.note_capture if thread is not None else lambda counts: None
+                captured = _capture(mission, camera_url, store, progress, shots, stop, note)
+        except FlightError:
+            if thread is not None:
+                thread.camera_failed = True
+            raise
         finally:
             capturing.clear()
             if thread is not None:
                 thread.join()
                 link.close()
+                if thread.counter is not None:
+                    thread.counter.close()
         if thread is not None:
             if thread.error:
                 raise thread.error
             sent = thread.result
-    result: dict[str, Any] = {
-        "frames_stored": len(store.frames),
-        "outbox": len(FrameStore(store_dir).outbox()),
-    }
+    left = FrameStore(store_dir)  # opened again: the downlink has its own
+    result: dict[str, Any] = {"frames_stored": len(left.frames), "outbox": len(left.outbox())}
     if camera_url is not None:
         result["capture"] = vars(captured)
     if link_url is not None:
@@ -235,12 +303,13 @@ def _run(
     else:
         if camera_url is not None:
             print(
-                f"captured {captured.stored} frames, {captured.already_stored} were there, {captured.failed} failed"
+                f"captured {captured.stored} frames, {captured.already_stored} were there, {captured.failed} failed, "
+                f"{captured.refused} refused, {captured.pose_invalid} without a valid pose"
             )
         if link_url is not None:
             print(f"delivered {sent.delivered} frames, {sent.segments_resent} segments resent")
         print(f"{result['frames_stored']} frames in {store_dir}, {result['outbox']} still to be delivered")
-    if captured.failed or (exit_when_empty and link_url is not None and result["outbox"]):
+    if captured.failed or captured.refused or (exit_when_empty and link_url is not None and result["outbox"]):
         raise typer.Exit(1)
 
 
@@ -251,16 +320,29 @@ def _capture(
     progress: Progress,
     shots: int,
     stop: threading.Event,
+    on_counts: Callable[[CaptureCounts], None],
 ) -> CaptureCounts:
     task = progress.add_task("captured", total=shots)
-    camera = open_camera(camera_url)
+    camera = open_camera(camera_url, mission.camera)
+
+    def wait_until(utc_ns: int) -> None:
+        if camera.waits:
+            stop.wait(max(0.0, (utc_ns - time.time_ns()) / 1e9))
+
+    def on_frame(counts: CaptureCounts) -> None:
+        counts.packets_lost = camera.packets_lost
+        progress.update(task, completed=counts.planned)
+        on_counts(counts)
+
     try:
         return capture(
             mission,
             camera,
             store,
-            on_frame=lambda counts: progress.update(task, completed=counts.planned),
+            on_frame=on_frame,
             should_stop=stop.is_set,
+            wait_until=wait_until,
+            settings=lambda: load_settings(store.folder, mission),
         )
     finally:
         camera.close()
@@ -272,15 +354,18 @@ class _Downlink(threading.Thread):
     def __init__(
         self,
         store: FrameStore,
-        link: SerialLink,
+        link: Link,
         mission: Mission,
+        counter: ReplayCounter | None,
         exit_when_empty: bool,
         capturing: threading.Event,
         stop: threading.Event,
         on_progress: Callable[[DownlinkProgress], None],
     ):
         super().__init__(name="downlink", daemon=True)
-        self.store, self.link, self.mission = store, link, mission
+        self.store, self.link, self.mission, self.counter = store, link, mission, counter
+        self.captured = CaptureCounts()
+        self.camera_failed = False
         self.exit_when_empty, self.capturing, self.stop, self.on_progress = (
             exit_when_empty,
             capturing,
@@ -294,10 +379,26 @@ class _Downlink(threading.Thread):
     def run(self) -> None:
         try:
             self.result = run_downlink(
-                self.store, self.link, self.mission, False, self._keep, should_stop=self._should_stop
+                self.store,
+                self.link,
+                self.mission,
+                on_progress=self._keep,
+                should_stop=self._should_stop,
+                counter=self.counter,
+                capture_values=self._capture_values,
             )
         except FlightError as error:
             self.error = error
+
+    def note_capture(self, counts: CaptureCounts) -> None:
+        self.captured = counts
+
+    def _capture_values(self) -> dict[str, Any]:
+        """Return what capture knows of the housekeeping packet."""
+        state = "capturing" if self.capturing.is_set() else "pass done" if self.captured.planned else "none"
+        state = "failed" if self.camera_failed else state
+        counts = {"frames_failed": self.captured.failed, "frames_refused": self.captured.refused}
+        return {"camera": state} | counts
 
     def _keep(self, now: DownlinkProgress) -> None:
         self.result = now

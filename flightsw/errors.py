@@ -17,6 +17,14 @@ class StoreError(FlightError):
     """The frame store cannot be read or written."""
 
 
+class StoreFull(StoreError):
+    """The quota or the disk is full, and the policy allows nothing to be deleted."""
+
+
+class NavigationError(FlightError):
+    """The navigation stream cannot be opened, or has no trustworthy state for the asked time."""
+
+
 class LinkError(FlightError):
     """The link's port cannot be opened or was lost."""
 

@@ -21,6 +21,7 @@ TT_MINUS_UTC_S = 69.184  # 37 leap seconds + 32.184 s; true since 2017-01-01
 EARTH_RADIUS_M = 6_378_137.0  # WGS 84
 SUN_RADIUS_M = 6.957e8  # IAU 2015 nominal
 ARCSEC_RAD = np.pi / 648_000
+SHADOW_STEP_NS = 30_000_000_000
 
 # The 13 largest terms of the IAU 1980 nutation (D, M, M', F, node; psi, psi per century, eps, eps per century, 1e-4
 # arcsec); the rest adds up to less than 0.03 arcsec. Source: Seidelmann 1982, as tabulated by Meeus, ch. 22.
@@ -125,6 +126,33 @@ def sunlit_fraction(position_m: np.ndarray, utc_ns: int) -> float:
     y = np.sqrt(max(a**2 - x**2, 0.0))
     hidden = a**2 * np.arccos(np.clip(x / a, -1, 1)) + b**2 * np.arccos(np.clip((c - x) / b, -1, 1)) - c * y
     return float(1 - hidden / (np.pi * a**2))
+
+
+def shadow_crossings(tle: tuple[str, ...], start_utc_ns: int, end_utc_ns: int) -> list[tuple[int, bool]]:
+    """Return when a satellite enters (True) or leaves the Earth's shadow between two times, to 0.1 s.
+
+    Shadows shorter than half a minute may be missed.
+
+    Raises:
+        OrbitError: as `propagate` and `sun_position_gcrs`.
+    """
+
+    def dark(utc_ns: int) -> bool:
+        return in_eclipse(propagate(tle, utc_ns).position_m, utc_ns)
+
+    crossings = []
+    low, was_dark = start_utc_ns, dark(start_utc_ns)
+    while low < end_utc_ns:
+        high = min(low + SHADOW_STEP_NS, end_utc_ns)
+        is_dark = dark(high)
+        if is_dark != was_dark:
+            lit_or_dark, at = low, high
+            while at - lit_or_dark > 100_000_000:
+                middle = (lit_or_dark + at) // 2
+                lit_or_dark, at = (middle, at) if dark(middle) == was_dark else (lit_or_dark, middle)
+            crossings.append((at, is_dark))
+        low, was_dark = high, is_dark
+    return crossings
 
 
 def teme_to_gcrs(utc_ns: int) -> np.ndarray:

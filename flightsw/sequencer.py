@@ -4,13 +4,14 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
+from flightsw.bracket import AutoBracket, Geometry
 from flightsw.cameras import Camera
-from flightsw.errors import FlightError
-from flightsw.icd.frame import Frame
+from flightsw.errors import CaptureError, FlightError, OrbitError, StoreFull
+from flightsw.icd.frame import Frame, PoseTag, decode_frame
 from flightsw.icd.mission import Mission
-from flightsw.pose import pose_tag
+from flightsw.pose import PoseTagger, pose_tag
+from flightsw.region import region_of_interest
+from flightsw.settings import Settings
 from flightsw.store import FrameStore
 
 log = logging.getLogger(__name__)
@@ -40,19 +41,30 @@ class CaptureCounts:
     stored: int = 0
     already_stored: int = 0
     failed: int = 0
+    refused: int = 0  # taken, but the store is full
+    skipped: int = 0  # not taken: safe mode
     in_eclipse: int = 0
-    pose_invalid: int = 0
+    pose_invalid: int = 0  # of the stored ones; the next three say why
+    stale_elements: int = 0
+    outside_ephemeris: int = 0
+    navigation_gaps: int = 0
+    packets_lost: int = 0  # between camera and computer
 
 
-def plan(mission: Mission) -> Iterator[Shot]:
-    """Yield the pass's exposures: brackets `interval_s` apart, their frames `frame_spacing_s` apart, shortest first."""
+def plan(
+    mission: Mission, times_s: Callable[[int], tuple[float, ...]] = lambda trigger_utc_ns: ()
+) -> Iterator[Shot]:
+    """Yield the pass's exposures: brackets `interval_s` apart, their frames `frame_spacing_s` apart, shortest first.
+
+    `times_s` may give other exposure times than the mission's; it is asked when a bracket's first exposure is due.
+    """
     bracket = mission.bracket
-    times_s = sorted(bracket.exposure_times_s)
     for bracket_id in range(bracket.count):
         trigger_ns = mission.orbit.start_utc_ns + round(bracket_id * bracket.interval_s * NS)
-        for index, exposure_time_s in enumerate(times_s):
+        exposures_s = sorted(times_s(trigger_ns) or bracket.exposure_times_s)
+        for index, exposure_time_s in enumerate(exposures_s):
             start_ns = trigger_ns + round(index * bracket.frame_spacing_s * NS)
-            yield Shot(bracket_id, index, len(times_s), exposure_time_s, start_ns)
+            yield Shot(bracket_id, index, len(exposures_s), exposure_time_s, start_ns)
 
 
 def capture(
@@ -61,41 +73,73 @@ def capture(
     store: FrameStore,
     on_frame: Callable[[CaptureCounts], None] = lambda counts: None,
     should_stop: Callable[[], bool] = lambda: False,
+    wait_until: Callable[[int], None] = lambda utc_ns: None,
+    settings: Callable[[], Settings] | None = None,
 ) -> CaptureCounts:
     """Take every planned exposure that the store does not hold yet, and return the counts.
 
+    Args:
+        wait_until: returns when it is time for an exposure (UTC, ns); it may return early to stop.
+        settings: what the ground has commanded, read before each bracket (times) and each exposure (NEAR, safe mode).
+
     Raises:
-        StoreError: the disk refuses; without a store there is no capture.
+        NavigationError: the mission's navigation file is not there.
+        StoreError: the disk refuses; without a store there is no capture. A full store is counted, not raised.
     """
     counts = CaptureCounts()
-    for shot in plan(mission):
-        if should_stop():
-            break
-        counts.planned += 1
-        if store.holds(shot.bracket_id, shot.bracket_index):
-            counts.already_stored += 1
-        else:
-            try:
-                frame = expose(mission, camera, shot, store.next_frame_id)
-            except FlightError as error:
-                counts.failed += 1
-                log.warning("bracket %d frame %d lost: %s", shot.bracket_id, shot.bracket_index, error)
+    tagger = PoseTagger(mission)
+    times = _BracketTimes(mission, store, settings)
+    try:
+        for shot in plan(mission, times.at):
+            if should_stop():
+                break
+            commanded = settings() if settings else None
+            if store.holds(shot.bracket_id, shot.bracket_index):
+                counts.already_stored += 1
+            elif commanded is not None and commanded.safe_mode:
+                counts.skipped += 1
             else:
-                store.put(frame, roi_mask=region_of_interest(frame.dn, mission))
-                counts.stored += 1
-                counts.in_eclipse += frame.pose.in_eclipse
-                counts.pose_invalid += not frame.pose.valid
-        on_frame(counts)
+                wait_until(shot.start_utc_ns)
+                if should_stop():
+                    break
+                try:
+                    frame = expose(mission, camera, shot, store.next_frame_id, tagger)
+                    near = commanded.near if commanded else 0
+                    store.put(frame, near=near, roi_mask=region_of_interest(frame.dn, mission))
+                except StoreFull as error:
+                    counts.refused += 1
+                    log.warning("%s", error)
+                except (CaptureError, ValueError) as error:
+                    counts.failed += 1
+                    log.warning("bracket %d frame %d lost: %s", shot.bracket_id, shot.bracket_index, error)
+                else:
+                    times.observe(frame)
+                    counts.stored += 1
+                    counts.in_eclipse += frame.pose.in_eclipse
+                    counts.pose_invalid += not frame.pose.valid
+            counts.planned += 1
+            counts.stale_elements = tagger.stale_elements
+            counts.outside_ephemeris = tagger.outside_ephemeris
+            counts.navigation_gaps = tagger.navigation_gaps
+            on_frame(counts)
+    finally:
+        tagger.close()
     return counts
 
 
-def expose(mission: Mission, camera: Camera, shot: Shot, frame_id: int) -> Frame:
+def expose(
+    mission: Mission, camera: Camera, shot: Shot, frame_id: int, tag: Callable[[int], PoseTag]
+) -> Frame:
     """Return one exposure with its tag.
 
     Raises:
-        FlightError: the camera or the orbit failed.
+        CaptureError: the camera failed, or its picture is not of the mission's size.
     """
+    section = mission.camera
     exposure = camera.expose(shot.exposure_time_s, shot.start_utc_ns)
+    expected = (section.height, section.width) + ((3,) if section.channels == 3 else ())
+    if exposure.dn.shape != expected:
+        raise CaptureError(f"the mission's camera gives {expected} pixels, this one {exposure.dn.shape}")
     return Frame(
         frame_id=frame_id,
         bracket_id=shot.bracket_id,
@@ -103,34 +147,51 @@ def expose(mission: Mission, camera: Camera, shot: Shot, frame_id: int) -> Frame
         bracket_count=shot.bracket_count,
         exposure_time_s=exposure.exposure_time_s,
         mid_exposure_utc_ns=exposure.mid_exposure_utc_ns,
-        pose=pose_tag(mission, exposure.mid_exposure_utc_ns),
+        pose=tag(exposure.mid_exposure_utc_ns),
         dn=exposure.dn,
-        bit_depth=mission.camera.bit_depth,
-        black_dn=mission.camera.black_dn,
-        saturated_count=int((exposure.dn >= mission.camera.white_dn).sum()),
+        bit_depth=section.bit_depth,
+        black_dn=section.black_dn,
+        saturated_count=int((exposure.dn >= section.white_dn).sum()),
     )
 
 
-def region_of_interest(dn: np.ndarray, mission: Mission) -> np.ndarray:
-    """Return the mask [H, W] of pixels worth sending: near anything `roi_sigma` above black in a 3x3 mean.
+class _BracketTimes:
+    """Which exposure times the next bracket has: commanded, the mission's, or by what the last bracket showed."""
 
-    Outside it the frame carries the black level, which compresses to nothing.
-    """
-    camera, link = mission.camera, mission.link
-    brightness = dn.astype(np.float32).reshape(*dn.shape[:2], -1).mean(axis=2)
-    noise_dn = np.hypot(camera.read_noise_dn, 0.3) / 3  # of a 3x3 mean; 0.3 DN is the rounding
-    bright = _box_sum(brightness - camera.black_dn, 1) / 9 > link.roi_sigma * noise_dn
-    return _box_sum(bright.astype(np.float32), link.roi_margin_px) > 0.5
+    def __init__(self, mission: Mission, store: FrameStore, settings: Callable[[], Settings] | None):
+        self._mission, self._settings = mission, settings
+        self._auto = AutoBracket(mission.camera, mission.bracket)
+        self._taken: list[Frame] = []
+        self._last_seen: Geometry | None = None
+        if mission.bracket.auto and store.frames:  # a restart goes on where the last bracket ended
+            last = max(stored.bracket_id for stored in store.frames)
+            for stored in store.frames:
+                if stored.bracket_id == last:
+                    try:
+                        self._taken.append(decode_frame(store.read(stored.frame_id)))
+                    except (FlightError, ValueError) as error:
+                        log.warning("not used for the exposure times: %s", error)
 
+    def observe(self, frame: Frame) -> None:
+        if self._taken and self._taken[-1].bracket_id != frame.bracket_id:
+            self._taken = []
+        self._taken.append(frame)
 
-def _box_sum(image: np.ndarray, radius_px: int) -> np.ndarray:
-    """Return the sum over a square window around each pixel, zero outside the image."""
-    size = 2 * radius_px + 1
-    for axis in (0, 1):
-        pad = [(0, 0), (0, 0)]
-        pad[axis] = (radius_px + 1, radius_px)
-        total = np.cumsum(np.pad(image, pad), axis=axis, dtype=np.float64)
-        upper, lower = [slice(None)] * 2, [slice(None)] * 2
-        upper[axis], lower[axis] = slice(size, None), slice(None, -size)
-        image = total[tuple(upper)] - total[tuple(lower)]
-    return image
+    def at(self, trigger_utc_ns: int) -> tuple[float, ...]:
+        """Return the exposure times of the bracket that begins now; empty for the mission's own."""
+        commanded = self._settings() if self._settings else None
+        if commanded is not None and commanded.exposure_times_ms is not None:
+            return tuple(time_ms / 1e3 for time_ms in commanded.exposure_times_ms)
+        if not self._mission.bracket.auto:
+            return ()
+        if self._taken:
+            self._last_seen = Geometry.of(self._taken[-1].pose)
+            self._auto.observe([(frame.dn, frame.exposure_time_s) for frame in self._taken], self._last_seen)
+            self._taken = []
+        if self._mission.navigation.source != "sgp4" and self._last_seen is not None:
+            return self._auto.times_s(self._last_seen)  # the stream does not know the future
+        try:
+            return self._auto.times_s(Geometry.of(pose_tag(self._mission, trigger_utc_ns)))
+        except OrbitError as error:
+            log.warning("exposure times of the mission file: %s", error)
+            return ()

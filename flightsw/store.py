@@ -1,6 +1,7 @@
 """The crash-safe frame store: a frame is there whole or not at all, its number is never used twice."""
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import json
@@ -9,14 +10,20 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from flightsw.errors import StoreError
+from flightsw.errors import StoreError, StoreFull
 from flightsw.icd.frame import Frame, decode_frame, encode_frame
+from flightsw.icd.mission import Mission
 from flightsw.icd.packet import PacketError
 
 log = logging.getLogger(__name__)
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+RESERVE_BYTES = (
+    64 * 1024
+)  # kept for transfer numbers, so that a full disk cannot stop the downlink that empties it
 
 
 @dataclass(frozen=True)
@@ -33,60 +40,92 @@ class StoredFrame:
 class FrameStore:
     """A folder of frame containers, their index, and the outbox: what the ground has not confirmed yet.
 
-    frames/00000012.obf holds the container, index.jsonl a line for each stored frame, outbox/00000012 an
-    empty file for each frame still to be delivered. After a power cut the store opens again: an unfinished
-    line is cut off, a whole container without its line gets one. One process may capture, another send.
+    frames/00000012.obf holds the container, index.jsonl a line for each stored frame and one for each that was deleted
+    (`{"frame_id": 12, "dropped": REASON}`), outbox/00000012 an empty file for each frame still to be delivered. After a
+    power cut the store opens again: an unfinished line is cut off, a whole container without its line gets one, a torn
+    one goes to quarantine/. One process may capture, another send.
+
+    Args:
+        quota_bytes: what the containers may take in all; None: what the disk holds.
+        when_full: what is deleted for a new frame after all confirmed frames: nothing, or the oldest waiting ones.
 
     Raises:
         StoreError: the disk refuses, or the index is damaged other than at its end.
     """
 
-    def __init__(self, folder: Path):
-        self.folder = folder
+    def __init__(
+        self,
+        folder: Path,
+        quota_bytes: int | None = None,
+        when_full: Literal["refuse", "drop-oldest"] = "refuse",
+    ):
+        self.folder, self.quota_bytes, self.when_full = folder, quota_bytes, when_full
+        self.refused = 0  # frames of this run that found no room
         self._frames, self._outbox, self._index = folder / "frames", folder / "outbox", folder / "index.jsonl"
-        self._stored: dict[int, StoredFrame] = {}
-        self._index_read_bytes = 0
+        self._forget_index()
         with _disk_errors("open the store"):
             self._frames.mkdir(parents=True, exist_ok=True)
             self._outbox.mkdir(exist_ok=True)
-            with self._locked():
+            with self.locked():
                 for part in self._frames.glob("*.part"):
                     part.unlink()
                 self._read_index()
                 if self._index_read_bytes < self._index_bytes:  # the power went in the middle of a line
                     os.truncate(self._index, self._index_read_bytes)
                 self._index_unindexed()
+                self._keep_reserve()
 
     @property
     def next_frame_id(self) -> int:
-        return max(self._stored, default=-1) + 1
+        return self._last_id + 1
 
     @property
     def frames(self) -> list[StoredFrame]:
         return [self._stored[frame_id] for frame_id in sorted(self._stored)]
 
     def holds(self, bracket_id: int, bracket_index: int) -> bool:
-        """Tell whether this exposure of the pass is stored already."""
-        return any(
-            (f.bracket_id, f.bracket_index) == (bracket_id, bracket_index) for f in self._stored.values()
-        )
+        """Tell whether this exposure of the pass was stored, even if it has been deleted since."""
+        return (bracket_id, bracket_index) in self._exposures
 
     def put(self, frame: Frame, *, near: int = 0, roi_mask: np.ndarray | None = None) -> StoredFrame:
         """Store a frame and put it into the outbox; when this returns, a power cut cannot lose it.
 
         Raises:
+            StoreFull: no room, and the policy lets nothing be deleted for it; the frame is counted as refused.
             StoreError: the disk refuses, or the frame's number is taken.
         """
-        if frame.frame_id in self._stored:
-            raise StoreError(
-                f"frame {frame.frame_id} is stored already; the next free number is {self.next_frame_id}"
-            )
         container = encode_frame(frame, near=near, roi_mask=roi_mask)
-        with _disk_errors(f"store frame {frame.frame_id}"), self._locked():
-            (self._outbox / f"{frame.frame_id:08d}").touch()
-            sync_folder(self._outbox)
-            write_whole(self.path(frame.frame_id), container)
-            return self._add_to_index(frame, container)
+        with _disk_errors(f"store frame {frame.frame_id}"), self.locked():
+            self._read_index()
+            if frame.frame_id <= self._last_id:
+                raise StoreError(
+                    f"frame {frame.frame_id} is stored already or its number was used; "
+                    f"the next free number is {self.next_frame_id}"
+                )
+            used_limit = float("inf") if self.quota_bytes is None else self.quota_bytes - len(container)
+            if used_limit < 0:
+                self._refuse(frame.frame_id, f"its {len(container)} bytes exceed the quota")
+            while self.used_bytes > used_limit:
+                self._make_room(frame.frame_id, f"the quota of {self.quota_bytes} bytes")
+            while True:
+                try:
+                    return self._write(frame, container)
+                except OSError as error:
+                    if error.errno not in DISK_FULL:
+                        raise
+                    self._make_room(frame.frame_id, f"the disk ({os.strerror(error.errno or 0)})")
+
+    def drop(self, frame_id: int, reason: str = "command") -> None:
+        """Delete a frame and its place in the outbox; its number and its exposure are not used again.
+
+        Raises:
+            StoreError: the frame is not there, or the disk refuses.
+        """
+        with _disk_errors(f"delete frame {frame_id}"), self.locked():
+            self._read_index()
+            if frame_id not in self._stored:
+                raise StoreError(f"there is no frame {frame_id} to delete")
+            self._drop(frame_id, reason)
 
     def path(self, frame_id: int) -> Path:
         return self._frames / f"{frame_id:08d}.obf"
@@ -99,14 +138,18 @@ class FrameStore:
         """
         with _disk_errors(f"read frame {frame_id}"):
             container = self.path(frame_id).read_bytes()
-        if hashlib.sha256(container).hexdigest() != self._stored[frame_id].sha256:
-            raise StoreError(f"frame {frame_id} has changed on the disk")
+        if frame_id not in self._stored:  # another process captures
+            with _disk_errors("read the index"):
+                self._read_index()
+        stored = self._stored.get(frame_id)
+        if stored is None or hashlib.sha256(container).hexdigest() != stored.sha256:
+            raise StoreError(f"frame {frame_id} has changed on the disk; run flightsw fsck")
         return container
 
     def outbox(self) -> list[int]:
         """Return the numbers of the frames still to be delivered, oldest first."""
         with _disk_errors("read the outbox"):
-            waiting = sorted(int(path.name) for path in self._outbox.iterdir() if path.name.isdigit())
+            waiting = self._waiting()
             if any(frame_id not in self._stored for frame_id in waiting):  # another process captures
                 self._read_index()
         return [frame_id for frame_id in waiting if frame_id in self._stored]
@@ -114,91 +157,240 @@ class FrameStore:
     def next_transaction(self) -> int:
         """Return a file transfer's number, never given before, not even before a power cut."""
         path = self.folder / "transaction"
-        with _disk_errors("number a transfer"), self._locked():
+        with _disk_errors("number a transfer"), self.locked():
             text = path.read_text() if path.exists() else "0"
             if not text.strip().isdigit():
-                raise StoreError(f"{path} should hold a number, it holds {text[:20]!r}")
+                raise StoreError(f"{path} should hold a number, it holds {text[:20]!r}; run flightsw fsck")
             number = (int(text) + 1) % (1 << 32)
-            write_whole(path, f"{number}\n".encode())
+            try:
+                write_whole(path, f"{number}\n".encode())
+            except OSError as error:
+                if error.errno not in DISK_FULL:
+                    raise
+                self._reserve.unlink(missing_ok=True)
+                write_whole(path, f"{number}\n".encode())
         return number
 
     def mark_delivered(self, frame_id: int) -> None:
-        """Take a frame out of the outbox; the frame itself stays."""
+        """Take a frame out of the outbox; the frame itself stays until its room is needed."""
         with _disk_errors(f"mark frame {frame_id}"):
             (self._outbox / f"{frame_id:08d}").unlink(missing_ok=True)
             sync_folder(self._outbox)
 
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from writing to the store at the same time."""
+        with lock_store(self.folder):
+            yield
+
+    def _waiting(self) -> list[int]:
+        return sorted(int(path.name) for path in self._outbox.iterdir() if path.name.isdigit())
+
+    def _write(self, frame: Frame, container: bytes) -> StoredFrame:
+        marker, path = self._outbox / f"{frame.frame_id:08d}", self.path(frame.frame_id)
+        try:
+            marker.touch()
+            sync_folder(self._outbox)
+            write_whole(path, container)
+            return self._add_line(
+                StoredFrame(
+                    frame.frame_id,
+                    frame.bracket_id,
+                    frame.bracket_index,
+                    hashlib.sha256(container).hexdigest(),
+                    len(container),
+                )
+            )
+        except OSError:  # leave nothing half done: what stays would take the room that is missing
+            path.unlink(missing_ok=True)
+            marker.unlink(missing_ok=True)
+            raise
+
+    def _make_room(self, for_frame: int, what_is_full: str) -> None:
+        """Delete one frame: the oldest confirmed one, or if there is none what the policy says."""
+        waiting = set(self._waiting())
+        confirmed = sorted(frame_id for frame_id in self._stored if frame_id not in waiting)
+        if confirmed:
+            log.info("frame %d deleted, the ground has it: %s is full", confirmed[0], what_is_full)
+            self._drop(confirmed[0], "delivered")
+        elif self.when_full == "drop-oldest" and self._stored:
+            oldest = min(self._stored)
+            log.warning(
+                "frame %d deleted undelivered for frame %d: %s is full", oldest, for_frame, what_is_full
+            )
+            self._drop(oldest, "oldest")
+        else:
+            self._refuse(for_frame, f"{what_is_full} is full")
+
+    def _refuse(self, frame_id: int, reason: str) -> None:
+        self.refused += 1
+        raise StoreFull(f"frame {frame_id} refused: {reason}, policy {self.when_full}")
+
+    def _drop(self, frame_id: int, reason: str) -> None:
+        (self._outbox / f"{frame_id:08d}").unlink(missing_ok=True)
+        self.path(frame_id).unlink(missing_ok=True)
+        self._append(
+            {"frame_id": frame_id, "dropped": reason}
+        )  # a line lost here is written at the next start
+        self._read_index()
+
+    @property
+    def _reserve(self) -> Path:
+        return self.folder / "reserve"
+
+    def _keep_reserve(self) -> None:
+        try:
+            if not self._reserve.exists():
+                write_whole(self._reserve, bytes(RESERVE_BYTES))
+        except OSError as error:
+            log.warning("no reserve for transfer numbers: %s", error)
+
     @property
     def _index_bytes(self) -> int:
         return self._index.stat().st_size if self._index.exists() else 0
+
+    def _forget_index(self) -> None:
+        self.used_bytes = 0
+        self.dropped_undelivered = 0  # by drop-oldest, since the store was made
+        self._stored: dict[int, StoredFrame] = {}
+        self._exposures: set[tuple[int, int]] = set()
+        self._last_id = -1
+        self._index_read_bytes = self._index_inode = 0
 
     def _read_index(self) -> None:
         """Read what the index has gained, whole lines only."""
         if not self._index.exists():
             return
         with open(self._index, "rb") as index:
+            inode = os.fstat(index.fileno()).st_ino
+            if inode != self._index_inode:  # the first time, or fsck has written it again
+                self._forget_index()
+                self._index_inode = inode
             index.seek(self._index_read_bytes)
             *lines, _unfinished = index.read().split(b"\n")
         for line in lines:
             try:
-                stored = StoredFrame(**json.loads(line))
-            except (ValueError, TypeError) as error:
+                entry = parse_index_line(line)
+            except ValueError as error:
                 at = self._index_read_bytes
-                raise StoreError(f"{self._index} is damaged at byte {at}: {error}") from error
-            self._stored[stored.frame_id] = stored
+                raise StoreError(
+                    f"{self._index} is damaged at byte {at}: {error}; run flightsw fsck"
+                ) from error
+            if isinstance(entry, StoredFrame):
+                self._stored[entry.frame_id] = entry
+                self._exposures.add((entry.bracket_id, entry.bracket_index))
+                self.used_bytes += entry.size_bytes
+                self._last_id = max(self._last_id, entry.frame_id)
+            else:
+                frame_id, reason = entry
+                dropped = self._stored.pop(frame_id, None)
+                self.used_bytes -= dropped.size_bytes if dropped else 0
+                self.dropped_undelivered += reason == "oldest"
+                self._last_id = max(self._last_id, frame_id)
             self._index_read_bytes += len(line) + 1
 
     def _index_unindexed(self) -> None:
-        """Give a line to each container whose line never reached the disk; drop what is no container."""
+        """Give a line to each container whose line never reached the disk, and to each line whose container is gone."""
         for path in sorted(self._frames.glob("*.obf")):
             if not path.stem.isdigit() or int(path.stem) in self._stored:
                 continue
             container = path.read_bytes()
             try:
-                frame = decode_frame(container)
+                self._add_line(index_entry(path, container))
             except PacketError as error:
-                log.warning("%s dropped: %s", path, error)
-                path.unlink()
-            else:
-                self._add_to_index(frame, container)
+                log.warning("%s goes to quarantine: %s", path, error)
+                quarantine(self.folder, path)
+        for frame_id in list(self._stored):
+            if not self.path(frame_id).exists():
+                log.warning("frame %d is gone from the disk", frame_id)
+                self._drop(frame_id, "lost")
 
-    def _add_to_index(self, frame: Frame, container: bytes) -> StoredFrame:
-        stored = StoredFrame(
-            frame.frame_id,
-            frame.bracket_id,
-            frame.bracket_index,
-            hashlib.sha256(container).hexdigest(),
-            len(container),
-        )
+    def _add_line(self, stored: StoredFrame) -> StoredFrame:
+        self._append(vars(stored))
+        self._read_index()
+        return stored
+
+    def _append(self, entry: dict) -> None:
         before_bytes = self._index_bytes
         try:
             with open(self._index, "ab") as index:
-                index.write(json.dumps(vars(stored)).encode() + b"\n")
+                index.write(json.dumps(entry).encode() + b"\n")
                 index.flush()
                 os.fsync(index.fileno())
         except OSError:
             if self._index.exists():  # a full disk: half a line would damage the index for good
                 os.truncate(self._index, before_bytes)
             raise
-        self._read_index()
-        return stored
 
-    @contextlib.contextmanager
-    def _locked(self) -> Iterator[None]:
-        """Keep other processes from writing to the store at the same time."""
-        with open(self.folder / "lock", "wb") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            yield
+
+def open_store(folder: Path, mission: Mission) -> FrameStore:
+    """Return the store with the mission's quota and policy."""
+    return FrameStore(folder, mission.store.quota_bytes, mission.store.when_full)
+
+
+def parse_index_line(line: bytes) -> StoredFrame | tuple[int, str]:
+    """Return a line of the index: a stored frame, or the number of a deleted one and the reason.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    entry = json.loads(line)
+    try:
+        if set(entry) == {"frame_id", "dropped"}:
+            return int(entry["frame_id"]), str(entry["dropped"])
+        stored = StoredFrame(**entry)
+    except TypeError as error:
+        raise ValueError(str(error)) from error
+    numbers = (stored.frame_id, stored.bracket_id, stored.bracket_index, stored.size_bytes)
+    if not all(isinstance(n, int) and n >= 0 for n in numbers) or not isinstance(stored.sha256, str):
+        raise ValueError(f"values out of range: {entry}")
+    return stored
+
+
+def index_entry(path: Path, container: bytes) -> StoredFrame:
+    """Return the index line of a container, after decoding all of it.
+
+    Raises:
+        PacketError: it is no whole container, or not the one that its name says.
+    """
+    frame = decode_frame(container)
+    if f"{frame.frame_id:08d}" != path.stem:
+        raise PacketError(f"the file is called {path.name} but holds frame {frame.frame_id}")
+    sha256 = hashlib.sha256(container).hexdigest()
+    return StoredFrame(frame.frame_id, frame.bracket_id, frame.bracket_index, sha256, len(container))
+
+
+def quarantine(store: Path, path: Path) -> Path:
+    """Move a damaged file to the store's quarantine folder, where nothing is ever overwritten, and return its place."""
+    folder = store / "quarantine"
+    folder.mkdir(exist_ok=True)
+    number = sum(1 for _ in folder.iterdir())
+    moved = folder / f"{number:04d}-{path.name}"
+    os.replace(path, moved)
+    sync_folder(folder)
+    return moved
+
+
+@contextlib.contextmanager
+def lock_store(folder: Path) -> Iterator[None]:
+    """Hold the store's lock; waits for another process that holds it."""
+    with open(folder / "lock", "wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file whole or not at all, power cuts included: temporary name, sync, rename, sync folder."""
     part = path.with_name(path.name + ".part")
-    with open(part, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, path)
+    try:
+        with open(part, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
     sync_folder(path.parent)
 
 

@@ -1,6 +1,11 @@
 """Which frames are worth sending first: those that the uplinked model predicts worst. onnxruntime and numpy only."""
 
+import hashlib
+import logging
 import math
+import os
+import queue
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,15 +14,23 @@ import numpy as np
 from flightsw.errors import TriageError
 from flightsw.icd.frame import Frame, decode_frame
 from flightsw.icd.packet import PacketError
+from flightsw.model_file import verified_model
 
-MAX_MODEL_BYTES = 64 * 1024 * 1024
+log = logging.getLogger(__name__)
+
 TILE_ROWS, TILE_COLUMNS = 20, 40  # px, as in the ground's densification
 FACTS = ("black_dn", "white_dn", "dn_per_radiance_s", "electrons_per_dn", "read_noise_dn")
+NICENESS = 10  # of the ranking thread: the link goes first
+INPUTS = {"world_to_camera": [4, 4], "K": [3, 3], "exposure_time_s": []}
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """One frame's place: the mean chi² of its worst tile (1 is noise), and where that tile is."""
+    """One frame's place: the mean chi² of its worst tile (1 is noise), and where that tile is.
+
+    A frame taken in eclipse or with a pose that is not valid is not `comparable`: its chi² says nothing about
+    the model.
+    """
 
     frame_id: int
     path: Path
@@ -25,13 +38,15 @@ class Ranked:
     mean_chi2: float
     tile_row_px: int
     tile_column_px: int
+    comparable: bool
 
 
 class Renderer:
     """An uplinked model, verified before it is run, on one core of onnxruntime.
 
     Raises:
-        TriageError: not a model, too large, not of standard operators, or without what triage needs.
+        TriageError: not a model, too large, not of standard operators, not all in one file, or without what triage
+            needs.
     """
 
     def __init__(self, path: Path, threads: int = 1):
@@ -39,59 +54,68 @@ class Renderer:
             import onnxruntime
         except ImportError as error:
             raise TriageError("triage needs onnxruntime: install obbgs[onnx]") from error
-        try:
-            size_bytes = path.stat().st_size
-        except OSError as error:
-            raise TriageError(f"{path}: {error.strerror}") from error
-        if size_bytes > MAX_MODEL_BYTES:
-            raise TriageError(f"{path} has {size_bytes} bytes; the limit is {MAX_MODEL_BYTES}")
+        content = verified_model(path)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = threads
         options.log_severity_level = 3
+        options.add_session_config_entry("session.load_model_format", "ONNX")  # the format that was verified
         try:
-            # without custom operator libraries registered, onnxruntime itself refuses any other operator
-            self._session = onnxruntime.InferenceSession(
-                str(path), options, providers=["CPUExecutionProvider"]
-            )
+            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's errors share no base class; the file is from the link
             raise TriageError(
                 f"{path} is not a model that onnxruntime accepts: {str(error)[:200]}"
             ) from error
-        inputs = {i.name for i in self._session.get_inputs()}
-        outputs = {o.name for o in self._session.get_outputs()}
-        if inputs != {"world_to_camera", "K", "exposure_time_s"} or not {"image", "alpha"} <= outputs:
-            raise TriageError(
-                f"{path} takes {sorted(inputs)} and gives {sorted(outputs)}: not a renderer of ours"
-            )
         metadata = self._session.get_modelmeta().custom_metadata_map
         try:
             self.width, self.height = int(metadata["width"]), int(metadata["height"])
             self.sensor = {name: float(metadata[name]) for name in FACTS}
         except (KeyError, ValueError) as error:
             raise TriageError(f"{path} lacks metadata that triage needs: {error}") from error
-        if not all(math.isfinite(value) for value in self.sensor.values()):
-            raise TriageError(f"{path} has metadata that is not finite: {self.sensor}")
+        sensor = self.sensor
+        if not (
+            all(math.isfinite(value) for value in sensor.values())
+            and sensor["white_dn"] > sensor["black_dn"] >= 0 <= sensor["read_noise_dn"]
+            and sensor["electrons_per_dn"] > 0
+        ):
+            raise TriageError(f"{path} has metadata that is no sensor: {sensor}")
+        inputs = {i.name: i.shape for i in self._session.get_inputs()}
+        outputs = {o.name: o.shape for o in self._session.get_outputs()}
+        size = [self.height, self.width]
+        if inputs != INPUTS or outputs.get("image") not in ([*size, 1], [*size, 3]):
+            raise TriageError(f"{path} takes {inputs} and gives {outputs}: not a renderer of ours")
+        self.channels: int = outputs["image"][2]
 
     def expected_dn(self, world_to_camera: np.ndarray, K: np.ndarray, exposure_time_s: float) -> np.ndarray:
-        """Return the image [H, W, C] that the model expects, digital numbers, clipped at full scale."""
+        """Return the image [H, W, C] that the model expects, digital numbers, clipped at full scale.
+
+        Raises:
+            TriageError: the model fails while it runs, or its image is not of numbers or of another shape.
+        """
         feed = {
             "world_to_camera": world_to_camera.astype(np.float32),
             "K": K.astype(np.float32),
             "exposure_time_s": np.array(exposure_time_s, dtype=np.float32),
         }
-        (image,) = self._session.run(["image"], feed)
-        return np.asarray(image) * self.sensor["white_dn"]
+        try:
+            image = np.asarray(self._session.run(["image"], feed)[0])
+        except Exception as error:  # as above
+            raise TriageError(f"the model fails while it renders: {str(error)[:200]}") from error
+        if image.shape != (self.height, self.width, self.channels) or not np.isfinite(image).all():
+            raise TriageError(f"the model's image {image.shape} is not finite or not of the promised shape")
+        return image * self.sensor["white_dn"]
 
 
 def rank_frames(model: Path, frames: Path, K: np.ndarray) -> tuple[list[Ranked], int]:
     """Return the stored frames, worst predicted first, and how many containers could not be read.
+
+    Frames that are not comparable come last, whatever their chi².
 
     Args:
         frames: a folder of .obf containers, or a store that has one.
         K: [3, 3] px, the camera's.
 
     Raises:
-        TriageError: no usable model, no frames, or frames of another size.
+        TriageError: no usable model, no frames, or frames of another size or number of channels.
     """
     renderer = Renderer(model)
     folder = frames / "frames" if (frames / "frames").is_dir() else frames
@@ -106,7 +130,7 @@ def rank_frames(model: Path, frames: Path, K: np.ndarray) -> tuple[list[Ranked],
             unreadable += 1
             continue
         ranked.append(_rank(renderer, frame, path, K))
-    return sorted(ranked, key=lambda r: (-r.worst_chi2, r.frame_id)), unreadable
+    return sorted(ranked, key=lambda r: (not r.comparable, -r.worst_chi2, r.frame_id)), unreadable
 
 
 def _rank(renderer: Renderer, frame: Frame, path: Path, K: np.ndarray) -> Ranked:
@@ -114,6 +138,11 @@ def _rank(renderer: Renderer, frame: Frame, path: Path, K: np.ndarray) -> Ranked
         raise TriageError(
             f"frame {frame.frame_id} is {frame.dn.shape[1]}x{frame.dn.shape[0]} px, the model renders "
             f"{renderer.width}x{renderer.height}: export one for this camera"
+        )
+    channels = 1 if frame.dn.ndim == 2 else frame.dn.shape[2]
+    if channels != renderer.channels:
+        raise TriageError(
+            f"frame {frame.frame_id} has {channels} channels, the model renders {renderer.channels}"
         )
     expected = renderer.expected_dn(frame.world_to_camera, K, frame.exposure_time_s)
     chi2 = chi2_map(frame.dn.reshape(expected.shape), expected, renderer.sensor)
@@ -126,7 +155,88 @@ def _rank(renderer: Renderer, frame: Frame, path: Path, K: np.ndarray) -> Ranked
         float(chi2.mean()),
         int(row) * TILE_ROWS,
         int(column) * TILE_COLUMNS,
+        frame.pose.valid and not frame.pose.in_eclipse,
     )
+
+
+@dataclass(frozen=True)
+class ModelVerified:
+    """How the verification of a model file ended; `problem` is None for one that ranks frames from now on."""
+
+    path: Path
+    sha256: bytes
+    problem: str | None
+
+
+class TriageWorker:
+    """Verifies models and ranks frames in a thread of its own, while the link goes on."""
+
+    def __init__(self, K: np.ndarray, width: int, height: int):
+        self._K, self._size = K, (width, height)
+        self._renderer: Renderer | None = None
+        self._tasks: queue.SimpleQueue[tuple[Path, bool] | None] = queue.SimpleQueue()
+        self._results: queue.SimpleQueue[ModelVerified | tuple[Path, Ranked | None]] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="triage", daemon=True)
+
+    def verify(self, model: Path) -> None:
+        """Look at a model file; if it is good, later frames are ranked by it."""
+        self._put(model, True)
+
+    def rank(self, container: Path) -> None:
+        """Rank a stored frame by the newest model."""
+        self._put(container, False)
+
+    def results(self) -> list[ModelVerified | tuple[Path, Ranked | None]]:
+        """Return what was done since the last call, in order; None for a frame that cannot be ranked."""
+        done = []
+        while not self._results.empty():
+            done.append(self._results.get())
+        return done
+
+    def stop(self) -> None:
+        """End after the task under way; the others are forgotten."""
+        if self._thread.is_alive():
+            while not self._tasks.empty():
+                self._tasks.get()
+            self._tasks.put(None)
+            self._thread.join()
+
+    def _put(self, path: Path, is_model: bool) -> None:
+        if not self._thread.is_alive():
+            self._thread.start()
+        self._tasks.put((path, is_model))
+
+    def _run(self) -> None:
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)  # of this thread alone, on Linux
+        while (task := self._tasks.get()) is not None:
+            path, is_model = task
+            if is_model:
+                self._results.put(self._verified(path))
+            else:
+                self._results.put((path, self._ranked(path)))
+
+    def _ranked(self, path: Path) -> Ranked | None:
+        if self._renderer is None:
+            return None
+        try:
+            return _rank(self._renderer, decode_frame(path.read_bytes()), path, self._K)
+        except (PacketError, OSError, TriageError) as error:
+            log.warning("%s cannot be ranked: %s", path.name, error)
+            return None
+
+    def _verified(self, path: Path) -> ModelVerified:
+        try:
+            sha256 = hashlib.sha256(path.read_bytes()).digest()
+            renderer = Renderer(path)
+            if (renderer.width, renderer.height) != self._size:
+                width, height = self._size
+                raise TriageError(
+                    f"the model renders {renderer.width}x{renderer.height}, the camera has {width}x{height}"
+                )
+        except (TriageError, OSError) as error:
+            return ModelVerified(path, b"", str(error))
+        self._renderer = renderer
+        return ModelVerified(path, sha256, None)
 
 
 def chi2_map(dn: np.ndarray, expected_dn: np.ndarray, sensor: dict[str, float]) -> np.ndarray:

@@ -4,23 +4,38 @@ import logging
 import re
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from flightsw.icd.frame import decode_frame
+import imagecodecs
+
+from flightsw.icd.frame import Frame, decode_frame
 from flightsw.icd.framing import PacketStream
 from flightsw.icd.mission import Mission
-from flightsw.icd.packet import APID_FILES, TELECOMMAND, PacketError
-from flightsw.icd.transfer import Receiver, timer_s
-from ground.link import SerialLink
-from ground.session import SessionError, SessionWriter
+from flightsw.icd.packet import (
+    APID_COMMANDS,
+    APID_FILES,
+    APID_HOUSEKEEPING,
+    APID_UPLINK_FILES,
+    TELECOMMAND,
+    PacketError,
+)
+from flightsw.icd.transfer import Incoming, Receiver, timer_s
+from ground.link import Link, open_link
+from ground.session import SessionError, SessionWriter, write_whole
+from ground.telemetry import TelemetryLog
+from ground.uplink import Uplinker, listening
 
 log = logging.getLogger(__name__)
 
 WAIT_S = 0.02  # longest wait for bytes before timers are looked at again
 SAVE_S = 1.0  # between writes of session.json
-FRAME_NAME = re.compile(r"(\d{8})\.obf", re.ASCII)  # any other name is refused: a name is no path
-LINGER_INTERVALS = 4  # of silence before a sender with an open transfer counts as gone
+STATUS_S = 0.25  # between looks of the console
+# a picture or a thumbnail by its number; any other name is refused: a name is no path
+FILE_NAME = re.compile(r"(\d{8})\.(obf|obt)", re.ASCII)
+LINGER_INTERVALS = 4  # without a packet before the flight side counts as gone
+SETTLE_INTERVALS = 12  # after the last wanted frame, for a flight side that has not heard of all of them
 
 
 @dataclass(frozen=True)
@@ -29,28 +44,51 @@ class ListenSummary:
 
     frames_received: int = 0
     frames_in_session: int = 0
+    thumbnails_received: int = 0
+    headers_received: int = 0  # of frames, as telemetry
     bytes_received: int = 0  # from the port
+    bytes_sent: int = 0
+    packets_received: int = 0
     payload_bytes: int = 0  # containers of frames_received
     open_transfers: int = 0
+    commands_ended: int = 0
     skipped_bytes: int = 0  # not part of a good packet
     crc_errors: int = 0  # packets damaged on the wire
-    packets_missing: int = 0  # gaps in the sequence count
+    packets_missing: int = 0  # gaps in the sequence counts
     packets_foreign: int = 0
+    telemetry_refused: int = 0  # whole packets that the dictionary does not know
     segments_resent: int = 0
     pdus_refused: int = 0
-    frames_rejected: int = 0  # arrived whole, but no usable frame
+    frames_rejected: int = 0  # arrived whole, but no usable frame or thumbnail
     duplicates: int = 0  # frames that came again
     store_failures: int = 0  # disk refused; the flight side keeps the frame
     hang_ups: int = 0
+    link_losses: dict[str, int] = field(default_factory=dict)  # the wire's own counts
 
     @property
     def losses(self) -> dict[str, int]:
         """The counts that session.json keeps."""
         names = (
-            "skipped_bytes crc_errors packets_missing packets_foreign segments_resent pdus_refused "
-            "frames_rejected duplicates store_failures hang_ups"
+            "skipped_bytes crc_errors packets_missing packets_foreign telemetry_refused segments_resent "
+            "pdus_refused frames_rejected duplicates store_failures hang_ups"
         )
-        return {name: getattr(self, name) for name in names.split()}
+        return {name: getattr(self, name) for name in names.split()} | self.link_losses
+
+
+@dataclass(frozen=True)
+class Status:
+    """What the console shows."""
+
+    now_s: float
+    summary: ListenSummary
+    connected: bool  # the port is open
+    quiet_s: float  # since the last good packet
+    incoming: list[Incoming]
+    housekeeping: dict[str, Any]  # the newest, {} before the first
+    housekeeping_age_s: float
+    frame_header: dict[str, Any]
+    events: list[dict[str, Any]]
+    commands: list[tuple[int, str, str]]  # counter, name, stage of those under way
 
 
 def listen(
@@ -62,65 +100,99 @@ def listen(
     on_progress: Callable[[ListenSummary], None] = lambda summary: None,
     should_stop: Callable[[], bool] = lambda: False,
     clock_s: Callable[[], float] = time.monotonic,
+    on_status: Callable[[Status], None] = lambda status: None,
+    on_event: Callable[[dict[str, Any]], None] = lambda event: None,
 ) -> ListenSummary:
     """Write what comes over the link into a session, new or continued, and return the counts.
 
-    Ends when told to stop, when the session holds `exit_after` frames, or when no packet has come for
-    `idle_timeout_s`. `on_progress` is called after each frame and about once a second.
+    Commands that `ground uplink` leaves in the session are sent. Ends when told to stop, when the session holds
+    `exit_after` frames, or when no packet has come for `idle_timeout_s`. `on_progress` is called after each frame
+    and about once a second, `on_status` four times a second, `on_event` at once.
 
     Raises:
         ConfigError: the URL is not usable.
         LinkError: the port cannot be opened.
-        SessionError: the folder cannot be used as this mission's session.
+        SessionError: the folder cannot be used as this mission's session, or another process listens into it.
     """
-    with SerialLink(link_url) as link:
+    with open_link(link_url) as link:
         writer = SessionWriter(session_dir, mission)
-        ingest = _Ingest(link, writer, mission)
-        interval_s = timer_s(link.baud_rate)
-        last_packet_s = last_save_s = clock_s()
-        while not should_stop():
+        with listening(writer.folder):
+            ingest = _Ingest(link, writer, mission, on_event)
+            interval_s = timer_s(link.baud_rate)
             now_s = clock_s()
-            frames_before = ingest.frames_received
-            if ingest.turn(now_s):
-                last_packet_s = now_s
-            if ingest.frames_received > frames_before or now_s - last_save_s >= SAVE_S:
-                on_progress(ingest.summary())
-            if now_s - last_save_s >= SAVE_S:
-                last_save_s = now_s
-                ingest.save()
-            if idle_timeout_s is not None and now_s - last_packet_s > idle_timeout_s:
-                log.info("no packet for %.1f s", idle_timeout_s)
-                break
-            if exit_after is not None and writer.frame_count >= exit_after:
-                # the flight side must hear that its last frames are stored, if it is still there
-                quiet_s = now_s - last_packet_s
-                if not ingest.open_transfers or quiet_s > LINGER_INTERVALS * interval_s:
+            ingest.last_packet_s = last_save_s = last_status_s = now_s
+            complete_s: float | None = None  # since when the session holds what was wanted
+            while not should_stop():
+                now_s = clock_s()
+                frames_before = ingest.frames_received
+                ingest.turn(now_s)
+                if ingest.frames_received > frames_before or now_s - last_save_s >= SAVE_S:
+                    on_progress(ingest.summary())
+                if now_s - last_save_s >= SAVE_S:
+                    last_save_s = now_s
+                    ingest.save()
+                if now_s - last_status_s >= STATUS_S:
+                    last_status_s = now_s
+                    on_status(ingest.status(now_s))
+                if idle_timeout_s is not None and now_s - ingest.last_packet_s > idle_timeout_s:
+                    log.info("no packet for %.1f s", idle_timeout_s)
                     break
-        ingest.save()
-        on_progress(ingest.summary())
-        return ingest.summary()
+                if exit_after is not None and writer.frame_count >= exit_after:
+                    # the flight side must hear that its last frames are stored, if it is still there
+                    complete_s = now_s if complete_s is None else complete_s
+                    is_told = ingest.flight_outbox == 0 and not ingest.open_transfers
+                    is_gone = now_s - ingest.last_packet_s > LINGER_INTERVALS * interval_s
+                    if is_told or is_gone or now_s - complete_s > SETTLE_INTERVALS * interval_s:
+                        break
+            ingest.save()
+            on_progress(ingest.summary())
+            on_status(ingest.status(now_s))
+            return ingest.summary()
 
 
 class _Ingest:
-    def __init__(self, link: SerialLink, writer: SessionWriter, mission: Mission):
+    def __init__(
+        self, link: Link, writer: SessionWriter, mission: Mission, on_event: Callable[[dict[str, Any]], None]
+    ):
         self.frames_received = 0
-        self._link, self._writer = link, writer
-        self._stream = PacketStream(TELECOMMAND, APID_FILES, mission.link.max_packet_bytes)
-        self._receiver = Receiver(self._stream.max_data_bytes, timer_s(link.baud_rate), self._accept)
+        self.last_packet_s = float("-inf")
+        self.flight_outbox: int | None = None  # as housekeeping said after the last frame
+        self._link, self._writer, self._on_event = link, writer, on_event
+        self._stream = PacketStream(TELECOMMAND, mission.link.max_packet_bytes)
+        interval_s, max_pdu_bytes = timer_s(link.baud_rate), self._stream.max_data_bytes
+        self._receiver = Receiver(max_pdu_bytes, interval_s, self._accept)
+        self._uplinker = Uplinker(writer.folder, max_pdu_bytes, interval_s, self._note_end)
+        self._telemetry = TelemetryLog(
+            writer.folder,
+            on_event,
+            lambda report: self._uplinker.take_report(report, self.last_packet_s),
+        )
+        self._thumbnails = self._commands_ended = 0
         self._payload_bytes = self._rejected = self._duplicates = self._store_failures = 0
 
     @property
     def open_transfers(self) -> int:
         return self._receiver.open_transactions
 
-    def turn(self, now_s: float) -> bool:
-        """Take what came and send what is due; tell whether a good packet came."""
-        packets = self._stream.decode(self._link.exchange(WAIT_S))
-        for pdu in packets:
-            self._receiver.receive(pdu, now_s)
+    def turn(self, now_s: float) -> None:
+        """Take what came and send what is due: answers, then commands, then a piece of a file."""
+        wait_s = 0.0 if self._uplinker.is_sending_file and self._link.ready else WAIT_S
+        for apid, content in self._stream.decode(self._link.exchange(wait_s)):
+            self.last_packet_s = now_s
+            if apid == APID_FILES:
+                self._receiver.receive(content, now_s)
+            elif apid == APID_UPLINK_FILES:
+                self._uplinker.files.receive(content, now_s)
+            else:
+                self._telemetry.add(apid, content)
+                if apid == APID_HOUSEKEEPING:
+                    self.flight_outbox = self._telemetry.housekeeping.get("outbox_frames")
         while self._link.ready and (pdu := self._receiver.next_pdu(now_s)) is not None:
-            self._link.write(self._stream.encode(pdu))
-        return bool(packets)
+            self._link.write(self._stream.encode(APID_FILES, pdu))
+        if self._link.ready and (command := self._uplinker.next_command(now_s)) is not None:
+            self._link.write(self._stream.encode(APID_COMMANDS, command))
+        if self._link.ready and (pdu := self._uplinker.next_pdu(now_s)) is not None:
+            self._link.write(self._stream.encode(APID_UPLINK_FILES, pdu))
 
     def _accept(self, name: str, container: bytes) -> bool:
         """Store a file that came whole; False only when it is worth sending again.
@@ -129,10 +201,14 @@ class _Ingest:
         The flight side's store still has it.
         """
         try:
-            match = FRAME_NAME.fullmatch(name)
+            match = FILE_NAME.fullmatch(name)
             frame = decode_frame(container)
             if match is None or int(match[1]) != frame.frame_id:
                 raise PacketError(f"frame {frame.frame_id} came under the name {name[:40]!r}")
+            if match[2] == "obt":
+                self._keep_thumbnail(frame)
+                return True
+            self.flight_outbox = None
             is_new = self._writer.add(frame, container)
         except (PacketError, SessionError) as error:
             self._rejected += 1
@@ -151,6 +227,20 @@ class _Ingest:
             log.info("frame %d came again", frame.frame_id)
         return True
 
+    def _keep_thumbnail(self, frame: Frame) -> None:
+        """Write a thumbnail's picture: 16-bit linear like the frames, a few dozen pixels wide."""
+        folder = self._writer.folder / "thumbnails"
+        folder.mkdir(exist_ok=True)
+        write_whole(folder / f"{frame.frame_id:06d}.png", bytes(imagecodecs.png_encode(frame.dn, level=1)))
+        self._thumbnails += 1
+
+    def _note_end(self, counter: int, command: str, stage: str, text: str) -> None:
+        self._commands_ended += 1
+        severity = "info" if stage == "completed" else "warning"
+        line = {"event": "command", "severity": severity, "text": f"{command} {counter} {stage}: {text}"}
+        self._telemetry.events.append({"received_utc_ns": time.time_ns()} | line)
+        self._on_event(self._telemetry.events[-1])
+
     def save(self) -> None:
         summary = self.summary()
         try:
@@ -158,22 +248,44 @@ class _Ingest:
         except OSError as error:
             log.error("session.json cannot be written: %s", error)
 
+    def status(self, now_s: float) -> Status:
+        telemetry = self._telemetry
+        return Status(
+            now_s=now_s,
+            summary=self.summary(),
+            connected=self._link.connected,
+            quiet_s=now_s - self.last_packet_s,
+            incoming=self._receiver.incoming(),
+            housekeeping=telemetry.housekeeping,
+            housekeeping_age_s=(time.time_ns() - telemetry.housekeeping_utc_ns) / 1e9,
+            frame_header=telemetry.frame_header,
+            events=list(telemetry.events),
+            commands=[(job.counter, job.command, job.stage) for job in self._uplinker.jobs.values()],
+        )
+
     def summary(self) -> ListenSummary:
         deframer = self._stream.deframer
         return ListenSummary(
             frames_received=self.frames_received,
             frames_in_session=self._writer.frame_count,
+            thumbnails_received=self._thumbnails,
+            headers_received=self._telemetry.headers_received,
             bytes_received=self._link.bytes_read,
+            bytes_sent=self._link.bytes_written,
+            packets_received=self._stream.packets_received,
             payload_bytes=self._payload_bytes,
             open_transfers=self.open_transfers,
+            commands_ended=self._commands_ended,
             skipped_bytes=deframer.skipped_bytes,
             crc_errors=deframer.crc_errors,
             packets_missing=self._stream.packets_missing,
             packets_foreign=self._stream.packets_foreign,
+            telemetry_refused=self._telemetry.refused,
             segments_resent=self._receiver.segments_resent,
             pdus_refused=self._receiver.pdus_refused,
             frames_rejected=self._rejected,
             duplicates=self._duplicates,
-            store_failures=self._store_failures,
+            store_failures=self._store_failures + self._telemetry.write_failures,
             hang_ups=self._link.hang_ups,
+            link_losses=self._link.losses,
         )

@@ -6,6 +6,7 @@ Simulated time is in lock step: the request says when the shutter opens, and the
 
 import json
 import logging
+import os
 import socketserver
 import threading
 from pathlib import Path
@@ -19,28 +20,43 @@ from hil.blender import BlenderError, RenderFarm
 from hil.sensor import expose
 
 log = logging.getLogger(__name__)
+MAX_SOCKET_PATH_BYTES = 107  # sun_path of Linux
 
 
 class CameraServer:
-    """Serves the mission's camera on a Unix socket until closed; `url` is what `flightsw --camera` takes."""
+    """Serves the mission's camera until closed; `url` is what `flightsw --camera` takes.
 
-    def __init__(self, mission: Mission, farm: RenderFarm, socket_path: Path, seed: int = 0):
+    Args:
+        listen: path of a Unix socket, or hil:///path/to/socket, or hil://host:port (port 0 takes a free one).
+
+    Raises:
+        ValueError: `listen` is none of these, its path is too long or holds a file that is not a socket.
+        OSError: the address is taken or not this machine's.
+    """
+
+    def __init__(self, mission: Mission, farm: RenderFarm, listen: Path | str, seed: int = 0):
         self.mission, self.farm, self.seed = mission, farm, seed
         self.exposures = 0
-        self.url = f"hil://{socket_path.resolve()}"
-        socket_path.unlink(missing_ok=True)
         camera = self
 
         class Handler(socketserver.StreamRequestHandler):
             def handle(self) -> None:
-                for line in self.rfile:
-                    header, pixels = camera.answer(line)
-                    self.wfile.write(json.dumps(header).encode() + b"\n" + pixels)
+                try:
+                    for line in self.rfile:
+                        header, pixels = camera.answer(line)
+                        self.wfile.write(json.dumps(header).encode() + b"\n" + pixels)
+                except ConnectionError as error:
+                    log.warning("a client left in the middle: %s", error)
 
-        class Server(socketserver.ThreadingUnixStreamServer):
-            daemon_threads = True
-
-        self._server = Server(str(socket_path), Handler)
+        address = _address(listen)
+        if isinstance(address, str):
+            self._server = _UnixServer(address, Handler)
+            self.url = f"hil://{address}"
+        else:
+            self._server = _TcpServer(address, Handler)
+            host, port = self._server.server_address[:2]
+            self.url = f"hil://{host}:{port}"
+        self._socket_file = address if isinstance(address, str) else None
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
 
@@ -51,6 +67,8 @@ class CameraServer:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+        if self._socket_file:
+            Path(self._socket_file).unlink(missing_ok=True)
 
     def answer(self, line: bytes) -> tuple[dict, bytes]:
         """Return the reply to one request line: header and pixel bytes. A bad request gets ok=False, never a crash."""
@@ -69,6 +87,7 @@ class CameraServer:
     def _info(self) -> dict:
         camera = self.mission.camera
         return {
+            "start_utc_ns": self.mission.orbit.start_utc_ns,
             "width": camera.width,
             "height": camera.height,
             "channels": camera.channels,
@@ -91,3 +110,38 @@ class CameraServer:
             "mid_exposure_utc_ns": mid_ns,
         }
         return {**header, "nbytes": len(pixels)}, pixels
+
+
+class _UnixServer(socketserver.ThreadingUnixStreamServer):
+    daemon_threads = True
+
+
+class _TcpServer(socketserver.ThreadingTCPServer):
+    daemon_threads = True
+    allow_reuse_address = True
+
+
+def _address(listen: Path | str) -> str | tuple[str, int]:
+    """Return a Unix socket's absolute path, free of an earlier server's socket, or (host, port)."""
+    place = str(listen)
+    if isinstance(listen, str):
+        if not listen.startswith("hil://"):
+            raise ValueError(
+                f"expected hil:///path/to/socket or hil://host:port to listen on, got {listen!r}"
+            )
+        place = listen.removeprefix("hil://")
+        host, _, port = place.rpartition(":")
+        if not place.startswith("/"):
+            if not (host and port.isdecimal() and int(port) < 1 << 16):
+                raise ValueError(f"expected hil://host:port with a port below 65536, got {listen!r}")
+            return host, int(port)
+    path = Path(place).resolve()
+    if len(os.fsencode(path)) > MAX_SOCKET_PATH_BYTES:
+        raise ValueError(
+            f"{path}: a Unix socket's path has at most {MAX_SOCKET_PATH_BYTES} bytes; take a shorter one "
+            "or hil://127.0.0.1:0"
+        )
+    if path.exists() and not path.is_socket():
+        raise ValueError(f"{path}: is a file, not a socket; it would be overwritten")
+    path.unlink(missing_ok=True)
+    return str(path)

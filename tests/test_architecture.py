@@ -61,4 +61,4 @@ from flightsw.cli import main
 main()
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert len(json.loads(done.stdout)) == 40
+    assert len(json.loads(done.stdout)["brackets"]) == 40

@@ -5,6 +5,8 @@ from typing import Protocol
 
 import numpy as np
 
+from flightsw.icd.mission import CameraSection
+
 
 @dataclass(frozen=True)
 class Exposure:
@@ -16,6 +18,16 @@ class Exposure:
 
 
 class Camera(Protocol):
+    @property
+    def waits(self) -> bool:
+        """Whether exposures must be asked for when their time has come, as of a camera in our own time."""
+        ...
+
+    @property
+    def packets_lost(self) -> int:
+        """Packets of pictures that never came over the camera's own link."""
+        ...
+
     def expose(self, exposure_time_s: float, start_utc_ns: int) -> Exposure:
         """Open the shutter at a UTC time and return the exposure; CaptureError when the camera fails."""
         ...
@@ -23,15 +35,21 @@ class Camera(Protocol):
     def close(self) -> None: ...
 
 
-def open_camera(url: str) -> Camera:
-    """Return the camera that a URL names.
+def open_camera(url: str, section: CameraSection) -> Camera:
+    """Return the camera that a URL names; `section` is what the mission expects of it.
 
     Raises:
-        CaptureError: the camera does not answer.
+        CaptureError: the camera does not answer, or cannot be what the mission expects.
         ValueError: no driver for this URL.
     """
     if url.startswith("hil://"):
         from flightsw.cameras.hil import HilCamera
 
         return HilCamera(url)
-    raise ValueError(f"no camera driver for {url!r}; expected hil:///path/to/socket or hil://host:port")
+    if url.startswith("gige://"):
+        from flightsw.cameras.gige import GigeCamera
+
+        return GigeCamera(url, section)
+    raise ValueError(
+        f"no camera driver for {url!r}; expected hil:///path/to/socket, hil://host:port or gige://<device id or IP>"
+    )

@@ -13,7 +13,10 @@ MAX_BYTES = 8192 * 8192 * 3 * 2
 
 
 class HilCamera:
-    """Client of the simulator's camera server."""
+    """Client of the simulator's camera server; its time is the simulator's, which waits for us."""
+
+    waits = False
+    packets_lost = 0  # the socket loses none
 
     def __init__(self, url: str):
         address = url.removeprefix("hil://")

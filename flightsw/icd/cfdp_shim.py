@@ -279,6 +279,10 @@ class MendedSource(SourceHandler):
             timeout_s = self._params.remote_cfg.positive_ack_timer_interval_seconds
             self._params.positive_ack_params.ack_timer = ClockCountdown(self.clock, timeout_s)
 
+    def limit_segments(self, segment_bytes: int) -> None:
+        """Send what is still to be sent, and what is asked for again, in segments of at most this many bytes."""
+        self._params.fp.segment_len = min(self._params.fp.segment_len, segment_bytes)
+
     def _check_inserted_packet(self, packet: Any) -> None:
         if isinstance(packet, FinishedPdu) and self.states.step == SourceStep.WAITING_FOR_EOF_ACK:
             # Finished says more than the EOF's acknowledgement, which is lost; the original drops it

@@ -2,7 +2,8 @@
 
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import imagecodecs
 import numpy as np
@@ -21,6 +22,8 @@ FLAG_ECLIPSE, FLAG_POSE_VALID, FLAG_MASKED = 1, 2, 4
 CODEC_JPEG_LS = 1
 END_OF_IMAGE = b"\xff\xd9"
 MAX_PIXELS = 8192 * 8192
+THUMBNAIL_PX = 64  # longest side of a thumbnail
+THUMBNAIL_NEAR = 2  # DN
 TRIANGLE = np.tril_indices(6)
 
 
@@ -182,6 +185,47 @@ def decode_frame(data: bytes) -> Frame:
     if CRC.unpack_from(data, len(data) - CRC.size)[0] != zlib.crc32(data[: -CRC.size]):
         raise CrcMismatch("the container's CRC-32 does not fit its bytes")
     return _frame_from(fields, data[HEADER.size : -CRC.size], pixel_crc)
+
+
+def read_header(data: bytes) -> dict[str, Any]:
+    """Return the values in a container's header alone, by their names in README.md; what a frame is before it is here.
+
+    Raises:
+        PacketError: not one whole header of this version, or a value that is not finite.
+    """
+    if len(data) != HEADER.size or data[:4] != MAGIC:
+        raise PacketError(f"expected a header of {HEADER.size} bytes starting with {MAGIC!r}")
+    fields = HEADER.unpack(data)
+    if fields[1:3] != (VERSION, HEADER.size) or fields[16] >= len(SOURCES):
+        raise PacketError(f"frame version {fields[1]}; this software reads {VERSION}")
+    numbers = (fields[8], fields[17], *fields[19:50])
+    if not np.isfinite(numbers).all():
+        raise PacketError("a frame header with values that are not finite")
+    names = "frame_id bracket_id bracket_index bracket_count flags exposure_time_s mid_exposure_utc_ns height width"
+    values = dict(zip(names.split(), fields[3:12], strict=True))
+    return values | {
+        "near": fields[15],
+        "pose_source": SOURCES[fields[16]],
+        "saturated_count": fields[18],
+        "quat_body_to_camera": list(fields[19:23]),
+        "position_body_m": list(fields[23:26]),
+        "sun_dir_body": list(fields[26:29]),
+        "codestream_bytes": fields[50],
+    }
+
+
+def encode_thumbnail(frame: Frame) -> bytes | None:
+    """Return a container of the frame averaged over squares to at most 64 px a side; None if it is hardly larger."""
+    size_px = -(-max(frame.dn.shape[:2]) // THUMBNAIL_PX)
+    if size_px < 3:
+        return None
+    rows, columns = (side // size_px for side in frame.dn.shape[:2])
+    if rows == 0 or columns == 0:
+        return None
+    squares = frame.dn[: rows * size_px, : columns * size_px]
+    squares = squares.reshape(rows, size_px, columns, size_px, *frame.dn.shape[2:])
+    dn = squares.mean(axis=(1, 3)).round().astype(np.uint16)
+    return encode_frame(replace(frame, dn=dn), near=THUMBNAIL_NEAR)
 
 
 def _frame_from(fields: tuple, codestream: bytes, pixel_crc: int) -> Frame:

@@ -8,7 +8,7 @@ too, and COBS makes such a zero of a delimiter with its lowest bit flipped.
 from cobs import cobs
 from fastcrc import crc16
 
-from flightsw.icd.packet import HEADER, PacketError, pack_packet, unpack_packet
+from flightsw.icd.packet import APIDS, HEADER, PacketError, pack_packet, unpack_packet
 
 DELIMITER = b"\0"
 CRC_BYTES = 2
@@ -94,30 +94,34 @@ def _packet_in(frame: bytes) -> bytes | None:
 
 
 class PacketStream:
-    """Both directions of one application's packets on a wire, with gaps in the other side's count noticed."""
+    """Both directions of our packets on a wire, with gaps in the other side's counts noticed.
 
-    def __init__(self, packet_type: int, apid: int, max_packet_bytes: int):
+    Args:
+        packet_type: of the packets that this side sends.
+    """
+
+    def __init__(self, packet_type: int, max_packet_bytes: int):
         self.deframer = Deframer(max_packet_bytes)
         self.max_data_bytes = max_packet_bytes - HEADER.size
         self.packets_sent = 0
         self.bytes_sent = 0
         self.packets_received = 0
-        self.packets_missing = 0  # by gaps in the sequence count
-        self.packets_foreign = 0  # whole, but no packet of the other side's application
-        self._packet_type, self._apid = packet_type, apid
-        self._expected_count: int | None = None
+        self.packets_missing = 0  # by gaps in the sequence count of each APID
+        self.packets_foreign = 0  # whole, but no packet of the other side's
+        self._packet_type = packet_type
+        self._next_count = dict.fromkeys(APIDS, 0)
+        self._expected_count: dict[int, int] = {}
 
-    def encode(self, data: bytes) -> bytes:
-        """Return `data` as the next packet, framed for the wire."""
-        framed = frame_packet(
-            pack_packet(self._packet_type, self._apid, self.packets_sent % SEQ_COUNTS, data)
-        )
+    def encode(self, apid: int, data: bytes) -> bytes:
+        """Return `data` as the APID's next packet, framed for the wire."""
+        framed = frame_packet(pack_packet(self._packet_type, apid, self._next_count[apid], data))
+        self._next_count[apid] = (self._next_count[apid] + 1) % SEQ_COUNTS
         self.packets_sent += 1
         self.bytes_sent += len(framed)
         return framed
 
-    def decode(self, wire_bytes: bytes) -> list[bytes]:
-        """Return the data of the packets that `wire_bytes` completes."""
+    def decode(self, wire_bytes: bytes) -> list[tuple[int, bytes]]:
+        """Return APID and data of the packets that `wire_bytes` completes."""
         data = []
         for packet in self.deframer.feed(wire_bytes):
             try:
@@ -125,19 +129,20 @@ class PacketStream:
             except PacketError:
                 self.packets_foreign += 1
                 continue
-            if header.apid != self._apid or header.packet_type == self._packet_type:
+            if header.apid not in APIDS or header.packet_type == self._packet_type:
                 self.packets_foreign += 1
                 continue
-            self._count(header.seq_count)
-            data.append(content)
+            self._count(header.apid, header.seq_count)
+            data.append((header.apid, content))
         return data
 
-    def _count(self, seq_count: int) -> None:
+    def _count(self, apid: int, seq_count: int) -> None:
         self.packets_received += 1
-        if self._expected_count is not None:
-            gap = (seq_count - self._expected_count) % SEQ_COUNTS
+        expected_count = self._expected_count.get(apid)
+        if expected_count is not None:
+            gap = (seq_count - expected_count) % SEQ_COUNTS
             if gap >= SEQ_COUNTS // 2:  # an older packet: late or sent twice, not missing any more
                 self.packets_missing = max(0, self.packets_missing - 1)
                 return
             self.packets_missing += gap
-        self._expected_count = (seq_count + 1) % SEQ_COUNTS
+        self._expected_count[apid] = (seq_count + 1) % SEQ_COUNTS

@@ -185,6 +185,10 @@ class CameraSection:
 @dataclass(frozen=True)
 class BracketSection:
     exposure_times_ms: tuple[float, ...] = (0.05, 0.1, 0.2)
+    auto: bool = False  # choose as many times as there are above, by the target's brightness
+    exposure_min_ms: float = 0.01  # limits of the automatic choice
+    exposure_max_ms: float = 20.0
+    target_extent_m: float = 6.0  # largest dimension of the target, as far as known; for planning only
     frame_spacing_s: float = 0.5
     interval_s: float = 27.0
     count: int = 40
@@ -207,6 +211,22 @@ class BracketSection:
                 f"{path}.frame_spacing_s",
                 f"{self.frame_spacing_s} s is shorter than an exposure of {time_ms} ms",
             )
+        _require(
+            1e-3 <= self.exposure_min_ms < self.exposure_max_ms <= 60_000,
+            f"{path}.exposure_max_ms",
+            "expected 0.001 <= exposure_min_ms < exposure_max_ms <= 60000, got "
+            f"{self.exposure_min_ms} and {self.exposure_max_ms} ms",
+        )
+        _require(
+            not self.auto or self.exposure_max_ms / 1e3 <= self.frame_spacing_s,
+            f"{path}.exposure_max_ms",
+            f"{self.exposure_max_ms} ms is longer than frame_spacing_s, {self.frame_spacing_s} s",
+        )
+        _require(
+            self.target_extent_m > 0,
+            f"{path}.target_extent_m",
+            f"must be positive, got {self.target_extent_m}",
+        )
         shortest_s = self.frame_spacing_s * len(self.exposure_times_ms)
         _require(
             self.interval_s >= shortest_s,
@@ -223,10 +243,24 @@ class BracketSection:
 
 @dataclass(frozen=True)
 class PoseSection:
+    """Uncertainty of the tags, and how the camera is mounted on the chaser."""
+
     sigma_position_m: float = 0.02
     sigma_attitude_deg: float = 0.01
+    quat_chaser_to_camera: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)  # w, x, y, z
+    camera_position_m: tuple[float, ...] = (0.0, 0.0, 0.0)  # in the chaser's frame, from its centre of mass
 
     def __post_init__(self):
+        path = "mission.pose"
+        for name, count in (("quat_chaser_to_camera", 4), ("camera_position_m", 3)):
+            got = len(getattr(self, name))
+            _require(got == count, f"{path}.{name}", f"expected {count} numbers, got {got}")
+        length = math.hypot(*self.quat_chaser_to_camera)
+        _require(
+            abs(length - 1) < 1e-6,
+            f"{path}.quat_chaser_to_camera",
+            f"expected a unit quaternion, got length {length:.6f}",
+        )
         for name in ("sigma_position_m", "sigma_attitude_deg"):
             _require(
                 getattr(self, name) >= 0,
@@ -236,23 +270,73 @@ class PoseSection:
 
 
 @dataclass(frozen=True)
+class NavigationSection:
+    """Where the pose comes from: the two-line elements, or states as JSON lines (flightsw/navigation.py)."""
+
+    source: str = "sgp4"  # or file:///path, tcp://host:port
+    max_gap_s: float = 2.0  # no pose is interpolated between states further apart
+    wait_s: float = 2.0  # for a state that has not arrived yet
+
+    def __post_init__(self):
+        path = "mission.navigation"
+        _require(
+            self.source == "sgp4"
+            or re.fullmatch(r"file:///.+|tcp://[^:/]+:\d{1,5}", self.source) is not None,
+            f"{path}.source",
+            f"expected sgp4, file:///path or tcp://host:port, got {self.source!r}",
+        )
+        _require(
+            0 < self.max_gap_s <= 3600, f"{path}.max_gap_s", f"expected 0 to 3600 s, got {self.max_gap_s}"
+        )
+        _require(0 <= self.wait_s <= 60, f"{path}.wait_s", f"expected 0 to 60 s, got {self.wait_s}")
+
+
+@dataclass(frozen=True)
+class StoreSection:
+    """How much the frame store may take, and what happens when it is full.
+
+    Frames that the ground has confirmed are always deleted first, oldest first. When that is not enough, `refuse` keeps
+    what is waiting and refuses new frames; `drop-oldest` deletes the oldest waiting frame for the new one.
+    """
+
+    quota_mb: float = 0.0  # of frame containers, 10^6 bytes; 0: as much as the disk holds
+    when_full: Literal["refuse", "drop-oldest"] = "refuse"
+
+    def __post_init__(self):
+        _require(self.quota_mb >= 0, "mission.store.quota_mb", f"must not be negative, got {self.quota_mb}")
+
+    @property
+    def quota_bytes(self) -> int | None:
+        return round(self.quota_mb * 1e6) or None
+
+
+@dataclass(frozen=True)
 class LinkSection:
     baud_rate: int = 921_600
     max_packet_bytes: int = 1100
     roi_sigma: float = 4.0
     roi_margin_px: int = 9
+    priority: Literal["oldest", "triage", "thumbnail-first"] = (
+        "thumbnail-first"  # of the outbox, until commanded
+    )
+    housekeeping_s: float = 1.0  # from one housekeeping packet to the next
 
     def __post_init__(self):
         path = "mission.link"
+        _require(
+            0.1 <= self.housekeeping_s <= 3600,
+            f"{path}.housekeeping_s",
+            f"expected 0.1 to 3600 s, got {self.housekeeping_s}",
+        )
         _require(
             1200 <= self.baud_rate <= 12_000_000,
             f"{path}.baud_rate",
             f"expected 1200 to 12000000, got {self.baud_rate}",
         )
         _require(
-            128 <= self.max_packet_bytes <= 4096,
+            512 <= self.max_packet_bytes <= 4096,  # the longest telemetry packets have some 400 bytes
             f"{path}.max_packet_bytes",
-            f"expected 128 to 4096, got {self.max_packet_bytes}",
+            f"expected 512 to 4096, got {self.max_packet_bytes}",
         )
         _require(self.roi_sigma > 0, f"{path}.roi_sigma", f"must be positive, got {self.roi_sigma}")
         _require(
@@ -282,6 +366,8 @@ class Mission:
     target_attitude: TargetAttitudeSection = field(default_factory=TargetAttitudeSection)
     bracket: BracketSection = field(default_factory=BracketSection)
     pose: PoseSection = field(default_factory=PoseSection)
+    navigation: NavigationSection = field(default_factory=NavigationSection)
+    store: StoreSection = field(default_factory=StoreSection)
     link: LinkSection = field(default_factory=LinkSection)
     reconstruct: ReconstructSection = field(default_factory=ReconstructSection)
     sha256: str = ""  # of the file's bytes, so a result can be traced to its mission
@@ -309,11 +395,20 @@ def load_mission(path: str | Path) -> Mission:
         content = Path(path).read_bytes()
     except OSError as error:
         raise ConfigError(str(path), f"cannot read the mission file: {error.strerror}") from error
-    try:
-        tree = yaml.load(content, _StrictLoader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # 2026-13-01 is a ValueError of PyYAML's
-        raise ConfigError(str(path), f"is not valid YAML: {' '.join(str(error).split())}") from error
+    tree = parse_yaml(content, str(path))
     return build(Mission, tree, "mission", sha256=hashlib.sha256(content).hexdigest())
+
+
+def parse_yaml(content: bytes, path: str) -> Any:
+    """Return what a YAML text holds; a key written twice is an error.
+
+    Raises:
+        ConfigError: not YAML; `path` names it.
+    """
+    try:
+        return yaml.load(content, _StrictLoader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # 2026-13-01 is a ValueError of PyYAML's
+        raise ConfigError(path, f"is not valid YAML: {' '.join(str(error).split())}") from error
 
 
 def build(section: type, tree: Any, path: str, **given: Any) -> Any:
@@ -363,6 +458,9 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         _require(number and abs(value) < 1e300, path, f"expected a number, got {_describe(value)}")
         return float(value)
+    if hint is bool:
+        _require(isinstance(value, bool), path, f"expected true or false, got {_describe(value)}")
+        return value
     if hint is int:
         _require(
             isinstance(value, int) and not isinstance(value, bool),

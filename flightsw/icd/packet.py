@@ -7,7 +7,14 @@ from typing import Self
 HEADER = struct.Struct(">HHH")
 TELEMETRY, TELECOMMAND = 0, 1
 UNSEGMENTED = 3
-APID_FILES = 0x0C0  # CFDP PDUs, both directions
+APID_FILES = 0x0C0  # CFDP PDUs of files to the ground, both directions
+APID_HOUSEKEEPING = 0x0C1  # to the ground
+APID_EVENTS = 0x0C2  # to the ground
+APID_REPORTS = 0x0C3  # what became of commands, to the ground
+APID_FRAME_HEADERS = 0x0C4  # a frame's header as soon as it is stored, to the ground
+APID_COMMANDS = 0x0C5  # sealed commands, to the spacecraft
+APID_UPLINK_FILES = 0x0C6  # CFDP PDUs of files to the spacecraft, both directions
+APIDS = range(APID_FILES, APID_UPLINK_FILES + 1)
 
 
 class PacketError(ValueError):

@@ -1,6 +1,6 @@
 """Files over packets: CFDP class 2 (CCSDS 727.0-B). Bytes in, bytes out, time passed in.
 
-The flight side owns a Sender, the ground a Receiver. Both take PDUs with `receive` and give PDUs with
+The side that has a file owns a Sender, the other a Receiver. Both take PDUs with `receive` and give PDUs with
 `next_pdu`; they keep no thread, no clock, no port and no disk.
 """
 
@@ -35,11 +35,17 @@ from flightsw.icd.cfdp_shim import (
 from flightsw.icd.packet import PacketError
 
 FLIGHT, GROUND = ByteFieldU8(1), ByteFieldU8(2)  # entity IDs
+Route = tuple[ByteFieldU8, ByteFieldU8]  # the entities that send and receive a file
+DOWNLINK: Route = (FLIGHT, GROUND)
+UPLINK: Route = (GROUND, FLIGHT)
 TIMER_LIMIT = 8  # expirations in a row before a transaction ends; below 6 a lossy link ends good ones
 SILENCE_INTERVALS = 4  # a living receiver that owes us an answer sends something every interval
 BUFFER_BYTES = 20_480  # what a pseudo-terminal or driver holds before it makes the writer wait
 REMEMBERED = 4096  # closed transactions whose late PDUs are still answered
 POLL_S = 0.02  # between looks at the receiving side's timers
+MAX_NAK_BYTES = 128  # of a PDU: a short one gets through where a CAN bus loses most long messages
+FIT_SEGMENTS = 8  # how many must have been sent before their loss says anything
+MIN_SEGMENT_BYTES = 32  # a packet needs 27 bytes more
 
 UNPARSABLE = (
     ValueError,
@@ -70,11 +76,11 @@ def timer_s(baud_rate: int) -> float:
     return 2 * round_trip_s
 
 
-def parse_pdu(data: bytes) -> Any:
+def parse_pdu(data: bytes, route: Route = DOWNLINK) -> Any:
     """Return the PDU in `data`.
 
     Raises:
-        PacketError: no PDU, not of class 2, or with bytes left over.
+        PacketError: no PDU, not of class 2, of another route, or with bytes left over.
     """
     try:
         pdu = PduFactory.from_raw(data)
@@ -89,18 +95,24 @@ def parse_pdu(data: bytes) -> Any:
         raise PacketError(f"not one whole CFDP PDU without CRC in {len(data)} bytes")
     if pdu.transmission_mode != TransmissionMode.ACKNOWLEDGED:
         raise PacketError("a CFDP PDU of class 1, this link uses class 2")
-    if (pdu.source_entity_id.value, pdu.dest_entity_id.value) != (FLIGHT.value, GROUND.value):
+    if (pdu.source_entity_id.value, pdu.dest_entity_id.value) != (route[0].value, route[1].value):
         raise PacketError(
             f"CFDP entities {pdu.source_entity_id.value} to {pdu.dest_entity_id.value}, not ours"
         )
     return pdu
 
 
-def _configuration(local: ByteFieldU8, remote: ByteFieldU8, max_pdu_bytes: int, interval_s: float):
+def _configuration(
+    local: ByteFieldU8,
+    remote: ByteFieldU8,
+    max_pdu_bytes: int,
+    interval_s: float,
+    max_segment_bytes: int | None = None,
+):
     local_config = LocalEntityConfig(local, IndicationConfig(), Faults())
     remote_config = RemoteEntityConfig(
         entity_id=remote,
-        max_file_segment_len=None,
+        max_file_segment_len=max_segment_bytes,
         max_packet_len=max_pdu_bytes,
         closure_requested=True,
         crc_on_transmission=False,
@@ -156,19 +168,29 @@ class _Sending:
     user: Indications
     faults: Faults
     last_sign_s: float  # last PDU sent or received
+    round_bytes: int  # sent in this round: at first the whole file, then what was asked for again
     queue: deque[bytes] = field(default_factory=deque)
     sent_up_to: int = 0
+    asked_bytes: int = 0  # for the next round
+    asked_up_to: int = 0  # end of the last NAK's scope, 0 before the first
+    urgent: bool = False
 
 
 class Sender:
-    """The sending entity: several files in flight, the oldest first on the wire."""
+    """The sending entity: several files in flight, the first put first on the wire."""
 
-    def __init__(self, max_pdu_bytes: int, interval_s: float, max_in_flight: int = 8):
+    def __init__(
+        self, max_pdu_bytes: int, interval_s: float, max_in_flight: int = 8, route: Route = DOWNLINK
+    ):
         self.segments_sent = 0
         self.segments_resent = 0
         self.pdus_received = 0
         self.pdus_refused = 0
         self._max_pdu_bytes, self._interval_s, self._max_in_flight = max_pdu_bytes, interval_s, max_in_flight
+        self._route = route
+        self._segment_bytes = max_pdu_bytes
+        self._fit_sent_bytes = self._fit_lost_bytes = 0  # since the segments were last looked at
+        self._next_fit_s = float("-inf")
         self._clock = Clock()
         self._sending: OrderedDict[int, _Sending] = OrderedDict()
         self._closed: OrderedDict[int, str] = OrderedDict()  # transaction to name
@@ -183,25 +205,40 @@ class Sender:
     def has_room(self) -> bool:
         return len(self._sending) < self._max_in_flight
 
-    def put(self, name: str, content: bytes, transaction: int, now_s: float) -> None:
-        """Start to send a file. A transaction number must never be used twice, not even after a restart."""
+    @property
+    def unsent(self) -> int:
+        """How many files in flight have data that has not been sent once."""
+        return sum(sending.sent_up_to < sending.size_bytes for sending in self._sending.values())
+
+    def put(self, name: str, content: bytes, transaction: int, now_s: float, urgent: bool = False) -> None:
+        """Start to send a file, before all others that are not `urgent`.
+
+        A transaction number must never be used twice, not even after a restart.
+        """
         self._clock.now_s = now_s
-        config, remotes = _configuration(FLIGHT, GROUND, self._max_pdu_bytes, self._interval_s)
+        source, destination = self._route
+        config, remotes = _configuration(
+            source, destination, self._max_pdu_bytes, self._interval_s, self._segment_bytes
+        )
         user = Indications(OneFile(content, len(content)))
         handler = MendedSource(config, user, remotes, NoCheckTimer(), _OneNumber(transaction))
         handler.clock = self._clock
         path = Path(name)
-        handler.put_request(PutRequest(GROUND, path, path, TransmissionMode.ACKNOWLEDGED, True))
+        handler.put_request(PutRequest(destination, path, path, TransmissionMode.ACKNOWLEDGED, True))
         faults = config.default_fault_handlers
         assert isinstance(faults, Faults)
-        self._sending[transaction] = _Sending(name, len(content), handler, user, faults, now_s)
+        self._sending[transaction] = _Sending(name, len(content), handler, user, faults, now_s, len(content))
+        if urgent:
+            self._sending[transaction].urgent = True
+            for number in [n for n, sending in self._sending.items() if not sending.urgent]:
+                self._sending.move_to_end(number)
 
     def receive(self, data: bytes, now_s: float) -> None:
-        """Take a PDU from the ground; what is not valid is counted and dropped."""
+        """Take a PDU from the other side; what is not valid is counted and dropped."""
         self._clock.now_s = now_s
         self.pdus_received += 1
         try:
-            pdu = parse_pdu(data)
+            pdu = parse_pdu(data, self._route)
             if pdu.direction != Direction.TOWARDS_SENDER:
                 raise PacketError("a CFDP PDU for the receiver came to the sender")
             if not isinstance(pdu, NakPdu | FinishedPdu) and not _acknowledges(pdu, DirectiveType.EOF_PDU):
@@ -216,9 +253,17 @@ class Sender:
             return
         sending.last_sign_s = now_s
         if isinstance(pdu, NakPdu):
-            if sending.queue:  # what it asks for is on its way
+            if sending.queue and pdu.start_of_scope < sending.asked_up_to:  # what it asks for is on its way
                 return
             pdu.segment_requests = _merged(pdu.segment_requests, sending.size_bytes)
+            if pdu.start_of_scope < sending.asked_up_to:  # asked anew
+                sending.asked_bytes = 0
+            sending.asked_up_to = pdu.end_of_scope
+            sending.asked_bytes += sum(end - start for start, end in pdu.segment_requests)
+            if pdu.end_of_scope >= sending.size_bytes:
+                self._fit_segments(sending.round_bytes, sending.asked_bytes)
+                sending.round_bytes, sending.asked_bytes = sending.asked_bytes, 0
+            sending.handler.limit_segments(self._segment_bytes)
         self._step(transaction, sending, pdu)
 
     def next_pdu(self, now_s: float) -> bytes | None:
@@ -246,6 +291,24 @@ class Sender:
         ended, self._outcomes = self._outcomes, []
         return ended
 
+    def _fit_segments(self, sent_bytes: int, lost_bytes: int) -> None:
+        """Halve the segments while most are lost, double them while few are.
+
+        What loses CAN frames loses most long messages and few short ones. On a serial line the length does not
+        matter, and the longest wins.
+        """
+        self._fit_sent_bytes += sent_bytes
+        self._fit_lost_bytes += lost_bytes
+        if self._fit_sent_bytes < FIT_SEGMENTS * self._segment_bytes:
+            return
+        now_s, share = self._clock.now_s, self._fit_lost_bytes / self._fit_sent_bytes
+        if share > 1 / 2 and now_s >= self._next_fit_s:
+            self._next_fit_s = now_s + self._interval_s  # once for all files that a cut has hit
+            self._segment_bytes = max(self._segment_bytes // 2, MIN_SEGMENT_BYTES)
+        elif share < 1 / 4:
+            self._segment_bytes = min(2 * self._segment_bytes, self._max_pdu_bytes)
+        self._fit_sent_bytes = self._fit_lost_bytes = 0
+
     def _step(self, transaction: int, sending: _Sending, pdu: Any) -> None:
         try:
             sending.handler.state_machine(pdu)
@@ -261,6 +324,8 @@ class Sender:
                 sending.queue.append(bytes(outgoing.pack()))
         if sending.user.finished is not None:
             good = delivered(sending.user.finished)
+            if good:
+                self._fit_segments(sending.round_bytes, 0)
             self._close(transaction, sending, "" if good else sending.user.finished.condition_code.name, good)
         elif sending.faults.condition is not None:
             self._close(transaction, sending, sending.faults.condition.name)
@@ -274,12 +339,21 @@ class Sender:
         self._outcomes.append(Outcome(sending.name, good, reason))
 
     def _answer_late(self, pdu: Any, transaction: int) -> None:
-        """Acknowledge a Finished that comes again, or too late: else the ground keeps on sending it."""
+        """Acknowledge a Finished that comes again, or too late: else the receiver keeps on sending it."""
         if not isinstance(pdu, FinishedPdu):
             return
         if transaction in self._closed and delivered(pdu.finished_params):
             self._outcomes.append(Outcome(self._closed[transaction], True, "told late"))
         self._last_words.append(_acknowledgement(pdu, Direction.TOWARDS_RECEIVER))
+
+
+@dataclass(frozen=True)
+class Incoming:
+    """A file under way."""
+
+    name: str  # the sender's, anything; empty until known
+    received_bytes: int  # up to the last byte that came
+    size_bytes: int | None  # None until known
 
 
 @dataclass
@@ -306,13 +380,14 @@ class Receiver:
         accept: Callable[[str, bytes], bool],
         max_file_bytes: int = 64 << 20,
         max_open: int = 32,
+        route: Route = DOWNLINK,
     ):
         self.segments_received = 0
         self.segments_resent = 0  # came at or below what was there already: resent, late or twice
         self.pdus_received = 0
         self.pdus_refused = 0
         self._max_pdu_bytes, self._interval_s, self._accept = max_pdu_bytes, interval_s, accept
-        self._max_file_bytes, self._max_open = max_file_bytes, max_open
+        self._max_file_bytes, self._max_open, self._route = max_file_bytes, max_open, route
         self._clock = Clock()
         self._receiving: OrderedDict[int, _Receiving] = OrderedDict()
         self._closed: OrderedDict[int, bytes] = OrderedDict()  # transaction to its Finished PDU
@@ -323,12 +398,20 @@ class Receiver:
     def open_transactions(self) -> int:
         return len(self._receiving)
 
+    def incoming(self) -> list[Incoming]:
+        """Return the files that are not whole yet."""
+        return [
+            Incoming(receiving.user.dest_name or "", receiving.received_up_to, receiving.size_bytes)
+            for receiving in self._receiving.values()
+            if receiving.finished_pdu is None
+        ]
+
     def receive(self, data: bytes, now_s: float) -> None:
-        """Take a PDU from the flight side; what is not valid is counted and dropped."""
+        """Take a PDU from the sending side; what is not valid is counted and dropped."""
         self._clock.now_s = now_s
         self.pdus_received += 1
         try:
-            pdu = parse_pdu(data)
+            pdu = parse_pdu(data, self._route)
             transaction = pdu.transaction_seq_num.value
             self._check(pdu, self._receiving.get(transaction))
         except PacketError:
@@ -396,7 +479,9 @@ class Receiver:
         if len(self._receiving) >= self._max_open:
             oldest = min(self._receiving, key=lambda number: self._receiving[number].last_sign_s)
             del self._receiving[oldest]
-        config, remotes = _configuration(GROUND, FLIGHT, self._max_pdu_bytes, self._interval_s)
+        source, destination = self._route
+        nak_bytes = min(self._max_pdu_bytes, MAX_NAK_BYTES)
+        config, remotes = _configuration(destination, source, nak_bytes, self._interval_s)
         user = Indications(OneFile(b"", self._max_file_bytes), self._accept)
         handler = MendedDest(config, user, remotes, NoCheckTimer())
         handler.clock = self._clock
@@ -444,4 +529,14 @@ def _remember(closed: OrderedDict, transaction: int, value: Any) -> None:
         closed.popitem(last=False)
 
 
-__all__ = ["ConditionCode", "Outcome", "Receiver", "Sender", "parse_pdu", "timer_s"]
+__all__ = [
+    "DOWNLINK",
+    "UPLINK",
+    "ConditionCode",
+    "Incoming",
+    "Outcome",
+    "Receiver",
+    "Sender",
+    "parse_pdu",
+    "timer_s",
+]

@@ -16,8 +16,8 @@ def run(*arguments: str, tool: str = "flightsw") -> subprocess.CompletedProcess:
 
 @pytest.mark.parametrize(
     ("tool", "command"),
-    [("flightsw", c) for c in ("capture", "serve", "downlink", "triage", "plan")]
-    + [("ground", c) for c in ("listen", "reconstruct", "evaluate", "report")]
+    [("flightsw", c) for c in ("capture", "serve", "downlink", "triage", "plan", "fsck")]
+    + [("ground", c) for c in ("listen", "key", "uplink", "reconstruct", "evaluate", "report")]
     + [("hil", c) for c in ("demo", "camera", "link", "target")],
 )
 def test_every_command_has_help_with_an_example(tool, command):

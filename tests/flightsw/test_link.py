@@ -1,15 +1,22 @@
-"""The serial port of either side: URLs, hang-up and return, back-pressure. Both ports do the same."""
+"""The ports of either side: URLs, hang-up and return, back-pressure, CAN. Both sides' do the same."""
 
+import contextlib
+import inspect
 import os
+import subprocess
 import time
 import tty
+from pathlib import Path
 
+import can
 import pytest
 
 import flightsw.link
 import ground.link
 from flightsw.errors import LinkError
-from flightsw.icd.link_url import parse_link_url
+from flightsw.icd.can import format_slcan
+from flightsw.icd.framing import frame_packet
+from flightsw.icd.link_url import LinkUrl, parse_link_url
 from flightsw.icd.mission import ConfigError
 
 BOTH_SIDES = pytest.mark.parametrize("side", [flightsw.link, ground.link])
@@ -38,21 +45,47 @@ def exchange_until(link, condition, timeout_s=5.0) -> bytes:
     return data
 
 
-def test_url_gives_device_and_baud_rate():
-    assert parse_link_url("serial:///dev/ttyUSB0?baud=115200") == ("/dev/ttyUSB0", 115_200)
-    assert parse_link_url("serial:///dev/pts/3") == ("/dev/pts/3", 921_600)
+def test_a_url_gives_the_device_and_its_rates():
+    assert parse_link_url("serial:///dev/ttyUSB0?baud=115200") == LinkUrl("serial", "/dev/ttyUSB0", 115_200)
+    assert parse_link_url("serial:///dev/pts/3") == LinkUrl("serial", "/dev/pts/3", 921_600)
+    assert parse_link_url("slcan:///dev/ttyACM0?bitrate=500000") == LinkUrl(
+        "slcan", "/dev/ttyACM0", 3_000_000, 500_000
+    )
+    assert parse_link_url("slcan:///dev/ttyACM0?fd=1&baud=115200") == LinkUrl(
+        "slcan", "/dev/ttyACM0", 115_200, 1_000_000, True
+    )
+    assert parse_link_url("can://can0") == LinkUrl("can", "can0", 3_000_000, 1_000_000)
+
+
+def test_timers_follow_the_rate_at_which_packets_pass():
+    rates = [
+        parse_link_url(url).payload_baud_rate
+        for url in (
+            "serial:///dev/x?baud=3000000",
+            "slcan:///dev/x",
+            "slcan:///dev/x?fd=1",
+            "can://can0?bitrate=125000",
+        )
+    ]
+    assert rates[0] == 3_000_000
+    assert 500_000 < rates[1] < 700_000  # 7 of 8 bytes in at least 111 bits
+    assert 4_000_000 < rates[2] < 5_000_000
+    assert rates[3] == rates[1] // 8
 
 
 @pytest.mark.parametrize(
     ("url", "problem"),
     [
-        ("slcan:///dev/ttyACM0?bitrate=1000000", "CAN links are not built yet"),
-        ("can://can0", "CAN links are not built yet"),
         ("/dev/ttyUSB0", "expected serial:///dev"),
         ("serial://ttyUSB0", "expected serial:///dev"),
+        ("slcan://ttyACM0", "slcan:///dev/"),
+        ("can:///can0", "can://can0"),
         ("serial:///dev/ttyUSB0?baud=fast", "got 'fast'"),
         ("serial:///dev/ttyUSB0?baud=50", "got '50'"),
         ("serial:///dev/ttyUSB0?parity=even", "unknown option parity"),
+        ("serial:///dev/ttyUSB0?fd=1", "unknown option fd"),
+        ("slcan:///dev/ttyACM0?bitrate=123456", "got '123456'"),
+        ("can://can0?fd=yes", "got 'yes'"),
         ("serial://[", "not a URL"),
     ],
 )
@@ -61,10 +94,22 @@ def test_an_unusable_url_says_what_is_wrong(url, problem):
         parse_link_url(url)
 
 
+def test_both_sides_have_the_same_ports():
+    """Neither side may import the other: the two files differ in their head alone."""
+    flight, own = (inspect.getsource(side) for side in (flightsw.link, ground.link))
+    start = "\nREOPEN_S"
+    assert flight[flight.index(start) :] == own[own.index(start) :]
+    assert flightsw.link.OWN_IDS == ground.link.OTHER_IDS and flightsw.link.OTHER_IDS == ground.link.OWN_IDS
+
+
 @BOTH_SIDES
 def test_a_port_that_is_not_there_is_a_link_error(side, tmp_path):
     with pytest.raises(side.LinkError, match=f"cannot open {tmp_path}/none"):
-        side.SerialLink(f"serial://{tmp_path}/none")
+        side.open_link(f"serial://{tmp_path}/none")
+    with pytest.raises(side.LinkError, match=f"cannot open {tmp_path}/none"):
+        side.open_link(f"slcan://{tmp_path}/none")
+    with pytest.raises(side.LinkError, match="cannot open nocan0"):
+        side.open_link("can://nocan0")
     assert flightsw.link.LinkError is LinkError
 
 
@@ -72,7 +117,7 @@ def test_a_port_that_is_not_there_is_a_link_error(side, tmp_path):
 def test_bytes_pass_unchanged_both_ways(side, terminal):
     master, _, name = terminal
     every_byte = bytes(range(256))
-    with side.SerialLink(f"serial://{name}") as link:
+    with side.open_link(f"serial://{name}") as link:
         os.write(master, every_byte)
         assert exchange_until(link, lambda data: len(data) >= 256) == every_byte
         link.write(every_byte)
@@ -84,7 +129,7 @@ def test_bytes_pass_unchanged_both_ways(side, terminal):
 @BOTH_SIDES
 def test_the_port_makes_the_writer_wait_and_nothing_is_lost(side, terminal):
     master, _, name = terminal
-    with side.SerialLink(f"serial://{name}") as link:
+    with side.open_link(f"serial://{name}") as link:
         block, written = b"x" * 1000, 0
         while link.ready and written < 1_000_000:
             link.write(block)
@@ -106,7 +151,7 @@ def test_the_port_makes_the_writer_wait_and_nothing_is_lost(side, terminal):
 @BOTH_SIDES
 def test_a_port_that_hung_up_is_opened_again_under_the_same_name(side, terminal):
     master, slave, name = terminal
-    with side.SerialLink(f"serial://{name}") as link:
+    with side.open_link(f"serial://{name}") as link:
         link.exchange(0.01)
         os.close(slave)
         os.close(master)
@@ -122,3 +167,179 @@ def test_a_port_that_hung_up_is_opened_again_under_the_same_name(side, terminal)
         assert exchange_until(link, lambda data: data) == b"back"
     os.close(new_master)
     os.close(new_slave)
+
+
+# ---- CAN ----
+
+
+def read_all(descriptor: int) -> bytes:
+    with contextlib.suppress(BlockingIOError):
+        return os.read(descriptor, 65_536)
+    return b""
+
+
+@BOTH_SIDES
+def test_an_slcan_adapter_is_set_up_at_opening_and_closed_at_the_end(side, terminal):
+    master, _, name = terminal
+    with side.open_link(f"slcan://{name}?bitrate=500000") as link:
+        link.exchange(0.02)
+        assert read_all(master) == b"\r\rC\rS6\rO\r"
+    assert read_all(master) == b"\rC\r"
+
+
+@BOTH_SIDES
+def test_a_packet_is_one_iso_tp_message_in_frames_of_the_side_s_identifier(side, terminal):
+    master, _, name = terminal
+    first_frame, flow_control = b"100B", bytes([0x30, 0, 0])
+    with side.open_link(f"slcan://{name}") as link:
+        link.exchange(0.02)
+        read_all(master)
+        link.write(b"abcdefghijk\0")
+        link.exchange(0.0)
+        assert (
+            read_all(master)
+            == f"t{side.OWN_IDS[0]:03X}8".encode() + first_frame + b"abcdef".hex().encode() + b"\r"
+        )
+        os.write(master, format_slcan(side.CanMessage(side.OTHER_IDS[0], 3, flow_control)))
+        exchange_until(link, lambda data: link.bytes_read)
+        link.exchange(0.0)
+        assert (
+            read_all(master)
+            == f"t{side.OWN_IDS[0]:03X}6".encode() + b"21" + b"ghijk".hex().upper().encode() + b"\r"
+        )
+        os.write(master, format_slcan(side.CanMessage(side.OTHER_IDS[1], 4, b"\x03xyz")))
+        assert exchange_until(link, lambda data: data) == b"xyz\0"
+
+
+@BOTH_SIDES
+def test_what_an_slcan_adapter_garbles_is_counted(side, terminal):
+    master, _, name = terminal
+    with side.open_link(f"slcan://{name}") as link:
+        os.write(
+            master, b"t0C83x\r\xff\xfe\r\a" + format_slcan(side.CanMessage(side.OTHER_IDS[0], 2, b"\x22x"))
+        )
+        exchange_until(link, lambda data: link.losses["can_frames_discarded"])
+        assert link.losses == {
+            "adapter_lines_skipped": 2,
+            "adapter_errors": 1,
+            "can_frames_discarded": 1,
+            "can_frames_repeated": 0,
+            "messages_failed": 0,
+        }
+
+
+@BOTH_SIDES
+def test_a_message_without_an_answer_is_given_up_and_counted(side, terminal):
+    _, _, name = terminal
+    with side.open_link(f"slcan://{name}") as link:
+        link.write(frame_packet(bytes(range(100))))
+        exchange_until(link, lambda data: link.losses["messages_failed"])
+        assert link.losses["messages_failed"] == 1
+        assert link.ready
+
+
+@BOTH_SIDES
+def test_an_adapter_that_came_back_or_fell_silent_is_set_up_again(side, terminal):
+    master, slave, name = terminal
+    now_s = [0.0]
+    with side.SlcanLink(f"slcan://{name}", lambda: now_s[0]) as link:
+        link.exchange(0.02)
+        read_all(master)
+        now_s[0] += side.SILENT_S + 1
+        link.exchange(0.0)
+        link.exchange(0.02)
+        assert b"O\r" in read_all(master)
+        os.close(slave)
+        os.close(master)
+        exchange_until(link, lambda data: not link.connected)
+        assert link.hang_ups == 1
+        new_master, new_slave = os.openpty()
+        tty.setraw(new_slave)
+        name.unlink()
+        name.symlink_to(os.ttyname(new_slave))
+        now_s[0] += 1
+        exchange_until(link, lambda data: link.connected)
+        link.exchange(0.02)
+        assert os.read(new_master, 100).endswith(b"O\r")
+    os.close(new_master)
+    os.close(new_slave)
+
+
+def pass_packets(near, far, packets: list[bytes]) -> bytes:
+    """Write packets into one link as it takes them; return what the other one received."""
+    waiting, received, end_s = list(packets), b"", time.monotonic() + 20
+    while received.count(b"\0") < len(packets) and time.monotonic() < end_s:
+        if waiting and near.ready:
+            near.write(waiting.pop(0))
+        near.exchange(0.0)
+        received += far.exchange(0.0)
+    return received
+
+
+@pytest.mark.parametrize("fd", [False, True], ids=["classic", "fd"])
+def test_a_kernel_interface_carries_packets_both_ways(fd, monkeypatch):
+    """On python-can's virtual bus, which works where the kernel has no CAN."""
+    real_bus = can.Bus
+
+    def virtual_bus(channel, interface, fd):
+        assert interface == "socketcan"
+        return real_bus(channel, interface="virtual")
+
+    monkeypatch.setattr(can, "Bus", virtual_bus)
+    packets = [frame_packet(os.urandom(size)) for size in (1, 20, 62, 63, 1000, 4096, 30)]
+    with (
+        flightsw.link.open_link(f"can://test{fd}?fd={int(fd)}") as flight,
+        ground.link.open_link(f"can://test{fd}?fd={int(fd)}") as own,
+    ):
+        assert pass_packets(flight, own, packets) == b"".join(packets)
+        assert pass_packets(own, flight, packets) == b"".join(packets)
+        assert own.losses["can_frames_discarded"] == flight.losses["messages_failed"] == 0
+        assert own.bytes_read == flight.bytes_written > sum(map(len, packets))
+
+
+def test_a_kernel_interface_that_goes_away_is_opened_again_and_a_full_queue_only_waits(monkeypatch):
+    errors = [can.CanOperationError("Transmit buffer full"), can.CanOperationError("down", 100)]
+
+    class Bus:
+        """An interface that refuses once with each error."""
+
+        opened = 0
+        sent = 0
+
+        def __init__(self, *_, **__):
+            Bus.opened += 1
+
+        def recv(self, timeout):
+            return None
+
+        def send(self, message, timeout):
+            if errors:
+                raise errors.pop(0)
+            Bus.sent += 1
+
+        def shutdown(self):
+            pass
+
+    monkeypatch.setattr(can, "Bus", Bus)
+    with flightsw.link.open_link("can://can0") as link:
+        link.write(b"abc\0")
+        assert (link.connected, link.ready, link.hang_ups) == (True, False, 0)  # full: it waits
+        link.exchange(0.0)
+        assert (link.connected, link.hang_ups) == (False, 1)
+        exchange_until(link, lambda data: link.connected)
+        link.write(b"abc\0")
+        assert (Bus.opened, Bus.sent) == (2, 1)
+
+
+@pytest.mark.skipif(not Path("/proc/net/can").exists(), reason="the kernel has no CAN (modprobe can vcan)")
+def test_a_real_virtual_can_interface_carries_packets():
+    add = subprocess.run(["ip", "link", "add", "dev", "obbgs0", "type", "vcan"], capture_output=True)
+    if add.returncode:
+        pytest.skip(f"no virtual CAN interface: {add.stderr.decode().strip()}")
+    try:
+        subprocess.run(["ip", "link", "set", "obbgs0", "up"], check=True)
+        packets = [frame_packet(os.urandom(1000)) for _ in range(5)]
+        with flightsw.link.open_link("can://obbgs0") as flight, ground.link.open_link("can://obbgs0") as own:
+            assert pass_packets(flight, own, packets) == b"".join(packets)
+    finally:
+        subprocess.run(["ip", "link", "del", "obbgs0"], check=True)

@@ -1,15 +1,19 @@
 """The frame store: nothing half there, nothing numbered twice, whatever moment the power goes."""
 
+import contextlib
+import errno
 import hashlib
 import json
+import os
 import subprocess
 import sys
 
 import pytest
 
-from flightsw.errors import StoreError
+from flightsw.errors import StoreError, StoreFull
+from flightsw.fsck import fsck
 from flightsw.icd.frame import decode_frame, encode_frame
-from flightsw.store import FrameStore
+from flightsw.store import FrameStore, write_whole
 
 
 def fill(store: FrameStore, make_frame, count: int) -> None:
@@ -153,3 +157,111 @@ def test_a_kill_at_any_moment_loses_no_stored_frame(tmp_path, make_frame):
         )
         for frame in store.frames:
             assert decode_frame(store.read(frame.frame_id)).frame_id == frame.frame_id
+
+
+def container_bytes(make_frame) -> int:
+    return len(encode_frame(make_frame(0)))
+
+
+def test_a_full_quota_refuses_new_frames_and_keeps_what_waits(tmp_path, make_frame):
+    store = FrameStore(tmp_path, quota_bytes=round(2.5 * container_bytes(make_frame)))
+    fill(store, make_frame, 2)
+    for _ in range(2):
+        with pytest.raises(StoreFull, match="frame 2 refused: the quota"):
+            store.put(make_frame(2))
+    assert store.refused == 2 and store.outbox() == [0, 1]
+    store.mark_delivered(0)  # the ground has it: it makes room
+    store.put(make_frame(2))
+    assert [f.frame_id for f in store.frames] == [1, 2] == store.outbox()
+    assert store.used_bytes <= (store.quota_bytes or 0)
+    assert sorted(p.stem for p in (tmp_path / "frames").iterdir()) == ["00000001", "00000002"]
+
+
+def test_drop_oldest_keeps_the_newest_and_counts_what_it_lost(tmp_path, make_frame, caplog):
+    store = FrameStore(tmp_path, round(2.5 * container_bytes(make_frame)), "drop-oldest")
+    fill(store, make_frame, 6)
+    assert store.outbox() == [4, 5] and store.dropped_undelivered == 4
+    assert "frame 0 deleted undelivered for frame 2" in caplog.text
+    again = FrameStore(tmp_path, store.quota_bytes, "drop-oldest")
+    assert (again.dropped_undelivered, again.next_frame_id) == (4, 6)
+    assert again.holds(0, 0)  # what was deleted is not taken once more
+    with pytest.raises(StoreError, match=r"next free number is 6"):
+        again.put(make_frame(3))
+
+
+def test_delivered_frames_go_first_under_either_policy(tmp_path, make_frame):
+    store = FrameStore(tmp_path, round(3.5 * container_bytes(make_frame)), "drop-oldest")
+    fill(store, make_frame, 3)
+    store.mark_delivered(2)
+    store.put(make_frame(3))
+    assert store.outbox() == [0, 1, 3] and store.dropped_undelivered == 0
+
+
+def test_a_frame_larger_than_the_quota_is_refused_whatever_the_policy(tmp_path, make_frame):
+    store = FrameStore(tmp_path, 1000, "drop-oldest")
+    with pytest.raises(StoreFull, match="exceed the quota"):
+        store.put(make_frame(0))
+
+
+def test_a_deleted_frame_is_gone_for_every_process_and_its_number_is_not_used_again(tmp_path, make_frame):
+    capturing, sending = FrameStore(tmp_path), FrameStore(tmp_path)
+    fill(capturing, make_frame, 2)
+    assert sending.outbox() == [0, 1]
+    sending.drop(1)
+    assert sending.outbox() == [0] == capturing.outbox()
+    with pytest.raises(StoreError, match="there is no frame 1"):
+        capturing.drop(1)
+    capturing.put(make_frame(2))
+    assert FrameStore(tmp_path).next_frame_id == 3
+
+
+@pytest.mark.parametrize("policy", ["refuse", "drop-oldest"])
+def test_a_full_disk_is_met_by_the_policy_and_heals(tmp_path, make_frame, monkeypatch, policy):
+    """The disk is `free` bytes large; writing more is ENOSPC, deleting gives it back."""
+    store = FrameStore(tmp_path, when_full=policy)
+    size = container_bytes(make_frame)
+    free = round(2.2 * size)
+    real_write_whole = write_whole
+
+    def small_disk(path, content):
+        used = sum(p.stat().st_size for p in (tmp_path / "frames").iterdir())
+        if used + len(content) > free:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real_write_whole(path, content)
+
+    monkeypatch.setattr("flightsw.store.write_whole", small_disk)
+    fill(store, make_frame, 2)
+    if policy == "refuse":
+        with pytest.raises(StoreFull, match="No space left"):
+            store.put(make_frame(2))
+        assert store.outbox() == [0, 1]
+    else:
+        store.put(make_frame(2))
+        assert store.outbox() == [1, 2]
+    assert fsck(tmp_path, repair=False).problems == []
+    free = 10 * size
+    store.put(make_frame(store.next_frame_id))
+    assert FrameStore(tmp_path).outbox() == store.outbox()
+
+
+def test_a_disk_that_is_truly_full_is_met_and_a_transfer_number_can_still_be_had(tmp_path, make_frame):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", disk], check=False).returncode:
+        pytest.skip("no right to mount a tmpfs here")
+    try:
+        store = FrameStore(disk / "store")
+        stored = 0
+        with pytest.raises(StoreFull, match="No space left"):
+            for stored in range(200):  # noqa: B007 (the count is wanted afterwards)
+                store.put(make_frame(store.next_frame_id))
+        assert stored > 5 and len(store.frames) == stored
+        with open(disk / "foreign", "wb", buffering=0) as foreign, contextlib.suppress(OSError):
+            while True:
+                foreign.write(bytes(512))
+        assert store.next_transaction() == 1
+        store.mark_delivered(0)
+        store.put(make_frame(store.next_frame_id))
+        assert fsck(disk / "store").problems == []
+    finally:
+        subprocess.run(["umount", disk], check=True)

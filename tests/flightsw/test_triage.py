@@ -1,18 +1,34 @@
 """On-board triage on the golden session: what the model has not seen ranks first."""
 
+import hashlib
 import json
+import tempfile
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from flightsw.cli import app
 from flightsw.errors import TriageError
 from flightsw.icd.frame import Frame, PoseTag, encode_frame
 from flightsw.icd.mission import load_mission
-from flightsw.triage import TILE_COLUMNS, TILE_ROWS, Renderer, chi2_map, rank_frames, tile_means
+from flightsw.model_file import MAX_MODEL_BYTES, verified_model
+from flightsw.triage import (
+    TILE_COLUMNS,
+    TILE_ROWS,
+    ModelVerified,
+    Renderer,
+    TriageWorker,
+    chi2_map,
+    rank_frames,
+    tile_means,
+)
 from obbgs_core.export_onnx import export_onnx
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
@@ -96,23 +112,135 @@ def test_tile_means_cover_ragged_edges():
     )
 
 
-def test_hostile_models_are_refused(model, tmp_path):
-    junk = tmp_path / "junk.onnx"
-    junk.write_bytes(b"\x08\x07junk")
-    with pytest.raises(TriageError, match="onnxruntime"):
-        Renderer(junk)
+def damaged(model: Path, change) -> Path:
+    """Return a copy of the model, changed."""
+    proto = onnx.load(model)
+    change(proto)
+    path = model.with_name("damaged.onnx")
+    onnx.save(proto, path)
+    return path
+
+
+def runtime_operator(proto):
+    proto.graph.node[0].op_type, proto.graph.node[0].domain = "FusedMatMul", "com.microsoft"
+
+
+def hidden_in_a_subgraph(proto):
+    inner = onnx.helper.make_graph(
+        [onnx.helper.make_node("FusedMatMul", ["a", "b"], ["c"], domain="com.microsoft")], "g", [], []
+    )
+    proto.graph.node[0].attribute.append(onnx.helper.make_attribute("body_of_evil", inner))
+
+
+def data_elsewhere(proto):
+    tensor = proto.graph.initializer[0]
+    tensor.ClearField("raw_data")
+    tensor.data_location = onnx.TensorProto.EXTERNAL
+    entry = tensor.external_data.add()
+    entry.key, entry.value = "location", "/etc/passwd"
+
+
+def no_metadata(proto):
+    del proto.metadata_props[:]
+
+
+def impossible_sensor(proto):
+    next(p for p in proto.metadata_props if p.key == "white_dn").value = "nan"
+
+
+def other_operator(proto):
+    proto.graph.node[0].op_type = "Evil"
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (runtime_operator, "not standard ONNX: b'com.microsoft'"),
+        (hidden_in_a_subgraph, "not standard ONNX: b'com.microsoft'"),
+        (data_elsewhere, "keeps tensors outside the file"),
+        (no_metadata, "metadata"),
+        (impossible_sensor, "no sensor"),
+        (other_operator, "onnxruntime"),
+    ],
+)
+def test_hostile_models_are_refused(model, change, problem):
+    with pytest.raises(TriageError, match=problem):
+        Renderer(damaged(model, change))
+
+
+@pytest.mark.parametrize("content", [b"", b"\x08\x07junk", b"\xff" * 50, b"\x3a\xff\xff\xff\xff\x0f"])
+def test_what_is_no_model_is_refused(tmp_path, content):
+    (tmp_path / "junk.onnx").write_bytes(content)
+    with pytest.raises(TriageError):
+        Renderer(tmp_path / "junk.onnx")
     with pytest.raises(TriageError, match="No such file"):
         Renderer(tmp_path / "nowhere.onnx")
-    other = onnx.load(model)
-    other.graph.node[0].op_type, other.graph.node[0].domain = "Evil", "evil.domain"
-    onnx.save(other, junk)
-    with pytest.raises(TriageError, match="onnxruntime"):
-        Renderer(junk)
-    bare = onnx.load(model)
-    del bare.metadata_props[:]
-    onnx.save(bare, junk)
-    with pytest.raises(TriageError, match="metadata"):
-        Renderer(junk)
+
+
+def test_a_model_that_is_too_large_is_not_even_read(tmp_path):
+    with open(tmp_path / "large.onnx", "wb") as file:
+        file.truncate(MAX_MODEL_BYTES + 1)
+    with pytest.raises(TriageError, match=f"the limit is {MAX_MODEL_BYTES}"):
+        verified_model(tmp_path / "large.onnx")
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_are_looked_through_or_refused(content):
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(content)
+        file.flush()
+        try:
+            assert verified_model(Path(file.name)) == content
+        except TriageError as error:
+            assert file.name in str(error)
+
+
+def test_frames_in_eclipse_or_without_a_pose_come_last_whatever_their_residual(model, tmp_path):
+    renderer = Renderer(model)
+    for frame_id, changes in enumerate(({"in_eclipse": True}, {"valid": False}, {})):
+        frame = frame_of(renderer, frame_id, 0.0 if frame_id == 2 else 200.0, seed=frame_id)
+        frame = replace(frame, pose=replace(frame.pose, **changes))
+        (tmp_path / f"{frame_id:08d}.obf").write_bytes(encode_frame(frame))
+    ranked, _ = rank_frames(model, tmp_path, K)
+    assert [r.frame_id for r in ranked if r.comparable] == [2] == [ranked[0].frame_id]
+    assert {r.frame_id for r in ranked[1:]} == {0, 1}
+
+
+def results(worker: TriageWorker, count: int) -> list:
+    done, end_s = [], time.monotonic() + 30
+    while len(done) < count and time.monotonic() < end_s:
+        done += worker.results()
+        time.sleep(0.01)
+    return done
+
+
+def test_the_worker_verifies_then_ranks_and_keeps_the_good_model_when_a_bad_one_comes(model, tmp_path):
+    for frame_id, patch_dn in enumerate((0.0, 100.0)):
+        frame = frame_of(Renderer(model), frame_id, patch_dn, seed=frame_id)
+        (tmp_path / f"{frame_id:08d}.obf").write_bytes(encode_frame(frame))
+    expected, _ = rank_frames(model, tmp_path, K)
+    frames = sorted(tmp_path.glob("*.obf"))
+    worker = TriageWorker(K, CAMERA.width, CAMERA.height)
+    worker.rank(frames[0])  # without a model
+    worker.verify(model)
+    worker.verify(damaged(model, no_metadata))
+    worker.rank(frames[0])
+    worker.rank(frames[1])
+    worker.rank(tmp_path / "00000009.obf")  # gone
+    unranked, good, bad, *ranked, gone = results(worker, 6)
+    worker.stop()
+    assert unranked == (frames[0], None) and gone[1] is None
+    assert good == ModelVerified(model, hashlib.sha256(model.read_bytes()).digest(), None)
+    assert bad.problem and "metadata" in bad.problem
+    assert {score for _, score in ranked} == set(expected)
+
+
+def test_a_model_for_another_camera_is_refused(model):
+    worker = TriageWorker(K, CAMERA.width + 1, CAMERA.height)
+    worker.verify(model)
+    (verified,) = results(worker, 1)
+    worker.stop()
+    assert f"renders {CAMERA.width}x{CAMERA.height}, the camera has" in verified.problem
 
 
 def test_a_folder_without_frames_and_frames_of_another_size_are_named(model, tmp_path):

@@ -18,6 +18,8 @@ from flightsw.icd.frame import (
     PoseTag,
     decode_frame,
     encode_frame,
+    encode_thumbnail,
+    read_header,
 )
 
 finite = st.floats(-1e6, 1e6)
@@ -172,3 +174,62 @@ def test_each_refusal_says_what_is_wrong(make_frame):
 def test_a_frame_cannot_hold_values_that_the_container_cannot(make_frame, wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         dataclasses.replace(make_frame(1), **wrong)
+
+
+def test_a_header_alone_says_what_the_frame_is(make_frame):
+    frame = make_frame(7)
+    values = read_header(encode_frame(frame, near=2)[: HEADER.size])
+    for name in (
+        "frame_id",
+        "bracket_id",
+        "bracket_index",
+        "exposure_time_s",
+        "mid_exposure_utc_ns",
+        "saturated_count",
+    ):
+        assert values[name] == getattr(frame, name)
+    assert (values["height"], values["width"], values["near"], values["pose_source"]) == (48, 48, 2, "sgp4")
+    for name in ("quat_body_to_camera", "position_body_m", "sun_dir_body"):
+        np.testing.assert_array_equal(values[name], getattr(frame.pose, name))
+
+
+@given(st.binary(max_size=HEADER.size + 4), st.integers(0, HEADER.size - 1))
+@settings(deadline=None)
+def test_any_bytes_are_a_header_or_a_packet_error(data, at):
+    for candidate in (data, b"OBGF" + data, (data + bytes(HEADER.size))[: HEADER.size]):
+        try:
+            values = read_header(candidate)
+        except PacketError:
+            continue
+        assert np.isfinite(values["exposure_time_s"])
+
+
+@own_fixture
+@given(data=st.data())
+def test_a_damaged_header_is_read_or_refused_never_a_crash(make_frame, data):
+    header = bytearray(encode_frame(make_frame(1))[: HEADER.size])
+    bit = data.draw(st.integers(0, 8 * len(header) - 1))
+    header[bit // 8] ^= 1 << bit % 8
+    try:
+        assert set(read_header(bytes(header))) >= {"frame_id", "position_body_m"}
+    except PacketError:
+        assert bit < 64 or bit // 8 in (20, 21, 44, 46, 47) or bit // 8 >= 54
+
+
+@pytest.mark.parametrize(("size_px", "channels"), [(200, 1), (331, 3)])
+def test_a_thumbnail_is_the_frame_averaged_over_squares(make_frame, size_px, channels):
+    frame = make_frame(3, size_px=size_px, channels=channels)
+    container = encode_thumbnail(frame)
+    assert container is not None
+    thumbnail = decode_frame(container)
+    square = -(-size_px // 64)
+    side = size_px // square
+    assert thumbnail.dn.shape[:2] == (side, side) and side <= 64
+    expected = frame.dn[:square, square : 2 * square].astype(float).mean(axis=(0, 1))
+    near_and_rounding_dn = 2.5
+    np.testing.assert_allclose(thumbnail.dn[0, 1], expected, atol=near_and_rounding_dn)
+    assert_equal(dataclasses.replace(thumbnail, dn=frame.dn), frame)
+
+
+def test_a_small_frame_has_no_thumbnail(make_frame):
+    assert encode_thumbnail(make_frame(3)) is None

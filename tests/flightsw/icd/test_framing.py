@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flightsw.icd.framing import CRC_BYTES, Deframer, PacketStream, frame_packet, max_frame_bytes
-from flightsw.icd.packet import APID_FILES, TELECOMMAND, TELEMETRY
+from flightsw.icd.packet import APID_EVENTS, APID_FILES, APIDS, TELECOMMAND, TELEMETRY, pack_packet
 
 MAX_PACKET_BYTES = 300
 packets = st.lists(st.binary(min_size=1, max_size=MAX_PACKET_BYTES), max_size=8)
@@ -79,26 +79,28 @@ def test_crc_is_that_of_the_catalogue():
 
 
 def test_gaps_in_the_count_are_noticed_and_late_packets_taken_back():
-    flight = PacketStream(TELEMETRY, APID_FILES, MAX_PACKET_BYTES)
-    ground = PacketStream(TELECOMMAND, APID_FILES, MAX_PACKET_BYTES)
-    wire = [flight.encode(bytes([number])) for number in range(6)]
+    flight = PacketStream(TELEMETRY, MAX_PACKET_BYTES)
+    ground = PacketStream(TELECOMMAND, MAX_PACKET_BYTES)
+    wire = [flight.encode(APID_FILES, bytes([number])) for number in range(6)]
     for number in (0, 1, 4, 3):  # 2 is lost, 3 comes late
-        assert ground.decode(wire[number]) == [bytes([number])]
+        assert ground.decode(wire[number]) == [(APID_FILES, bytes([number]))]
+        assert ground.decode(flight.encode(APID_EVENTS, b"counted on its own"))
     assert ground.packets_missing == 1
-    assert ground.packets_received == 4
+    assert ground.packets_received == 8
 
 
 def test_packets_of_another_application_or_our_own_echo_are_not_for_us():
-    flight = PacketStream(TELEMETRY, APID_FILES, MAX_PACKET_BYTES)
-    other = PacketStream(TELECOMMAND, APID_FILES + 1, MAX_PACKET_BYTES)
-    assert flight.decode(flight.encode(b"echo") + other.encode(b"other") + frame_packet(b"short")) == []
+    flight = PacketStream(TELEMETRY, MAX_PACKET_BYTES)
+    foreign = frame_packet(pack_packet(TELECOMMAND, APIDS.stop, 0, b"other"))
+    echo = flight.encode(APID_FILES, b"echo")
+    assert flight.decode(echo + foreign + frame_packet(b"short")) == []
     assert flight.packets_foreign == 3
 
 
 def test_the_sequence_count_wraps_without_a_gap():
-    flight = PacketStream(TELEMETRY, APID_FILES, MAX_PACKET_BYTES)
-    ground = PacketStream(TELECOMMAND, APID_FILES, MAX_PACKET_BYTES)
-    flight.packets_sent = (1 << 14) - 2
-    for number in range(4):
-        assert ground.decode(flight.encode(bytes([number]))) == [bytes([number])]
-    assert ground.packets_missing == 0
+    flight = PacketStream(TELEMETRY, MAX_PACKET_BYTES)
+    ground = PacketStream(TELECOMMAND, MAX_PACKET_BYTES)
+    for _ in range((1 << 14) + 2):
+        (_, data), *more = ground.decode(flight.encode(APID_FILES, b"next"))
+        assert data == b"next" and not more
+    assert (ground.packets_missing, ground.packets_received) == (0, (1 << 14) + 2)

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import flightsw.icd
+from flightsw.icd import packet
+from flightsw.icd.auth import SECURITY_HEADER, TAG_BYTES, Key, seal
 from flightsw.icd.frame import CODEC_JPEG_LS, CRC, HEADER, SOURCES, encode_frame
-from flightsw.icd.packet import APID_FILES, PacketHeader
+from flightsw.icd.packet import PacketHeader
 
 README = (Path(flightsw.icd.__path__[0]) / "README.md").read_text()
 
@@ -81,5 +83,22 @@ def test_packet_table_is_what_the_header_packs(field):
     assert int.from_bytes(full.pack(), "big") == ((1 << bits) - 1) << (48 - bit - bits)
 
 
-def test_packet_table_names_the_application():
-    assert f"0x{APID_FILES:03X} " in next(value for _, _, name, value in table("bit") if name == "apid")
+def test_stream_table_has_every_application_of_the_code():
+    rows = [stream.split(" ") for stream, _, _ in table("stream")]
+    assert {f"APID_{name}": int(number, 16) for number, name in rows} == {
+        name: value for name, value in vars(packet).items() if name.startswith("APID_")
+    }
+
+
+def test_security_table_is_what_seal_writes():
+    sealed = seal(Key(513, bytes(32)), 7, b"ping")
+    rows = {name: (place, kind) for place, kind, name, _ in table("place")}
+    assert rows.pop("tag") == (f"end - {TAG_BYTES}", f"{TAG_BYTES}s")
+    assert rows.pop("command")[0] == str(SECURITY_HEADER.size)
+    values = {"spi": (513,), "iv_zeros": (), "counter": (7,)}
+    position = 0
+    for name, (place, kind) in rows.items():
+        assert int(place) == position
+        assert struct.unpack_from(">" + kind, sealed, position) == values.pop(name)
+        position += struct.calcsize(">" + kind)
+    assert not values and len(sealed) == position + len(b"ping") + TAG_BYTES

@@ -161,6 +161,42 @@ def test_the_oldest_file_goes_first():
     assert order == sorted(order)
 
 
+def test_segments_shrink_while_long_packets_are_lost_and_grow_again_afterwards():
+    """As on a CAN bus that loses frames: a packet in many frames hardly ever arrives."""
+    wire = Wire(lose_down=lambda pdu, number: isinstance(pdu, FileDataPdu) and len(pdu.file_data) > 60)
+    wire.sender.put("a", content(1500), 1, 0.0)
+    wire.run(10.0)
+    assert wire.stored["a"] == content(1500) and wire.failed == []
+    assert all(len(pdu.file_data) <= 60 for pdu in wire.sent_down[-20:] if isinstance(pdu, FileDataPdu))
+    wire._lose_down = NEVER
+    for number in range(2, 6):
+        wire.sender.put(str(number), content(1500), number, wire.now_s)
+        wire.run(wire.now_s + 1.0)
+    assert max(len(pdu.file_data) for pdu in wire.sent_down[-8:] if isinstance(pdu, FileDataPdu)) > 150
+
+
+def test_a_cut_that_hits_all_files_halves_the_segments_once():
+    wire = Wire(lose_down=lambda pdu, number: isinstance(pdu, FileDataPdu) and number < 50)
+    for number in range(4):
+        wire.sender.put(str(number), content(1500), number + 1, 0.0)
+    wire.run(5.0)
+    assert wire.delivered == {"0", "1", "2", "3"}
+    sizes = {len(pdu.file_data) for pdu in wire.sent_down if isinstance(pdu, FileDataPdu)}
+    assert {186, 100} <= sizes <= {186, 100, 1500 % 186, 186 - 100}  # whole, halved, what is left over
+
+
+def test_many_gaps_are_asked_for_in_several_short_packets_and_all_sent_in_one_round():
+    wire = Wire(lose_down=lambda pdu, number: number % 3 == 0 and number < 100)
+    wire.receiver = Receiver(1000, INTERVAL_S, wire.store)
+    wire.sender.put("a", content(15_000), 1, 0.0)
+    wire.run(5.0)
+    naks = [pdu for pdu in wire.sent_up if isinstance(pdu, NakPdu)]
+    assert wire.stored["a"] == content(15_000)
+    assert len(naks) > 2 and all(pdu.packet_len <= transfer.MAX_NAK_BYTES for pdu in naks)
+    assert naks[0].start_of_scope == 0 and naks[-1].end_of_scope == 15_000
+    assert wire.sender.segments_resent == sum(len(pdu.segment_requests) for pdu in naks)
+
+
 def test_the_sender_is_told_only_after_the_file_is_stored_and_not_when_it_cannot_be():
     wire = Wire()
     wire.receiver._accept = lambda name, data: False  # a full disk
@@ -419,3 +455,60 @@ def test_a_restarted_sender_with_a_new_number_does_not_mix_files():
     wire.sender.put("new", content(1500, 2), 8, wire.now_s)
     wire.run(3.0)
     assert wire.stored == {"new": content(1500, 2)}
+
+
+def run_both_ways(sender: Sender, receiver: Receiver, until_s: float) -> list[Any]:
+    """Return the outcomes of a lossless wire in simulated time."""
+    outcomes, now_s = [], 0.0
+    while now_s < until_s:
+        down, up = sender.next_pdu(now_s), receiver.next_pdu(now_s)
+        now_s += STEP_S
+        if down is not None:
+            receiver.receive(down, now_s)
+        if up is not None:
+            sender.receive(up, now_s)
+        outcomes += sender.outcomes()
+    return outcomes
+
+
+def test_files_go_up_as_they_go_down_and_the_two_routes_do_not_mix():
+    stored: dict[str, bytes] = {}
+
+    def store(name: str, content: bytes) -> bool:
+        stored[name] = content
+        return True
+
+    up = Sender(MAX_PDU_BYTES, INTERVAL_S, route=transfer.UPLINK)
+    up.put("model-1", b"weights" * 100, 1, 0.0)
+    outcomes = run_both_ways(up, Receiver(MAX_PDU_BYTES, INTERVAL_S, store, route=transfer.UPLINK), 3.0)
+    assert [(o.name, o.delivered) for o in outcomes] == [("model-1", True)]
+    assert stored == {"model-1": b"weights" * 100}
+    up.put("model-2", b"weights", 2, 3.0)
+    down_only = Receiver(MAX_PDU_BYTES, INTERVAL_S, store)
+    pdu = up.next_pdu(3.0)
+    assert pdu is not None
+    down_only.receive(pdu, 3.0)
+    assert (down_only.pdus_refused, down_only.open_transactions) == (1, 0)
+
+
+def test_an_urgent_file_overtakes_those_under_way_and_progress_is_told():
+    stored: list[str] = []
+
+    def store(name: str, content: bytes) -> bool:
+        stored.append(name)
+        return True
+
+    sender, receiver = Sender(MAX_PDU_BYTES, INTERVAL_S), Receiver(MAX_PDU_BYTES, INTERVAL_S, store)
+    sender.put("slow", bytes(5000), 1, 0.0)
+    for _ in range(10):
+        pdu = sender.next_pdu(0.0)
+        assert pdu is not None
+        receiver.receive(pdu, 0.0)
+    (incoming,) = receiver.incoming()
+    assert (incoming.name, incoming.size_bytes) == ("slow", 5000) and 0 < incoming.received_bytes < 5000
+    assert sender.unsent == 1
+    sender.put("first", bytes(500), 2, 0.0, urgent=True)
+    sender.put("second", bytes(500), 3, 0.0, urgent=True)
+    run_both_ways(sender, receiver, 3.0)
+    assert stored == ["first", "second", "slow"]
+    assert receiver.incoming() == [] and sender.unsent == 0

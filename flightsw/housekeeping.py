@@ -1,0 +1,83 @@
+"""What the flight software says of itself: housekeeping values of the process and the disk, and events."""
+
+import logging
+import os
+import shutil
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from flightsw.icd.telemetry import DICTIONARY
+
+MAX_EVENTS = 200  # waiting to be sent; the oldest are lost, and counted in the next one
+
+
+class EventLog(logging.Handler):
+    """Events to be sent. As a logging handler it makes an event of every warning and error of the flight software.
+
+    Any thread may write, one takes them out.
+    """
+
+    def __init__(self, utc_ns: Callable[[], int] = time.time_ns):
+        super().__init__(logging.WARNING)
+        self._utc_ns = utc_ns
+        self._packets: deque[bytes] = deque()
+        self._lost = 0
+        self._guard = threading.Lock()
+
+    def add(self, name: str, **values: Any) -> None:
+        """Queue an event of the dictionary."""
+        packet = DICTIONARY.events[name].pack(utc_ns=self._utc_ns(), **values)
+        with self._guard:
+            if len(self._packets) >= MAX_EVENTS:
+                self._packets.popleft()
+                self._lost += 1
+            self._packets.append(packet)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.add("error" if record.levelno >= logging.ERROR else "warning", problem=record.getMessage())
+
+    def take(self) -> bytes | None:
+        """Return the next event's packet data, None when there is none."""
+        with self._guard:
+            if not self._packets:
+                return None
+            lost, self._lost = self._lost, 0
+            packet = self._packets.popleft()
+        if lost:
+            self.add("warning", problem=f"{lost} events were lost: more than {MAX_EVENTS} waited")
+        return packet
+
+
+class ProcessMeter:
+    """The load of this process."""
+
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic):
+        self._clock_s = clock_s
+        self.started_s = clock_s()
+        self._then = (self.started_s, time.process_time())
+
+    def values(self) -> dict[str, Any]:
+        """Return uptime, processor time since the last call, and memory, by their names in the dictionary."""
+        now = (self._clock_s(), time.process_time())
+        elapsed_s = max(now[0] - self._then[0], 1e-9)
+        cpu_percent = 100 * (now[1] - self._then[1]) / elapsed_s
+        self._then = now
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return {
+            "uptime_s": int(now[0] - self.started_s),
+            "cpu_percent": cpu_percent,
+            "rss_bytes": pages * os.sysconf("SC_PAGE_SIZE"),
+        }
+
+
+def disk_values(folder: Path, store_bytes: int) -> dict[str, int]:
+    """Return the disk's values by their names in the dictionary."""
+    try:
+        free_bytes = shutil.disk_usage(folder).free
+    except OSError:
+        free_bytes = 0
+    return {"store_bytes": store_bytes, "disk_free_bytes": free_bytes}

@@ -1,0 +1,307 @@
+"""The navigation filter's states as JSON lines, from a file or a TCP port, interpolated to the middle of an exposure.
+
+A line holds the states of both satellites, or the camera's pose relative to the target (SI units, quaternions w, x, y,
+z; a step of more than `max_gap_s` is a gap):
+
+    {"utc_ns": 1784631150000000000,
+     "target": {"position_m": [3, GCRS], "velocity_m_s": [3], "quat_gcrs_to_body": [4, optional]},
+     "chaser": {"position_m": [3], "velocity_m_s": [3], "quat_gcrs_to_chaser": [4, optional]},
+     "covariance": [[6x6, optional: position (m) and velocity (m/s) of the chaser relative to the target, GCRS]]}
+
+    {"utc_ns": 1784631150000000000, "quat_body_to_camera": [4], "position_body_m": [3, camera centre],
+     "covariance": [[6x6: position (m, body), rotation vector (rad, camera)]]}
+
+Without attitudes, the target turns as the mission says and the chaser points its camera at the target.
+"""
+
+import collections
+import json
+import os
+import select
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flightsw.errors import NavigationError
+from flightsw.icd.frame import matrix_to_quat, quat_to_matrix
+from flightsw.icd.mission import NavigationSection
+
+MAX_LINE_BYTES = 16_384
+MAX_STATES = 4096  # kept behind the newest one
+POLL_S = 0.01
+NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class SatelliteStates:
+    """Both satellites in GCRS at one time."""
+
+    utc_ns: int
+    target_position_m: np.ndarray  # [3]
+    target_velocity_m_s: np.ndarray  # [3]
+    chaser_position_m: np.ndarray  # [3]
+    chaser_velocity_m_s: np.ndarray  # [3]
+    quat_gcrs_to_body: np.ndarray | None  # [4]
+    quat_gcrs_to_chaser: np.ndarray | None  # [4]
+    covariance: np.ndarray | None  # [6, 6] chaser minus target: position m, velocity m/s
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """The camera in the target's body frame at one time."""
+
+    utc_ns: int
+    quat_body_to_camera: np.ndarray  # [4]
+    position_body_m: np.ndarray  # [3]
+    covariance: np.ndarray  # [6, 6] position m (body), rotation vector rad (camera)
+
+
+NavigationState = SatelliteStates | RelativePose
+
+
+def parse_state(line: bytes) -> NavigationState:
+    """Return the state in one JSON line.
+
+    Raises:
+        NavigationError: it is not JSON, a value is missing, of the wrong shape or not finite, a quaternion is not unit,
+            a covariance is not symmetric and positive semi-definite.
+    """
+    try:
+        entry = json.loads(line)
+        utc_ns = entry["utc_ns"]
+        if not isinstance(utc_ns, int) or isinstance(utc_ns, bool) or not 0 <= utc_ns < 1 << 63:
+            raise ValueError(f"utc_ns must be whole nanoseconds, got {utc_ns!r}")
+        if "quat_body_to_camera" in entry:
+            return RelativePose(
+                utc_ns,
+                _quaternion(entry["quat_body_to_camera"]),
+                _vector(entry["position_body_m"], 3),
+                _covariance(entry["covariance"]),
+            )
+        target, chaser = entry["target"], entry["chaser"]
+        return SatelliteStates(
+            utc_ns,
+            _vector(target["position_m"], 3),
+            _vector(target["velocity_m_s"], 3),
+            _vector(chaser["position_m"], 3),
+            _vector(chaser["velocity_m_s"], 3),
+            _quaternion(target["quat_gcrs_to_body"]) if "quat_gcrs_to_body" in target else None,
+            _quaternion(chaser["quat_gcrs_to_chaser"]) if "quat_gcrs_to_chaser" in chaser else None,
+            _covariance(entry["covariance"]) if "covariance" in entry else None,
+        )
+    except KeyError as error:
+        raise NavigationError(f"a navigation state without {error}") from error
+    except (ValueError, TypeError, RecursionError, OverflowError) as error:
+        raise NavigationError(f"not a navigation state: {error}") from error
+
+
+def _vector(value: Any, *shape: int) -> np.ndarray:
+    array = np.array(value, dtype=np.float64)
+    if array.shape != shape or not np.abs(array).max() < 1e15:  # refuses NaN too
+        raise ValueError(f"expected {shape} finite numbers, got {str(value)[:60]}")
+    return array
+
+
+def _quaternion(value: Any) -> np.ndarray:
+    quat = _vector(value, 4)
+    if abs(np.linalg.norm(quat) - 1) > 1e-3:
+        raise ValueError(f"expected a unit quaternion, got {quat}")
+    return quat / np.linalg.norm(quat)
+
+
+def _covariance(value: Any) -> np.ndarray:
+    matrix = _vector(value, 6, 6)
+    scale = np.abs(matrix).max()
+    if np.abs(matrix - matrix.T).max() > 1e-9 * scale or np.linalg.eigvalsh(matrix)[0] < -1e-9 * scale:
+        raise ValueError("a covariance must be symmetric and positive semi-definite")
+    return (matrix + matrix.T) / 2
+
+
+def interpolate(before: NavigationState, after: NavigationState, utc_ns: int) -> NavigationState:
+    """Return the state between two of the same kind.
+
+    Positions follow the cubic through both positions and velocities, attitudes the shorter arc. A relative pose is
+    interpolated as the target's position in the camera, which hardly moves while the camera tracks,
+    however fast the target spins. The covariance is the weighted mean of both: no smaller than the filter's own.
+    """
+    step_ns = after.utc_ns - before.utc_ns
+    u = (utc_ns - before.utc_ns) / step_ns if step_ns else 0.0
+    if isinstance(before, RelativePose) and isinstance(after, RelativePose):
+        quat = _slerp(before.quat_body_to_camera, after.quat_body_to_camera, u)
+        seen = [quat_to_matrix(s.quat_body_to_camera) @ s.position_body_m for s in (before, after)]
+        return RelativePose(
+            utc_ns,
+            quat,
+            quat_to_matrix(quat).T @ ((1 - u) * seen[0] + u * seen[1]),
+            (1 - u) * before.covariance + u * after.covariance,
+        )
+    assert isinstance(before, SatelliteStates) and isinstance(after, SatelliteStates)
+    step_s = step_ns / NS
+
+    def optional(a: np.ndarray | None, b: np.ndarray | None, mix: Callable) -> np.ndarray | None:
+        return None if a is None or b is None else mix(a, b, u)
+
+    return SatelliteStates(
+        utc_ns,
+        *_hermite(
+            before.target_position_m,
+            before.target_velocity_m_s,
+            after.target_position_m,
+            after.target_velocity_m_s,
+            step_s,
+            u,
+        ),
+        *_hermite(
+            before.chaser_position_m,
+            before.chaser_velocity_m_s,
+            after.chaser_position_m,
+            after.chaser_velocity_m_s,
+            step_s,
+            u,
+        ),
+        optional(before.quat_gcrs_to_body, after.quat_gcrs_to_body, _slerp),
+        optional(before.quat_gcrs_to_chaser, after.quat_gcrs_to_chaser, _slerp),
+        optional(before.covariance, after.covariance, lambda a, b, u: (1 - u) * a + u * b),
+    )
+
+
+def _hermite(
+    p0: np.ndarray, v0: np.ndarray, p1: np.ndarray, v1: np.ndarray, step_s: float, u: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return position and velocity of the cubic through two states; 10 s apart in low orbit it is true to 0.3 mm."""
+    if not step_s:
+        return p0, v0
+    m0, m1, chord = v0 * step_s, v1 * step_s, p1 - p0
+    a, b = m0 + m1 - 2 * chord, 3 * chord - 2 * m0 - m1
+    return ((a * u + b) * u + m0) * u + p0, ((3 * a * u + 2 * b) * u + m0) / step_s
+
+
+def _slerp(a: np.ndarray, b: np.ndarray, u: float) -> np.ndarray:
+    """Return the unit quaternion a share `u` of the way from `a` to `b`."""
+    b = b if a @ b >= 0 else -b
+    angle = np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b)) * 2
+    if angle < 1e-9:
+        mixed = (1 - u) * a + u * b
+    else:
+        mixed = (np.sin((1 - u) * angle) * a + np.sin(u * angle) * b) / np.sin(angle)
+    return matrix_to_quat(quat_to_matrix(mixed))  # unit, w not negative
+
+
+class NavigationStream:
+    """Reads states as they come and gives the state at any time that two of them enclose.
+
+    Args:
+        section: where from, the largest gap, how long to wait for a state that is not there yet.
+
+    Raises:
+        NavigationError: the file is not there. A port that is not there yet is tried again at every request.
+    """
+
+    def __init__(self, section: NavigationSection):
+        self.bad_lines = 0  # not understood, or not newer than the line before
+        self.hang_ups = 0
+        self._section = section
+        self._states: collections.deque[NavigationState] = collections.deque(maxlen=MAX_STATES)
+        self._pending = b""
+        self._descriptor: int | None = None
+        self._socket: socket.socket | None = None
+        if section.source.startswith("file://"):
+            path = section.source.removeprefix("file://")
+            try:
+                self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+            except OSError as error:
+                raise NavigationError(f"no navigation states in {path}: {error.strerror}") from error
+
+    def close(self) -> None:
+        for stream in (self._socket, self._descriptor):
+            if isinstance(stream, socket.socket):
+                stream.close()
+            elif stream is not None:
+                os.close(stream)
+        self._socket = self._descriptor = None
+
+    def at(self, utc_ns: int) -> NavigationState:
+        """Return the state at a time, waiting `wait_s` for one that is not older.
+
+        Raises:
+            NavigationError: before the first state or after the last, or the states around it are too far apart.
+        """
+        deadline_s = time.monotonic() + self._section.wait_s
+        while not self._states or self._states[-1].utc_ns < utc_ns:
+            if not self._read(utc_ns) and time.monotonic() >= deadline_s:
+                newest = (
+                    f"{(utc_ns - self._states[-1].utc_ns) / NS:.3f} s older" if self._states else "missing"
+                )
+                raise NavigationError(f"gap in the navigation stream: the newest state is {newest}")
+        after = before = self._states[-1]
+        for state in reversed(self._states):
+            before = state
+            if state.utc_ns <= utc_ns:
+                break
+            after = state
+        if before.utc_ns > utc_ns:
+            raise NavigationError(
+                f"gap in the navigation stream: it begins {(before.utc_ns - utc_ns) / NS:.3f} s later"
+            )
+        if before.utc_ns == utc_ns:
+            after = before
+        gap_s = (after.utc_ns - before.utc_ns) / NS
+        if gap_s > self._section.max_gap_s or type(before) is not type(after):
+            raise NavigationError(
+                f"gap in the navigation stream: {gap_s:.3f} s between states, at most {self._section.max_gap_s} s"
+            )
+        return interpolate(before, after, utc_ns)
+
+    def _read(self, until_utc_ns: int) -> bool:
+        """Take in lines up to the first state that is not older; tell whether there was anything to read."""
+        if b"\n" not in self._pending:
+            data = self._receive()
+            if not data:
+                return False
+            self._pending += data
+        while b"\n" in self._pending:
+            line, _, self._pending = self._pending.partition(b"\n")
+            try:
+                state = parse_state(line)
+                if self._states and state.utc_ns <= self._states[-1].utc_ns:
+                    raise NavigationError("a state that is not newer than the one before")
+            except NavigationError:
+                self.bad_lines += 1
+                continue
+            self._states.append(state)
+            if state.utc_ns >= until_utc_ns:
+                break
+        if len(self._pending) > MAX_LINE_BYTES and b"\n" not in self._pending:
+            self._pending = b""
+            self.bad_lines += 1
+        return True
+
+    def _receive(self) -> bytes:
+        """Return what has come, empty after a short wait."""
+        if self._descriptor is not None:
+            try:
+                data = os.read(self._descriptor, 65_536)
+            except BlockingIOError:  # a pipe whose writer is silent
+                data = b""
+            if not data:
+                time.sleep(POLL_S)
+            return data
+        try:
+            if self._socket is None:
+                host, _, port = self._section.source.removeprefix("tcp://").rpartition(":")
+                self._socket = socket.create_connection((host, int(port)), timeout=1.0)
+                self._pending = b""
+            if not select.select([self._socket], [], [], POLL_S)[0]:
+                return b""
+            if data := self._socket.recv(65_536):
+                return data
+            raise ConnectionError("the navigation port closed the connection")
+        except OSError:
+            self.hang_ups += self._socket is not None
+            self.close()
+            time.sleep(POLL_S)
+            return b""

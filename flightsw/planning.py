@@ -1,0 +1,118 @@
+"""What a planned pass will see: range, light, eclipse and what the sensor should read, bracket by bracket."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from flightsw.bracket import Geometry, bracket_times_s, expected_light
+from flightsw.icd.mission import Mission
+from flightsw.orbit import shadow_crossings
+from flightsw.pose import pose_tag
+from flightsw.sequencer import NS, plan
+
+
+@dataclass(frozen=True)
+class PlannedBracket:
+    bracket: int
+    utc: str
+    range_m: float
+    phase_deg: float  # between Sun and camera, seen from the target: 0 is full light
+    sun_deg: float  # between the camera's axis and the Sun: small is blinding
+    px_per_m: float
+    target_px: int  # pixels a face of the target's largest dimension would cover
+    eclipse: bool
+    pose_valid: bool
+    exposure_times_ms: tuple[float, ...]
+    expected_dn: tuple[
+        int, ...
+    ]  # of a white face turned to the Sun, in each exposure; full scale is saturated
+
+
+@dataclass(frozen=True)
+class PlannedPass:
+    """Brackets in a row that the Sun lights."""
+
+    first_bracket: int
+    last_bracket: int
+    start_utc: str
+    end_utc: str
+    frames: int
+    range_m: tuple[float, float]  # least and greatest
+    phase_deg: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class PassPlan:
+    brackets: list[PlannedBracket]
+    passes: list[PlannedPass]
+    shadow: list[tuple[str, str]]  # UTC, "enters" or "leaves": the target and the Earth's shadow
+
+
+def pass_plan(mission: Mission) -> PassPlan:
+    """Return the plan of the mission's bracket section, from SGP4; automatic exposure times are the first guess.
+
+    Raises:
+        OrbitError: the orbits or the Sun cannot be computed for these times.
+    """
+    triggers = [shot.start_utc_ns for shot in plan(mission) if shot.bracket_index == 0]
+    brackets = [_bracket(mission, number, trigger_ns) for number, trigger_ns in enumerate(triggers)]
+    passes = []
+    for eclipse, group in itertools.groupby(brackets, key=lambda b: b.eclipse):
+        if not eclipse:
+            passes.append(_pass(list(group)))
+    end_ns = triggers[-1] + round(mission.bracket.interval_s * NS)
+    crossings = shadow_crossings(mission.orbit.target_tle, triggers[0], end_ns)
+    shadow = [(_utc(utc_ns), "enters" if enters else "leaves") for utc_ns, enters in crossings]
+    return PassPlan(brackets, passes, shadow)
+
+
+def _bracket(mission: Mission, number: int, trigger_ns: int) -> PlannedBracket:
+    camera, section = mission.camera, mission.bracket
+    tag = pose_tag(mission, trigger_ns)
+    range_m = float(np.linalg.norm(tag.position_body_m))
+    geometry = Geometry.of(tag)
+    times_s: tuple[float, ...] = tuple(sorted(section.exposure_times_s))
+    highlight = 0.0
+    if geometry is not None:
+        light = expected_light(geometry, camera, section.target_extent_m)
+        highlight = light.highlight
+        if section.auto:
+            times_s = bracket_times_s(light, camera, section)
+    signals_dn = [camera.black_dn + camera.dn_per_radiance_s * t * highlight for t in times_s]
+    boresight = tag.world_to_camera[2, :3]
+    px_per_m = camera.fx_px / range_m
+    return PlannedBracket(
+        bracket=number,
+        utc=_utc(trigger_ns),
+        range_m=round(range_m, 2),
+        phase_deg=_angle_deg(tag.position_body_m / range_m, tag.sun_dir_body),
+        sun_deg=_angle_deg(boresight, tag.sun_dir_body),
+        px_per_m=round(px_per_m, 2),
+        target_px=round((px_per_m * section.target_extent_m) ** 2),
+        eclipse=tag.in_eclipse,
+        pose_valid=tag.valid,
+        exposure_times_ms=tuple(round(t * 1e3, 4) for t in times_s),
+        expected_dn=tuple(min(round(dn), camera.white_dn) for dn in signals_dn),
+    )
+
+
+def _pass(brackets: list[PlannedBracket]) -> PlannedPass:
+    ranges, phases = [b.range_m for b in brackets], [b.phase_deg for b in brackets]
+    return PlannedPass(
+        brackets[0].bracket,
+        brackets[-1].bracket,
+        brackets[0].utc,
+        brackets[-1].utc,
+        sum(len(b.exposure_times_ms) for b in brackets),
+        (min(ranges), max(ranges)),
+        (min(phases), max(phases)),
+    )
+
+
+def _angle_deg(a: np.ndarray, b: np.ndarray) -> float:
+    return round(float(np.degrees(np.arccos(np.clip(a @ b, -1, 1)))), 2)
+
+
+def _utc(utc_ns: int) -> str:
+    return str(np.datetime64(utc_ns, "ns"))[:23] + "Z"

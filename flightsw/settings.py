@@ -1,0 +1,70 @@
+"""What the ground has commanded, kept in the store's folder so that it survives a restart."""
+
+import dataclasses
+import json
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+from flightsw.errors import StoreError
+from flightsw.icd.mission import BracketSection, ConfigError, Mission
+from flightsw.store import write_whole
+
+log = logging.getLogger(__name__)
+ORDERS = ("oldest", "triage", "thumbnail-first")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How frames are taken and which goes down first. None leaves the exposures to the mission."""
+
+    priority: str
+    exposure_times_ms: tuple[float, ...] | None = None
+    near: int = 0  # largest coding error, DN
+    safe_mode: bool = False  # no exposures
+
+    def __post_init__(self):
+        if self.priority not in ORDERS:
+            raise ValueError(f"priority must be one of {', '.join(ORDERS)}, got {self.priority!r}")
+        if type(self.near) is not int or not 0 <= self.near <= 255 or type(self.safe_mode) is not bool:
+            raise ValueError(f"near={self.near!r}, safe_mode={self.safe_mode!r}: out of range")
+
+    def bracket(self, mission: Mission) -> BracketSection:
+        """Return the mission's bracket with the commanded exposures.
+
+        Raises:
+            ConfigError: they do not fit the mission's spacing.
+        """
+        if self.exposure_times_ms is None:
+            return mission.bracket
+        return dataclasses.replace(mission.bracket, exposure_times_ms=self.exposure_times_ms, auto=False)
+
+
+def load_settings(folder: Path, mission: Mission) -> Settings:
+    """Return what was commanded last, the mission's own settings when nothing was or the file is damaged."""
+    default = Settings(mission.link.priority)
+    path = folder / "settings.json"
+    try:
+        tree = json.loads(path.read_bytes())
+        if tree["exposure_times_ms"] is not None:
+            tree["exposure_times_ms"] = tuple(map(float, tree["exposure_times_ms"]))
+        settings = Settings(**tree)
+        settings.bracket(mission)
+    except FileNotFoundError:
+        return default
+    except (OSError, ValueError, TypeError, KeyError, ConfigError) as error:
+        log.error("%s is not usable, the mission's own settings are used: %s", path, error)
+        return default
+    return settings
+
+
+def save_settings(folder: Path, settings: Settings) -> None:
+    """Keep what was commanded.
+
+    Raises:
+        StoreError: the disk refuses; what was there before is still there.
+    """
+    try:
+        write_whole(folder / "settings.json", json.dumps(vars(settings)).encode())
+    except OSError as error:
+        raise StoreError(f"cannot keep the settings: {error}") from error

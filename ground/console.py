@@ -1,0 +1,179 @@
+"""The operator's console: what `ground listen` knows, on one screen; lines of text where there is no terminal."""
+
+import math
+from collections import deque
+from datetime import UTC, datetime
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.panel import Panel
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from flightsw.icd.telemetry import DICTIONARY, printable
+from ground.ingest import Status
+
+RATE_WINDOW_S = 5.0
+SILENT_S = 3.0  # without a packet the link counts as down: housekeeping comes every second
+EVENTS_SHOWN = 10
+FILES_SHOWN = 8
+HOUSEKEEPING = DICTIONARY.telemetry["housekeeping"]
+COLOURS = {"green": "green", "yellow": "yellow", "red": "bold red"}
+SEVERITIES = {"info": "", "warning": "yellow", "error": "bold red"}
+# the items of the housekeeping panel; the rest is in telemetry.jsonl
+SHOWN = """
+mode camera exposure_times_ms near priority model frames_stored frames_failed outbox_frames frames_ranked
+transfers_failed segments_resent crc_errors hang_ups disk_free_bytes cpu_percent rss_bytes commands_accepted
+commands_refused
+"""
+COUNTS = """
+crc_errors packets_missing skipped_bytes segments_resent duplicates frames_rejected telemetry_refused store_failures
+hang_ups
+"""
+
+
+class ConsoleView:
+    """Draws statuses; keeps the last seconds to tell rates."""
+
+    def __init__(self) -> None:
+        self._history: deque[tuple[float, int, int, int]] = deque()
+
+    def rates(self, status: Status) -> tuple[float, float, float]:
+        """Return bytes a second down, up and of stored frames, over the last five seconds."""
+        summary = status.summary
+        now = (status.now_s, summary.bytes_received, summary.bytes_sent, summary.payload_bytes)
+        self._history.append(now)
+        while self._history[0][0] < status.now_s - RATE_WINDOW_S:
+            self._history.popleft()
+        then = self._history[0]
+        elapsed_s = now[0] - then[0]
+        if elapsed_s <= 0:
+            return 0.0, 0.0, 0.0
+        down, up, payload = ((now[i] - then[i]) / elapsed_s for i in (1, 2, 3))
+        return down, up, payload
+
+    def draw(self, status: Status) -> RenderableType:
+        """Return the screen."""
+        down, up, _payload = self.rates(status)
+        top = Table.grid(expand=True, padding=(0, 1))
+        top.add_column(ratio=1)
+        top.add_column(ratio=1)
+        top.add_row(Panel(_link(status, down, up), title="link"), Panel(_flight(status), title="spacecraft"))
+        return Group(
+            top,
+            Panel(_files(status, down), title="files"),
+            Panel(_commands_and_events(status), title="events"),
+        )
+
+    def line(self, status: Status) -> str:
+        """Return the status in one line of text."""
+        down, up, _payload = self.rates(status)
+        s = status.summary
+        return (
+            f"{link_state(status)[0]}, {s.frames_in_session} frames, {down / 1e3:.1f} kB/s down, {up / 1e3:.1f} up, "
+            f"{s.crc_errors} CRC errors, {s.packets_missing} missing, {s.segments_resent} resent, "
+            f"outbox {status.housekeeping.get('outbox_frames', '?')}"
+        )
+
+
+def link_state(status: Status) -> tuple[str, str]:
+    """Return the link's state in words, and its colour."""
+    if not status.connected:
+        return "port closed", "bold red"
+    if status.quiet_s > SILENT_S or not status.summary.packets_received:
+        return f"silent for {status.quiet_s:.0f} s", "yellow"
+    return "up", "green"
+
+
+def _link(status: Status, down: float, up: float) -> Table:
+    state, colour = link_state(status)
+    s = status.summary
+    rows: list[tuple[str, Text]] = [
+        ("state", Text(state, colour)),
+        ("rate down / up", Text(f"{down / 1e3:.1f} / {up / 1e3:.1f} kB/s")),
+        ("received", Text(f"{s.bytes_received:,} B, {s.packets_received:,} packets")),
+        ("frames", Text(f"{s.frames_in_session}, {s.frames_received} in this run")),
+        ("headers / thumbnails", Text(f"{s.headers_received} / {s.thumbnails_received}")),
+    ]
+    for name in COUNTS.split():
+        count = getattr(s, name)
+        rows.append((name.replace("_", " "), Text(f"{count:,}", "yellow" if count else "")))
+    rows += [
+        (name.replace("_", " "), Text(f"{count:,}", "yellow" if count else ""))
+        for name, count in s.link_losses.items()
+    ]
+    return _rows(rows)
+
+
+def _flight(status: Status) -> RenderableType:
+    values = status.housekeeping
+    if not values:
+        return Text("no housekeeping yet", "yellow")
+    age_colour = "yellow" if status.housekeeping_age_s > SILENT_S else "green"
+    rows = [("telemetry age", Text(f"{status.housekeeping_age_s:.1f} s", age_colour))]
+    for name in SHOWN.split():
+        item = HOUSEKEEPING.item(name)
+        rows.append(
+            (name.replace("_", " "), Text(shown(name, values[name]), COLOURS[item.limit(values[name])]))
+        )
+    header = status.frame_header
+    if header:
+        seconds = header["mid_exposure_utc_ns"] // 10**9
+        range_m = math.hypot(*header["position_body_m"])
+        text = (
+            f"{header['frame_id']}: {utc(seconds)}, {header['exposure_time_s'] * 1e3:g} ms, {range_m:.1f} m"
+        )
+        rows.append(("last exposure", Text(text)))
+    return _rows(rows)
+
+
+def shown(name: str, value: Any) -> str:
+    """Return a housekeeping value as text with its unit."""
+    item = HOUSEKEEPING.item(name)
+    if isinstance(value, bytes):
+        return value.hex() if any(value) else "none"
+    if isinstance(value, tuple):
+        return ", ".join(f"{number:g}" for number in value) + f" {item.unit}"
+    if item.unit == "B":
+        return f"{value / 1e6:,.1f} MB"
+    number = f"{value:.1f}" if isinstance(value, float) else f"{value}"
+    return f"{number} {item.unit}".rstrip()
+
+
+def _files(status: Status, down: float) -> RenderableType:
+    if not status.incoming:
+        return Text("none in flight")
+    table = Table.grid(padding=(0, 1))
+    before_bytes = 0
+    for file in status.incoming[:FILES_SHOWN]:
+        size_bytes = file.size_bytes or 0
+        before_bytes += max(size_bytes - file.received_bytes, 0)
+        left = f"{before_bytes / down:.0f} s left" if down and size_bytes else ""
+        bar = ProgressBar(total=max(size_bytes, 1), completed=file.received_bytes, width=30)
+        name = printable(file.name)[:30] or "(not named yet)"
+        table.add_row(Text(name), bar, Text(f"{file.received_bytes:,} of {size_bytes:,} B"), Text(left))
+    return table
+
+
+def _commands_and_events(status: Status) -> RenderableType:
+    lines = [Text(f"command {name} {counter}: {stage}", "cyan") for counter, name, stage in status.commands]
+    for event in status.events[-EVENTS_SHOWN:]:
+        seconds = event["received_utc_ns"] // 10**9
+        lines.append(Text(f"{utc(seconds)}  {printable(event['text'])}", SEVERITIES[event["severity"]]))
+    return Group(*lines) if lines else Text("none")
+
+
+def _rows(rows: list[tuple[str, Text]]) -> Table:
+    table = Table.grid(padding=(0, 2))
+    for name, text in rows:
+        table.add_row(Text(name, "dim"), text)
+    return table
+
+
+def utc(seconds: int) -> str:
+    """Return a Unix time as a time of day; anything that is none as it is."""
+    try:
+        return datetime.fromtimestamp(seconds, UTC).strftime("%H:%M:%SZ")
+    except (ValueError, OverflowError, OSError):
+        return f"{seconds} s"

@@ -1,0 +1,318 @@
+"""Commands on their way up: sealed by `ground uplink`, sent by whoever has the port, `ground listen`.
+
+`ground uplink` seals a command, so that the key stays with it, and leaves it in the session's folder uplink/ as
+NUMBER.json, NUMBER the command's counter; a model's sealed file lies beside it as NUMBER.bin. The listener sends
+them in that order, keeps on asking until the spacecraft has told the end, and writes it to NUMBER.done.json.
+"""
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import logging
+import os
+import re
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from flightsw.icd.auth import Key, seal, seal_file
+from flightsw.icd.command import ENDED, Command, Report, model_file_name
+from flightsw.icd.mission import ConfigError
+from flightsw.icd.transfer import UPLINK, Sender
+from ground.session import SessionError, write_whole
+
+log = logging.getLogger(__name__)
+JOB_NAME = re.compile(r"(\d{20})\.json", re.ASCII)
+MAX_MODEL_BYTES = 64 * 1024 * 1024  # as the dictionary's `model.size_bytes`
+LOOK_S = 0.2  # between looks at the folder
+ASK_INTERVALS = 2  # timer intervals before a command that was not answered is sent again
+END_INTERVALS = 4  # the same for one whose end is not known: the spacecraft answers with its reports
+NS = 1_000_000_000
+
+
+def make_key(path: Path, spi: int = 1) -> Key:
+    """Write a new key and the counters of both sides beside it: PATH, PATH.sent and PATH.received.
+
+    Raises:
+        ConfigError: there is a key already, or the folder cannot be written.
+    """
+    key = Key(spi, secrets.token_bytes(32))
+    try:
+        for suffix, text in (
+            (".sent", key.counter_text(0)),
+            (".received", key.counter_text(0)),
+            ("", key.text),
+        ):
+            part = path.with_name(path.name + suffix)
+            with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+                file.write(text)
+    except FileExistsError as error:
+        raise ConfigError(str(error.filename), "is there already; a key is never overwritten") from error
+    except OSError as error:
+        raise ConfigError(str(path), f"cannot write the key: {error.strerror}") from error
+    return key
+
+
+def parse_command(name: str, arguments: list[str]) -> tuple[Command, Path | None]:
+    """Return the command of a command line; for `model` its file too.
+
+    Raises:
+        ValueError: no such command, or arguments that it does not take.
+    """
+    match name, arguments:
+        case "ping" | "safe" | "resume", []:
+            return Command(name, {}), None
+        case "bracket", [times]:
+            return Command(
+                name, {"exposure_times_ms": tuple(_number(t, float) for t in times.split(","))}
+            ), None
+        case "near", [near]:
+            return Command(name, {"near": _number(near, int)}), None
+        case "priority", [order]:
+            return Command(name, {"order": order}), None
+        case "model", [file]:
+            return Command(name, {}), Path(file)
+        case "arm", [command]:
+            return Command(name, {"command": command}), None
+        case "delete", [first, last]:
+            frames = {"first_frame": _number(first, int), "last_frame": _number(last, int)}
+            return Command(name, frames), None
+    given = " ".join([name, *arguments])
+    raise ValueError(f"not a command with its arguments: {given!r}; see `ground uplink --help`")
+
+
+def _number(text: str, kind: type) -> Any:
+    try:
+        return kind(text)
+    except ValueError as error:
+        raise ValueError(f"expected a number, got {text!r}") from error
+
+
+def submit(session: Path, key_file: Path, command: Command, model: Path | None, expires_s: float) -> int:
+    """Seal a command and leave it for the listener; return its counter.
+
+    The counter is on the disk before the sealed command is: no counter is ever used for two commands.
+
+    Args:
+        command: for `model` its arguments are made here, from the file.
+        expires_s: from now, after which it is not sent any more.
+
+    Raises:
+        ConfigError: the key, its counter or the model file cannot be used.
+        ValueError: an argument is out of range.
+        SessionError: the session folder cannot be written.
+    """
+    content = b""
+    if model is not None:
+        content, command = _model_command(model)
+    packed = command.pack()  # before a counter is spent on it
+    folder = session / "uplink"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with _next_counter(key_file) as (key, counter):
+            (folder / f"{counter:020d}.done.json").unlink(missing_ok=True)  # of an earlier key
+            if content:
+                file_key = command.arguments["file_key"]
+                write_whole(folder / f"{counter:020d}.bin", seal_file(file_key, content))
+            job = {
+                "command": command.name,
+                "packet": seal(key, counter, packed).hex(),
+                "expires_utc_ns": time.time_ns() + int(expires_s * NS),
+            }
+            write_whole(folder / f"{counter:020d}.json", json.dumps(job).encode())
+    except OSError as error:
+        raise SessionError(f"cannot leave the command in {folder}: {error}") from error
+    return counter
+
+
+def _model_command(model: Path) -> tuple[bytes, Command]:
+    try:
+        content = model.read_bytes()
+    except OSError as error:
+        raise ConfigError(str(model), f"cannot read the model: {error.strerror}") from error
+    if not 0 < len(content) <= MAX_MODEL_BYTES:
+        raise ConfigError(str(model), f"expected 1 to {MAX_MODEL_BYTES} bytes, got {len(content)}")
+    arguments = {
+        "size_bytes": len(content),
+        "sha256": hashlib.sha256(content).digest(),
+        "file_key": secrets.token_bytes(32),
+    }
+    return content, Command("model", arguments)
+
+
+@contextlib.contextmanager
+def _next_counter(key_file: Path) -> Iterator[tuple[Key, int]]:
+    """Give the key and a counter that was never given before; commands are made one at a time."""
+    path = key_file.with_name(key_file.name + ".sent")
+    try:
+        with open(path.with_name(path.name + ".lock"), "wb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            key = Key.parse(key_file.read_text(), str(key_file))
+            counter = key.parse_counter(path.read_text(), str(path)) + 1
+            write_whole(path, key.counter_text(counter).encode())
+            yield key, counter
+    except (FileNotFoundError, PermissionError, UnicodeDecodeError) as error:
+        raise ConfigError(str(key_file), f"cannot use the key and its counter: {error}") from error
+
+
+def outcome(session: Path, counter: int) -> dict[str, Any] | None:
+    """Return how a command ended (stage, text, reports), None while it has not."""
+    path = session / "uplink" / f"{counter:020d}.done.json"
+    return json.loads(path.read_bytes()) if path.exists() else None
+
+
+def withdraw(session: Path, counter: int) -> None:
+    """Take a command back that is not sent yet; one that is sent may still be executed."""
+    for suffix in (".json", ".bin"):
+        (session / "uplink" / f"{counter:020d}{suffix}").unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def listening(session: Path) -> Iterator[None]:
+    """Hold the session's lock: one process listens, and `is_listening` knows.
+
+    Raises:
+        SessionError: another process listens.
+    """
+    with open(session / "listener.lock", "wb") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise SessionError(f"another process listens into {session}") from error
+        yield
+
+
+def is_listening(session: Path) -> bool:
+    """Tell whether a process listens into a session."""
+    try:
+        with open(session / "listener.lock", "rb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except BlockingIOError:
+        return True
+    return False
+
+
+@dataclass
+class Job:
+    """A command on its way."""
+
+    counter: int
+    command: str
+    packet: bytes
+    expires_utc_ns: int
+    file: bytes | None
+    file_put: bool = False
+    next_ask_s: float = float("-inf")
+    reports: list[Report] = field(default_factory=list)
+
+    @property
+    def stage(self) -> str:
+        return self.reports[-1].stage if self.reports else "waiting"
+
+
+class Uplinker:
+    """The listener's part: gives packets to send, takes reports, writes outcomes. No port, time passed in."""
+
+    def __init__(
+        self,
+        session: Path,
+        max_pdu_bytes: int,
+        interval_s: float,
+        on_end: Callable[[int, str, str, str], None] = lambda counter, command, stage, text: None,
+        utc_ns: Callable[[], int] = time.time_ns,
+    ):
+        self.jobs: dict[int, Job] = {}
+        self.files = Sender(max_pdu_bytes, interval_s, route=UPLINK)
+        self._folder, self._on_end, self._utc_ns = session / "uplink", on_end, utc_ns
+        self._interval_s = interval_s
+        self._next_look_s = float("-inf")
+
+    @property
+    def is_sending_file(self) -> bool:
+        return bool(self.files.in_flight)
+
+    def next_command(self, now_s: float) -> bytes | None:
+        """Return a sealed command to send now: the first that is not accepted, or one whose end is overdue."""
+        if now_s >= self._next_look_s:
+            self._next_look_s = now_s + LOOK_S
+            self._look()
+        for counter in sorted(self.jobs):
+            job = self.jobs[counter]
+            if now_s >= job.next_ask_s and not (job.file_put and self.is_sending_file):
+                intervals = END_INTERVALS if job.reports else ASK_INTERVALS
+                job.next_ask_s = now_s + intervals * self._interval_s
+                return job.packet
+            if not job.reports:
+                return None  # the counters must arrive in order
+        return None
+
+    def next_pdu(self, now_s: float) -> bytes | None:
+        """Return the next PDU of a model file that the spacecraft waits for."""
+        for job in self.jobs.values():
+            if job.file is not None and job.reports and not job.file_put:
+                job.file_put = True
+                self.files.put(model_file_name(job.counter), job.file, job.counter % (1 << 32), now_s)
+        pdu = self.files.next_pdu(now_s)
+        for ended in self.files.outcomes():
+            if not ended.delivered:
+                log.warning("%s: transfer failed (%s)", ended.name, ended.reason)
+                for job in list(self.jobs.values()):
+                    if model_file_name(job.counter) == ended.name:
+                        self._end(job, "failed", f"the file did not arrive: {ended.reason}")
+        return pdu
+
+    def take_report(self, report: Report, report_s: float) -> None:
+        """Note what the spacecraft says of a command; what is not ours is left alone."""
+        job = self.jobs.get(report.counter)
+        if job is None or any(report.stage == known.stage for known in job.reports):
+            return
+        job.reports.append(report)
+        job.next_ask_s = report_s + END_INTERVALS * self._interval_s
+        if report.stage in ENDED:
+            self._end(job, report.stage, report.text)
+
+    def _look(self) -> None:
+        names = os.listdir(self._folder) if self._folder.is_dir() else []
+        counters = {int(match[1]) for match in map(JOB_NAME.fullmatch, names) if match}
+        for counter in counters - set(self.jobs):
+            try:
+                self.jobs[counter] = self._read(counter)
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                log.error("command %d cannot be read: %s", counter, error)
+                (self._folder / f"{counter:020d}.json").unlink(missing_ok=True)
+        for counter, job in list(self.jobs.items()):
+            if counter not in counters:
+                del self.jobs[counter]  # withdrawn
+            elif self._utc_ns() > job.expires_utc_ns:
+                self._end(job, "failed", "no answer in time" if not job.reports else f"still {job.stage}")
+
+    def _read(self, counter: int) -> Job:
+        tree = json.loads((self._folder / f"{counter:020d}.json").read_bytes())
+        file = self._folder / f"{counter:020d}.bin"
+        content = file.read_bytes() if file.exists() else None
+        packet = bytes.fromhex(tree["packet"])
+        return Job(counter, str(tree["command"]), packet, int(tree["expires_utc_ns"]), content)
+
+    def _end(self, job: Job, stage: str, text: str) -> None:
+        done = {
+            "counter": job.counter,
+            "command": job.command,
+            "stage": stage,
+            "text": text,
+            "reports": [vars(report) for report in job.reports],
+        }
+        name = f"{job.counter:020d}"
+        try:
+            write_whole(self._folder / f"{name}.done.json", json.dumps(done).encode())
+            for suffix in (".json", ".bin"):
+                (self._folder / f"{name}{suffix}").unlink(missing_ok=True)
+        except OSError as error:
+            log.error("the end of command %d cannot be written: %s", job.counter, error)
+        self.jobs.pop(job.counter, None)
+        self._on_end(job.counter, job.command, stage, text)

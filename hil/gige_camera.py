@@ -1,0 +1,192 @@
+"""The simulated sky as a GigE Vision camera on loopback: Aravis' fake camera speaks the protocol, this fills frames.
+
+A picture may take seconds to render, but the fake camera answers its client's heartbeat only between pictures. So the
+client's trigger goes to registers of our own (gige_camera.xml); when the picture is ready, the fake camera's own
+trigger is pulled.
+"""
+
+import ctypes
+import dataclasses
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from flightsw.cameras.aravis import PIXEL_FORMATS, aravis
+from flightsw.errors import FlightError
+from flightsw.icd.frame import PoseTag
+from flightsw.icd.mission import CameraSection, Mission
+from flightsw.pose import pose_tag
+from hil.blender import BlenderError
+from hil.sensor import expose
+
+log = logging.getLogger(__name__)
+DESCRIPTION = Path(__file__).with_name("gige_camera.xml")
+LOOPBACK, GVCP_PORT = "127.0.0.1", 3956
+POLL_S = 1e-3
+SEND_S = 1.0  # longest wait for the fake camera to take a picture
+NS = 1_000_000_000
+
+# Registers of Aravis' fake camera (arvfakecamera.h), and ours (gige_camera.xml).
+WIDTH, HEIGHT, GAIN_TENTH_DB, SENSOR_HEIGHT, SENSOR_WIDTH = 0x100, 0x104, 0x110, 0x118, 0x11C
+EXPOSURE_US, ACQUISITION, PIXEL_FORMAT, OFFSET_X, OFFSET_Y = 0x120, 0x124, 0x128, 0x130, 0x134
+FAKE_TRIGGER_MODE, FAKE_TRIGGER_SOURCE, FAKE_TRIGGER = 0x300, 0x304, 0x30C
+TRIGGER_MODE, TRIGGER, LATE_FRAMES, FRAME_PERIOD_US, START_UTC_NS = 0xA000, 0xA00C, 0xA010, 0xA014, 0xA020
+FillPattern = ctypes.CFUNCTYPE(
+    None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
+)
+
+
+class GigeCameraServer:
+    """A GigE Vision camera at 127.0.0.1 until closed; `url` is what `flightsw --camera` takes.
+
+    A software trigger exposes at the time in the feature SimulatedStartUtcNs, or at the simulated time of now, which
+    runs from the mission's start in real time. Without a trigger the camera runs free at its frame rate; a frame that
+    is not ready in time is left out and counted in LateFrameCount. Pictures carry the simulated time of the shutter.
+
+    Args:
+        radiance: gives the sky [H, W, C] for a true pose.
+
+    Raises:
+        CaptureError: Aravis is not installed.
+        OSError: another GigE Vision camera or client holds the port.
+    """
+
+    def __init__(self, mission: Mission, radiance: Callable[[PoseTag], np.ndarray], seed: int = 0):
+        self.mission, self.radiance, self.seed = mission, radiance, seed
+        self.url = f"gige://{LOOPBACK}"
+        self.exposures = self.late_frames = self.failures = 0
+        self._aravis = aravis()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:  # the fake camera would stay silent
+            probe.bind((LOOPBACK, GVCP_PORT))
+        self._device = self._aravis.call(
+            "arv_gv_fake_camera_new_full", LOOPBACK.encode(), b"OBGF", str(DESCRIPTION).encode()
+        )
+        self._camera = self._aravis.call("arv_gv_fake_camera_get_fake_camera", self._device)
+        self._picture, self._picture_utc_ns = b"", 0
+        self._sent = threading.Event()
+        self._stop = threading.Event()
+        self._fill_callback = FillPattern(self._fill)  # kept for as long as the camera may call it
+        self._set_up()
+        self._started_s = time.monotonic()
+        self._thread = threading.Thread(target=self._run, name="gige camera", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> "GigeCameraServer":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._aravis.unref(self._device)
+
+    def _set_up(self) -> None:
+        camera = self.mission.camera
+        bits = next(bits for bits in (8, 12, 16) if bits >= camera.bit_depth)
+        number = PIXEL_FORMATS[f"{'Mono' if camera.channels == 1 else 'BayerRG'}{bits}"][0]
+        for address, value in (
+            (SENSOR_WIDTH, camera.width),
+            (SENSOR_HEIGHT, camera.height),
+            (WIDTH, camera.width),
+            (HEIGHT, camera.height),
+            (PIXEL_FORMAT, number),
+            (EXPOSURE_US, round(self.mission.bracket.exposure_times_ms[0] * 1e3)),
+            (GAIN_TENTH_DB, 0),
+            (FRAME_PERIOD_US, 40_000),
+            (FAKE_TRIGGER_SOURCE, 1),
+            (FAKE_TRIGGER_MODE, 1),
+        ):
+            self._write(address, value)
+        call = self._aravis.call
+        call("arv_fake_camera_set_trigger_frequency", self._camera, 1 / POLL_S)  # how often it looks for one
+        fill = ctypes.cast(self._fill_callback, ctypes.c_void_p)
+        call("arv_fake_camera_set_fill_pattern", self._camera, fill, None)
+
+    def _run(self) -> None:
+        due_s = time.monotonic()
+        while not self._stop.wait(POLL_S):
+            now_s = time.monotonic()
+            if not self._read(ACQUISITION):
+                due_s = now_s
+            elif self._read(TRIGGER_MODE):
+                if self._read(TRIGGER):
+                    self._write(TRIGGER, 0)
+                    self._take(self._read(START_UTC_NS, 8) or self._simulated_utc_ns())
+            elif now_s >= due_s:
+                self._take(self._simulated_utc_ns())
+                period_s = max(self._read(FRAME_PERIOD_US), 1000) / 1e6
+                late = int((time.monotonic() - due_s) / period_s)
+                self.late_frames += late
+                self._write(LATE_FRAMES, self.late_frames)
+                due_s += (late + 1) * period_s
+
+    def _simulated_utc_ns(self) -> int:
+        return self.mission.orbit.start_utc_ns + round((time.monotonic() - self._started_s) * NS)
+
+    def _take(self, start_utc_ns: int) -> None:
+        """Expose, and hand the picture to the fake camera; a sky that fails leaves the client without a picture."""
+        exposure_s = self._read(EXPOSURE_US) / 1e6
+        mid_ns = start_utc_ns + round(exposure_s * NS / 2)
+        gain = 10 ** (self._read(GAIN_TENTH_DB) / 200)
+        camera = self.mission.camera
+        amplified = dataclasses.replace(
+            camera,
+            dn_per_radiance_s=camera.dn_per_radiance_s * gain,
+            electrons_per_dn=camera.electrons_per_dn / gain,
+        )
+        try:
+            radiance = self.radiance(pose_tag(self.mission, mid_ns))
+            rng = np.random.default_rng((self.seed, mid_ns))
+            dn = expose(radiance, exposure_s, amplified, rng)
+            self._picture = self._encode(dn, camera)
+        except (FlightError, BlenderError, ValueError) as error:
+            self.failures += 1
+            log.warning("no picture: %s", error)
+            return
+        self._picture_utc_ns = start_utc_ns
+        self._sent.clear()
+        self._write(FAKE_TRIGGER, 1)
+        if self._sent.wait(SEND_S):
+            self.exposures += 1
+        else:
+            self._write(FAKE_TRIGGER, 0)  # the client stopped in the meantime
+
+    def _encode(self, dn: np.ndarray, camera: CameraSection) -> bytes:
+        """Return the region and pixel format that the client asked for, from the sensor's numbers."""
+        number = self._read(PIXEL_FORMAT)
+        names = [name for name, (known, *_) in PIXEL_FORMATS.items() if known == number]
+        if not names:
+            raise ValueError(f"pixel format {number:#x} is not offered")
+        _, bits, pattern = PIXEL_FORMATS[names[0]]
+        dn = dn.reshape(*dn.shape[:2], -1).astype(np.uint32)
+        if pattern and dn.shape[2] == 3:  # colour sensor: RGGB
+            mosaic = dn[..., 1].copy()
+            mosaic[::2, ::2], mosaic[1::2, 1::2] = dn[::2, ::2, 0], dn[1::2, 1::2, 2]
+        else:
+            mosaic = np.rint(dn.mean(axis=2)).astype(np.uint32)
+        shift = camera.bit_depth - bits
+        mosaic = mosaic >> shift if shift >= 0 else mosaic << -shift
+        x, y = self._read(OFFSET_X), self._read(OFFSET_Y)
+        region = mosaic[y : y + self._read(HEIGHT), x : x + self._read(WIDTH)]
+        return region.astype(np.uint8 if bits == 8 else "<u2").tobytes()
+
+    def _fill(self, buffer: int, _data: int, _exposure_us: int, _gain: int, _format: int) -> None:
+        """Copy the picture into the buffer that the fake camera sends; runs in its thread."""
+        size = ctypes.c_size_t()
+        data = self._aravis.call("arv_buffer_get_data", buffer, ctypes.byref(size))
+        ctypes.memmove(data, self._picture, len(self._picture))
+        self._aravis.call("arv_buffer_set_timestamp", buffer, self._picture_utc_ns)
+        self._sent.set()
+
+    def _read(self, address: int, size: int = 4) -> int:
+        value = ctypes.create_string_buffer(size)
+        self._aravis.call("arv_fake_camera_read_memory", self._camera, address, size, value)
+        return int.from_bytes(value.raw, "big")
+
+    def _write(self, address: int, value: int) -> None:
+        data = value.to_bytes(4, "big")
+        self._aravis.call("arv_fake_camera_write_memory", self._camera, address, len(data), data)

@@ -1,0 +1,240 @@
+"""Packets over CAN: ISO-TP messages and slcan text, held to python-can and to hostile bytes."""
+
+import can
+import isotp
+import pytest
+from can.interfaces.slcan import slcanBus
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flightsw.icd.can import (
+    FD_SIZES,
+    FLIGHT_IDS,
+    GROUND_IDS,
+    MAX_MESSAGE_BYTES,
+    IsoTpChannels,
+    SlcanText,
+    format_slcan,
+    open_slcan,
+    parse_slcan,
+)
+from flightsw.icd.framing import frame_packet
+from flightsw.icd.link_url import parse_link_url
+
+CLASSIC, FD = (parse_link_url(f"slcan:///dev/null?fd={fd}") for fd in (0, 1))
+BOTH = pytest.mark.parametrize("url", [CLASSIC, FD], ids=["classic", "fd"])
+
+
+@st.composite
+def can_frames(draw) -> isotp.CanMessage:
+    extended, fd = draw(st.booleans()), draw(st.booleans())
+    code = draw(st.integers(0, 15 if fd else 8))
+    data = draw(st.binary(min_size=FD_SIZES[code], max_size=FD_SIZES[code]))
+    number = draw(st.integers(0, (1 << (29 if extended else 11)) - 1))
+    return isotp.CanMessage(number, code, data, extended, fd, fd and draw(st.booleans()))
+
+
+def fields(frame: isotp.CanMessage) -> tuple:
+    return tuple(getattr(frame, name) for name in isotp.CanMessage.__slots__)
+
+
+class Wire:
+    """Both sides' channels, and a wire that a test may damage."""
+
+    def __init__(self, url):
+        self.flight = IsoTpChannels(FLIGHT_IDS, GROUND_IDS, url)
+        self.ground = IsoTpChannels(GROUND_IDS, FLIGHT_IDS, url)
+        self.received = b""
+        self.down: list[isotp.CanMessage] = []
+
+    def run(self, alter=lambda frames: frames) -> bytes:
+        """Pass frames to and fro until both are quiet; return what the ground received."""
+        _, down = self.flight.exchange([])
+        while down:
+            self.down += down
+            packets, up = self.ground.exchange(alter(down))
+            self.received += packets
+            _, down = self.flight.exchange(up)
+        return self.received
+
+
+# ---- slcan ----
+
+
+@given(can_frames())
+def test_a_frame_survives_the_text(frame):
+    text = format_slcan(frame)
+    assert fields(parse_slcan(text[:-1])) == fields(frame)
+
+
+class PythonCan(slcanBus):
+    """python-can's slcan without a port: an independent writer and reader of the same text."""
+
+    def __init__(self):
+        self.text = ""
+
+    def _write(self, string: str) -> None:
+        self.text += string + "\r"
+
+    def _read(self, timeout) -> str:
+        return self.text
+
+    def send_text(self, frame: isotp.CanMessage) -> bytes:
+        self.serialPortOrig = type("Port", (), {"write_timeout": None})
+        self._queue = type("Queue", (), {"qsize": lambda self: 0})()
+        self.send(
+            can.Message(
+                arbitration_id=frame.arbitration_id,
+                data=frame.data,
+                is_extended_id=frame.is_extended_id,
+                is_fd=frame.is_fd,
+                bitrate_switch=frame.bitrate_switch,
+            )
+        )
+        return self.text.encode()
+
+
+@given(can_frames())
+def test_python_can_writes_the_same_text_and_reads_the_same_frame(frame):
+    theirs = PythonCan()
+    assert theirs.send_text(frame) == format_slcan(frame)
+    message, _ = theirs._recv_internal(0)
+    assert message is not None
+    assert (message.arbitration_id, bytes(message.data)) == (frame.arbitration_id, frame.data)
+    assert (message.is_extended_id, message.is_fd) == (frame.is_extended_id, frame.is_fd)
+
+
+def test_python_can_sends_the_same_commands_to_open():
+    theirs = PythonCan()
+    theirs._listen_only = False
+    theirs.set_bitrate(1_000_000, 5_000_000)
+    assert open_slcan(FD).strip(b"\r") + b"\r" == theirs.text.encode()
+    for bitrate, code in slcanBus._BITRATES.items():
+        url = parse_link_url(f"slcan:///dev/null?bitrate={bitrate}")
+        assert f"\r{code}\r".encode() in open_slcan(url)
+
+
+@given(st.lists(can_frames(), max_size=6), st.lists(st.integers(1, 60), max_size=30))
+def test_any_chunking_of_the_text_yields_the_same_frames(sent, chunk_sizes):
+    stream = b"".join(map(format_slcan, sent))
+    text, received = SlcanText(), []
+    for size in chunk_sizes:
+        received += text.feed(stream[:size])
+        stream = stream[size:]
+    received += text.feed(stream)
+    assert list(map(fields, received)) == list(map(fields, sent))
+    assert text.skipped_bytes == 0
+
+
+@given(
+    st.lists(st.one_of(st.binary(max_size=300), st.from_regex(rb"[tTdDbBzZ\r\a0-9A-F]{0,200}")), max_size=8)
+)
+def test_hostile_text_takes_no_memory_and_every_byte_is_counted(chunks):
+    text = SlcanText()
+    for chunk in chunks:
+        for frame in text.feed(chunk):
+            assert len(frame.data) in FD_SIZES
+        assert text.pending_bytes <= SlcanText.MAX_LINE_BYTES
+    counted = text.frame_bytes + text.reply_bytes + text.skipped_bytes + text.pending_bytes
+    assert counted == sum(map(len, chunks))
+
+
+def test_an_adapter_s_answers_are_no_errors_but_its_bell_is():
+    text = SlcanText()
+    assert text.feed(b"\rz\rZ\r\r") == []
+    assert (text.reply_bytes, text.skipped_bytes, text.adapter_errors) == (6, 0, 0)
+    text.feed(b"\a")
+    assert text.adapter_errors == 1
+
+
+# ---- ISO-TP ----
+
+
+@BOTH
+@given(
+    packets=st.lists(
+        st.integers(1, 4096).flatmap(lambda n: st.binary(min_size=n, max_size=n)), min_size=1, max_size=12
+    )
+)
+@settings(max_examples=25, deadline=None)
+def test_packets_of_any_length_arrive_whole_and_in_order(url, packets):
+    wire = Wire(url)
+    framed = b"".join(map(frame_packet, packets))
+    wire.flight.write(framed)
+    assert wire.run() == framed
+    assert wire.ground.frames_discarded == wire.flight.messages_failed == 0
+    assert len(frame_packet(bytes(4096))) <= MAX_MESSAGE_BYTES
+
+
+@BOTH
+def test_frames_are_those_of_iso_15765_2(url):
+    """Against the byte tables of the standard, by hand."""
+    wire = Wire(url)
+    message = bytes(range(1, 126))
+    wire.flight.write(message + b"\0")
+    wire.run()
+    size = 64 if url.fd else 8
+    assert wire.down[0].data == bytes([0x10, 125]) + message[: size - 2]  # first frame
+    assert wire.down[1].data[:size] == (bytes([0x21]) + message[size - 2 :])[:size]  # consecutive frame 1
+    assert {frame.arbitration_id for frame in wire.down} == {FLIGHT_IDS[0]}
+    assert all(len(frame.data) in FD_SIZES for frame in wire.down)
+
+
+@BOTH
+def test_a_message_that_lost_a_frame_is_dropped_and_counted_and_the_next_one_passes(url):
+    wire = Wire(url)
+    first, second = frame_packet(bytes(range(1, 200)) * 3), frame_packet(bytes(range(1, 200)) * 2)
+
+    def lose_one(frames):
+        return [frame for number, frame in enumerate(frames) if number != 3 or len(frames) < 5]
+
+    wire.flight.write(first)
+    assert wire.run(lose_one) == b""
+    wire.flight.write(second)
+    assert wire.run() == second
+    assert wire.ground.frames_discarded > 0
+
+
+@BOTH
+def test_a_frame_that_comes_twice_harms_nothing(url):
+    wire = Wire(url)
+    framed = frame_packet(bytes(range(1, 200)) * 3)
+    wire.flight.write(framed)
+    assert (
+        wire.run(lambda frames: [frame for frame in frames for _ in range(1 + (frame.data[0] >> 4 == 2))])
+        == framed
+    )
+    assert wire.ground.frames_repeated > 0
+    assert wire.ground.frames_discarded == 0
+
+
+def test_frames_of_other_nodes_are_not_for_us():
+    wire = Wire(CLASSIC)
+    other = [
+        isotp.CanMessage(0x123, 3, b"\x02ab"),
+        isotp.CanMessage(FLIGHT_IDS[0], 3, b"\x02ab", extended_id=True),
+    ]
+    assert wire.ground.exchange(other) == (b"", [])
+    assert wire.ground.frames_foreign == 2
+
+
+@BOTH
+@given(st.data())
+@settings(max_examples=60, deadline=None)
+def test_hostile_frames_neither_raise_nor_take_memory_nor_yield_more_than_they_carry(url, data):
+    ground = IsoTpChannels(GROUND_IDS, FLIGHT_IDS, url)
+    carried = yielded = 0
+    for _ in range(data.draw(st.integers(1, 60))):
+        size = data.draw(st.sampled_from(FD_SIZES if url.fd else FD_SIZES[:9]))
+        content = data.draw(st.binary(min_size=size, max_size=size))
+        if content and data.draw(st.booleans()):  # else random bytes rarely make a sequence
+            content = (
+                bytes([data.draw(st.sampled_from([0x03, 0x10, 0x20, 0x21, 0x22, 0x30, 0x32]))]) + content[1:]
+            )
+        frame = isotp.CanMessage(data.draw(st.sampled_from(FLIGHT_IDS[:2])), FD_SIZES.index(size), content)
+        packets, answers = ground.exchange([frame])
+        carried, yielded = carried + size, yielded + len(packets) - packets.count(b"\0")
+        assert len(answers) <= 1
+    assert yielded <= carried
+    buffers = [len(channel.rx_buffer) for channel in ground._channels.values()]
+    assert max(buffers) <= MAX_MESSAGE_BYTES

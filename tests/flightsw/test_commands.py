@@ -1,0 +1,305 @@
+"""Commands on board: nothing without the key, nothing twice, nothing out of range, nothing that was not armed."""
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from flightsw.commands import ANSWER_S, Commander, ReplayCounter
+from flightsw.icd.auth import Key, seal, seal_file
+from flightsw.icd.command import Command
+from flightsw.icd.mission import ConfigError
+from flightsw.icd.telemetry import DICTIONARY
+from flightsw.settings import Settings, load_settings, save_settings
+from flightsw.store import FrameStore
+from ground.uplink import make_key
+
+ANYTHING = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=80)
+
+
+class Spacecraft:
+    """A commander with its key, store and clock; `send` seals as the ground does."""
+
+    def __init__(self, folder: Path, mission, make_frame, frames: int = 0):
+        folder.mkdir(exist_ok=True)
+        self.key_file, self.mission = folder / "mission.key", mission
+        self.key = make_key(self.key_file)
+        self.store = FrameStore(folder / "store")
+        for _ in range(frames):
+            self.store.put(make_frame(self.store.next_frame_id))
+        self.now_s = 100.0
+        self.counter = 0
+        self.refusals: list[str] = []
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget everything that is not on the disk."""
+        if self.counter:
+            self.replay.close()
+        self.replay = ReplayCounter(self.key_file)
+        self.commander = Commander(
+            self.replay, self.store, self.mission, self.refusals.append, lambda: self.now_s, lambda: 5
+        )
+
+    def seal(self, name: str, **arguments) -> bytes:
+        self.counter += 1
+        return seal(self.key, self.counter, Command(name, arguments).pack())
+
+    def send(self, name: str, **arguments) -> list[tuple[str, str]]:
+        """Return stage and text of what is reported."""
+        self.commander.receive(self.seal(name, **arguments))
+        return self.reports()
+
+    def reports(self) -> list[tuple[str, str]]:
+        reports, self.commander.reports[:] = list(self.commander.reports), []
+        return [(report.stage, report.text) for report in reports]
+
+    def state(self) -> tuple:
+        """Return all that a command can change."""
+        files = {path: path.read_bytes() for path in self.store.folder.rglob("*") if path.is_file()}
+        return self.commander.settings, self.commander.upload, self.replay.last, files
+
+
+@pytest.fixture
+def spacecraft(tmp_path, small_mission, make_frame):
+    made = Spacecraft(tmp_path / "flight", small_mission, make_frame, frames=3)
+    yield made
+    made.replay.close()
+
+
+def test_a_command_is_accepted_started_and_completed(spacecraft):
+    assert spacecraft.send("ping") == [("accepted", "ping"), ("started", "ping"), ("completed", "alive")]
+    assert spacecraft.commander.accepted == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "expected"),
+    [
+        ("bracket", {"exposure_times_ms": (0.02, 0.04)}, {"exposure_times_ms": (0.02, 0.04)}),
+        ("near", {"near": 2}, {"near": 2}),
+        ("priority", {"order": "triage"}, {"priority": "triage"}),
+        ("safe", {}, {"safe_mode": True}),
+    ],
+)
+def test_what_is_commanded_survives_a_restart(spacecraft, name, arguments, expected):
+    before = spacecraft.commander.settings
+    assert spacecraft.send(name, **arguments)[-1][0] == "completed"
+    spacecraft.restart()
+    assert spacecraft.commander.settings == replace(before, **expected)
+    assert load_settings(spacecraft.store.folder, spacecraft.mission) == replace(before, **expected)
+
+
+def test_a_replay_has_no_effect_is_counted_and_answered_with_the_same_reports(spacecraft):
+    packet = spacecraft.seal("near", near=2)
+    spacecraft.commander.receive(packet)
+    first = spacecraft.reports()
+    spacecraft.send("near", near=4)
+    before = spacecraft.state()
+    spacecraft.commander.receive(packet)
+    assert spacecraft.reports() == first
+    assert spacecraft.state() == before
+    assert spacecraft.commander.repeated == 1
+
+
+def test_a_flood_of_replays_is_counted_but_answered_at_a_walking_pace(spacecraft):
+    packet = spacecraft.seal("ping")
+    spacecraft.commander.receive(packet)
+    answers_once = len(spacecraft.reports())
+    for _ in range(1000):
+        spacecraft.commander.receive(packet)
+    assert spacecraft.commander.repeated == 1000
+    assert len(spacecraft.reports()) == answers_once
+    spacecraft.now_s += ANSWER_S
+    spacecraft.commander.receive(packet)
+    assert len(spacecraft.reports()) == answers_once
+
+
+def test_the_counter_survives_a_restart_and_old_packets_stay_refused(spacecraft):
+    packets = [spacecraft.seal("near", near=number) for number in (1, 2)]
+    for packet in packets:
+        spacecraft.commander.receive(packet)
+    spacecraft.restart()
+    before = spacecraft.state()
+    for packet in packets:
+        spacecraft.now_s += ANSWER_S
+        spacecraft.commander.receive(packet)
+    assert {stage for stage, _ in spacecraft.reports()} == {"refused"}
+    assert spacecraft.state() == before
+    assert spacecraft.commander.repeated == 2
+    assert spacecraft.send("ping")[-1] == ("completed", "alive")
+
+
+def test_a_command_has_no_effect_when_its_counter_cannot_be_kept(spacecraft):
+    block = spacecraft.replay.path.with_name(spacecraft.replay.path.name + ".part")
+    block.mkdir()  # as root nothing less makes the disk refuse
+    packet = spacecraft.seal("near", near=2)
+    spacecraft.commander.receive(packet)
+    assert [stage for stage, _ in spacecraft.reports()] == ["refused"]
+    assert spacecraft.commander.settings.near == 0
+    block.rmdir()
+    spacecraft.commander.receive(packet)  # it was told as refused: it stays so
+    assert [stage for stage, _ in spacecraft.reports()] == ["refused"]
+    assert spacecraft.commander.settings.near == 0
+
+
+@pytest.mark.parametrize("forged", ["no key on board", "wrong key", "cut", "flipped", "noise"])
+def test_what_is_not_authentic_is_refused_counted_and_has_no_effect(spacecraft, forged):
+    packet = bytearray(spacecraft.seal("near", near=2))
+    if forged == "wrong key":
+        packet = bytearray(seal(Key(1, bytes(32)), 1, Command("near", {"near": 2}).pack()))
+    elif forged == "cut":
+        del packet[-1]
+    elif forged == "flipped":
+        packet[-1] ^= 1
+    elif forged == "noise":
+        packet = bytearray(range(60))
+    elif forged == "no key on board":
+        mission, store = spacecraft.mission, spacecraft.store
+        spacecraft.commander = Commander(None, store, mission, spacecraft.refusals.append)
+    before = spacecraft.state()
+    spacecraft.commander.receive(bytes(packet))
+    assert spacecraft.reports() == []  # nobody who can prove anything is there to be told
+    assert spacecraft.state() == before
+    assert spacecraft.commander.refused == len(spacecraft.refusals) == 1
+
+
+@ANYTHING
+@given(data=st.binary(max_size=120))
+def test_an_authentic_packet_with_any_content_is_executed_in_range_or_refused(spacecraft, data):
+    version = bytes([DICTIONARY.version])
+    for content in (data, version + data):
+        spacecraft.counter += 1
+        spacecraft.commander.receive(seal(spacecraft.key, spacecraft.counter, content))
+        stages = [stage for stage, _ in spacecraft.reports()]
+        assert stages in (["refused"], ["accepted", "started", "completed"], ["accepted", "started"])
+    assert 0 <= spacecraft.commander.settings.near <= 16
+    assert len(spacecraft.store.frames) == 3  # nothing destructive without arming
+
+
+@pytest.mark.parametrize(
+    "content", [b"\1\3\x11", b"\1\3\xff", b"\1\3", b"\1\3\1\1", b"\2\3\1", b"\1\xc8", b""]
+)
+def test_an_authentic_command_out_of_range_is_refused_and_has_no_effect(spacecraft, content):
+    before = spacecraft.commander.settings
+    spacecraft.counter += 1
+    spacecraft.commander.receive(seal(spacecraft.key, spacecraft.counter, content))
+    assert [stage for stage, _ in spacecraft.reports()] == ["refused"]
+    assert (spacecraft.commander.settings, spacecraft.commander.refused) == (before, 1)
+
+
+def test_exposures_longer_than_the_missions_spacing_are_refused(spacecraft):
+    ((stage, text),) = spacecraft.send("bracket", exposure_times_ms=(0.1, 600.0))
+    assert stage == "refused" and "frame_spacing_s" in text
+    assert spacecraft.commander.settings.exposure_times_ms is None
+
+
+def test_delete_wants_arming_and_removes_just_the_named_frames(spacecraft):
+    ((stage, text),) = spacecraft.send("delete", first_frame=0, last_frame=1)
+    assert stage == "refused" and "arm delete" in text
+    assert len(spacecraft.store.frames) == 3
+    spacecraft.send("arm", command="delete")
+    assert spacecraft.send("delete", first_frame=0, last_frame=1)[-1] == ("completed", "2 frames deleted")
+    assert [frame.frame_id for frame in spacecraft.store.frames] == spacecraft.store.outbox() == [2]
+    assert (
+        spacecraft.send("delete", first_frame=2, last_frame=2)[0][0] == "refused"
+    )  # armed once, not for ever
+
+
+@pytest.mark.parametrize("spoiled_by", ["time", "another command", "arming another", "a restart"])
+def test_arming_ends(spacecraft, spoiled_by):
+    spacecraft.send("arm", command="resume" if spoiled_by == "arming another" else "delete")
+    if spoiled_by == "time":
+        spacecraft.now_s += DICTIONARY.arm_s + 0.1
+    elif spoiled_by == "another command":
+        spacecraft.send("ping")
+    elif spoiled_by == "a restart":
+        spacecraft.restart()
+    assert spacecraft.send("delete", first_frame=0, last_frame=2)[0][0] == "refused"
+    assert len(spacecraft.store.frames) == 3
+
+
+def test_safe_mode_is_entered_at_once_and_left_only_when_armed(spacecraft):
+    assert spacecraft.send("safe")[-1][0] == "completed"
+    assert spacecraft.send("resume")[0][0] == "refused"
+    assert spacecraft.commander.settings.safe_mode
+    spacecraft.send("arm", command="resume")
+    assert spacecraft.send("resume")[-1] == ("completed", "exposures go on")
+    assert not spacecraft.commander.settings.safe_mode
+
+
+def announce(spacecraft: Spacecraft, content: bytes, file_key: bytes = bytes(range(32))) -> str:
+    """Announce a model and return the name under which it must come."""
+    sha256 = hashlib.sha256(content).digest()
+    reports = spacecraft.send("model", size_bytes=len(content), sha256=sha256, file_key=file_key)
+    assert [stage for stage, _ in reports] == ["accepted", "started"]  # completed only when it is verified
+    assert spacecraft.commander.upload is not None
+    return spacecraft.commander.upload.file_name
+
+
+def test_the_announced_file_is_taken_once_under_a_name_of_ours(spacecraft):
+    name = announce(spacecraft, b"a model")
+    sealed = seal_file(bytes(range(32)), b"a model")
+    path = spacecraft.commander.receive_model(name, sealed)
+    assert path == spacecraft.store.folder / "model.onnx.received" and path.read_bytes() == b"a model"
+    assert spacecraft.commander.receive_model(name, sealed) is None
+    spacecraft.commander.end_model(spacecraft.counter, None, "in use")
+    assert spacecraft.reports() == [("completed", "in use")]
+
+
+@pytest.mark.parametrize("name", ["../model-1", "/etc/passwd", "model-2", "model.onnx", "", "model-1\0"])
+def test_a_file_under_any_other_name_is_left_alone(spacecraft, name):
+    announce(spacecraft, b"a model")
+    before = set(spacecraft.store.folder.parent.rglob("*"))
+    assert spacecraft.commander.receive_model(name, seal_file(bytes(range(32)), b"a model")) is None
+    assert spacecraft.commander.upload is not None  # the right one may still come
+    assert set(spacecraft.store.folder.parent.rglob("*")) == before
+
+
+@pytest.mark.parametrize("content", [b"another", b"a mode", b"a model and more"])
+def test_a_file_that_is_not_the_announced_one_is_reported_and_not_kept(spacecraft, content):
+    name = announce(spacecraft, b"a model")
+    assert spacecraft.commander.receive_model(name, seal_file(bytes(range(32)), content)) is None
+    assert [stage for stage, _ in spacecraft.reports()] == ["failed"]
+    assert not list(spacecraft.store.folder.glob("model*"))
+    name = announce(spacecraft, b"a model")
+    assert spacecraft.commander.receive_model(name, seal_file(bytes(32), b"a model")) is None
+    assert [stage for stage, _ in spacecraft.reports()] == ["failed"]
+
+
+@pytest.mark.parametrize("damage", ["no key", "no counter", "another key's counter", "damaged counter"])
+def test_without_a_trustworthy_counter_no_command_is_taken_at_all(tmp_path, damage):
+    key_file = tmp_path / "mission.key"
+    make_key(key_file)
+    received = tmp_path / "mission.key.received"
+    if damage == "no key":
+        key_file.unlink()
+    elif damage == "no counter":
+        received.unlink()
+    else:
+        received.write_text(Key(1, bytes(32)).counter_text(3) if damage.startswith("another") else "3\n")
+    with pytest.raises(ConfigError, match=r"mission\.key"):
+        ReplayCounter(key_file)
+
+
+def test_two_processes_cannot_share_a_counter(spacecraft):
+    with pytest.raises(ConfigError, match="another process takes commands"):
+        ReplayCounter(spacecraft.key_file)
+
+
+def test_damaged_settings_fall_back_to_the_mission(tmp_path, small_mission):
+    default = Settings(small_mission.link.priority)
+    assert load_settings(tmp_path, small_mission) == default
+    save_settings(tmp_path, replace(default, near=3))
+    assert load_settings(tmp_path, small_mission).near == 3
+    for text in (
+        "",
+        "{",
+        "[]",
+        '{"priority": "newest"}',
+        '{"priority": "oldest", "exposure_times_ms": [9e9]}',
+    ):
+        (tmp_path / "settings.json").write_text(text)
+        assert load_settings(tmp_path, small_mission) == default

@@ -1,0 +1,216 @@
+"""What the flight side puts on the wire, in which order, without a port: a link of lists and a clock of ours."""
+
+import logging
+from pathlib import Path
+
+import pytest
+from spacepackets.cfdp.pdu import FileDataPdu, MetadataPdu
+
+from flightsw.commands import ReplayCounter
+from flightsw.downlink import GOODBYE_S, WAIT_S, run_downlink
+from flightsw.housekeeping import MAX_EVENTS, EventLog, ProcessMeter
+from flightsw.icd.frame import HEADER, read_header
+from flightsw.icd.framing import PacketStream
+from flightsw.icd.packet import (
+    APID_COMMANDS,
+    APID_EVENTS,
+    APID_FILES,
+    APID_FRAME_HEADERS,
+    APID_HOUSEKEEPING,
+    APID_UPLINK_FILES,
+    TELECOMMAND,
+)
+from flightsw.icd.telemetry import DICTIONARY
+from flightsw.icd.transfer import UPLINK, Sender, parse_pdu
+from flightsw.settings import Settings, save_settings
+from flightsw.store import FrameStore
+from ground.uplink import make_key
+
+
+class ListLink:
+    """Keeps what is written, gives what is laid into `incoming`; each exchange takes its time on our clock."""
+
+    baud_rate = 3_000_000
+    bytes_read = bytes_written = hang_ups = 0
+    connected = ready = True
+    losses: dict[str, int] = {}  # noqa: RUF012
+
+    def __init__(self):
+        self.written: list[bytes] = []
+        self.incoming: list[bytes] = []
+        self.now_s = 0.0
+
+    def write(self, data: bytes) -> None:
+        self.written.append(data)
+
+    def exchange(self, timeout_s: float) -> bytes:
+        self.now_s += timeout_s + 0.001
+        return self.incoming.pop(0) if self.incoming else b""
+
+    def packets(self) -> list[tuple[int, bytes]]:
+        return PacketStream(TELECOMMAND, 1100).decode(b"".join(self.written))
+
+    def files(self) -> list[str]:
+        """Return the names of the files in the order in which they began."""
+        pdus = [parse_pdu(data) for apid, data in self.packets() if apid == APID_FILES]
+        return [pdu.dest_file_name for pdu in pdus if isinstance(pdu, MetadataPdu)]
+
+    def unpacked(self, apid: int, section: str) -> list[tuple[str, dict]]:
+        unpacked = [DICTIONARY.unpack(section, data) for number, data in self.packets() if number == apid]
+        return [(layout.name, values) for layout, values in unpacked]
+
+    def close(self) -> None:
+        pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def fly(link: ListLink, store: FrameStore, mission, until_s: float, **arguments):
+    return run_downlink(
+        store,
+        link,
+        mission,
+        should_stop=lambda: link.now_s > until_s,
+        clock_s=lambda: link.now_s,
+        **arguments,
+    )
+
+
+@pytest.fixture
+def store(tmp_path, make_frame) -> FrameStore:
+    made = FrameStore(tmp_path / "store")
+    for number in range(3):
+        made.put(make_frame(number, size_px=200))
+    return made
+
+
+def test_headers_go_at_once_then_thumbnails_then_pictures(store, small_mission):
+    link = ListLink()
+    fly(link, store, small_mission, 0.5)
+    assert link.files()[:6] == [f"{n:08d}.{kind}" for kind in ("obt", "obf") for n in range(3)]
+    order = [apid for apid, _ in link.packets()]
+    assert order[0] == APID_EVENTS  # that the software has started
+    assert max(i for i, apid in enumerate(order) if apid == APID_FRAME_HEADERS) < order.index(APID_FILES)
+    headers = [data for apid, data in link.packets() if apid == APID_FRAME_HEADERS]
+    assert headers == [store.read(number)[: HEADER.size] for number in range(3)]
+    assert [read_header(data)["frame_id"] for data in headers] == [0, 1, 2]
+
+
+def test_in_the_order_oldest_there_are_no_thumbnails(store, small_mission):
+    save_settings(store.folder, Settings("oldest"))
+    link = ListLink()
+    fly(link, store, small_mission, 0.5)
+    assert link.files()[:3] == ["00000000.obf", "00000001.obf", "00000002.obf"]
+    assert not any(name.endswith(".obt") for name in link.files())
+
+
+def test_little_is_put_ahead_of_the_wire_so_that_the_order_can_still_change(
+    tmp_path, small_mission, make_frame
+):
+    store = FrameStore(tmp_path / "store")
+    for number in range(8):
+        store.put(make_frame(number))
+    save_settings(store.folder, Settings("oldest"))
+    link = ListLink()
+    link.ready = False  # the wire takes nothing
+    progress = fly(link, store, small_mission, 1.0)
+    assert (progress.waiting, progress.in_flight) == (8, 2)
+
+
+def test_housekeeping_comes_in_its_interval_and_says_what_is_so(store, small_mission):
+    link = ListLink()
+    fly(link, store, small_mission, 5.5, capture_values=lambda: {"camera": "capturing", "frames_failed": 4})
+    packets = link.unpacked(APID_HOUSEKEEPING, "telemetry")
+    assert len(packets) == 7  # at 0, 1, 2, 3, 4, 5 s and at the end
+    name, values = packets[-1]
+    assert name == "housekeeping"
+    assert (values["frames_stored"], values["outbox_frames"], values["delivered"]) == (3, 3, 0)
+    assert (values["camera"], values["frames_failed"], values["mode"]) == ("capturing", 4, "normal")
+    assert values["exposure_times_ms"] == small_mission.bracket.exposure_times_ms
+    assert values["store_bytes"] == sum(frame.size_bytes for frame in store.frames)
+    assert values["priority"] == "thumbnail-first" and values["model"] == bytes(4)
+    assert values["uptime_s"] == 5
+
+
+def test_warnings_of_any_part_become_events_and_the_end_is_told(store, small_mission):
+    link = ListLink()
+
+    def warn(_progress) -> None:
+        if link.now_s < 0.001:
+            logging.getLogger("flightsw.sequencer").warning("bracket %d lost\x1b[2J", 7)
+
+    fly(link, store, small_mission, 0.5, on_progress=warn)
+    events = link.unpacked(APID_EVENTS, "events")
+    assert [name for name, _ in events] == ["started", "warning", "stopped"]
+    assert events[1][1]["problem"] == "bracket 7 lost?[2J"
+    assert logging.getLogger("flightsw").handlers == []
+
+
+def test_a_port_that_takes_nothing_does_not_keep_the_software_from_ending(store, small_mission):
+    link = ListLink()
+    link.ready = False
+    fly(link, store, small_mission, 1.0)
+    assert link.written == []
+    assert link.now_s < 1.0 + GOODBYE_S + 3 * WAIT_S
+
+
+def test_a_flood_of_forged_commands_is_counted_and_does_not_fill_the_downlink(store, small_mission, tmp_path):
+    make_key(tmp_path / "k")
+    counter = ReplayCounter(tmp_path / "k")
+    link, ground = ListLink(), PacketStream(TELECOMMAND, 1100)
+    link.incoming = [b"".join(ground.encode(APID_COMMANDS, bytes(50)) for _ in range(5)) for _ in range(100)]
+    progress = fly(link, store, small_mission, 3.5, counter=counter)
+    counter.close()
+    assert progress.commands_refused == 500
+    refusals = [name for name, _ in link.unpacked(APID_EVENTS, "events") if name == "command_refused"]
+    assert 1 <= len(refusals) <= 4
+    assert link.unpacked(APID_HOUSEKEEPING, "telemetry")[-1][1]["commands_refused"] == 500
+
+
+def test_a_file_that_no_command_announced_is_not_even_kept_in_memory(store, small_mission):
+    link, ground = ListLink(), PacketStream(TELECOMMAND, 1100)
+    sender = Sender(ground.max_data_bytes, 1.0, route=UPLINK)
+    sender.put("model-1", bytes(5000), 1, 0.0)
+    while (pdu := sender.next_pdu(0.0)) is not None:
+        link.incoming.append(ground.encode(APID_UPLINK_FILES, pdu))
+    assert len(link.incoming) > 5
+    fly(link, store, small_mission, 1.0)
+    assert not [apid for apid, _ in link.packets() if apid == APID_UPLINK_FILES]  # not a word of answer
+    assert {path.name for path in store.folder.iterdir()} >= {"frames", "outbox"}
+    assert not list(store.folder.glob("*model*"))
+
+
+def test_a_frame_that_cannot_be_read_is_counted_once_and_the_others_go_on(store, small_mission):
+    save_settings(store.folder, Settings("oldest"))
+    store.path(0).write_bytes(b"damaged")
+    link = ListLink()
+    progress = fly(link, store, small_mission, 2.0)
+    assert progress.frames_unreadable == 1
+    assert link.files()[:2] == ["00000001.obf", "00000002.obf"]
+    data = [parse_pdu(d) for apid, d in link.packets() if apid == APID_FILES]
+    assert any(isinstance(pdu, FileDataPdu) for pdu in data)
+
+
+def test_waiting_events_are_bounded_and_the_lost_ones_told():
+    events = EventLog(lambda: 0)
+    for number in range(MAX_EVENTS + 5):
+        events.add("warning", problem=str(number))
+    texts = []
+    while (packet := events.take()) is not None:
+        texts.append(DICTIONARY.unpack("events", packet)[1]["problem"])
+    assert texts[0] == "5" and len(texts) == MAX_EVENTS + 1
+    assert texts[-1] == f"5 events were lost: more than {MAX_EVENTS} waited"
+
+
+def test_the_process_meter_agrees_with_the_kernel():
+    meter = ProcessMeter()
+    sum(range(300_000))
+    values = meter.values()
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    kilobytes = int(status["VmRSS"].split()[0])
+    assert values["rss_bytes"] == pytest.approx(kilobytes * 1024, rel=0.02)
+    assert values["uptime_s"] == 0 and values["cpu_percent"] > 0
