@@ -3,6 +3,7 @@
 import base64
 import html
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 import imagecodecs
@@ -12,21 +13,19 @@ import plotly.io
 import torch
 import yaml
 from plotly.offline import get_plotlyjs
-from plotly.subplots import make_subplots
 
 from ground.evaluate import Run, Truth, bounding_box, clean_image, open_run
+from ground.plots import INK, histogram_figure, model_figure, training_figure
 from ground.reconstruct import predicted_image
-from ground.session import FrameRecord, write_whole
-from obbgs_core import sh
+from ground.session import FrameRecord, SessionError, write_whole
+from obbgs_core.metrics import COMPLETENESS_RADIUS, psnr_db
 from obbgs_core.sensor import Sensor
 
 COLUMNS = 6  # brackets shown for each exposure
-TRIPLE_VIEWS = 3
+HELD_OUT_VIEWS = 3
 MARGIN_PX = 10
-POINTS_SHOWN = 15_000
+ABOVE_BLACK = 0.01  # of full scale: brighter pixels are the target, as far as cropping goes
 ERROR_FULL_SCALE = 0.1  # of full scale: shown as white
-INK, ACCENT, WARM = "#1c2733", "#1f6feb", "#d1652a"
-EXPOSURE_COLOURS = ("#1f6feb", "#2a9d8f", "#d1652a", "#8e44ad", "#c0392b")
 
 STYLE = """
 :root { --ink: #1c2733; --soft: #5b6b7b; --line: #dde3ea; --card: #ffffff; }
@@ -48,8 +47,12 @@ td.n { text-align: right; font-variant-numeric: tabular-nums; }
 .grid img { width: 100%; display: block; background: #000; border-radius: 3px; image-rendering: pixelated; }
 .grid .label { color: var(--soft); font-size: 13px; align-self: center; }
 .grid figure { margin: 0; } .grid figcaption { color: var(--soft); font-size: 12px; text-align: center; }
-.two { display: grid; grid-template-columns: 1fr 1fr; gap: 24px; }
-pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px; overflow-x: auto; margin: 0; }
+h3 { font-size: 15px; margin: 18px 0 8px; }
+.two { display: grid; grid-template-columns: 1fr 1fr; gap: 8px 32px; align-items: start; }
+.ramp { display: inline-block; width: 90px; height: 10px; border-radius: 3px; margin: 0 6px; border: 1px solid var(--line);
+  background: linear-gradient(90deg, #000, #f00, #ff0, #fff); }
+ul.notes { background: #fff7e6; border: 1px solid #f0d9a8; border-radius: 8px; margin: 0 0 14px; padding: 10px 14px 10px 30px; }
+pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px; overflow-x: auto; margin: 0 0 12px; }
 """
 
 
@@ -61,13 +64,12 @@ def write_report(session_dir: Path, name: str) -> Path:
     """
     run = open_run(session_dir, name)
     truth = Truth(run.session) if Truth.exists(run.session) else None
-    history = [json.loads(line) for line in (run.folder / "metrics.jsonl").read_text().splitlines()]
     sections = [
         _headline(run, truth),
         _frames(run),
-        _triples(run, truth),
+        _held_out(run, truth),
         _model(run),
-        _training(history),
+        _training(run),
         _histogram(run),
         _link(run),
         _configuration(run),
@@ -79,8 +81,8 @@ def write_report(session_dir: Path, name: str) -> Path:
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style>'
         f"<script>{get_plotlyjs()}</script></head><body><main><h1>{title}</h1>"
-        f'<p class="note">{run.metrics["method"]} on {run.metrics["frames_received"]} frames received, session of '
-        f"{html.escape(run.session.created_utc)}</p>{''.join(sections)}</main></body></html>"
+        f'<p class="note">Method {html.escape(str(run.metrics["method"]))}, {run.metrics["frames_received"]} frames '
+        f"received, session of {html.escape(run.session.created_utc)}.</p>{''.join(sections)}</main></body></html>"
     )
     path = run.folder / "report.html"
     write_whole(path, page.encode())
@@ -96,246 +98,172 @@ def _headline(run: Run, truth: Truth | None) -> str:
     cards: list[tuple[str, str]] = []
     if "psnr_clean_db" in m:
         cards.append((f"{m['psnr_clean_db']:.2f} dB", "clean held-out PSNR, exposure known"))
-    if "psnr_clean_blind_db" in m:
-        gain = m["psnr_clean_db"] - m["psnr_clean_blind_db"]
-        cards.append(
-            (
-                f"{m['psnr_clean_blind_db']:.2f} dB",
-                f"the same training blind to exposure ({gain:+.2f} dB gained)",
-            )
-        )
     elif "psnr_noisy_db" in m:
         cards.append((f"{m['psnr_noisy_db']:.2f} dB", "held-out PSNR against the noisy frames"))
+    if "psnr_clean_blind_db" in m:
+        gain_db = m["psnr_clean_db"] - m["psnr_clean_blind_db"]
+        label = f"the same training blind to exposure (knowing it is worth {gain_db:+.2f} dB)"
+        cards.append((f"{m['psnr_clean_blind_db']:.2f} dB", label))
     if "chamfer" in m:
         cards.append((f"{m['chamfer']:.4f}", "Chamfer distance of the centres (largest dimension = 2)"))
-        cards.append((f"{m['completeness_surface']:.1f} %", "of the true surface within 0.01 of the model's"))
+    if "completeness_surface" in m:
+        label = f"of the true surface lies within {COMPLETENESS_RADIUS} of the model's"
+        cards.append((f"{m['completeness_surface']:.1f} %", label))
     cards.append((f"{m['gaussians']:,}", "Gaussians"))
     cards.append((f"{m['train_seconds']:.0f} s", f"training; {html.escape(m['stop_reason'])}"))
     cards.append((f"{m['frames_received']} / {m['frames_captured']}", "frames received / captured"))
-    cards.append(
-        (f"{m['onnx_parity_db']:.0f} dB", f"ONNX renderer against ours, {m['onnx_bytes'] / 1e6:.2f} MB")
-    )
+    size = f"{m['onnx_bytes'] / 1e6:.2f} MB"
+    cards.append((f"{m['onnx_parity_db']:.0f} dB", f"ONNX renderer against ours, worst of its views; {size}"))
     body = "".join(f'<div class="card"><b>{value}</b><span>{label}</span></div>' for value, label in cards)
     note = (
-        "Clean: against noiseless exposures of views that were never trained on, full scale = 1."
+        "Clean: against noiseless exposures of views that were never trained on, full scale = 1. Distances: in units "
+        "where the target's largest dimension is 2."
         if truth
         else "No truth beside this session: figures are against the received frames themselves."
     )
-    table = _details(m)
-    return _section("Result", note, f'<div class="cards">{body}</div>{table}')
+    notes = "".join(f"<li>{html.escape(line)}</li>" for line in m.get("notes", []))
+    callout = f'<ul class="notes">{notes}</ul>' if notes else ""
+    return _section("Result", note, f'{callout}<div class="cards">{body}</div>{_details(m)}')
 
 
 def _details(m: dict) -> str:
     names = {
+        "psnr_clean_db": "clean PSNR, dB",
+        **{key: f"… at {_exposure_ms(key)} ms, dB" for key in m if _exposure_ms(key)},
+        "psnr_clean_foreground_db": "… inside the target's bounding box, dB",
+        "psnr_clean_blind_db": "… of the training blind to exposure, dB",
         "psnr_noisy_db": "PSNR against the noisy held-out frames, dB",
-        "psnr_clean_foreground_db": "clean PSNR inside the target's bounding box, dB",
         "psnr_radiance_db": "PSNR of scene-linear radiance (brightest = 1), dB",
         "ssim_clean": "SSIM, clean",
+        "chamfer": "Chamfer distance of the centres",
         "chamfer_surface": "Chamfer distance of 100,000 surface points",
         "hausdorff": "Hausdorff distance of the centres",
         "accuracy": "mean distance of the centres to the true surface",
-        "completeness": "true points within 0.01 of a centre, %",
+        "completeness": f"true points within {COMPLETENESS_RADIUS} of a centre, %",
+        "completeness_surface": f"true points within {COMPLETENESS_RADIUS} of a surface point, %",
         "chi2": "residual chi² where the model is (1 is noise)",
     }
-    rows = [(label, m[key]) for key, label in names.items() if key in m]
-    rows += [
-        (f"clean PSNR at {key.removeprefix('psnr_clean_').removesuffix('ms_db')} ms, dB", value)
-        for key, value in m.items()
-        if key.startswith("psnr_clean_") and key.endswith("ms_db")
-    ]
+    rows = [(label, f"{m[key]:.4g}") for key, label in names.items() if m.get(key) is not None]
+    return f'<div style="margin-top:16px">{_two_tables(rows)}</div>'
+
+
+def _exposure_ms(key: str) -> str:
+    """Return the exposure of a key such as psnr_clean_0.05ms_db; empty for other keys."""
+    if not (key.startswith("psnr_clean_") and key.endswith("ms_db")):
+        return ""
+    return key.removeprefix("psnr_clean_").removesuffix("ms_db")
+
+
+def _two_tables(rows: list[tuple[str, str]]) -> str:
+    """Return rows of label and value as two tables side by side, read down the left one first."""
+    half = (len(rows) + 1) // 2
+    return f'<div class="two">{_table(rows[:half])}{_table(rows[half:])}</div>'
+
+
+def _table(rows: Iterable[tuple[str, str]]) -> str:
     cells = "".join(
-        f'<tr><td>{html.escape(label)}</td><td class="n">{value:.4g}</td></tr>' for label, value in rows
+        f'<tr><td>{html.escape(label)}</td><td class="n">{value}</td></tr>' for label, value in rows
     )
-    return f'<table style="margin-top:16px">{cells}</table>'
+    return f"<table>{cells}</table>"
 
 
 def _frames(run: Run) -> str:
     exposures = sorted({r.exposure_time_s for r in run.session.frames})
-    brackets = sorted({r.bracket for r in run.session.frames})
-    picked = [brackets[i] for i in np.unique(np.linspace(0, len(brackets) - 1, COLUMNS).round().astype(int))]
+    by_key = {(r.bracket, r.exposure_time_s): r for r in run.session.frames}
+    picked = _spread(sorted({r.bracket for r in run.session.frames}), COLUMNS)
     cells = []
     for exposure_s in exposures:
         cells.append(f'<div class="label">{exposure_s * 1e3:g} ms</div>')
         for bracket in picked:
-            record = next(
-                (r for r in run.session.frames if r.bracket == bracket and r.exposure_time_s == exposure_s),
-                None,
-            )
+            record = by_key.get((bracket, exposure_s))
             if record is None:
                 cells.append('<div class="label">missing</div>')
                 continue
-            image = _noisy_image(run, record)
-            range_m = float(np.linalg.norm(record.position_body_m))
-            cells.append(
-                f'<figure><img alt="frame {record.id}" src="{_png(tone(image, run.sensor))}">'
-                f"<figcaption>frame {record.id}, {range_m:.0f} m, {record.saturated} saturated</figcaption></figure>"
-            )
-    grid = f'<div class="grid" style="grid-template-columns: 60px repeat({len(picked)}, 1fr)">{"".join(cells)}</div>'
+            caption = f"frame {record.id}, {_range_m(record):.0f} m"
+            if record.saturated:
+                caption += f"<br>{record.saturated:,} px saturated"
+            cells.append(_picture(tone(_noisy_image(run, record), run.sensor), f"frame {record.id}", caption))
     return _section(
         "Frames by exposure",
-        "As received, one column a bracket, one row an exposure time. Shown as the square root of the signal.",
-        grid,
+        "As received: one column a bracket, one row an exposure time; below each its number and range. "
+        "Brightness is the square root of the signal above black, full scale white.",
+        _grid(f"60px repeat({len(picked)}, 1fr)", cells),
     )
 
 
-def _triples(run: Run, truth: Truth | None) -> str:
-    exposures = sorted({r.exposure_time_s for r in run.held_out})
-    brackets = sorted({r.bracket for r in run.held_out})
-    views = [
-        brackets[i] for i in np.unique(np.linspace(0, len(brackets) - 1, TRIPLE_VIEWS).round().astype(int))
-    ]
-    names = ["truth" if truth else "frame", "render", "error"]
-    cells = ['<div class="label"></div>', *(f'<div class="label">{n}</div>' for _ in views for n in names)]
-    for exposure_s in exposures:
-        cells.append(f'<div class="label">{exposure_s * 1e3:g} ms</div>')
-        for bracket in views:
-            record = next(
-                (r for r in run.held_out if (r.bracket, r.exposure_time_s) == (bracket, exposure_s)), None
-            )
-            if record is None:
-                cells += ['<div class="label">missing</div>'] * 3
-                continue
-            seen_at_s = run.metrics.get("reference_exposure_s") or exposure_s
-            render = predicted_image(run.gaussians, run.session, record, run.sensor, seen_at_s)
-            expected = (
-                clean_image(run, truth, record) if truth else torch.from_numpy(_noisy_image(run, record))
-            )
-            black = run.sensor.black_dn / run.sensor.white_dn
-            box = bounding_box(expected.mean(-1) > black + 0.01, MARGIN_PX)
-            error = ((render - expected).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
-            for image in (
-                tone(expected[box].numpy(), run.sensor),
-                tone(render[box].numpy(), run.sensor),
-                heat(error[box].numpy()),
-            ):
-                cells.append(f'<figure><img alt="frame {record.id}" src="{_png(image)}"></figure>')
-    columns = f"60px repeat({3 * len(views)}, 1fr)"
-    grid = f'<div class="grid" style="grid-template-columns: {columns}; align-items: center">{"".join(cells)}</div>'
-    return _section(
-        "Held-out views: truth, render, error",
-        f"{len(views)} brackets that were never trained on, cropped to the target. Square-root scale; the error is the "
-        f"absolute difference, white at {ERROR_FULL_SCALE:.0%} of full scale.",
-        grid,
+def _held_out(run: Run, truth: Truth | None) -> str:
+    m = run.metrics
+    by_key = {(r.bracket, r.exposure_time_s): r for r in run.held_out}
+    reference = "truth" if truth else "frame"
+    names = [reference, "render", "error"] + (["blind render", "blind error"] if run.blind else [])
+    views = _spread(sorted({r.bracket for r in run.held_out}), HELD_OUT_VIEWS)
+    body = []
+    for bracket in views:
+        of_view = [by_key[key] for key in sorted(by_key) if key[0] == bracket]
+        expected = [
+            clean_image(run, truth, r) if truth else torch.from_numpy(_noisy_image(run, r)) for r in of_view
+        ]
+        black = run.sensor.black_dn / run.sensor.white_dn
+        box = bounding_box(expected[-1].mean(-1) > black + ABOVE_BLACK, MARGIN_PX)  # of the longest exposure
+        cells = ['<div class="label"></div>', *(f'<div class="label">{name}</div>' for name in names)]
+        for record, image in zip(of_view, expected, strict=True):
+            cells.append(f'<div class="label">{record.exposure_time_s * 1e3:g} ms</div>')
+            cells.append(_picture(tone(image[box].numpy(), run.sensor), reference, f"frame {record.id}"))
+            models = [(run.gaussians, m.get("reference_exposure_s"))]
+            if run.blind:
+                models.append((run.blind, m["blind_reference_exposure_s"]))
+            for gaussians, taken_for_s in models:
+                exposure_s = taken_for_s or record.exposure_time_s
+                render = predicted_image(gaussians, run.session, record, run.sensor, exposure_s)
+                error = ((render - image).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
+                decibels = f"{psnr_db(render, image):.1f} dB"
+                cells.append(_picture(tone(render[box].numpy(), run.sensor), "render", decibels))
+                cells.append(_picture(heat(error[box].numpy()), "error", "&nbsp;"))
+        body.append(f"<h3>Bracket {bracket}, {_range_m(of_view[0]):.0f} m</h3>")
+        body.append(_grid(f"60px repeat({len(names)}, 1fr)", cells))
+    seen = "never trained on" if m["frames_held_out"] else "trained on: the session has one bracket only"
+    note = (
+        f"{len(views)} of {len({r.bracket for r in run.held_out})} brackets, {seen}; cropped to the target. Brightness "
+        f"as above. Error: absolute difference, 0<span class='ramp'></span>{ERROR_FULL_SCALE:.0%} of full scale or "
+        f"more. PSNR is of the whole frame against the {'noiseless exposure' if truth else 'noisy frame'}."
     )
+    if run.blind:
+        note += " Blind: the same training with every exposure taken for their mean."
+    return _section(f"Held-out views: {reference}, render, error", note, "".join(body))
 
 
 def _model(run: Run) -> str:
-    g = run.gaussians
-    solid = torch.nonzero(g.opacities > 0.2)[:, 0]
-    if len(solid) > POINTS_SHOWN:
-        solid = solid[torch.randperm(len(solid), generator=torch.Generator().manual_seed(0))[:POINTS_SHOWN]]
-    radiance = sh.radiance(g.sh[solid, :1], torch.zeros(len(solid), 3)).mean(dim=1).numpy()
-    points = g.means[solid].numpy()
-    reach_m = float(np.quantile(np.linalg.norm(points, axis=1), 0.995)) if len(points) else 1.0
-    figure = go.Figure()
-    figure.add_scatter3d(
-        x=points[:, 0],
-        y=points[:, 1],
-        z=points[:, 2],
-        mode="markers",
-        name="Gaussian centres",
-        marker={
-            "size": 1.8,
-            "color": np.sqrt(radiance),
-            "colorscale": "Cividis",
-            "colorbar": {"title": {"text": "√radiance"}, "thickness": 12, "len": 0.6},
-        },
-        hovertemplate="%{x:.2f}, %{y:.2f}, %{z:.2f} m<extra></extra>",
-    )
-    frames = sorted(run.session.frames, key=lambda r: r.mid_exposure_utc_ns)
-    centres = np.array([r.position_body_m for r in frames])
-    ranges_m = np.linalg.norm(centres, axis=1)
-    shown = (
-        centres / ranges_m[:, None] * reach_m * 2.2
-    )  # true directions at one drawn range: the track is far away
-    figure.add_scatter3d(
-        x=shown[:, 0],
-        y=shown[:, 1],
-        z=shown[:, 2],
-        mode="markers",
-        name="camera directions",
-        marker={"size": 3, "color": WARM},
-        text=[f"frame {r.id}, {d:.0f} m" for r, d in zip(frames, ranges_m, strict=True)],
-        hovertemplate="%{text}<extra></extra>",
-    )
-    sun = np.mean([r.sun_dir_body for r in frames], axis=0) * reach_m * 2.2
-    figure.add_scatter3d(
-        x=[0, sun[0]],
-        y=[0, sun[1]],
-        z=[0, sun[2]],
-        mode="lines",
-        name="to the Sun",
-        line={"color": "#e0a100", "width": 4},
-    )
-    figure.update_layout(
-        scene={"aspectmode": "data", "xaxis_title": "x, m", "yaxis_title": "y, m", "zaxis_title": "z, m"},
-        height=560,
-        margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        legend={"x": 0, "y": 1},
-        scene_camera={"eye": {"x": 0.9, "y": 0.9, "z": 0.6}},
-    )
+    figure, shown = model_figure(run.gaussians, run.session.frames)
+    ranges_m = [_range_m(record) for record in run.session.frames]
     note = (
-        f"{len(points):,} of {len(g):,} Gaussians, body frame. Camera directions are true, drawn at one range; flown "
-        f"ranges were {ranges_m.min():.0f} to {ranges_m.max():.0f} m. Drag to turn, scroll to zoom."
+        f"{shown:,} of {len(run.gaussians):,} Gaussians (the solid ones), target body frame. The camera's directions "
+        f"are true but drawn at one range; flown ranges were {min(ranges_m):.0f} to {max(ranges_m):.0f} m. Drag to "
+        "turn, scroll to zoom."
     )
     return _section("Model and camera track", note, _plot(figure))
 
 
-def _training(history: list[dict]) -> str:
-    figure = make_subplots(rows=1, cols=2, subplot_titles=("loss", "PSNR of the step's frames, dB"))
-    for label, colour in (("known exposure", ACCENT), ("blind to exposure", WARM)):
-        rows = [h for h in history if h["training"] == label]
-        if not rows:
-            continue
-        seconds = [h["seconds"] for h in rows]
-        for column, key in ((1, "loss"), (2, "psnr_db")):
-            figure.add_scatter(
-                x=seconds,
-                y=_smooth([h[key] for h in rows]),
-                name=label,
-                line={"color": colour, "width": 2},
-                showlegend=column == 1,
-                row=1,
-                col=column,
-            )
-    figure.update_yaxes(type="log", row=1, col=1)
-    figure.update_xaxes(title_text="seconds")
-    figure.update_layout(
-        height=360, margin={"l": 50, "r": 20, "t": 40, "b": 45}, legend={"orientation": "h", "y": -0.2}
-    )
-    return _section(
-        "Training",
-        "Running mean over ten logged steps. Steps before 40 % of the way are at reduced resolution, where averaging "
-        "suppresses noise, so PSNR jumps when the resolution changes.",
-        _plot(figure),
-    )
+def _training(run: Run) -> str:
+    path = run.folder / "metrics.jsonl"
+    try:
+        figure = training_figure([json.loads(line) for line in path.read_text().splitlines()])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SessionError(f"{path} is damaged: {error!r}") from error
+    note = "Running mean over ten logged steps. The PSNR is of the noisy frames that the step trained on."
+    if run.metrics["method"] == "obbgs":
+        note += (
+            " Early steps see averaged, less noisy pixels, so both curves jump where the resolution rises."
+        )
+    return _section("Training", note, _plot(figure))
 
 
 def _histogram(run: Run) -> str:
-    figure = go.Figure()
-    edges = np.linspace(0, run.sensor.white_dn + 1, 129)
-    for index, exposure_s in enumerate(sorted({r.exposure_time_s for r in run.session.frames})):
-        counts = np.zeros(128)
-        for record in run.session.frames:
-            if record.exposure_time_s == exposure_s:
-                counts += np.histogram(run.session.dn(record), edges)[0]
-        figure.add_scatter(
-            x=(edges[:-1] + edges[1:]) / 2,
-            y=np.where(counts > 0, counts, np.nan),
-            name=f"{exposure_s * 1e3:g} ms",
-            mode="lines",
-            line={"shape": "hvh", "width": 2, "color": EXPOSURE_COLOURS[index % len(EXPOSURE_COLOURS)]},
-        )
-    for level, label in ((run.sensor.black_dn, "black"), (run.sensor.white_dn, "full scale")):
-        figure.add_vline(x=level, line={"dash": "dot", "color": "#8795a5"}, annotation_text=label)
-    figure.update_yaxes(type="log", title_text="pixels")
-    figure.update_xaxes(title_text="digital number")
-    figure.update_layout(height=340, margin={"l": 60, "r": 20, "t": 30, "b": 45})
     saturated = sum(r.saturated for r in run.session.frames)
     note = (
-        f"All received frames. {saturated:,} saturated pixels; they count only as a lower bound in training."
+        f"All pixels of all received frames, logarithmic. {saturated:,} are saturated: the sensor says “at least this "
+        "much”, and training takes them as that lower bound."
     )
-    return _section("Exposure histogram", note, _plot(figure))
+    return _section("Exposure histogram", note, _plot(histogram_figure(run.session, run.sensor)))
 
 
 def _link(run: Run) -> str:
@@ -345,19 +273,52 @@ def _link(run: Run) -> str:
         ("frames received", received),
         ("frames missing", captured - received),
         ("bytes received", run.session.bytes_received),
-        *((key.replace("_", " "), value) for key, value in run.session.losses.items()),
+        *((_spelled(key), value) for key, value in run.session.losses.items()),
     ]
-    cells = "".join(f'<tr><td>{html.escape(k)}</td><td class="n">{v:,}</td></tr>' for k, v in rows)
-    note = "What the ground counted. Segments that were lost or damaged were asked for again."
-    return _section("Link", note, f"<table>{cells}</table>")
+    note = "What the ground counted. Segments that were lost or damaged are asked for again, and counted as resent."
+    return _section("Losses on the link", note, _two_tables([(label, f"{count:,}") for label, count in rows]))
+
+
+def _spelled(key: str) -> str:
+    words = key.replace("_", " ").replace("crc", "CRC").replace("pdus", "PDUs")
+    return words.replace("skipped bytes", "bytes skipped: in no good packet")
 
 
 def _configuration(run: Run) -> str:
-    config = (run.folder / "config.yaml").read_text()
-    camera = yaml.safe_dump({"camera": vars(run.session.camera)}, sort_keys=False)
-    tles = yaml.safe_dump({"tles": {k: list(v) for k, v in run.session.tles.items()}}, sort_keys=False)
-    body = f'<div class="two"><pre>{html.escape(config)}</pre><pre>{html.escape(camera + tles)}</pre></div>'
+    path = run.folder / "config.yaml"
+    try:
+        config = yaml.safe_load(path.read_text())
+        method = {"method": config.pop("method")}
+    except (OSError, yaml.YAMLError, AttributeError, KeyError) as error:
+        raise SessionError(f"{path} is damaged: {error!r}") from error
+    camera = {"camera": vars(run.session.camera)}
+    tles = {"tles": {name: list(lines) for name, lines in run.session.tles.items()}}
+    body = f'<div class="two"><div>{_yaml(method)}</div><div>{_yaml(config)}{_yaml(camera)}</div></div>{_yaml(tles)}'
     return _section("Configuration and versions", "Everything needed to repeat the run.", body)
+
+
+def _yaml(tree: dict) -> str:
+    text = yaml.safe_dump(
+        tree, sort_keys=False, default_flow_style=None if "method" in tree else False, width=80
+    )
+    return f"<pre>{html.escape(text)}</pre>"
+
+
+def _spread(values: list[int], count: int) -> list[int]:
+    """Return at most `count` of the values, evenly spread, first and last included."""
+    return [values[i] for i in np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))]
+
+
+def _range_m(record: FrameRecord) -> float:
+    return float(np.linalg.norm(record.position_body_m))
+
+
+def _grid(columns: str, cells: list[str]) -> str:
+    return f'<div class="grid" style="grid-template-columns: {columns}">{"".join(cells)}</div>'
+
+
+def _picture(image: np.ndarray, alt: str, caption: str) -> str:
+    return f'<figure><img alt="{alt}" src="{_png(image)}"><figcaption>{caption}</figcaption></figure>'
 
 
 def _plot(figure: go.Figure) -> str:
@@ -391,10 +352,3 @@ def heat(error: np.ndarray) -> np.ndarray:
 def _png(image: np.ndarray) -> str:
     png = imagecodecs.png_encode(np.ascontiguousarray(image), level=9)
     return "data:image/png;base64," + base64.b64encode(bytes(png)).decode()
-
-
-def _smooth(values: list[float], window: int = 10) -> list[float]:
-    total = np.cumsum([0.0, *values])
-    ends = np.arange(1, len(values) + 1)
-    starts = np.maximum(0, ends - window)
-    return ((total[ends] - total[starts]) / (ends - starts)).tolist()
