@@ -1,6 +1,7 @@
 """A finished run against the held-out frames and, where a simulator left it, the truth."""
 
 import json
+import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,16 +10,18 @@ import numpy as np
 import torch
 from plyfile import PlyData, PlyParseError
 
+from ground.card import model_card
 from ground.reconstruct import camera_of, predicted_image, sensor_of, split
 from ground.session import FrameRecord, Session, SessionError, open_session, write_whole
 from obbgs_core.gaussians import Gaussians
-from obbgs_core.metrics import cloud_distances, psnr_db, ssim, surface_points
+from obbgs_core.lpips import WeightsMissing, lpips
+from obbgs_core.metrics import cloud_distances, psnr_db, ssim
 from obbgs_core.ply import load_ply
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 
-SURFACE_POINTS = 100_000
 FOREGROUND_MARGIN_PX = 4
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -72,10 +75,9 @@ class Truth:
             facts = json.loads((self.folder / "truth.json").read_text())
             self._radiance = {entry["id"]: entry["radiance"] for entry in facts["frames"]}
             self.largest_dimension_m = float(facts["largest_dimension_m"])
-            vertices = PlyData.read(str(self.folder / facts["cloud"]))["vertex"]
-        except (OSError, ValueError, KeyError, TypeError, PlyParseError) as error:
+            self.cloud_m = read_points(self.folder / facts["cloud"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise SessionError(f"{self.folder} is damaged: {error}") from error
-        self.cloud_m = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
 
     @staticmethod
     def exists(session: Session) -> bool:
@@ -88,14 +90,28 @@ class Truth:
             return radiance, torch.from_numpy(arrays["alpha"].astype(np.float32) / 255)
 
 
+def read_points(path: Path) -> np.ndarray:
+    """Return the vertices [N, 3] of a PLY file.
+
+    Raises:
+        SessionError: the file is missing or damaged.
+    """
+    try:
+        vertices = PlyData.read(str(path))["vertex"]
+        return np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+    except (OSError, ValueError, KeyError, PlyParseError) as error:
+        raise SessionError(f"{path} is damaged: {error}") from error
+
+
 def evaluate(session_dir: Path, name: str) -> dict:
     """Score a run, add the figures to its metrics.json and return them all.
 
     Keys: psnr_noisy_db against the frames themselves; with truth also psnr_clean_db (expected image against the
     noiseless exposure, full scale 1, mean over held-out frames), psnr_clean_<exposure>_db, psnr_clean_foreground_db
-    (the target's bounding box), ssim_clean, psnr_radiance_db (scene-linear, its brightest pixel 1), the clean PSNR
-    of the blind training (psnr_clean_blind_db), and chamfer, hausdorff, accuracy, completeness of the Gaussians'
-    centres and *_surface of 100,000 points on the model, where the target's largest dimension is 2.
+    (the target's bounding box), ssim_clean, lpips_clean (AlexNet, where its weights were fetched), psnr_radiance_db
+    (scene-linear, its brightest pixel 1), the clean PSNR of the blind training (psnr_clean_blind_db), and chamfer,
+    hausdorff, accuracy, completeness of the Gaussians' centres and *_surface of the 100,000 points of surface.ply,
+    where the target's largest dimension is 2.
 
     Raises:
         SessionError: no such session or run, or damaged truth.
@@ -111,19 +127,20 @@ def evaluate(session_dir: Path, name: str) -> dict:
         scale = 2 / truth.largest_dimension_m
         true_cloud = truth.cloud_m * scale
         centres = run.gaussians.means.double().numpy() * scale
-        surface = surface_points(run.gaussians, SURFACE_POINTS).double().numpy() * scale
+        surface = read_points(run.folder / "surface.ply") * scale
         figures |= cloud_distances(centres, true_cloud)
         if len(surface):
             on_surface = cloud_distances(surface, true_cloud)
             figures |= {f"{key}_surface": value for key, value in on_surface.items()}
     metrics = {**run.metrics, **{key: round(value, 5) for key, value in figures.items()}}
     write_whole(run.folder / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
+    write_whole(run.folder / "model_card.md", model_card(run.session.created_utc, metrics).encode())
     return metrics
 
 
 def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:
     by_exposure: dict[float, list[float]] = {}
-    foreground, similarity, blind, linear = [], [], [], []
+    foreground, similarity, blind, linear, perceptual = [], [], [], [], []
     for record in run.held_out:
         clean = clean_image(run, truth, record)
         predicted = _predicted(run, run.gaussians, record)
@@ -131,6 +148,7 @@ def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:
         box = bounding_box(truth.radiance(record)[1] > 0, FOREGROUND_MARGIN_PX)
         foreground.append(psnr_db(predicted[box], clean[box]))
         similarity.append(ssim(predicted, clean))
+        perceptual += _lpips(predicted, clean)
         linear.append(_radiance_psnr_db(run, truth, record))
         if run.blind is not None:
             exposure_s = run.metrics["blind_reference_exposure_s"]
@@ -141,10 +159,21 @@ def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:
         figures[f"psnr_clean_{exposure_s * 1e3:g}ms_db"] = _mean(values)
     figures["psnr_clean_foreground_db"] = _mean(foreground)
     figures["ssim_clean"] = _mean(similarity)
+    if perceptual:
+        figures["lpips_clean"] = _mean(perceptual)
     figures["psnr_radiance_db"] = _mean(linear)
     if blind:
         figures["psnr_clean_blind_db"] = _mean(blind)
     return figures
+
+
+def _lpips(predicted: torch.Tensor, clean: torch.Tensor) -> list[float]:
+    """Return the LPIPS (AlexNet) of two images, or nothing where its weights were never fetched."""
+    try:
+        return [lpips(predicted, clean, network="alex")]
+    except WeightsMissing as error:
+        log.info("LPIPS is left out: %s", error)
+        return []
 
 
 def clean_image(run: Run, truth: Truth, record: FrameRecord) -> torch.Tensor:

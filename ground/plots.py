@@ -25,7 +25,7 @@ RADIANCE_SCALE = [[0.0, "#33465c"], [0.5, "#93a8bd"], [1.0, "#fff4d9"]]
 
 
 def model_figure(gaussians: Gaussians, frames: Sequence[FrameRecord]) -> tuple[go.Figure, int]:
-    """Return the centres coloured by radiance with the camera directions and the Sun, and how many centres are shown."""
+    """Return the centres coloured by radiance with camera directions and Sun, and how many centres are shown."""
     solid = torch.nonzero(gaussians.opacities > LEAST_OPACITY)[:, 0]
     if len(solid) > POINTS_SHOWN:
         solid = solid[torch.randperm(len(solid), generator=torch.Generator().manual_seed(0))[:POINTS_SHOWN]]

@@ -1,5 +1,6 @@
 """A session's frames to a run folder: the model, its ONNX renderer, what was done and how it went."""
 
+import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
@@ -8,7 +9,7 @@ import logging
 import math
 import platform
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,16 +24,19 @@ from ground.session import FrameRecord, Session, SessionError, open_session
 from obbgs_core.cameras import Cameras
 from obbgs_core.export_onnx import export_onnx
 from obbgs_core.gaussians import Gaussians
-from obbgs_core.methods import MethodConfig, preset
+from obbgs_core.methods import MethodConfig, preset, with_quality
 from obbgs_core.optimize import StepInfo, TrainingFrame, TrainResult, train
-from obbgs_core.ply import save_ply
+from obbgs_core.ply import save_ply, save_surface_ply
 from obbgs_core.render import native_kernels, render
 from obbgs_core.sensor import Sensor
+from obbgs_core.spz import save_spz
+from obbgs_core.surface import surface_points
 
 log = logging.getLogger(__name__)
 HELD_OUT = 8  # every eighth bracket is never trained on
 LOG_EVERY = 10  # steps
 PARITY_VIEWS = 5
+SURFACE_POINTS = 100_000
 PACKAGES = ("obbgs", "torch", "numpy", "onnxruntime", "plotly")
 
 
@@ -56,6 +60,8 @@ def reconstruct(
 ) -> Path:
     """Train on a session and return the run folder, written whole or not at all; an older run of the name is replaced.
 
+    A run that was killed goes on from its last checkpoint when it is asked for again, to the same model.
+
     Truth is never read here. With `blind_reference` the same training runs a second time with every exposure taken for
     their geometric mean, so that a report can show what knowing the exposure is worth.
 
@@ -73,34 +79,30 @@ def reconstruct(
     frames = [training_frame(session, record) for record in training]
     folder = session.path / "runs" / name
     part = folder.with_name(f".{name}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    try:
-        handler = _log_to(part / "log")
-        with open(part / "metrics.jsonl", "w") as lines:
-            result = _train("known exposure", frames, sensor, config, seed, time_limit_s, on_progress, lines)
-            blind = None
-            if blind_reference and config.exposure_aware:
-                ignoring = dataclasses.replace(config, exposure_aware=False)
-                label = "blind to exposure"
-                blind = _train(label, frames, sensor, ignoring, seed, time_limit_s, on_progress, lines)
+    part.mkdir(parents=True, exist_ok=True)  # what an interrupted run left is gone on with
+    with _logged_to(part / "log"):
+        result = _train("known exposure", frames, sensor, config, seed, time_limit_s, on_progress, part)
+        blind = None
+        if blind_reference and config.exposure_aware:
+            ignoring = dataclasses.replace(config, exposure_aware=False)
+            blind = _train(
+                "blind to exposure", frames, sensor, ignoring, seed, time_limit_s, on_progress, part
+            )
         exposures_s = sorted({record.exposure_time_s for record in training})
         white_radiance = (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * exposures_s[0])
-        save_ply(result.gaussians, part / "model.ply", white_radiance)
-        if blind is not None:
-            save_ply(blind.gaussians, part / "blind.ply", white_radiance)
+        _write_models(result.gaussians, blind, session, training, white_radiance, part)
         camera = session.camera
-        exported = export_onnx(
-            result.gaussians, sensor, part / "model.onnx", camera.width, camera.height, exposures_s
-        )
+        export_onnx(result.gaussians, sensor, part / "model.onnx", camera.width, camera.height, exposures_s)
         views = (held_out or training)[:: max(1, len(held_out or training) // PARITY_VIEWS)][:PARITY_VIEWS]
         metrics = {
             "method": method,
             "gaussians": len(result.gaussians),
+            "sh_degree": math.isqrt(result.gaussians.sh.shape[1]) - 1,
             "train_seconds": round(result.seconds, 3),
             "stop_reason": result.stop_reason,
             "start": result.start,
             "removed_outliers": result.removed_outliers,
+            "dark_frames": result.dark_frames,
             "chi2": result.history[-1].chi2,
             "frames_received": len(session.frames),
             # frames are numbered without gaps in flight, so a gap here is a frame that never came
@@ -109,7 +111,7 @@ def reconstruct(
             "frames_held_out": len(held_out),
             "exposures_s": exposures_s,
             "bytes_received": session.bytes_received,
-            "onnx_bytes": exported.size_bytes,
+            **{f"{name}_bytes": (part / f"model.{name}").stat().st_size for name in ("ply", "spz", "onnx")},
             "onnx_parity_db": onnx_parity_db(part / "model.onnx", result.gaussians, session, views, sensor),
             "reference_exposure_s": result.reference_exposure_s,
         }
@@ -120,15 +122,31 @@ def reconstruct(
                 "blind_reference_exposure_s": blind.reference_exposure_s,
             }
         (part / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+        _write_history({"known exposure": result, "blind to exposure": blind}, part / "metrics.jsonl")
         (part / "config.yaml").write_text(yaml.safe_dump(_resolved(session, config, seed), sort_keys=False))
         log.info("%d Gaussians in %.1f s: %s", len(result.gaussians), result.seconds, result.stop_reason)
-        handler.close()
-        logging.getLogger().removeHandler(handler)
-        shutil.rmtree(folder, ignore_errors=True)
-        part.rename(folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+    for checkpoint in part.glob("*.checkpoint"):
+        checkpoint.unlink()
+    shutil.rmtree(folder, ignore_errors=True)
+    part.rename(folder)
     return folder
+
+
+def changes_for(method: str, quality: str, budget: str, steps: int | None) -> dict:
+    """Return the changes to a method's preset that a user's wishes come to.
+
+    Raises:
+        ValueError: no such method or quality, or a budget that is neither `auto` nor a number.
+    """
+    wished = with_quality(preset(method), quality)
+    changes: dict = {"steps": steps or wished.steps, "start_count": wished.start_count}
+    changes["max_gaussians"] = wished.max_gaussians
+    if budget != "auto":
+        if not budget.isdigit() or int(budget) == 0:
+            raise ValueError(f"--budget must be auto or a number of Gaussians, got {budget!r}")
+        changes["max_gaussians"] = int(budget)
+        changes["start_count"] = min(wished.start_count, int(budget))
+    return changes
 
 
 def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
@@ -169,12 +187,19 @@ def sensor_of(camera: CameraSection) -> Sensor:
 
 def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
     dn = session.dn(record).astype(np.float32)
+    world_to_camera = torch.tensor(record.world_to_camera, dtype=torch.float32)
+    body_to_camera = record.world_to_camera[:3, :3]
+    position_m2 = body_to_camera @ record.covariance[:3, :3] @ body_to_camera.T
+    variances = np.concatenate([np.diag(record.covariance)[3:], np.diag(position_m2)])
     return TrainingFrame(
         dn=torch.from_numpy(dn.reshape(*dn.shape[:2], session.camera.channels)),
         exposure_time_s=record.exposure_time_s,
-        world_to_camera=torch.tensor(record.world_to_camera, dtype=torch.float32),
+        world_to_camera=world_to_camera,
         K=torch.tensor(session.camera.K),
         id=record.id,
+        bracket=record.bracket,
+        pose_sigma=torch.from_numpy(np.sqrt(np.clip(variances, 0, None)).astype(np.float32)),
+        sun_direction=torch.tensor(record.sun_dir_body, dtype=torch.float32),
     )
 
 
@@ -221,17 +246,56 @@ def _train(
     seed: int,
     time_limit_s: float,
     on_progress: Callable[[Progress], None],
-    lines,
+    part: Path,
 ) -> TrainResult:
-    def on_step(info: StepInfo) -> None:
-        on_progress(Progress(label, info))
-        if info.step % LOG_EVERY == 0 or info.step == info.steps:
-            line = {"training": label, **dataclasses.asdict(info)}
-            lines.write(json.dumps({k: None if v != v else v for k, v in line.items()}) + "\n")
-
-    result = train(frames, sensor, config, seed, on_step, time_limit_s)
+    checkpoint = part / f"{label.replace(' ', '-')}.checkpoint"
+    result = train(
+        frames,
+        sensor,
+        config,
+        seed,
+        lambda info: on_progress(Progress(label, info)),
+        time_limit_s,
+        checkpoint,
+    )
     log.info("%s: start from %s; %s", label, result.start, result.stop_reason)
     return result
+
+
+def _write_models(
+    gaussians: Gaussians,
+    blind: TrainResult | None,
+    session: Session,
+    training: list[FrameRecord],
+    white_radiance: float,
+    part: Path,
+) -> None:
+    """Write the model in full and compact, its blind twin, and points of its surface."""
+    save_ply(gaussians, part / "model.ply", white_radiance)
+    save_spz(gaussians, part / "model.spz", white_radiance)
+    if blind is not None:
+        save_ply(blind.gaussians, part / "blind.ply", white_radiance)
+    one_a_bracket = {record.bracket: record for record in training}.values()
+    poses = [torch.tensor(record.world_to_camera, dtype=torch.float32) for record in one_a_bracket]
+    K = torch.tensor(session.camera.K).expand(len(poses), 3, 3)
+    cameras = Cameras(torch.stack(poses), K, session.camera.width, session.camera.height)
+    points, normals = surface_points(gaussians, cameras, SURFACE_POINTS)
+    if len(points) == 0:
+        log.warning("the model has no solid surface that two cameras see: surface.ply is empty")
+    save_surface_ply(points, normals, part / "surface.ply")
+
+
+def _write_history(results: dict[str, TrainResult | None], path: Path) -> None:
+    with open(path, "w") as lines:
+        for label, result in results.items():
+            for info in result.history if result is not None else []:
+                if info.step % LOG_EVERY == 0 or info.step == info.steps:
+                    line = {"training": label, **dataclasses.asdict(info)}
+                    lines.write(json.dumps({k: None if v != v else v for k, v in line.items()}) + "\n")
+
+
+def _plain(value):
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value
 
 
 def _resolved(session: Session, config: MethodConfig, seed: int) -> dict:
@@ -240,9 +304,7 @@ def _resolved(session: Session, config: MethodConfig, seed: int) -> dict:
     versions = {name: importlib.metadata.version(name) for name in PACKAGES}
     kernels = native_kernels()
     return {
-        "method": {
-            k: list(map(list, v)) if k == "pyramid" else v for k, v in dataclasses.asdict(config).items()
-        },
+        "method": {k: _plain(v) for k, v in dataclasses.asdict(config).items()},
         "seed": seed,
         "threads": torch.get_num_threads(),
         "rasterizer": f"native {kernels[0]}" if kernels else "reference",
@@ -256,9 +318,14 @@ def _resolved(session: Session, config: MethodConfig, seed: int) -> dict:
     }
 
 
-def _log_to(path: Path) -> logging.FileHandler:
+@contextlib.contextmanager
+def _logged_to(path: Path) -> Iterator[None]:
     handler = logging.FileHandler(path)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     root = logging.getLogger()
     root.addHandler(handler)
-    return handler
+    try:
+        yield
+    finally:
+        root.removeHandler(handler)
+        handler.close()

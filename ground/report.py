@@ -49,9 +49,10 @@ td.n { text-align: right; font-variant-numeric: tabular-nums; }
 .grid figure { margin: 0; } .grid figcaption { color: var(--soft); font-size: 12px; text-align: center; }
 h3 { font-size: 15px; margin: 18px 0 8px; }
 .two { display: grid; grid-template-columns: 1fr 1fr; gap: 8px 32px; align-items: start; }
-.ramp { display: inline-block; width: 90px; height: 10px; border-radius: 3px; margin: 0 6px; border: 1px solid var(--line);
-  background: linear-gradient(90deg, #000, #f00, #ff0, #fff); }
-ul.notes { background: #fff7e6; border: 1px solid #f0d9a8; border-radius: 8px; margin: 0 0 14px; padding: 10px 14px 10px 30px; }
+.ramp { display: inline-block; width: 90px; height: 10px; border-radius: 3px; margin: 0 6px;
+  border: 1px solid var(--line); background: linear-gradient(90deg, #000, #f00, #ff0, #fff); }
+ul.notes { background: #fff7e6; border: 1px solid #f0d9a8; border-radius: 8px; margin: 0 0 14px;
+  padding: 10px 14px 10px 30px; }
 pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px; overflow-x: auto; margin: 0 0 12px; }
 """
 

@@ -11,7 +11,9 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -22,7 +24,9 @@ from hil import spacecraft
 log = logging.getLogger(__name__)
 WORKER = Path(__file__).with_name("blender_worker.py")
 SAMPLES = 16  # with OIDN; more changes little and costs in proportion
+BPY_VERSION = "4.5.15"
 RETRIES = 2  # a crash of Blender costs one frame's time, a second crash on the same frame is a defect
+SIDE_FILES = (".mtl", ".bin", ".png", ".jpg", ".jpeg")  # what an OBJ or glTF keeps beside it
 LIBRARIES = "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
 
 
@@ -47,8 +51,15 @@ def blender_command() -> list[str]:
         return [installed, "--background", "--factory-startup", "--python", str(WORKER)]
     raise BlenderError(
         "Blender is missing: run `make setup`, put a `blender` (4.5) on the PATH, or point OBBGS_BLENDER_PYTHON "
-        "at a Python 3.11 that has bpy==4.5.15"
+        "at a Python 3.11 that has "
+        f"bpy=={BPY_VERSION}"
     )
+
+
+def _remedy(reason: str) -> str:
+    if "No module named 'bpy'" in reason:
+        return f"run `make setup`, or {blender_command()[0]} -m pip install bpy=={BPY_VERSION}"
+    return f"on Debian: apt-get install -y --no-install-recommends {LIBRARIES}"
 
 
 class Worker:
@@ -64,15 +75,21 @@ class Worker:
         self.restarts += 1
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed with the process)
         self._process = subprocess.Popen(
-            blender_command(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True
+            blender_command(),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+            text=True,
+            start_new_session=True,  # Ctrl-C is for us; the frame under way is finished and kept
         )
-        if not self._reply():
-            raise BlenderError(
-                f"Blender did not start: {self._last_words()}. On Debian: apt-get install -y "
-                f"--no-install-recommends {LIBRARIES}"
-            )
+        greeting = self._reply()
+        if greeting is None:
+            reason = self._last_words()
+            self.close()
+            raise BlenderError(f"Blender did not start: {reason}; {_remedy(reason)}")
+        self.version = greeting["ready"]
         load = {"op": "load", "mesh": str(self.mesh.resolve()), "samples": self.samples}
-        load["keep_scale"] = sha256(self.mesh) == sha256(spacecraft.SHIPPED)
+        load["keep_scale"] = mesh_sha256(self.mesh) == mesh_sha256(spacecraft.SHIPPED)
         if self.ambient is not None:
             load["ambient"] = self.ambient
         reply = self._exchange(load)
@@ -147,11 +164,12 @@ class RenderFarm:
             raise MeshError(f"{mesh}: no such file")
         self.mission, self.mesh, self.cache = mission, mesh, cache
         cache.mkdir(parents=True, exist_ok=True)
-        self._identity = hashlib.sha256(sha256(mesh).encode() + WORKER.read_bytes()).hexdigest()
         self._count = workers
         self._workers: list[Worker] = []
         self._lock = threading.Lock()
         self._first = self._worker(0)  # a bad mesh is known at once
+        settings = f"{mesh_sha256(mesh)} {SAMPLES} {self._first.version} ".encode()
+        self._identity = hashlib.sha256(settings + WORKER.read_bytes()).hexdigest()
 
     def __enter__(self) -> "RenderFarm":
         return self
@@ -165,9 +183,9 @@ class RenderFarm:
         """What the worker found in the mesh: largest_dimension_m, triangles, normals_recomputed."""
         return self._first.facts
 
-    def path(self, pose: PoseTag) -> Path:
-        """Return where the picture of this pose is kept."""
-        content = json.dumps(self._request(pose), sort_keys=True)
+    def path(self, pose: PoseTag, op: Literal["render", "geometry"] = "render") -> Path:
+        """Return where the picture of this pose, or its depth and normals, is kept."""
+        content = json.dumps(self._request(pose, op), sort_keys=True)
         return self.cache / (hashlib.sha256((self._identity + content).encode()).hexdigest()[:32] + ".npz")
 
     def radiance(self, pose: PoseTag) -> np.ndarray:
@@ -177,39 +195,49 @@ class RenderFarm:
         with np.load(path) as arrays:
             return arrays["radiance"]
 
-    def prerender(self, poses: Sequence[PoseTag], on_rendered: Callable[[], None] = lambda: None) -> int:
-        """Render what is not in the cache yet on all workers; return how many were rendered."""
+    def geometry(self, pose: PoseTag) -> tuple[np.ndarray, np.ndarray]:
+        """Return what pixel centres see: planar depth [H, W] float32, m, inf for nothing; normals [H, W, 3] float16."""
+        with self._lock:
+            path = self._rendered(self._first, pose, "geometry")
+        with np.load(path) as arrays:
+            return arrays["depth"], arrays["normals"]
+
+    def prerender(
+        self,
+        poses: Sequence[PoseTag],
+        on_rendered: Callable[[], None] = lambda: None,
+        ops: Sequence[Literal["render", "geometry"]] = ("render",),
+    ) -> int:
+        """Render what is not in the cache yet on all workers; return how many poses were not."""
         waiting: queue.SimpleQueue[PoseTag] = queue.SimpleQueue()
         missing = 0
         for pose in poses:
-            if self.path(pose).exists():
+            if all(self.path(pose, op).exists() for op in ops):
                 on_rendered()
             else:
                 waiting.put(pose)
                 missing += 1
-        errors: list[Exception] = []
+        stop = threading.Event()
 
         def work(worker: Worker) -> None:
-            while not errors:
-                try:
+            try:
+                while not stop.is_set():
                     pose = waiting.get_nowait()
-                except queue.Empty:
-                    return
-                try:
-                    self._rendered(worker, pose)
-                except (BlenderError, MeshError) as error:
-                    errors.append(error)
-                    return
-                on_rendered()
+                    for op in ops:
+                        self._rendered(worker, pose, op)
+                    on_rendered()
+            except queue.Empty:
+                pass
+            finally:  # all is done, or one worker failed
+                stop.set()
 
-        threads = []
-        for index in range(min(self._count, missing)):
-            threads.append(threading.Thread(target=work, args=(self._worker(index),), daemon=True))
-            threads[-1].start()
-        for thread in threads:
-            thread.join()
-        if errors:
-            raise errors[0]
+        with ThreadPoolExecutor(self._count) as pool:
+            try:
+                count = min(self._count, missing)
+                for running in [pool.submit(work, self._worker(index)) for index in range(count)]:
+                    running.result()
+            finally:  # interrupted: the frames under way are finished and kept
+                stop.set()
         return missing
 
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
@@ -221,23 +249,26 @@ class RenderFarm:
                 return arrays["vertices"], arrays["faces"]
 
     def visible(self, points: np.ndarray, centres: np.ndarray) -> np.ndarray:
-        """Return which of the points [N, 3] at least one of the camera centres [M, 3] sees, as bool [N]."""
-        with tempfile.TemporaryDirectory() as folder:
-            given, out = Path(folder) / "points.npz", Path(folder) / "seen.npz"
-            np.savez(given, points=points, centres=centres)
-            self._first.ask(op="visible", points=str(given), out=str(out))
-            with np.load(out) as arrays:
-                return arrays["seen"]
+        """Return which of the points [N, 3] at least one of the camera centres [M, 3] sees, as bool [N]; cached."""
+        content = self._identity.encode() + points.tobytes() + centres.tobytes()
+        path = self.cache / (hashlib.sha256(content).hexdigest()[:32] + ".npz")
+        if not path.exists():
+            with tempfile.TemporaryDirectory() as folder, self._lock:
+                given = Path(folder) / "points.npz"
+                np.savez(given, points=points, centres=centres)
+                self._first.ask(op="visible", points=str(given), out=str(path))
+        with np.load(path) as arrays:
+            return arrays["seen"]
 
     def _worker(self, index: int) -> Worker:
         while len(self._workers) <= index:
             self._workers.append(Worker(self.mesh))
         return self._workers[index]
 
-    def _request(self, pose: PoseTag) -> dict:
+    def _request(self, pose: PoseTag, op: str) -> dict:
         camera = self.mission.camera
         return {
-            "op": "render",
+            "op": op,
             "world_to_camera": pose.world_to_camera.tolist(),
             "K": camera.K,
             "width": camera.width,
@@ -247,12 +278,19 @@ class RenderFarm:
             "in_eclipse": pose.in_eclipse,
         }
 
-    def _rendered(self, worker: Worker, pose: PoseTag) -> Path:
-        path = self.path(pose)
+    def _rendered(self, worker: Worker, pose: PoseTag, op: Literal["render", "geometry"] = "render") -> Path:
+        path = self.path(pose, op)
         if not path.exists():
-            worker.ask(**self._request(pose), out=str(path))
+            worker.ask(**self._request(pose, op), out=str(path))
         return path
 
 
-def sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def mesh_sha256(mesh: Path) -> str:
+    """Return the digest of a mesh file and, for the formats that refer to others, of the materials beside it."""
+    files = [mesh]
+    if mesh.suffix.lower() in (".obj", ".gltf"):
+        files += sorted(path for path in mesh.parent.iterdir() if path.suffix.lower() in SIDE_FILES)
+    digest = hashlib.sha256()
+    for path in files:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()

@@ -2,6 +2,7 @@
 
 Only bpy, numpy and the standard library here. Settings and traps were measured with bpy 4.5.15 (Cycles, CPU). Requests
 on stdin, replies on stdout, both one JSON object a line; pixels go to the .npz that the request names.
+Light is `render`, shape is `geometry`: with many samples, depth would be that of a random point of the pixel.
 """
 
 import json
@@ -20,6 +21,8 @@ SUN_ANGLE_RAD = 0.00925  # the Sun's diameter at 1 au
 EARTHSHINE_RADIANCE = 0.06  # uniform light from all around, share of that plate's radiance
 MAX_METALLIC = 0.3  # a metal under one Sun and a black sky renders black
 MIN_ROUGHNESS = 0.15
+LARGEST_FLOAT16 = 65504.0
+NOTHING_M = 1e9  # Cycles' depth of the background is 1e10
 
 
 def load(path, keep_scale):
@@ -41,9 +44,9 @@ def load(path, keep_scale):
         undo = Matrix.Identity(4)
     else:
         raise ValueError(f"expected a .glb, .gltf, .obj or .stl file, got {suffix or 'no suffix'}")
-    meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and len(o.data.polygons)]
+    meshes = mesh_objects()  # what the importer adds to show bones is outside the view layer
     for o in list(bpy.context.scene.objects):
-        if o.type in ("CAMERA", "LIGHT"):
+        if o not in meshes and o.type in ("MESH", "CAMERA", "LIGHT"):
             bpy.data.objects.remove(o)
     if not meshes:
         raise ValueError("the file holds no triangles")
@@ -69,6 +72,10 @@ def load(path, keep_scale):
     bpy.context.view_layer.update()
     triangles = sum(len(p.vertices) - 2 for o in meshes for p in o.data.polygons)
     return {"largest_dimension_m": extent, "triangles": triangles, "normals_recomputed": recomputed}
+
+
+def mesh_objects():
+    return [o for o in bpy.context.view_layer.objects if o.type == "MESH" and len(o.data.polygons)]
 
 
 def bounds(meshes):
@@ -101,7 +108,12 @@ def tame(material):
     """Keep a material visible under one Sun: clamp metallic and roughness, remove emission."""
     if not material.use_nodes:
         return
-    for node in material.node_tree.nodes:
+    nodes = list(material.node_tree.nodes)
+    if not any(node.type == "BSDF_PRINCIPLED" for node in nodes):
+        for node in nodes:
+            if node.type == "EMISSION":
+                light_up(material, node)
+    for node in nodes:
         if node.type != "BSDF_PRINCIPLED":
             continue
         links = material.node_tree.links
@@ -122,6 +134,18 @@ def tame(material):
         node.inputs["Emission Strength"].default_value = 0.0
 
 
+def light_up(material, emission):
+    """Let the Sun light an unlit material (KHR_materials_unlit glows and casts no shadow): matt, same colour."""
+    links = material.node_tree.links
+    matt = material.node_tree.nodes.new("ShaderNodeBsdfDiffuse")
+    matt.inputs["Color"].default_value = emission.inputs["Color"].default_value
+    for link in list(emission.inputs["Color"].links):
+        links.new(link.from_socket, matt.inputs["Color"])
+    for node in material.node_tree.nodes:
+        if node.type == "OUTPUT_MATERIAL":
+            links.new(matt.outputs["BSDF"], node.inputs["Surface"])
+
+
 def set_up(samples, ambient):
     """Prepare Cycles, the Sun, Earth-shine and the camera of an opened scene."""
     scene = bpy.context.scene
@@ -135,12 +159,11 @@ def set_up(samples, ambient):
     cycles.use_denoising, cycles.denoiser = samples > 1, "OPENIMAGEDENOISE"
     cycles.seed = 0
     layer = scene.view_layers[0]
-    layer.use_pass_combined = layer.use_pass_z = True
+    layer.use_pass_combined = layer.use_pass_z = layer.use_pass_normal = True
     world = bpy.data.worlds.new("earthshine")
     world.use_nodes = True
     world.node_tree.nodes["Background"].inputs["Color"].default_value = (1, 1, 1, 1)
-    world.node_tree.nodes["Background"].inputs["Strength"].default_value = ambient
-    scene.world = world
+    scene.world, scene["ambient"] = world, ambient
     sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
     sun.data.energy, sun.data.angle = SUN_IRRADIANCE, SUN_ANGLE_RAD
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
@@ -150,7 +173,7 @@ def set_up(samples, ambient):
 
 
 def place(request):
-    """Put camera and Sun where the request says; see the camera formulas in the notes of the driver."""
+    """Put camera and Sun where the request says; OpenCV axes and pixel centres become Blender's."""
     scene = bpy.context.scene
     world_to_camera, K = np.array(request["world_to_camera"]), np.array(request["K"])
     width, height = request["width"], request["height"]
@@ -175,7 +198,10 @@ def place(request):
     direction = Vector(request["sun_dir_body"])
     sun.rotation_mode = "QUATERNION"
     sun.rotation_quaternion = direction.to_track_quat("Z", "Y")
-    sun.data.energy = 0.0 if request.get("in_eclipse") else SUN_IRRADIANCE
+    in_eclipse = request.get("in_eclipse", False)  # the Earth's night side sends no light either
+    sun.data.energy = 0.0 if in_eclipse else SUN_IRRADIANCE
+    world = scene.world.node_tree.nodes["Background"].inputs["Strength"]
+    world.default_value = 0.0 if in_eclipse else scene["ambient"]
 
 
 PASSES = {}
@@ -200,34 +226,59 @@ def keep_passes():
 
 
 def render(request):
-    """Render one view: premultiplied radiance, alpha, planar depth; request["out"] is written whole or not at all."""
+    """Render one view: premultiplied radiance and alpha, float32 radiance where the request says so."""
     place(request)
     PASSES.clear()
     bpy.ops.render.render(write_still=False)
     combined = PASSES["Combined"]
     alpha = np.clip(combined[..., 3], 0, 1)
-    radiance = np.where(
-        alpha[..., None] > 0, np.maximum(combined[..., :3], 0), 0
-    )  # OIDN leaks outside the alpha
+    radiance = np.clip(np.nan_to_num(combined[..., :3]), 0, LARGEST_FLOAT16)
+    radiance[alpha == 0] = 0  # OIDN leaks outside the alpha
     if request["channels"] == 1:
         radiance = radiance @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # Rec. 709 luminance
         radiance = radiance[..., None]
-    arrays = {"radiance": radiance.astype(np.float16), "alpha": np.round(alpha * 255).astype(np.uint8)}
-    if request.get("depth"):
-        arrays["depth"] = PASSES["Depth"][..., 0].astype(np.float32)
-        arrays["radiance"] = radiance.astype(np.float32)
-    part = request["out"] + f".{os.getpid()}.part"
+    dtype = np.float32 if request.get("float32") else np.float16
+    coverage = np.round(alpha * 255).astype(np.uint8)
+    write_whole(request["out"], radiance=radiance.astype(dtype), alpha=coverage)
+
+
+def geometry(request):
+    """Write what the middle of each pixel sees: planar depth, m (inf: nothing), and the unit normal, body axes."""
+    cycles = bpy.context.scene.cycles
+    usual = {
+        "samples": cycles.samples,
+        "use_denoising": cycles.use_denoising,
+        "max_bounces": cycles.max_bounces,
+    }
+    usual |= {"pixel_filter_type": cycles.pixel_filter_type, "filter_width": cycles.filter_width}
+    one_ray = {"samples": 1, "use_denoising": False, "max_bounces": 0}
+    one_ray |= {"pixel_filter_type": "BOX", "filter_width": 0.01}  # px; no smaller one is possible
+    try:
+        for name, value in one_ray.items():
+            setattr(cycles, name, value)
+        place(request)
+        PASSES.clear()
+        bpy.ops.render.render(write_still=False)
+    finally:
+        for name, value in usual.items():
+            setattr(cycles, name, value)
+    depth, normals = PASSES["Depth"][..., 0].astype(np.float32), PASSES["Normal"].astype(np.float16)
+    depth[depth > NOTHING_M] = np.inf
+    write_whole(request["out"], depth=depth, normals=normals)
+
+
+def write_whole(out, **arrays):
+    """Write an .npz whole or not at all."""
+    part = out + f".{os.getpid()}.part"
     with open(part, "wb") as f:
         np.savez_compressed(f, **arrays)
-    os.replace(part, request["out"])
+    os.replace(part, out)
 
 
 def surface():
     """Return the scene's triangles as vertices [V, 3] m and faces [F, 3]."""
     all_vertices, all_faces, offset = [], [], 0
-    for o in bpy.context.scene.objects:
-        if o.type != "MESH":
-            continue
+    for o in mesh_objects():
         o.data.calc_loop_triangles()
         faces = np.empty(3 * len(o.data.loop_triangles), dtype=np.int32)
         o.data.loop_triangles.foreach_get("vertices", faces)
@@ -252,8 +303,7 @@ def visible(request):
             if tree.ray_cast(Vector(point + lift_m * direction), Vector(direction))[0] is None:
                 seen[i] = True
                 break
-    with open(request["out"], "wb") as out:
-        np.savez(out, seen=seen)
+    write_whole(request["out"], seen=seen)
 
 
 def answer(request):
@@ -264,6 +314,9 @@ def answer(request):
         return facts
     if op == "render":
         render(request)
+        return {}
+    if op == "geometry":
+        geometry(request)
         return {}
     if op == "surface":
         v, f = surface()

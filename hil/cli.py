@@ -1,5 +1,6 @@
-"""hil: demo, camera, link, target."""
+"""hil: demo, camera, link, scenario, dataset, target."""
 
+import dataclasses
 import json
 import logging
 import signal
@@ -10,6 +11,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.progress import TaskID
 
 from flightsw.errors import FlightError
 from flightsw.icd.mission import ConfigError, load_mission
@@ -43,47 +45,186 @@ def demo(
 
 @app.command()
 def camera(
-    socket: Annotated[Path, typer.Option(help="Unix socket to serve on.")] = Path("camera.sock"),
+    listen: Annotated[
+        str, typer.Option(help="hil:///path/to/socket, or hil://host:port; port 0 takes a free one.")
+    ] = "hil://127.0.0.1:0",
     mission: MissionFile = Path("mission.yaml"),
     mesh: Mesh = spacecraft.SHIPPED,
     cache: Annotated[Path, typer.Option(help="Rendered frames are kept here.")] = Path("renders"),
+    gige: Annotated[bool, typer.Option("--gige", help="Serve GigE Vision on 127.0.0.1 instead.")] = False,
 ) -> None:
-    """Serve the simulated camera until stopped; frames are rendered when they are asked for.
+    """Serve the simulated camera until stopped; prints its URL. Frames are rendered when they are asked for.
 
-    Example: hil camera --socket /tmp/camera.sock --mesh target.glb
+    With --gige any GenICam client sees the sky: `arv-viewer-0.8`, `arv-camera-test-0.8 -n 127.0.0.1`, `flightsw`.
+
+    Example: hil camera --listen hil:///tmp/camera.sock --mesh target.glb
     """
     from hil.blender import RenderFarm
+    from hil.gige_camera import GigeCameraServer
     from hil.virtual_camera import CameraServer
 
     loaded = load_mission(mission)
     stop = _stop_event()
-    with RenderFarm(loaded, mesh, cache, workers=1) as farm, CameraServer(loaded, farm, socket) as server:
-        print(server.url, flush=True)
-        stop.wait()
-        print(f"{server.exposures} exposures served", file=sys.stderr)
+    with RenderFarm(loaded, mesh, cache, workers=1) as farm:
+        serving = GigeCameraServer(loaded, farm.radiance) if gige else CameraServer(loaded, farm, listen)
+        with serving as server:
+            print(server.url, flush=True)
+            stop.wait()
+            print(f"{server.exposures} exposures served", file=sys.stderr)
 
 
 @app.command()
 def link(
-    baud: Annotated[int, typer.Option(help="Bits per second; a byte takes ten.")] = 921_600,
-    loss: Annotated[float, typer.Option(help="Share of packets lost.")] = 0.0,
-    flip: Annotated[float, typer.Option(help="Share of packets with a flipped bit.")] = 0.0,
-    duplicate: Annotated[float, typer.Option(help="Share of packets sent twice.")] = 0.0,
-    reorder: Annotated[float, typer.Option(help="Share of packets that change places.")] = 0.0,
+    can: Annotated[
+        bool, typer.Option(help="Two slcan adapters on a CAN bus instead of a serial line.")
+    ] = False,
+    fd: Annotated[
+        bool, typer.Option(help="The bus is CAN FD, data phase at 5 Mbit/s; implies --can.")
+    ] = False,
+    baud: Annotated[int, typer.Option(help="Serial: bits per second; a byte takes ten.")] = 921_600,
+    bitrate: Annotated[int, typer.Option(help="CAN: bits per second.")] = 1_000_000,
+    latency: Annotated[float, typer.Option(help="Seconds from one end to the other, beside the rate.")] = 0.0,
+    loss: Annotated[float, typer.Option(help="Share of packets (CAN: frames) lost.")] = 0.0,
+    flip: Annotated[float, typer.Option(help="Share with a flipped bit.")] = 0.0,
+    duplicate: Annotated[float, typer.Option(help="Share sent twice.")] = 0.0,
+    reorder: Annotated[float, typer.Option(help="Share that change places.")] = 0.0,
+    overrun: Annotated[
+        bool, typer.Option(help="Serial: no flow control, what nobody reads in time is lost.")
+    ] = False,
+    one_shot: Annotated[
+        bool, typer.Option(help="CAN: a frame lost on the bus is not sent again by the controller.")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Same seed, same faults.")] = 0,
 ) -> None:
-    """Run a virtual serial line with seeded faults until stopped; prints both ends, and the counts at the end.
+    """Run a virtual serial line or CAN bus with seeded faults until stopped; prints both ends, then the counts.
+
+    While it runs it obeys lines on its standard input: cut, mend, latency 0.2, loss 0.1, bit_flip, duplicate, reorder.
+    SIGUSR1 cuts and SIGUSR2 mends too.
 
     Example: hil link --baud 921600 --loss 0.02 --flip 0.01 --seed 3
     """
-    from hil.virtual_link import Faults, VirtualSerial, run_link
+    from hil.virtual_can import VirtualCan
+    from hil.virtual_link import Faults, VirtualLink, VirtualSerial, control, run_link
 
-    def ready(line: VirtualSerial) -> None:
+    faults = Faults(loss, flip, duplicate, reorder)
+    line: VirtualLink
+    if can or fd:
+        line = VirtualCan(bitrate, fd, faults, seed, latency, one_shot)
+    else:
+        line = VirtualSerial(baud, faults, seed, latency, flow_control=not overrun)
+
+    def obey_standard_input() -> None:
+        for command in sys.stdin:
+            try:
+                print(control(line, command), file=sys.stderr)
+            except ValueError as error:
+                print(error, file=sys.stderr)
+
+    def ready(line: VirtualLink) -> None:
+        signal.signal(signal.SIGUSR1, lambda *_: line.cut())
+        signal.signal(signal.SIGUSR2, lambda *_: line.mend())
         print(f"flight {line.flight_url}\nground {line.ground_url}", flush=True)
+        threading.Thread(target=obey_standard_input, daemon=True).start()
 
     stop = _stop_event()
-    counts = run_link(baud, Faults(loss, flip, duplicate, reorder), seed, ready, stop.is_set)
+    counts = run_link(line, ready, stop.is_set)
     print(json.dumps({direction: vars(lane) for direction, lane in counts.items()}))
+
+
+@app.command()
+def scenario(
+    name: Annotated[str, typer.Argument(help="A ready-made scenario or a YAML file.")] = "fly-around",
+    fly_around: Annotated[
+        bool, typer.Option("--fly-around", help="Design a fly-around about the mission's target instead.")
+    ] = False,
+    mission: MissionFile = Path("mission.yaml"),
+    radial: Annotated[float, typer.Option(help="Half height of the ellipse, m.")] = 200.0,
+    out_of_plane: Annotated[
+        float | None, typer.Option(help="Half width across the orbit, m; default a constant range.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="The chaser's TLE is written here.")] = Path("chaser.tle"),
+    json_: AsJson = False,
+) -> None:
+    """Describe a scenario: range, phase angle, eclipse; or design a fly-around and write the chaser's TLE.
+
+    Example: hil scenario tumbling --json; hil scenario --fly-around --radial 150 --out chaser.tle
+    """
+    from hil.fly_around import FlyAround, design
+    from hil.scenario import describe, load_scenario
+
+    if not fly_around:
+        facts = describe(load_scenario(name))
+    else:
+        orbit = load_mission(mission).orbit
+        wanted = FlyAround(radial, -1.0 if out_of_plane is None else out_of_plane)
+        made = design(orbit.target_tle, wanted, orbit.start_utc_ns, span_s=0.0)  # at least one orbit
+        out.write_text("\n".join(made.chaser_tle) + "\n")
+        facts = {**dataclasses.asdict(made), "half_width_m": wanted.half_width_m, "written": str(out)}
+    print(json.dumps(facts) if json_ else "\n".join(f"{key:24} {value}" for key, value in facts.items()))
+
+
+@app.command()
+def dataset(
+    out: Annotated[Path, typer.Option(help="The data set's folder; a set of several has one below it each.")],
+    mesh: Annotated[
+        Path | None, typer.Option(help="GLB, OBJ or STL; default the shipped spacecraft.")
+    ] = None,
+    set_: Annotated[
+        str | None, typer.Option("--set", help="Several targets: obr-st, obr-st-small or a YAML file.")
+    ] = None,
+    meshes: Annotated[Path, typer.Option(help="Where the set's meshes are.")] = Path(),
+    scenario: Annotated[str, typer.Option(help="A ready-made scenario or a YAML file.")] = "fly-around",
+    frames: Annotated[int, typer.Option(help="A multiple of the bracket's exposures.")] = 363,
+    size: Annotated[int, typer.Option(help="Width and height, px.")] = 800,
+    bracket: Annotated[str, typer.Option(help="Exposure times, ms.")] = "0.05,0.1,0.2",
+    sensor: Annotated[str, typer.Option(help="paper or spacecam.")] = "paper",
+    seed: Annotated[int, typer.Option(help="Same seed, same noise.")] = 1,
+    cache: Annotated[Path, typer.Option(help="Rendered pictures are kept here.")] = Path("renders"),
+    workers: Annotated[int, typer.Option(min=1, help="Blender processes.")] = 2,
+    json_: AsJson = False,
+) -> None:
+    """Make a data set: frames as a session and in NeRF-synthetic layout, with their truth. An interrupted one goes on.
+
+    Example: hil dataset --mesh TDRS.glb --scenario fly-around --frames 363 --size 800 --bracket 0.05,0.1,0.2 --out tdrs
+    """
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+    from rich.progress import Progress as Bar
+
+    from flightsw.icd.mission import build
+    from hil.dataset import DatasetConfig, Progress, load_dataset_config, make_dataset, target_meshes
+
+    if set_ is not None:
+        if mesh is not None:
+            raise ValueError("give --mesh or --set, not both")
+        config = load_dataset_config(set_)
+        jobs = [(path, out / path.stem) for path in target_meshes(config, meshes)]
+    else:
+        times_ms = [float(text) for text in bracket.split(",")]
+        settings = {"scenario": scenario, "frames": frames, "size_px": size, "bracket_ms": times_ms}
+        config = build(DatasetConfig, {**settings, "sensor": sensor, "seed": seed}, "dataset")
+        jobs = [(mesh or spacecraft.SHIPPED, out)]
+    columns = (TextColumn("{task.description:>20}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Bar(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def show(step: Progress) -> None:
+            label = f"{step.target} {step.step}"
+            if label not in tasks:
+                tasks[label] = bars.add_task(label, total=step.total)
+            bars.update(tasks[label], completed=step.done)
+
+        made = {path.stem: make_dataset(config, path, folder, cache, workers, show) for path, folder in jobs}
+    if json_:
+        print(json.dumps(made))
+    for target_name, facts in () if json_ else made.items():
+        split = ", ".join(f"{count} {name}" for name, count in facts["split"].items())
+        print(f"{target_name}: {facts['frames']} frames ({split}), {facts['in_eclipse']} in eclipse")
 
 
 @app.command()
@@ -112,7 +253,7 @@ def main() -> None:
         sys.exit(_fail("interrupted; run it again, finished rendering is kept", 1))
     except (ConfigError, ValueError) as error:
         sys.exit(_fail(str(error), 2))
-    except FlightError as error:
+    except (FlightError, OSError) as error:
         sys.exit(_fail(str(error), 1))
     except RuntimeError as error:
         if type(error).__module__.partition(".")[0] != "hil":

@@ -1,11 +1,24 @@
-"""What flight will do if nothing fails: every exposure's time and true pose, so that the sky can be rendered ahead."""
+"""What happens in the sky: orbits, attitude and light of a scenario, and every exposure's time and true pose."""
 
-from dataclasses import dataclass
+import functools
+import hashlib
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
 
-from flightsw.icd.frame import PoseTag
-from flightsw.icd.mission import Mission
-from flightsw.pose import pose_tag
+import numpy as np
+import yaml
+
+from flightsw.icd.frame import PoseTag, matrix_to_quat
+from flightsw.icd.mission import BracketSection, ConfigError, Mission, OrbitSection, PoseSection, build
+from flightsw.orbit import OrbitState, propagate, sun_direction_gcrs, sunlit_fraction
+from flightsw.pose import look_along, pose_tag
 from flightsw.sequencer import plan
+from hil.attitude import AttitudeSection, attitude
+from hil.fly_around import Design, FlyAround, RelativeElements, design
+
+SCENARIOS = Path(__file__).parent / "scenarios"
+HORIZON_MARGIN_S = 3600.0  # a tumble is integrated so much longer than the scenario
 
 
 @dataclass(frozen=True)
@@ -26,3 +39,200 @@ def true_exposures(mission: Mission) -> list[TrueExposure]:
         )
         for shot in plan(mission)
     ]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Who flies where, how the target turns, and when pictures are taken.
+
+    The chaser is given in one of three ways: a TLE, relative elements at the start, or a fly-around.
+    """
+
+    description: str
+    start_utc: str
+    duration_s: float  # from the first bracket to the last
+    brackets: int  # evenly spread over the duration, unless the caller wants another number
+    target_tle: tuple[str, ...]
+    fov_deg: float  # of the image's width
+    chaser_tle: tuple[str, ...] = ()
+    relative_elements: RelativeElements | None = None
+    fly_around: FlyAround | None = None
+    attitude: AttitudeSection = field(default_factory=AttitudeSection)
+    sha256: str = ""  # of the file's bytes
+
+    def __post_init__(self):
+        given = [bool(self.chaser_tle), self.relative_elements is not None, self.fly_around is not None]
+        if sum(given) != 1:
+            raise ConfigError(
+                "scenario",
+                "expected exactly one of chaser_tle, relative_elements and fly_around, "
+                f"got {sum(given)} of them",
+            )
+        OrbitSection(
+            self.target_tle, self.chaser_tle or self.target_tle, self.start_utc
+        )  # raises what is wrong
+        for name, low, high in (
+            ("duration_s", 1.0, 30 * 86_400.0),
+            ("brackets", 1, 100_000),
+            ("fov_deg", 1e-3, 120.0),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise ConfigError(
+                    f"scenario.{name}", f"expected {low:g} to {high:g}, got {getattr(self, name)}"
+                )
+
+    @functools.cached_property
+    def design(self) -> Design | None:
+        """The chaser's TLE made from relative elements or a fly-around; None where a TLE is given."""
+        wanted = self.relative_elements or self.fly_around
+        if wanted is None:
+            return None
+        start_utc_ns = OrbitSection(self.target_tle, self.target_tle, self.start_utc).start_utc_ns
+        return design(self.target_tle, wanted, start_utc_ns, self.duration_s)
+
+    @functools.cached_property
+    def orbit(self) -> OrbitSection:
+        """Both TLEs and the start, as a mission has them."""
+        chaser_tle = self.design.chaser_tle if self.design else self.chaser_tle
+        return OrbitSection(self.target_tle, chaser_tle, self.start_utc)
+
+    def bracket_section(
+        self, exposure_times_ms: tuple[float, ...], count: int | None = None
+    ) -> BracketSection:
+        """Return `count` brackets (default: the scenario's) spread evenly over the duration.
+
+        Raises:
+            ConfigError: they do not fit into it.
+        """
+        count = count or self.brackets
+        spacing_s = min(0.5, self.duration_s / (count * len(exposure_times_ms)))
+        return BracketSection(
+            exposure_times_ms=exposure_times_ms,
+            frame_spacing_s=spacing_s,
+            interval_s=self.duration_s / max(count - 1, 1),
+            count=count,
+        )
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """Everything that light and geometry need at one time; directions are unit vectors in the target's body frame."""
+
+    utc_ns: int
+    target: OrbitState
+    chaser: OrbitState
+    pose: PoseTag  # the true camera: looks at the target, image y against the chaser's orbit normal
+    gcrs_to_camera: np.ndarray  # [3, 3]
+    earth_dir_body: np.ndarray  # [3] to the Earth's centre: where Earth-shine comes from
+    relative_rtn_m: np.ndarray  # [3] chaser from target: radial, along the track, along the orbit normal
+    range_m: float
+    phase_angle_rad: float  # between the Sun and the chaser, seen from the target
+    sunlit: float  # part of the Sun's disc that the target sees
+
+
+class Sky:
+    """A scenario at any time from its start on."""
+
+    def __init__(self, scenario: Scenario):
+        self.scenario = scenario
+        self.orbit = scenario.orbit
+        self._gcrs_to_body = attitude(
+            scenario.attitude,
+            self.orbit.target_tle,
+            self.orbit.start_utc_ns,
+            scenario.duration_s + HORIZON_MARGIN_S,
+        )
+        sigma = PoseSection()  # what the tag claims; the pose itself is exact
+        variances = [sigma.sigma_position_m**2, np.radians(sigma.sigma_attitude_deg) ** 2]
+        self._covariance = np.diag(np.repeat(variances, 3))
+
+    def state(self, utc_ns: int) -> SceneState:
+        """Return the scene at a time.
+
+        Raises:
+            OrbitError: an orbit cannot be propagated so far, or the time is outside the ephemeris.
+            ValueError: the camera's roll is undefined, or a tumble is not known at that time.
+        """
+        target = propagate(self.orbit.target_tle, utc_ns)
+        chaser = propagate(self.orbit.chaser_tle, utc_ns)
+        relative_m = chaser.position_m - target.position_m
+        gcrs_to_camera = look_along(-relative_m, down=-np.cross(chaser.position_m, chaser.velocity_m_s))
+        gcrs_to_body = self._gcrs_to_body(utc_ns)
+        sun = sun_direction_gcrs(utc_ns)
+        range_m = float(np.linalg.norm(relative_m))
+        sunlit = sunlit_fraction(target.position_m, utc_ns)
+        radial = target.position_m / np.linalg.norm(target.position_m)
+        normal = np.cross(target.position_m, target.velocity_m_s)
+        normal /= np.linalg.norm(normal)
+        pose = PoseTag(
+            quat_body_to_camera=matrix_to_quat(gcrs_to_camera @ gcrs_to_body.T),
+            position_body_m=gcrs_to_body @ relative_m,
+            covariance=self._covariance,
+            sun_dir_body=gcrs_to_body @ sun,
+            in_eclipse=sunlit < 0.5,
+            valid=True,
+            source="truth",
+        )
+        return SceneState(
+            utc_ns=utc_ns,
+            target=target,
+            chaser=chaser,
+            pose=pose,
+            gcrs_to_camera=gcrs_to_camera,
+            earth_dir_body=gcrs_to_body @ -radial,
+            relative_rtn_m=np.stack([radial, np.cross(normal, radial), normal]) @ relative_m,
+            range_m=range_m,
+            phase_angle_rad=float(np.arccos(np.clip(relative_m @ sun / range_m, -1, 1))),
+            sunlit=sunlit,
+        )
+
+
+def describe(scenario: Scenario) -> dict:
+    """Return a scenario's facts over its brackets: range, phase angle, eclipse, how far the body sees the Sun move.
+
+    For a designed chaser also how well it follows the orbit that it was designed with.
+    """
+    sky, start_ns = Sky(scenario), scenario.orbit.start_utc_ns
+    times_s = np.linspace(0.0, scenario.duration_s, scenario.brackets)
+    states = [sky.state(start_ns + round(t * 1e9)) for t in times_s]
+    ranges = [state.range_m for state in states]
+    phases = [math.degrees(state.phase_angle_rad) for state in states]
+    suns = np.array([state.pose.sun_dir_body for state in states])
+    facts = {
+        "description": scenario.description,
+        "brackets": len(states),
+        "duration_s": scenario.duration_s,
+        "range_m": [round(min(ranges), 1), round(max(ranges), 1)],
+        "phase_angle_deg": [round(min(phases), 1), round(max(phases), 1)],
+        "in_eclipse": sum(state.pose.in_eclipse for state in states),
+        "sun_moves_deg": round(float(np.degrees(np.arccos(np.clip(suns @ suns[0], -1, 1)).max())), 2),
+        "chaser_tle": list(sky.orbit.chaser_tle),
+    }
+    made = scenario.design
+    if made is not None:
+        facts |= {
+            name: round(getattr(made, name), 3)
+            for name in ("error_rms_m", "error_max_m", "unrounded_error_max_m", "drift_m_per_orbit")
+        }
+    return facts
+
+
+def load_scenario(name: str | Path) -> Scenario:
+    """Return a ready-made scenario by its name, or the one in a YAML file.
+
+    Raises:
+        ConfigError: no such scenario, or the file is wrong; the message starts with the key's path.
+    """
+    path = SCENARIOS / f"{name}.yaml"
+    if not path.is_file():
+        path = Path(name)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        names = ", ".join(sorted(p.stem for p in SCENARIOS.glob("*.yaml")))
+        raise ConfigError(str(name), f"no such scenario: expected a YAML file or one of {names}") from error
+    try:
+        tree = yaml.safe_load(content)
+    except (yaml.YAMLError, ValueError) as error:
+        raise ConfigError(str(path), f"is not valid YAML: {' '.join(str(error).split())}") from error
+    return build(Scenario, tree, "scenario", sha256=hashlib.sha256(content).hexdigest())

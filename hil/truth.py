@@ -2,45 +2,69 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import trimesh
 
+from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission
 from flightsw.pose import pose_tag
 from hil.blender import RenderFarm
 
 CLOUD_POINTS = 100_000
+LARGEST_SAMPLE = 10  # times the points wanted: a target whose inside is a tenth outside is given up on
 
 
-def write_truth(session: Path, mission: Mission, farm: RenderFarm, points: int = CLOUD_POINTS) -> None:
+def write_truth(
+    session: Path,
+    mission: Mission,
+    farm: RenderFarm,
+    points: int = CLOUD_POINTS,
+    pose_at: Callable[[int], PoseTag] | None = None,
+    geometry: bool = False,
+) -> None:
     """Write `session`/truth for the frames that reached the session; an existing truth folder is replaced.
 
-    The cloud holds the surface points that at least one of those frames sees, of `points` spread evenly by area.
+    The cloud holds `points` surface points, even by area, that at least one of those frames' brackets sees. A frame's
+    radiance file also holds its mask, as coverage (`alpha`).
+
+    Args:
+        pose_at: UTC ns to the true pose; by default the mission's own orbits and attitude.
+        geometry: write each frame's depth (planar, m, inf for nothing) and normals (body axes) too.
     """
+    pose_at = pose_at or (lambda utc_ns: pose_tag(mission, utc_ns))
     folder, part = session / "truth", session / "truth.part"
     shutil.rmtree(part, ignore_errors=True)
     (part / "radiance").mkdir(parents=True)
+    if geometry:
+        (part / "geometry").mkdir()
     entries, centres = [], {}
     for line in (session / "frames.jsonl").read_text().splitlines():
         record = json.loads(line)
-        pose = pose_tag(mission, record["mid_exposure_utc_ns"])
+        pose = pose_at(record["mid_exposure_utc_ns"])
+        name = f"{record['id']:06d}.npz"
         farm.radiance(pose)
-        name = f"radiance/{record['id']:06d}.npz"
-        shutil.copyfile(farm.path(pose), part / name)
-        entries.append(
-            {"id": record["id"], "world_to_camera": pose.world_to_camera.tolist(), "radiance": name}
-        )
+        shutil.copyfile(farm.path(pose), part / "radiance" / name)
+        entry = {
+            "id": record["id"],
+            "world_to_camera": pose.world_to_camera.tolist(),
+            "radiance": f"radiance/{name}",
+        }
+        if geometry:
+            farm.geometry(pose)
+            shutil.copyfile(farm.path(pose, "geometry"), part / "geometry" / name)
+            entry["geometry"] = f"geometry/{name}"
+        entries.append(entry)
         centres.setdefault(
             record["bracket"], pose.position_body_m
         )  # a bracket's frames stand centimetres apart
     vertices, faces = farm.surface()
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.export(part / "mesh.ply")
-    sampled = trimesh.sample.sample_surface(mesh, points, seed=0)[0]
-    seen = farm.visible(np.asarray(sampled), np.array(list(centres.values())))
-    trimesh.PointCloud(np.asarray(sampled)[seen].astype(np.float32)).export(part / "cloud.ply")
+    cloud = visible_points(farm, mesh, np.array(list(centres.values())), points)
+    trimesh.PointCloud(cloud.astype(np.float32)).export(part / "cloud.ply")
     facts = {
         "frames": entries,
         "cloud": "cloud.ply",
@@ -50,3 +74,16 @@ def write_truth(session: Path, mission: Mission, farm: RenderFarm, points: int =
     (part / "truth.json").write_text(json.dumps(facts))
     shutil.rmtree(folder, ignore_errors=True)
     part.rename(folder)
+
+
+def visible_points(farm: RenderFarm, mesh: trimesh.Trimesh, centres: np.ndarray, count: int) -> np.ndarray:
+    """Return `count` points [count, 3], even by area over what the camera centres [M, 3] see of the surface.
+
+    Fewer come back where less than a tenth of the surface is seen.
+    """
+    found, sampled = np.empty((0, 3)), 0
+    while len(found) < count and sampled < LARGEST_SAMPLE * count:
+        points = np.asarray(trimesh.sample.sample_surface(mesh, count, seed=sampled)[0])
+        found = np.concatenate([found, points[farm.visible(points, centres)]])
+        sampled += count
+    return found[:count]

@@ -1,25 +1,30 @@
 """The virtual serial line: rate, back-pressure, and faults that are seeded and counted."""
 
 import contextlib
+import json
 import os
+import signal
+import subprocess
+import sys
 import time
+from subprocess import PIPE
 
 import pytest
 import serial
 
 from flightsw.icd.framing import Deframer, frame_packet
-from hil.virtual_link import Faults, VirtualSerial, run_link
+from hil.virtual_link import Faults, VirtualLink, VirtualSerial, control, run_link
 
 PACKETS = [bytes([number % 256]) * (20 + number % 50) for number in range(300)]
 STREAM = b"".join(map(frame_packet, PACKETS))
 
 
-def send(line: VirtualSerial, stream: bytes, quiet_s: float = 0.3) -> bytes:
+def send(line: VirtualLink, stream: bytes, quiet_s: float = 0.3) -> bytes:
     """Send a stream down the line as fast as it takes it; return what arrives until it is quiet."""
     received, last_s = b"", time.monotonic()
     with (
-        serial.Serial(line.flight_device, line.baud_rate, timeout=0, write_timeout=0, exclusive=True) as near,
-        serial.Serial(line.ground_device, line.baud_rate, timeout=0, exclusive=True) as far,
+        serial.Serial(line.flight_device, timeout=0, write_timeout=0, exclusive=True) as near,
+        serial.Serial(line.ground_device, timeout=0, exclusive=True) as far,
     ):
         while stream or time.monotonic() - last_s < quiet_s:
             with contextlib.suppress(BlockingIOError):
@@ -34,7 +39,7 @@ def send(line: VirtualSerial, stream: bytes, quiet_s: float = 0.3) -> bytes:
 def assert_counts_add_up(line: VirtualSerial) -> None:
     for lane in line.statistics().values():
         assert lane.bytes_in + lane.duplicated_bytes == (
-            lane.bytes_out + lane.lost_bytes + lane.cut_bytes + lane.held_bytes
+            lane.bytes_out + lane.lost_bytes + lane.cut_bytes + lane.overrun_bytes + lane.held_bytes
         )
 
 
@@ -116,17 +121,62 @@ def test_both_directions_work_at_once():
         assert (far.read(4), near.read(2)) == (b"down", b"up")
 
 
+def test_latency_delays_the_first_byte_and_loses_none():
+    with VirtualSerial(3_000_000, latency_s=0.3) as line:
+        began_s = time.monotonic()
+        assert send(line, STREAM, quiet_s=0.6) == STREAM
+        assert time.monotonic() - began_s > 0.3 + 0.6
+        assert_counts_add_up(line)
+
+
+def test_without_flow_control_what_nobody_reads_in_time_is_lost_and_counted():
+    with (
+        VirtualSerial(3_000_000, flow_control=False) as line,
+        serial.Serial(line.flight_device, timeout=0, write_timeout=0) as near,
+        serial.Serial(line.ground_device, timeout=0.5) as far,
+    ):
+        end_s, written = time.monotonic() + 10, 0
+        while written < 100_000 and time.monotonic() < end_s:
+            with contextlib.suppress(BlockingIOError):
+                written += os.write(near.fileno(), b"x" * 1000)
+            time.sleep(0.001)
+        received = far.read(written)
+        lane = line.statistics()["down"]
+        assert lane.overrun_bytes > 0
+        assert len(received) == lane.bytes_out == written - lane.overrun_bytes
+        assert_counts_add_up(line)
+
+
+def test_a_running_line_obeys_commands():
+    with VirtualSerial(3_000_000) as line:
+        assert control(line, "cut").startswith("cut")
+        assert send(line, STREAM[:1000]) == b""
+        assert control(line, "mend").startswith("whole")
+        assert "0.25 s" in control(line, "latency 0.25")
+        assert "'loss': 1.0" in control(line, "loss 1")
+        assert send(line, STREAM[:1000], quiet_s=0.5) == b""
+        control(line, "loss 0")
+        assert send(line, STREAM[1000:2000], quiet_s=0.5)
+        assert_counts_add_up(line)
+
+
+@pytest.mark.parametrize("command", ["", "loss", "loss 2", "loss much", "latency -1", "cut 3", "explode"])
+def test_a_command_that_makes_no_sense_changes_nothing_and_says_why(command):
+    line = VirtualSerial(9600)
+    with pytest.raises(ValueError, match=r"expected cut, mend|must be 0 to 1|could not convert"):
+        control(line, command)
+    assert (line.faults, line.latency_s, line.is_cut) == (Faults(), 0.0, False)
+
+
 def test_run_link_names_its_ends_and_returns_its_counts():
     seen, reports = [], []
 
-    def on_ready(line: VirtualSerial) -> None:
+    def on_ready(line: VirtualLink) -> None:
         seen.append((line.flight_url, line.ground_url))
         assert send(line, STREAM[:500]) == STREAM[:500]
 
     statistics = run_link(
-        921_600,
-        Faults(),
-        0,
+        VirtualSerial(921_600),
         on_ready,
         should_stop=lambda: bool(reports),
         on_statistics=reports.append,
@@ -135,6 +185,30 @@ def test_run_link_names_its_ends_and_returns_its_counts():
     assert seen[0][0].startswith("serial:///dev/") and seen[0][0].endswith("?baud=921600")
     assert seen[0][0] != seen[0][1]
     assert statistics["down"].bytes_out == 500
+
+
+@pytest.mark.parametrize(
+    ("arguments", "scheme"), [(["--baud", "115200"], "serial"), (["--fd", "--one-shot"], "slcan")]
+)
+def test_the_link_command_prints_its_ends_obeys_its_input_and_prints_its_counts(arguments, scheme):
+    command = [sys.executable, "-m", "hil.cli", "link", "--seed", "3", *arguments]
+    with subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True) as process:
+        assert process.stdout and process.stdin and process.stderr
+        ends = [process.stdout.readline().split() for _ in range(2)]
+        assert [end[0] for end in ends] == ["flight", "ground"]
+        assert all(end[1].startswith(f"{scheme}:///dev/") for end in ends)
+        process.stdin.write("loss 0.5\nnonsense\n")
+        process.stdin.flush()
+        assert "'loss': 0.5" in process.stderr.readline()
+        assert "expected cut, mend" in process.stderr.readline()
+        process.send_signal(signal.SIGUSR1)
+        process.stdin.write("latency 0.1\n")
+        process.stdin.flush()
+        assert process.stderr.readline().startswith("cut, latency 0.1 s")
+        process.terminate()
+        counts = json.loads(process.stdout.readline())
+        assert set(counts) == {"down", "up"}
+    assert process.returncode == 0
 
 
 def test_a_fault_s_rate_is_a_probability():

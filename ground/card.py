@@ -1,0 +1,36 @@
+"""The model card: what a model is, how good, and why it is no larger."""
+
+SIZES = {"model.ply": "ply_bytes", "model.spz": "spz_bytes", "model.onnx": "onnx_bytes"}
+USES = {
+    "model.ply": "every number, read back exactly",
+    "model.spz": "quantised, for viewers and storage",
+    "model.onnx": "the renderer for use on board",
+}
+
+
+def model_card(session_created_utc: str, metrics: dict) -> str:
+    """Return the card as Markdown: figures that were not measured are left out."""
+    exposures_ms = [1e3 * exposure_s for exposure_s in metrics["exposures_s"]]
+    lines = [
+        "# Model card",
+        "",
+        f"{metrics['gaussians']:,} Gaussians with radiance of degree {metrics['sh_degree']}, by method "
+        f"{metrics['method']} from {metrics['frames_trained']} frames of the session of {session_created_utc}.",
+        "",
+        f"- Started from: {metrics['start']}. Stopped because: {metrics['stop_reason']}, after "
+        f"{metrics['train_seconds']:.0f} s.",
+        f"- Exposure times it was trained on: {exposures_ms[0]:g} to {exposures_ms[-1]:g} ms. Between them its images "
+        "are as good as below; outside them it extrapolates linearly.",
+        f"- Residual chi² on the target: {metrics['chi2']:.2f} (1 is pure noise).",
+    ]
+    for key, text in (
+        ("psnr_noisy_db", "Held-out PSNR against the noisy frames: {:.2f} dB."),
+        ("psnr_clean_db", "Held-out PSNR against the noiseless exposures: {:.2f} dB."),
+        ("chamfer", "Chamfer distance of the centres (largest dimension = 2): {:.4f}."),
+        ("completeness_surface", "Of the true surface, {:.1f} % lies within 0.01 of surface.ply."),
+    ):
+        if key in metrics:
+            lines.append("- " + text.format(metrics[key]))
+    lines += ["", "| file | bytes | for |", "| --- | --- | --- |"]
+    lines += [f"| {name} | {metrics[key]:,} | {USES[name]} |" for name, key in SIZES.items()]
+    return "\n".join([*lines, ""])

@@ -1,0 +1,218 @@
+"""NeRF-synthetic folders: transforms_{train,val,test}.json, camera-to-world in OpenGL axes, pictures of 8 bits.
+
+Extra keys that other readers ignore keep what the format cannot say: the calibration, and for each frame its exposure,
+time, bracket and light.
+"""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import imagecodecs
+import numpy as np
+
+from flightsw.icd.mission import CameraSection, ConfigError, build
+from ground.formats.views import (
+    FormatError,
+    Intrinsics,
+    View,
+    image_size,
+    opengl_to_world_to_camera,
+    world_to_camera_to_opengl,
+)
+from ground.session import FrameRecord, Session, write_whole
+
+SPLITS = ("train", "val", "test")
+# Of eleven brackets six train, two validate, three test: 363 frames in threes give 198, 66 and 99, as published
+SPLIT_PATTERN = (0, 1, 0, 2, 0, 2, 0, 1, 0, 2, 0)
+
+
+def read_nerf(folder: Path) -> tuple[list[View], CameraSection | None]:
+    """Return the pictures of all splits, in the order of their frame numbers, and the calibration if we wrote it.
+
+    Raises:
+        FormatError: there is no transforms_*.json, or one is not what it should be.
+    """
+    numbered: list[tuple[int, View]] = []
+    camera = None
+    for split in SPLITS:
+        path = folder / f"transforms_{split}.json"
+        if not path.is_file():
+            continue
+        tree = load_transforms(path)
+        camera = camera or read_calibration(tree, path)
+        for frame in tree["frames"]:
+            image = image_path(folder, frame, path)
+            intrinsics = _intrinsics(tree, image, path)
+            numbered.append(
+                (frame.get("frame_id", len(numbered)), read_frame(frame, image, intrinsics, path))
+            )
+    if not numbered:
+        raise FormatError(f"{folder}: no transforms_train.json, transforms_val.json or transforms_test.json")
+    return [view for _, view in sorted(numbered, key=lambda entry: entry[0])], camera
+
+
+def export_nerf(session: Session, out: Path) -> dict[str, int]:
+    """Write a session as a NeRF-synthetic folder and return the frames of each split.
+
+    Pictures are linear: black level to full scale becomes 0 to 255, opaque. Splits are whole brackets.
+    """
+    split_of = split_brackets(session)
+    camera = session.camera
+    counts = {}
+    for split in SPLITS:
+        (out / split).mkdir(parents=True, exist_ok=True)
+        records = [record for record in session.frames if split_of[record.bracket] == split]
+        frames = []
+        for record in records:
+            name = f"{split}/r_{record.id:04d}"
+            write_whole(out / f"{name}.png", picture(session, record))
+            frames.append({"file_path": f"./{name}", "rotation": 0.0, **frame_keys(session, record)})
+        tree = {
+            "camera_angle_x": 2 * math.atan(camera.width / (2 * camera.fx_px)),
+            **camera_keys(camera),
+            "frames": frames,
+        }
+        write_whole(out / f"transforms_{split}.json", json.dumps(tree, indent=1).encode() + b"\n")
+        counts[split] = len(records)
+    return counts
+
+
+def split_brackets(session: Session) -> dict[int, str]:
+    """Return the split of each bracket: train, val or test, in the published proportion 6:2:3, mixed along the pass."""
+    brackets = sorted({record.bracket for record in session.frames})
+    return {b: SPLITS[SPLIT_PATTERN[i % len(SPLIT_PATTERN)]] for i, b in enumerate(brackets)}
+
+
+def picture(session: Session, record: FrameRecord) -> bytes:
+    """Return a frame as PNG, RGBA of 8 bits, linear and opaque."""
+    camera = session.camera
+    dn = session.dn(record).astype(np.float64)
+    value = np.clip((dn - camera.black_dn) / (camera.white_dn - camera.black_dn), 0, 1)
+    rgba = np.full((*dn.shape[:2], 4), 255, dtype=np.uint8)
+    rgba[..., :3] = np.rint(255 * value.reshape(*dn.shape[:2], -1))
+    return bytes(imagecodecs.png_encode(rgba, level=6))
+
+
+def frame_keys(session: Session, record: FrameRecord) -> dict[str, Any]:
+    """Return a frame's pose, and what is ours alone."""
+    start_ns = session.frames[0].mid_exposure_utc_ns
+    return {
+        "transform_matrix": world_to_camera_to_opengl(record.world_to_camera).tolist(),
+        "exposure_time_s": record.exposure_time_s,
+        "time": (record.mid_exposure_utc_ns - start_ns) * 1e-9,  # s since the first frame
+        "mid_exposure_utc_ns": record.mid_exposure_utc_ns,
+        "frame_id": record.id,
+        "bracket": record.bracket,
+        "bracket_index": record.bracket_index,
+        "sun_dir_body": record.sun_dir_body.tolist(),
+        "in_eclipse": record.in_eclipse,
+    }
+
+
+def camera_keys(camera: CameraSection) -> dict[str, Any]:
+    """Return the intrinsics as nerfstudio names them, and our calibration."""
+    return {
+        "fl_x": camera.fx_px,
+        "fl_y": camera.fy_px,
+        "cx": camera.cx_px,
+        "cy": camera.cy_px,
+        "w": camera.width,
+        "h": camera.height,
+        "calibration": dataclasses.asdict(camera),
+    }
+
+
+def load_transforms(path: Path) -> dict[str, Any]:
+    """Return a transforms file whose "frames" is a list of objects.
+
+    Raises:
+        FormatError: it is not.
+    """
+    try:
+        tree = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise FormatError(f"{path}: cannot be read as JSON: {error}") from error
+    frames = tree.get("frames") if isinstance(tree, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise FormatError(f'{path}: expected an object with a list "frames"')
+    return tree
+
+
+def image_path(folder: Path, frame: dict[str, Any], where: Path) -> Path:
+    """Return a frame's picture; NeRF-synthetic leaves the .png away."""
+    name = frame.get("file_path")
+    if not isinstance(name, str):
+        raise FormatError(f"{where}: a frame has no file_path")
+    image = folder / name
+    return image if image.is_file() else image.with_name(image.name + ".png")
+
+
+def read_frame(frame: dict[str, Any], image: Path, intrinsics: Intrinsics, where: Path) -> View:
+    """Return one frame of a transforms file.
+
+    Raises:
+        FormatError: the pose or one of our extra keys is wrong.
+    """
+    pose = opengl_to_world_to_camera(frame.get("transform_matrix"), f"{where}: {image.name}")
+    try:
+        time_ns, bracket = frame.get("mid_exposure_utc_ns"), frame.get("bracket")
+        sun = np.array(frame.get("sun_dir_body", (0.0, 0.0, 0.0)), dtype=np.float64)
+        exposure_time_s = float(frame.get("exposure_time_s", 1.0))
+        if sun.shape != (3,) or not 0 < exposure_time_s < math.inf:
+            raise ValueError(f"exposure_time_s {exposure_time_s}, sun_dir_body {sun.tolist()}")
+        return View(
+            image,
+            pose,
+            intrinsics,
+            exposure_time_s=exposure_time_s,
+            mid_exposure_utc_ns=None if time_ns is None else int(time_ns),
+            bracket=None if bracket is None else int(bracket),
+            bracket_index=int(frame.get("bracket_index", 0)),
+            sun_dir_body=sun,
+            in_eclipse=bool(frame.get("in_eclipse", False)),
+        )
+    except (ValueError, TypeError) as error:
+        raise FormatError(f"{where}: {image.name}: {error}") from error
+
+
+def read_calibration(tree: dict[str, Any], where: Path) -> CameraSection | None:
+    """Return the calibration that our export wrote, its noise increased by the 8 bits' rounding; else None.
+
+    Raises:
+        FormatError: it is damaged.
+    """
+    if "calibration" not in tree:
+        return None
+    try:
+        camera: CameraSection = build(CameraSection, tree["calibration"], "calibration")
+    except ConfigError as error:
+        raise FormatError(f"{where}: {error}") from error
+    step_dn = (camera.white_dn - camera.black_dn) / 255
+    if step_dn <= 1:
+        return camera
+    rounding_dn = step_dn / math.sqrt(12)
+    return dataclasses.replace(camera, read_noise_dn=math.hypot(camera.read_noise_dn, rounding_dn))
+
+
+def _intrinsics(tree: dict[str, Any], image: Path, where: Path) -> Intrinsics:
+    try:
+        if "w" in tree and "h" in tree:
+            width, height = int(tree["w"]), int(tree["h"])
+        else:
+            width, height = image_size(image)
+        focal_px = tree.get("fl_x") or width / (2 * math.tan(tree["camera_angle_x"] / 2))
+        return Intrinsics(
+            width,
+            height,
+            float(focal_px),
+            float(tree.get("fl_y", focal_px)),
+            float(tree.get("cx", width / 2)),
+            float(tree.get("cy", height / 2)),
+        )
+    except KeyError as error:
+        raise FormatError(f"{where}: {error} is missing") from error
+    except (TypeError, ValueError) as error:
+        raise FormatError(f"{where}: the camera is not given in numbers: {error}") from error

@@ -1,0 +1,298 @@
+"""Data sets like the source paper's: a scenario rendered, exposed and written as a session and as NeRF pictures."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import yaml
+
+from flightsw.icd.frame import Frame, PoseTag, encode_frame
+from flightsw.icd.mission import ConfigError, Mission, build
+from flightsw.sequencer import Shot, plan
+from ground.formats.nerf import export_nerf
+from ground.session import SessionWriter, open_session, write_whole
+from hil import blender, sensor, truth
+from hil.blender import RenderFarm, mesh_sha256
+from hil.motion import image_velocity, smear
+from hil.scenario import SceneState, Sky, load_scenario
+from hil.sensor import PRESETS, SensorModel, read_out
+from hil.stars import star_radiance
+
+DATASETS = Path(__file__).parent / "datasets"
+MARKER = "dataset.json"
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".stl")
+# The lens is chosen so that a bright part of the target reads 0.7 of full scale at the middle exposure
+BRIGHT_PERCENTILE, BRIGHT_SIGNAL, COVERED_ALPHA = 97, 0.7, 230
+MOTION_S = 0.1  # poses so far apart give the image's velocity
+
+
+class DatasetError(RuntimeError):
+    """A data set cannot be made where or as it was asked for."""
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """What makes one data set, apart from the mesh; `targets` are mesh names for a set of several."""
+
+    scenario: str = "fly-around"
+    frames: int = 363
+    size_px: int = 800
+    bracket_ms: tuple[float, ...] = (0.05, 0.1, 0.2)
+    sensor: Literal["paper", "spacecam"] = "paper"
+    seed: int = 1
+    targets: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        if not self.bracket_ms or self.frames < 1 or self.frames % len(self.bracket_ms):
+            raise ConfigError(
+                "dataset.frames",
+                f"expected a multiple of the bracket's {len(self.bracket_ms)} exposures, got {self.frames}",
+            )
+        if not 8 <= self.size_px <= 8192:
+            raise ConfigError("dataset.size_px", f"expected 8 to 8192, got {self.size_px}")
+        if not all(np.isfinite(t) and t > 0 for t in self.bracket_ms):
+            raise ConfigError("dataset.bracket_ms", f"expected positive times, got {list(self.bracket_ms)}")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far one step of one target's data set is."""
+
+    target: str
+    step: Literal["render", "expose"]
+    done: int
+    total: int
+
+
+def load_dataset_config(name: str | Path) -> DatasetConfig:
+    """Return a ready-made data set's configuration by its name, or the one in a YAML file.
+
+    Raises:
+        ConfigError: there is none, or it is wrong; the message names the key.
+    """
+    path = DATASETS / f"{name}.yaml"
+    if not path.is_file():
+        path = Path(name)
+    try:
+        tree = yaml.safe_load(path.read_bytes())
+    except OSError as error:
+        names = ", ".join(sorted(p.stem for p in DATASETS.glob("*.yaml")))
+        raise ConfigError(str(name), f"no such data set: expected a YAML file or one of {names}") from error
+    except (yaml.YAMLError, ValueError) as error:
+        raise ConfigError(str(path), f"is not valid YAML: {' '.join(str(error).split())}") from error
+    return build(DatasetConfig, tree, "dataset")
+
+
+def target_meshes(config: DatasetConfig, folder: Path) -> list[Path]:
+    """Return the mesh files of a set's targets in a folder.
+
+    Raises:
+        ConfigError: the configuration names none, or one is not there.
+    """
+    if not config.targets:
+        raise ConfigError("dataset.targets", "names no targets; give one mesh instead")
+    meshes = []
+    for name in config.targets:
+        found = [path for suffix in MESH_SUFFIXES if (path := folder / f"{name}{suffix}").is_file()]
+        if not found:
+            raise ConfigError("dataset.targets", f"{folder} holds no {name}{{{','.join(MESH_SUFFIXES)}}}")
+        meshes.append(found[0])
+    return meshes
+
+
+def make_dataset(
+    config: DatasetConfig,
+    mesh: Path,
+    out: Path,
+    cache: Path,
+    workers: int = 2,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> dict:
+    """Make one target's data set in `out` and return its facts; what is there already is kept and continued.
+
+    `out` holds session/ (frames, and truth/ with radiance and masks, depth and normals, mesh, cloud), the NeRF layout
+    (transforms_{train,val,test}.json with their pictures), and dataset.json. Frames are tagged with their true poses.
+
+    Raises:
+        ConfigError: scenario, sensor or bracket do not fit together.
+        DatasetError: `out` holds a data set made with other settings, or the scenario leaves the target dark.
+        MeshError, BlenderError: the mesh or Blender is not usable.
+    """
+    scenario = load_scenario(config.scenario)
+    brackets = scenario.bracket_section(config.bracket_ms, config.frames // len(config.bracket_ms))
+    digest = _digest(config, scenario.sha256, mesh)
+    done = _already_made(out, digest)
+    if done is not None:
+        return done
+    out.mkdir(parents=True, exist_ok=True)
+    _write_json(out / MARKER, {"complete": False, "digest": digest})
+
+    focal_px = config.size_px / 2 / np.tan(np.radians(scenario.fov_deg) / 2)
+    model = PRESETS[config.sensor]
+    camera = model.camera_section(config.size_px, config.size_px, focal_px)
+    mission = Mission(orbit=scenario.orbit, camera=camera, bracket=brackets, sha256=digest)
+    sky = Sky(scenario)
+    shots = list(plan(mission))
+    states = [sky.state(shot.mid_exposure_utc_ns) for shot in shots]
+    with RenderFarm(mission, mesh, cache, workers) as farm:
+        rendered = iter(range(1, len(states) + 1))  # a worker's thread takes the next number: a count
+        farm.prerender(
+            [state.pose for state in states],
+            lambda: on_progress(Progress(mesh.stem, "render", next(rendered), len(states))),
+            ops=("render", "geometry"),
+        )
+        middle_s = sorted(config.bracket_ms)[len(config.bracket_ms) // 2] / 1e3
+        gain = _gain(farm, states, model, middle_s)
+        model = model.with_gain(gain)
+        mission = dataclasses.replace(
+            mission, camera=model.camera_section(config.size_px, config.size_px, focal_px)
+        )
+        writer = SessionWriter(out / "session", mission)
+        for index, frame in enumerate(_frames(mission, sky, shots, states, farm, model, config.seed)):
+            writer.add(frame, encode_frame(frame))
+            on_progress(Progress(mesh.stem, "expose", index + 1, len(shots)))
+        writer.save({}, 0)
+        truth.write_truth(
+            out / "session",
+            mission,
+            farm,
+            truth.CLOUD_POINTS,
+            pose_at=lambda utc_ns: sky.state(utc_ns).pose,
+            geometry=True,
+        )
+        mesh_facts = farm.facts
+    session = open_session(out / "session")
+    counts = export_nerf(session, out)
+    facts = {
+        "complete": True,
+        "digest": digest,
+        "config": dataclasses.asdict(config),
+        "mesh": {"name": mesh.name, "sha256": mesh_sha256(mesh), **mesh_facts},
+        "scenario": {"name": config.scenario, "sha256": scenario.sha256},
+        "blender": blender.BPY_VERSION,
+        "dn_per_radiance_s": gain,
+        "frames": len(shots),
+        "in_eclipse": sum(state.pose.in_eclipse for state in states),
+        "saturated_share": sum(r.saturated for r in session.frames) / (len(shots) * config.size_px**2),
+        "split": counts,
+    }
+    _write_json(out / MARKER, facts)
+    return facts
+
+
+def _frames(
+    mission: Mission,
+    sky: Sky,
+    shots: list[Shot],
+    states: list[SceneState],
+    farm: RenderFarm,
+    model: SensorModel,
+    seed: int,
+) -> Iterator[Frame]:
+    for number, (shot, state) in enumerate(zip(shots, states, strict=True)):
+        light = _light(mission, sky, state, farm, model, shot.exposure_time_s)
+        dn = read_out(model, light, shot.exposure_time_s, np.random.default_rng((seed, number)))
+        yield Frame(
+            frame_id=number,
+            bracket_id=shot.bracket_id,
+            bracket_index=shot.bracket_index,
+            bracket_count=shot.bracket_count,
+            exposure_time_s=shot.exposure_time_s,
+            mid_exposure_utc_ns=shot.mid_exposure_utc_ns,
+            pose=state.pose,
+            dn=dn[..., 0] if model.channels == 1 else dn,
+            bit_depth=model.bit_depth,
+            black_dn=model.black_dn,
+            saturated_count=int((dn.reshape(*dn.shape[:2], -1) >= model.white_dn).any(axis=2).sum()),
+        )
+
+
+def _light(
+    mission: Mission,
+    sky: Sky,
+    state: SceneState,
+    farm: RenderFarm,
+    model: SensorModel,
+    exposure_time_s: float,
+) -> np.ndarray:
+    """Return the mean radiance [H, W, C] in front of the lens during an exposure: the target, moving, and the stars."""
+    camera = mission.camera
+    light = farm.radiance(state.pose).astype(np.float64)
+    if model.stars:
+        alpha = _alpha(farm, state.pose)
+        sky_light = star_radiance(state.gcrs_to_camera, np.array(camera.K), camera.width, camera.height)
+        light += (sky_light * (1 - alpha))[..., None]
+    if model.line_time_s or exposure_time_s > MOTION_S / 100:
+        depth, _ = farm.geometry(state.pose)
+        start_ns = sky.orbit.start_utc_ns
+        before_ns = max(start_ns, state.utc_ns - round(MOTION_S * 5e8))
+        after_ns = state.utc_ns + round(MOTION_S * 5e8)
+        velocity = image_velocity(
+            depth,
+            np.array(camera.K),
+            sky.state(before_ns).pose.world_to_camera,
+            sky.state(after_ns).pose.world_to_camera,
+            (after_ns - before_ns) * 1e-9,
+        )
+        light = smear(light, velocity, exposure_time_s, model.line_time_s)
+    return light
+
+
+def _alpha(farm: RenderFarm, pose: PoseTag) -> np.ndarray:
+    with np.load(farm.path(pose)) as arrays:
+        return arrays["alpha"] / 255.0
+
+
+def _gain(farm: RenderFarm, states: list[SceneState], model: SensorModel, exposure_time_s: float) -> float:
+    """Return the digital numbers per radiance and second that put the target's bright parts at 0.7 of full scale."""
+    covered = []
+    for state in states:
+        if not state.pose.in_eclipse:
+            radiance = farm.radiance(state.pose).astype(np.float32).mean(axis=2)
+            covered.append(radiance[_alpha(farm, state.pose) * 255 >= COVERED_ALPHA])
+    values = np.concatenate(covered) if covered else np.empty(0)
+    bright = float(np.percentile(values, BRIGHT_PERCENTILE)) if len(values) else 0.0
+    if not bright > 0:
+        raise DatasetError("no frame of this scenario shows a lit target: nothing to set the exposure by")
+    gain = BRIGHT_SIGNAL * (model.white_dn - model.black_dn) / (bright * exposure_time_s)
+    return float(f"{gain:.6g}")
+
+
+def _digest(config: DatasetConfig, scenario_sha256: str, mesh: Path) -> str:
+    """Return the digest of all that shapes a data set: settings, scenario, mesh, and the code that makes pixels."""
+    if not mesh.is_file():
+        raise blender.MeshError(f"{mesh}: no such file")
+    settings = {**dataclasses.asdict(config), "targets": None, "scenario": scenario_sha256}
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode() + mesh_sha256(mesh).encode())
+    for source in (blender.WORKER, Path(sensor.__file__), Path(truth.__file__), Path(__file__)):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
+def _already_made(out: Path, digest: str) -> dict | None:
+    """Return the facts of a finished data set, None where there is nothing or one to continue."""
+    marker = out / MARKER
+    if not marker.exists():
+        if (out / "session").exists():
+            raise DatasetError(f"{out}/session was not made by `hil dataset`; choose another folder")
+        return None
+    try:
+        facts = json.loads(marker.read_text())
+        same, complete = facts["digest"] == digest, facts["complete"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{marker} is damaged ({error}); remove {out} and run again") from error
+    if not same:
+        raise DatasetError(
+            f"{out} was made with other settings or another version; choose another folder or remove it "
+            "(rendered pictures are kept in the cache)"
+        )
+    return facts if complete else None
+
+
+def _write_json(path: Path, content: dict) -> None:
+    write_whole(path, (json.dumps(content, indent=2) + "\n").encode())

@@ -1,0 +1,39 @@
+"""Stars behind the target: invented places, the real sky's brightness and number."""
+
+import functools
+
+import numpy as np
+
+FAINTEST_MAGNITUDE = 9.0
+SUN_MAGNITUDE = -26.74
+SUN_IRRADIANCE = np.pi  # in the renderer's unit: a white Lambert plate facing the Sun has radiance 1
+
+
+@functools.cache
+def catalogue() -> tuple[np.ndarray, np.ndarray]:
+    """Return stars brighter than magnitude 9: directions [N, 3] in GCRS and irradiances [N] in the renderer's unit.
+
+    Numbers grow as 10^(0.51 m), 5,000 brighter than magnitude 6, as on the real sky (Allen's Astrophysical Quantities);
+    places are random and always the same.
+    """
+    rng = np.random.default_rng(20260721)
+    count = round(5000 * 10 ** (0.51 * (FAINTEST_MAGNITUDE - 6)))
+    directions = rng.standard_normal((count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    magnitudes = FAINTEST_MAGNITUDE + np.log10(rng.random(count)) / 0.51
+    return directions, SUN_IRRADIANCE * 10 ** (-0.4 * (magnitudes - SUN_MAGNITUDE))
+
+
+def star_radiance(gcrs_to_camera: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Return the stars' radiance [H, W], each star's light in one pixel (a lens with a PSF spreads it)."""
+    directions, irradiances = catalogue()
+    in_camera = directions @ gcrs_to_camera.T
+    ahead = in_camera[:, 2] > 1e-6
+    image = in_camera[ahead] @ np.asarray(K).T
+    column, row = np.floor(image[:, :2] / image[:, 2:]).T
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    radiance = np.zeros((height, width))
+    pixel_sr = 1 / (K[0][0] * K[1][1])
+    place = (row[inside].astype(int), column[inside].astype(int))
+    np.add.at(radiance, place, irradiances[ahead][inside] / pixel_sr)
+    return radiance

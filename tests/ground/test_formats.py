@@ -1,0 +1,419 @@
+"""Import and export: small folders in the exact layouts, and readers and writers that are not ours."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import imagecodecs
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flightsw.icd.frame import encode_frame, quat_to_matrix
+from ground.formats.colmap import read_colmap
+from ground.formats.nerf import export_nerf, read_nerf, split_brackets
+from ground.formats.nerfstudio import export_nerfstudio, read_nerfstudio
+from ground.formats.shirt import read_shirt
+from ground.formats.views import (
+    FormatError,
+    Intrinsics,
+    opengl_to_world_to_camera,
+    undistort,
+    world_to_camera_to_opengl,
+    write_session,
+)
+from ground.session import SessionError, SessionWriter, open_session
+
+RNG = np.random.default_rng(3)
+unit_quats = st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1)
+
+
+def random_pose(rng=RNG) -> np.ndarray:
+    quat = rng.normal(size=4)
+    matrix = np.eye(4)
+    matrix[:3, :3] = quat_to_matrix(quat / np.linalg.norm(quat))
+    matrix[:3, 3] = rng.normal(size=3) * 5
+    return matrix
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(imagecodecs.png_encode(image))
+
+
+@pytest.fixture
+def session(tmp_path, small_mission, make_frame):
+    """Twelve frames of noise in four brackets, as flight sends them."""
+    writer = SessionWriter(tmp_path / "original", small_mission)
+    for number in range(12):
+        frame = make_frame(number)
+        writer.add(frame, encode_frame(frame))
+    return open_session(tmp_path / "original")
+
+
+# --- axes ---
+
+
+@settings(max_examples=50, deadline=None)
+@given(quat=unit_quats, place=st.tuples(*[st.floats(-1e3, 1e3)] * 3))
+def test_opengl_poses_come_back_to_rounding(quat, place):
+    pose = np.eye(4)
+    pose[:3, :3] = quat_to_matrix(np.array(quat) / np.linalg.norm(quat))
+    pose[:3, 3] = place
+    again = opengl_to_world_to_camera(world_to_camera_to_opengl(pose).tolist(), "here")
+    np.testing.assert_array_equal(again[:3, :3], pose[:3, :3])  # signs only
+    np.testing.assert_allclose(again, pose, atol=1e-9)
+
+
+def test_an_opengl_camera_looks_along_minus_z_with_y_up():
+    c2w = np.eye(4)
+    c2w[:3, 3] = [0, 0, 5]  # Blender's camera at +5 z sees the origin
+    np.testing.assert_array_equal(opengl_to_world_to_camera(c2w, "here") @ [0, 0, 0, 1], [0, 0, 5, 1])
+    np.testing.assert_array_equal(opengl_to_world_to_camera(c2w, "here") @ [1, 2, 0, 1], [1, -2, 5, 1])
+
+
+# --- NeRF-synthetic ---
+
+
+def nerf_folder(folder: Path, suffix: str = "") -> dict[str, np.ndarray]:
+    """The layout of the original NeRF data: RGBA, no size, no suffix, three splits."""
+    poses = {}
+    for split, count in (("train", 3), ("val", 1), ("test", 2)):
+        frames = []
+        for i in range(count):
+            rgba = RNG.integers(0, 256, (20, 24, 4), dtype=np.uint8)
+            write_png(folder / split / f"r_{i}.png", rgba)
+            c2w = random_pose()
+            poses[f"{split}/r_{i}"] = c2w
+            frames.append(
+                {
+                    "file_path": f"./{split}/r_{i}{suffix}",
+                    "rotation": 0.0126,
+                    "transform_matrix": c2w.tolist(),
+                }
+            )
+        tree = {"camera_angle_x": 0.6911112070083618, "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(tree))
+    return poses
+
+
+@pytest.mark.parametrize("suffix", ["", ".png"])
+def test_nerf_synthetic_becomes_a_session(tmp_path, suffix):
+    poses = nerf_folder(tmp_path / "lego", suffix)
+    views, camera = read_nerf(tmp_path / "lego")
+    assert camera is None and write_session(views, tmp_path / "s", "lego") == 6
+    session = open_session(tmp_path / "s")
+    assert session.camera.fx_px == pytest.approx(12 / math.tan(0.6911112070083618 / 2))
+    assert (session.camera.cx_px, session.camera.cy_px, session.camera.channels) == (12, 10, 3)
+    for record, (name, c2w) in zip(session.frames, poses.items(), strict=True):
+        rgba = imagecodecs.imread(tmp_path / "lego" / f"{name}.png").astype(float)
+        np.testing.assert_array_equal(session.dn(record), np.rint(rgba[..., :3] * rgba[..., 3:] / 255))
+        # three.js, Blender and NeRF agree on these axes; inverse by NumPy, signs written out
+        expected = np.linalg.inv(c2w) * np.array([[1], [-1], [-1], [1]])
+        np.testing.assert_allclose(record.world_to_camera, expected, atol=1e-12)
+
+
+def test_srgb_is_undone_on_request(tmp_path):
+    nerf_folder(tmp_path / "lego")
+    views, _ = read_nerf(tmp_path / "lego")
+    write_session(views, tmp_path / "s", "lego", srgb=True)
+    session = open_session(tmp_path / "s")
+    rgba = imagecodecs.imread(views[0].image) / 255
+    linear = np.where(rgba <= 0.04045, rgba / 12.92, ((rgba + 0.055) / 1.055) ** 2.4)[..., :3] * rgba[..., 3:]
+    assert session.camera.bit_depth == 16
+    np.testing.assert_allclose(session.dn(session.frames[0]) / 65535, linear, atol=1e-5)
+
+
+def test_a_session_survives_export_and_import(tmp_path, session):
+    counts = export_nerf(session, tmp_path / "nerf")
+    assert counts == {"train": 6, "val": 3, "test": 3}
+    views, camera = read_nerf(tmp_path / "nerf")
+    write_session(views, tmp_path / "again", "nerf", camera=camera)
+    again = open_session(tmp_path / "again")
+    step_dn = (session.camera.white_dn - session.camera.black_dn) / 255
+    for a, b in zip(session.frames, again.frames, strict=True):
+        np.testing.assert_allclose(a.world_to_camera, b.world_to_camera, atol=1e-9)
+        for name in (
+            "id",
+            "bracket",
+            "bracket_index",
+            "exposure_time_s",
+            "mid_exposure_utc_ns",
+            "in_eclipse",
+        ):
+            assert getattr(a, name) == getattr(b, name)
+        np.testing.assert_allclose(a.sun_dir_body, b.sun_dir_body)
+        above_black = np.maximum(session.dn(a).astype(float), session.camera.black_dn)
+        assert np.abs(above_black - again.dn(b)).max() <= step_dn / 2 + 0.5
+    assert again.camera.dn_per_radiance_s == session.camera.dn_per_radiance_s
+    assert again.camera.read_noise_dn == pytest.approx(math.hypot(8.0, step_dn / math.sqrt(12)))
+
+
+def test_whole_brackets_go_to_one_split(session):
+    assert split_brackets(session) == {0: "train", 1: "val", 2: "train", 3: "test"}
+
+
+def test_what_we_export_is_what_a_plain_nerf_loader_expects(tmp_path, session):
+    """After load_blender.py of the original NeRF: json, imread, stack, focal from the angle."""
+    export_nerf(session, tmp_path / "nerf")
+    for split in ("train", "val", "test"):
+        meta = json.loads((tmp_path / "nerf" / f"transforms_{split}.json").read_text())
+        images = [
+            cv2.imread(str(tmp_path / "nerf" / (f["file_path"] + ".png")), cv2.IMREAD_UNCHANGED)
+            for f in meta["frames"]
+        ]
+        stack = (np.array(images) / 255.0).astype(np.float32)
+        assert stack.shape[1:] == (48, 48, 4) and (stack[..., 3] == 1).all()
+        focal = 0.5 * stack.shape[2] / np.tan(0.5 * meta["camera_angle_x"])
+        assert focal == pytest.approx(session.camera.fx_px)
+        for frame in meta["frames"]:
+            record = next(r for r in session.frames if r.id == frame["frame_id"])
+            c2w = np.array(frame["transform_matrix"])
+            np.testing.assert_allclose(c2w[:3, 3], record.position_body_m, atol=1e-6)
+            ahead = -c2w[:3, 2]  # OpenGL looks along -z
+            np.testing.assert_allclose(ahead, record.world_to_camera[2, :3], atol=1e-12)
+
+
+# --- nerfstudio ---
+
+
+def test_nerfstudio_export_holds_what_its_documentation_asks_for(tmp_path, session):
+    counts = export_nerfstudio(session, tmp_path / "ns")
+    tree = json.loads((tmp_path / "ns" / "transforms.json").read_text())
+    assert {"camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "frames"} <= set(
+        tree
+    )
+    assert tree["camera_model"] == "OPENCV" and tree["w"] == 48 and tree["fl_x"] == session.camera.fx_px
+    names = [frame["file_path"] for frame in tree["frames"]]
+    assert sorted(tree["train_filenames"] + tree["val_filenames"] + tree["test_filenames"]) == sorted(names)
+    assert counts == {"train": 6, "val": 3, "test": 3}
+    for frame, record in zip(tree["frames"], session.frames, strict=True):
+        assert imagecodecs.imread(tmp_path / "ns" / frame["file_path"]).shape == (48, 48, 4)
+        inverse = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))
+        np.testing.assert_allclose(inverse, record.world_to_camera, atol=1e-6)
+    views, camera = read_nerfstudio(tmp_path / "ns")
+    assert camera is not None and len(views) == 12
+    np.testing.assert_allclose(views[7].world_to_camera, session.frames[7].world_to_camera, atol=1e-9)
+
+
+def test_nerfstudio_cameras_of_frames_and_lens_distortion_are_read(tmp_path):
+    image = RNG.integers(0, 256, (30, 40), dtype=np.uint8)
+    write_png(tmp_path / "images/a.png", image)
+    frame = {"file_path": "images/a.png", "transform_matrix": np.eye(4).tolist()[:3], "fl_x": 50.0}
+    tree = {"fl_x": 1.0, "fl_y": 51.0, "cx": 20.5, "cy": 15.5, "w": 40, "h": 30, "k1": -0.1, "p2": 0.01}
+    (tmp_path / "transforms.json").write_text(json.dumps({**tree, "frames": [frame]}))
+    views, camera = read_nerfstudio(tmp_path)
+    assert camera is None
+    assert views[0].intrinsics == Intrinsics(40, 30, 50.0, 51.0, 20.5, 15.5, (-0.1, 0.0, 0.0, 0.01, 0.0))
+    (tmp_path / "transforms.json").write_text(
+        json.dumps({**tree, "camera_model": "OPENCV_FISHEYE", "frames": [frame]})
+    )
+    with pytest.raises(FormatError, match="OPENCV_FISHEYE"):
+        read_nerfstudio(tmp_path)
+
+
+def test_undistortion_agrees_with_opencv():
+    smooth = cv2.GaussianBlur(RNG.random((120, 160)), (0, 0), 3)
+    camera = Intrinsics(160, 120, 150.0, 148.0, 82.0, 58.0, (-0.22, 0.3, -0.004, 0.003, -0.1))
+    K = np.array(
+        [[150.0, 0, 81.5], [0, 148.0, 57.5], [0, 0, 1]]
+    )  # OpenCV's first pixel centre is 0, ours 0.5
+    expected = cv2.undistort(smooth, K, np.array(camera.distortion))
+    ours = undistort(smooth[..., None], camera)[..., 0]
+    # OpenCV rounds places to 1/32 px
+    assert np.abs(ours - expected)[2:-2, 2:-2].max() < 0.05 * np.ptp(smooth)
+    assert np.abs(ours - expected)[2:-2, 2:-2].mean() < 1e-3 < np.abs(smooth - expected).mean()
+
+
+# --- COLMAP ---
+
+
+def colmap_model(folder: Path, model: str, parameters: list[float]) -> dict[str, np.ndarray]:
+    """A model made by COLMAP's own library."""
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(camera_id=5, model=model, width=40, height=30, params=parameters)
+    reconstruction.add_camera_with_trivial_rig(camera)
+    poses = {}
+    for number in (3, 1, 2):
+        name = f"shot {number}.png"
+        pose = random_pose()
+        rigid = pycolmap.Rigid3d(pose[:3])
+        image = pycolmap.Image(name=name, camera_id=5, image_id=number)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(np.array([1.5, 2.5]))] * (number - 1))
+        reconstruction.add_image_with_trivial_frame(image, rigid)
+        poses[name] = pose
+        write_png(folder / "images" / name, RNG.integers(0, 256, (30, 40, 3), dtype=np.uint8))
+    model_folder = folder / "sparse" / "0"
+    model_folder.mkdir(parents=True)
+    reconstruction.write_binary(str(model_folder))
+    reconstruction.write_text(str(model_folder))
+    return poses
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+@pytest.mark.parametrize(
+    ("model", "parameters", "intrinsics"),
+    [
+        ("SIMPLE_PINHOLE", [50, 20, 15], (50, 50, 20, 15, (0, 0, 0, 0, 0))),
+        ("PINHOLE", [50, 51, 20, 15], (50, 51, 20, 15, (0, 0, 0, 0, 0))),
+        ("SIMPLE_RADIAL", [50, 20, 15, 0.1], (50, 50, 20, 15, (0.1, 0, 0, 0, 0))),
+        ("RADIAL", [50, 20, 15, 0.1, 0.2], (50, 50, 20, 15, (0.1, 0.2, 0, 0, 0))),
+        ("OPENCV", [50, 51, 20, 15, 0.1, 0.2, 0.3, 0.4], (50, 51, 20, 15, (0.1, 0.2, 0.3, 0.4, 0))),
+    ],
+)
+def test_models_that_colmap_wrote_are_read(tmp_path, kind, model, parameters, intrinsics):
+    poses = colmap_model(tmp_path, model, parameters)
+    for path in (tmp_path / "sparse/0").glob("*.txt" if kind == "bin" else "*.bin"):
+        path.unlink()
+    views = read_colmap(tmp_path)
+    assert [view.image.name for view in views] == ["shot 1.png", "shot 2.png", "shot 3.png"]
+    for view in views:
+        np.testing.assert_allclose(view.world_to_camera, poses[view.image.name], atol=1e-9)
+        assert view.intrinsics == Intrinsics(40, 30, *intrinsics)
+    assert write_session(views, tmp_path / "s", "colmap") == 3
+    assert open_session(tmp_path / "s").camera.channels == 3
+
+
+def test_a_damaged_or_unsupported_colmap_model_is_refused(tmp_path):
+    with pytest.raises(FormatError, match="no cameras and images"):
+        read_colmap(tmp_path)
+    colmap_model(tmp_path, "OPENCV_FISHEYE", [50, 51, 20, 15, 0, 0, 0, 0])
+    with pytest.raises(FormatError, match="camera model"):
+        read_colmap(tmp_path)
+    content = (tmp_path / "sparse/0/images.bin").read_bytes()
+    (tmp_path / "sparse/0/images.bin").write_bytes(content[:50])
+    with pytest.raises(FormatError, match="damaged"):
+        read_colmap(tmp_path)
+
+
+# --- SHIRT ---
+
+
+def shirt_folder(root: Path, mounting: tuple[list[float], list[float]]) -> tuple[Path, list[np.ndarray]]:
+    roe, poses, entries = root / "shirtv1" / "roe1", [], []
+    for number in range(4):
+        pose = random_pose()
+        quat = RNG.normal(size=4)
+        quat /= np.linalg.norm(quat)
+        pose[:3, :3] = quat_to_matrix(quat)
+        name = f"img{number + 1:06d}.jpg"
+        for domain in ("synthetic", "lightbox"):
+            (roe / domain / "images").mkdir(parents=True, exist_ok=True)
+            jpeg = imagecodecs.jpeg_encode(RNG.integers(0, 256, (24, 32), dtype=np.uint8), level=95)
+            (roe / domain / "images" / name).write_bytes(jpeg)
+        entries.append(
+            {"filename": name, "q_vbs2tango_true": quat.tolist(), "r_Vo2To_vbs_true": pose[:3, 3].tolist()}
+        )
+        poses.append(pose)
+    (roe / "roe1.json").write_text(json.dumps(entries))
+    q, r = mounting
+    metadata = {"pSim": {"cam_step": 5, "num_images": 4}, "pMdl": {"q_pri2cam": q, "r_pri2cam_pri": r}}
+    (roe / "metadata.json").write_text(json.dumps(metadata))
+    camera = {
+        "Nu": 32,
+        "Nv": 24,
+        "cameraMatrix": [[60.0, 0, 16], [0, 61.0, 12], [0, 0, 1]],
+        "distCoeffs": [-0.2, 0.5, -6e-4, -2e-4, -0.13],
+    }
+    (root / "shirtv1" / "camera.json").write_text(json.dumps(camera))
+    return roe, poses
+
+
+@pytest.mark.parametrize("domain", ["synthetic", "lightbox"])
+def test_shirt_becomes_a_session_with_its_poses_and_times(tmp_path, domain):
+    roe, poses = shirt_folder(tmp_path, ([1.0, 0, 0, 0], [0.0, 0, 0]))
+    views = read_shirt(roe / domain)
+    assert views[0].intrinsics == Intrinsics(32, 24, 60.0, 61.0, 16.0, 12.0, (-0.2, 0.5, -6e-4, -2e-4, -0.13))
+    write_session(views, tmp_path / "s", "shirt")
+    session = open_session(tmp_path / "s")
+    for record, pose in zip(session.frames, poses, strict=True):
+        np.testing.assert_allclose(record.world_to_camera, pose, atol=1e-12)
+        assert record.mid_exposure_utc_ns == record.id * 5_000_000_000 and record.exposure_time_s == 1.0
+    decoded = imagecodecs.imread(views[1].image)
+    expected = undistort(decoded[..., None] / 255.0, views[1].intrinsics)[..., 0]
+    np.testing.assert_allclose(session.dn(session.frames[1]) / 255, expected, atol=0.51 / 255)
+
+
+def test_a_shirt_camera_that_is_mounted_askew_is_taken_into_account(tmp_path):
+    half = math.sqrt(0.5)
+    roe, poses = shirt_folder(tmp_path, ([half, 0, 0, half], [0.1, 0.2, 0.3]))
+    in_servicer = poses[0] @ [1.0, 2.0, 3.0, 1.0]
+    x, y, z = in_servicer[:3] - [0.1, 0.2, 0.3]
+    # the camera's axes are the servicer's turned by 90 degrees about z: its x is their y
+    expected = [y, -x, z]
+    np.testing.assert_allclose(
+        (read_shirt(roe / "synthetic")[0].world_to_camera @ [1, 2, 3, 1])[:3], expected
+    )
+
+
+# --- refusals and the command line ---
+
+
+def test_what_cannot_be_one_session_is_refused(tmp_path):
+    nerf_folder(tmp_path / "lego")
+    views, _ = read_nerf(tmp_path / "lego")
+    write_session(views, tmp_path / "s", "lego")
+    with pytest.raises(SessionError, match="holds a session already"):
+        write_session(views, tmp_path / "s", "lego")
+    write_png(tmp_path / "lego/val/r_0.png", np.zeros((5, 5, 3), dtype=np.uint8))
+    views, _ = read_nerf(tmp_path / "lego")
+    with pytest.raises(FormatError, match="one camera"):
+        write_session(views, tmp_path / "t", "lego")
+    (tmp_path / "lego/val/r_0.png").write_bytes(b"no picture")
+    with pytest.raises(FormatError, match="cannot be read"):
+        read_nerf(tmp_path / "lego")
+    with pytest.raises(FormatError, match="no pictures"):
+        write_session([], tmp_path / "t", "nothing")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"[]",
+        b"{}",
+        b'{"frames": [3]}',
+        b'{"frames": [{"file_path": 4}], "camera_angle_x": 1}',
+        b"\xff\xfe",
+    ]
+    + [
+        b'{"frames": [{"file_path": "a", "transform_matrix": %s}], "camera_angle_x": 1, "w": 4, "h": 4}'
+        % matrix
+        for matrix in (b"3", b'"x"', b"[[1]]", b"[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]")
+    ],
+)
+def test_a_damaged_transforms_file_is_one_named_error(tmp_path, content):
+    (tmp_path / "transforms_train.json").write_bytes(content)
+    with pytest.raises(FormatError, match="transforms_train"):
+        read_nerf(tmp_path)
+
+
+def test_the_commands_import_and_export(tmp_path):
+    nerf_folder(tmp_path / "lego")
+    ground = str(Path(sys.executable).with_name("ground"))
+
+    def run(*arguments: str) -> subprocess.CompletedProcess:
+        return subprocess.run([ground, *arguments], capture_output=True, text=True)
+
+    done = run(
+        "import",
+        "--format",
+        "nerf",
+        "--from",
+        str(tmp_path / "lego"),
+        "--session",
+        str(tmp_path / "s"),
+        "--json",
+    )
+    assert json.loads(done.stdout)["frames"] == 6
+    done = run("export", "--session", str(tmp_path / "s"), "--out", str(tmp_path / "out"), "--json")
+    assert sum(json.loads(done.stdout).values()) == 6
+    wrong = run("import", "--format", "obj", "--from", str(tmp_path), "--session", str(tmp_path / "t"))
+    assert wrong.returncode == 2 and "nerf, nerfstudio, colmap or shirt" in wrong.stderr
+    empty = run("import", "--format", "colmap", "--from", str(tmp_path), "--session", str(tmp_path / "t"))
+    assert empty.returncode == 1 and "no cameras" in empty.stderr
