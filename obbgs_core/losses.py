@@ -1,11 +1,150 @@
-"""Image losses: robust likelihood, L1, SSIM and Sobel edges. Images are [B, H, W, C]."""
+"""Image losses: robust likelihood, L1, SSIM and Sobel edges. Images are [B, H, W, C].
+
+`likelihood_loss`, `published_loss` and `fit_figures` run in our C++ (kernels/training.cpp) on float32 CPU tensors:
+value and gradient in one sweep. The same in readable PyTorch is the truth, and runs everywhere else.
+"""
+
+import math
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from obbgs_core import compiled
+from obbgs_core.sensor import Sensor
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Wang et al. 2004
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+
+
+ON_TARGET_ALPHA = 0.05  # where the model shows at least this much, the fit is judged
+
+
+def likelihood_loss(
+    radiance: Tensor,
+    exposure_time_s: Tensor,
+    dn: Tensor,
+    sensor: Sensor,
+    averaged_pixels: int = 1,
+    edge_weight: float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """Return the robust negative log likelihood of readings plus weighted edges, and the noise-normalised residual.
+
+    Edges are compared on the scale where noise is the same everywhere, with the prediction clamped at full scale.
+
+    Args:
+        radiance: predicted [B, H, W, C]; the loss has a gradient by it.
+        exposure_time_s: [B, 1, 1, 1].
+        dn: read [B, H, W, C].
+        averaged_pixels: sensor pixels averaged into each pixel of dn; the noise is smaller by its root.
+
+    Returns:
+        loss: scalar; residual: [B, H, W, C] in sigma, without gradient.
+
+    Raises:
+        ValueError: shapes disagree, or images are smaller than the 3x3 of an edge.
+    """
+    _check(radiance, exposure_time_s, dn)
+    native = compiled.module_for(radiance, exposure_time_s, dn)
+    if native is None:
+        return likelihood_loss_reference(radiance, exposure_time_s, dn, sensor, averaged_pixels, edge_weight)
+    model = _sensor_model(native, sensor, averaged_pixels)
+    return _swept(native.likelihood, radiance, exposure_time_s, dn, sensor, model, edge_weight)
+
+
+def likelihood_loss_reference(
+    radiance: Tensor,
+    exposure_time_s: Tensor,
+    dn: Tensor,
+    sensor: Sensor,
+    averaged_pixels: int = 1,
+    edge_weight: float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """Return what `likelihood_loss` does, in readable PyTorch."""
+    residual = sensor.normalised_residual(radiance, exposure_time_s, dn) * math.sqrt(averaged_pixels)
+    loss = charbonnier(residual)
+    if edge_weight:
+        visible = sensor.expected_dn(radiance, exposure_time_s).clamp(max=sensor.white_dn)
+        loss = loss + edge_weight * sobel_edge_loss(sensor.stabilised(visible), sensor.stabilised(dn))
+    return loss, residual.detach()
+
+
+def published_loss(
+    radiance: Tensor,
+    exposure_time_s: Tensor,
+    dn: Tensor,
+    sensor: Sensor,
+    ssim_weight: float = 0.2,
+    edge_weight: float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """Return (1 - ssim_weight)·L1 + ssim_weight·(1 - SSIM) + edge_weight·Sobel and the residual, as in publications.
+
+    The loss of 3DGS (Kerbl et al. 2023) with the edges of Jiang et al. 2025, each a mean over images of which 0 is
+    black and 1 full scale.
+
+    Args:
+        radiance, exposure_time_s, dn: as for `likelihood_loss`.
+
+    Returns:
+        loss: scalar; residual: [B, H, W, C] predicted - read in full scales, without gradient.
+
+    Raises:
+        ValueError: shapes disagree, or images are smaller than the 3x3 of an edge.
+    """
+    _check(radiance, exposure_time_s, dn)
+    native = compiled.module_for(radiance, exposure_time_s, dn)
+    if native is None:
+        return published_loss_reference(radiance, exposure_time_s, dn, sensor, ssim_weight, edge_weight)
+    model = _sensor_model(native, sensor)
+    return _swept(native.published, radiance, exposure_time_s, dn, sensor, model, ssim_weight, edge_weight)
+
+
+def published_loss_reference(
+    radiance: Tensor,
+    exposure_time_s: Tensor,
+    dn: Tensor,
+    sensor: Sensor,
+    ssim_weight: float = 0.2,
+    edge_weight: float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """Return what `published_loss` does, in readable PyTorch."""
+    full_scale_dn = sensor.white_dn - sensor.black_dn
+    predicted = (sensor.expected_dn(radiance, exposure_time_s) - sensor.black_dn) / full_scale_dn
+    truth = (dn - sensor.black_dn) / full_scale_dn
+    loss = (1 - ssim_weight) * (predicted - truth).abs().mean()
+    if ssim_weight:
+        loss = loss + ssim_weight * (1 - ssim(predicted, truth))
+    if edge_weight:
+        loss = loss + edge_weight * sobel_edge_loss(predicted, truth)
+    return loss, (predicted - truth).detach()
+
+
+@torch.no_grad()
+def fit_figures(
+    radiance: Tensor,
+    alpha: Tensor,
+    exposure_time_s: Tensor,
+    dn: Tensor,
+    sensor: Sensor,
+    averaged_pixels: int = 1,
+) -> tuple[float, float]:
+    """Return how well a step's frames fit: chi² on the target, and PSNR in dB of the prediction clamped at full scale.
+
+    chi² is the mean squared noise-normalised residual (pure noise: 1) where alpha [B, H, W] exceeds 0.05, NaN where it
+    does nowhere. The others are as for `likelihood_loss`.
+    """
+    native = compiled.module_for(radiance, alpha, exposure_time_s, dn)
+    if native is not None:
+        model, gains = _sensor_model(native, sensor, averaged_pixels), _gains(sensor, exposure_time_s)
+        images = (image.detach().contiguous() for image in (radiance, alpha, dn))
+        chi2, mse = native.fit(*images, gains, model, ON_TARGET_ALPHA, torch.get_num_threads())
+    else:
+        residual = sensor.normalised_residual(radiance, exposure_time_s, dn)[alpha > ON_TARGET_ALPHA]
+        chi2 = averaged_pixels * residual.square().mean().item()
+        expected = sensor.expected_dn(radiance, exposure_time_s).clamp(max=sensor.white_dn)
+        mse = ((expected - dn) / sensor.white_dn).square().mean().item()
+    return chi2, -10 * math.log10(max(mse, 1e-12))
 
 
 def charbonnier(normalised_residual: Tensor, knee: float = 2.0) -> Tensor:
@@ -50,3 +189,54 @@ def sobel_edge_loss(predicted: Tensor, truth: Tensor) -> Tensor:
     """Return |Sx(predicted) - Sx(truth)| + |Sy(predicted) - Sy(truth)|, means over pixels (Jiang et al. 2025)."""
     dx, dy = sobel(predicted - truth)
     return dx.abs().mean() + dy.abs().mean()
+
+
+def _check(radiance: Tensor, exposure_time_s: Tensor, dn: Tensor) -> None:
+    if radiance.shape != dn.shape or radiance.ndim != 4 or min(radiance.shape[1:3]) < 3:
+        raise ValueError(
+            f"radiance and dn must both be [B, H, W, C] with H, W >= 3, got {list(radiance.shape)} and {list(dn.shape)}"
+        )
+    if exposure_time_s.shape != (len(radiance), 1, 1, 1):
+        raise ValueError(
+            f"exposure_time_s must be [{len(radiance)}, 1, 1, 1], got {list(exposure_time_s.shape)}"
+        )
+
+
+def _sensor_model(native, sensor: Sensor, averaged_pixels: int = 1):
+    """Return the sensor as the compiled module takes it."""
+    return native.SensorModel(
+        sensor.black_dn, sensor.white_dn, sensor.electrons_per_dn, sensor.read_noise_dn, averaged_pixels
+    )
+
+
+def _gains(sensor: Sensor, exposure_time_s: Tensor) -> Tensor:
+    """Return the DN per radiance of each frame [B]."""
+    return (sensor.dn_per_radiance_s * exposure_time_s).flatten()
+
+
+def _swept(
+    sweep, radiance: Tensor, exposure_time_s: Tensor, dn: Tensor, sensor: Sensor, model, *weights: float
+) -> tuple[Tensor, Tensor]:
+    """Return a compiled loss, with its gradient when one is wanted, and its residual."""
+    values = radiance.detach().contiguous()
+    residual = torch.empty_like(values)
+    gradient = torch.empty_like(values) if radiance.requires_grad else None
+    gains, threads = _gains(sensor, exposure_time_s), torch.get_num_threads()
+    loss = sweep(values, dn.contiguous(), gains, model, *weights, residual, gradient, threads)
+    if gradient is None:
+        return radiance.new_tensor(loss), residual
+    return _KnownGradient.apply(radiance, loss, gradient), residual
+
+
+class _KnownGradient(torch.autograd.Function):
+    """A scalar that was computed together with its gradient by `images`."""
+
+    @staticmethod
+    def forward(ctx, images: Tensor, value: float, gradient: Tensor) -> Tensor:
+        ctx.save_for_backward(gradient)
+        return images.new_tensor(value)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream: Tensor):
+        return ctx.saved_tensors[0] * upstream, None, None

@@ -1,4 +1,4 @@
-"""One door to rendering: `render`. Projection is PyTorch; compositing is our C++, or plain PyTorch as the truth."""
+"""One door to rendering: `render`. All of it in our C++, or in plain PyTorch as the truth, or composited by gsplat."""
 
 import functools
 import logging
@@ -48,7 +48,7 @@ class Rendered:
 
 @dataclass
 class ScreenGradients:
-    """Filled by backward: what densification needs; one entry a camera, in camera order."""
+    """Filled by backward: what densification needs; one entry a camera."""
 
     means2d: dict[int, Tensor] = field(default_factory=dict)  # [N, 2] loss per px
     pixels: dict[int, Tensor] = field(default_factory=dict)  # [N] pixels touched
@@ -77,8 +77,11 @@ def render(gaussians: Gaussians, cameras: Cameras, backend: str = "auto", normal
     Raises:
         ValueError: an unknown backend, or one that is not available here.
     """
-    projected = project(gaussians, cameras)
     composite = _backend(backend, gaussians.means)
+    if isinstance(composite, str):
+        return _render_native(composite, gaussians, cameras, normals)
+    projected = project(gaussians, cameras)
+    gaussians, _ = _repaired(gaussians)
     directions = gaussians.means[None] - cameras.centres[:, None]  # [C, N, 3]
     directions = directions / directions.norm(dim=-1, keepdim=True).clamp(min=1e-12)
     channels = gaussians.sh.shape[2]
@@ -122,9 +125,10 @@ def project(gaussians: Gaussians, cameras: Cameras) -> Projected:
 
     Source: Zwicker et al., EWA Volume Splatting, 2001.
     """
+    gaussians, sound = _repaired(gaussians)
     R, t = cameras.world_to_camera[:, :3, :3], cameras.world_to_camera[:, :3, 3]
     p = torch.einsum("cij,nj->cni", R, gaussians.means) + t[:, None]  # [C, N, 3]
-    drawn = (p[..., 2] > cameras.near_m) & torch.isfinite(p).all(dim=-1)
+    drawn = sound & (p[..., 2] > cameras.near_m) & torch.isfinite(p).all(dim=-1)
     z = torch.where(drawn, p[..., 2], torch.ones_like(p[..., 2]))
     fx, fy = cameras.K[:, 0, 0, None], cameras.K[:, 1, 1, None]
     cx, cy = cameras.K[:, 0, 2, None], cameras.K[:, 1, 2, None]
@@ -156,6 +160,16 @@ def project(gaussians: Gaussians, cameras: Cameras) -> Projected:
     return Projected(means2d, conics, torch.where(drawn, z, torch.zeros_like(z)), radii)
 
 
+def _repaired(gaussians: Gaussians) -> tuple[Gaussians, Tensor]:
+    """Return the Gaussians with any that hold NaN or infinity set to zeros, and which [N] were sound."""
+    numbers = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    sound = torch.stack([torch.isfinite(t).reshape(len(t), -1).all(dim=1) for t in numbers]).all(dim=0)
+    tensors = gaussians.tensors().items()
+    return Gaussians(
+        **{n: torch.where(sound.reshape(-1, *[1] * (t.ndim - 1)), t, torch.zeros_like(t)) for n, t in tensors}
+    ), sound
+
+
 def _normals(gaussians: Gaussians, directions: Tensor) -> Tensor:
     """Return each Gaussian's shortest axis [N, 3], turned towards the camera, body frame."""
     axes = quats_to_matrices(gaussians.quats)
@@ -165,6 +179,7 @@ def _normals(gaussians: Gaussians, directions: Tensor) -> Tensor:
 
 
 def _backend(name: str, like: Tensor):
+    """Return the compositor of a backend, or the name of a compiled kernel, which renders by itself."""
     if name == "auto":
         if like.is_cuda:
             name = "gsplat"
@@ -180,7 +195,7 @@ def _backend(name: str, like: Tensor):
             raise ValueError(
                 "the compiled rasterizer is missing: install g++ and python3-dev, then reinstall"
             )
-        return functools.partial(_composite_native, kernel)
+        return kernel or native_kernels()[0]
     raise ValueError(f"backend must be auto, native, reference or gsplat, got {name!r}")
 
 
@@ -228,7 +243,7 @@ def composite_reference(
         after = torch.cumprod(1 - alpha, dim=-1)
         before = torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], dim=-1)
         crossing = (before > 0.5) & (after <= 0.5)
-        final = after[..., -1] if len(order) else torch.ones(dx.shape[:2], dtype=means2d.dtype)
+        final = after[..., -1].clone() if len(order) else torch.ones(dx.shape[:2], dtype=means2d.dtype)
         median = (crossing * depths[order]).sum(-1).detach()
         parts.append(((alpha * before) @ features[order], final, median))
     image, transmittance, median = (torch.cat(p) for p in zip(*parts, strict=True))
@@ -245,54 +260,69 @@ def _pixels_touched(means2d: Tensor, conics: Tensor, opacities: Tensor, depths: 
     return torch.where(depths > 0, math.pi * q / determinant.sqrt(), torch.zeros_like(q))
 
 
+def _render_native(kernel: str, gaussians: Gaussians, cameras: Cameras, normals: bool) -> Rendered:
+    screen = ScreenGradients()
+    images = _Native.apply(
+        *gaussians.tensors().values(), cameras.world_to_camera, cameras, kernel, normals, screen
+    )
+    radiance, alpha, depth, median_depth, means2d, radii, *more = images
+    return Rendered(radiance, alpha, depth, median_depth, means2d, radii, more[0] if more else None, screen)
+
+
 class _Native(torch.autograd.Function):
-    """The C++ compositor as an autograd function of one camera."""
+    """The C++ rasterizer as an autograd function of the model's tensors and the camera poses."""
 
     @staticmethod
-    def forward(ctx, means2d, conics, opacities, depths, features, size, kernel, screen, camera_index):
+    def forward(
+        ctx, means, quats, log_scales, opacity_logits, sh, world_to_camera, cameras, kernel, normals, screen
+    ):
         from obbgs_core import _rasterizer  # pyright: ignore[reportAttributeAccessIssue]
 
-        means2d, conics, opacities, depths, features = (
-            t.detach().float().contiguous() for t in (means2d, conics, opacities, depths, features)
+        inputs = (means, quats, log_scales, opacity_logits, sh, world_to_camera)
+        arrays = [t.detach().float().contiguous() for t in (*inputs, cameras.K)]
+        count, n, height, width = len(cameras), means.shape[0], cameras.height, cameras.width
+        radiance = torch.empty(count, height, width, sh.shape[2])
+        alpha, depth, median_depth = (torch.empty(count, height, width) for _ in range(3))
+        means2d, radii = torch.empty(count, n, 2), torch.empty(count, n)
+        normal_images = [torch.empty(count, height, width, 3)] if normals else []
+        rasterization = _rasterizer.Rasterization(kernel, width, height, cameras.near_m, *arrays)
+        rasterization.forward(
+            torch.get_num_threads(),
+            radiance,
+            alpha,
+            depth,
+            median_depth,
+            normal_images[0] if normals else None,
+            means2d,
+            radii,
         )
-        height, width = size
-        rasterization = _rasterizer.Rasterization(means2d, conics, opacities, depths, width, height, kernel)
-        image = torch.zeros(height, width, features.shape[1])
-        transmittance, median = torch.ones(height, width), torch.zeros(height, width)
-        rasterization.forward(features, image, transmittance, median, torch.get_num_threads())
-        ctx.save_for_backward(features, image, transmittance)
-        ctx.rasterization, ctx.screen, ctx.camera_index = rasterization, screen, camera_index
-        ctx.mark_non_differentiable(median)
-        return image, transmittance, median
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*inputs, radiance, depth, *normal_images)
+        ctx.rasterization, ctx.screen = rasterization, screen
+        ctx.mark_non_differentiable(median_depth, radii)
+        return radiance, alpha, depth, median_depth, means2d, radii, *normal_images
 
     @staticmethod
-    def backward(ctx, *gradients):
-        features, image, transmittance = ctx.saved_tensors
-        grad_image, grad_transmittance = (g.float().contiguous() for g in gradients[:2])
-        n = features.shape[0]
-        means2d, conics, opacities = torch.empty(n, 2), torch.empty(n, 3), torch.empty(n)
-        splat_features, pixels = torch.empty_like(features), torch.empty(n)
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, radiance, alpha, depth, median_depth, means2d, radii, normals=None):
+        inputs, images = ctx.saved_tensors[:6], ctx.saved_tensors[6:]
+        gradients = [torch.empty(t.shape) for t in inputs]
+        count, n = inputs[5].shape[0], inputs[0].shape[0]
+        screen_means2d, pixels = torch.empty(count, n, 2), torch.empty(count, n)
         ctx.rasterization.backward(
-            features,
-            image,
-            transmittance,
-            grad_image,
-            grad_transmittance,
-            means2d,
-            conics,
-            opacities,
-            splat_features,
-            pixels,
             torch.get_num_threads(),
+            images[0],
+            images[1],
+            images[2] if len(images) > 2 else None,
+            *(None if g is None else g.float() for g in (radiance, alpha, depth, normals)),
+            None if means2d is None else means2d.float().contiguous(),
+            *gradients,
+            screen_means2d,
+            pixels,
         )
-        ctx.screen.means2d[ctx.camera_index] = means2d
-        ctx.screen.pixels[ctx.camera_index] = pixels
-        return means2d, conics, opacities, None, splat_features, None, None, None, None
-
-
-def _composite_native(kernel, means2d, conics, opacities, depths, features, cameras, screen, camera_index):
-    size = (cameras.height, cameras.width)
-    return _Native.apply(means2d, conics, opacities, depths, features, size, kernel, screen, camera_index)
+        ctx.screen.means2d.update(enumerate(screen_means2d))
+        ctx.screen.pixels.update(enumerate(pixels))
+        return *(g.to(t.dtype) for g, t in zip(gradients, inputs, strict=True)), None, None, None, None
 
 
 def _composite_gsplat(means2d, conics, opacities, depths, features, cameras, screen, camera_index):

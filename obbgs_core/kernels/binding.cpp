@@ -1,125 +1,165 @@
 // Python door to the rasterizer: arrays in, arrays filled in place, instruction set chosen at run time.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <optional>
 #include <stdexcept>
 #include <string>
 
 #include "rasterizer.h"
 
 namespace nb = nanobind;
-using obbgs::Bins;
 using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using Strided = nb::ndarray<const float, nb::device::cpu>;
 
 namespace {
 
 struct Kernel {
   std::string name;
-  decltype(&obbgs::portable::forward) forward;
-  decltype(&obbgs::portable::backward) backward;
+  decltype(&obbgs::portable::project) project;
+  decltype(&obbgs::portable::bin) bin;
+  decltype(&obbgs::portable::composite) composite;
+  decltype(&obbgs::portable::composite_backward) composite_backward;
+  decltype(&obbgs::portable::project_backward) project_backward;
 };
+#define OBBGS_KERNEL(name) \
+  {#name, obbgs::name::project, obbgs::name::bin, obbgs::name::composite, obbgs::name::composite_backward, obbgs::name::project_backward}
 
 std::vector<Kernel> available_kernels() {  // best first
   std::vector<Kernel> kernels;
 #ifdef KERNELS_X86
   if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq") &&
       __builtin_cpu_supports("avx512bw"))
-    kernels.push_back({"avx512", obbgs::avx512::forward, obbgs::avx512::backward});
-  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
-    kernels.push_back({"avx2", obbgs::avx2::forward, obbgs::avx2::backward});
+    kernels.push_back(OBBGS_KERNEL(avx512));
+  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) kernels.push_back(OBBGS_KERNEL(avx2));
 #endif
-  kernels.push_back({"portable", obbgs::portable::forward, obbgs::portable::backward});
+  kernels.push_back(OBBGS_KERNEL(portable));
   return kernels;
 }
 
-void expect(const Array& array, const char* name, size_t count) {
+float* data_of(const Array& array, const char* name, size_t count) {
   if (array.size() != count)
     throw std::invalid_argument(std::string(name) + ": expected " + std::to_string(count) + " numbers, got " +
                                 std::to_string(array.size()));
+  return array.data();
 }
 
+// Gaussians seen by cameras of one size: rendered once, then differentiated any number of times.
 class Rasterization {
  public:
-  Rasterization(Array means2d, Array conics, Array opacities, Array depths, int width, int height, const std::string& kernel)
-      : means2d_(means2d), conics_(conics), opacities_(opacities), depths_(depths), width_(width), height_(height) {
-    const size_t n = depths.size();
-    expect(means2d, "means2d", 2 * n);
-    expect(conics, "conics", 3 * n);
-    expect(opacities, "opacities", n);
+  Rasterization(const std::string& kernel, int width, int height, float near_m, Array means, Array quats, Array log_scales,
+                Array opacity_logits, Array sh, Array world_to_camera, Array K)
+      : arrays_{means, quats, log_scales, opacity_logits, sh, world_to_camera, K} {
+    const size_t n = opacity_logits.size(), cameras = world_to_camera.size() / 16;
+    const size_t coefficients = sh.ndim() == 3 ? sh.shape(1) : 0, channels = sh.ndim() == 3 ? sh.shape(2) : 0;
     if (width < 1 || height < 1 || width > 16384 || height > 16384) throw std::invalid_argument("width and height must be 1 to 16384");
+    if (coefficients != 1 && coefficients != 4 && coefficients != 9 && coefficients != 16)
+      throw std::invalid_argument("expected 1, 4, 9 or 16 coefficients, got " + std::to_string(coefficients));
+    if (channels != 1 && channels != 3) throw std::invalid_argument("expected 1 or 3 channels, got " + std::to_string(channels));
+    if (n * cameras > (size_t(1) << 31)) throw std::invalid_argument("more than 2^31 Gaussians times cameras");
+    scene_ = {int(n), int(cameras), int(coefficients), int(channels), width, height, near_m, false,
+              data_of(means, "means", 3 * n), data_of(quats, "quats", 4 * n), data_of(log_scales, "log_scales", 3 * n),
+              opacity_logits.data(), data_of(sh, "sh", n * coefficients * channels),
+              data_of(world_to_camera, "world_to_camera", 16 * cameras), data_of(K, "K", 9 * cameras)};
     for (const Kernel& k : available_kernels())
       if (kernel.empty() || kernel == k.name) { kernel_ = k; break; }
-    if (!kernel_.forward) throw std::invalid_argument("no kernel " + kernel + " on this processor");
-    splats_ = {int(n), means2d_.data(), conics_.data(), opacities_.data(), depths_.data()};
-    nb::gil_scoped_release release;
-    bins_ = obbgs::bin(splats_, width, height);
+    if (!kernel_.project) throw std::invalid_argument("no kernel " + kernel + " on this processor");
   }
 
-  void forward(Array features, Array image, Array transmittance, Array median_depth, int threads) {
-    const int count = feature_count(features);
-    expect_images(count, image, transmittance, median_depth);
-    const obbgs::Images out{image.data(), transmittance.data(), median_depth.data()};
-    const float* f = features.data();
+  void forward(int threads, Array radiance, Array alpha, Array depth, Array median_depth, std::optional<Array> normals, Array means2d,
+               Array radii) {
+    scene_.normals = normals.has_value();
+    const size_t splats = size_t(scene_.cameras) * scene_.gaussians;
+    const obbgs::Images images = images_of(radiance, alpha, depth, median_depth, normals);
+    float *to_means2d = data_of(means2d, "means2d", 2 * splats), *to_radii = data_of(radii, "radii", splats);
     nb::gil_scoped_release release;
-    kernel_.forward(bins_, splats_, f, count, out, threads);
+    kernel_.project(scene_, frame_, to_means2d, to_radii, threads);
+    kernel_.bin(scene_, frame_, threads);
+    kernel_.composite(scene_, frame_, images, threads);
   }
 
-  void backward(Array features, Array image, Array transmittance, Array grad_image, Array grad_transmittance,
-                Array grad_means2d, Array grad_conics, Array grad_opacities, Array grad_features, Array pixels, int threads) {
-    const int count = feature_count(features);
-    expect_images(count, image, transmittance, transmittance);
-    expect_images(count, grad_image, grad_transmittance, grad_transmittance);
-    const size_t n = splats_.count;
-    expect(grad_means2d, "grad_means2d", 2 * n);
-    expect(grad_conics, "grad_conics", 3 * n);
-    expect(grad_opacities, "grad_opacities", n);
-    expect(grad_features, "grad_features", n * count);
-    expect(pixels, "pixels", n);
-    const obbgs::Images out{image.data(), transmittance.data(), nullptr};
-    const obbgs::Gradients g{grad_image.data(), grad_transmittance.data(), grad_means2d.data(), grad_conics.data(),
-                             grad_opacities.data(), grad_features.data(), pixels.data()};
-    const float* f = features.data();
+  void backward(int threads, Array radiance, Array depth, std::optional<Array> normals, std::optional<Strided> grad_radiance,
+                std::optional<Strided> grad_alpha, std::optional<Strided> grad_depth, std::optional<Strided> grad_normals,
+                std::optional<Array> grad_means2d, Array means, Array quats, Array log_scales, Array opacity_logits, Array sh,
+                Array world_to_camera, Array screen_means2d, Array pixels) const {
+    const obbgs::Scene& s = scene_;
+    if (!frame_.tile_begin.size()) throw std::logic_error("backward before forward");
+    const size_t n = s.gaussians, splats = n * s.cameras;
+    const obbgs::Images images = images_of(radiance, depth, depth, depth, normals);
+    const obbgs::ImageGradients g{gradient_of(grad_radiance, s.channels), gradient_of(grad_alpha, 0), gradient_of(grad_depth, 0),
+                                  gradient_of(grad_normals, 3)};
+    const obbgs::SceneGradients out{
+        grad_means2d ? data_of(*grad_means2d, "grad_means2d", 2 * splats) : nullptr,
+        data_of(means, "means", 3 * n), data_of(quats, "quats", 4 * n), data_of(log_scales, "log_scales", 3 * n),
+        data_of(opacity_logits, "opacity_logits", n), data_of(sh, "sh", n * s.sh_count * s.channels),
+        data_of(world_to_camera, "world_to_camera", 16 * size_t(s.cameras)), data_of(screen_means2d, "screen_means2d", 2 * splats),
+        data_of(pixels, "pixels", splats)};
     nb::gil_scoped_release release;
-    kernel_.backward(bins_, splats_, f, count, out, g, threads);
+    struct alignas(64) Record { float sums[obbgs::kRecord]; };
+    obbgs::Buffer<Record> records;
+    records.resize(frame_.pairs.size());
+    float* sums = reinterpret_cast<float*>(records.data());
+    kernel_.composite_backward(s, frame_, images, g, sums, threads);
+    kernel_.project_backward(s, frame_, sums, g.features(s), out, threads);
   }
 
-  size_t pairs() const { return bins_.pairs.size(); }
+  size_t pairs() const { return frame_.pairs.size(); }
+  size_t bytes() const {  // at the height of the backward pass, without the caller's arrays
+    return frame_.pairs.size() * obbgs::kRecord * sizeof(float) + frame_.splats.bytes() + frame_.visible.bytes() + frame_.tile_begin.bytes() + frame_.pairs.bytes() + frame_.transmittance.bytes();
+  }
 
  private:
-  int feature_count(const Array& features) const {
-    const size_t n = splats_.count;
-    const int count = features.ndim() == 2 ? int(features.shape(1)) : 0;
-    if (count < 1 || count > obbgs::kMaxFeatures || features.shape(0) != n)
-      throw std::invalid_argument("features: expected [" + std::to_string(n) + ", 1 to 8]");
-    return count;
-  }
-  void expect_images(int count, const Array& image, const Array& a, const Array& b) const {
-    const size_t pixels = size_t(width_) * height_;
-    expect(image, "image", pixels * count);
-    expect(a, "transmittance", pixels);
-    expect(b, "median_depth", pixels);
+  obbgs::Images images_of(const Array& radiance, const Array& alpha, const Array& depth, const Array& median_depth,
+                          const std::optional<Array>& normals) const {
+    const size_t pixels = size_t(scene_.cameras) * scene_.width * scene_.height;
+    if (normals.has_value() != scene_.normals) throw std::invalid_argument("normals: as in the forward pass");
+    return {data_of(radiance, "radiance", pixels * scene_.channels), data_of(alpha, "alpha", pixels), data_of(depth, "depth", pixels),
+            data_of(median_depth, "median_depth", pixels), normals ? data_of(*normals, "normals", 3 * pixels) : nullptr};
   }
 
-  Array means2d_, conics_, opacities_, depths_;
-  int width_, height_;
+  // A gradient of shape [cameras, height, width] or, with channels, [cameras, height, width, channels]; any strides.
+  obbgs::ImageGradient gradient_of(const std::optional<Strided>& array, int channels) const {
+    obbgs::ImageGradient g;
+    if (!array) return g;
+    const size_t shape[4] = {size_t(scene_.cameras), size_t(scene_.height), size_t(scene_.width), size_t(channels)};
+    const size_t ndim = channels ? 4 : 3;
+    bool same = array->ndim() == ndim;
+    for (size_t i = 0; same && i < ndim; ++i) same = array->shape(i) == shape[i];
+    if (!same) throw std::invalid_argument("an image gradient must have the shape of its image");
+    g.data = array->data();
+    for (size_t i = 0; i < ndim; ++i) g.stride[i] = array->stride(i);
+    return g;
+  }
+
+  std::vector<Array> arrays_;  // keeps the scene's memory
+  obbgs::Scene scene_;
   Kernel kernel_{};
-  obbgs::Splats splats_{};
-  Bins bins_;
+  obbgs::Frame frame_;
 };
 
 }  // namespace
 
+void bind_training(nb::module_& m);  // training.cpp
+
 NB_MODULE(_rasterizer, m) {
+  nb::set_leak_warnings(false);  // an image that still carries its graph when Python ends is no leak
   m.def("kernels", [] {
     std::vector<std::string> names;
     for (const Kernel& k : available_kernels()) names.push_back(k.name);
     return names;
   });
   nb::class_<Rasterization>(m, "Rasterization")
-      .def(nb::init<Array, Array, Array, Array, int, int, const std::string&>())
-      .def("forward", &Rasterization::forward)
-      .def("backward", &Rasterization::backward)
-      .def_prop_ro("pairs", &Rasterization::pairs);
+      .def(nb::init<const std::string&, int, int, float, Array, Array, Array, Array, Array, Array, Array>())
+      .def("forward", &Rasterization::forward, nb::arg("threads"), nb::arg("radiance"), nb::arg("alpha"), nb::arg("depth"),
+           nb::arg("median_depth"), nb::arg("normals").none(), nb::arg("means2d"), nb::arg("radii"))
+      .def("backward", &Rasterization::backward, nb::arg("threads"), nb::arg("radiance"), nb::arg("depth"), nb::arg("normals").none(),
+           nb::arg("grad_radiance").none(), nb::arg("grad_alpha").none(), nb::arg("grad_depth").none(), nb::arg("grad_normals").none(),
+           nb::arg("grad_means2d").none(), nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("opacity_logits"),
+           nb::arg("sh"), nb::arg("world_to_camera"), nb::arg("screen_means2d"), nb::arg("pixels"))
+      .def_prop_ro("pairs", &Rasterization::pairs)
+      .def_prop_ro("bytes", &Rasterization::bytes);
+  bind_training(m);
 }

@@ -1,118 +1,121 @@
-// Depth order and binning: one radix sort of all visible Gaussians, then stable binning into tiles.
+// Depth order and binning: one radix sort of all visible splats, then stable binning into tiles.
 #include <algorithm>
 #include <cmath>
-#include <cstring>
-#include <thread>
+#include <utility>
+#include <vector>
 
 #include "rasterizer.h"
+#include "simd.h"
+#include "threads.h"
 
 namespace obbgs {
+namespace KERNEL {
 namespace {
 
-// Stable least-significant-digit radix sort of indices by positive float keys.
-std::vector<uint32_t> sort_by_depth(const std::vector<uint32_t>& visible, const float* depths) {
-  struct Item { uint32_t key, index; };
-  std::vector<Item> items(visible.size()), other(visible.size());
-  for (size_t i = 0; i < visible.size(); ++i) {
-    std::memcpy(&items[i].key, &depths[visible[i]], 4);  // bits of positive floats are ordered like their values
-    items[i].index = visible[i];
+struct Found {  // a pair before it is put in its tile
+  uint32_t tile, splat;
+  uint64_t blocks;
+};
+
+// Stable least-significant-digit radix sort; bits of positive floats are ordered like their values.
+void sort_by_depth(Buffer<DepthKey>& keys, size_t count) {
+  constexpr int kDigit = 11, kValues = 1 << kDigit, kPasses = 3;
+  Buffer<DepthKey> other;
+  other.resize(count);
+  std::vector<uint32_t> begin(kPasses * kValues, 0);
+  for (size_t i = 0; i < count; ++i)
+    for (int pass = 0; pass < kPasses; ++pass) ++begin[pass * kValues + ((keys[i].depth_bits >> (pass * kDigit)) & (kValues - 1))];
+  for (int pass = 0; pass < kPasses; ++pass) {
+    uint32_t* next = &begin[pass * kValues];
+    if (count && next[(keys[0].depth_bits >> (pass * kDigit)) & (kValues - 1)] == count) continue;  // all alike in this digit
+    uint32_t total = 0;
+    for (int v = 0; v < kValues; ++v) total += std::exchange(next[v], total);
+    for (size_t i = 0; i < count; ++i) other[next[(keys[i].depth_bits >> (pass * kDigit)) & (kValues - 1)]++] = keys[i];
+    std::swap(keys, other);
   }
-  for (int shift = 0; shift < 32; shift += 11) {
-    uint32_t begin[2049] = {};
-    for (const Item& item : items) ++begin[((item.key >> shift) & 2047) + 1];
-    for (int d = 0; d < 2048; ++d) begin[d + 1] += begin[d];
-    for (const Item& item : items) other[begin[(item.key >> shift) & 2047]++] = item;
-    items.swap(other);
+}
+
+// Appends a pair for each tile where the splat's ellipse alpha >= kMinAlpha reaches a pixel centre. A block is marked where the
+// ellipse meets the square of its outermost pixel centres; sixteen rows of blocks, two tiles, are worked out at a time.
+void find_pairs(const Scene& s, const Splat& splat, uint32_t index, std::vector<Found>& found) {
+  const int blocks_y = (s.height + kBlock - 1) / kBlock, tiles_x = s.tiles_x();
+  const uint32_t first_tile = index / uint32_t(s.gaussians) * uint32_t(tiles_x * s.tiles_y());
+  const float q = std::max(splat.level + 7.99435344f, 0.0f), root = std::sqrt(q);  // u^2 + v^2 <= q where alpha >= 1/255
+  const float tilt = splat.k2 / splat.k3, stretch = std::sqrt(1 + tilt * tilt);
+  const float narrow = 1 / splat.k1, widest = root * narrow * stretch, tallest = root / splat.k3;
+  const float slack = 0.01f + 1e-6f * (std::abs(splat.x) + std::abs(splat.y) + widest + tallest);  // px, covers rounding
+  const float reach_x = widest + slack, reach_y = tallest + slack;
+  const float turn = tilt * tallest / stretch;  // the rightmost point of the ellipse is at dy = -turn, the leftmost at turn
+  // the first and last row of blocks, and tile, whose pixel centres are within reach
+  const int row0 = int(std::max(splat.y - reach_y + 0.5f, 0.0f)) / kBlock;
+  const int row1 = std::min(int(std::max(splat.y + reach_y - 0.5f, 0.0f)) / kBlock, blocks_y - 1);
+  const int tile0 = int(std::max(splat.x - reach_x + 0.5f, 0.0f)) / kTile;
+  const int tile1 = std::min(int(std::max(splat.x + reach_x - 0.5f, 0.0f)) / kTile, tiles_x - 1);
+
+  alignas(64) static constexpr float kRows[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+  const vf rows = load(kRows);
+  for (int tile_y = row0 / 8; tile_y <= row1 / 8; tile_y += 2) {
+    const vf row = rows + float(tile_y * 8);
+    const vf top = row * float(kBlock) + (0.5f - splat.y);  // its first pixel centre, from the mean
+    const vf from = larger(top, -reach_y), to = smaller(top + float(kBlock - 1), reach_y);
+    const mask inside = (from <= to) & (row < vf(float(blocks_y)));
+    const vf at_right = larger(smaller(-turn, to), from), at_left = larger(smaller(turn, to), from);
+    const auto half_width = [&](vf dy) { return sqrt(larger(vf(q) - (dy * splat.k3) * (dy * splat.k3), 0.0f)); };
+    const vf right = (half_width(at_right) - at_right * splat.k2) * narrow + (splat.x + slack);
+    const vf left = (-half_width(at_left) - at_left * splat.k2) * narrow + (splat.x - slack);
+    for (int tile_x = tile0; tile_x <= tile1; ++tile_x) {
+      // columns begin .. end - 1: their pixel centres 4b + 0.5 .. 4b + 3.5 reach into left .. right
+      const float x0 = float(tile_x * kTile);
+      const float columns = std::min(8.0f, float((s.width - tile_x * kTile + kBlock - 1) / kBlock));
+      const vf begin = larger(smaller((left - (x0 + 3.5f)) * (1.0f / kBlock), columns), 0.0f) + 0.999999f;  // rounded up
+      const vf end = zero_unless(inside, larger(smaller((right - (x0 - 3.5f)) * (1.0f / kBlock), columns), 0.0f));
+      const vi bits = (vi(1) << truncate(end)) - vi(1), skipped = (vi(1) << truncate(begin)) - vi(1);
+      uint64_t blocks[2];
+      store_bytes(blocks, bits & ~skipped);
+      for (int half = 0; half < 2; ++half)
+        if (blocks[half]) found.push_back({first_tile + uint32_t((tile_y + half) * tiles_x + tile_x), index, blocks[half]});
+    }
   }
-  std::vector<uint32_t> order(items.size());
-  for (size_t i = 0; i < items.size(); ++i) order[i] = items[i].index;
-  return order;
 }
 
 }  // namespace
 
-Bins bin(const Splats& s, int width, int height) {
-  Bins bins;
-  bins.width = width;
-  bins.height = height;
-  bins.tiles_x = (width + kTile - 1) / kTile;
-  bins.tiles_y = (height + kTile - 1) / kTile;
-  std::vector<uint32_t> visible;
-  for (int i = 0; i < s.count; ++i)
-    if (s.depths[i] > 0 && s.opacities[i] >= kMinAlpha) visible.push_back(i);
-  const std::vector<uint32_t> order = sort_by_depth(visible, s.depths);
-
-  struct TilePair { uint32_t tile; Pair pair; };
-  std::vector<TilePair> found;
-  found.reserve(order.size() * 2);
-  const int blocks_x = (width + kBlock - 1) / kBlock, blocks_y = (height + kBlock - 1) / kBlock;
-  std::vector<uint64_t> row_masks(bins.tiles_x);
-  std::vector<uint32_t> records(s.count, 0);
-  for (uint32_t i : order) {
-    const float mx = s.means2d[2 * i], my = s.means2d[2 * i + 1];
-    const float a = s.conics[3 * i], b = s.conics[3 * i + 1], c = s.conics[3 * i + 2];
-    const float q = 2 * std::log(s.opacities[i] / kMinAlpha);  // alpha >= kMinAlpha where d^T conic d <= q
-    const float det = a * c - b * b;
-    if (!(det > 0 && a > 0 && c > 0) || !std::isfinite(mx) || !std::isfinite(my)) continue;
-    const float reach_y = std::sqrt(q * a / det), reach_x = std::sqrt(q * c / det);
-    if (mx + reach_x < 0 || mx - reach_x > width || my + reach_y < 0 || my - reach_y > height) continue;
-    const float dy_right = -b / c * reach_x;  // where the ellipse is farthest right; the left point mirrors it
-    const int band0 = std::max(0, int(std::floor((my - reach_y - 0.5f) / kBlock)));
-    const int band1 = std::min(blocks_y - 1, int(std::floor((my + reach_y) / kBlock)));
-    for (int tile_y = band0 / 8; tile_y <= band1 / 8; ++tile_y) {
-      int tile_x0 = bins.tiles_x, tile_x1 = -1;
-      std::fill(row_masks.begin(), row_masks.end(), 0);
-      for (int band = std::max(band0, tile_y * 8); band <= std::min(band1, tile_y * 8 + 7); ++band) {
-        // the ellipse's widest x-range over the band's pixel centres, clipped to where the ellipse is
-        const float lo = std::max(band * kBlock + 0.5f - my, -reach_y);
-        const float hi = std::min(band * kBlock + kBlock - 0.5f - my, reach_y);
-        if (lo > hi) continue;
-        const auto half_width = [&](float dy) { return std::sqrt(std::max(0.0f, b * b * dy * dy - a * (c * dy * dy - q))); };
-        const float yr = std::clamp(dy_right, lo, hi), yl = std::clamp(-dy_right, lo, hi);
-        const float right = mx + (-b * yr + half_width(yr)) / a, left = mx + (-b * yl - half_width(yl)) / a;
-        // a hundredth of a pixel covers the rounding of the bound: masks may be generous, never short
-        const int x0 = std::max(0, int(std::floor((left - 0.51f) / kBlock)) );
-        const int x1 = std::min(blocks_x - 1, int(std::floor((right - 0.49f) / kBlock)));
-        for (int tx = x0 / 8; tx <= x1 / 8 && x0 <= x1; ++tx) {
-          const int from = std::max(x0 - tx * 8, 0), to = std::min(x1 - tx * 8, 7);
-          const uint64_t row = ((0xFFull >> (7 - to)) & (0xFFull << from)) & 0xFFull;
-          tile_x0 = std::min(tile_x0, tx);
-          tile_x1 = std::max(tile_x1, tx);
-          row_masks[tx] |= row << (8 * (band - tile_y * 8));
-        }
-      }
-      for (int tx = tile_x0; tx <= tile_x1; ++tx) {
-        if (!row_masks[tx]) continue;
-        found.push_back({uint32_t(tile_y * bins.tiles_x + tx), {i, records[i]++, row_masks[tx]}});
-      }
+void bin(const Scene& s, Frame& frame, int threads) {
+  sort_by_depth(frame.visible, frame.visible_count);
+  const size_t count = frame.visible_count, tiles = s.tiles();
+  const size_t chunk = std::max<size_t>(256, (count + 63) / 64), chunks = (count + chunk - 1) / chunk;
+  std::vector<std::vector<Found>> found(chunks);
+  std::vector<uint32_t> next(chunks * tiles, 0);  // pairs of each chunk in each tile, then where they go
+  const int useful = worthwhile(threads, count, 8192);
+  parallel_for(int(chunks), useful, [&](int c) {
+    found[c].reserve(2 * chunk);
+    for (size_t i = c * chunk; i < std::min(count, (c + 1) * chunk); ++i) {
+      if (i + 8 < count) __builtin_prefetch(&frame.splats[frame.visible[i + 8].splat], 1);
+      Splat& splat = frame.splats[frame.visible[i].splat];
+      splat.first_record = uint32_t(found[c].size());
+      find_pairs(s, splat, frame.visible[i].splat, found[c]);
+      splat.records = uint32_t(found[c].size()) - splat.first_record;
     }
+    for (const Found& f : found[c]) ++next[c * tiles + f.tile];
+  });
+  frame.tile_begin.resize(tiles + 1);
+  uint32_t total = 0;
+  for (size_t t = 0; t < tiles; ++t) {
+    frame.tile_begin[t] = total;
+    for (size_t c = 0; c < chunks; ++c) total += std::exchange(next[c * tiles + t], total);
   }
-
-  bins.splat_begin.assign(s.count + 1, 0);
-  for (int i = 0; i < s.count; ++i) bins.splat_begin[i + 1] = bins.splat_begin[i] + records[i];
-  const int tiles = bins.tiles_x * bins.tiles_y;
-  bins.tile_begin.assign(tiles + 1, 0);
-  for (const TilePair& f : found) ++bins.tile_begin[f.tile + 1];
-  for (int t = 0; t < tiles; ++t) bins.tile_begin[t + 1] += bins.tile_begin[t];
-  std::vector<uint32_t> next(bins.tile_begin.begin(), bins.tile_begin.end() - 1);
-  bins.pairs.resize(found.size());
-  for (const TilePair& f : found) {
-    Pair pair = f.pair;
-    pair.record += bins.splat_begin[pair.splat];
-    bins.pairs[next[f.tile]++] = pair;
-  }
-  return bins;
+  frame.tile_begin[tiles] = total;
+  frame.pairs.resize(total);
+  std::vector<uint32_t> first_record(chunks, 0);
+  for (size_t c = 1; c < chunks; ++c) first_record[c] = first_record[c - 1] + uint32_t(found[c - 1].size());
+  parallel_for(int(chunks), useful, [&](int c) {
+    for (uint32_t i = 0; i < found[c].size(); ++i) {
+      const Found& f = found[c][i];
+      frame.pairs[next[c * tiles + f.tile]++] = {f.splat, first_record[c] + i, f.blocks};
+    }
+    for (size_t i = c * chunk; i < std::min(count, (c + 1) * chunk); ++i) frame.splats[frame.visible[i].splat].first_record += first_record[c];
+  });
 }
 
-void for_each_tile(int tiles, int threads, const std::function<void(int)>& work) {
-  std::atomic<int> next{0};
-  const auto drain = [&] {
-    for (int tile; (tile = next.fetch_add(1)) < tiles;) work(tile);
-  };
-  std::vector<std::thread> helpers;
-  for (int t = 1; t < std::min(threads, tiles); ++t) helpers.emplace_back(drain);
-  drain();
-  for (std::thread& helper : helpers) helper.join();
-}
-
+}  // namespace KERNEL
 }  // namespace obbgs

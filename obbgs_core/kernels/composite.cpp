@@ -1,236 +1,259 @@
-// Front-to-back compositing of binned Gaussians and its analytic gradient, one 4x4 block a vector.
-// Compiled once for each instruction set (KERNEL names the namespace); plain GCC vector types throughout.
-#include <cstring>
-#include <vector>
-
+// Front-to-back compositing of binned splats and its analytic gradient, one 4x4 block a vector.
 #include "rasterizer.h"
+#include "simd.h"
+#include "threads.h"
 
 namespace obbgs {
 namespace KERNEL {
 namespace {
 
-constexpr int kLanes = kBlock * kBlock;
-typedef float vf __attribute__((vector_size(4 * kLanes)));
-typedef int32_t vi __attribute__((vector_size(4 * kLanes)));
+constexpr int kBlocks = 64;  // blocks of a tile
 
-inline vf splat_of(float x) { return x - vf{}; }
+struct Tile {
+  int camera, x0, y0, width, height;  // pixels inside the image
 
-// exp(x) for x <= 0, relative error 2e-7; below -60 the result is irrelevant (alpha is cut at 1/255).
-inline vf exp_negative(vf x) {
-  x = x < -60.0f ? splat_of(-60.0f) : x;
-  const vf t = x * 1.44269504f;
-  const vi n = __builtin_convertvector(t - 0.5f, vi);  // truncation towards zero of a negative number rounds it
-  const vf f = (t - __builtin_convertvector(n, vf)) * 0.693147181f;
-  vf p = f * 1.3888889e-3f + 8.3333333e-3f;
-  p = p * f + 4.1666667e-2f;
-  p = p * f + 1.6666667e-1f;
-  p = p * f + 0.5f;
-  p = p * f + 1.0f;
-  p = p * f + 1.0f;
-  const vi bits = (n + 127) << 23;
-  vf scale;
-  std::memcpy(&scale, &bits, sizeof scale);
-  return p * scale;
-}
-
-inline float sum(vf v) {
-  float total = 0;
-  for (int i = 0; i < kLanes; ++i) total += v[i];
-  return total;
-}
-
-inline bool any(vi mask) {
-  int32_t all = 0;
-  for (int i = 0; i < kLanes; ++i) all |= mask[i];
-  return all != 0;
-}
-
-struct Lanes { vf x, y; };
-inline Lanes block_offsets() {
-  Lanes lanes;
-  for (int i = 0; i < kLanes; ++i) { lanes.x[i] = (i % kBlock) + 0.5f; lanes.y[i] = (i / kBlock) + 0.5f; }
-  return lanes;
-}
-
-// What one Gaussian does to one block.
-struct Touch { vf dx, dy, falloff, alpha; vi on, stop; };
-
-inline Touch touch(const Splats& s, uint32_t i, vf px, vf py, vf T, vi alive) {
-  Touch t;
-  t.dx = px - s.means2d[2 * i];
-  t.dy = py - s.means2d[2 * i + 1];
-  const float a = s.conics[3 * i], b = s.conics[3 * i + 1], c = s.conics[3 * i + 2];
-  const vf power = -0.5f * (a * t.dx * t.dx + c * t.dy * t.dy) - b * t.dx * t.dy;
-  t.falloff = exp_negative(power > 0.0f ? vf{} : power);
-  t.alpha = s.opacities[i] * t.falloff;
-  t.alpha = t.alpha > kMaxAlpha ? splat_of(kMaxAlpha) : t.alpha;
-  t.on = (t.alpha >= kMinAlpha) & alive;
-  t.stop = t.on & (T * (1.0f - t.alpha) < kMinTransmittance);
-  t.on &= ~t.stop;
-  return t;
-}
-
-// Copies a [height, width, n] image into or out of a tile's blocks, lane by lane, inside the image only.
-template <typename Visit>
-inline void for_each_pixel(const Bins& bins, int tile, Visit visit) {
-  const int x0 = tile % bins.tiles_x * kTile, y0 = tile / bins.tiles_x * kTile;
-  const int w = bins.width - x0 < kTile ? bins.width - x0 : kTile, h = bins.height - y0 < kTile ? bins.height - y0 : kTile;
-  for (int y = 0; y < h; ++y)
-    for (int x = 0; x < w; ++x)
-      visit(size_t(y0 + y) * bins.width + x0 + x, (y / kBlock) * 8 + x / kBlock, (y % kBlock) * kBlock + x % kBlock);
-}
-
-template <int F>
-void forward_tile(const Bins& bins, const Splats& s, const float* features, const Images& out, int tile) {
-  const uint32_t begin = bins.tile_begin[tile], end = bins.tile_begin[tile + 1];
-  if (begin == end) return;  // outputs start as an empty sky
-  alignas(64) vf T[64], median[64], acc[64][F];
-  alignas(64) vi alive[64];
-  for (int k = 0; k < 64; ++k) {
-    T[k] = splat_of(1.0f);
-    median[k] = vf{};
-    alive[k] = vi{};
-    for (int f = 0; f < F; ++f) acc[k][f] = vf{};
+  Tile(const Scene& s, int index) {
+    const int tiles_x = s.tiles_x(), of_camera = index % (tiles_x * s.tiles_y());
+    camera = index / (tiles_x * s.tiles_y());
+    x0 = of_camera % tiles_x * kTile;
+    y0 = of_camera / tiles_x * kTile;
+    width = s.width - x0 < kTile ? s.width - x0 : kTile;
+    height = s.height - y0 < kTile ? s.height - y0 : kTile;
   }
-  for_each_pixel(bins, tile, [&](size_t, int k, int lane) { alive[k][lane] = -1; });
-  const Lanes lanes = block_offsets();
-  const float x0 = float(tile % bins.tiles_x * kTile), y0 = float(tile / bins.tiles_x * kTile);
-  uint64_t open = ~0ull;
-  for (uint32_t p = begin; p < end && open; ++p) {
-    const uint32_t i = bins.pairs[p].splat;
-    const float* feature = features + size_t(i) * F;
-    for (uint64_t left = bins.pairs[p].blocks & open; left; left &= left - 1) {
-      const int k = __builtin_ctzll(left);
-      const Touch t = touch(s, i, lanes.x + (x0 + (k & 7) * kBlock), lanes.y + (y0 + (k >> 3) * kBlock), T[k], alive[k]);
-      const vf w = t.on ? t.alpha * T[k] : vf{};
-      for (int f = 0; f < F; ++f) acc[k][f] += w * feature[f];
-      const vf after = T[k] - w;
-      median[k] = ((T[k] > 0.5f) & (after <= 0.5f)) ? splat_of(s.depths[i]) : median[k];
-      T[k] = after;
-      if (any(t.stop)) {
-        alive[k] &= ~t.stop;
-        if (!any(alive[k])) open &= ~(1ull << k);
-      }
+
+  // Calls visit(x, y, pixel, block, lane) for every pixel.
+  template <typename Visit>
+  void for_each_pixel(const Scene& s, Visit visit) const {
+    for (int y = 0; y < height; ++y) {
+      const size_t row = (size_t(camera) * s.height + y0 + y) * s.width + x0;
+      for (int x = 0; x < width; ++x)
+        visit(x0 + x, y0 + y, row + x, (y / kBlock) * 8 + x / kBlock, (y % kBlock) * kBlock + x % kBlock);
     }
   }
-  for_each_pixel(bins, tile, [&](size_t pixel, int k, int lane) {
-    out.transmittance[pixel] = T[k][lane];
+};
+
+// Lane offsets inside a block and block offsets inside a tile, px.
+struct Grid {
+  vf lane_x, lane_y;
+  float block_x[kBlocks], block_y[kBlocks];
+  Grid() {
+    for (int l = 0; l < kLanes; ++l) {
+      lane_x[l] = float(l % kBlock) + 0.5f;
+      lane_y[l] = float(l / kBlock) + 0.5f;
+    }
+    for (int k = 0; k < kBlocks; ++k) {
+      block_x[k] = float(k % 8 * kBlock);
+      block_y[k] = float(k / 8 * kBlock);
+    }
+  }
+};
+
+// A splat as seen from a tile: what is constant over its blocks.
+struct Brush {
+  vf k1, k2, k3, level, u0, v0;
+  OBBGS_INLINE Brush(const Splat& s, const Tile& tile, const Grid& grid) : k1(s.k1), k2(s.k2), k3(s.k3), level(s.level) {
+    const float x = s.x - float(tile.x0), y = s.y - float(tile.y0);
+    u0 = fma(k1, grid.lane_x - x, k2 * (grid.lane_y - y));
+    v0 = k3 * (grid.lane_y - y);
+  }
+};
+
+// What a splat does to a block. T < 0 marks finished pixels and those outside the image.
+struct Touch {
+  vf u, v, alpha, weight, after;  // alpha before the clamp; after: transmittance behind the splat
+  mask on;
+};
+
+OBBGS_INLINE Touch touch(const Brush& b, const Grid& grid, int k, vf T) {
+  const vf u = fma(b.k1, grid.block_x[k], fma(b.k2, grid.block_y[k], b.u0));
+  const vf v = fma(b.k3, grid.block_y[k], b.v0);
+  const vf alpha = exp2_unbounded(minus_fma(u, u, minus_fma(v, v, b.level)));
+  mask on = (vf(kMinAlpha) <= alpha) & (vf(0.0f) < T);
+  vf weight = zero_unless(on, smaller(alpha, kMaxAlpha) * T), after = T - weight;
+  const mask stop = on & (after < vf(kMinTransmittance));
+  if (__builtin_expect(any(stop), 0)) {  // these pixels end here, before this splat
+    on = and_not(on, stop);
+    weight = zero_unless(on, weight);
+    after = select(stop, -T, after);
+  }
+  return {u, v, alpha, weight, after, on};
+}
+
+template <int C, int F>  // channels of radiance, features in all
+void composite_tile(const Scene& s, Frame& frame, const Images& out, const Grid& grid, int index) {
+  const Tile tile(s, index);
+  const uint32_t begin = frame.tile_begin[index], end = frame.tile_begin[index + 1];
+  if (begin == end) {
+    tile.for_each_pixel(s, [&](int, int, size_t pixel, int, int) {
+      frame.transmittance[pixel] = 1.0f;
+      out.alpha[pixel] = out.depth[pixel] = out.median_depth[pixel] = 0.0f;
+      for (int f = 0; f < C; ++f) out.radiance[pixel * C + f] = 0.0f;
+      if (out.normals)
+        for (int f = 0; f < 3; ++f) out.normals[pixel * 3 + f] = 0.0f;
+    });
+    return;
+  }
+  vf T[kBlocks], median[kBlocks], light[kBlocks][F];
+  for (int k = 0; k < kBlocks; ++k) {
+    T[k] = -1.0f;
+    median[k] = 0.0f;
+    for (int f = 0; f < F; ++f) light[k][f] = 0.0f;
+  }
+  tile.for_each_pixel(s, [&](int, int, size_t, int k, int lane) { T[k][lane] = 1.0f; });
+  uint64_t open = ~0ull;
+  for (uint32_t p = begin; p < end; ++p) {
+    Pair& pair = frame.pairs[p];
+    if (p + 4 < end) __builtin_prefetch(&frame.splats[frame.pairs[p + 4].splat]);
+    const Splat& splat = frame.splats[pair.splat];
+    const Brush brush(splat, tile, grid);
+    vf feature[F];
+    for (int f = 0; f < F; ++f) feature[f] = splat.feature[f];
+    const vf depth = splat.feature[C];
+    uint64_t lit = 0;
+    for (uint64_t left = pair.blocks & open; left; left &= left - 1) {
+      const int k = __builtin_ctzll(left);
+      const Touch t = touch(brush, grid, k, T[k]);
+      lit |= uint64_t(any(t.on)) << k;
+      for (int f = 0; f < F; ++f) light[k][f] = multiply_add(t.weight, feature[f], light[k][f]);
+      median[k] = select((t.after <= vf(0.5f)) & (vf(0.5f) < T[k]), depth, median[k]);
+      T[k] = t.after;
+      if (!any(vf(0.0f) < t.after)) open &= ~(1ull << k);
+    }
+    pair.blocks = lit;
+  }
+  const float* lanes = reinterpret_cast<const float*>(light);
+  tile.for_each_pixel(s, [&](int, int, size_t pixel, int k, int lane) {
+    const float transmittance = __builtin_fabsf(T[k][lane]), alpha = 1.0f - transmittance;
+    const auto value = [&](int f) { return lanes[(k * F + f) * kLanes + lane]; };
+    frame.transmittance[pixel] = transmittance;
+    out.alpha[pixel] = alpha;
+    for (int f = 0; f < C; ++f) out.radiance[pixel * C + f] = value(f);
+    out.depth[pixel] = alpha > kMinDepthAlpha ? value(C) / alpha : 0.0f;
     out.median_depth[pixel] = median[k][lane];
-    for (int f = 0; f < F; ++f) out.features[pixel * F + f] = acc[k][f][lane];
+    if (out.normals)
+      for (int f = 0; f < 3; ++f) out.normals[pixel * 3 + f] = value(C + 1 + f);
   });
 }
 
-template <int F>
-void backward_tile(const Bins& bins, const Splats& s, const float* features, const Images& out, const Gradients& g,
-                   int tile, float* records) {
-  constexpr int R = 7 + F;  // a record: mean 2, conic 3, opacity 1, pixels 1, features F
-  const uint32_t begin = bins.tile_begin[tile], end = bins.tile_begin[tile + 1];
+// record[slot(i)] = the sum of all lanes of sums[i].
+template <int N>
+OBBGS_INLINE void store_sums(const vf (&sums)[N], float* record) {
+#if defined(__AVX512F__)
+  // Adds while transposing: sixteen vectors in four rounds.
+  __m512 v[16], half[8], quarter[4];
+  for (int i = 0; i < 16; ++i) v[i] = i < N ? sums[i].part[0] : _mm512_setzero_ps();
+  for (int i = 0; i < 8; ++i)
+    half[i] = _mm512_add_ps(_mm512_shuffle_f32x4(v[2 * i], v[2 * i + 1], 0x44), _mm512_shuffle_f32x4(v[2 * i], v[2 * i + 1], 0xEE));
+  for (int i = 0; i < 4; ++i)
+    quarter[i] = _mm512_add_ps(_mm512_shuffle_f32x4(half[2 * i], half[2 * i + 1], 0x88), _mm512_shuffle_f32x4(half[2 * i], half[2 * i + 1], 0xDD));
+  const auto add = [](__m512 a, __m512 b) { return _mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b)); };
+  const __m512d low = _mm512_castps_pd(add(quarter[0], quarter[1])), high = _mm512_castps_pd(add(quarter[2], quarter[3]));
+  _mm512_store_ps(record, _mm512_add_ps(_mm512_castpd_ps(_mm512_unpacklo_pd(low, high)), _mm512_castpd_ps(_mm512_unpackhi_pd(low, high))));
+#else
+  for (int i = 0; i < N; ++i) record[slot(i)] = sum(sums[i]);
+#endif
+}
+
+template <int C, int F>
+void composite_backward_tile(const Scene& s, const Frame& frame, const Images& out, const ImageGradients& g, float* records,
+                             const Grid& grid, int index) {
+  const Tile tile(s, index);
+  const uint32_t begin = frame.tile_begin[index], end = frame.tile_begin[index + 1];
   if (begin == end) return;
-  alignas(64) vf T[64], rest[64][F], grad[64][F], grad_T[64];  // rest: colour still to come from behind
-  alignas(64) vi alive[64];
-  std::memset(alive, 0, sizeof alive);
-  std::memset(grad, 0, sizeof grad);
-  std::memset(grad_T, 0, sizeof grad_T);
-  std::memset(rest, 0, sizeof rest);
-  for (int k = 0; k < 64; ++k) T[k] = splat_of(1.0f);
-  for_each_pixel(bins, tile, [&](size_t pixel, int k, int lane) {
-    alive[k][lane] = -1;
-    grad_T[k][lane] = g.transmittance[pixel] * out.transmittance[pixel];
-    for (int f = 0; f < F; ++f) {
-      rest[k][f][lane] = out.features[pixel * F + f];
-      grad[k][f][lane] = g.features[pixel * F + f];
-    }
-  });
-  const Lanes lanes = block_offsets();
-  const float x0 = float(tile % bins.tiles_x * kTile), y0 = float(tile / bins.tiles_x * kTile);
-  uint64_t open = ~0ull;
-  for (uint32_t p = begin; p < end && open; ++p) {
-    const uint32_t i = bins.pairs[p].splat;
-    const float* feature = features + size_t(i) * F;
-    const float a = s.conics[3 * i], b = s.conics[3 * i + 1], c = s.conics[3 * i + 2];
-    vf g_x{}, g_y{}, g_a{}, g_b{}, g_c{}, g_o{}, touched{}, g_f[F];
-    for (int f = 0; f < F; ++f) g_f[f] = vf{};
-    for (uint64_t left = bins.pairs[p].blocks & open; left; left &= left - 1) {
-      const int k = __builtin_ctzll(left);
-      const Touch t = touch(s, i, lanes.x + (x0 + (k & 7) * kBlock), lanes.y + (y0 + (k >> 3) * kBlock), T[k], alive[k]);
-      const vf w = t.on ? t.alpha * T[k] : vf{};
-      const vf inverse = 1.0f / (1.0f - t.alpha);
-      vf g_alpha = -grad_T[k] * inverse;
-      for (int f = 0; f < F; ++f) {
-        g_f[f] += grad[k][f] * w;
-        rest[k][f] -= w * feature[f];
-        g_alpha += grad[k][f] * (T[k] * feature[f] - rest[k][f] * inverse);
-      }
-      // a clamped alpha passes no gradient to the Gaussian's shape
-      g_alpha = (t.on & (t.alpha < kMaxAlpha)) ? g_alpha : vf{};
-      const vf g_power = g_alpha * t.alpha;
-      g_o += g_alpha * t.falloff;
-      g_x += g_power * (a * t.dx + b * t.dy);
-      g_y += g_power * (b * t.dx + c * t.dy);
-      g_a -= 0.5f * g_power * t.dx * t.dx;
-      g_b -= g_power * t.dx * t.dy;
-      g_c -= 0.5f * g_power * t.dy * t.dy;
-      touched += t.on ? splat_of(1.0f) : vf{};
-      T[k] -= w;
-      if (any(t.stop)) {
-        alive[k] &= ~t.stop;
-        if (!any(alive[k])) open &= ~(1ull << k);
-      }
-    }
-    float* record = records + size_t(bins.pairs[p].record) * R;
-    record[0] = sum(g_x);
-    record[1] = sum(g_y);
-    record[2] = sum(g_a);
-    record[3] = sum(g_b);
-    record[4] = sum(g_c);
-    record[5] = sum(g_o);
-    record[6] = sum(touched);
-    for (int f = 0; f < F; ++f) record[7 + f] = sum(g_f[f]);
+  // behind: the loss's first-order share of all light still to come, gradient . (light behind, final transmittance)
+  vf T[kBlocks], behind[kBlocks], grad[kBlocks][F];
+  for (int k = 0; k < kBlocks; ++k) {
+    T[k] = -1.0f;
+    behind[k] = 0.0f;
+    for (int f = 0; f < F; ++f) grad[k][f] = 0.0f;
   }
-}
-
-template <int F>
-void backward_all(const Bins& bins, const Splats& s, const float* features, const Images& out, const Gradients& g, int threads) {
-  constexpr int R = 7 + F;
-  std::vector<float> records(bins.pairs.size() * R, 0.0f);
-  for_each_tile(bins.tiles_x * bins.tiles_y, threads,
-                [&](int tile) { backward_tile<F>(bins, s, features, out, g, tile, records.data()); });
-  for (int i = 0; i < s.count; ++i) {  // a fixed order of sums: the same result on every run
-    float total[R] = {};
-    for (uint32_t r = bins.splat_begin[i]; r < bins.splat_begin[i + 1]; ++r)
-      for (int k = 0; k < R; ++k) total[k] += records[size_t(r) * R + k];
-    std::memcpy(g.means2d + 2 * i, total, 2 * sizeof(float));
-    std::memcpy(g.conics + 3 * i, total + 2, 3 * sizeof(float));
-    g.opacities[i] = total[5];
-    g.pixels[i] = total[6];
-    std::memcpy(g.splat_features + size_t(i) * F, total + 7, F * sizeof(float));
+  float* lanes = reinterpret_cast<float*>(grad);
+  tile.for_each_pixel(s, [&](int x, int y, size_t pixel, int k, int lane) {
+    const float transmittance = frame.transmittance[pixel], alpha = 1.0f - transmittance;
+    float grad_alpha = g.alpha.at(tile.camera, y, x, 0), total = 0.0f;
+    const auto add = [&](int f, float gradient, float value) {
+      lanes[(k * F + f) * kLanes + lane] = gradient;
+      total += gradient * value;
+    };
+    for (int f = 0; f < C; ++f) add(f, g.radiance.at(tile.camera, y, x, f), out.radiance[pixel * C + f]);
+    if (F > C && alpha > kMinDepthAlpha) {
+      const float depth = out.depth[pixel], grad_depth = g.depth.at(tile.camera, y, x, 0) / alpha;
+      add(C, grad_depth, depth * alpha);
+      grad_alpha -= grad_depth * depth;
+    }
+    for (int f = C + 1; f < F; ++f) {
+      const int axis = f - C - 1;
+      add(f, g.normals.at(tile.camera, y, x, axis), out.normals[pixel * 3 + axis]);
+    }
+    T[k][lane] = 1.0f;
+    behind[k][lane] = total - grad_alpha * transmittance;
+  });
+  for (uint32_t p = begin; p < end; ++p) {
+    const Pair& pair = frame.pairs[p];
+    float* record = records + size_t(pair.record) * kRecord;
+    if (!pair.blocks) {
+      std::memset(record, 0, kRecord * sizeof(float));
+      continue;
+    }
+    if (p + 4 < end) __builtin_prefetch(&frame.splats[frame.pairs[p + 4].splat]);
+    const Splat& splat = frame.splats[pair.splat];
+    const Brush brush(splat, tile, grid);
+    vf feature[F], sums[kFirstFeature + F];
+    for (int f = 0; f < F; ++f) feature[f] = splat.feature[f];
+    for (vf& total : sums) total = 0.0f;
+    int pixels = 0;
+    for (uint64_t left = pair.blocks; left; left &= left - 1) {
+      const int k = __builtin_ctzll(left);
+      const Touch t = touch(brush, grid, k, T[k]);
+      vf dot = grad[k][0] * feature[0];
+      for (int f = 1; f < F; ++f) dot = multiply_add(grad[k][f], feature[f], dot);
+      const vf share = t.weight * dot;
+      behind[k] = behind[k] - share;
+      // dL/dalpha * alpha; a clamped alpha passes no gradient to the Gaussian's shape
+      const vf slope = zero_unless(t.alpha < vf(kMaxAlpha), share - behind[k] * (t.weight * reciprocal(t.after)));
+      const vf slope_u = slope * t.u, slope_v = slope * t.v;
+      sums[kG] = sums[kG] + slope;
+      sums[kGU] = sums[kGU] + slope_u;
+      sums[kGV] = sums[kGV] + slope_v;
+      sums[kGUU] = multiply_add(slope_u, t.u, sums[kGUU]);
+      sums[kGUV] = multiply_add(slope_u, t.v, sums[kGUV]);
+      sums[kGVV] = multiply_add(slope_v, t.v, sums[kGVV]);
+      for (int f = 0; f < F; ++f) sums[kFirstFeature + f] = multiply_add(grad[k][f], t.weight, sums[kFirstFeature + f]);
+      pixels += count(t.on);
+      T[k] = t.after;
+    }
+    store_sums(sums, record);
+    record[kPixels] = float(pixels);
   }
 }
 
 }  // namespace
 
-#define OBBGS_FOR_FEATURES(call) \
-  switch (count) {               \
-    case 1: call(1); break;      \
-    case 2: call(2); break;      \
-    case 3: call(3); break;      \
-    case 4: call(4); break;      \
-    case 5: call(5); break;      \
-    case 6: call(6); break;      \
-    case 7: call(7); break;      \
-    default: call(8); break;     \
+constexpr size_t kGrain = 6000;  // pairs that are worth a thread
+
+// Calls work<channels, features>(..., tile) for every tile.
+#define OBBGS_FOR_TILES(scene, count, work, threads, ...)                                                              \
+  const auto run = [&](auto tile_work) {                                                                               \
+    parallel_for(scene.tiles(), worthwhile(threads, frame.pairs.size(), kGrain), [&](int tile) { tile_work(__VA_ARGS__, tile); }); \
+  };                                                                                                                   \
+  switch (10 * scene.channels + count) {                                                                               \
+    case 11: run(work<1, 1>); break;                                                                                   \
+    case 12: run(work<1, 2>); break;                                                                                   \
+    case 15: run(work<1, 5>); break;                                                                                   \
+    case 33: run(work<3, 3>); break;                                                                                   \
+    case 34: run(work<3, 4>); break;                                                                                   \
+    default: run(work<3, 7>); break;                                                                                   \
   }
 
-void forward(const Bins& bins, const Splats& s, const float* features, int count, const Images& out, int threads) {
-#define OBBGS_FORWARD(F) \
-  for_each_tile(bins.tiles_x * bins.tiles_y, threads, [&](int tile) { forward_tile<F>(bins, s, features, out, tile); })
-  OBBGS_FOR_FEATURES(OBBGS_FORWARD)
+void composite(const Scene& s, Frame& frame, const Images& out, int threads) {
+  const Grid grid;
+  frame.transmittance.resize(size_t(s.cameras) * s.width * s.height);
+  OBBGS_FOR_TILES(s, s.features(), composite_tile, threads, s, frame, out, grid)
 }
 
-void backward(const Bins& bins, const Splats& s, const float* features, int count, const Images& out,
-              const Gradients& g, int threads) {
-#define OBBGS_BACKWARD(F) backward_all<F>(bins, s, features, out, g, threads)
-  OBBGS_FOR_FEATURES(OBBGS_BACKWARD)
+void composite_backward(const Scene& s, const Frame& frame, const Images& out, const ImageGradients& g, float* records, int threads) {
+  const Grid grid;
+  OBBGS_FOR_TILES(s, g.features(s), composite_backward_tile, threads, s, frame, out, g, records, grid)
 }
 
 }  // namespace KERNEL

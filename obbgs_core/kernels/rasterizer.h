@@ -1,9 +1,9 @@
-// The CPU rasterizer: which 4x4 pixel blocks each projected Gaussian touches (bins), and compositing over them.
+// The CPU rasterizer: projection (project.cpp), which 4x4 pixel blocks each Gaussian touches (bins.cpp), compositing over them
+// (composite.cpp). These three are compiled once for each instruction set; binding.cpp picks one at run time.
 #pragma once
-#include <atomic>
+#include <cstddef>
 #include <cstdint>
-#include <functional>
-#include <vector>
+#include <memory>
 
 namespace obbgs {
 
@@ -12,47 +12,112 @@ constexpr int kTile = 32;                 // pixels along a tile's side: 8x8 blo
 constexpr float kMinAlpha = 1.0f / 255;   // fainter contributions are skipped
 constexpr float kMaxAlpha = 0.99f;
 constexpr float kMinTransmittance = 1e-4f;  // a pixel is finished before it falls below
-constexpr int kMaxFeatures = 8;
+constexpr float kMinDepthAlpha = 1e-6f;   // depth is 0 where alpha is no more
+constexpr float kDilation = 0.3f;         // px^2 added to the 2D covariance (Kerbl et al. 2023)
+constexpr float kFovMargin = 1.3f;        // the affine approximation is clamped this far outside the image (Kerbl et al. 2023)
+constexpr int kMaxFeatures = 7;           // radiance 3, depth 1, normal 3
+constexpr int kRecord = 16;               // floats of a gradient record: one cache line
 
-// Projected Gaussians; conics are (xx, xy, yy) of the inverse 2D covariance, px^-2.
-struct Splats {
-  int count;
-  const float *means2d, *conics, *opacities, *depths;
+// The model and the cameras, row-major float32 as in Gaussians and Cameras.
+struct Scene {
+  int gaussians, cameras, sh_count, channels, width, height;
+  float near_m;
+  bool normals;
+  const float *means, *quats, *log_scales, *opacity_logits, *sh, *world_to_camera, *K;
+
+  int features() const { return channels + 1 + 3 * normals; }  // radiance, depth, normal: in this order
+  int tiles_x() const { return (width + kTile - 1) / kTile; }
+  int tiles_y() const { return (height + kTile - 1) / kTile; }
+  int tiles() const { return cameras * tiles_x() * tiles_y(); }  // a camera's tiles follow the previous camera's
 };
 
-// One Gaussian in one tile. Pairs of a Gaussian are contiguous before binning, so `record` orders its gradients.
+// One Gaussian in one camera. At offset d px from (x, y): alpha = 2^(level - u^2 - v^2), u = k1 dx + k2 dy, v = k3 dy,
+// which is the Cholesky factor of the conic; level = log2(opacity).
+struct alignas(64) Splat {
+  float x, y, k1, k2, k3, level;
+  float feature[kMaxFeatures];
+  uint32_t first_record, records;  // its gradient records, one a tile it touches; no records: not drawn
+};
+
+// One splat in one tile.
 struct Pair {
   uint32_t splat, record;
-  uint64_t blocks;  // bit 8*row+column: the Gaussian reaches alpha >= kMinAlpha somewhere in that block's rows
+  uint64_t blocks;  // bit 8*row + column; compositing leaves only the blocks that received light
 };
 
-struct Bins {
-  int width, height, tiles_x, tiles_y;
-  std::vector<Pair> pairs;             // by tile, then by depth
-  std::vector<uint32_t> tile_begin;    // [tiles + 1]
-  std::vector<uint32_t> splat_begin;   // records of splat i: splat_begin[i] .. splat_begin[i + 1]
+template <typename T>
+class Buffer {  // uninitialised array
+ public:
+  void resize(size_t size) {
+    data_.reset(new T[size]);
+    size_ = size;
+  }
+  T* data() { return data_.get(); }
+  T& operator[](size_t i) { return data_[i]; }
+  const T& operator[](size_t i) const { return data_[i]; }
+  size_t size() const { return size_; }
+  size_t bytes() const { return size_ * sizeof(T); }
+
+ private:
+  std::unique_ptr<T[]> data_;
+  size_t size_ = 0;
 };
 
-Bins bin(const Splats& splats, int width, int height);
-
-struct Images {  // [height, width, features], [height, width], [height, width]
-  float *features, *transmittance, *median_depth;
+struct DepthKey {
+  uint32_t depth_bits, splat;
 };
 
-struct Gradients {  // of the loss, per pixel in and per Gaussian out
-  const float *features, *transmittance;
-  float *means2d, *conics, *opacities, *splat_features;
-  float *pixels;  // [count] pixels that each Gaussian touched
+// What the forward pass leaves for the backward pass.
+struct Frame {
+  Buffer<Splat> splats;          // [cameras * gaussians]
+  Buffer<DepthKey> visible;      // splats on an image, nearest first once binned
+  size_t visible_count = 0;
+  Buffer<uint32_t> tile_begin;   // [tiles + 1] into pairs
+  Buffer<Pair> pairs;            // by tile, then by depth
+  Buffer<float> transmittance;   // [cameras, height, width]
 };
 
-// Runs work(tile) for all tiles on up to `threads` threads; tiles are handed out one by one.
-void for_each_tile(int tiles, int threads, const std::function<void(int)>& work);
+struct Images {  // [cameras, height, width] and, for radiance and normals, channels
+  float *radiance, *alpha, *depth, *median_depth, *normals;
+};
 
-#define OBBGS_DECLARE_KERNEL(name)                                                                             \
-  namespace name {                                                                                             \
-  void forward(const Bins&, const Splats&, const float* features, int feature_count, const Images&, int threads); \
-  void backward(const Bins&, const Splats&, const float* features, int feature_count, const Images&,            \
-                const Gradients&, int threads);                                                                \
+// Gradient of an image with its strides in floats (camera, row, column, channel); zero where the loss does not depend on it.
+struct ImageGradient {
+  static constexpr float kZero = 0.0f;
+  const float* data = &kZero;
+  int64_t stride[4] = {};
+  bool given() const { return data != &kZero; }
+  float at(int camera, int y, int x, int channel) const {
+    return data[camera * stride[0] + y * stride[1] + x * stride[2] + channel * stride[3]];
+  }
+};
+
+struct ImageGradients {
+  ImageGradient radiance, alpha, depth, normals;
+  // Features that the loss depends on: a prefix of radiance, depth, normal.
+  int features(const Scene& s) const { return s.channels + (normals.given() ? 4 : depth.given() ? 1 : 0); }
+};
+
+struct SceneGradients {
+  const float* means2d_in;  // [cameras, gaussians, 2] gradient of the projected means from elsewhere, or null
+  float *means, *quats, *log_scales, *opacity_logits, *sh, *world_to_camera;
+  float *means2d, *pixels;  // [cameras, gaussians, 2] loss per px, [cameras, gaussians] pixels touched
+};
+
+// Sums over one splat's pixels in one tile of g = dL/dalpha * alpha and of its features' gradients. `slot` is where the i-th
+// sum lies: the order that falls out of adding up sixteen vectors at once.
+enum Sum { kG, kGU, kGV, kGUU, kGUV, kGVV, kFirstFeature };
+constexpr int slot(int sum) { return 4 * (sum % 4) + sum / 4; }
+constexpr int kPixels = 15;
+static_assert(kFirstFeature + kMaxFeatures < kRecord, "the last slot holds the pixel count");
+
+#define OBBGS_DECLARE_KERNEL(name)                                                                                      \
+  namespace name {                                                                                                      \
+  void project(const Scene&, Frame&, float* means2d, float* radii, int threads);                                         \
+  void bin(const Scene&, Frame&, int threads);                                                                          \
+  void composite(const Scene&, Frame&, const Images&, int threads);                                                     \
+  void composite_backward(const Scene&, const Frame&, const Images&, const ImageGradients&, float* records, int threads); \
+  void project_backward(const Scene&, const Frame&, const float* records, int features, const SceneGradients&, int threads); \
   }
 OBBGS_DECLARE_KERNEL(portable)
 OBBGS_DECLARE_KERNEL(avx2)

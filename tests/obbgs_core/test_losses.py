@@ -6,8 +6,33 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from obbgs_core.losses import charbonnier, sobel, sobel_edge_loss, ssim_map
+from obbgs_core import compiled
+from obbgs_core.losses import (
+    charbonnier,
+    fit_figures,
+    likelihood_loss,
+    likelihood_loss_reference,
+    published_loss,
+    published_loss_reference,
+    sobel,
+    sobel_edge_loss,
+    ssim_map,
+)
 from obbgs_core.metrics import psnr_db, ssim
+from obbgs_core.sensor import Sensor
+
+needs_native = pytest.mark.skipif(compiled._rasterizer is None, reason="the compiled module is not installed")
+PLAIN = Sensor(
+    black_dn=0, white_dn=1, dn_per_radiance_s=1, electrons_per_dn=1, read_noise_dn=0
+)  # dn is radiance
+SENSORS = {
+    "black level": Sensor(
+        black_dn=64, white_dn=4095, dn_per_radiance_s=2e7, electrons_per_dn=4, read_noise_dn=8
+    ),
+    "clipped at zero": Sensor(
+        black_dn=0, white_dn=1023, dn_per_radiance_s=5e6, electrons_per_dn=2.5, read_noise_dn=12
+    ),
+}
 
 
 def images(seed: int, channels: int = 3, dtype=torch.float64) -> tuple[torch.Tensor, torch.Tensor]:
@@ -64,3 +89,180 @@ def test_charbonnier_is_half_the_square_for_noise_and_linear_for_outliers():
     assert (
         charbonnier(torch.tensor([2000.0])) / charbonnier(torch.tensor([1000.0]))
     ).item() == pytest.approx(2, rel=1e-2)
+
+
+def bracket(sensor: Sensor, height: int = 47, width: int = 53, channels: int = 3, seed: int = 0):
+    """Return radiance, exposures and noisy readings of three frames: a third sky, some saturated, some far off."""
+    g = torch.Generator().manual_seed(seed)
+    exposures_s = torch.tensor([0.5e-4, 1e-4, 2e-4]).view(-1, 1, 1, 1)
+    radiance = 2.2 * torch.rand(3, height, width, channels, generator=g)
+    radiance[:, : height // 3] = 0
+    expected = sensor.expected_dn(radiance, exposures_s)
+    noise = torch.randn(expected.shape, generator=g) * sensor.variance_dn2(expected).sqrt()
+    dn = (expected + noise).round().clamp(0, sensor.white_dn)
+    error = torch.where(torch.rand(radiance.shape, generator=g) > 0.05, 0.02, 1.0)
+    return radiance * (1 + error * torch.randn(radiance.shape, generator=g)), exposures_s, dn
+
+
+def value_and_gradient(loss, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    images = images.clone().requires_grad_()
+    value = loss(images)
+    value.backward()
+    assert images.grad is not None
+    return value.detach(), images.grad
+
+
+def assert_gradients_agree(ours: torch.Tensor, truth: torch.Tensor) -> None:
+    """Float32 against float64: a few roundings of the largest gradient."""
+    assert (ours.double() - truth).abs().max() <= 1e-5 * truth.abs().max()
+
+
+@needs_native
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+@pytest.mark.parametrize(("channels", "averaged_pixels"), [(1, 1), (3, 16)])
+@pytest.mark.parametrize("edge_weight", [0.0, 0.05])
+def test_the_compiled_likelihood_is_the_readable_one(sensor, channels, averaged_pixels, edge_weight):
+    radiance, exposures_s, dn = bracket(sensor, channels=channels)
+    assert (dn == sensor.white_dn).float().mean() > 0.05 and (radiance < 0).any()
+    settings = (sensor, averaged_pixels, edge_weight)
+    loss, gradient = value_and_gradient(lambda r: likelihood_loss(r, exposures_s, dn, *settings)[0], radiance)
+    truth, true_gradient = value_and_gradient(
+        lambda r: likelihood_loss_reference(r, exposures_s.double(), dn.double(), *settings)[0],
+        radiance.double(),
+    )
+    assert loss.item() == pytest.approx(truth.item(), rel=1e-6)
+    assert_gradients_agree(gradient, true_gradient)
+    residual = likelihood_loss(radiance, exposures_s, dn, *settings)[1]
+    _, true_residual = likelihood_loss_reference(
+        radiance.double(), exposures_s.double(), dn.double(), *settings
+    )
+    torch.testing.assert_close(residual.double(), true_residual, rtol=1e-5, atol=1e-4)  # 4095 DN in float32
+
+
+@needs_native
+def test_the_compiled_likelihood_follows_the_clipped_normal_far_below_zero():
+    sensor = SENSORS["clipped at zero"]
+    radiance = torch.linspace(-0.5, 0.5, 3 * 1000).view(1, 3, 1000, 1)  # -21 to 9 sigma
+    exposures_s, dn = torch.full((1, 1, 1, 1), 1e-3), torch.zeros_like(radiance)
+    loss, gradient = value_and_gradient(lambda r: likelihood_loss(r, exposures_s, dn, sensor)[0], radiance)
+    truth, true_gradient = value_and_gradient(
+        lambda r: likelihood_loss(r, exposures_s.double(), dn.double(), sensor)[0], radiance.double()
+    )
+    assert loss.item() == pytest.approx(truth.item(), rel=1e-6)
+    assert_gradients_agree(gradient, true_gradient)
+
+
+@needs_native
+@pytest.mark.parametrize("weights", [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.2, 0.2)])
+@pytest.mark.parametrize(("height", "width", "channels"), [(95, 41, 3), (40, 64, 1), (3, 3, 1), (5, 20, 3)])
+def test_the_compiled_published_loss_is_the_readable_one(weights, height, width, channels):
+    g = torch.Generator().manual_seed(height)
+    sensor, exposures_s = SENSORS["black level"], torch.tensor([1e-4, 2e-4]).view(-1, 1, 1, 1)
+    radiance = torch.rand(2, height, width, channels, generator=g)
+    dn = 64 + 4031 * torch.rand(radiance.shape, generator=g)
+    ours, gradient = value_and_gradient(
+        lambda r: published_loss(r, exposures_s, dn, sensor, *weights)[0], radiance
+    )
+    expected, true_gradient = value_and_gradient(
+        lambda r: published_loss_reference(r, exposures_s.double(), dn.double(), sensor, *weights)[0],
+        radiance.double(),
+    )
+    assert ours.item() == pytest.approx(expected.item(), rel=1e-6)
+    assert_gradients_agree(gradient, true_gradient)
+    _, residual = published_loss(radiance, exposures_s, dn, sensor, *weights)
+    _, true_residual = published_loss_reference(radiance, exposures_s, dn, sensor, *weights)
+    torch.testing.assert_close(residual, true_residual, rtol=0, atol=1e-6)
+
+
+def test_the_published_loss_holds_scikit_images_ssim():
+    a, b = (torch.zeros(1, 80, 96, 3) for _ in range(2))
+    for padded, image in zip((a, b), images(5, dtype=torch.float32), strict=True):
+        padded[0, 16:-16, 16:-16] = image  # a black border: there zero padding and reflection are the same
+    expected = structural_similarity(
+        a[0].double().numpy(),
+        b[0].double().numpy(),
+        data_range=1.0,
+        channel_axis=-1,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,  # the map itself: its mean would leave the borders out
+    )[-1]
+    loss, _ = published_loss(a, torch.ones(1, 1, 1, 1), b, PLAIN, ssim_weight=1.0)
+    assert loss.item() == pytest.approx(1 - np.mean(expected), abs=1e-6)
+
+
+@needs_native
+def test_losses_do_not_depend_on_the_number_of_threads():
+    sensor = SENSORS["black level"]
+    radiance, exposures_s, dn = bracket(sensor, height=150)
+    before, results = torch.get_num_threads(), []
+    for threads in (1, 2, 5):
+        torch.set_num_threads(threads)
+        results.append(
+            (
+                *value_and_gradient(
+                    lambda r: likelihood_loss(r, exposures_s, dn, sensor, 1, 0.1)[0], radiance
+                ),
+                *value_and_gradient(
+                    lambda r: published_loss(r, exposures_s, dn, sensor, 0.2, 0.2)[0], radiance
+                ),
+            )
+        )
+    torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(ours, first) for ours, first in zip(other, results[0], strict=True))
+
+
+def test_the_loss_of_a_step_is_the_mean_of_its_frames():
+    sensor = SENSORS["black level"]
+    radiance, exposures_s, dn = bracket(sensor)
+    for loss in (likelihood_loss, published_loss):
+        together, _ = loss(radiance, exposures_s, dn, sensor, 1, 0.1)
+        alone = [
+            loss(r[None], t[None], d[None], sensor, 1, 0.1)[0]
+            for r, t, d in zip(radiance, exposures_s, dn, strict=True)
+        ]
+        assert together.item() == pytest.approx(torch.stack(alone).mean().item(), rel=1e-6)
+
+
+def test_a_prediction_that_is_not_finite_makes_the_loss_not_finite():
+    sensor = SENSORS["black level"]
+    radiance, exposures_s, dn = bracket(sensor)
+    for bad in (float("nan"), float("inf")):
+        radiance[1, 20, 20, 0] = bad
+        assert not torch.isfinite(likelihood_loss(radiance, exposures_s, dn, sensor)[0])
+        assert not torch.isfinite(published_loss(radiance, exposures_s, dn, sensor)[0])
+
+
+def test_images_that_do_not_match_are_refused():
+    sensor = SENSORS["black level"]
+    radiance, exposures_s, dn = bracket(sensor)
+    for loss in (likelihood_loss, published_loss):
+        with pytest.raises(ValueError, match="radiance and dn must both be"):
+            loss(radiance, exposures_s, dn[:, 1:], sensor)
+        with pytest.raises(ValueError, match=r"exposure_time_s must be \[3, 1, 1, 1\], got \[2, 1, 1, 1\]"):
+            loss(radiance, exposures_s[:2], dn, sensor)
+        with pytest.raises(ValueError, match="H, W >= 3"):
+            loss(radiance[:, :2], exposures_s, dn[:, :2], sensor)
+
+
+@pytest.mark.parametrize("module", ["compiled", "missing"])
+def test_the_figures_of_a_fit_are_chi2_on_the_target_and_psnr(module, monkeypatch):
+    if module == "missing":
+        monkeypatch.setattr(compiled, "_rasterizer", None)
+    elif compiled._rasterizer is None:
+        pytest.skip("the compiled module is not installed")
+    sensor = SENSORS["black level"]
+    radiance, exposures_s, dn = bracket(sensor)
+    alpha = torch.rand(radiance.shape[:3], generator=torch.Generator().manual_seed(1)) * 0.1
+    alpha[:, :10] = 0
+    chi2, fit_psnr_db = fit_figures(radiance, alpha, exposures_s, dn, sensor, averaged_pixels=4)
+    seen = np.minimum(64 + 2e7 * exposures_s.numpy() * radiance.numpy(), 4095) / 4095
+    assert fit_psnr_db == pytest.approx(
+        peak_signal_noise_ratio(dn.numpy() / 4095, seen.astype(np.float32), data_range=1.0), abs=1e-4
+    )
+    residual = 2 * sensor.normalised_residual(radiance.double(), exposures_s.double(), dn.double()).numpy()
+    assert chi2 == pytest.approx((residual[alpha.numpy() > 0.05] ** 2).mean(), rel=1e-5)
+    no_target = fit_figures(radiance, torch.zeros_like(alpha), exposures_s, dn, sensor)
+    assert np.isnan(no_target[0]) and no_target[1] == fit_psnr_db

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from obbgs_core.cameras import Cameras
 from obbgs_core.gaussians import Gaussians
@@ -71,6 +73,11 @@ def test_kernels_match_the_reference_in_values_and_gradients(kernel, channels, w
         # a contribution within rounding of the 1/255 cutoff may fall on either side: at most 4e-3 of a value there
         error = (getattr(ours, name) - getattr(truth, name)).abs()
         assert error.max() < 2e-2 and error.mean() < 1e-5, name
+    assert (
+        (ours.median_depth - truth.median_depth).abs() > 1e-4
+    ).float().mean() < 1e-3  # T = 0.5 within rounding
+    torch.testing.assert_close(ours.means2d, truth.means2d, rtol=0, atol=1e-4)
+    assert ((ours.radii - truth.radii).abs() > 0).float().mean() < 1e-2  # whole pixels, rounded up
     for name, expected in truth_gradients.items():
         scale = expected.abs().max()
         # single pixels on the cutoff move a gradient by a thousandth of the largest; float32 sums by 1e-5
@@ -79,17 +86,103 @@ def test_kernels_match_the_reference_in_values_and_gradients(kernel, channels, w
 
 
 @needs_native
-def test_all_kernels_agree_and_repeat_bit_for_bit():
-    gaussians, cameras = random_gaussians(500), looking_at_origin(1, 96)
-    images = {k: render(gaussians, cameras, f"native-{k}").radiance for k in native_kernels()}
-    first = outputs_and_gradients(gaussians, cameras, "native")
-    again = outputs_and_gradients(gaussians, cameras, "native")
-    assert torch.equal(first[0].radiance, again[0].radiance)
-    for name in first[1]:
-        assert torch.equal(first[1][name], again[1][name])
-    for name, image in images.items():
-        # fused and separate multiply-adds differ by rounding, amplified by a cutoff pixel at most
-        assert (image - images["portable"]).abs().mean() < 1e-6, name
+@pytest.mark.parametrize(("sh_count", "channels"), [(1, 1), (4, 3), (9, 1), (16, 3)])
+def test_native_gradients_match_the_reference_in_float64(sh_count, channels):
+    double = random_gaussians(60, channels, seed=sh_count, dtype=torch.float64, sh_count=sh_count)
+    double.log_scales += 1.0
+    # flat tops: hardly a pixel lies within float32 rounding of the 1/255 cutoff
+    single = Gaussians(**{name: value.float() for name, value in double.tensors().items()})
+    double = Gaussians(**{name: value.double() for name, value in single.tensors().items()})
+    cameras = looking_at_origin(3, 48)
+    exact = Cameras(cameras.world_to_camera.double(), cameras.K.double(), 48, 48)
+    _, expected = outputs_and_gradients(double, exact, "reference", normals=True)
+    _, ours = outputs_and_gradients(single, cameras, "native", normals=True)
+    for name, gradient in expected.items():
+        torch.testing.assert_close(
+            ours[name].double(), gradient, rtol=0, atol=2e-4 * float(gradient.abs().max()), msg=name
+        )
+
+
+@needs_native
+def test_gradients_of_projected_means_reach_the_model_as_in_the_reference():
+    gaussians, cameras = random_gaussians(40, 1, sh_count=1), looking_at_origin(2, 32)
+    weights = torch.rand(2, 40, 2, generator=torch.Generator().manual_seed(1))
+    gradients = {}
+    for backend in ("native", "reference"):
+        leaves = {n: t.clone().requires_grad_() for n, t in gaussians.tensors().items()}
+        pose = cameras.world_to_camera.clone().requires_grad_()
+        out = render(Gaussians(**leaves), Cameras(pose, cameras.K, 32, 32), backend)
+        ((out.means2d * weights).sum() + out.radiance.sum()).backward()
+        gradients[backend] = (leaves["means"].grad, pose.grad)
+    for ours, expected in zip(gradients["native"], gradients["reference"], strict=True):
+        torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max()))
+
+
+@needs_native
+def test_all_kernels_agree():
+    gaussians, cameras = random_gaussians(500), looking_at_origin(2, 96)
+    truth, truth_gradients = outputs_and_gradients(gaussians, cameras, "native-portable", normals=True)
+    for kernel in native_kernels():
+        out, gradients = outputs_and_gradients(gaussians, cameras, f"native-{kernel}", normals=True)
+        for name in ("radiance", "alpha", "depth", "median_depth", "normals"):
+            assert (getattr(out, name) - getattr(truth, name)).abs().max() < 1e-5, (kernel, name)
+        for name, expected in truth_gradients.items():
+            assert (gradients[name] - expected).abs().max() < 1e-5 * expected.abs().max(), (kernel, name)
+
+
+@needs_native
+def test_results_repeat_bit_for_bit_with_any_number_of_threads():
+    gaussians, cameras = random_gaussians(1500), looking_at_origin(3, 96)
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 1, 2, 5):
+            torch.set_num_threads(threads)
+            out, gradients = outputs_and_gradients(gaussians, cameras, "native")
+            results.append([out.radiance, out.depth, out.screen.means2d[2], *gradients.values()])
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@needs_native
+@settings(max_examples=60, deadline=None)
+@given(
+    st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5), st.floats(-1.0, 1.0)),
+    st.tuples(*[st.floats(-1, 1)] * 4),
+    st.tuples(*[st.floats(-7, 1)] * 3),
+    st.floats(-7, 9),
+)
+def test_one_gaussian_of_any_shape_covers_the_pixels_it_covers_in_the_reference(
+    mean, quat, log_scales, logit
+):
+    gaussian = Gaussians(
+        torch.tensor([mean]),
+        torch.tensor([quat]),
+        torch.tensor([log_scales]),
+        torch.tensor([logit]),
+        torch.full((1, 1, 1), 2.0),
+    )
+    cameras = looking_at_origin(1, 150, height=110)
+    ours, truth = render(gaussian, cameras, "native").alpha, render(gaussian, cameras, "reference").alpha
+    lost = (ours - truth).abs()
+    # long thin Gaussians amplify the float32 rounding of the conic in the reference; a lost block would show as 1/255
+    assert (lost > 1e-3).float().mean() <= 1e-3 and lost.mean() < 1e-4
+
+
+@needs_native
+def test_a_graph_can_be_differentiated_twice_but_not_after_its_model_changed():
+    gaussians, cameras = random_gaussians(50, 1), looking_at_origin(1, 32)
+    leaves = {n: t.clone().requires_grad_() for n, t in gaussians.tensors().items()}
+    loss = render(Gaussians(**leaves), cameras, "native").radiance.sum()
+    (first,) = torch.autograd.grad(loss, leaves["means"], retain_graph=True)
+    (second,) = torch.autograd.grad(loss, leaves["means"], retain_graph=True)
+    assert torch.equal(first, second) and first.abs().max() > 0
+    with torch.no_grad():
+        leaves["means"] += 1.0
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
 
 
 def test_reference_gradient_matches_finite_differences():
@@ -134,22 +227,38 @@ def test_order_of_gaussians_does_not_matter():
 
 @pytest.mark.parametrize("backend", ["reference", *(["native"] if native_kernels() else [])])
 def test_gaussians_behind_the_camera_or_not_finite_are_not_drawn_and_give_no_nan(backend):
-    gaussians, cameras = random_gaussians(6), looking_at_origin(1, 32)
-    centre = cameras.centres[0]
-    gaussians.means[0] = centre
-    gaussians.means[1] = 2 * centre
+    gaussians, cameras = random_gaussians(12), looking_at_origin(1, 32)
+    sound = outputs_and_gradients(gaussians.select(torch.arange(9, 12)), cameras, backend, normals=True)
+    gaussians.means[0] = cameras.centres[0]
+    gaussians.means[1] = 2 * cameras.centres[0]
     gaussians.means[2] = float("nan")
-    gaussians.quats[3] = 0.0
-    gaussians.log_scales[4] = 200.0
+    gaussians.means[3, 1] = float("inf")
+    gaussians.quats[4, 2] = float("nan")
+    gaussians.log_scales[5, 0] = float("nan")
+    gaussians.log_scales[6] = 200.0
+    gaussians.opacity_logits[7] = float("nan")
+    gaussians.sh[8, 1, 0] = float("nan")
+    out, gradients = outputs_and_gradients(gaussians, cameras, backend, normals=True)
+    assert (out.radii[0, :8] == 0).all() and (out.radii[0, 9:] > 0).all()
+    for name in ("radiance", "alpha", "depth", "median_depth", "normals"):
+        torch.testing.assert_close(getattr(out, name), getattr(sound[0], name), msg=name)
+    for name, gradient in gradients.items():
+        expected = sound[1][name]
+        if name == "world_to_camera":
+            torch.testing.assert_close(gradient, expected, msg=name)
+        else:
+            torch.testing.assert_close(gradient[9:], expected, msg=name)
+            assert (gradient[:9] == 0).all(), name
+
+
+@pytest.mark.parametrize("backend", ["reference", *(["native"] if native_kernels() else [])])
+def test_a_zero_quaternion_is_the_identity(backend):
+    gaussians, cameras = random_gaussians(3), looking_at_origin(1, 32)
+    gaussians.quats[:] = 0.0
     out, gradients = outputs_and_gradients(gaussians, cameras, backend)
-    assert (out.radii[0, :3] == 0).all() and out.radii[0, 4] == 0
-    assert torch.isfinite(out.radiance).all() and torch.isfinite(out.depth).all()
-    for name in ("means", "sh", "opacity_logits"):
-        assert (gradients[name][:2] == 0).all(), name
-    assert all(
-        torch.isfinite(gradients[n][[0, 1, 3, 5]]).all()
-        for n in ("means", "log_scales", "sh", "opacity_logits")
-    )
+    gaussians.quats[:, 0] = 1.0
+    torch.testing.assert_close(out.radiance, render(gaussians, cameras, backend).radiance)
+    assert (gradients["quats"] == 0).all()
 
 
 def test_an_empty_model_is_a_black_sky():
@@ -159,13 +268,28 @@ def test_an_empty_model_is_a_black_sky():
 
 @needs_native
 def test_screen_gradients_equal_the_gradient_of_the_projected_means():
-    gaussians, cameras = random_gaussians(50, 1), looking_at_origin(1, 32)
+    gaussians, cameras = random_gaussians(50, 1), looking_at_origin(2, 32)
+    leaves = {n: t.clone().requires_grad_() for n, t in gaussians.tensors().items()}
+    truth = render(Gaussians(**leaves), cameras, "reference")
+    truth.means2d.retain_grad()
+    truth.radiance.square().sum().backward()
+    ours = render(Gaussians(**leaves), cameras, "native")
+    ours.radiance.square().sum().backward()
+    for camera in range(2):
+        expected = truth.means2d.grad[camera]
+        torch.testing.assert_close(
+            ours.screen.means2d[camera], expected, rtol=1e-3, atol=1e-4 * float(expected.abs().max())
+        )
+        assert ((ours.screen.pixels[camera] > 0) <= (ours.radii[camera] > 0)).all()
+
+
+@needs_native
+def test_pixels_touched_are_counted_exactly():
+    gaussians, cameras = random_gaussians(1, 1, sh_count=1), looking_at_origin(1, 64)
     leaves = {n: t.clone().requires_grad_() for n, t in gaussians.tensors().items()}
     out = render(Gaussians(**leaves), cameras, "native")
-    out.means2d.retain_grad()
-    out.radiance.square().sum().backward()
-    torch.testing.assert_close(out.screen.means2d[0], out.means2d.grad[0])
-    assert ((out.screen.pixels[0] > 0) <= (out.radii[0] > 0)).all()
+    out.alpha.sum().backward()
+    assert float(out.screen.pixels[0][0]) == int((out.alpha > 0).sum()) > 0
 
 
 def test_projection_matches_opencv():

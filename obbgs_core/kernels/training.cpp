@@ -1,0 +1,304 @@
+// What a training step does to every pixel and every parameter besides rendering: the losses with their gradients in
+// one sweep, figures of the fit, and Adam. The readable versions are in losses.py and densify.py; tests compare them.
+//
+// Images are [count, height, width, channels] float32. Work is cut into bands of rows (or blocks of parameters) of a
+// fixed size whose sums are added in order, so the result does not depend on the number of threads.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "rows.h"
+#include "threads.h"
+
+namespace nb = nanobind;
+using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+
+namespace obbgs {
+namespace {
+
+constexpr int kBandRows = 40;
+constexpr int kBlockParameters = 1 << 15;
+
+// ------------------------------------------------------------------------------------------------- bands of rows
+
+struct Shape {
+  int count, height, width, channels;
+  int row() const { return width * channels; }
+  size_t image() const { return size_t(height) * row(); }
+  double values() const { return double(count) * height * row(); }
+  double edges() const { return double(count) * (height - 2) * (width - 2) * channels; }
+};
+
+struct Band { int image, begin, end; };  // rows begin .. end - 1
+
+// Returns the sum of work(band) over all bands of all images, added in their order; Sum{} is nothing.
+template <typename Sum = double, typename Work>
+Sum sum_over_bands(const Shape& shape, int threads, Work work) {
+  const int per_image = (shape.height + kBandRows - 1) / kBandRows;
+  std::vector<Sum> parts(size_t(shape.count) * per_image);
+  parallel_for(int(parts.size()), threads, [&](int i) {
+    const int begin = i % per_image * kBandRows;
+    parts[i] = work(Band{i / per_image, begin, std::min(begin + kBandRows, shape.height)});
+  });
+  return std::accumulate(parts.begin(), parts.end(), Sum{});
+}
+
+double total(const std::vector<float>& sums) { return std::accumulate(sums.begin(), sums.end(), 0.0); }
+
+// A few rows of a padded image, kept by row number.
+class Rows {
+ public:
+  Rows(int first, int last, int width, int margin = 0)
+      : first_(first), stride_(width + 2 * margin), margin_(margin), values_(size_t(last - first) * stride_, 0.0f) {}
+  float* operator[](int row) { return values_.data() + size_t(row - first_) * stride_ + margin_; }
+
+ private:
+  int first_, stride_, margin_;
+  std::vector<float> values_;
+};
+
+// Adds scale * d (|Sx| + |Sy|) / d radiance to the band's rows of `gradient` (when there is one) and returns the sum of
+// |Sx| + |Sy| over the band. fill(row, difference, slope) makes a row of differences and their slopes by radiance.
+template <typename Fill>
+double edge_band(const Shape& shape, const Band& band, float scale, float* gradient, Fill fill) {
+  const int n = shape.row(), c = shape.channels;
+  const int first = std::max(band.begin - 2, 0), last = std::min(band.end + 2, shape.height);
+  Rows difference(first, last, n), slope(first, last, n);
+  for (int y = first; y < last; ++y) fill(y, difference[y], slope[y]);
+  Rows sign_x(band.begin - 1, band.end + 1, n, c), sign_y(band.begin - 1, band.end + 1, n, c);
+  std::vector<float> inside(n, 0.0f), halo(n);
+  for (int y = std::max(band.begin - 1, 1); y < std::min(band.end + 1, shape.height - 1); ++y) {
+    float* sums = y >= band.begin && y < band.end ? inside.data() : halo.data();  // a neighbour counts its own rows
+    sobel_row(n, c, difference[y - 1], difference[y], difference[y + 1], sign_x[y], sign_y[y], sums);
+  }
+  for (int y = band.begin; gradient && y < band.end; ++y)
+    sobel_gradient_row(n, c, scale, sign_x[y - 1], sign_x[y], sign_x[y + 1], sign_y[y - 1], sign_y[y + 1], slope[y],
+                       gradient + size_t(y) * n);
+  return total(inside);
+}
+
+Window gaussian_window() {
+  double sum = 0, values[kTaps];
+  for (int k = 0; k < kTaps; ++k) sum += values[k] = std::exp(-0.5 * (k - kReach) * (k - kReach) / (1.5 * 1.5));
+  Window w;
+  for (int k = 0; k < kTaps; ++k) w.taps[k] = float(values[k] / sum);
+  return w;
+}
+
+// Adds scale * d SSIM / d a to the band's rows of `gradient` (when there is one); returns the sum of 1 - SSIM.
+// a and b hold the image's rows as far as the band's windows reach.
+double ssim_band(const Shape& shape, const Band& band, float scale, Rows& a, Rows& b, float* gradient) {
+  static const Window w = gaussian_window();
+  const int n = shape.row(), c = shape.channels, reach = gradient ? kReach : 0;
+  const int first = std::max(band.begin - reach, 0), last = std::min(band.end + reach, shape.height);
+  const std::vector<float> sky(n, 0.0f);  // what lies outside the image
+  Rows columns(0, 4, n, kReach * c), by_mean(first, last, n), by_squares(first, last, n), by_product(first, last, n);
+  std::vector<float> inside(n, 0.0f), halo(n);
+  const float *rows_a[kTaps], *rows_b[kTaps];
+  for (int y = first; y < last; ++y) {
+    for (int k = 0; k < kTaps; ++k) {
+      const int row = y + k - kReach;
+      const bool outside = row < 0 || row >= shape.height;
+      rows_a[k] = outside ? sky.data() : a[row];
+      rows_b[k] = outside ? sky.data() : b[row];
+    }
+    blur_down_products(n, w, rows_a, rows_b, columns[0], columns[1], columns[2], columns[3]);
+    float* sums = y >= band.begin && y < band.end ? inside.data() : halo.data();
+    ssim_row(n, c, w, columns[0], columns[1], columns[2], columns[3], sums, by_mean[y], by_squares[y], by_product[y]);
+  }
+  for (int y = band.begin; gradient && y < band.end; ++y) {
+    Rows* slopes[3] = {&by_mean, &by_squares, &by_product};
+    for (int s = 0; s < 3; ++s) {
+      for (int k = 0; k < kTaps; ++k) {
+        const int row = y + k - kReach;
+        rows_a[k] = row < first || row >= last ? sky.data() : (*slopes[s])[row];
+      }
+      blur_down(n, w, rows_a, columns[s]);
+    }
+    ssim_gradient_row(n, c, w, scale, columns[0], columns[1], columns[2], a[y], b[y], gradient + size_t(y) * n);
+  }
+  return total(inside);
+}
+
+// ------------------------------------------------------------------------------------------------ doors to Python
+
+Shape shape_of(const Array& images, const char* name) {
+  if (images.ndim() != 4)
+    throw std::invalid_argument(std::string(name) + ": expected [count, height, width, channels]");
+  return {int(images.shape(0)), int(images.shape(1)), int(images.shape(2)), int(images.shape(3))};
+}
+
+void expect(const Array& array, const char* name, size_t count) {
+  if (array.size() != count)
+    throw std::invalid_argument(std::string(name) + ": expected " + std::to_string(count) + " numbers, got " +
+                                std::to_string(array.size()));
+}
+
+// Mean Charbonnier penalty of the noise-normalised residual + edge_weight * mean Sobel difference, stabilised scale.
+double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, double edge_weight, Array residual,
+                  std::optional<Array> gradient, int threads) {
+  const Shape shape = shape_of(radiance, "radiance");
+  expect(dn, "dn", radiance.size());
+  expect(gains, "gains", shape.count);
+  expect(residual, "residual", radiance.size());
+  if (gradient) expect(*gradient, "gradient", radiance.size());
+  const float *r = radiance.data(), *d = dn.data(), *gain = gains.data();
+  float *out = residual.data(), *g = gradient ? gradient->data() : nullptr;
+  const double scale = 1 / shape.values(), edge_scale = edge_weight / shape.edges();
+  nb::gil_scoped_release release;
+  return sum_over_bands(shape, threads, [&](const Band& band) {
+    const int n = shape.row();
+    const size_t image = band.image * shape.image();
+    const float t = gain[band.image];
+    std::vector<float> penalty(n, 0.0f), unwanted(n);
+    for (int y = band.begin; y < band.end; ++y) {
+      const size_t at = image + size_t(y) * n;
+      float* slope = g ? g + at : unwanted.data();
+      likelihood_row(n, r + at, d + at, t, s, out + at, penalty.data(), slope);
+      scale_row(n, float(scale), slope);
+    }
+    double sum = scale * total(penalty);
+    if (edge_weight != 0)
+      sum += edge_scale * edge_band(shape, band, float(edge_scale), g ? g + image : nullptr,
+                                    [&](int y, float* difference, float* slope) {
+                                      const size_t at = image + size_t(y) * n;
+                                      stabilised_row(n, r + at, d + at, t, s, difference, slope);
+                                    });
+    return sum;
+  });
+}
+
+// (1 - ssim_weight) * mean |a - b| + ssim_weight * (1 - mean SSIM) + edge_weight * mean Sobel difference, where a is
+// the prediction and b the reading, in full scales above black; the residual is a - b.
+double published(Array radiance, Array dn, Array gains, const SensorModel& s, double ssim_weight, double edge_weight,
+                 Array residual, std::optional<Array> gradient, int threads) {
+  const Shape shape = shape_of(radiance, "radiance");
+  expect(dn, "dn", radiance.size());
+  expect(gains, "gains", shape.count);
+  expect(residual, "residual", radiance.size());
+  if (gradient) expect(*gradient, "gradient", radiance.size());
+  const float *r = radiance.data(), *d = dn.data(), *gain = gains.data();
+  float *out = residual.data(), *g = gradient ? gradient->data() : nullptr;
+  const double l1_scale = (1 - ssim_weight) / shape.values(), ssim_scale = ssim_weight / shape.values();
+  const double edge_scale = edge_weight / shape.edges();
+  nb::gil_scoped_release release;
+  return sum_over_bands(shape, threads, [&](const Band& band) {
+    const int n = shape.row();
+    const size_t image = band.image * shape.image();
+    const float per_dn = 1 / (s.white - s.black), slope = gain[band.image] * per_dn;  // of a by radiance
+    const int first = std::max(band.begin - 2 * kReach, 0), last = std::min(band.end + 2 * kReach, shape.height);
+    Rows a(first, last, n), b(first, last, n);
+    for (int y = first; y < last; ++y) {
+      scaled_row(n, r + image + size_t(y) * n, 0, slope, a[y]);
+      scaled_row(n, d + image + size_t(y) * n, s.black, per_dn, b[y]);
+    }
+    float* image_gradient = g ? g + image : nullptr;
+    std::vector<float> sums(n, 0.0f), unwanted(n);
+    for (int y = band.begin; y < band.end; ++y) {
+      const size_t at = image + size_t(y) * n;
+      absolute_row(n, float(l1_scale * slope), a[y], b[y], out + at, sums.data(), g ? g + at : unwanted.data());
+    }
+    double sum = l1_scale * total(sums);
+    if (ssim_weight != 0)
+      sum += ssim_scale * ssim_band(shape, band, float(-ssim_scale * slope), a, b, image_gradient);
+    if (edge_weight != 0)
+      sum += edge_scale * edge_band(shape, band, float(edge_scale * slope), image_gradient,
+                                    [&](int y, float* difference, float* by_a) {
+                                      difference_row(n, a[y], b[y], difference);
+                                      std::fill_n(by_a, n, 1.0f);
+                                    });
+    return sum;
+  });
+}
+
+struct Fit {
+  double squares = 0, values = 0, error = 0;  // of residuals on the target, their number, squared error everywhere
+  Fit operator+(const Fit& other) const {
+    return {squares + other.squares, values + other.values, error + other.error};
+  }
+};
+
+// Mean squared noise-normalised residual where alpha > least_alpha (NaN where that is nowhere), and mean squared error
+// everywhere, full scale 1.
+std::pair<double, double> fit(Array radiance, Array alpha, Array dn, Array gains, const SensorModel& s,
+                              float least_alpha, int threads) {
+  const Shape shape = shape_of(radiance, "radiance");
+  expect(alpha, "alpha", radiance.size() / std::max(shape.channels, 1));
+  expect(dn, "dn", radiance.size());
+  expect(gains, "gains", shape.count);
+  const float *r = radiance.data(), *opaque = alpha.data(), *d = dn.data(), *gain = gains.data();
+  nb::gil_scoped_release release;
+  const Fit sum = sum_over_bands<Fit>(shape, threads, [&](const Band& band) {
+    const int n = shape.row(), c = shape.channels;
+    std::vector<float> errors(n, 0.0f), residual(n), penalty(n, 0.0f), slope(n);
+    Fit part;
+    for (int y = band.begin; y < band.end; ++y) {
+      const size_t at = band.image * shape.image() + size_t(y) * n;
+      squared_error_row(n, r + at, d + at, gain[band.image], s, errors.data());
+      const float* row = opaque + at / c;
+      int x0 = 0, x1 = shape.width;  // the part of the row that may hold target
+      while (x0 < x1 && !(row[x0] > least_alpha)) ++x0;
+      while (x0 < x1 && !(row[x1 - 1] > least_alpha)) --x1;
+      likelihood_row((x1 - x0) * c, r + at + x0 * c, d + at + x0 * c, gain[band.image], s, residual.data(),
+                     penalty.data(), slope.data());
+      for (int x = x0; x < x1; ++x) {
+        if (!(row[x] > least_alpha)) continue;
+        part.values += c;
+        for (int k = (x - x0) * c; k < (x - x0 + 1) * c; ++k) part.squares += double(residual[k]) * residual[k];
+      }
+    }
+    part.error = total(errors);
+    return part;
+  });
+  return {sum.squares / sum.values, sum.error / shape.values()};
+}
+
+// One Adam step of one parameter, in place; rate already holds the bias correction.
+void adam_step(Array parameter, Array gradient, Array first, Array second, double rate, double b1, double b2,
+               double eps, int threads) {
+  const size_t n = parameter.size();
+  expect(gradient, "gradient", n);
+  expect(first, "first", n);
+  expect(second, "second", n);
+  float *p = parameter.data(), *m = first.data(), *v = second.data();
+  const float* g = gradient.data();
+  nb::gil_scoped_release release;
+  const int blocks = int((n + kBlockParameters - 1) / kBlockParameters);
+  parallel_for(blocks, threads, [&](int block) {
+    const size_t at = size_t(block) * kBlockParameters, count = std::min(n - at, size_t(kBlockParameters));
+    adam_block(count, p + at, g + at, m + at, v + at, float(rate), float(1 - b1), float(b2), float(1 - b2), float(eps));
+  });
+}
+
+}  // namespace
+}  // namespace obbgs
+
+void bind_training(nb::module_& m) {
+  using namespace nb::literals;
+  using obbgs::SensorModel;
+  nb::class_<SensorModel>(m, "SensorModel")
+      .def("__init__", [](SensorModel* self, double black_dn, double white_dn, double electrons_per_dn,
+                          double read_noise_dn, double averaged_pixels) {
+        const double read_noise_e = read_noise_dn * electrons_per_dn;
+        new (self) SensorModel{float(black_dn), float(white_dn), float(1 / electrons_per_dn), float(electrons_per_dn),
+                               float(read_noise_dn * read_noise_dn + 1.0 / 12),
+                               float(3.0 / 8 + read_noise_e * read_noise_e), float(std::sqrt(averaged_pixels))};
+      });
+  // what is filled in place must not be converted: the caller would get back an untouched original
+  m.def("likelihood", &obbgs::likelihood, "radiance"_a, "dn"_a, "gains"_a, "sensor"_a, "edge_weight"_a,
+        "residual"_a.noconvert(), "gradient"_a.none().noconvert(), "threads"_a);
+  m.def("published", &obbgs::published, "radiance"_a, "dn"_a, "gains"_a, "sensor"_a, "ssim_weight"_a, "edge_weight"_a,
+        "residual"_a.noconvert(), "gradient"_a.none().noconvert(), "threads"_a);
+  m.def("fit", &obbgs::fit, "radiance"_a, "alpha"_a, "dn"_a, "gains"_a, "sensor"_a, "least_alpha"_a, "threads"_a);
+  m.def("adam_step", &obbgs::adam_step, "parameter"_a.noconvert(), "gradient"_a, "first"_a.noconvert(),
+        "second"_a.noconvert(), "rate"_a, "b1"_a, "b2"_a, "eps"_a, "threads"_a);
+}
