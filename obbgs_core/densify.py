@@ -6,7 +6,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from obbgs_core import compiled
 from obbgs_core.gaussians import Gaussians
+from obbgs_core.methods import MethodConfig
+from obbgs_core.obb import Obb
 from obbgs_core.render import Rendered
 from obbgs_core.rotations import quats_to_matrices
 
@@ -55,11 +58,23 @@ class Adam:
         for name, parameter in gaussians.tensors().items():
             if parameter.grad is None:
                 continue
+            values, gradient, rate = parameter.detach(), parameter.grad.contiguous(), rates[name] * correction
             first, second = self.first[name], self.second[name]
-            first.lerp_(parameter.grad, 1 - b1)
-            second.mul_(b2).addcmul_(parameter.grad, parameter.grad, value=1 - b2)
-            parameter.addcdiv_(first, second.sqrt().add_(self.eps), value=-rates[name] * correction)
+            if native := compiled.module_for(values):  # the same in one pass over memory
+                threads = torch.get_num_threads()
+                native.adam_step(values, gradient, first, second, rate, b1, b2, self.eps, threads)
+            else:
+                first.lerp_(gradient, 1 - b1)
+                second.mul_(b2).addcmul_(gradient, gradient, value=1 - b2)
+                values.addcdiv_(first, second.sqrt().add_(self.eps), value=-rate)
             parameter.grad = None
+
+    def widen(self, gaussians: Gaussians) -> None:
+        """Follow coefficients of radiance that were added: theirs start at rest."""
+        for moments in (self.first, self.second):
+            more = torch.zeros_like(gaussians.sh)
+            more[:, : moments["sh"].shape[1]] = moments["sh"]
+            moments["sh"] = more
 
     def follow(self, kept: Tensor, added: int) -> None:
         """Keep the moments of the Gaussians `kept` (index) and start `added` new ones at rest."""
@@ -71,16 +86,16 @@ class Adam:
 
 @torch.no_grad()
 def grow(
-    gaussians: Gaussians, adam: Adam, chosen: Tensor, split_over_m: float, rng: torch.Generator
+    gaussians: Gaussians, adam: Adam, growing: Tensor, split_over_m: float, rng: torch.Generator
 ) -> Gaussians:
-    """Return the model with the chosen Gaussians [N] bool cloned (small ones) or split in two (large ones).
+    """Return the model with the growing Gaussians [N] bool cloned (small ones) or split in two (large ones).
 
     Splitting draws the halves' centres from the Gaussian itself and shrinks them, as in Kerbl et al. 2023.
     """
     large = gaussians.scales.max(dim=1).values > split_over_m
-    clones = torch.nonzero(chosen & ~large)[:, 0]
-    splits = torch.nonzero(chosen & large)[:, 0]
-    kept = torch.nonzero(~(chosen & large))[:, 0]
+    clones = torch.nonzero(growing & ~large)[:, 0]
+    splits = torch.nonzero(growing & large)[:, 0]
+    kept = torch.nonzero(~(growing & large))[:, 0]
     parts = [gaussians.select(kept), gaussians.select(clones)]
     for _ in range(2):
         half = gaussians.select(splits)
@@ -115,3 +130,53 @@ def outliers(gaussians: Gaussians, spread: float = 4.0, faint: float = 0.1) -> T
     distance = (gaussians.means - gaussians.means.median(dim=0).values).norm(dim=1)
     limit = spread * distance.median().clamp(min=1e-9)
     return (distance > limit) | ((gaussians.opacities < faint) & (distance > limit / 2))
+
+
+def densify(
+    gaussians: Gaussians,
+    adam: Adam,
+    gradient: Tensor,
+    radius: float,
+    config: MethodConfig,
+    rng: torch.Generator,
+) -> Gaussians:
+    """Grow where screen gradients [N] are large, within the budget; prune what is faint or far too large."""
+    gaussians = grow(gaussians, adam, chosen(gradient, gaussians, config), config.split_over * radius, rng)
+    with torch.no_grad():
+        wanted = gaussians.opacities > config.prune_opacity
+        wanted &= gaussians.scales.max(dim=1).values < config.prune_over * radius
+        wanted &= torch.isfinite(gaussians.means).all(dim=1)
+    return keep(gaussians, adam, wanted) if wanted.any() else gaussians
+
+
+def densify_boxes(
+    gaussians: Gaussians,
+    adam: Adam,
+    growth: Growth,
+    boxes: list[Obb],
+    radius: float,
+    config: MethodConfig,
+    rng: torch.Generator,
+) -> tuple[Gaussians, Growth]:
+    """Apply the clone/split rule inside the boxes only; what grows starts its gradient record anew."""
+    inside = torch.stack([box.contains(gaussians.means.detach()) for box in boxes]).any(dim=0)
+    growing = chosen(growth.mean(), gaussians, config) & inside
+    split = (gaussians.scales.detach().max(dim=1).values > config.split_over * radius) & growing
+    kept = torch.nonzero(~split)[:, 0]
+    gradient, weight = growth.gradient[kept], growth.weight[kept]
+    gaussians = grow(gaussians, adam, growing, config.split_over * radius, rng)
+    growth = Growth(len(gaussians), config.pixel_weighted)
+    growth.gradient[: len(kept)], growth.weight[: len(kept)] = gradient, weight
+    return gaussians, growth
+
+
+def chosen(gradient: Tensor, gaussians: Gaussians, config: MethodConfig) -> Tensor:
+    """Return which Gaussians [N] grow: over the threshold, or the given share; never beyond the budget."""
+    room = config.max_gaussians - len(gaussians)
+    count = int((gradient >= config.grow_grad2d).sum())
+    if config.grow_share:
+        count = int(config.grow_share * len(gaussians))
+    count = max(0, min(count, room, int((gradient > 0).sum())))
+    growing = torch.zeros(len(gaussians), dtype=torch.bool)
+    growing[gradient.topk(count).indices] = True
+    return growing

@@ -1,10 +1,11 @@
 """The model as an ONNX renderer of standard operators: a view and an exposure time in, the expected image out.
 
-The graph is the rasterizer of `render`, written for a runtime: project all Gaussians, sort by depth, and for each 8x8
-tile that any Gaussian reaches composite just the ones that reach it. No tile has a capacity, so nothing overflows.
+The graph is the rasterizer of `render`, written for a runtime: project all Gaussians, sort them by depth once, and for
+each 16x16 tile that any Gaussian reaches composite just the ones that reach it. No tile has a capacity, so nothing
+overflows; memory grows with the fullest tile, about 4 kB a Gaussian in it.
 """
 
-import os
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor
 
 from obbgs_core.errors import ExportError
+from obbgs_core.files import write_whole
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.render import DILATION_PX2, FOV_MARGIN, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from obbgs_core.rotations import quats_to_matrices
@@ -22,8 +24,9 @@ from obbgs_core.sensor import Sensor
 from obbgs_core.sh import C0, SOFTNESS
 
 OPSET = 18
-TILE = 8  # px
+TILE = 16  # px: 8 costs more calls, 32 more pixels that a Gaussian does not reach
 FORMAT_VERSION = "1"
+MAX_MODEL_BYTES = 64 * 1024 * 1024  # what flightsw.model_file accepts
 NEAR_M = 0.01
 
 
@@ -51,11 +54,13 @@ def export_onnx(
         exposures_s: the exposure times the model was trained on; their range goes into the metadata.
 
     Raises:
-        ExportError: the model is empty or not finite.
+        ExportError: the model is empty, not finite or larger than flight accepts, or there is no exposure time.
     """
     if len(gaussians) == 0:
         raise ExportError("there is no Gaussian to export")
-    for name, tensor in gaussians.tensors().items():
+    if not exposures_s or not all(math.isfinite(e) and e > 0 for e in exposures_s):
+        raise ExportError(f"exposures_s must be positive times, got {list(exposures_s)}")
+    for name, tensor in {**gaussians.tensors(), "scales": gaussians.scales}.items():
         if not tensor.isfinite().all():
             raise ExportError(f"{name} holds values that are not finite")
     graph = _Graph()
@@ -93,12 +98,12 @@ def export_onnx(
     helper.set_model_props(model, {name: str(value) for name, value in facts.items()})
     onnx.checker.check_model(model, full_check=True)
     content = model.SerializeToString()
-    part = path.with_name(path.name + ".part")
-    with open(part, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, path)
+    if len(content) > MAX_MODEL_BYTES:
+        raise ExportError(
+            f"{len(gaussians)} Gaussians make a model of {len(content)} bytes; the spacecraft accepts "
+            f"{MAX_MODEL_BYTES}: train with a smaller budget"
+        )
+    write_whole(path, content)
     return Exported(path, len(content), len(gaussians))
 
 
@@ -133,6 +138,12 @@ class _Graph:
         self.count += 1
         return f"{self.prefix}{self.count}"
 
+    def split(self, value: str, *widths: int) -> list[str]:
+        """Return the columns of a matrix in blocks of the given widths."""
+        results = [self._fresh() for _ in widths]
+        self.nodes.append(helper.make_node("Split", [value, self.ints(*widths)], results, axis=1))
+        return results
+
     def column(self, matrix: str, *index: int) -> str:
         """Return an element of a matrix as a scalar [1]."""
         flat = self.op("Reshape", matrix, self.ints(-1))
@@ -144,8 +155,19 @@ def _numpy(tensor: Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=np.float32)
 
 
-def _project(g: _Graph, gaussians: Gaussians, width: int, height: int) -> dict[str, str]:
-    """EWA projection of every Gaussian: names of [N] vectors, and the features [N, C + 1]."""
+@dataclass(frozen=True)
+class _Projected:
+    """Names of what every Gaussian is on the image plane."""
+
+    depth: str  # [N] m
+    centres: list[str]  # x and y, [N] px
+    reaches: list[str]  # half width and height of its box, [N] px; negative where it is not drawn
+    splats: str  # [N, 7]: centre, square root of the conic (2 x 2), logarithm of the opacity
+    features: str  # [N, C + 2]: radiance, depth, one
+
+
+def _project(g: _Graph, gaussians: Gaussians, width: int, height: int) -> _Projected:
+    """EWA projection of every Gaussian, as `render.project`."""
     RS = quats_to_matrices(gaussians.quats) * gaussians.scales[:, None, :]
     means = g._name(_numpy(gaussians.means))
     pose = "world_to_camera"
@@ -173,27 +195,38 @@ def _project(g: _Graph, gaussians: Gaussians, width: int, height: int) -> dict[s
     xx = g.op("Add", g.op("ReduceSum", g.op("Mul", M[0], M[0]), last, keepdims=0), DILATION_PX2)
     xy = g.op("ReduceSum", g.op("Mul", M[0], M[1]), last, keepdims=0)
     yy = g.op("Add", g.op("ReduceSum", g.op("Mul", M[1], M[1]), last, keepdims=0), DILATION_PX2)
-    determinant = g.op("Sub", g.op("Mul", xx, yy), g.op("Mul", xy, xy))
-    opacities = _numpy(gaussians.opacities)
+    # det(M Mᵀ + dI) as a sum of squares: xx·yy - xy² would cancel for needles
+    after, before = np.array([1, 2, 0]), np.array([2, 0, 1])
+    left, right = (
+        g.op("Mul", g.op("Gather", M[0], i, axis=1), g.op("Gather", M[1], j, axis=1))
+        for i, j in ((after, before), (before, after))
+    )
+    cross = g.op("ReduceSumSquare", g.op("Sub", left, right), last, keepdims=0)
+    dilated = g.op("Mul", g.op("Sub", g.op("Add", xx, yy), DILATION_PX2), DILATION_PX2)
+    determinant = g.op("Add", cross, dilated)
+    opacities = np.maximum(_numpy(gaussians.opacities), np.float32(1e-12))  # its logarithm is finite
     q = g._name(2 * np.log(np.maximum(opacities / np.float32(MIN_ALPHA), 1e-6)).astype(np.float32))
     drawn = g.op("And", drawn, g._name(opacities >= MIN_ALPHA))
+    # a Gaussian too large for float32 is not drawn, as in `render`
+    drawn = g.op("And", drawn, g.op("LessOrEqual", determinant, float(np.finfo(np.float32).max)))
     # an undrawn Gaussian reaches nothing: its box has negative size everywhere
     q_drawn = g.op("Where", drawn, q, 0.0)
     nothing = g.op("Where", drawn, 0.0, 1e9)
     reach_x = g.op("Sub", g.op("Sqrt", g.op("Mul", q_drawn, xx)), nothing)
     reach_y = g.op("Sub", g.op("Sqrt", g.op("Mul", q_drawn, yy)), nothing)
-    return {
-        "mean_x": mean_x,
-        "mean_y": mean_y,
-        "a": g.op("Div", yy, determinant),
-        "b": g.op("Neg", g.op("Div", xy, determinant)),
-        "c": g.op("Div", xx, determinant),
-        "opacity": g._name(opacities),
-        "reach_x": reach_x,
-        "reach_y": reach_y,
-        "depth": pz,
-        "radiance": _radiance(g, gaussians, means, R, t),
-    }
+    # with these, (x, y)·conic·(x, y) = (steep·x + skew·y)² + (flat·y)²
+    steep = g.op("Sqrt", g.op("Div", yy, determinant))
+    skew = g.op("Neg", g.op("Mul", steep, g.op("Div", xy, yy)))
+    flat = g.op("Reciprocal", g.op("Sqrt", yy))
+    columns = (mean_x, mean_y, steep, skew, g.op("Mul", flat, 0.0), flat, np.log(opacities))
+    radiance, ones = _radiance(g, gaussians, means, R, t), np.ones((len(gaussians), 1), dtype=np.float32)
+    return _Projected(
+        depth=pz,
+        centres=[mean_x, mean_y],
+        reaches=[reach_x, reach_y],
+        splats=g.op("Concat", *(g.op("Unsqueeze", column, last) for column in columns), axis=1),
+        features=g.op("Concat", radiance, g.op("Unsqueeze", pz, last), ones, axis=1),
+    )
 
 
 def _clamped(g: _Graph, tangent: str, focal: str, centre: str, size: int) -> str:
@@ -268,80 +301,76 @@ def _sh_basis(g: _Graph, direction: str, count: int) -> str:
     return g.op("Unsqueeze", basis, g.ints(2))
 
 
-def _composite(g: _Graph, projected: dict[str, str], channels: int, width: int, height: int) -> str:
-    """Composite every tile that is reached; return the image [H, W, C + 2]: radiance, depth sum, alpha."""
+def _composite(g: _Graph, projected: _Projected, channels: int, width: int, height: int) -> str:
+    """Composite every tile that is reached; return the image [C + 2, H, W]: radiance, depth sum, alpha."""
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    count = g.op("Shape", projected["depth"])
-    order = g.op("TopK", projected["depth"], count, outputs=2, axis=0, largest=0, sorted=1)
-    names = ("mean_x", "mean_y", "a", "b", "c", "opacity", "reach_x", "reach_y", "depth")
-    s = {name: g.op("Gather", projected[name], order, axis=0) for name in names}
-    features = g.op(
-        "Concat",
-        g.op("Gather", projected["radiance"], order, axis=0),
-        g.op("Unsqueeze", s["depth"], g.ints(1)),
-        axis=1,
-    )
-    rows = [g.op("Unsqueeze", s[name], g.ints(0)) for name in ("mean_x", "mean_y", "a", "b", "c", "opacity")]
-    splats = g.op("Concat", *rows, axis=0)  # [6, N]
+    count = g.op("Shape", projected.depth)
+    order = g.op("TopK", projected.depth, count, outputs=2, axis=0, largest=0, sorted=1)
+    splats, features = (g.op("Gather", v, order, axis=0) for v in (projected.splats, projected.features))
     reached = []
-    for mean, reach, tiles in ((s["mean_x"], s["reach_x"], tiles_x), (s["mean_y"], s["reach_y"], tiles_y)):
+    for centre, reach, tiles in zip(projected.centres, projected.reaches, (tiles_x, tiles_y), strict=True):
         start = (np.arange(tiles, dtype=np.float32) * TILE)[:, None]  # [tiles, 1]
-        low = g.op("Sub", mean, reach)
-        high = g.op("Add", mean, reach)
-        reached.append(
-            g.op("And", g.op("Less", low, start + TILE), g.op("Greater", high, start))
-        )  # [tiles, N]
+        mean, reach = (g.op("Gather", value, order, axis=0) for value in (centre, reach))
+        begins = g.op("Less", g.op("Sub", mean, reach), start + TILE)
+        reached.append(g.op("And", begins, g.op("Greater", g.op("Add", mean, reach), start)))  # [tiles, N]
     in_columns, in_rows = reached
     as_numbers = [g.op("Cast", mask, to=TensorProto.FLOAT) for mask in (in_rows, in_columns)]
     members = g.op(
         "MatMul", as_numbers[0], g.op("Transpose", as_numbers[1], perm=[1, 0])
     )  # [tiles_y, tiles_x]
-    active = g.op("NonZero", g.op("Cast", g.op("Greater", members, 0.5), to=TensorProto.INT64))  # [2, A]
+    active = g.op("NonZero", g.op("Greater", members, 0.5))  # [2, A]
     # the first tile is always composited, so that the loop is never empty
     active = g.op("Concat", g._name(np.zeros((2, 1), dtype=np.int64)), active, axis=1)
     tile_y, tile_x = (g.op("Gather", active, np.array(i, dtype=np.int64), axis=0) for i in range(2))
     body = _tile_body(splats, features, in_rows, in_columns, channels)
-    tiles = g.op("Scan", tile_y, tile_x, body=body, num_scan_inputs=2)  # [A, TILE², C + 2]
+    tiles = g.op("Scan", tile_y, tile_x, body=body, num_scan_inputs=2)  # [A, C + 2, TILE²]
     index = g.op("Unsqueeze", g.op("Add", g.op("Mul", tile_y, g.ints(tiles_x)), tile_x), g.ints(1))
-    sky = np.zeros((tiles_y * tiles_x, TILE * TILE, channels + 2), dtype=np.float32)
+    sky = np.zeros((tiles_y * tiles_x, channels + 2, TILE * TILE), dtype=np.float32)
     image = g.op("ScatterND", sky, index, tiles)
-    image = g.op("Reshape", image, g.ints(tiles_y, tiles_x, TILE, TILE, channels + 2))
-    image = g.op("Transpose", image, perm=[0, 2, 1, 3, 4])
-    image = g.op("Reshape", image, g.ints(tiles_y * TILE, tiles_x * TILE, channels + 2))
-    return g.op("Slice", image, g.ints(0, 0), g.ints(height, width), g.ints(0, 1))
+    image = g.op("Reshape", image, g.ints(tiles_y, tiles_x, channels + 2, TILE, TILE))
+    image = g.op("Transpose", image, perm=[2, 0, 3, 1, 4])
+    image = g.op("Reshape", image, g.ints(channels + 2, tiles_y * TILE, tiles_x * TILE))
+    return g.op("Slice", image, g.ints(0, 0), g.ints(height, width), g.ints(1, 2))
 
 
 def _tile_body(splats: str, features: str, in_rows: str, in_columns: str, channels: int) -> onnx.GraphProto:
     """One tile: the Gaussians that reach it, already in depth order, composited front to back."""
     b = _Graph("tile_")
-    both = b.op(
-        "And", b.op("Gather", in_rows, "tile_row", axis=0), b.op("Gather", in_columns, "tile_column", axis=0)
+    in_row, in_column = (
+        b.op("Gather", mask, tile, axis=0)
+        for mask, tile in ((in_rows, "tile_row"), (in_columns, "tile_column"))
     )
-    chosen = b.op("Squeeze", b.op("NonZero", b.op("Cast", both, to=TensorProto.INT64)), b.ints(0))  # [M]
-    local = b.op("Gather", splats, chosen, axis=1)  # [6, M]
-    x, y, a, bb, c, opacity = (b.op("Gather", local, np.array(i, dtype=np.int64), axis=0) for i in range(6))
-    pixel = np.arange(TILE * TILE, dtype=np.float32)[:, None]
-    corner_x = b.op("Mul", b.op("Cast", "tile_column", to=TensorProto.FLOAT), float(TILE))
-    corner_y = b.op("Mul", b.op("Cast", "tile_row", to=TensorProto.FLOAT), float(TILE))
-    dx = b.op("Sub", b.op("Add", pixel % TILE + np.float32(0.5), corner_x), x)  # [TILE², M]
-    dy = b.op("Sub", b.op("Add", pixel // TILE + np.float32(0.5), corner_y), y)
-    along_x = b.op("Mul", dx, b.op("Add", b.op("Mul", a, dx), b.op("Mul", b.op("Mul", bb, 2.0), dy)))
-    power = b.op("Mul", b.op("Add", along_x, b.op("Mul", c, b.op("Mul", dy, dy))), -0.5)
-    alpha = b.op("Min", b.op("Mul", opacity, b.op("Exp", b.op("Min", power, 0.0))), MAX_ALPHA)
-    alpha = b.op("Where", b.op("Less", alpha, MIN_ALPHA), 0.0, alpha)
-    passed = b.op("Log", b.op("Sub", 1.0, alpha))
-    after = b.op("CumSum", passed, np.array(1, dtype=np.int64))
-    before = b.op("Sub", after, passed)
-    alpha = b.op("Where", b.op("Less", after, float(np.log(MIN_TRANSMITTANCE))), 0.0, alpha)
-    weight = b.op("Mul", alpha, b.op("Exp", before))
-    colour = b.op("MatMul", weight, b.op("Gather", features, chosen, axis=0))
-    coverage = b.op("ReduceSum", weight, b.ints(1), keepdims=1)
-    b.op("Concat", colour, coverage, axis=1, name="tile_image")
+    chosen = b.op("Squeeze", b.op("NonZero", b.op("And", in_row, in_column)), b.ints(0))  # [M]
+    mean, root, log_opacity = b.split(b.op("Gather", splats, chosen, axis=0), 2, 4, 1)
+    tile = b.op("Concat", *(b.op("Unsqueeze", n, b.ints(0)) for n in ("tile_column", "tile_row")), axis=0)
+    middle = b.op("Add", b.op("Mul", b.op("Cast", tile, to=TensorProto.FLOAT), float(TILE)), TILE / 2)
+    # two linear forms of each pixel, measured from the tile's middle; their squares add up to the exponent
+    root = b.op("Reshape", root, b.ints(-1, 2, 2))
+    towards = b.op("Unsqueeze", b.op("Sub", middle, mean), b.ints(1))  # [M, 1, 2]
+    constant = b.op("ReduceSum", b.op("Mul", root, towards), b.ints(2), keepdims=1)
+    pixel = np.arange(TILE * TILE, dtype=np.float32)
+    x, y = pixel % TILE + np.float32(0.5 - TILE / 2), pixel // TILE + np.float32(0.5 - TILE / 2)
+    pixels = np.stack([x, y, np.ones_like(x)]) * np.float32(math.sqrt(0.5))
+    forms = b.op("Reshape", b.op("Concat", root, constant, axis=2), b.ints(-1, 6))
+    squares = []
+    for form in b.split(forms, 3, 3):
+        value = b.op("MatMul", form, pixels)  # [M, TILE²]
+        squares.append(b.op("Mul", value, value))
+    log_alpha = b.op("Sub", b.op("Sub", log_opacity, squares[0]), squares[1])
+    alpha = b.op("Exp", b.op("Min", log_alpha, math.log(MAX_ALPHA)))  # [M, TILE²]
+    alpha = b.op("ThresholdedRelu", alpha, alpha=MIN_ALPHA)
+    before = b.op("CumSum", b.op("Log", b.op("Sub", 1.0, alpha)), np.array(0, dtype=np.int64), exclusive=1)
+    before = b.op("Exp", before)
+    weight = b.op("Mul", alpha, before)
+    opaque = b.op("Less", b.op("Sub", before, weight), MIN_TRANSMITTANCE)
+    weight = b.op("Where", opaque, 0.0, weight)
+    chosen_features = b.op("Transpose", b.op("Gather", features, chosen, axis=0), perm=[1, 0])
+    b.op("MatMul", chosen_features, weight, name="tile_image")
     return helper.make_graph(
         b.nodes,
         "tile",
         [helper.make_tensor_value_info(n, TensorProto.INT64, []) for n in ("tile_row", "tile_column")],
-        [helper.make_tensor_value_info("tile_image", TensorProto.FLOAT, [TILE * TILE, channels + 2])],
+        [helper.make_tensor_value_info("tile_image", TensorProto.FLOAT, [channels + 2, TILE * TILE])],
         b.constants,
     )
 
@@ -350,11 +379,12 @@ def _finish(g: _Graph, composed: str, channels: int, sensor: Sensor) -> None:
     """Turn the composed image into the outputs."""
     parts = []
     for start, end in ((0, channels), (channels, channels + 1), (channels + 1, channels + 2)):
-        parts.append(g.op("Slice", composed, g.ints(start), g.ints(end), g.ints(2)))
+        parts.append(g.op("Slice", composed, g.ints(start), g.ints(end), g.ints(0)))
     radiance, depth_sum, alpha = parts
+    radiance = g.op("Transpose", radiance, perm=[1, 2, 0])
     signal = g.op("Mul", radiance, g.op("Mul", "exposure_time_s", sensor.dn_per_radiance_s))
     g.op("Clip", g.op("Div", g.op("Add", signal, sensor.black_dn), sensor.white_dn), 0.0, 1.0, name="image")
-    g.op("Squeeze", alpha, g.ints(2), name="alpha")
+    g.op("Squeeze", alpha, g.ints(0), name="alpha")
     depth = g.op("Div", depth_sum, g.op("Max", alpha, 1e-6))
     depth = g.op("Where", g.op("Greater", alpha, 1e-6), depth, 0.0)
-    g.op("Squeeze", depth, g.ints(2), name="depth")
+    g.op("Squeeze", depth, g.ints(0), name="depth")

@@ -11,68 +11,125 @@ from torch import Tensor
 from obbgs_core.sensor import Sensor
 
 log = logging.getLogger(__name__)
-BRIGHT_SIGMA = 5.0  # of a 3x3 mean; fainter pixels are sky
-AGREEMENT = (
-    0.92  # share of views that must see light where a voxel projects; the rest may look at shadowed faces
-)
-COARSE_VOXELS = 64  # along each axis of the first grid; two subdivisions follow
-SUBDIVISIONS = 2
+SURE_SIGMA = 5.5  # of a window's mean: certainly light; sizes the target
+LIKELY_SIGMA = 2.0  # perhaps light; enough for a vote, since one view in twenty may be wrong
+WINDOWS_PX = (3, 5, 9, 15)  # wide ones find shadowed faces that no single pixel shows
+FEWEST_BRIGHT_PX = 4  # of the target, for a frame to be of use
+SPECK = 0.4  # a sure pixel with fewer sure neighbours (share of 3x3) is noise
+INSIDE = 0.9995  # share of all sure pixels that the target's radius must reach
+AGREEMENT = 0.95  # share of views that must see light where a voxel projects
+COARSE_VOXELS = 64  # along each axis of the first grid
+SUBDIVISIONS = 2  # at most
+FINEST_PX = 0.7  # a voxel's least width on the image
+VOXELS_AT_ONCE = 1_000_000
 
 
 @dataclass(frozen=True)
 class Silhouette:
-    """Where one frame sees light: mask [H, W] bool."""
+    """Where one frame sees light: surely (few false alarms) and likely (few misses), [H, W] bool each."""
 
-    mask: Tensor
+    sure: Tensor
+    likely: Tensor
     world_to_camera: Tensor
     K: Tensor
 
 
-def silhouette(dn: Tensor, sensor: Sensor, world_to_camera: Tensor, K: Tensor, dilate_px: int) -> Silhouette:
+def silhouette(
+    dn: Tensor, sensor: Sensor, world_to_camera: Tensor, K: Tensor, dilate_px: int = 0
+) -> Silhouette:
     """Return the pixels of dn [H, W, C] that are brighter than noise, grown by `dilate_px` for pose errors."""
-    signal = (dn.mean(dim=-1) - sensor.black_dn)[None, None]
-    sigma = math.hypot(sensor.read_noise_dn, 0.3) / 3
-    if sensor.black_dn < 2 * sensor.read_noise_dn:  # noise clipped at zero has a mean of its own
-        signal = signal - 0.4 * sensor.read_noise_dn
-    bright = (F.avg_pool2d(signal, 3, 1, 1) > BRIGHT_SIGMA * sigma).float()
+    sky_dn, sigma_dn = _dark_reading(sensor)
+    sigma_dn /= math.sqrt(dn.shape[2])
+    signal = (dn.mean(dim=-1) - sky_dn)[None, None]
+    means = {w: F.avg_pool2d(signal, w, 1, w // 2) * (w / sigma_dn) for w in WINDOWS_PX}  # in sigmas
+    sure, likely = torch.zeros_like(signal, dtype=torch.bool), torch.zeros_like(signal, dtype=torch.bool)
+    for mean in means.values():  # light is there, not only nearby
+        sure |= (mean > SURE_SIGMA) & (means[3] > LIKELY_SIGMA)
+        likely |= (mean > LIKELY_SIGMA) & (means[3] > 0)
+    sure &= F.avg_pool2d(sure.float(), 3, 1, 1) > SPECK
     size = 2 * dilate_px + 1
-    return Silhouette(F.max_pool2d(bright, size, 1, dilate_px)[0, 0] > 0, world_to_camera, K)
+    likely = F.max_pool2d(likely.float(), size, 1, dilate_px) > 0
+    return Silhouette(sure[0, 0], likely[0, 0], world_to_camera, K)
+
+
+def shows_light(dn: Tensor, sensor: Sensor) -> bool:
+    """Return whether anything in dn [H, W, C] surely rises above the noise; in eclipse nothing does."""
+    sky_dn, sigma_dn = _dark_reading(sensor)
+    signal = F.avg_pool2d((dn.mean(dim=-1) - sky_dn)[None], 3, 1)
+    bright = signal > SURE_SIGMA * sigma_dn / math.sqrt(dn.shape[2]) / 3
+    return int(bright.sum()) >= FEWEST_BRIGHT_PX
+
+
+def _dark_reading(sensor: Sensor) -> tuple[float, float]:
+    """Return mean and deviation, DN, of a pixel without light: normal noise on the black level, clipped at zero."""
+    mean, sigma = sensor.black_dn, math.hypot(sensor.read_noise_dn, math.sqrt(1 / 12))
+    share = 0.5 * (1 + math.erf(mean / sigma / math.sqrt(2)))
+    density = math.exp(-0.5 * (mean / sigma) ** 2) / math.sqrt(2 * math.pi)
+    first = mean * share + sigma * density
+    second = (mean**2 + sigma**2) * share + mean * sigma * density
+    return first, math.sqrt(second - first**2)
 
 
 def radius_m(silhouettes: list[Silhouette]) -> float:
-    """Return how far from the origin the target reaches, from the farthest light in each view; 0 when all are dark."""
-    radii = []
+    """Return how far from the origin the light reaches across the lines of sight; 0 when all views are dark."""
+    reaches = []
     for s in silhouettes:
-        rows, columns = torch.nonzero(s.mask, as_tuple=True)
-        if len(rows) == 0:
-            continue
+        rows, columns = torch.nonzero(s.sure, as_tuple=True)
         origin = s.world_to_camera[:3, 3]
-        if origin[2] <= 0:
+        if len(rows) == 0 or origin[2] <= 0:
             continue
         x = (columns + 0.5 - s.K[0, 2]) / s.K[0, 0] - origin[0] / origin[2]
         y = (rows + 0.5 - s.K[1, 2]) / s.K[1, 1] - origin[1] / origin[2]
-        radii.append(float(torch.quantile(torch.hypot(x, y), 0.998) * origin[2]))
-    return 1.05 * max(radii, default=0.0)
+        reaches.append(torch.hypot(x, y) * origin[2])
+    if not reaches:
+        return 0.0
+    reach = torch.cat(reaches)
+    return 1.05 * float(reach.kthvalue(max(1, int(INSIDE * len(reach)))).values)
 
 
 def hull_points(silhouettes: list[Silhouette], radius: float) -> tuple[Tensor, float]:
     """Return surface points [M, 3] m of the visual hull, and the voxel size, m.
 
-    The grid starts coarse and only what survives is subdivided. Empty when the views do not agree anywhere.
+    The grid starts coarse and only what survives is looked at again, twice as fine, down to what a pixel shows. Empty
+    when the views do not agree anywhere.
     """
     voxel_m = 2 * radius / COARSE_VOXELS
-    axis = (torch.arange(COARSE_VOXELS) + 0.5) * voxel_m - radius
-    points = torch.cartesian_prod(axis, axis, axis)
-    for level in range(SUBDIVISIONS + 1):
+    pixels_m = [float(s.world_to_camera[:3, 3].norm() / s.K[0, 0]) for s in silhouettes]
+    finer = math.log2(voxel_m / max(FINEST_PX * sorted(pixels_m)[len(pixels_m) // 2], 1e-9))
+    subdivisions = min(SUBDIVISIONS, max(0, math.floor(finer)))
+    inside = torch.ones((COARSE_VOXELS,) * 3, dtype=torch.bool)
+    for level in range(subdivisions + 1):
         if level:
-            offsets = torch.cartesian_prod(*(torch.tensor([-0.25, 0.25]),) * 3) * voxel_m
-            points = (points[:, None] + offsets).reshape(-1, 3)
-            voxel_m /= 2
+            inside, voxel_m = _doubled(inside), voxel_m / 2
         # a coarse voxel survives when light falls anywhere near its projection, a final one when at its centre
-        points = points[agreement(silhouettes, points, 0.87 * voxel_m * (level < SUBDIVISIONS)) >= AGREEMENT]
-        if len(points) == 0:
+        reach_m = 0.87 * voxel_m * (level < subdivisions)
+        points = _centres(inside, voxel_m, radius).split(VOXELS_AT_ONCE)
+        inside[inside.clone()] = torch.cat([agreement(silhouettes, p, reach_m) for p in points]) >= AGREEMENT
+        if not inside.any():
             break
-    return points[_on_surface(points, voxel_m)], voxel_m
+    return _centres(inside & ~_eroded(inside), voxel_m, radius), voxel_m
+
+
+def _doubled(grid: Tensor) -> Tensor:
+    return grid.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+
+
+def _eroded(inside: Tensor) -> Tensor:
+    """Return the voxels whose six neighbours are all inside."""
+    padded = F.pad(inside, (1,) * 6)
+    n = inside.shape[0]
+    eroded = torch.ones_like(inside)
+    for axis in range(3):
+        for start in (0, 2):
+            starts = [1, 1, 1]
+            starts[axis] = start
+            eroded &= padded[tuple(slice(s, s + n) for s in starts)]
+    return eroded
+
+
+def _centres(grid: Tensor, voxel_m: float, radius: float) -> Tensor:
+    """Return the centres [M, 3] m of the voxels that are set."""
+    return (torch.nonzero(grid) + 0.5) * voxel_m - radius
 
 
 def agreement(silhouettes: list[Silhouette], points: Tensor, reach_m: float) -> Tensor:
@@ -82,9 +139,9 @@ def agreement(silhouettes: list[Silhouette], points: Tensor, reach_m: float) -> 
         p = points @ s.world_to_camera[:3, :3].T + s.world_to_camera[:3, 3]
         z = p[:, 2].clamp(min=1e-6)
         u, v = s.K[0, 0] * p[:, 0] / z + s.K[0, 2], s.K[1, 1] * p[:, 1] / z + s.K[1, 2]
-        height, width = s.mask.shape
+        height, width = s.likely.shape
         inside = (p[:, 2] > 1e-6) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        mask = s.mask
+        mask = s.likely
         if reach_m > 0:
             pixels = math.ceil(float(s.K[0, 0]) * reach_m / max(float(s.world_to_camera[2, 3]), 1e-6))
             pixels = min(pixels, min(height, width) // 4)
@@ -93,20 +150,3 @@ def agreement(silhouettes: list[Silhouette], points: Tensor, reach_m: float) -> 
         votes += (lit & inside).float()
         seen += inside.float()
     return torch.where(seen >= max(1, len(silhouettes) // 3), votes / seen.clamp(min=1), 0.0)
-
-
-def _on_surface(points: Tensor, voxel_m: float) -> Tensor:
-    """Return which voxels [M] lack at least one of their six neighbours."""
-    if len(points) == 0:
-        return torch.zeros(0, dtype=torch.bool)
-    cell = torch.round((points - points.min(0).values) / voxel_m).long() + 1
-    stride = int(cell.max()) + 2
-    weights = torch.tensor([stride * stride, stride, 1])
-    keys = torch.sort((cell * weights).sum(1)).values
-    surface = torch.zeros(len(points), dtype=torch.bool)
-    for axis in range(3):
-        for side in (-1, 1):
-            neighbour = (cell * weights).sum(1) + side * weights[axis]
-            at = torch.searchsorted(keys, neighbour).clamp(max=len(keys) - 1)
-            surface |= keys[at] != neighbour
-    return surface

@@ -42,6 +42,18 @@ class MethodConfig:
     lr_log_scales: float = 0.005
     lr_opacity_logits: float = 0.05
     lr_sh: float = 0.0025
+    lr_end: float = 1.0  # all other rates fall to this share of theirs
+    lr_poses: float = 0.05  # in deviations of the pose tag
+    refine_poses: bool = False  # six numbers a bracket, held by the tag's covariance
+    flat_weight: float = 0.0  # on the mean shortest scale: flat Gaussians are surface
+    solid_weight: float = 0.0  # on opacity·(1 - opacity): solid or gone
+    solid_from: float = 0.5  # share of the steps
+    weigh_at: tuple[float, ...] = ()  # shares of the steps at which each Gaussian must earn its parameters
+    price_factor: float = 1.0  # of (parameters / 2)·ln(values measured)
+    keep_opacity: float = (
+        1.0  # more opaque Gaussians are kept whatever they earn: dark surface explains no light
+    )
+    most_sh_degree: int = 0  # the degree may rise to this where the likelihood pays for it
     chi2_end: float = 0.0  # > 0: stop when the mean squared normalised residual falls to this
 
     def __post_init__(self):
@@ -117,3 +129,23 @@ def preset(name: str, **changes) -> MethodConfig:
     if unknown := set(changes) - known:
         raise ValueError(f"{name} has no setting {', '.join(sorted(unknown))}")
     return replace(PRESETS[name], **changes)
+
+
+QUALITIES = {"draft": 1 / 3, "standard": 1.0, "best": 3.0}  # of the method's own steps and Gaussians
+
+
+def with_quality(config: MethodConfig, quality: str) -> MethodConfig:
+    """Return the method with its steps and its largest model scaled to a quality.
+
+    Raises:
+        ValueError: no such quality.
+    """
+    if quality not in QUALITIES:
+        raise ValueError(f"quality must be one of {', '.join(QUALITIES)}, got {quality!r}")
+    factor = QUALITIES[quality]
+    return replace(
+        config,
+        steps=round(config.steps * factor),
+        max_gaussians=round(config.max_gaussians * factor),
+        start_count=round(config.start_count * min(1.0, factor)),
+    )

@@ -3,16 +3,12 @@
 import math
 
 import numpy as np
-import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from obbgs_core.gaussians import Gaussians
 from obbgs_core.losses import SSIM_WINDOW, ssim_map
-from obbgs_core.rotations import quats_to_matrices
 
 COMPLETENESS_RADIUS = 0.01
-SOLID_OPACITY = 0.3  # fainter Gaussians are not surface
 
 
 def psnr_db(a: Tensor, b: Tensor) -> float:
@@ -46,23 +42,3 @@ def cloud_distances(cloud: np.ndarray, truth: np.ndarray) -> dict[str, float]:
         "accuracy": float(to_truth.mean()),
         "completeness": 100 * float((to_cloud < COMPLETENESS_RADIUS).mean()),
     }
-
-
-@torch.no_grad()
-def surface_points(gaussians: Gaussians, count: int, seed: int = 0) -> Tensor:
-    """Return `count` points [count, 3] m spread over the solid Gaussians' discs, in proportion to their area.
-
-    A disc is the Gaussian's one-sigma ellipse across its shortest axis. Empty when no Gaussian is solid.
-    """
-    solid = gaussians.select(torch.nonzero(gaussians.opacities > SOLID_OPACITY)[:, 0])
-    if len(solid) == 0:
-        return torch.zeros(0, 3)
-    generator = torch.Generator().manual_seed(seed)
-    scales, order = solid.scales.sort(dim=1)
-    chosen = torch.multinomial(scales[:, 1] * scales[:, 2], count, replacement=True, generator=generator)
-    angle = 2 * math.pi * torch.rand(count, generator=generator)
-    reach = torch.rand(count, generator=generator).sqrt()
-    local = torch.zeros(count, 3)
-    local.scatter_(1, order[chosen, 1:2], (reach * angle.cos() * scales[chosen, 1])[:, None])
-    local.scatter_(1, order[chosen, 2:3], (reach * angle.sin() * scales[chosen, 2])[:, None])
-    return solid.means[chosen] + (quats_to_matrices(solid.quats[chosen]) @ local[..., None])[..., 0]

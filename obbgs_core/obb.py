@@ -45,10 +45,11 @@ def fit(points: Tensor, mean_centre: bool = False) -> Obb:
 
 
 def worst_tile(error: Tensor) -> tuple[int, int]:
-    """Return the top row and left column, px, of the tile with the largest mean error in error [H, W]."""
-    height, width = error.shape
+    """Return the top row and left column, px, of the tile with the largest mean error in error [H, W, C]."""
+    height, width, channels = error.shape
     rows, columns = min(TILE_ROWS, height), min(TILE_COLUMNS, width)
-    means = F.avg_pool2d(error[None, None], (rows, columns), (rows, columns))[0, 0]
+    tile = (rows, columns * channels)  # channels lie beside each other in memory
+    means = F.avg_pool2d(error.reshape(1, 1, height, width * channels), tile, tile)[0, 0]
     index = int(means.argmax())
     return index // means.shape[1] * rows, index % means.shape[1] * columns
 

@@ -1,51 +1,94 @@
-"""Gaussians as a standard 3DGS PLY: other viewers show it, and reading it back is exact."""
+"""Models and surfaces as PLY: other viewers show them, and reading a model back is exact.
 
-import os
+Viewers of 3DGS files take a colour for `0.5 + SH(direction)`, clipped to 0..1 and shown as it is. Our coefficients mean
+`softplus(SH(direction))` in scene-linear light, so f_dc and f_rest hold display colours, `(radiance / white)^(1/2.2)`
+fitted with spherical harmonics, and our own coefficients follow as radiance_sh_<coefficient>_<channel>, which viewers
+ignore. Everything else means the same there and here: metres, logarithms of sigmas, logits, quaternions w, x, y, z.
+"""
+
+import math
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from obbgs_core import sh
 from obbgs_core.errors import ReconstructionError
+from obbgs_core.files import write_whole
 from obbgs_core.gaussians import Gaussians
 
 DISPLAY_GAMMA = 2.2
+FIT_DIRECTIONS = 64  # four for each coefficient of degree 3
+
+
+def display_sh(gaussians: Gaussians, white_radiance: float) -> Tensor:
+    """Return coefficients [N, K, 3] of display colours, as 3DGS viewers take them; `white_radiance` shows as 1."""
+    directions, to_coefficients = _fit(gaussians.sh.shape[1])
+    shown = torch.stack(
+        [(sh.radiance(gaussians.sh, d.expand(len(gaussians), 3)) / white_radiance) for d in directions], dim=1
+    )
+    shown = shown.expand(-1, -1, 3) ** (1 / DISPLAY_GAMMA)  # [N, directions, 3]
+    return torch.einsum("kd,ndc->nkc", to_coefficients, shown - 0.5)
+
+
+def radiance_sh(display: Tensor, white_radiance: float, channels: int) -> Tensor:
+    """Return our coefficients [N, K, channels] for coefficients of display colours [N, K, 3]."""
+    directions, to_coefficients = _fit(display.shape[1])
+    shown = 0.5 + torch.einsum("dk,nkc->ndc", sh.sh_basis(directions, display.shape[1]), display)
+    if channels == 1:
+        shown = shown.mean(dim=2, keepdim=True)
+    before_softplus = sh.C0 * sh.from_radiance(white_radiance * shown.clamp(min=0) ** DISPLAY_GAMMA)
+    return torch.einsum("kd,ndc->nkc", to_coefficients, before_softplus)
+
+
+def _fit(count: int) -> tuple[Tensor, Tensor]:
+    """Return directions [D, 3] spread over the sphere, and the matrix [K, D] from values there to coefficients."""
+    if count == 1:
+        return torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1 / sh.C0]])
+    i = torch.arange(FIT_DIRECTIONS, dtype=torch.float64)
+    z = 1 - (2 * i + 1) / FIT_DIRECTIONS
+    angle = math.pi * (1 + math.sqrt(5)) * i  # a Fibonacci lattice
+    reach = (1 - z * z).sqrt()
+    directions = torch.stack([reach * angle.cos(), reach * angle.sin(), z], dim=1)
+    return directions.float(), torch.linalg.pinv(sh.sh_basis(directions, count)).float()
 
 
 def save_ply(gaussians: Gaussians, path: Path, white_radiance: float = 1.0) -> None:
-    """Write the model; the file appears whole or not at all.
-
-    f_dc holds what a viewer shows: radiance over `white_radiance`, gamma 2.2, clipped. The scene-linear coefficients
-    follow as radiance_sh_*, which viewers ignore and `load_ply` reads.
-    """
+    """Write the model; the file appears whole or not at all. `white_radiance` is what viewers show as white."""
     count, coefficients, channels = gaussians.sh.shape
-    shown = sh.radiance(gaussians.sh[:, :1], torch.zeros(count, 3)).expand(-1, 3) / white_radiance
-    f_dc = (shown.clamp(0, 1) ** (1 / DISPLAY_GAMMA) - 0.5) / sh.C0
-    columns: dict[str, torch.Tensor] = {}
+    shown = display_sh(gaussians.detach(), white_radiance)
+    rest = shown[:, 1:].transpose(1, 2).flatten(1)  # all of red, then of green, then of blue
+    table: dict[str, Tensor] = {}
     for i, axis in enumerate("xyz"):
-        columns[axis] = gaussians.means[:, i]
+        table[axis] = gaussians.means[:, i]
     for axis in ("nx", "ny", "nz"):
-        columns[axis] = torch.zeros(count)
-    for i in range(3):
-        columns[f"f_dc_{i}"] = f_dc[:, i]
-    columns["opacity"] = gaussians.opacity_logits
-    for i in range(3):
-        columns[f"scale_{i}"] = gaussians.log_scales[:, i]
-    for i in range(4):
-        columns[f"rot_{i}"] = gaussians.quats[:, i]
+        table[axis] = torch.zeros(count)
+    table |= {f"f_dc_{i}": shown[:, 0, i] for i in range(3)}
+    table |= {f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])}
+    table["opacity"] = gaussians.opacity_logits
+    table |= {f"scale_{i}": gaussians.log_scales[:, i] for i in range(3)}
+    table |= {f"rot_{i}": gaussians.quats[:, i] for i in range(4)}
     for k in range(coefficients):
-        for c in range(channels):
-            columns[f"radiance_sh_{k}_{c}"] = gaussians.sh[:, k, c]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    header += [f"property float {name}" for name in columns] + ["end_header\n"]
-    table = torch.stack(list(columns.values()), dim=1).detach().cpu().numpy().astype("<f4")
-    part = path.with_name(path.name + ".part")
-    with open(part, "wb") as file:
-        file.write("\n".join(header).encode("ascii") + table.tobytes())
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, path)
+        table |= {f"radiance_sh_{k}_{c}": gaussians.sh[:, k, c] for c in range(channels)}
+    comment = (
+        f"f_dc and f_rest: (radiance / {white_radiance:.9g})^(1/{DISPLAY_GAMMA}); radiance_sh: scene-linear"
+    )
+    write_whole(path, _ply(table, comment))
+
+
+def save_surface_ply(points: Tensor, normals: Tensor, path: Path) -> None:
+    """Write oriented points [M, 3] m, [M, 3]; the file appears whole or not at all."""
+    table = {axis: points[:, i] for i, axis in enumerate("xyz")}
+    table |= {axis: normals[:, i] for i, axis in enumerate(("nx", "ny", "nz"))}
+    write_whole(path, _ply(table, "metres, target body frame; normals outwards"))
+
+
+def _ply(table: dict[str, Tensor], comment: str) -> bytes:
+    values = torch.stack(list(table.values()), dim=1).detach().cpu().numpy().astype("<f4")
+    header = ["ply", "format binary_little_endian 1.0", f"comment {comment}"]
+    header += [f"element vertex {len(values)}", *(f"property float {name}" for name in table), "end_header\n"]
+    return "\n".join(header).encode("ascii") + values.tobytes()
 
 
 def load_ply(path: Path) -> Gaussians:

@@ -37,3 +37,9 @@ def multiply(a: Tensor, b: Tensor) -> Tensor:
         ],
         dim=-1,
     )
+
+
+def from_rotation_vectors(vectors: Tensor) -> Tensor:
+    """Return unit quaternions [..., 4] of rotation vectors [..., 3], rad."""
+    half = vectors.norm(dim=-1, keepdim=True) / 2
+    return torch.cat([half.cos(), 0.5 * vectors * torch.sinc(half / torch.pi)], dim=-1)

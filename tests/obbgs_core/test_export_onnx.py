@@ -8,9 +8,10 @@ import onnxruntime
 import pytest
 import torch
 
+from flightsw import model_file
 from obbgs_core.cameras import Cameras
 from obbgs_core.errors import ExportError
-from obbgs_core.export_onnx import export_onnx
+from obbgs_core.export_onnx import MAX_MODEL_BYTES, export_onnx
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
@@ -46,7 +47,7 @@ def test_onnxruntime_agrees_with_our_renderer(tmp_path, sh_count, channels, widt
     session = onnxruntime.InferenceSession(str(path))
     K = np.array([[80, 0, width / 2], [0, 78, height / 2 - 1], [0, 0, 1]], dtype=np.float32)
     rng = np.random.default_rng(1)
-    for exposure_s in (5e-5, 1e-4, 2e-4, 1e-4, 1e-4):
+    for exposure_s in np.geomspace(5e-5, 2e-4, 20):
         pose = random_view(rng)
         feed = {"world_to_camera": pose, "K": K, "exposure_time_s": np.array(exposure_s, dtype=np.float32)}
         image, alpha, depth = session.run(["image", "alpha", "depth"], feed)
@@ -57,6 +58,43 @@ def test_onnxruntime_agrees_with_our_renderer(tmp_path, sh_count, channels, widt
         torch.testing.assert_close(torch.tensor(alpha), ours.alpha[0], rtol=0, atol=5e-3)  # cutoff pixels
         covered = ours.alpha[0] > 0.1
         torch.testing.assert_close(torch.tensor(depth)[covered], ours.depth[0][covered], rtol=0, atol=0.05)
+
+
+def needles() -> Gaussians:
+    """Return lines of light a thousand times longer than wide, the worst case for float32."""
+    gaussians = scene(200, 1, 1)
+    gaussians.log_scales = torch.tensor([1.0, 1e-3, 1e-3]).log().expand(200, 3).contiguous()
+    return gaussians
+
+
+@pytest.mark.parametrize(
+    ("gaussians", "distance"),
+    [(needles(), 5.0), (scene(600, 1, 1), 150.0)],
+    ids=["needles", "all in one tile"],
+)
+def test_float64_agrees_with_the_exported_float32(tmp_path, gaussians, distance):
+    path = tmp_path / "model.onnx"
+    export_onnx(gaussians, SENSOR, path, 64, 64, [1e-4])
+    K = np.array([[80, 0, 32], [0, 80, 32], [0, 0, 1]], dtype=np.float32)
+    pose = random_view(np.random.default_rng(2), distance)
+    feed = {"world_to_camera": pose, "K": K, "exposure_time_s": np.array(1e-4, dtype=np.float32)}
+    image = onnxruntime.InferenceSession(str(path)).run(["image"], feed)[0]
+    exact = Gaussians(**{name: tensor.double() for name, tensor in gaussians.tensors().items()})
+    cameras = Cameras(torch.tensor(pose)[None].double(), torch.tensor(K)[None].double(), 64, 64)
+    radiance = render(exact, cameras, "reference").radiance[0]
+    expected = (SENSOR.expected_dn(radiance, 1e-4) / SENSOR.white_dn).clamp(0, 1)
+    assert expected.max() > 0.05  # the black level is 0.016: something is seen
+    assert (
+        -10 * math.log10(((torch.tensor(image) - expected) ** 2).mean() + 1e-12) >= 80
+    )  # dB, 12 bits are 84
+
+
+def test_a_model_that_flight_would_refuse_is_not_written(tmp_path, monkeypatch):
+    assert MAX_MODEL_BYTES == model_file.MAX_MODEL_BYTES
+    monkeypatch.setattr("obbgs_core.export_onnx.MAX_MODEL_BYTES", 100_000)
+    with pytest.raises(ExportError, match="smaller budget"):
+        export_onnx(scene(5000, 1, 1), SENSOR, tmp_path / "m.onnx", 32, 32, [1e-4])
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_view_of_empty_sky_is_the_black_level(tmp_path):

@@ -1,0 +1,130 @@
+"""What training looks at: exposures with their poses, and the few of them that make a step."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from obbgs_core.cameras import Cameras
+from obbgs_core.errors import ReconstructionError, TooFewFrames
+from obbgs_core.methods import MethodConfig
+
+FEWEST_FRAMES = 3
+
+
+@dataclass(frozen=True)
+class TrainingFrame:
+    """One exposure: dn [H, W, C] float, known exposure time, pose [4, 4] body to camera, K [3, 3] px.
+
+    pose_sigma: deviations [6] of the pose tag, rad about and m along the camera axes; None: the pose is exact.
+    sun_direction: unit vector [3] towards the Sun, body frame; None: not known, or taken as fixed.
+    """
+
+    dn: Tensor
+    exposure_time_s: float
+    world_to_camera: Tensor
+    K: Tensor
+    id: int = 0
+    bracket: int | None = None  # frames of one trigger share a pose correction
+    pose_sigma: Tensor | None = None
+    sun_direction: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The frames of one step at one image scale."""
+
+    indices: list[int]  # into the training frames
+    cameras: Cameras
+    dn: Tensor  # [B, H, W, C]
+    exposure_time_s: Tensor  # [B, 1, 1, 1]
+    averaged_pixels: int  # sensor pixels in one pixel of dn
+
+
+def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[TrainingFrame], float | None]:
+    """Return the checked frames; with exposure ignored, all take the geometric mean of the exposures.
+
+    Raises:
+        TooFewFrames: fewer than three.
+        ReconstructionError: sizes differ, or a value is not finite.
+    """
+    if len(frames) < FEWEST_FRAMES:
+        raise TooFewFrames(f"a reconstruction needs at least {FEWEST_FRAMES} frames, got {len(frames)}")
+    shapes = {tuple(f.dn.shape) for f in frames}
+    if len(shapes) > 1:
+        raise ReconstructionError(f"all frames must have one size and channel count, got {sorted(shapes)}")
+    for f in frames:
+        finite = torch.isfinite(f.dn).all() and torch.isfinite(f.world_to_camera).all()
+        if not (finite and torch.isfinite(f.K).all() and 0 < f.exposure_time_s < math.inf):
+            raise ReconstructionError(
+                f"frame {f.id} holds a value or a pose that is not finite, or no exposure time; leave it out"
+            )
+    if exposure_aware:
+        return frames, None
+    reference_s = math.exp(sum(math.log(f.exposure_time_s) for f in frames) / len(frames))
+    return [dataclasses.replace(f, exposure_time_s=reference_s) for f in frames], reference_s
+
+
+class Batches:
+    """Draws frames without replacement, one of each exposure in turn when the method asks for brackets."""
+
+    def __init__(self, frames: list[TrainingFrame], config: MethodConfig, rng: torch.Generator):
+        self.frames, self.rng = frames, rng
+        self.frames_per_step = min(config.frames_per_step, len(frames))
+        groups: dict[float, list[int]] = {}
+        for index, frame in enumerate(frames):
+            groups.setdefault(frame.exposure_time_s if config.bracket_steps else 0.0, []).append(index)
+        self.groups = list(groups.values())
+        self.waiting: list[list[int]] = [[] for _ in self.groups]
+        self.turn = 0
+        self.levels: dict[int, list[Tensor]] = {}
+
+    def state(self) -> dict:
+        return {"waiting": [list(w) for w in self.waiting], "turn": self.turn}
+
+    def restore(self, state: dict) -> None:
+        self.waiting, self.turn = [list(w) for w in state["waiting"]], state["turn"]
+
+    def take(self, scale: float) -> Batch:
+        """Return the next frames, averaged to `scale` (1/whole number) of their size."""
+        chosen = []
+        for _ in range(self.frames_per_step):
+            group = self.turn % len(self.groups)
+            if not self.waiting[group]:
+                members = self.groups[group]
+                order = torch.randperm(len(members), generator=self.rng).tolist()
+                self.waiting[group] = [members[i] for i in order]
+            chosen.append(self.waiting[group].pop())
+            self.turn += 1
+        return self.batch(chosen, scale)
+
+    def batch(self, indices: list[int], scale: float) -> Batch:
+        """Return given frames at a scale."""
+        factor = round(1 / scale)
+        if factor not in self.levels:
+            self.levels[factor] = [_shrunk(f.dn, factor) for f in self.frames]
+        frames = [self.frames[i] for i in indices]
+        height, width = frames[0].dn.shape[:2]
+        poses = torch.stack([f.world_to_camera for f in frames])
+        cameras = Cameras(poses, torch.stack([f.K for f in frames]), width, height)
+        return Batch(
+            indices,
+            cameras.scaled(1 / factor) if factor > 1 else cameras,
+            torch.stack([self.levels[factor][i] for i in indices]),
+            torch.tensor([f.exposure_time_s for f in frames]).view(-1, 1, 1, 1),
+            factor * factor,
+        )
+
+
+def _shrunk(dn: Tensor, factor: int) -> Tensor:
+    """Return dn averaged over factor x factor pixels; a block with a saturated pixel stays saturated."""
+    if factor == 1:
+        return dn
+    image = dn.movedim(-1, 0)[None]
+    mean = F.avg_pool2d(image, factor, ceil_mode=True)
+    largest = F.max_pool2d(image, factor, ceil_mode=True)
+    top = image.max()
+    return torch.where(largest >= top, largest, mean)[0].movedim(0, -1) if top > 0 else mean[0].movedim(0, -1)

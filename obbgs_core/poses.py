@@ -1,0 +1,108 @@
+"""Pose refinement: six small numbers a bracket beside the Gaussians, held by the pose tag's own covariance."""
+
+import torch
+from torch import Tensor
+
+from obbgs_core.frames import Batch, TrainingFrame
+from obbgs_core.gaussians import Gaussians
+from obbgs_core.rotations import from_rotation_vectors, multiply
+
+
+class PoseCorrections:
+    """Corrections [P, 6] in units of the tag's deviations: rotation about, then shift along, the camera's axes.
+
+    Frames of one bracket share their correction: the error of a navigation solution hardly changes within it.
+    """
+
+    def __init__(self, frames: list[TrainingFrame], betas: tuple[float, float] = (0.9, 0.99)):
+        numbers: dict[int, int] = {}
+        keys = [f.id if f.bracket is None else -1 - f.bracket for f in frames]
+        self.of_frame = [numbers.setdefault(key, len(numbers)) for key in keys]
+        self.sigma = torch.zeros(len(numbers), 6)
+        for frame, number in zip(frames, self.of_frame, strict=True):
+            if frame.pose_sigma is not None:
+                self.sigma[number] = frame.pose_sigma
+        self.value = torch.zeros(len(numbers), 6, requires_grad=True)
+        self.first, self.second = torch.zeros(len(numbers), 6), torch.zeros(len(numbers), 6)
+        self.visits = torch.zeros(len(numbers), 1)
+        self.betas = betas
+
+    def corrected(self, indices: list[int], world_to_camera: Tensor) -> Tensor:
+        """Return the poses [B, 4, 4] of frames with their corrections in front; gradients reach the corrections."""
+        numbers = torch.tensor([self.of_frame[i] for i in indices])
+        return rigid_motions(self.value[numbers] * self.sigma[numbers]) @ world_to_camera
+
+    def prior(self, batch: Batch) -> Tensor:
+        """Return the corrections' share of a step's mean loss: half their squares over all the step's values."""
+        numbers = torch.tensor([self.of_frame[i] for i in batch.indices])
+        return 0.5 * self.value[numbers].square().sum() / batch.dn.numel()
+
+    @torch.no_grad()
+    def step(self, rate: float) -> None:
+        """Move what has a gradient, Adam with a count of its own for every bracket; `rate` is in deviations."""
+        gradient = self.value.grad
+        if gradient is None:
+            return
+        seen = gradient.abs().sum(1, keepdim=True) > 0
+        b1, b2 = self.betas
+        self.visits += seen
+        self.first = torch.where(seen, b1 * self.first + (1 - b1) * gradient, self.first)
+        self.second = torch.where(seen, b2 * self.second + (1 - b2) * gradient**2, self.second)
+        count = self.visits.clamp(min=1)
+        first, second = self.first / (1 - b1**count), self.second / (1 - b2**count)
+        self.value -= torch.where(seen, rate * first / (second.sqrt() + 1e-15), 0.0)
+        self.value.grad = None
+
+    @torch.no_grad()
+    def settle(self, gaussians: Gaussians, frames: list[TrainingFrame]) -> Gaussians:
+        """Fix the gauge: move model and corrections together to where the corrections are least likely noise.
+
+        Moving the model rigidly by d and every pose by its inverse changes no image; of all such twins the one with
+        the smallest corrections (weighted by the tags) is kept.
+        """
+        tags = torch.zeros(len(self.sigma), 4, 4)
+        for frame, number in zip(frames, self.of_frame, strict=True):
+            tags[number] = frame.world_to_camera
+        R, t = tags[:, :3, :3], tags[:, :3, 3]
+        # a small motion d of the body, seen in the camera's axes: rotation R w, shift R v + t x (R w)
+        adjoint = torch.zeros(len(tags), 6, 6)
+        adjoint[:, :3, :3] = R
+        adjoint[:, 3:, 3:] = R
+        adjoint[:, 3:, :3] = _cross_matrices(t) @ R
+        weight = torch.where(self.sigma > 0, 1 / self.sigma.clamp(min=1e-12), 0.0)
+        rows = (adjoint * weight[..., None]).reshape(-1, 6).double()
+        motion = torch.linalg.lstsq(rows, self.value.reshape(-1, 1).double()).solution[:, 0].float()
+        moved = adjoint @ motion
+        self.value -= torch.where(self.sigma > 0, moved * weight, 0.0)
+        rigid = rigid_motions(motion[None])[0]
+        return Gaussians(
+            means=gaussians.means @ rigid[:3, :3].T + rigid[:3, 3],
+            quats=multiply(from_rotation_vectors(motion[:3]).expand(len(gaussians), 4), gaussians.quats),
+            log_scales=gaussians.log_scales,
+            opacity_logits=gaussians.opacity_logits,
+            sh=gaussians.sh,  # a turn this small does not show in the radiance
+        )
+
+    def state(self) -> dict:
+        return {name: getattr(self, name).detach().clone() for name in ("value", "first", "second", "visits")}
+
+    def restore(self, state: dict) -> None:
+        for name, tensor in state.items():
+            setattr(self, name, tensor.clone())
+        self.value.requires_grad_()
+
+
+def rigid_motions(xi: Tensor) -> Tensor:
+    """Return [B, 4, 4] of rotation vectors (rad) and shifts (m) [B, 6]; exact rotations for any angle."""
+    generator = torch.zeros(len(xi), 4, 4, dtype=xi.dtype)
+    generator[:, :3, :3] = _cross_matrices(xi[:, :3])
+    motion = torch.matrix_exp(generator)
+    shift = torch.zeros_like(motion)
+    shift[:, :3, 3] = xi[:, 3:]
+    return motion + shift
+
+
+def _cross_matrices(v: Tensor) -> Tensor:
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))

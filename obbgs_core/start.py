@@ -1,0 +1,96 @@
+"""The first Gaussians: on the visual hull of the long exposures, or at random."""
+
+import logging
+import math
+
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from obbgs_core import hull, sh
+from obbgs_core.densify import trainable
+from obbgs_core.errors import ReconstructionError
+from obbgs_core.frames import TrainingFrame
+from obbgs_core.gaussians import Gaussians
+from obbgs_core.methods import MethodConfig
+from obbgs_core.sensor import Sensor
+
+log = logging.getLogger(__name__)
+FEWEST_HULL_POINTS = 200
+VIEWS_FOR_COLOUR = 24
+MOST_DILATION_PX = 8
+
+
+def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> list[hull.Silhouette]:
+    """Return silhouettes of the longest exposures (shadowed faces are brightest there), grown by the pose error."""
+    longest_s = max(f.exposure_time_s for f in frames)
+    return [
+        hull.silhouette(f.dn, sensor, f.world_to_camera, f.K, _pose_error_px(f))
+        for f in frames
+        if f.exposure_time_s > 0.99 * longest_s
+    ]
+
+
+def _pose_error_px(frame: TrainingFrame) -> int:
+    """Return how far, px, one deviation of the pose tag moves the target in the image."""
+    if frame.pose_sigma is None:
+        return 0
+    range_m = float(frame.world_to_camera[:3, 3].norm().clamp(min=1e-6))
+    tilt_rad = float(frame.pose_sigma[:2].max()) + float(frame.pose_sigma[3:5].max()) / range_m
+    return min(MOST_DILATION_PX, round(float(frame.K[0, 0]) * tilt_rad))
+
+
+def first_gaussians(
+    frames: list[TrainingFrame], sensor: Sensor, config: MethodConfig, rng: torch.Generator
+) -> tuple[Gaussians, float, str]:
+    """Return the first Gaussians, the target's radius (m), and where the Gaussians came from.
+
+    Raises:
+        ReconstructionError: every frame is black.
+    """
+    outlines = silhouettes(frames, sensor)
+    radius = hull.radius_m(outlines)
+    if radius == 0:
+        raise ReconstructionError(
+            f"all {len(frames)} frames are black (eclipse, or exposures too short): nothing rises above the noise"
+        )
+    if config.start == "hull":
+        points, voxel_m = hull.hull_points(outlines, radius)
+        if len(points) >= FEWEST_HULL_POINTS:
+            chosen = torch.randperm(len(points), generator=rng)[: config.start_count]
+            points = points[chosen] + (torch.rand(len(chosen), 3, generator=rng) - 0.5) * voxel_m
+            return _at(points, frames, sensor, 0.5, config), radius, f"visual hull, {len(chosen)} points"
+        log.warning("the silhouettes agree on only %d points; starting at random", len(points))
+    points = (2 * torch.rand(config.start_count, 3, generator=rng) - 1) * radius
+    return _at(points, frames, sensor, 0.1, config), radius, f"random, {config.start_count} points"
+
+
+def _at(
+    points: Tensor, frames: list[TrainingFrame], sensor: Sensor, opacity: float, config: MethodConfig
+) -> Gaussians:
+    """Return round Gaussians at points, as wide as their neighbours are far, with the radiance seen there."""
+    distances, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
+    spacing = torch.from_numpy(distances).float()[:, 1:].mean(dim=1).clamp(min=1e-6)
+    count, channels = len(points), frames[0].dn.shape[2]
+    coefficients = torch.zeros(count, (config.sh_degree + 1) ** 2, channels)
+    coefficients[:, 0] = sh.from_radiance(_seen_radiance(points, frames, sensor))
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1
+    logits = torch.full((count,), math.log(opacity / (1 - opacity)))
+    return trainable(Gaussians(points, quats, spacing.log()[:, None].repeat(1, 3), logits, coefficients))
+
+
+def _seen_radiance(points: Tensor, frames: list[TrainingFrame], sensor: Sensor) -> Tensor:
+    """Return the mean radiance [N, C] that some of the frames show where the points project, occlusion ignored."""
+    total, seen = torch.zeros(len(points), frames[0].dn.shape[2]), torch.zeros(len(points), 1)
+    for frame in frames[:: max(1, len(frames) // VIEWS_FOR_COLOUR)]:
+        p = points @ frame.world_to_camera[:3, :3].T + frame.world_to_camera[:3, 3]
+        z = p[:, 2].clamp(min=1e-6)
+        u = (frame.K[0, 0] * p[:, 0] / z + frame.K[0, 2]).long()
+        v = (frame.K[1, 1] * p[:, 1] / z + frame.K[1, 2]).long()
+        height, width = frame.dn.shape[:2]
+        inside = ((p[:, 2] > 1e-6) & (u >= 0) & (v >= 0) & (u < width) & (v < height))[:, None]
+        signal = frame.dn[v.clamp(0, height - 1), u.clamp(0, width - 1)] - sensor.black_dn
+        total += inside * signal.clamp(min=0) / (sensor.dn_per_radiance_s * frame.exposure_time_s)
+        seen += inside
+    return total / seen.clamp(min=1)

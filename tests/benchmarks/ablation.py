@@ -1,0 +1,55 @@
+"""What each ingredient of obbgs is worth, one taken away at a time: python -m tests.benchmarks.ablation"""
+
+import argparse
+import json
+
+import torch
+
+from tests.benchmarks import targets
+from tests.benchmarks.methods import configure, measure
+
+WITHOUT: dict[str, dict] = {
+    "obbgs": {},
+    "- exposure known": {"exposure_aware": False},
+    "- sensor likelihood": {"loss": "l1_ssim", "ssim_weight": 0.2, "edge_weight": 0.2},
+    "- Sobel": {"edge_weight": 0.0},
+    "- bracket steps": {"bracket_steps": False},
+    "- visual hull": {"start": "random"},
+    "- OBB growth": {"obb_interval": 0},
+    "- Pixel-GS weights": {"pixel_weighted": False},
+    "- pyramid": {"pyramid": ((0.0, 1.0),)},
+    "- weighing": {"weigh_at": ()},
+    "- flattening": {"flat_weight": 0.0},
+    "- solid opacities": {"solid_weight": 0.0},
+    "- growth": {"grow_until": 0.0},
+    "+ outlier filter": {"outlier_filter": True},
+    "+ degree 1": {"sh_degree": 1},
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", action="store_true", help="one JSON object a row")
+    parser.add_argument("--targets", default="all", help="comma-separated names, or all")
+    parser.add_argument("--size", type=int, default=400)
+    parser.add_argument("--steps-share", type=float, default=1.0)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--only", help="comma-separated rows, by name")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    for target_name in targets.names() if arguments.targets == "all" else arguments.targets.split(","):
+        target = targets.load(target_name, arguments.size)
+        for name, changes in WITHOUT.items():
+            if arguments.only and name not in arguments.only.split(","):
+                continue
+            row = {"ablation": name} | measure(
+                configure("obbgs", arguments.steps_share, **changes), target, 0
+            )
+            print(
+                json.dumps(row) if arguments.json else "  ".join(f"{k} {v}" for k, v in row.items()),
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

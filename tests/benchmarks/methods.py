@@ -1,0 +1,141 @@
+"""Every method on the rendered targets, in the same run: python -m tests.benchmarks.methods
+
+Each row is one training: clean held-out PSNR, geometry, size and seconds of training alone (measuring stops the clock).
+`--curve` adds the clean PSNR and Chamfer distance on the way, `--chart FILE` draws them against seconds. Published
+methods are blind to exposure, as published; `NAME+exposure` gives them the exposure and the sensor's gain.
+"""
+
+import argparse
+import json
+import math
+from pathlib import Path
+
+import torch
+
+from obbgs_core.methods import PRESETS, preset
+from obbgs_core.optimize import Trainer
+from tests.benchmarks import targets
+
+CURVE_STEPS = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)  # shares of the steps
+
+
+def configure(name: str, steps_share: float, **changes):
+    """Return the configuration of `METHOD` or `METHOD+exposure` with its steps scaled."""
+    method, _, known = name.partition("+")
+    config = preset(method)
+    if known:
+        changes["exposure_aware"] = True
+    return preset(method, **({"steps": max(1, round(config.steps * steps_share))} | changes))
+
+
+def measure(
+    config, target: targets.Target, seed: int, curve: bool = False, time_limit_s: float = math.inf
+) -> dict:
+    """Return a row: what the method reached on the target, and on the way if asked."""
+    trainer = Trainer(target.training, target.sensor, config, seed)
+    marks = {round(share * config.steps) for share in CURVE_STEPS} if curve else set()
+    way = []
+    while not (reason := trainer.stop_reason(time_limit_s)):
+        info = trainer.step()
+        if info.step in marks:
+            gaussians = trainer.gaussians.detach()
+            clean = targets.clean_psnr_db(gaussians, target, trainer.reference_exposure_s)
+            chamfer = targets.cloud_distances(gaussians.means.double().numpy(), target.cloud)["chamfer"]
+            way.append((round(info.seconds, 2), round(clean, 3), round(chamfer, 5)))
+    result = trainer.result(reason)
+    row = {
+        "target": target.name,
+        "seed": seed,
+        "gaussians": len(result.gaussians),
+        "steps": trainer.steps_done,
+    }
+    row |= {"seconds": round(result.seconds, 2), "start": result.start, "stop": result.stop_reason}
+    row |= targets.image_figures(result.gaussians, target, result.reference_exposure_s)
+    row |= targets.cloud_figures(result.gaussians, target, seed)
+    row = {key: round(value, 5) if isinstance(value, float) else value for key, value in row.items()}
+    if curve:
+        row["curve"] = [*way, (row["seconds"], row["psnr_clean_db"], row["chamfer"])]
+    return row
+
+
+def draw(rows: list[dict], path: Path) -> None:
+    """Draw clean PSNR and Chamfer distance against seconds, one line a training."""
+    from plotly.subplots import make_subplots
+
+    figure = make_subplots(rows=1, cols=2, subplot_titles=("clean held-out PSNR, dB", "Chamfer distance"))
+    colours = (
+        "#1f6feb",
+        "#d1652a",
+        "#2a9d8f",
+        "#8e44ad",
+        "#c0392b",
+        "#7f8c8d",
+        "#16a085",
+        "#f39c12",
+        "#34495e",
+    )
+    names = list(dict.fromkeys(row["method"] for row in rows))
+    for row in rows:
+        seconds, psnr_db, chamfer = zip(*row["curve"], strict=True)
+        colour = colours[names.index(row["method"]) % len(colours)]
+        first = row is next(r for r in rows if r["method"] == row["method"])
+        for column, values in ((1, psnr_db), (2, chamfer)):
+            figure.add_scatter(
+                x=seconds,
+                y=values,
+                name=row["method"],
+                legendgroup=row["method"],
+                showlegend=first and column == 1,
+                mode="lines+markers",
+                line={"color": colour},
+                hovertext=row["target"],
+                row=1,
+                col=column,
+            )
+    figure.update_xaxes(type="log", title="seconds of training")
+    figure.update_yaxes(type="log", row=1, col=2)
+    figure.update_layout(template="plotly_white", height=480, width=1100)
+    figure.write_html(path, include_plotlyjs=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON object a row")
+    parser.add_argument(
+        "--methods", default="3dgs,pixel-gs,mvgs,jiang2025,obbgs", help="comma-separated, or all"
+    )
+    parser.add_argument("--targets", default="all", help="comma-separated names, or all")
+    parser.add_argument("--seeds", type=int, default=1, help="trainings of each, seeds 0, 1, ...")
+    parser.add_argument("--size", type=int, default=400, help="pixels along a side: 400, 200 or 100")
+    parser.add_argument("--steps-share", type=float, default=1.0, help="of each method's own steps")
+    parser.add_argument("--published-share", type=float, help="the same for all methods but obbgs")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--curve", action="store_true", help="measure on the way")
+    parser.add_argument("--chart", type=Path, help="draw the curves into this HTML file")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    names = arguments.methods.split(",")
+    if arguments.methods == "all":
+        names = [*PRESETS, *(f"{name}+exposure" for name in PRESETS if not PRESETS[name].exposure_aware)]
+    rows = []
+    for target_name in targets.names() if arguments.targets == "all" else arguments.targets.split(","):
+        target = targets.load(target_name, arguments.size)
+        for name in names:
+            share = arguments.steps_share
+            if not name.startswith("obbgs") and arguments.published_share is not None:
+                share = arguments.published_share
+            for seed in range(arguments.seeds):
+                row = {"method": name} | measure(
+                    configure(name, share), target, seed, arguments.curve or arguments.chart is not None
+                )
+                rows.append(row)
+                text = "  ".join(f"{k} {v}" for k, v in row.items() if k != "curve")
+                print(json.dumps(row) if arguments.json else text, flush=True)
+    if arguments.chart is not None:
+        draw(rows, arguments.chart)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""Where training holds and where it cannot: python -m tests.benchmarks.stability
+
+Each row changes one condition of one target. `ok` is a model better than the mean image of the training frames, or a
+named error that says why there is none; a NaN, a crash, or a model worse than the mean image is a failure, and the
+command ends with 1.
+"""
+
+import argparse
+import dataclasses
+import json
+import sys
+
+import numpy as np
+import torch
+
+from obbgs_core.errors import ReconstructionError
+from obbgs_core.frames import TrainingFrame
+from obbgs_core.metrics import psnr_db
+from obbgs_core.poses import rigid_motions
+from tests.benchmarks import targets
+from tests.benchmarks.methods import configure, measure
+
+BASE_S = 5e-5
+
+
+def bracket(*ratios: float) -> dict:
+    return {"bracket_s": tuple(BASE_S * ratio for ratio in ratios)}
+
+
+LOADS: dict[str, dict] = {
+    "as the paper": {},
+    **{
+        f"ratios {':'.join(map(str, r))}": bracket(*r)
+        for r in ((1, 1, 1), (1, 4, 16), (1, 8, 64), (1, 16, 256))
+    },
+    **{f"noise x{factor:g}": {"sigma": factor * targets.PAPER_SIGMA} for factor in (0.5, 2, 4)},
+    **{f"{count} frames": {"frames": count} for count in (12, 24, 48)},
+}
+POSE_ERRORS_DEG = (0.05, 0.1, 0.3, 1.0)
+LOST_PERCENT = (10, 30, 50, 70)
+
+
+def with_pose_error(target: targets.Target, degrees: float, seed: int) -> targets.Target:
+    """Return the target with every training pose turned at random about each axis, and tagged as that uncertain."""
+    rng = torch.Generator().manual_seed(seed)
+    sigma = torch.tensor([np.radians(degrees)] * 3 + [1e-6] * 3, dtype=torch.float32)
+    frames = []
+    for frame in target.training:
+        error = rigid_motions(torch.randn(1, 6, generator=rng) * sigma)[0]
+        frames.append(
+            dataclasses.replace(frame, world_to_camera=error @ frame.world_to_camera, pose_sigma=sigma)
+        )
+    return dataclasses.replace(target, training=frames)
+
+
+def keep(target: targets.Target, wanted) -> targets.Target:
+    """Return the target with only the training frames (index, frame) that are wanted."""
+    return dataclasses.replace(target, training=[f for i, f in enumerate(target.training) if wanted(i, f)])
+
+
+def in_eclipse(target: targets.Target, first: float, last: float) -> targets.Target:
+    """Return the target with a stretch of its frames black but for noise."""
+    rng, count = np.random.default_rng(0), len(target.training)
+
+    def dark(frame: TrainingFrame) -> TrainingFrame:
+        noise = rng.normal(0, target.sensor.read_noise_dn, tuple(frame.dn.shape))
+        return dataclasses.replace(frame, dn=torch.from_numpy(np.clip(np.round(noise), 0, 255)).float())
+
+    frames = [dark(f) if first <= i / count < last else f for i, f in enumerate(target.training)]
+    return dataclasses.replace(target, training=frames)
+
+
+def mean_image_db(target: targets.Target) -> float:
+    """Return the clean PSNR of predicting, for each exposure, the mean of the training frames."""
+    means = {}
+    for exposure_s in {f.exposure_time_s for f in target.held_out}:
+        same = [f.dn for f in target.training if f.exposure_time_s == exposure_s] or [
+            f.dn for f in target.training
+        ]
+        means[exposure_s] = torch.stack(same).mean(0) / target.sensor.white_dn
+    values = [
+        psnr_db(means[f.exposure_time_s], exact)
+        for f, exact in zip(target.held_out, target.clean, strict=True)
+    ]
+    return sum(values) / len(values)
+
+
+def cases(name: str, size: int, seeds: int):
+    """Yield (condition, target, changes of the method, seed)."""
+    for condition, load in LOADS.items():
+        yield condition, targets.load(name, size, **load), {}, 0
+    plain = targets.load(name, size)
+    for seed in range(1, seeds):
+        yield f"seed {seed}", plain, {}, seed
+    for degrees in POSE_ERRORS_DEG:
+        wrong = with_pose_error(plain, degrees, 0)
+        yield f"pose error {degrees:g} deg", wrong, {}, 0
+        yield f"pose error {degrees:g} deg, refined", wrong, {"refine_poses": True}, 0
+    rng = np.random.default_rng(0)
+    for percent in LOST_PERCENT:
+        lost = set(rng.permutation(len(plain.training))[: len(plain.training) * percent // 100].tolist())
+        yield f"{percent} % of frames lost", keep(plain, lambda i, f, lost=lost: i not in lost), {}, 0
+    for exposure_s in targets.BRACKET_S:
+        rest = keep(plain, lambda i, f, exposure_s=exposure_s: f.exposure_time_s != exposure_s)
+        yield f"{exposure_s * 1e3:g} ms missing", rest, {}, 0
+    yield "eclipse in mid-session", in_eclipse(plain, 0.4, 0.7), {}, 0
+    yield "random start", plain, {"start": "random", "start_count": 20_000}, 0
+    yield "two frames", keep(plain, lambda i, f: i < 2), {}, 0
+    yield "all frames black", in_eclipse(plain, 0.0, 1.0), {}, 0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON object a row")
+    parser.add_argument("--target", default="TDRS")
+    parser.add_argument("--size", type=int, default=200)
+    parser.add_argument("--steps-share", type=float, default=0.5)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=1)
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    failures = 0
+    for condition, target, changes, seed in cases(arguments.target, arguments.size, arguments.seeds):
+        row: dict = {"condition": condition}
+        try:
+            row |= measure(configure("obbgs", arguments.steps_share, **changes), target, seed)
+            row["mean_image_db"] = round(mean_image_db(target), 3)
+            row["ok"] = bool(
+                np.isfinite(row["psnr_clean_db"]) and row["psnr_clean_db"] > row["mean_image_db"]
+            )
+        except ReconstructionError as error:
+            row |= {"error": f"{type(error).__name__}: {error}", "ok": True}
+        failures += not row["ok"]
+        print(
+            json.dumps(row) if arguments.json else "  ".join(f"{k} {v}" for k, v in row.items()), flush=True
+        )
+    sys.exit(1 if failures else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,245 @@
+"""The training as a whole: repeatable, resumable, and honest about what each Gaussian and each pose is worth."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from obbgs_core.cameras import Cameras
+from obbgs_core.errors import Diverged, ReconstructionError, TooFewFrames
+from obbgs_core.frames import Batches, TrainingFrame
+from obbgs_core.gaussians import Gaussians
+from obbgs_core.methods import preset, with_quality
+from obbgs_core.optimize import Trainer, train
+from obbgs_core.parsimony import likelihood_gains, next_degree_gain
+from obbgs_core.poses import PoseCorrections, rigid_motions
+from obbgs_core.render import render
+from obbgs_core.sensor import Sensor
+from obbgs_core.sh import from_radiance
+
+SIZE, RANGE_M = 64, 5.0
+SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=2.0, read_noise_dn=3.0)
+K = torch.tensor([[130.0, 0, SIZE / 2], [0, 130.0, SIZE / 2], [0, 0, 1]])
+QUICK = {"steps": 40, "start_count": 400, "max_gaussians": 600, "pyramid": ((0.0, 1.0),)}
+
+
+def target(count: int = 60, seed: int = 0) -> Gaussians:
+    rng = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=torch.randn(count, 3, generator=rng) * 0.4,
+        quats=torch.randn(count, 4, generator=rng),
+        log_scales=torch.log(0.05 + 0.15 * torch.rand(count, 3, generator=rng)),
+        opacity_logits=torch.full((count,), 2.0),
+        sh=from_radiance(0.1 + 0.5 * torch.rand(count, 1, 1, generator=rng)),
+    )
+
+
+def pose(rotation: np.ndarray) -> torch.Tensor:
+    world_to_camera = torch.eye(4)
+    world_to_camera[:3, :3] = torch.tensor(rotation, dtype=torch.float32)
+    world_to_camera[2, 3] = RANGE_M
+    return world_to_camera
+
+
+def photographed(gaussians: Gaussians, count: int = 18, seed: int = 0) -> list[TrainingFrame]:
+    """Return frames of a model with shot and read noise, three exposures in turn."""
+    rng = np.random.default_rng(seed)
+    frames = []
+    for i, rotation in enumerate(Rotation.random(count, rng=rng).as_matrix()):
+        exposure_s = (5e-5, 1e-4, 2e-4)[i % 3]
+        cameras = Cameras(pose(rotation)[None], K[None], SIZE, SIZE)
+        expected = SENSOR.expected_dn(render(gaussians, cameras).radiance[0], exposure_s)
+        noise = rng.normal(size=tuple(expected.shape)) * SENSOR.variance_dn2(expected).sqrt().numpy()
+        dn = np.clip(np.round(expected.numpy() + noise), 0, 4095)
+        frames.append(
+            TrainingFrame(torch.from_numpy(dn).float(), exposure_s, cameras.world_to_camera[0], K, i)
+        )
+    return frames
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[TrainingFrame]:
+    return photographed(target())
+
+
+def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path):
+    config = preset("obbgs", **QUICK, refine_poses=True, weigh_at=(0.5,))
+    tagged = [dataclasses.replace(f, pose_sigma=torch.full((6,), 1e-3)) for f in frames]
+    whole = train(tagged, SENSOR, config, seed=3)
+    first = Trainer(tagged, SENSOR, config, seed=3)
+    for _ in range(23):
+        first.step()
+    first.save(tmp_path / "training.checkpoint")
+    steps = []
+    resumed = train(
+        tagged,
+        SENSOR,
+        config,
+        3,
+        lambda info: steps.append(info.step),
+        checkpoint=tmp_path / "training.checkpoint",
+    )
+    assert steps == list(range(24, 41)) and [i.step for i in resumed.history] == list(range(1, 41))
+    for name, tensor in whole.gaussians.tensors().items():
+        assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
+
+
+def test_a_checkpoint_of_another_training_is_not_used(frames, tmp_path):
+    Trainer(frames, SENSOR, preset("obbgs", **QUICK), seed=1).save(tmp_path / "c")
+    assert not Trainer(frames, SENSOR, preset("obbgs", **QUICK), seed=2).resume(tmp_path / "c")
+    assert not Trainer(frames[:-1], SENSOR, preset("obbgs", **QUICK), seed=1).resume(tmp_path / "c")
+    assert not Trainer(frames, SENSOR, preset("obbgs", **QUICK), seed=1).resume(tmp_path / "none")
+    assert Trainer(frames, SENSOR, preset("obbgs", **QUICK), seed=1).resume(tmp_path / "c")
+
+
+def test_the_time_limit_ends_the_training_and_says_so(frames):
+    result = train(frames, SENSOR, preset("obbgs", **QUICK), time_limit_s=0.0)
+    assert (
+        result.stop_reason == "time limit of 0 s" and len(result.history) == 0 and len(result.gaussians) > 0
+    )
+
+
+def test_the_chi2_of_a_good_model_is_near_one(frames):
+    result = train(frames, SENSOR, preset("obbgs", **QUICK | {"steps": 400, "max_gaussians": 1500}))
+    assert result.history[-1].chi2 < 3
+    assert result.history[-1].seconds_left == pytest.approx(0, abs=1e-6)
+
+
+def test_what_removing_a_gaussian_costs_matches_removing_it():
+    model = target(8, seed=2)
+    frames = photographed(model, count=12)
+    batches = Batches(frames, preset("obbgs"), torch.Generator().manual_seed(0))
+    rng = torch.Generator().manual_seed(1)
+    estimates = torch.stack([likelihood_gains(model, batches, SENSOR, 1.0, rng)[0] for _ in range(60)])
+    exact = torch.zeros(len(model))
+    for j in range(len(model)):
+        fewer = model.select(torch.arange(len(model)) != j)
+        for index in range(len(frames)):
+            batch = batches.batch([index], 1.0)
+            with torch.no_grad():
+                all_dn = SENSOR.expected_dn(render(model, batch.cameras).radiance, batch.exposure_time_s)
+                dn = SENSOR.expected_dn(render(fewer, batch.cameras).radiance, batch.exposure_time_s)
+            lit = batch.dn < SENSOR.white_dn
+            exact[j] += 0.5 * ((dn - all_dn) ** 2 / SENSOR.variance_dn2(all_dn) * lit).sum()
+    # 60 draws of 12 frames with a relative deviation of about 1.4 each: 5 % a Gaussian; alpha cutoffs add a little
+    torch.testing.assert_close(estimates.mean(0), exact, rtol=0.25, atol=0)
+
+
+def test_colour_that_turns_with_the_view_asks_for_harmonics_and_plain_colour_does_not():
+    plain = target(10, seed=4)
+    turning = Gaussians(
+        **{**plain.tensors(), "sh": torch.cat([plain.sh, torch.full((10, 3, 1), 0.3)], dim=1)}
+    )
+    gains = []
+    for seen in (plain, turning):
+        batches = Batches(photographed(seen, 24), preset("obbgs"), torch.Generator().manual_seed(0))
+        gains.append(next_degree_gain(plain, batches, SENSOR, 1.0, torch.Generator().manual_seed(0)))
+    assert gains[0][0] < gains[0][1]
+    assert gains[1][0] > gains[1][1]
+
+
+def test_pose_refinement_takes_most_of_the_error_out():
+    model = target(80, seed=5)
+    rng = torch.Generator().manual_seed(0)
+    sigma = torch.tensor([0.005] * 3 + [1e-4] * 3)  # rad, m: 0.3 degrees, most of a pixel here
+    true, wrong = photographed(model, 24), []
+    for frame in true:
+        error = rigid_motions(torch.randn(1, 6, generator=rng) * sigma)[0]
+        wrong.append(
+            dataclasses.replace(frame, world_to_camera=error @ frame.world_to_camera, pose_sigma=sigma)
+        )
+    config = preset("obbgs", **QUICK | {"steps": 400, "max_gaussians": 1500, "refine_poses": True})
+    trainer = Trainer(wrong, SENSOR, config)
+    while not trainer.stop_reason():
+        trainer.step()
+    trainer.result("")
+    assert trainer.poses is not None
+    before, after = [], []
+    for i, (t, w) in enumerate(zip(true, wrong, strict=True)):
+        corrected = trainer.poses.corrected([i], w.world_to_camera[None])[0].detach()
+        for poses, errors in ((w.world_to_camera, before), (corrected, after)):
+            turn = Rotation.from_matrix((poses[:3, :3] @ t.world_to_camera[:3, :3].T).numpy())
+            errors.append(turn.magnitude() ** 2)
+    assert math.sqrt(np.mean(after)) < 0.5 * math.sqrt(np.mean(before))
+
+
+def test_settling_the_gauge_changes_no_image():
+    model, frames = target(30, seed=6), photographed(target(30, seed=6), 6)
+    tagged = [dataclasses.replace(f, pose_sigma=torch.full((6,), 0.01)) for f in frames]
+    poses = PoseCorrections(tagged)
+    with torch.no_grad():
+        poses.value += 0.5 + 0.2 * torch.randn(poses.value.shape, generator=torch.Generator().manual_seed(0))
+
+    def images(gaussians: Gaussians) -> torch.Tensor:
+        tags = torch.stack([f.world_to_camera for f in tagged])
+        corrected = poses.corrected(list(range(6)), tags).detach()
+        return render(gaussians, Cameras(corrected, K.expand(6, 3, 3), SIZE, SIZE)).radiance
+
+    before, size_before = images(model), float(poses.value.detach().norm())
+    after = images(poses.settle(model, tagged))
+    assert float(poses.value.detach().norm()) < size_before
+    assert (before - after).abs().mean() < 1e-3  # the motions are 0.005 rad and m; second order is 2.5e-5
+
+
+@given(st.integers(0, 10_000))
+def test_rigid_motions_match_scipy(seed):
+    rng = np.random.default_rng(seed)
+    vector, shift = rng.normal(size=3), rng.normal(size=3)
+    motion = rigid_motions(torch.tensor(np.concatenate([vector, shift]))[None])[0].numpy()
+    np.testing.assert_allclose(motion[:3, :3], Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(motion[:3, 3], shift)
+
+
+def test_black_frames_are_left_out_and_counted(frames):
+    black = dataclasses.replace(frames[0], dn=torch.full_like(frames[0].dn, SENSOR.black_dn))
+    trainer = Trainer([*frames, black, black], SENSOR, preset("obbgs", **QUICK))
+    assert trainer.dark_frames == 2 and len(trainer.frames) == len(frames)
+    with pytest.raises(ReconstructionError, match="5 of 5 frames are black"):
+        Trainer([black] * 5, SENSOR, preset("obbgs", **QUICK))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("dn", torch.full((SIZE, SIZE, 1), math.nan)),
+        ("world_to_camera", torch.full((4, 4), math.inf)),
+        ("K", torch.full((3, 3), math.nan)),
+        ("exposure_time_s", 0.0),
+        ("exposure_time_s", math.nan),
+    ],
+)
+def test_hostile_frames_are_named(frames, field, value):
+    hostile = dataclasses.replace(frames[0], id=77, **{field: value})
+    with pytest.raises(ReconstructionError, match="frame 77"):
+        Trainer([*frames, hostile], SENSOR, preset("obbgs", **QUICK))
+
+
+def test_too_few_frames_and_a_diverging_rate_are_named_errors(frames):
+    with pytest.raises(TooFewFrames, match="at least 3 frames, got 2"):
+        train(frames[:2], SENSOR, preset("obbgs", **QUICK))
+    with pytest.raises(Diverged, match="smaller learning rates"):
+        train(frames, SENSOR, preset("obbgs", **QUICK | {"lr_sh": 1e38, "lr_log_scales": 1e30}))
+
+
+def test_cameras_that_never_meet_end_in_a_finite_model():
+    apart = []
+    for i, frame in enumerate(photographed(target(), 6)):
+        moved = frame.world_to_camera.clone()
+        moved[:3, 3] += torch.tensor([40.0 * i, 0, 0])
+        apart.append(dataclasses.replace(frame, world_to_camera=moved))
+    result = train(apart, SENSOR, preset("obbgs", **QUICK | {"steps": 5}))
+    assert all(torch.isfinite(t).all() for t in result.gaussians.tensors().values())
+
+
+def test_quality_scales_steps_and_size_and_unknown_ones_are_refused():
+    standard = preset("obbgs")
+    assert with_quality(standard, "standard") == standard
+    assert with_quality(standard, "draft").steps == round(standard.steps / 3)
+    assert with_quality(standard, "best").max_gaussians == 3 * standard.max_gaussians
+    with pytest.raises(ValueError, match="quality must be one of draft, standard, best"):
+        with_quality(standard, "ultra")

@@ -1,0 +1,110 @@
+"""PLY files against plyfile and the formulas of the 3DGS viewers."""
+
+import numpy as np
+import plyfile
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from scipy.special import expit, sph_harm_y
+
+from obbgs_core import sh
+from obbgs_core.errors import ReconstructionError
+from obbgs_core.gaussians import Gaussians
+from obbgs_core.ply import display_sh, load_ply, radiance_sh, save_ply, save_surface_ply
+
+WHITE = 2.0
+
+
+def model(count: int, sh_count: int = 1, channels: int = 1, seed: int = 0) -> Gaussians:
+    """Return Gaussians whose radiance is about 1 and depends mildly on direction."""
+    g = torch.Generator().manual_seed(seed)
+    coefficients = 0.1 * torch.randn(count, sh_count, channels, generator=g)
+    coefficients[:, 0] += 1 / sh.C0
+    return Gaussians(
+        torch.randn(count, 3, generator=g),
+        torch.randn(count, 4, generator=g),
+        torch.rand(count, 3, generator=g) * 2 - 4,
+        torch.randn(count, generator=g),
+        coefficients,
+    )
+
+
+def viewer_colour(vertex: plyfile.PlyElement, direction: np.ndarray) -> np.ndarray:
+    """Return [N, 3] what a 3DGS viewer shows for a direction: real spherical harmonics made of scipy's complex ones."""
+    f_dc = np.stack([vertex[f"f_dc_{c}"] for c in range(3)], axis=1)
+    rest = [name for name in vertex.data.dtype.names if name.startswith("f_rest_")]
+    colour = 0.5 + 0.28209479177387814 * f_dc
+    per_channel = len(rest) // 3
+    theta, phi = np.arccos(direction[2]), np.arctan2(direction[1], direction[0])
+    for k in range(per_channel):
+        degree = int(np.sqrt(k + 1))
+        order = k + 1 - degree * degree - degree
+        value = sph_harm_y(degree, abs(order), theta, phi)
+        real = value.real if order == 0 else np.sqrt(2) * (value.imag if order < 0 else value.real)
+        for c in range(3):
+            colour[:, c] += real * np.asarray(vertex[f"f_rest_{c * per_channel + k}"])
+    return colour
+
+
+@pytest.mark.parametrize(("sh_count", "channels"), [(1, 1), (1, 3), (4, 3), (9, 1), (16, 3)])
+def test_a_viewer_shows_the_radiance_on_a_gamma_scale(tmp_path, sh_count, channels):
+    gaussians = model(40, sh_count, channels)
+    save_ply(gaussians, tmp_path / "m.ply", WHITE)
+    vertex = plyfile.PlyData.read(str(tmp_path / "m.ply"))["vertex"]
+    a_grey_level = 1 / 255 if sh_count == 1 else 0.02  # a power of harmonics is no sum of so few harmonics
+    for direction in np.random.default_rng(0).normal(size=(5, 3)):
+        direction /= np.linalg.norm(direction)
+        ours = sh.radiance(gaussians.sh, torch.tensor(direction, dtype=torch.float32).expand(40, 3)).numpy()
+        shown = np.broadcast_to((ours / WHITE) ** (1 / 2.2), (40, 3))
+        np.testing.assert_allclose(viewer_colour(vertex, direction), shown, atol=a_grey_level)
+
+
+def test_shape_and_opacity_mean_what_viewers_take_them_for(tmp_path):
+    gaussians = model(20)
+    save_ply(gaussians, tmp_path / "m.ply")
+    vertex = plyfile.PlyData.read(str(tmp_path / "m.ply"))["vertex"]
+    np.testing.assert_array_equal(np.stack([vertex[a] for a in "xyz"], 1), gaussians.means.numpy())
+    quats = np.stack([vertex[f"rot_{i}"] for i in range(4)], axis=1).astype(np.float64)
+    turns = Rotation.from_quat(quats, scalar_first=True).as_matrix()
+    scaled = turns * np.exp(np.stack([vertex[f"scale_{i}"] for i in range(3)], axis=1))[:, None, :]
+    np.testing.assert_allclose(scaled @ scaled.transpose(0, 2, 1), gaussians.covariances().numpy(), atol=1e-7)
+    np.testing.assert_allclose(expit(vertex["opacity"]), gaussians.opacities.numpy(), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("sh_count", "channels"), [(1, 1), (4, 3), (16, 1)])
+def test_a_model_comes_back_exactly(tmp_path, sh_count, channels):
+    gaussians = model(17, sh_count, channels)
+    gaussians.sh *= 5  # far from anything that a display can show
+    save_ply(gaussians, tmp_path / "m.ply", WHITE)
+    again = load_ply(tmp_path / "m.ply")
+    for name, tensor in gaussians.tensors().items():
+        assert torch.equal(getattr(again, name), tensor), name
+    assert not list(tmp_path.glob("*.part"))
+
+
+@pytest.mark.parametrize(("sh_count", "channels"), [(1, 1), (1, 3), (4, 3), (16, 3)])
+def test_radiance_is_recovered_from_display_colours(sh_count, channels):
+    gaussians = model(50, sh_count, channels)
+    coefficients = radiance_sh(display_sh(gaussians, WHITE), WHITE, channels)
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(1)))
+    error = sh.radiance(coefficients, directions) - sh.radiance(gaussians.sh, directions)
+    assert error.abs().max() < (
+        1e-4 if sh_count == 1 else 0.06
+    )  # of about 1; harmonics of higher degree are lost
+
+
+def test_a_foreign_or_cut_ply_is_refused(tmp_path):
+    save_ply(model(3), tmp_path / "m.ply")
+    content = (tmp_path / "m.ply").read_bytes()
+    for broken in (content[:-5], b"ply\n" + content[10:60], b""):
+        (tmp_path / "b.ply").write_bytes(broken)
+        with pytest.raises(ReconstructionError):
+            load_ply(tmp_path / "b.ply")
+
+
+def test_a_surface_is_read_by_others(tmp_path):
+    points, normals = torch.rand(7, 3), torch.nn.functional.normalize(torch.randn(7, 3), dim=1)
+    save_surface_ply(points, normals, tmp_path / "surface.ply")
+    vertex = plyfile.PlyData.read(str(tmp_path / "surface.ply"))["vertex"]
+    np.testing.assert_array_equal(np.stack([vertex[a] for a in "xyz"], 1), points.numpy())
+    np.testing.assert_array_equal(np.stack([vertex[a] for a in ("nx", "ny", "nz")], 1), normals.numpy())

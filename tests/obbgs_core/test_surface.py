@@ -1,0 +1,122 @@
+"""Surface points of models whose surface is known."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import KDTree
+
+from obbgs_core.cameras import Cameras
+from obbgs_core.gaussians import Gaussians
+from obbgs_core.surface import depth_map, surface_points
+
+SIZE = 96
+DISTANCE = 4.0
+
+
+def evenly_on_a_sphere(count: int) -> torch.Tensor:
+    i = torch.arange(count, dtype=torch.float64)
+    z, angle = 1 - (2 * i + 1) / count, math.pi * (1 + math.sqrt(5)) * i
+    reach = (1 - z * z).sqrt()
+    return torch.stack([reach * angle.cos(), reach * angle.sin(), z], dim=1)
+
+
+def discs(
+    centres: torch.Tensor, normals: torch.Tensor, radius: float, opacity_logit: float = 3.0
+) -> Gaussians:
+    """Return discs 0.002 m thick whose third axis is the normal."""
+    n = len(centres)
+    # half-way rotation from z to the normal, as a quaternion
+    quats = torch.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], torch.zeros(n)], dim=1)
+    log_scales = torch.tensor([radius, radius, 0.002]).log().expand(n, 3).contiguous()
+    logits, colours = torch.full((n,), opacity_logit), torch.ones(n, 1, 1)
+    return Gaussians(centres.float(), quats.float(), log_scales, logits, colours)
+
+
+def sphere(count: int = 1500) -> Gaussians:
+    points = evenly_on_a_sphere(count)
+    return discs(points, points, radius=0.055)
+
+
+def cameras_around(count: int) -> Cameras:
+    poses = []
+    for centre in evenly_on_a_sphere(count):
+        z = -centre
+        x = torch.nn.functional.normalize(
+            torch.linalg.cross(z, torch.tensor([0.1, 0.2, 0.97]).double()), dim=0
+        )
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = torch.stack([x, torch.linalg.cross(z, x), z])
+        pose[2, 3] = DISTANCE
+        poses.append(pose)
+    focal = 1.6 * SIZE
+    K = torch.tensor([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]])
+    return Cameras(torch.stack(poses).float(), K.expand(count, 3, 3), SIZE, SIZE)
+
+
+def test_a_sphere_of_discs_gives_the_sphere_evenly():
+    points, normals = surface_points(sphere(), cameras_around(20), 20_000)
+    assert points.shape == normals.shape == (20_000, 3)
+    radii = points.norm(dim=1, keepdim=True)
+    disc_stands_off_m = 0.055**2  # of the sphere that it touches, at 1.4 sigma
+    assert (radii - 1).abs().mean() < disc_stands_off_m and (radii - 1).abs().max() < 0.05
+    angles = torch.rad2deg(torch.acos((normals * points / radii).sum(dim=1).clamp(-1, 1)))
+    assert angles.mean() < 2 and angles.max() < 20
+    torch.testing.assert_close(normals.norm(dim=1), torch.ones(20_000))
+    cells = KDTree(evenly_on_a_sphere(150).numpy())
+    counts = np.bincount(cells.query((points / radii).numpy())[1], minlength=150)
+    assert counts.std() < 0.2 * counts.mean() and counts.min() > 0.5 * counts.mean()
+    gaps, _ = KDTree(points.numpy()).query(evenly_on_a_sphere(5000).numpy())
+    assert gaps.max() < 0.06  # a pixel is 0.02 m wide
+
+
+def test_depth_follows_a_tilted_disc_and_not_its_centre():
+    tilt = math.radians(50)
+    normal = torch.tensor([[math.sin(tilt), 0.0, -math.cos(tilt)]])
+    pose = torch.eye(4)[None]
+    K = torch.tensor([[[100.0, 0, 48], [0, 100, 48], [0, 0, 1]]])
+    disc = discs(torch.tensor([[0.0, 0.0, 2.0]]), normal, radius=0.3)
+    depth, slope = depth_map(disc, Cameras(pose, K, SIZE, SIZE))
+    rows, columns = torch.nonzero(depth.isfinite(), as_tuple=True)
+    assert len(rows) > 100
+    across = (columns + 0.5 - 48) / 100
+    true_m = 2 / (1 - across * math.tan(tilt))  # where the ray (across, ., 1) meets the plane
+    width_px = (columns + 0.5 - 48).abs()
+    second_order = 2 * (width_px / 100 * math.tan(tilt)) ** 2 + 1e-3  # the depth is linear in the image
+    assert ((depth[rows, columns] - true_m).abs() < 2 * second_order).all()
+    torch.testing.assert_close(
+        slope[rows, columns].mean(dim=0), torch.tensor([2 * math.tan(tilt) / 100, 0.0]), rtol=0.02, atol=1e-4
+    )
+
+
+def test_no_point_lies_between_two_plates_one_behind_the_other():
+    grid = torch.linspace(-1, 1, 30)
+    x, y = (t.flatten() for t in torch.meshgrid(grid, grid, indexing="ij"))
+    back = torch.stack([x, y, torch.full_like(x, -0.5)], dim=1)
+    front = torch.stack([0.3 * x, 0.3 * y, torch.full_like(x, 0.5)], dim=1)
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+    plates = Gaussians.concatenate(
+        [discs(back, up.expand(900, 3), 0.06), discs(front, up.expand(900, 3), 0.02)]
+    )
+    points, _ = surface_points(plates, cameras_around(20), 5000)
+    heights = points[:, 2]
+    off_m = torch.minimum((heights + 0.5).abs(), (heights - 0.5).abs())
+    assert off_m.max() < 0.05
+    on_front = float((heights > 0).float().mean())
+    assert (
+        abs(on_front - 0.3**2 / (1 + 0.3**2)) < 0.03
+    )  # its share of the area, both plates seen from both sides
+
+
+def test_the_seed_decides_and_an_empty_sky_has_no_surface():
+    cameras = cameras_around(4)
+    first, again, other = (surface_points(sphere(), cameras, 500, seed)[0] for seed in (1, 1, 2))
+    assert torch.equal(first, again) and not torch.equal(first, other)
+    faint = sphere(100)
+    faint.opacity_logits[:] = -5.0
+    for gaussians in (faint, faint.select(torch.tensor([], dtype=torch.long))):
+        points, normals = surface_points(gaussians, cameras, 500)
+        assert points.shape == normals.shape == (0, 3)
+    with pytest.raises(ValueError, match="count"):
+        surface_points(faint, cameras, 0)
