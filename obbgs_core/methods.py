@@ -45,6 +45,7 @@ class MethodConfig:
     lr_end: float = 1.0  # all other rates fall to this share of theirs
     lr_poses: float = 0.05  # in deviations of the pose tag
     refine_poses: bool = False  # six numbers a bracket, held by the tag's covariance
+    poses_from: float = 0.3  # share of the steps: before, the model is too coarse to correct anything
     flat_weight: float = 0.0  # on the mean shortest scale: flat Gaussians are surface
     solid_weight: float = 0.0  # on opacity·(1 - opacity): solid or gone
     solid_from: float = 0.5  # share of the steps

@@ -138,7 +138,7 @@ class Trainer:
             self._observe(rendered, batch, residual)
         self.adam.step(self.gaussians, _rates(config, share, self.radius))
         if self.poses is not None:
-            self.poses.step(config.lr_poses * (1 - share))
+            self.poses.step(config.lr_poses * (1 - share) if share >= config.poses_from else 0.0)
         self._change_number(share, batch)
         self._look(rendered, batch)
         self.steps_done += 1

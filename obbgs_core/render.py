@@ -243,7 +243,7 @@ def composite_reference(
         after = torch.cumprod(1 - alpha, dim=-1)
         before = torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], dim=-1)
         crossing = (before > 0.5) & (after <= 0.5)
-        final = after[..., -1].clone() if len(order) else torch.ones(dx.shape[:2], dtype=means2d.dtype)
+        final = after[..., -1] if len(order) else torch.ones(dx.shape[:2], dtype=means2d.dtype)
         median = (crossing * depths[order]).sum(-1).detach()
         parts.append(((alpha * before) @ features[order], final, median))
     image, transmittance, median = (torch.cat(p) for p in zip(*parts, strict=True))

@@ -1,5 +1,6 @@
 // One pool of waiting threads for every parallel loop of this module.
 #pragma once
+#include <cstddef>
 #include <functional>
 
 namespace obbgs {

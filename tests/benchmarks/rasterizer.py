@@ -82,7 +82,7 @@ def measure(backend: str, count: int, width: int, threads: int, distance: float 
         "backward_ms": round(statistics.median(b for _, b in times), 2),
         "threads": threads,
         "fastest_ms": round(min(f + b for f, b in times), 2),
-        "bytes": out.radiance.grad_fn.rasterization.bytes,
+        "bytes": out.radiance.grad_fn.rasterization.bytes,  # pyright: ignore
         "covered": round(float((out.alpha > 0).float().mean()), 3),
     }
 
