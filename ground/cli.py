@@ -350,7 +350,9 @@ def main() -> None:
     try:
         app()
     except KeyboardInterrupt:
-        sys.exit(_fail("interrupted; nothing half-written was left", 1))
+        sys.exit(
+            _fail("interrupted; nothing half-written was left, the same command goes on where it can", 1)
+        )
     except ConfigError as error:
         sys.exit(_fail(str(error), 2))
     except ValueError as error:

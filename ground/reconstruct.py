@@ -22,6 +22,7 @@ from torch import Tensor
 from flightsw.icd.mission import CameraSection
 from ground.session import FrameRecord, Session, SessionError, open_session
 from obbgs_core.cameras import Cameras
+from obbgs_core.errors import ReconstructionError
 from obbgs_core.export_onnx import export_onnx
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.methods import MethodConfig, preset, with_quality
@@ -80,7 +81,7 @@ def reconstruct(
     folder = session.path / "runs" / name
     part = folder.with_name(f".{name}.part")
     part.mkdir(parents=True, exist_ok=True)  # what an interrupted run left is gone on with
-    with _logged_to(part / "log"):
+    with _discarded_on_failure(part), _logged_to(part / "log"):
         result = _train("known exposure", frames, sensor, config, seed, time_limit_s, on_progress, part)
         blind = None
         if blind_reference and config.exposure_aware:
@@ -316,6 +317,16 @@ def _resolved(session: Session, config: MethodConfig, seed: int) -> dict:
         "versions": {"python": platform.python_version(), **versions},
         "machine": platform.machine(),
     }
+
+
+@contextlib.contextmanager
+def _discarded_on_failure(part: Path) -> Iterator[None]:
+    """Remove a run that can never finish; one that was interrupted stays, to go on."""
+    try:
+        yield
+    except ReconstructionError:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
 
 
 @contextlib.contextmanager

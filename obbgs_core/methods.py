@@ -21,6 +21,9 @@ class MethodConfig:
     pyramid: tuple[tuple[float, float], ...] = ((0.0, 1.0),)  # (from this share of the steps, image scale)
     sh_degree: int = 3
     max_gaussians: int = 500_000
+    gaussians_per_frame: int = (
+        0  # > 0: never more than this many for each frame, or few frames are fitted by heart
+    )
     grow_from: float = 500 / 30_000  # share of the steps
     grow_until: float = 0.5
     grow_interval: int = 100
@@ -46,6 +49,7 @@ class MethodConfig:
     lr_poses: float = 0.05  # in deviations of the pose tag
     refine_poses: bool = False  # six numbers a bracket, held by the tag's covariance
     poses_from: float = 0.3  # share of the steps: before, the model is too coarse to correct anything
+    sh_weight: float = 0.0  # on the mean square of what turns with the view: a prior for matt surface
     flat_weight: float = 0.0  # on the mean shortest scale: flat Gaussians are surface
     solid_weight: float = 0.0  # on opacity·(1 - opacity): solid or gone
     solid_from: float = 0.5  # share of the steps
@@ -98,6 +102,7 @@ PRESETS: dict[str, MethodConfig] = {
             pyramid=((0.0, 0.25), (0.15, 0.5), (0.4, 1.0)),
             sh_degree=0,
             max_gaussians=10_000,
+            gaussians_per_frame=150,
             grow_from=0.08,
             grow_until=0.7,
             grow_interval=60,
@@ -107,11 +112,17 @@ PRESETS: dict[str, MethodConfig] = {
             prune_opacity=0.02,
             opacity_reset_interval=0,
             outlier_filter=False,  # nothing strays from the hull: it cost 0.4 dB on the demo session
-            lr_means=2e-3,
+            lr_means=4e-3,
             lr_means_end=2e-5,
-            lr_quats=0.005,
-            lr_log_scales=0.01,
-            lr_sh=0.02,
+            lr_quats=0.01,
+            lr_log_scales=0.02,
+            lr_sh=0.04,
+            lr_end=0.2,
+            sh_weight=1.0,
+            flat_weight=3.0,
+            weigh_at=(0.3, 0.5, 0.7, 0.85),
+            keep_opacity=0.5,
+            most_sh_degree=1,
             chi2_end=1.0,
         ),
     )

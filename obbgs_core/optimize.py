@@ -110,6 +110,12 @@ class Trainer:
                 f"{self.dark_frames} of {len(checked)} frames are black (eclipse, or exposures too short): only "
                 f"{len(self.frames)} rise above the noise, {FEWEST_FRAMES} are needed"
             )
+        if config.gaussians_per_frame:
+            most = min(config.max_gaussians, config.gaussians_per_frame * len(self.frames))
+            config = dataclasses.replace(
+                config, max_gaussians=most, start_count=min(config.start_count, most)
+            )
+            self.config = config
         self.gaussians, self.radius, self.start = first_gaussians(self.frames, sensor, config, self.rng)
         self.adam = Adam(self.gaussians)
         self.growth = Growth(len(self.gaussians), config.pixel_weighted)
@@ -250,6 +256,8 @@ class Trainer:
     def _priors(self, batch: Batch, share: float) -> Tensor:
         """Return what is asked of the Gaussians besides the images: thin ones, solid or absent ones, likely poses."""
         config, total = self.config, torch.zeros(())
+        if config.sh_weight and self.gaussians.sh.shape[1] > 1:
+            total = total + config.sh_weight * self.gaussians.sh[:, 1:].square().mean()
         if config.flat_weight:
             total = total + config.flat_weight * self.gaussians.scales.amin(dim=1).mean() / self.radius
         if config.solid_weight and share >= config.solid_from:

@@ -17,18 +17,21 @@ from obbgs_core.sensor import Sensor
 
 log = logging.getLogger(__name__)
 FEWEST_HULL_POINTS = 200
+FEWEST_VIEWS = 12  # that carve the hull
 VIEWS_FOR_COLOUR = 24
 MOST_DILATION_PX = 8
 
 
 def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> list[hull.Silhouette]:
-    """Return silhouettes of the longest exposures (shadowed faces are brightest there), grown by the pose error."""
-    longest_s = max(f.exposure_time_s for f in frames)
-    return [
-        hull.silhouette(f.dn, sensor, f.world_to_camera, f.K, _pose_error_px(f))
-        for f in frames
-        if f.exposure_time_s > 0.99 * longest_s
-    ]
+    """Return silhouettes of the longest exposures, grown by the pose error: shadowed faces are brightest there.
+
+    Where they are few the next longest join in: a view that misses a shadowed face does less harm than no view.
+    """
+    chosen: list[TrainingFrame] = []
+    for exposure_s in sorted({f.exposure_time_s for f in frames}, reverse=True):
+        if len(chosen) < FEWEST_VIEWS:
+            chosen += [f for f in frames if f.exposure_time_s == exposure_s]
+    return [hull.silhouette(f.dn, sensor, f.world_to_camera, f.K, _pose_error_px(f)) for f in chosen]
 
 
 def _pose_error_px(frame: TrainingFrame) -> int:

@@ -19,11 +19,14 @@ WITHOUT: dict[str, dict] = {
     "- Pixel-GS weights": {"pixel_weighted": False},
     "- pyramid": {"pyramid": ((0.0, 1.0),)},
     "- weighing": {"weigh_at": ()},
+    "- harmonics by need": {"most_sh_degree": 0},
     "- flattening": {"flat_weight": 0.0},
-    "- solid opacities": {"solid_weight": 0.0},
+    "- falling rates": {"lr_end": 1.0},
     "- growth": {"grow_until": 0.0},
+    "+ solid opacities": {"solid_weight": 0.3},
     "+ outlier filter": {"outlier_filter": True},
-    "+ degree 1": {"sh_degree": 1},
+    "+ degree 1 from the start": {"sh_degree": 1},
+    "+ pose refinement": {"refine_poses": True},
 }
 
 

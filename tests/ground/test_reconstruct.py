@@ -3,10 +3,13 @@
 import json
 import math
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
+import plyfile
 import pytest
 import torch
 import yaml
@@ -14,7 +17,7 @@ from typer.testing import CliRunner
 
 from ground import cli
 from ground.evaluate import bounding_box, evaluate
-from ground.reconstruct import reconstruct, split
+from ground.reconstruct import changes_for, reconstruct, split
 from ground.report import write_report
 from ground.session import MissingFrames, SessionError, open_session
 from obbgs_core.errors import ReconstructionError, TooFewFrames
@@ -79,6 +82,59 @@ def test_the_report_is_one_file_that_needs_no_network(trained):
     assert 'src="http' not in page and "<link" not in page
 
 
+def test_every_output_is_there_and_the_card_says_what_they_are(trained):
+    session, metrics = trained
+    folder = session / "runs" / "run"
+    card = (folder / "model_card.md").read_text()
+    assert f"{metrics['gaussians']:,} Gaussians" in card and metrics["stop_reason"] in card
+    assert f"{metrics['psnr_clean_db']:.2f} dB" in card and "0.05 to 0.2 ms" in card
+    for name in ("ply", "spz", "onnx"):
+        size_bytes = (folder / f"model.{name}").stat().st_size
+        assert metrics[f"{name}_bytes"] == size_bytes and f"| {size_bytes:,} |" in card
+    vertices = plyfile.PlyData.read(str(folder / "surface.ply"))["vertex"]
+    normals = np.stack([vertices[axis] for axis in ("nx", "ny", "nz")], axis=1)
+    assert len(vertices) == 100_000
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
+    assert not list(folder.glob("*.checkpoint"))
+
+
+def test_a_killed_run_goes_on_to_the_same_model(tmp_path):
+    """SIGKILL between two checkpoints: the second call resumes, and ends where an undisturbed run ends."""
+    session = copy_session(tmp_path)
+    reconstruct(session, "whole", "obbgs", QUICK)
+    code = f"""
+import os, signal
+from pathlib import Path
+import obbgs_core.optimize as optimize
+from ground.reconstruct import reconstruct
+optimize.CHECKPOINT_EVERY_S = 0.0
+def die(progress):
+    if progress.info.step == 40:
+        os.kill(os.getpid(), signal.SIGKILL)
+reconstruct(Path({str(session)!r}), "killed", "obbgs", {QUICK!r}, on_progress=die)
+"""
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -9
+    part = session / "runs" / ".killed.part"
+    assert (part / "known-exposure.checkpoint").exists() and not (session / "runs" / "killed").exists()
+    steps = []
+    reconstruct(session, "killed", "obbgs", QUICK, on_progress=lambda p: steps.append(p.info.step))
+    assert steps[0] == 40 and steps[-1] == 60
+    one, other = (load_ply(session / "runs" / name / "model.ply") for name in ("whole", "killed"))
+    assert torch.equal(one.means, other.means) and torch.equal(one.sh, other.sh)
+
+
+def test_budget_and_quality_shape_the_training_and_nonsense_is_refused():
+    standard = PRESETS["obbgs"]
+    assert changes_for("obbgs", "standard", "auto", None)["steps"] == standard.steps
+    assert changes_for("obbgs", "draft", "auto", None)["max_gaussians"] == round(standard.max_gaussians / 3)
+    tight = changes_for("obbgs", "best", "900", 50)
+    assert tight["max_gaussians"] == tight["start_count"] == 900 and tight["steps"] == 50
+    with pytest.raises(ValueError, match="--budget must be auto or a number"):
+        changes_for("obbgs", "standard", "many", None)
+    with pytest.raises(ValueError, match="quality must be one of"):
+        changes_for("obbgs", "perfect", "auto", None)
+
+
 def test_truth_is_never_read_in_training(trained, tmp_path):
     session = copy_session(tmp_path)
     shutil.rmtree(session / "truth")
@@ -126,7 +182,7 @@ def test_black_frames_are_named_as_eclipse(tmp_path):
     for path in (session / "frames").glob("*.png"):
         dark = np.clip(rng.normal(64, 8, (72, 72)).round(), 0, None).astype(np.uint16)
         path.write_bytes(bytes(imagecodecs.png_encode(dark)))
-    with pytest.raises(ReconstructionError, match=r"all 42 frames are black \(eclipse"):
+    with pytest.raises(ReconstructionError, match=r"42 of 42 frames are black \(eclipse"):
         reconstruct(session, "run", "obbgs", QUICK)
     assert not list((session / "runs").iterdir())
 
@@ -146,7 +202,7 @@ def test_frames_flagged_as_eclipsed_are_left_out_and_too_few_are_named(tmp_path)
         reconstruct(session, "run", "obbgs", QUICK)
 
 
-def test_an_interrupted_run_leaves_nothing(tmp_path):
+def test_an_interrupted_run_leaves_no_run_and_the_next_one_finishes(tmp_path):
     session = copy_session(tmp_path)
 
     def interrupt(progress):
@@ -155,7 +211,9 @@ def test_an_interrupted_run_leaves_nothing(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         reconstruct(session, "run", "obbgs", QUICK, on_progress=interrupt)
-    assert not list((session / "runs").iterdir())
+    assert [path.name for path in (session / "runs").iterdir()] == [".run.part"]
+    reconstruct(session, "run", "obbgs", QUICK)
+    assert [path.name for path in (session / "runs").iterdir()] == ["run"]
 
 
 def test_a_session_without_frames_is_refused(tmp_path):

@@ -194,21 +194,30 @@ def test_the_link_command_prints_its_ends_obeys_its_input_and_prints_its_counts(
     command = [sys.executable, "-m", "hil.cli", "link", "--seed", "3", *arguments]
     with subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True) as process:
         assert process.stdout and process.stdin and process.stderr
-        ends = [process.stdout.readline().split() for _ in range(2)]
-        assert [end[0] for end in ends] == ["flight", "ground"]
-        assert all(end[1].startswith(f"{scheme}:///dev/") for end in ends)
-        process.stdin.write("loss 0.5\nnonsense\n")
-        process.stdin.flush()
-        assert "'loss': 0.5" in process.stderr.readline()
-        assert "expected cut, mend" in process.stderr.readline()
-        process.send_signal(signal.SIGUSR1)
-        process.stdin.write("latency 0.1\n")
-        process.stdin.flush()
-        assert process.stderr.readline().startswith("cut, latency 0.1 s")
-        process.terminate()
+        try:
+            ends = [process.stdout.readline().split() for _ in range(2)]
+            assert [end[0] for end in ends] == ["flight", "ground"]
+            assert all(end[1].startswith(f"{scheme}:///dev/") for end in ends)
+            assert "'loss': 0.5" in answer(process, "loss 0.5")
+            assert "expected cut, mend" in answer(process, "nonsense")
+            process.send_signal(signal.SIGUSR1)
+            answers = (
+                answer(process, "latency 0.1") for _ in range(100)
+            )  # the signal may come after the line
+            assert any(text.startswith("cut, latency 0.1 s") for text in answers)
+        finally:
+            process.terminate()
         counts = json.loads(process.stdout.readline())
         assert set(counts) == {"down", "up"}
     assert process.returncode == 0
+
+
+def answer(process: subprocess.Popen, line: str) -> str:
+    """Return what the command says to a line on its standard input."""
+    assert process.stdin and process.stderr
+    process.stdin.write(line + "\n")
+    process.stdin.flush()
+    return process.stderr.readline()
 
 
 def test_a_fault_s_rate_is_a_probability():
