@@ -45,10 +45,15 @@ class Sensor:
         return torch.where(dn >= self.white_dn, residual.clamp(max=0), residual) / sigma
 
     def stabilised(self, dn: Tensor) -> Tensor:
-        """Return readings on a scale where noise has unit variance everywhere (generalised Anscombe transform)."""
+        """Return readings on a scale where noise has unit variance everywhere, 0 where no light is.
+
+        The generalised Anscombe transform minus its value at the black level, in the form that loses no digits where
+        read noise is far larger than shot noise.
+        """
         signal_e = (dn - self.black_dn) * self.electrons_per_dn
         floor = 3 / 8 + (self.read_noise_dn * self.electrons_per_dn) ** 2
-        return 2 * (signal_e + floor).clamp(min=1e-3).sqrt()
+        signal_e = signal_e.clamp(min=1e-3 - floor)
+        return 2 * signal_e / ((signal_e + floor).clamp(min=1e-3).sqrt() + math.sqrt(floor))
 
 
 def clipped_mean(mean: Tensor, sigma: Tensor) -> Tensor:

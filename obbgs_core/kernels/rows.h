@@ -89,11 +89,14 @@ void stabilised_row(int n, const float* __restrict radiance, const float* __rest
                     const SensorModel s, float* __restrict difference, float* __restrict slope) {
   for (int x = 0; x < n; ++x) {
     const float signal = gain * radiance[x], most = s.white - s.black;
-    const float predicted = (signal > most ? most : signal) * s.electrons_per_dn + s.anscombe_floor;
-    const float read = (dn[x] - s.black) * s.electrons_per_dn + s.anscombe_floor;
-    const float root = std::sqrt(predicted < 1e-3f ? 1e-3f : predicted);
-    difference[x] = 2 * (root - std::sqrt(read < 1e-3f ? 1e-3f : read));
-    slope[x] = (signal > most || predicted < 1e-3f) ? 0.0f : s.electrons_per_dn * gain / root;
+    const float predicted = (signal > most ? most : signal) * s.electrons_per_dn;
+    const float read = (dn[x] - s.black) * s.electrons_per_dn;
+    // 2(sqrt(p + floor) - sqrt(r + floor)) without the cancellation where the floor is large; roots of 0.001 at least
+    const float least = 1e-3f - s.anscombe_floor;
+    const float p = predicted < least ? least : predicted, r = read < least ? least : read;
+    const float root = std::sqrt(p + s.anscombe_floor < 1e-3f ? 1e-3f : p + s.anscombe_floor);
+    difference[x] = 2 * (p - r) / (root + std::sqrt(r + s.anscombe_floor < 1e-3f ? 1e-3f : r + s.anscombe_floor));
+    slope[x] = (signal > most || predicted < least) ? 0.0f : s.electrons_per_dn * gain / root;
   }
 }
 

@@ -65,3 +65,12 @@ def test_the_stabilised_scale_has_unit_noise_everywhere():
 def test_an_impossible_sensor_is_refused():
     with pytest.raises(ValueError, match="ordered and positive"):
         Sensor(100, 50, 1, 1, 1)
+
+
+@pytest.mark.parametrize("electrons_per_dn", [0.5, 4.0, 1e9])
+def test_the_stabilised_scale_keeps_its_digits_however_small_the_shot_noise(electrons_per_dn):
+    sensor = Sensor(64.0, 4095.0, 1e6, electrons_per_dn, 8.0)
+    dn = torch.linspace(64, 4095, 50)
+    floor = 3 / 8 + (8.0 * electrons_per_dn) ** 2
+    exact = 2 * (((dn.double() - 64) * electrons_per_dn + floor).sqrt() - floor**0.5)
+    torch.testing.assert_close(sensor.stabilised(dn).double(), exact, rtol=1e-5, atol=1e-5)
