@@ -7,11 +7,14 @@ import torch.nn.functional as F
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from obbgs_core import sh
 from obbgs_core.cameras import Cameras
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.render import project, render
 from obbgs_core.rotations import quats_to_matrices
 
+BLACKEST = 3e-4  # of the bright surface's radiance; fainter Gaussians show no light, so no surface was measured there
+BRIGHT_QUANTILE = 0.97
 STEEPEST = 4.0  # tangent of the largest angle between line of sight and normal, 76 degrees
 SAME_DEPTH_PX = 2.0  # depths agree within so many pixels' width
 AGREEING_VIEWS = 2  # that must see a point, besides its own
@@ -37,9 +40,9 @@ def surface_points(
     Raises:
         ValueError: no camera, or a count under 1.
     """
-    generator = torch.Generator().manual_seed(seed)
     if len(cameras) == 0 or count < 1:
         raise ValueError(f"expected a camera and a count of at least 1, got {len(cameras)} and {count}")
+    gaussians = _lit(gaussians)
     if len(gaussians) == 0:
         return torch.zeros(0, 3), torch.zeros(0, 3)
     generator = torch.Generator().manual_seed(seed)
@@ -65,6 +68,14 @@ def surface_points(
     patch[:, 1:3] += shift
     points, _ = _back_project(patch, cameras)
     return points, _fitted_normals(points, cameras.centres[patch[:, 0].long()] - points)
+
+
+def _lit(gaussians: Gaussians) -> Gaussians:
+    """Return the Gaussians that shine at all: black ones in front of black sky contradict no picture."""
+    if len(gaussians) == 0:
+        return gaussians
+    radiance = sh.radiance(gaussians.sh[:, :1], torch.zeros_like(gaussians.means)).mean(dim=-1)
+    return gaussians.select(radiance > BLACKEST * radiance.quantile(BRIGHT_QUANTILE))
 
 
 @torch.no_grad()

@@ -120,3 +120,15 @@ def test_the_seed_decides_and_an_empty_sky_has_no_surface():
         assert points.shape == normals.shape == (0, 3)
     with pytest.raises(ValueError, match="count"):
         surface_points(faint, cameras, 0)
+
+
+def test_black_gaussians_in_empty_space_are_no_surface():
+    """Nothing in any picture says that they are there."""
+    bright = sphere()
+    black = Gaussians(
+        **{**bright.tensors(), "means": bright.means * 1.5, "sh": torch.full_like(bright.sh, -10.0)}
+    )
+    with_shell = Gaussians.concatenate([bright, black])
+    points, _ = surface_points(with_shell, cameras_around(20), 2000)
+    alone, _ = surface_points(bright, cameras_around(20), 2000)
+    torch.testing.assert_close(points, alone)
