@@ -11,7 +11,7 @@ import torch
 from plyfile import PlyData, PlyParseError
 
 from ground.card import model_card
-from ground.reconstruct import camera_of, predicted_image, sensor_of, split
+from ground.reconstruct import camera_of, exposed, predicted_image, sensor_of, split
 from ground.session import FrameRecord, Session, SessionError, open_session, write_whole
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.lpips import WeightsMissing, lpips
@@ -119,7 +119,10 @@ def evaluate(session_dir: Path, name: str) -> dict:
     run = open_run(session_dir, name)
     figures: dict[str, float] = {}
     figures["psnr_noisy_db"] = _mean(
-        psnr_db(_predicted(run, run.gaussians, r), _noisy(run, r)) for r in run.held_out
+        psnr_db(
+            predicted_image(run.gaussians, run.session, r, run.sensor, _exposure_s(run, r)), _noisy(run, r)
+        )
+        for r in run.held_out
     )
     if Truth.exists(run.session):
         truth = Truth(run.session)
@@ -140,16 +143,21 @@ def evaluate(session_dir: Path, name: str) -> dict:
 
 def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:
     by_exposure: dict[float, list[float]] = {}
-    foreground, similarity, blind, linear, perceptual = [], [], [], [], []
+    foreground, similarity, blind, linear = [], [], [], []
+    pairs: list[tuple[torch.Tensor, torch.Tensor]] = []
     for record in run.held_out:
-        clean = clean_image(run, truth, record)
-        predicted = _predicted(run, run.gaussians, record)
+        true, coverage = truth.radiance(record)
+        clean = exposed(true, run.sensor, record.exposure_time_s)
+        with torch.no_grad():
+            radiance = render(run.gaussians, camera_of(run.session, record)).radiance[0]
+        predicted = exposed(radiance, run.sensor, _exposure_s(run, record))
+        pairs.append((predicted, clean))
         by_exposure.setdefault(record.exposure_time_s, []).append(psnr_db(predicted, clean))
-        box = bounding_box(truth.radiance(record)[1] > 0, FOREGROUND_MARGIN_PX)
+        box = bounding_box(coverage > 0, FOREGROUND_MARGIN_PX)
         foreground.append(psnr_db(predicted[box], clean[box]))
         similarity.append(ssim(predicted, clean))
-        perceptual += _lpips(predicted, clean)
-        linear.append(_radiance_psnr_db(run, truth, record))
+        brightest = true.max().clamp(min=1e-6)
+        linear.append(psnr_db(radiance / brightest, true / brightest))
         if run.blind is not None:
             exposure_s = run.metrics["blind_reference_exposure_s"]
             ignoring = predicted_image(run.blind, run.session, record, run.sensor, exposure_s)
@@ -159,27 +167,19 @@ def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:
         figures[f"psnr_clean_{exposure_s * 1e3:g}ms_db"] = _mean(values)
     figures["psnr_clean_foreground_db"] = _mean(foreground)
     figures["ssim_clean"] = _mean(similarity)
-    if perceptual:
-        figures["lpips_clean"] = _mean(perceptual)
+    try:
+        figures["lpips_clean"] = _mean(lpips(*pair, network="alex") for pair in pairs)
+    except WeightsMissing as error:
+        log.info("LPIPS is left out: %s", error)
     figures["psnr_radiance_db"] = _mean(linear)
     if blind:
         figures["psnr_clean_blind_db"] = _mean(blind)
     return figures
 
 
-def _lpips(predicted: torch.Tensor, clean: torch.Tensor) -> list[float]:
-    """Return the LPIPS (AlexNet) of two images, or nothing where its weights were never fetched."""
-    try:
-        return [lpips(predicted, clean, network="alex")]
-    except WeightsMissing as error:
-        log.info("LPIPS is left out: %s", error)
-        return []
-
-
 def clean_image(run: Run, truth: Truth, record: FrameRecord) -> torch.Tensor:
     """Return the noiseless exposure of a frame [H, W, C] over full scale, clipped as the sensor clips."""
-    radiance, _ = truth.radiance(record)
-    return (run.sensor.expected_dn(radiance, record.exposure_time_s) / run.sensor.white_dn).clamp(0, 1)
+    return exposed(truth.radiance(record)[0], run.sensor, record.exposure_time_s)
 
 
 def bounding_box(mask: torch.Tensor, margin_px: int) -> tuple[slice, slice]:
@@ -191,22 +191,14 @@ def bounding_box(mask: torch.Tensor, margin_px: int) -> tuple[slice, slice]:
     return slice(top, int(rows[-1]) + margin_px + 1), slice(left, int(columns[-1]) + margin_px + 1)
 
 
-def _predicted(run: Run, gaussians: Gaussians, record: FrameRecord) -> torch.Tensor:
-    exposure_s = run.metrics.get("reference_exposure_s") or record.exposure_time_s
-    return predicted_image(gaussians, run.session, record, run.sensor, exposure_s)
+def _exposure_s(run: Run, record: FrameRecord) -> float:
+    """Return the exposure that the model takes a frame's for: all alike when it was trained blind."""
+    return run.metrics.get("reference_exposure_s") or record.exposure_time_s
 
 
 def _noisy(run: Run, record: FrameRecord) -> torch.Tensor:
     dn = run.session.dn(record).astype(np.float32)
     return torch.from_numpy(dn.reshape(*dn.shape[:2], -1) / run.sensor.white_dn)
-
-
-def _radiance_psnr_db(run: Run, truth: Truth, record: FrameRecord) -> float:
-    true, _ = truth.radiance(record)
-    with torch.no_grad():
-        ours = render(run.gaussians, camera_of(run.session, record)).radiance[0]
-    brightest = true.max().clamp(min=1e-6)
-    return psnr_db(ours / brightest, true / brightest)
 
 
 def _mean(values) -> float:

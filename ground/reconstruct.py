@@ -24,9 +24,10 @@ from ground.session import FrameRecord, Session, SessionError, open_session
 from obbgs_core.cameras import Cameras
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.export_onnx import export_onnx
+from obbgs_core.frames import TrainingFrame
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.methods import MethodConfig, preset, with_quality
-from obbgs_core.optimize import StepInfo, TrainingFrame, TrainResult, train
+from obbgs_core.optimize import StepInfo, TrainResult, train
 from obbgs_core.ply import save_ply, save_surface_ply
 from obbgs_core.render import native_kernels, render
 from obbgs_core.sensor import Sensor
@@ -200,7 +201,6 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
         id=record.id,
         bracket=record.bracket,
         pose_sigma=torch.from_numpy(np.sqrt(np.clip(variances, 0, None)).astype(np.float32)),
-        sun_direction=torch.tensor(record.sun_dir_body, dtype=torch.float32),
     )
 
 
@@ -216,7 +216,11 @@ def predicted_image(
     gaussians: Gaussians, session: Session, record: FrameRecord, sensor: Sensor, exposure_time_s: float
 ) -> Tensor:
     """Return the model's image of a frame [H, W, C], expected digital numbers over full scale, 0..1."""
-    radiance = render(gaussians, camera_of(session, record)).radiance[0]
+    return exposed(render(gaussians, camera_of(session, record)).radiance[0], sensor, exposure_time_s)
+
+
+def exposed(radiance: Tensor, sensor: Sensor, exposure_time_s: float) -> Tensor:
+    """Return the noiseless image [H, W, C] of a radiance over full scale, clipped as the sensor clips."""
     return (sensor.expected_dn(radiance, exposure_time_s) / sensor.white_dn).clamp(0, 1)
 
 

@@ -10,6 +10,6 @@ except ImportError:
 
 
 def module_for(*tensors: Tensor):
-    """Return the compiled module when it is installed and all tensors are float32 on the CPU, else None."""
+    """Return the compiled module when it is installed and all tensors, if any, are float32 on the CPU, else None."""
     takes = all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors)
     return _rasterizer if takes else None

@@ -20,7 +20,6 @@ class TrainingFrame:
     """One exposure: dn [H, W, C] float, known exposure time, pose [4, 4] body to camera, K [3, 3] px.
 
     pose_sigma: deviations [6] of the pose tag, rad about and m along the camera axes; None: the pose is exact.
-    sun_direction: unit vector [3] towards the Sun, body frame; None: not known, or taken as fixed.
     """
 
     dn: Tensor
@@ -30,7 +29,6 @@ class TrainingFrame:
     id: int = 0
     bracket: int | None = None  # frames of one trigger share a pose correction
     pose_sigma: Tensor | None = None
-    sun_direction: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,9 @@
 """The training loop, readable top to bottom: frames and a method in, Gaussians out."""
 
 import dataclasses
+import functools
 import hashlib
+import io
 import json
 import logging
 import math
@@ -17,6 +19,7 @@ from obbgs_core import obb
 from obbgs_core.cameras import Cameras
 from obbgs_core.densify import Adam, Growth, densify, densify_boxes, keep, outliers, trainable
 from obbgs_core.errors import Diverged, ReconstructionError
+from obbgs_core.files import write_whole
 from obbgs_core.frames import FEWEST_FRAMES, Batch, Batches, TrainingFrame, usable
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.hull import shows_light
@@ -28,7 +31,6 @@ from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
 from obbgs_core.start import first_gaussians
 
-__all__ = ["StepInfo", "TrainResult", "Trainer", "TrainingFrame", "train"]
 log = logging.getLogger(__name__)
 CHI2_MEMORY = 0.98  # of the running chi² a step
 CHECKPOINT_EVERY_S = 20.0
@@ -200,7 +202,7 @@ class Trainer:
     def save(self, path: Path) -> None:
         """Write everything the next step depends on, whole or not at all."""
         state = {
-            "fingerprint": self._fingerprint(),
+            "fingerprint": self.fingerprint,
             "gaussians": self.gaussians.detach().tensors(),
             "adam": {"first": self.adam.first, "second": self.adam.second, "steps": self.adam.steps},
             "growth": (self.growth.gradient, self.growth.weight),
@@ -211,16 +213,16 @@ class Trainer:
             "numbers": (self.chi2, self.psnr_db, self.steps_done, self.seconds),
             "history": [dataclasses.astuple(info) for info in self.history],
         }
-        part = path.with_name(f".{path.name}.part")
-        torch.save(state, part)
-        part.replace(path)
+        content = io.BytesIO()
+        torch.save(state, content)
+        write_whole(path, content.getvalue())
 
     def resume(self, path: Path) -> bool:
         """Go on from a checkpoint of this very training; return False when there is none."""
         if not path.exists():
             return False
         state = torch.load(path, weights_only=True)
-        if state["fingerprint"] != self._fingerprint():
+        if state["fingerprint"] != self.fingerprint:
             log.warning("%s belongs to another training: it is not used", path)
             return False
         self.gaussians = trainable(Gaussians(**state["gaussians"]))
@@ -237,7 +239,9 @@ class Trainer:
         self.history = [StepInfo(*info) for info in state["history"]]
         return True
 
-    def _fingerprint(self) -> str:
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """What makes this training this one: the method, the seed, the sensor and the frames."""
         digest = hashlib.sha256(json.dumps([dataclasses.asdict(self.config), self.seed]).encode())
         digest.update(repr(self.sensor).encode())
         for f in self.frames:

@@ -1,6 +1,8 @@
 """How much light each Gaussian explains: its likelihood gain, in nats, and whether it earns its parameters."""
 
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -28,21 +30,17 @@ def likelihood_gains(
     each opacity; at the optimum the cost is half the sum of that change squared over the noise variance. The sum of
     squares over pixels is estimated without bias by back-propagating random signs (Hutchinson 1989), one draw a frame.
     """
-    chosen = range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS))
     model = gaussians.detach()
     model.opacity_logits.requires_grad_()
-    gains, values = torch.zeros(len(gaussians)), 0
-    for index in chosen:
-        batch = batches.batch([index], scale)
-        predicted = sensor.expected_dn(render(model, batch.cameras).radiance, batch.exposure_time_s)
-        sigma = (sensor.variance_dn2(predicted) / batch.averaged_pixels).sqrt()
-        weight = torch.where(batch.dn < sensor.white_dn, 1 / sigma, 0.0)  # saturated pixels measure nothing
-        signs = torch.randint(0, 2, predicted.shape, generator=rng) * 2.0 - 1
-        (slope,) = torch.autograd.grad((predicted * weight * signs).sum(), model.opacity_logits)
+    gains, values, times = torch.zeros(len(gaussians)), 0, 0.0
+    for view in _views(model, batches, sensor, scale, rng):
+        (slope,) = torch.autograd.grad(
+            (view.predicted * view.weight * view.signs).sum(), model.opacity_logits
+        )
         change = slope / (1 - model.opacities.detach()).clamp(min=1e-6)  # o d/do from the logit's derivative
         gains += 0.5 * change**2
-        values += int((predicted.detach() - sensor.black_dn > sigma).sum()) * batch.averaged_pixels
-    return gains * (len(batches.frames) / len(chosen)), values * len(batches.frames) // len(chosen)
+        values, times = values + view.values, view.times
+    return gains * times, round(values * times)
 
 
 def next_degree_gain(
@@ -56,24 +54,45 @@ def next_degree_gain(
     model = padded(gaussians.detach(), math.isqrt(old))
     model.sh.requires_grad_()
     slope, curvature = torch.zeros_like(model.sh), torch.zeros_like(model.sh)
+    values, times = 0, 0.0
+    for view in _views(model, batches, sensor, scale, rng):
+        residual = ((view.dn - view.predicted.detach()) * view.weight).clamp(-3, 3)  # robust, as the loss is
+        signal = view.predicted * view.weight
+        (g,) = torch.autograd.grad((signal * residual).sum(), model.sh, retain_graph=True)
+        (probe,) = torch.autograd.grad((signal * view.signs).sum(), model.sh)
+        slope += g
+        curvature += probe**2
+        values, times = values + view.values, view.times
+    new_slope, new_curvature = slope[:, old:], curvature[:, old:]
+    gain = times * (new_slope**2 / (2 * new_curvature.clamp(min=1e-6))).sum().item()
+    return gain, 0.5 * new_slope.numel() * math.log(max(2, values * times))
+
+
+@dataclass(frozen=True)
+class _View:
+    """One training frame as the model predicts it [1, H, W, C], with random signs to probe the likelihood with."""
+
+    predicted: Tensor  # DN, with its graph
+    dn: Tensor
+    weight: Tensor  # 1 / sigma, 0 where saturated: such pixels measure nothing
+    signs: Tensor
+    values: int  # sensor values that show the target above the noise
+    times: float  # training frames for each frame looked at
+
+
+def _views(
+    model: Gaussians, batches: Batches, sensor: Sensor, scale: float, rng: torch.Generator
+) -> Iterator[_View]:
+    """Render some of the training frames, spread evenly."""
     chosen = range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS))
-    values = 0
     for index in chosen:
         batch = batches.batch([index], scale)
         predicted = sensor.expected_dn(render(model, batch.cameras).radiance, batch.exposure_time_s)
         sigma = (sensor.variance_dn2(predicted) / batch.averaged_pixels).sqrt()
         weight = torch.where(batch.dn < sensor.white_dn, 1 / sigma, 0.0)
-        residual = ((batch.dn - predicted.detach()) * weight).clamp(-3, 3)  # robust, as the loss is
         signs = torch.randint(0, 2, predicted.shape, generator=rng) * 2.0 - 1
-        (g,) = torch.autograd.grad((predicted * weight * residual).sum(), model.sh, retain_graph=True)
-        (probe,) = torch.autograd.grad((predicted * weight * signs).sum(), model.sh)
-        slope += g
-        curvature += probe**2
-        values += int((predicted.detach() - sensor.black_dn > sigma).sum()) * batch.averaged_pixels
-    new_slope, new_curvature = slope[:, old:], curvature[:, old:]
-    times = len(batches.frames) / len(chosen)
-    gain = times * (new_slope**2 / (2 * new_curvature.clamp(min=1e-6))).sum().item()
-    return gain, 0.5 * new_slope.numel() * math.log(max(2, values * times))
+        values = int((predicted.detach() - sensor.black_dn > sigma).sum()) * batch.averaged_pixels
+        yield _View(predicted, batch.dn, weight, signs, values, len(batches.frames) / len(chosen))
 
 
 def padded(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from obbgs_core import sh
+from obbgs_core import compiled, sh
 from obbgs_core.cameras import Cameras
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.rotations import quats_to_matrices
@@ -202,12 +202,11 @@ def _backend(name: str, like: Tensor):
 @functools.lru_cache(maxsize=1)
 def native_kernels() -> tuple[str, ...]:
     """Return the compiled kernels that this processor runs, best first; empty (and one warning) without the module."""
-    try:
-        from obbgs_core import _rasterizer  # pyright: ignore[reportAttributeAccessIssue]
-    except ImportError:
+    module = compiled.module_for()
+    if module is None:
         log.warning("the compiled rasterizer is missing; rendering in plain PyTorch, tens of times slower")
         return ()
-    return tuple(_rasterizer.kernels())
+    return tuple(module.kernels())
 
 
 def composite_reference(
@@ -243,7 +242,7 @@ def composite_reference(
         after = torch.cumprod(1 - alpha, dim=-1)
         before = torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], dim=-1)
         crossing = (before > 0.5) & (after <= 0.5)
-        final = after[..., -1] if len(order) else torch.ones(dx.shape[:2], dtype=means2d.dtype)
+        final = after[..., -1].clone() if len(order) else torch.ones(dx.shape[:2], dtype=means2d.dtype)
         median = (crossing * depths[order]).sum(-1).detach()
         parts.append(((alpha * before) @ features[order], final, median))
     image, transmittance, median = (torch.cat(p) for p in zip(*parts, strict=True))
@@ -276,8 +275,6 @@ class _Native(torch.autograd.Function):
     def forward(
         ctx, means, quats, log_scales, opacity_logits, sh, world_to_camera, cameras, kernel, normals, screen
     ):
-        from obbgs_core import _rasterizer  # pyright: ignore[reportAttributeAccessIssue]
-
         inputs = (means, quats, log_scales, opacity_logits, sh, world_to_camera)
         arrays = [t.detach().float().contiguous() for t in (*inputs, cameras.K)]
         count, n, height, width = len(cameras), means.shape[0], cameras.height, cameras.width
@@ -285,7 +282,9 @@ class _Native(torch.autograd.Function):
         alpha, depth, median_depth = (torch.empty(count, height, width) for _ in range(3))
         means2d, radii = torch.empty(count, n, 2), torch.empty(count, n)
         normal_images = [torch.empty(count, height, width, 3)] if normals else []
-        rasterization = _rasterizer.Rasterization(kernel, width, height, cameras.near_m, *arrays)
+        module = compiled.module_for()
+        assert module is not None  # a kernel's name comes from it
+        rasterization = module.Rasterization(kernel, width, height, cameras.near_m, *arrays)
         rasterization.forward(
             torch.get_num_threads(),
             radiance,

@@ -1,10 +1,12 @@
 """What several packages' tests need: a mission and frames for it."""
 
+import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import skyfield.api
 
 from flightsw.icd.frame import Frame, PoseTag
 from flightsw.icd.mission import Mission, load_mission
@@ -56,3 +58,13 @@ def make_frame() -> Callable[..., Frame]:
         )
 
     return make
+
+
+@pytest.fixture(scope="session")
+def skyfield_oracle():
+    """Skyfield's time scale and its own DE421, from the file we ship."""
+    spec = importlib.util.find_spec("skyfield_data")
+    assert spec and spec.origin
+    ephemeris = skyfield.api.Loader(str(Path(spec.origin).parent / "data"))("de421.bsp")
+    yield skyfield.api.load.timescale(builtin=True), ephemeris
+    ephemeris.close()

@@ -36,8 +36,6 @@ class IsoTpChannels:
     """
 
     def __init__(self, own_ids: tuple[int, ...], other_ids: tuple[int, ...], url: LinkUrl):
-        self.messages_sent = 0
-        self.messages_received = 0
         self.messages_failed = 0  # not sent to the end: no flow control came
         self.frames_discarded = 0  # errors of reception: frames missing, repeated or out of place
         self.frames_repeated = 0  # came twice in a row
@@ -146,7 +144,6 @@ class IsoTpChannels:
                 "rx_flowcontrol_timeout", self._answer_ms(len(self._channels) * len(message)), validate=False
             )
             idle[0].send(message)
-            self.messages_sent += 1
             started = True
             if len(message) <= self._single_bytes:
                 break  # it takes the channel until it is processed
@@ -158,7 +155,6 @@ class IsoTpChannels:
         while self._incoming:
             channel.process()
         while (message := channel.recv()) is not None:
-            self.messages_received += 1
             received += message + DELIMITER
         return bytes(received)
 

@@ -18,9 +18,10 @@ from torch import Tensor
 from obbgs_core import optimize
 from obbgs_core.cameras import Cameras
 from obbgs_core.densify import Adam, trainable
+from obbgs_core.frames import TrainingFrame
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.methods import MethodConfig, preset
-from obbgs_core.optimize import Trainer, TrainingFrame
+from obbgs_core.optimize import Trainer
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 from tests.benchmarks.rasterizer import camera, scene

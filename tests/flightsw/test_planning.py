@@ -1,14 +1,13 @@
 """The plan of a pass: light, eclipses and expected counts, against skyfield and the sensor."""
 
 import dataclasses
-import importlib.util
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
 from skyfield.almanac import find_discrete
-from skyfield.api import EarthSatellite, Loader, load
+from skyfield.api import EarthSatellite
 
 from flightsw.icd.mission import load_mission
 from flightsw.orbit import shadow_crossings
@@ -23,28 +22,21 @@ ISS = (  # crosses the shadow each revolution; published elements of 2008-09-20
 )
 
 
-@pytest.fixture(scope="module")
-def sky():
-    spec = importlib.util.find_spec("skyfield_data")
-    assert spec and spec.origin
-    ephemeris = Loader(str(Path(spec.origin).parent / "data"))("de421.bsp")
-    yield load.timescale(builtin=True), ephemeris
-    ephemeris.close()
-
-
 def skyfield_time(timescale, utc_ns: int):
     return timescale.from_datetime(datetime.fromtimestamp(utc_ns / 1e9, UTC))
 
 
-def test_shadow_crossings_of_a_day_match_skyfield_to_three_seconds(sky):
+def test_shadow_crossings_of_a_day_match_skyfield_to_three_seconds(skyfield_oracle):
     start_ns, end_ns = 1_221_913_540_000_000_000, 1_221_913_540_000_000_000 + 12 * 3600 * 10**9
-    satellite = EarthSatellite(*ISS, ts=sky[0])
+    satellite = EarthSatellite(*ISS, ts=skyfield_oracle[0])
 
     def dark(t):
-        return (~satellite.at(t).is_sunlit(sky[1])).astype(int)
+        return (~satellite.at(t).is_sunlit(skyfield_oracle[1])).astype(int)
 
     dark.step_days = 0.0005
-    times, values = find_discrete(skyfield_time(sky[0], start_ns), skyfield_time(sky[0], end_ns), dark)
+    times, values = find_discrete(
+        skyfield_time(skyfield_oracle[0], start_ns), skyfield_time(skyfield_oracle[0], end_ns), dark
+    )
     expected = [(t.utc_datetime().timestamp(), bool(v)) for t, v in zip(times, values, strict=True)]
     ours = shadow_crossings(ISS, start_ns, end_ns)
     assert len(ours) == len(expected) > 12
@@ -53,17 +45,18 @@ def test_shadow_crossings_of_a_day_match_skyfield_to_three_seconds(sky):
         assert enters == their_enters and abs(our_ns / 1e9 - their_s) < 3
 
 
-def test_range_phase_and_sun_angle_match_skyfield(sky):
+def test_range_phase_and_sun_angle_match_skyfield(skyfield_oracle):
     planned = pass_plan(MISSION).brackets
     satellites = [
-        EarthSatellite(*tle, ts=sky[0]) for tle in (MISSION.orbit.target_tle, MISSION.orbit.chaser_tle)
+        EarthSatellite(*tle, ts=skyfield_oracle[0])
+        for tle in (MISSION.orbit.target_tle, MISSION.orbit.chaser_tle)
     ]
     for bracket in planned[::13]:
         time = skyfield_time(
-            sky[0], round(datetime.fromisoformat(bracket.utc).timestamp() * 1000) * 1_000_000
+            skyfield_oracle[0], round(datetime.fromisoformat(bracket.utc).timestamp() * 1000) * 1_000_000
         )
         target, chaser = (s.at(time).xyz.m for s in satellites)
-        to_sun = (sky[1]["sun"] - sky[1]["earth"]).at(time).xyz.m
+        to_sun = (skyfield_oracle[1]["sun"] - skyfield_oracle[1]["earth"]).at(time).xyz.m
         to_sun /= np.linalg.norm(to_sun)
         line = chaser - target
         assert abs(bracket.range_m - np.linalg.norm(line)) < 0.02  # a centimetre each of rounding and frames

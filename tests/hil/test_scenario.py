@@ -1,12 +1,10 @@
 """The ready-made scenarios, and their geometry and light against skyfield."""
 
-import importlib.util
 from datetime import UTC, datetime
-from pathlib import Path
 
 import numpy as np
 import pytest
-from skyfield.api import EarthSatellite, Loader, load
+from skyfield.api import EarthSatellite
 
 from flightsw.icd.mission import ConfigError, Mission, TargetAttitudeSection
 from flightsw.pose import pose_tag
@@ -15,22 +13,13 @@ from hil.scenario import SCENARIOS, Scenario, Sky, describe, load_scenario
 NAMES = ["approach", "eclipse", "fly-around", "sparse", "tumbling", "v-bar"]
 
 
-@pytest.fixture(scope="module")
-def oracle():
-    spec = importlib.util.find_spec("skyfield_data")
-    assert spec and spec.origin
-    ephemeris = Loader(str(Path(spec.origin).parent / "data"))("de421.bsp")
-    yield load.timescale(builtin=True), ephemeris
-    ephemeris.close()
-
-
 def test_the_ready_made_scenarios_are_these():
     assert sorted(path.stem for path in SCENARIOS.glob("*.yaml")) == NAMES
 
 
 @pytest.mark.parametrize("name", ["fly-around", "approach"])
-def test_range_phase_angle_sun_and_eclipse_match_skyfield(oracle, name):
-    timescale, ephemeris = oracle
+def test_range_phase_angle_sun_and_eclipse_match_skyfield(skyfield_oracle, name):
+    timescale, ephemeris = skyfield_oracle
     scenario = load_scenario(name)
     sky = Sky(scenario)
     target, chaser = (
@@ -56,8 +45,8 @@ def test_range_phase_angle_sun_and_eclipse_match_skyfield(oracle, name):
         assert body_angle == pytest.approx(earth @ sun_m / np.linalg.norm(sun_m), abs=2e-4)
 
 
-def test_the_eclipse_scenario_enters_and_leaves_the_shadow_when_skyfield_says(oracle):
-    timescale, ephemeris = oracle
+def test_the_eclipse_scenario_enters_and_leaves_the_shadow_when_skyfield_says(skyfield_oracle):
+    timescale, ephemeris = skyfield_oracle
     sky = Sky(load_scenario("eclipse"))
     target = EarthSatellite(*sky.orbit.target_tle, ts=timescale)
     times_s = np.arange(0, 5690, 10)
