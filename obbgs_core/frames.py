@@ -40,6 +40,7 @@ class Batch:
     dn: Tensor  # [B, H, W, C]
     exposure_time_s: Tensor  # [B, 1, 1, 1]
     averaged_pixels: int  # sensor pixels in one pixel of dn
+    sky: Tensor | None = None  # [B, H, W] share of each pixel that is seen to be empty, where anyone looked
 
 
 def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[TrainingFrame], float | None]:
@@ -79,6 +80,7 @@ class Batches:
         self.waiting: list[list[int]] = [[] for _ in self.groups]
         self.turn = 0
         self.levels: dict[int, list[Tensor]] = {}
+        self.sky: dict[int, Tensor] = {}  # [H, W] bool of some of the frames, by index
 
     def state(self) -> dict:
         return {"waiting": [list(w) for w in self.waiting], "turn": self.turn}
@@ -114,7 +116,15 @@ class Batches:
             torch.stack([self.levels[factor][i] for i in indices]),
             torch.tensor([f.exposure_time_s for f in frames]).view(-1, 1, 1, 1),
             factor * factor,
+            torch.stack([self._sky(i, factor) for i in indices]) if self.sky else None,
         )
+
+    def _sky(self, index: int, factor: int) -> Tensor:
+        """Return a frame's share of empty sky at a scale [H, W]; 0 where nobody looked."""
+        height, width = self.levels[factor][index].shape[:2]
+        if index not in self.sky:
+            return torch.zeros(height, width)
+        return F.avg_pool2d(self.sky[index][None].float(), factor, ceil_mode=True)[0]
 
 
 def _shrunk(dn: Tensor, factor: int) -> Tensor:

@@ -12,9 +12,13 @@ from obbgs_core.sensor import Sensor
 
 log = logging.getLogger(__name__)
 SURE_SIGMA = 5.5  # of a window's mean: certainly light; sizes the target
+SKY_SIGMA = 1.0  # of a 9x9 window's mean: no more is empty sky
+BRIGHT_SIGMA = 4.0  # of a single pixel
+EDGE_SIGMA = 1.5  # of a single pixel beside brighter ones
 LIKELY_SIGMA = 2.0  # perhaps light; enough for a vote, since one view in twenty may be wrong
 WINDOWS_PX = (3, 5, 9, 15)  # wide ones find shadowed faces that no single pixel shows
 FEWEST_BRIGHT_PX = 4  # of the target, for a frame to be of use
+FEWEST_CHOSEN = 3  # pixels of a window
 SPECK = 0.4  # a sure pixel with fewer sure neighbours (share of 3x3) is noise
 INSIDE = 0.9995  # share of all sure pixels that the target's radius must reach
 AGREEMENT = 0.95  # share of views that must see light where a voxel projects
@@ -26,10 +30,14 @@ VOXELS_AT_ONCE = 1_000_000
 
 @dataclass(frozen=True)
 class Silhouette:
-    """Where one frame sees light: surely (few false alarms) and likely (few misses), [H, W] bool each."""
+    """Where one frame sees light: surely (few false alarms), likely (few misses), not even a hint; [H, W] bool each.
+
+    A third of the empty sky counts as `sky`, and of a face whose light is twice the noise of 5x5 pixels one in fifty.
+    """
 
     sure: Tensor
     likely: Tensor
+    sky: Tensor
     world_to_camera: Tensor
     K: Tensor
 
@@ -40,16 +48,29 @@ def silhouette(
     """Return the pixels of dn [H, W, C] that are brighter than noise, grown by `dilate_px` for pose errors."""
     sky_dn, sigma_dn = _dark_reading(sensor)
     sigma_dn /= math.sqrt(dn.shape[2])
-    signal = (dn.mean(dim=-1) - sky_dn)[None, None]
-    means = {w: F.avg_pool2d(signal, w, 1, w // 2) * (w / sigma_dn) for w in WINDOWS_PX}  # in sigmas
-    sure, likely = torch.zeros_like(signal, dtype=torch.bool), torch.zeros_like(signal, dtype=torch.bool)
-    for mean in means.values():  # light is there, not only nearby
-        sure |= (mean > SURE_SIGMA) & (means[3] > LIKELY_SIGMA)
-        likely |= (mean > LIKELY_SIGMA) & (means[3] > 0)
+    signal = ((dn.mean(dim=-1) - sky_dn) / sigma_dn)[None, None]  # in sigmas
+    bright = signal > BRIGHT_SIGMA
+    sure, likely = torch.zeros_like(bright), bright.clone()
+    means = {w: F.avg_pool2d(signal, w, 1, w // 2) * w for w in WINDOWS_PX}
+    faint = {
+        w: _mean_of(signal, ~bright, w) for w in WINDOWS_PX
+    }  # what is bright does not light its neighbours
+    for w in WINDOWS_PX:  # light is there, not only nearby
+        sure |= (means[w] > SURE_SIGMA) & (means[3] > LIKELY_SIGMA)
+        likely |= (faint[w] > LIKELY_SIGMA) & (faint[5] > 0)
+    likely |= (means[3] > SURE_SIGMA) & (signal > EDGE_SIGMA)
     sure &= F.avg_pool2d(sure.float(), 3, 1, 1) > SPECK
+    lit = likely | (faint[5] > 0) | (faint[9] > SKY_SIGMA)
     size = 2 * dilate_px + 1
-    likely = F.max_pool2d(likely.float(), size, 1, dilate_px) > 0
-    return Silhouette(sure[0, 0], likely[0, 0], world_to_camera, K)
+    likely, lit = (F.max_pool2d(mask.float(), size, 1, dilate_px) > 0 for mask in (likely, lit))
+    return Silhouette(sure[0, 0], likely[0, 0], ~lit[0, 0], world_to_camera, K)
+
+
+def _mean_of(signal: Tensor, chosen: Tensor, window: int) -> Tensor:
+    """Return the mean of the chosen pixels around each [1, 1, H, W], in sigmas of that mean; 0 where they are few."""
+    share = F.avg_pool2d(chosen.float(), window, 1, window // 2)
+    total = F.avg_pool2d(signal * chosen, window, 1, window // 2) * window
+    return torch.where(share * window**2 > FEWEST_CHOSEN - 0.5, total / share.clamp(min=1e-6).sqrt(), 0.0)
 
 
 def shows_light(dn: Tensor, sensor: Sensor) -> bool:

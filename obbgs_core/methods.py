@@ -51,6 +51,9 @@ class MethodConfig:
     poses_from: float = 0.3  # share of the steps: before, the model is too coarse to correct anything
     sh_weight: float = 0.0  # on the mean square of what turns with the view: a prior for matt surface
     flat_weight: float = 0.0  # on the mean shortest scale: flat Gaussians are surface
+    sky_weight: float = (
+        0.0  # on the alpha of pixels that show no light: space is empty where nothing says otherwise
+    )
     solid_weight: float = 0.0  # on opacity·(1 - opacity): solid or gone
     solid_from: float = 0.5  # share of the steps
     weigh_at: tuple[float, ...] = ()  # shares of the steps at which each Gaussian must earn its parameters
@@ -120,6 +123,7 @@ PRESETS: dict[str, MethodConfig] = {
             lr_end=0.2,
             sh_weight=1.0,
             flat_weight=3.0,
+            sky_weight=0.2,
             weigh_at=(0.3, 0.5, 0.7, 0.85),
             keep_opacity=0.5,
             most_sh_degree=1,

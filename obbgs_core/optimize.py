@@ -29,7 +29,7 @@ from obbgs_core.parsimony import likelihood_gains, next_degree_gain, padded, pri
 from obbgs_core.poses import PoseCorrections
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
-from obbgs_core.start import first_gaussians
+from obbgs_core.start import first_gaussians, silhouettes
 
 log = logging.getLogger(__name__)
 CHI2_MEMORY = 0.98  # of the running chi² a step
@@ -118,10 +118,15 @@ class Trainer:
                 config, max_gaussians=most, start_count=min(config.start_count, most)
             )
             self.config = config
-        self.gaussians, self.radius, self.start = first_gaussians(self.frames, sensor, config, self.rng)
+        outlines = silhouettes(self.frames, sensor)
+        self.gaussians, self.radius, self.start = first_gaussians(
+            self.frames, list(outlines.values()), sensor, config, self.rng
+        )
         self.adam = Adam(self.gaussians)
         self.growth = Growth(len(self.gaussians), config.pixel_weighted)
         self.batches = Batches(self.frames, config, self.rng)
+        if config.sky_weight:
+            self.batches.sky = {i: outline.sky for i, outline in outlines.items()}
         self.poses = PoseCorrections(self.frames) if config.refine_poses else None
         self.boxes: list[obb.Obb] = []
         self.chi2, self.psnr_db, self.steps_done = math.nan, math.nan, 0
@@ -141,7 +146,7 @@ class Trainer:
         loss, residual = _image_loss(rendered, batch, self.sensor, config)
         if not torch.isfinite(loss):
             raise Diverged(self.steps_done, loss.item())
-        (loss + self._priors(batch, share)).backward()
+        (loss + self._priors(batch, share, rendered)).backward()
         if config.grow_from <= share < config.grow_until:
             self._observe(rendered, batch, residual)
         self.adam.step(self.gaussians, _rates(config, share, self.radius))
@@ -257,11 +262,13 @@ class Trainer:
         corrected = self.poses.corrected(batch.indices, batch.cameras.world_to_camera)
         return dataclasses.replace(batch.cameras, world_to_camera=corrected)
 
-    def _priors(self, batch: Batch, share: float) -> Tensor:
+    def _priors(self, batch: Batch, share: float, rendered: Rendered) -> Tensor:
         """Return what is asked of the Gaussians besides the images: thin ones, solid or absent ones, likely poses."""
         config, total = self.config, torch.zeros(())
         if config.sh_weight and self.gaussians.sh.shape[1] > 1:
             total = total + config.sh_weight * self.gaussians.sh[:, 1:].square().mean()
+        if batch.sky is not None:
+            total = total + config.sky_weight * (rendered.alpha * batch.sky).mean()
         if config.flat_weight:
             total = total + config.flat_weight * self.gaussians.scales.amin(dim=1).mean() / self.radius
         if config.solid_weight and share >= config.solid_from:

@@ -22,16 +22,21 @@ VIEWS_FOR_COLOUR = 24
 MOST_DILATION_PX = 8
 
 
-def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> list[hull.Silhouette]:
-    """Return silhouettes of the longest exposures, grown by the pose error: shadowed faces are brightest there.
+def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.Silhouette]:
+    """Return silhouettes of the longest exposures by the frame's index, grown by the pose error.
 
-    Where they are few the next longest join in: a view that misses a shadowed face does less harm than no view.
+    Shadowed faces are brightest there. Where they are few the next longest join in: a view that misses a shadowed face
+    does less harm than no view.
     """
-    chosen: list[TrainingFrame] = []
+    chosen: list[int] = []
     for exposure_s in sorted({f.exposure_time_s for f in frames}, reverse=True):
         if len(chosen) < FEWEST_VIEWS:
-            chosen += [f for f in frames if f.exposure_time_s == exposure_s]
-    return [hull.silhouette(f.dn, sensor, f.world_to_camera, f.K, _pose_error_px(f)) for f in chosen]
+            chosen += [i for i, f in enumerate(frames) if f.exposure_time_s == exposure_s]
+    outlines = {}
+    for i in chosen:
+        f = frames[i]
+        outlines[i] = hull.silhouette(f.dn, sensor, f.world_to_camera, f.K, _pose_error_px(f))
+    return outlines
 
 
 def _pose_error_px(frame: TrainingFrame) -> int:
@@ -44,14 +49,20 @@ def _pose_error_px(frame: TrainingFrame) -> int:
 
 
 def first_gaussians(
-    frames: list[TrainingFrame], sensor: Sensor, config: MethodConfig, rng: torch.Generator
+    frames: list[TrainingFrame],
+    outlines: list[hull.Silhouette],
+    sensor: Sensor,
+    config: MethodConfig,
+    rng: torch.Generator,
 ) -> tuple[Gaussians, float, str]:
     """Return the first Gaussians, the target's radius (m), and where the Gaussians came from.
+
+    Args:
+        outlines: of some of the frames.
 
     Raises:
         ReconstructionError: every frame is black.
     """
-    outlines = silhouettes(frames, sensor)
     radius = hull.radius_m(outlines)
     if radius == 0:
         raise ReconstructionError(

@@ -15,11 +15,12 @@ from obbgs_core.rotations import quats_to_matrices
 
 BLACKEST = 3e-4  # of the bright surface's radiance; fainter Gaussians show no light, so no surface was measured there
 BRIGHT_QUANTILE = 0.97
-STEEPEST = 4.0  # tangent of the largest angle between line of sight and normal, 76 degrees
+STEEPEST = 4.0  # tangent of the largest angle between line of sight and a Gaussian's normal, 76 degrees
+STEEPEST_DEPTH = 16.0  # the same of the depth map itself; steeper is an edge
 SAME_DEPTH_PX = 2.0  # depths agree within so many pixels' width
 AGREEING_VIEWS = 2  # that must see a point, besides its own
 NORMAL_NEIGHBOURS = 64  # fewer follow the noise of the depth maps, more round the edges off
-CANDIDATES = 400_000  # pixels that are looked up in every view
+CANDIDATES = 600_000  # pixels that are looked up in every view
 
 
 @torch.no_grad()
@@ -95,8 +96,19 @@ def depth_map(gaussians: Gaussians, camera: Cameras) -> tuple[Tensor, Tensor]:
     slope = _slopes(gaussians, camera)[stopping]  # [H, W, 2]
     v, u = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     from_centre = torch.stack([u, v], dim=-1) - projected.means2d[0][stopping]
-    depth = median + (slope * from_centre).sum(dim=-1)
+    depth = median + (slope * from_centre).sum(dim=-1) - _half_depths(gaussians, camera)[stopping]
     return torch.where((median > 0) & (depth > camera.near_m), depth, torch.inf), slope
+
+
+def _half_depths(gaussians: Gaussians, camera: Cameras) -> Tensor:
+    """Return one deviation of each Gaussian along its ray [N] m: a solid's surface lies so far before the peak."""
+    R, t = camera.world_to_camera[0, :3, :3], camera.world_to_camera[0, :3, 3]
+    p = gaussians.means @ R.T + t
+    axes = R @ quats_to_matrices(gaussians.quats)
+    along = (axes.transpose(1, 2) @ p[..., None])[
+        ..., 0
+    ] / gaussians.scales  # the ray in each Gaussian's sigmas
+    return p[:, 2] / along.norm(dim=1)
 
 
 def _slopes(gaussians: Gaussians, camera: Cameras) -> Tensor:
@@ -189,7 +201,7 @@ def _candidates(
 ) -> tuple[Tensor, float]:
     """Return pixels on no depth edge [P, 5] (u, v, depth, slopes), at most `limit`, and the share that they are."""
     pixel_m = depth / K[0, 0]
-    flat = depth.isfinite() & (far - near <= 2 * STEEPEST * pixel_m)  # across two pixels
+    flat = depth.isfinite() & (far - near <= 2 * STEEPEST_DEPTH * pixel_m)  # across two pixels
     flat &= slope.norm(dim=-1) < 0.99 * STEEPEST * pixel_m  # not held to it
     rows, columns = torch.nonzero(flat, as_tuple=True)
     chosen = torch.randperm(len(rows), generator=generator)[:limit]

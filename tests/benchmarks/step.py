@@ -123,7 +123,7 @@ def frames(distance: float) -> list[TrainingFrame]:
     return out
 
 
-def first_gaussians(_frames, _sensor, config: MethodConfig, _rng) -> tuple[Gaussians, float, str]:
+def first_gaussians(_frames, _outlines, _sensor, config: MethodConfig, _rng) -> tuple[Gaussians, float, str]:
     """Return the frames' own Gaussians, with as many colour coefficients as the method has, and their radius, m."""
     truth = scene(GAUSSIANS)
     coefficients = torch.zeros(GAUSSIANS, (config.sh_degree + 1) ** 2, 3)

@@ -16,6 +16,7 @@ from obbgs_core.gaussians import Gaussians
 from obbgs_core.methods import PRESETS, preset
 from obbgs_core.metrics import cloud_distances
 from obbgs_core.rotations import multiply, quats_to_matrices
+from obbgs_core.sensor import Sensor
 
 
 def model(count: int, sh_count: int = 1, channels: int = 1, seed: int = 0) -> Gaussians:
@@ -75,12 +76,27 @@ def test_the_hull_of_a_ball_is_its_surface():
         pose = torch.eye(4)
         pose[:3, :3] = torch.tensor(rotation, dtype=torch.float32)
         pose[2, 3] = 5.0
-        silhouettes.append(hull.Silhouette(mask, mask, pose, K))
+        silhouettes.append(hull.Silhouette(mask, mask, ~mask, pose, K))
     assert hull.radius_m(silhouettes) == pytest.approx(1.05 * radius_px / 100 * 5, rel=0.05)
     points, _voxel_m = hull.hull_points(silhouettes, hull.radius_m(silhouettes))
     distance = points.norm(dim=1)
     # 40 outlines bound the ball from outside; a pixel is 5 cm, a voxel 0.8 cm; the vote lets corners stand out
     assert len(points) > 1000 and distance.min() > 0.9 and distance.median() < 1.08
+
+
+def test_light_does_not_leak_into_the_dark_and_a_faint_face_is_found():
+    sensor = Sensor(0.0, 255.0, 1e7, 1e9, 6.4)
+    generator = np.random.default_rng(5)
+    signal = np.zeros((120, 160, 3))
+    signal[30:90, 20:60] = 180.0  # lit
+    signal[30:90, 60:110] = 4.0  # in shadow: under one sigma of a pixel
+    dn = torch.from_numpy(np.clip(np.round(signal + generator.normal(0, 6.4, signal.shape)), 0, 255)).float()
+    seen = hull.silhouette(dn, sensor, torch.eye(4), torch.eye(3))
+    assert seen.sure[30:90, 20:60].all()
+    assert seen.likely[32:88, 20:108].float().mean() > 0.98  # most of the faint face
+    assert seen.likely[30:90, :18].float().mean() < 0.2  # two pixels beside the lit face only noise is left
+    assert seen.sky[32:88, 20:108].float().mean() < 0.02 and not (seen.sky & seen.likely).any()
+    assert 0.2 < seen.sky[:, 120:].float().mean() < 0.6
 
 
 def test_views_that_disagree_leave_no_hull():
@@ -92,7 +108,7 @@ def test_views_that_disagree_leave_no_hull():
         mask = torch.zeros(100, 100, dtype=torch.bool)
         row, column = rng.integers(10, 80, 2)
         mask[row : row + 8, column : column + 8] = True
-        silhouettes.append(hull.Silhouette(mask, mask, pose, K))
+        silhouettes.append(hull.Silhouette(mask, mask, ~mask, pose, K))
     points, _ = hull.hull_points(silhouettes, 2.0)
     assert len(points) == 0
 
