@@ -20,7 +20,7 @@ from obbgs_core.cameras import Cameras
 from obbgs_core.densify import Adam, Growth, densify, densify_boxes, keep, outliers, trainable
 from obbgs_core.errors import Diverged, ReconstructionError
 from obbgs_core.files import write_whole
-from obbgs_core.frames import FEWEST_FRAMES, Batch, Batches, TrainingFrame, usable
+from obbgs_core.frames import FEWEST_FRAMES, Batch, Batches, TrainingFrame, sun_span_deg, usable
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.hull import shows_light
 from obbgs_core.losses import fit_figures, likelihood_loss, published_loss
@@ -58,6 +58,8 @@ class TrainResult:
     reference_exposure_s: float | None = None  # what every exposure was taken for when exposure is ignored
     removed_outliers: int = 0
     dark_frames: int = 0  # left out: nothing in them rises above the noise
+    sun_span_deg: float = 0.0  # largest angle between two frames' Suns, body frame
+    appearance: str = ""  # what the radiance turns with, and why
     seconds: float = 0.0
 
 
@@ -119,6 +121,10 @@ class Trainer:
             )
             self.config = config
         self.gaussians, self.radius, self.start = first_gaussians(self.frames, sensor, config, self.rng)
+        self.sun_span_deg = sun_span_deg(self.frames)
+        self.appearance = (
+            "constant" if self.gaussians.sh.shape[1] == 1 else "turns with the view, as configured"
+        )
         self.adam = Adam(self.gaussians)
         self.growth = Growth(len(self.gaussians), config.pixel_weighted)
         self.batches = Batches(self.frames, config, self.rng)
@@ -196,6 +202,8 @@ class Trainer:
             self.reference_exposure_s,
             removed,
             self.dark_frames,
+            self.sun_span_deg,
+            self.appearance,
             self.seconds,
         )
 
@@ -203,7 +211,8 @@ class Trainer:
         """Write everything the next step depends on, whole or not at all."""
         state = {
             "fingerprint": self.fingerprint,
-            "gaussians": self.gaussians.detach().tensors(),
+            "gaussians": dataclasses.asdict(self.gaussians.detach()),
+            "appearance": self.appearance,
             "adam": {"first": self.adam.first, "second": self.adam.second, "steps": self.adam.steps},
             "growth": (self.growth.gradient, self.growth.weight),
             "boxes": [(box.centre, box.axes, box.half_extents) for box in self.boxes],
@@ -225,7 +234,7 @@ class Trainer:
         if state["fingerprint"] != self.fingerprint:
             log.warning("%s belongs to another training: it is not used", path)
             return False
-        self.gaussians = trainable(Gaussians(**state["gaussians"]))
+        self.gaussians, self.appearance = trainable(Gaussians(**state["gaussians"])), state["appearance"]
         self.adam.first, self.adam.second = state["adam"]["first"], state["adam"]["second"]
         self.adam.steps = state["adam"]["steps"]
         self.growth = Growth(len(self.gaussians), self.config.pixel_weighted)
@@ -248,7 +257,9 @@ class Trainer:
             digest.update(
                 f.dn.numpy().tobytes() + f.world_to_camera.numpy().tobytes() + f.K.numpy().tobytes()
             )
-            digest.update(repr(f.exposure_time_s).encode())
+            digest.update(
+                repr((f.exposure_time_s, None if f.sun_dir is None else f.sun_dir.tolist())).encode()
+            )
         return digest.hexdigest()
 
     def _cameras(self, batch: Batch) -> Cameras:
@@ -260,7 +271,7 @@ class Trainer:
     def _priors(self, batch: Batch, share: float) -> Tensor:
         """Return what is asked of the Gaussians besides the images: thin ones, solid or absent ones, likely poses."""
         config, total = self.config, torch.zeros(())
-        if config.sh_weight and self.gaussians.sh.shape[1] > 1:
+        if config.sh_weight and self.gaussians.sh.shape[1] > 1 and self.gaussians.sh_direction == "view":
             total = total + config.sh_weight * self.gaussians.sh[:, 1:].square().mean()
         if config.flat_weight:
             total = total + config.flat_weight * self.gaussians.scales.amin(dim=1).mean() / self.radius
@@ -303,11 +314,19 @@ class Trainer:
         if config.opacity_reset_interval and growing and now % config.opacity_reset_interval == 0:
             with torch.no_grad():
                 self.gaussians.opacity_logits.clamp_(max=math.log(0.01 / 0.99))
+        scale = math.sqrt(1 / batch.averaged_pixels)
         if any(now == round(at * config.steps) for at in config.weigh_at):
-            self._weigh(math.sqrt(1 / batch.averaged_pixels))
+            self._weigh(scale)
+            self._raise_degree(scale)
+        elif self._sun_moves and now == round(config.sun_from * config.steps):
+            self._raise_degree(scale)
+
+    @property
+    def _sun_moves(self) -> bool:
+        return 0 < self.config.sun_span_deg < self.sun_span_deg
 
     def _weigh(self, scale: float) -> None:
-        """Remove the Gaussians that do not earn their parameters; raise the harmonics' degree if that would pay."""
+        """Remove the Gaussians that do not earn their parameters."""
         gains, values = likelihood_gains(self.gaussians, self.batches, self.sensor, scale, self.rng)
         earning = gains >= self.config.price_factor * price(self.gaussians, values)
         earning |= self.gaussians.opacities.detach() > self.config.keep_opacity
@@ -316,19 +335,29 @@ class Trainer:
             self.gaussians = keep(self.gaussians, self.adam, earning)
             self.growth, self.boxes = Growth(len(self.gaussians), self.config.pixel_weighted), []
             log.info("step %d: %d Gaussians did not earn their parameters", self.steps_done + 1, removed)
+
+    def _raise_degree(self, scale: float) -> None:
+        """Raise the harmonics' degree if that would pay; the first that does turns with the view or a moving Sun."""
         degree = math.isqrt(self.gaussians.sh.shape[1])
-        if degree <= self.config.most_sh_degree:
-            gain, cost = next_degree_gain(self.gaussians, self.batches, self.sensor, scale, self.rng)
-            log.info(
-                "step %d: degree %d would gain %.0f nats at a price of %.0f",
-                self.steps_done + 1,
-                degree,
-                gain,
-                cost,
-            )
-            if gain > cost:
-                self.gaussians = trainable(padded(self.gaussians, degree))
-                self.adam.widen(self.gaussians)
+        if degree > self.config.most_sh_degree:
+            return
+        candidates, best, tested = [self.gaussians], None, []
+        if degree == 1 and self._sun_moves:
+            candidates.append(dataclasses.replace(self.gaussians, sh_direction="sun"))
+        most = 0.0
+        for candidate in candidates:
+            gain, cost = next_degree_gain(candidate, self.batches, self.sensor, scale, self.rng)
+            tested.append(f"with the {candidate.sh_direction} {gain:.0f} nats at a price of {cost:.0f}")
+            if gain - cost > most:
+                best, most = candidate, gain - cost
+        what = f"turns with the {best.sh_direction}" if best else self.appearance.split(":")[0]
+        self.appearance = (
+            f"{what}: at step {self.steps_done + 1} degree {degree} would gain {', '.join(tested)}"
+        )
+        log.info("radiance %s", self.appearance)
+        if best is not None:
+            self.gaussians = trainable(padded(best, degree))
+            self.adam.widen(self.gaussians)
 
     def _look(self, rendered: Rendered, batch: Batch) -> None:
         """Keep the running chi² on the target, and the PSNR of this step's frames."""

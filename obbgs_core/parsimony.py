@@ -1,5 +1,6 @@
 """How much light each Gaussian explains: its likelihood gain, in nats, and whether it earns its parameters."""
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -99,4 +100,4 @@ def padded(gaussians: Gaussians, degree: int) -> Gaussians:
     """Return the same Gaussians with room for spherical harmonics up to `degree`, the new ones zero."""
     count = (degree + 1) ** 2
     room = torch.zeros(len(gaussians), count - gaussians.sh.shape[1], gaussians.sh.shape[2])
-    return Gaussians(**{**gaussians.tensors(), "sh": torch.cat([gaussians.sh, room], dim=1)})
+    return dataclasses.replace(gaussians, sh=torch.cat([gaussians.sh, room], dim=1))
