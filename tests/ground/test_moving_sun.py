@@ -23,11 +23,12 @@ from ground.session import SessionWriter, open_session
 from obbgs_core.cameras import Cameras
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.export_onnx import export_onnx
-from obbgs_core.frames import TrainingFrame, sun_span_deg
+from obbgs_core.frames import Batches, TrainingFrame, sun_span_deg
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.methods import preset
 from obbgs_core.metrics import psnr_db
 from obbgs_core.optimize import Trainer, train
+from obbgs_core.parsimony import next_degree_gain
 from obbgs_core.ply import display_sh, load_ply, save_ply
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
@@ -180,6 +181,32 @@ def test_the_span_is_the_largest_angle_between_two_suns(angle_deg):
         Trainer(
             [*lit[:2], dataclasses.replace(lit[2], sun_dir=torch.ones(3))], SENSOR, preset("obbgs", **QUICK)
         )
+
+
+def shown(model: Gaussians, spread_deg: float) -> list[TrainingFrame]:
+    """Return noisy frames of a model, their Suns within a cone of `spread_deg` about z."""
+    rng, frames = np.random.default_rng(3), []
+    for i, (pose, _) in enumerate(views(24, still=True)):
+        off = rng.normal(size=2) * math.tan(math.radians(spread_deg / 2)) / 2
+        sun = torch.nn.functional.normalize(torch.tensor([*off, 1.0]), dim=0).float()
+        world_to_camera, matrix = torch.tensor(pose).float(), torch.tensor(K).float()
+        camera = Cameras(world_to_camera[None], matrix[None], SIZE_PX, SIZE_PX, sun_dir=sun[None])
+        dn = read_out(render(model, camera).radiance[0].numpy(), 1e-4, rng)
+        frames.append(
+            TrainingFrame(torch.from_numpy(dn).float(), 1e-4, world_to_camera, matrix, i, sun_dir=sun)
+        )
+    return frames
+
+
+def test_light_that_follows_the_sun_asks_for_its_harmonics_and_constant_light_does_not():
+    lit = lit_model(8, channels=1, seed=2)
+    lit.opacity_logits[:], lit.log_scales[:] = 2.0, -1.5
+    lit.sh[:, 0] = 2.0
+    plain = dataclasses.replace(lit, sh=lit.sh[:, :1])
+    for truth, spread_deg, pays in ((lit, 60, True), (plain, 60, False), (plain, 8, False)):
+        batches = Batches(shown(truth, spread_deg), preset("obbgs"), torch.Generator().manual_seed(0))
+        gain, cost = next_degree_gain(plain, batches, SENSOR, 1.0, torch.Generator().manual_seed(0))
+        assert (gain > cost) == pays, (gain, cost)
 
 
 def test_a_killed_training_under_the_sun_resumes_to_the_same_bits(moving, under_the_sun, tmp_path):
