@@ -338,7 +338,7 @@ class Trainer:
 
         A Sun that moves goes first: it is known to change what is seen. Of two score tests the larger gain is no guide:
         each frame has one view and one Sun, so either explains much of the other, and neighbours' gains are counted
-        twice (a tumbling target, view by 1.66 to 1.52 Mnats: 30.6 dB on held-out views; with the Sun 33.8 dB).
+        twice (a tumbling target, view by 1.66 to 1.52 Mnats: 30.6 dB on held-out views; with the Sun 33.9 dB).
         """
         degree = math.isqrt(self.gaussians.sh.shape[1])
         if degree > self.config.most_sh_degree:
