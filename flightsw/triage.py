@@ -22,6 +22,7 @@ TILE_ROWS, TILE_COLUMNS = 20, 40  # px, as in the ground's densification
 FACTS = ("black_dn", "white_dn", "dn_per_radiance_s", "electrons_per_dn", "read_noise_dn")
 NICENESS = 10  # of the ranking thread: the link goes first
 INPUTS = {"world_to_camera": [4, 4], "K": [3, 3], "exposure_time_s": []}
+SUN_INPUT = {"sun_dir": [3]}  # of a model whose radiance turns with the Sun
 
 
 @dataclass(frozen=True)
@@ -81,21 +82,39 @@ class Renderer:
         inputs = {i.name: i.shape for i in self._session.get_inputs()}
         outputs = {o.name: o.shape for o in self._session.get_outputs()}
         size = [self.height, self.width]
-        if inputs != INPUTS or outputs.get("image") not in ([*size, 1], [*size, 3]):
+        self.turns_with_sun = "sun_dir" in inputs
+        known = INPUTS | SUN_INPUT if self.turns_with_sun else INPUTS
+        if inputs != known or outputs.get("image") not in ([*size, 1], [*size, 3]):
             raise TriageError(f"{path} takes {inputs} and gives {outputs}: not a renderer of ours")
         self.channels: int = outputs["image"][2]
 
-    def expected_dn(self, world_to_camera: np.ndarray, K: np.ndarray, exposure_time_s: float) -> np.ndarray:
+    def expected_dn(
+        self,
+        world_to_camera: np.ndarray,
+        K: np.ndarray,
+        exposure_time_s: float,
+        sun_dir: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Return the image [H, W, C] that the model expects, digital numbers, clipped at full scale.
 
+        Args:
+            sun_dir: [3] unit, target to Sun, body frame; needed where the model's radiance turns with the Sun.
+
         Raises:
-            TriageError: the model fails while it runs, or its image is not of numbers or of another shape.
+            TriageError: the model fails while it runs, its image is not of numbers or of another shape, or it needs the
+                Sun's direction and there is none.
         """
         feed = {
             "world_to_camera": world_to_camera.astype(np.float32),
             "K": K.astype(np.float32),
             "exposure_time_s": np.array(exposure_time_s, dtype=np.float32),
         }
+        if self.turns_with_sun:
+            if sun_dir is None:
+                raise TriageError(
+                    "the model's radiance turns with the Sun: give sun_dir, the Sun's direction"
+                )
+            feed["sun_dir"] = sun_dir.astype(np.float32)
         try:
             image = np.asarray(self._session.run(["image"], feed)[0])
         except Exception as error:  # as above
@@ -144,7 +163,7 @@ def _rank(renderer: Renderer, frame: Frame, path: Path, K: np.ndarray) -> Ranked
         raise TriageError(
             f"frame {frame.frame_id} has {channels} channels, the model renders {renderer.channels}"
         )
-    expected = renderer.expected_dn(frame.world_to_camera, K, frame.exposure_time_s)
+    expected = renderer.expected_dn(frame.world_to_camera, K, frame.exposure_time_s, frame.pose.sun_dir_body)
     chi2 = chi2_map(frame.dn.reshape(expected.shape), expected, renderer.sensor)
     tiles = tile_means(chi2)
     row, column = np.unravel_index(int(tiles.argmax()), tiles.shape)

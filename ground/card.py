@@ -8,6 +8,24 @@ USES = {
 }
 
 
+def appearance(metrics: dict) -> list[str]:
+    """Return what the radiance turns with and why, as a point of a list; nothing for runs that did not note it."""
+    if "appearance" not in metrics:
+        return []
+    lines = [
+        f"- Radiance {metrics['appearance']}. The Sun's direction spans {metrics['sun_span_deg']:.1f} degrees in the "
+        "target's frame."
+    ]
+    if metrics["sh_direction"] == "sun":
+        x, y, z = metrics["shown_under_sun_dir_body"]
+        lines.append(
+            "- Shadows that parts cast on one another are not modelled. model.ply and model.onnx hold every Sun; "
+            f"model.spz, and what viewers show of model.ply, are lit from ({x:.3f}, {y:.3f}, {z:.3f}), target body "
+            "frame."
+        )
+    return lines
+
+
 def model_card(session_created_utc: str, metrics: dict) -> str:
     """Return the card as Markdown: figures that were not measured are left out."""
     exposures_ms = [1e3 * exposure_s for exposure_s in metrics["exposures_s"]]
@@ -22,6 +40,7 @@ def model_card(session_created_utc: str, metrics: dict) -> str:
         f"- Exposure times it was trained on: {exposures_ms[0]:g} to {exposures_ms[-1]:g} ms. Between them its images "
         "are as good as below; outside them it extrapolates linearly.",
         f"- Residual chi² on the target: {metrics['chi2']:.2f} (1 is pure noise).",
+        *appearance(metrics),
     ]
     for key, text in (
         ("psnr_noisy_db", "Held-out PSNR against the noisy frames: {:.2f} dB."),

@@ -9,7 +9,6 @@ import torch
 from plotly.subplots import make_subplots
 
 from ground.session import FrameRecord, Session
-from obbgs_core import sh
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
 
@@ -25,12 +24,13 @@ RADIANCE_SCALE = [[0.0, "#33465c"], [0.5, "#93a8bd"], [1.0, "#fff4d9"]]
 
 
 def model_figure(gaussians: Gaussians, frames: Sequence[FrameRecord]) -> tuple[go.Figure, int]:
-    """Return the centres coloured by radiance with camera directions and Sun, and how many centres are shown."""
+    """Return the centres coloured by mean radiance, camera directions and Sun, and how many centres are shown."""
     solid = torch.nonzero(gaussians.opacities > LEAST_OPACITY)[:, 0]
     if len(solid) > POINTS_SHOWN:
         solid = solid[torch.randperm(len(solid), generator=torch.Generator().manual_seed(0))[:POINTS_SHOWN]]
     points = gaussians.means[solid].numpy()
-    radiance = sh.radiance(gaussians.sh[solid, :1], torch.zeros(len(solid), 3)).mean(dim=1).numpy()
+    suns = torch.tensor(np.array([record.sun_dir_body for record in frames]), dtype=torch.float32)
+    radiance = gaussians.select(solid).mean_radiance(suns).mean(dim=1).numpy()
     brightness = np.sqrt(radiance)
     reach_m = float(np.quantile(np.linalg.norm(points, axis=1), 0.995)) if len(points) else 1.0
     figure = go.Figure()

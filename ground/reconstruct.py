@@ -92,7 +92,8 @@ def reconstruct(
             )
         exposures_s = sorted({record.exposure_time_s for record in training})
         white_radiance = (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * exposures_s[0])
-        _write_models(result.gaussians, blind, session, training, white_radiance, part)
+        shown_under = _middle_sun(training)
+        _write_models(result.gaussians, blind, session, training, white_radiance, shown_under, part)
         camera = session.camera
         export_onnx(result.gaussians, sensor, part / "model.onnx", camera.width, camera.height, exposures_s)
         views = (held_out or training)[:: max(1, len(held_out or training) // PARITY_VIEWS)][:PARITY_VIEWS]
@@ -100,6 +101,12 @@ def reconstruct(
             "method": method,
             "gaussians": len(result.gaussians),
             "sh_degree": math.isqrt(result.gaussians.sh.shape[1]) - 1,
+            "sh_direction": result.gaussians.sh_direction,
+            "appearance": result.appearance,
+            "sun_span_deg": round(result.sun_span_deg, 2),
+            "shown_under_sun_dir_body": None
+            if shown_under is None
+            else [round(x, 6) for x in shown_under.tolist()],
             "train_seconds": round(result.seconds, 3),
             "stop_reason": result.stop_reason,
             "start": result.start,
@@ -201,13 +208,40 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
         id=record.id,
         bracket=record.bracket,
         pose_sigma=torch.from_numpy(np.sqrt(np.clip(variances, 0, None)).astype(np.float32)),
+        sun_dir=sun_direction(record),
     )
 
 
+def sun_direction(record: FrameRecord) -> Tensor | None:
+    """Return the direction [3] of a frame's Sun, unit, body frame; None where the tag does not know it."""
+    length = float(np.linalg.norm(record.sun_dir_body))
+    return torch.tensor(record.sun_dir_body / length, dtype=torch.float32) if length > 0 else None
+
+
+def _middle_sun(records: list[FrameRecord]) -> Tensor | None:
+    """Return the frames' Sun direction that is nearest to all the others: what a picture of the model is lit from."""
+    known = [sun for record in records if (sun := sun_direction(record)) is not None]
+    if not known:
+        return None
+    directions = torch.stack(known)
+    return directions[torch.cdist(directions, directions).sum(dim=1).argmin()]
+
+
 def camera_of(session: Session, record: FrameRecord) -> Cameras:
-    pose = torch.tensor(record.world_to_camera, dtype=torch.float32)
+    return cameras_of(session, [record])
+
+
+def cameras_of(session: Session, records: list[FrameRecord]) -> Cameras:
+    """Return the cameras of some frames, with their Sun where all tags know it."""
+    poses = torch.stack([torch.tensor(r.world_to_camera, dtype=torch.float32) for r in records])
+    suns = [sun for record in records if (sun := sun_direction(record)) is not None]
+    camera = session.camera
     return Cameras(
-        pose[None], torch.tensor(session.camera.K)[None], session.camera.width, session.camera.height
+        poses,
+        torch.tensor(camera.K).expand(len(records), 3, 3),
+        camera.width,
+        camera.height,
+        sun_dir=torch.stack(suns) if len(suns) == len(records) else None,
     )
 
 
@@ -237,6 +271,8 @@ def onnx_parity_db(
             "K": K,
             "exposure_time_s": np.array(record.exposure_time_s, dtype=np.float32),
         }
+        if gaussians.sh_direction == "sun":
+            feed["sun_dir"] = record.sun_dir_body.astype(np.float32)
         image = np.asarray(runtime.run(["image"], feed)[0])
         ours = predicted_image(gaussians, session, record, sensor, record.exposure_time_s).numpy()
         worst = min(worst, -10 * math.log10(max(float(np.mean((image - ours) ** 2)), 1e-12)))
@@ -273,17 +309,16 @@ def _write_models(
     session: Session,
     training: list[FrameRecord],
     white_radiance: float,
+    shown_under: Tensor | None,
     part: Path,
 ) -> None:
     """Write the model in full and compact, its blind twin, and points of its surface."""
-    save_ply(gaussians, part / "model.ply", white_radiance)
-    save_spz(gaussians, part / "model.spz", white_radiance)
+    save_ply(gaussians, part / "model.ply", white_radiance, shown_under)
+    save_spz(gaussians, part / "model.spz", white_radiance, shown_under)
     if blind is not None:
-        save_ply(blind.gaussians, part / "blind.ply", white_radiance)
+        save_ply(blind.gaussians, part / "blind.ply", white_radiance, shown_under)
     one_a_bracket = {record.bracket: record for record in training}.values()
-    poses = [torch.tensor(record.world_to_camera, dtype=torch.float32) for record in one_a_bracket]
-    K = torch.tensor(session.camera.K).expand(len(poses), 3, 3)
-    cameras = Cameras(torch.stack(poses), K, session.camera.width, session.camera.height)
+    cameras = cameras_of(session, list(one_a_bracket))
     points, normals = surface_points(gaussians, cameras, SURFACE_POINTS)
     if len(points) == 0:
         log.warning("the model has no solid surface that two cameras see: surface.ply is empty")

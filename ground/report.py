@@ -241,6 +241,11 @@ def _model(run: Run) -> str:
         f"are true but drawn at one range; flown ranges were {min(ranges_m):.0f} to {max(ranges_m):.0f} m. Drag to "
         "turn, scroll to zoom."
     )
+    if "appearance" in run.metrics:
+        note += (
+            f" Radiance {html.escape(run.metrics['appearance'])}; the Sun's direction spans "
+            f"{run.metrics['sun_span_deg']:.1f} degrees, and points are coloured by the mean over it."
+        )
     return _section("Model and camera track", note, _plot(figure))
 
 

@@ -1,5 +1,6 @@
 """Pinhole cameras: OpenCV axes, pixel centres at +0.5."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -8,19 +9,29 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Cameras:
-    """C cameras of one image size; world_to_camera [C, 4, 4] (may carry a gradient), K [C, 3, 3] px."""
+    """C cameras of one image size; world_to_camera [C, 4, 4] (may carry a gradient), K [C, 3, 3] px.
+
+    sun_dir [C, 3] (no gradient): towards the Sun when each picture is taken, unit, body frame; only models whose
+    radiance turns with the Sun need it.
+    """
 
     world_to_camera: Tensor
     K: Tensor
     width: int
     height: int
     near_m: float = 0.01
+    sun_dir: Tensor | None = None
 
     def __post_init__(self):
         count = self.world_to_camera.shape[0]
-        for name, shape in (("world_to_camera", (count, 4, 4)), ("K", (count, 3, 3))):
-            if tuple(getattr(self, name).shape) != shape:
-                raise ValueError(f"{name} must be {list(shape)}, got {list(getattr(self, name).shape)}")
+        for name, shape in (
+            ("world_to_camera", (count, 4, 4)),
+            ("K", (count, 3, 3)),
+            ("sun_dir", (count, 3)),
+        ):
+            value = getattr(self, name)
+            if value is not None and tuple(value.shape) != shape:
+                raise ValueError(f"{name} must be {list(shape)}, got {list(value.shape)}")
         if self.width < 1 or self.height < 1 or not self.near_m > 0:
             raise ValueError(
                 f"width, height and near_m must be positive: {self.width}, {self.height}, {self.near_m}"
@@ -39,4 +50,4 @@ class Cameras:
         """Return the cameras of images resized by `factor` (0.5: half as wide and high, rounded up)."""
         K = self.K * torch.tensor([[factor], [factor], [1.0]], dtype=self.K.dtype, device=self.K.device)
         width, height = -int(-self.width * factor // 1), -int(-self.height * factor // 1)
-        return Cameras(self.world_to_camera, K, width, height, self.near_m)
+        return dataclasses.replace(self, K=K, width=width, height=height)

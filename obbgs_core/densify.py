@@ -1,5 +1,6 @@
 """Growth and pruning: who is cloned, split or removed, with the optimiser's state carried along."""
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 
@@ -117,7 +118,8 @@ def keep(gaussians: Gaussians, adam: Adam, mask: Tensor) -> Gaussians:
 
 def trainable(gaussians: Gaussians) -> Gaussians:
     """Return the same values as leaves that collect gradients."""
-    return Gaussians(**{n: t.detach().clone().requires_grad_() for n, t in gaussians.tensors().items()})
+    leaves = {n: t.detach().clone().requires_grad_() for n, t in gaussians.tensors().items()}
+    return dataclasses.replace(gaussians, **leaves)
 
 
 @torch.no_grad()

@@ -47,7 +47,8 @@ def export_onnx(
 ) -> Exported:
     """Write the renderer; the file appears whole or not at all.
 
-    Inputs: world_to_camera [4, 4], K [3, 3] px, exposure_time_s [], all float32. Outputs: image [H, W, C], expected
+    Inputs: world_to_camera [4, 4], K [3, 3] px, exposure_time_s [] and, where the radiance turns with the Sun, sun_dir
+    [3] (towards it, unit, body frame), all float32. Outputs: image [H, W, C], expected
     digital numbers over full scale, 0..1; alpha [H, W]; depth [H, W] m (0 where nothing is).
 
     Args:
@@ -67,6 +68,7 @@ def export_onnx(
     projected = _project(graph, gaussians, width, height)
     composed = _composite(graph, projected, gaussians.sh.shape[2], width, height)
     _finish(graph, composed, gaussians.sh.shape[2], sensor)
+    turns_with_sun = gaussians.sh_direction == "sun"
     model = helper.make_model(
         helper.make_graph(
             graph.nodes,
@@ -75,6 +77,11 @@ def export_onnx(
                 helper.make_tensor_value_info("world_to_camera", TensorProto.FLOAT, [4, 4]),
                 helper.make_tensor_value_info("K", TensorProto.FLOAT, [3, 3]),
                 helper.make_tensor_value_info("exposure_time_s", TensorProto.FLOAT, []),
+                *(
+                    [helper.make_tensor_value_info("sun_dir", TensorProto.FLOAT, [3])]
+                    if turns_with_sun
+                    else []
+                ),
             ],
             [
                 helper.make_tensor_value_info(
@@ -237,16 +244,19 @@ def _clamped(g: _Graph, tangent: str, focal: str, centre: str, size: int) -> str
 
 
 def _radiance(g: _Graph, gaussians: Gaussians, means: str, R: str, t: str) -> str:
-    """Radiance [N, C] seen from the camera; a constant when the model does not depend on direction."""
+    """Radiance [N, C] seen from the camera, or under the Sun; a constant when it depends on neither."""
     sh = _numpy(gaussians.sh)
     if sh.shape[1] == 1:
         value = np.logaddexp(0, SOFTNESS * C0 * sh[:, 0]) / SOFTNESS
         return g._name(value.astype(np.float32))
-    centre = g.op("Neg", g.op("MatMul", t, R))  # [1, 3]
-    direction = g.op("Sub", means, centre)
-    length = g.op("Sqrt", g.op("ReduceSum", g.op("Mul", direction, direction), g.ints(1), keepdims=1))
-    direction = g.op("Div", direction, g.op("Max", length, 1e-12))
-    basis = _sh_basis(g, direction, sh.shape[1])  # [N, K, 1]
+    if gaussians.sh_direction == "sun":
+        direction = g.op("Reshape", "sun_dir", g.ints(1, 3))
+    else:
+        centre = g.op("Neg", g.op("MatMul", t, R))  # [1, 3]
+        direction = g.op("Sub", means, centre)
+        length = g.op("Sqrt", g.op("ReduceSum", g.op("Mul", direction, direction), g.ints(1), keepdims=1))
+        direction = g.op("Div", direction, g.op("Max", length, 1e-12))
+    basis = _sh_basis(g, direction, sh.shape[1])  # [N, K, 1], or [1, K, 1] under the Sun
     value = g.op("ReduceSum", g.op("Mul", basis, sh), g.ints(1), keepdims=0)
     return g.op("Div", g.op("Softplus", g.op("Mul", value, SOFTNESS)), SOFTNESS)
 

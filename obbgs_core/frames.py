@@ -20,6 +20,7 @@ class TrainingFrame:
     """One exposure: dn [H, W, C] float, known exposure time, pose [4, 4] body to camera, K [3, 3] px.
 
     pose_sigma: deviations [6] of the pose tag, rad about and m along the camera axes; None: the pose is exact.
+    sun_dir: [3] towards the Sun, unit, body frame; None: not known.
     """
 
     dn: Tensor
@@ -29,6 +30,7 @@ class TrainingFrame:
     id: int = 0
     bracket: int | None = None  # frames of one trigger share a pose correction
     pose_sigma: Tensor | None = None
+    sun_dir: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,15 @@ class Batch:
     exposure_time_s: Tensor  # [B, 1, 1, 1]
     averaged_pixels: int  # sensor pixels in one pixel of dn
     sky: Tensor | None = None  # [B, H, W] share of each pixel that is seen to be empty, where anyone looked
+
+
+def sun_span_deg(frames: list[TrainingFrame]) -> float:
+    """Return the largest angle between the Sun's directions in two frames; 0 where it is not known in all."""
+    known = [f.sun_dir.double() for f in frames if f.sun_dir is not None]
+    if not known or len(known) < len(frames):
+        return 0.0
+    directions = torch.stack(known)
+    return math.degrees(torch.cdist(directions, directions).max().div(2).clamp(max=1).asin().mul(2).item())
 
 
 def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[TrainingFrame], float | None]:
@@ -57,6 +68,10 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
         raise ReconstructionError(f"all frames must have one size and channel count, got {sorted(shapes)}")
     for f in frames:
         finite = torch.isfinite(f.dn).all() and torch.isfinite(f.world_to_camera).all()
+        if f.sun_dir is not None and not abs(float(f.sun_dir.norm()) - 1) < 1e-3:
+            raise ReconstructionError(
+                f"frame {f.id} has {f.sun_dir.tolist()} for the Sun's direction, expected a unit vector; leave it out"
+            )
         if not (finite and torch.isfinite(f.K).all() and 0 < f.exposure_time_s < math.inf):
             raise ReconstructionError(
                 f"frame {f.id} holds a value or a pose that is not finite, or no exposure time; leave it out"
@@ -109,7 +124,9 @@ class Batches:
         frames = [self.frames[i] for i in indices]
         height, width = frames[0].dn.shape[:2]
         poses = torch.stack([f.world_to_camera for f in frames])
-        cameras = Cameras(poses, torch.stack([f.K for f in frames]), width, height)
+        suns = [f.sun_dir for f in frames if f.sun_dir is not None]
+        sun_dir = torch.stack(suns) if len(suns) == len(frames) else None
+        cameras = Cameras(poses, torch.stack([f.K for f in frames]), width, height, sun_dir=sun_dir)
         return Batch(
             indices,
             cameras.scaled(1 / factor) if factor > 1 else cameras,

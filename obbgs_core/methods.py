@@ -62,6 +62,10 @@ class MethodConfig:
         1.0  # more opaque Gaussians are kept whatever they earn: dark surface explains no light
     )
     most_sh_degree: int = 0  # the degree may rise to this where the likelihood pays for it
+    sun_span_deg: float = (
+        0.0  # > 0: the radiance may turn with the Sun where its direction spans more than this
+    )
+    sun_from: float = 0.05  # share of the steps at which a Sun that moves may first join, before any growth
     chi2_end: float = 0.0  # > 0: stop when the mean squared normalised residual falls to this
 
     def __post_init__(self):
@@ -127,6 +131,7 @@ PRESETS: dict[str, MethodConfig] = {
             weigh_at=(0.3, 0.5, 0.7, 0.85),
             keep_opacity=0.5,
             most_sh_degree=1,
+            sun_span_deg=5.0,
             chi2_end=1.0,
         ),
     )

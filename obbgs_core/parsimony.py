@@ -1,5 +1,6 @@
 """How much light each Gaussian explains: its likelihood gain, in nats, and whether it earns its parameters."""
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -48,12 +49,13 @@ def next_degree_gain(
 ) -> tuple[float, float]:
     """Return what the next spherical-harmonic degree would gain, nats, and what it must gain to be worth it.
 
-    A score test: with slope g and curvature F of the log-likelihood at zero, a coefficient gains g²/(2F).
+    A score test: with slope g and curvature F of the log-likelihood at zero, a coefficient gains g²/(2F). A Sun that
+    hardly moves makes its harmonics hardly different from the constant: what the constant explains is taken out first.
     """
     old = gaussians.sh.shape[1]
     model = padded(gaussians.detach(), math.isqrt(old))
     model.sh.requires_grad_()
-    slope, curvature = torch.zeros_like(model.sh), torch.zeros_like(model.sh)
+    slope, curvature, shared = (torch.zeros_like(model.sh) for _ in range(3))
     values, times = 0, 0.0
     for view in _views(model, batches, sensor, scale, rng):
         residual = ((view.dn - view.predicted.detach()) * view.weight).clamp(-3, 3)  # robust, as the loss is
@@ -62,8 +64,13 @@ def next_degree_gain(
         (probe,) = torch.autograd.grad((signal * view.signs).sum(), model.sh)
         slope += g
         curvature += probe**2
+        shared += probe * probe[:, :1]
         values, times = values + view.values, view.times
     new_slope, new_curvature = slope[:, old:], curvature[:, old:]
+    if model.sh_direction == "sun":
+        by_constant = shared[:, old:] / curvature[:, :1].clamp(min=1e-6)
+        new_slope = new_slope - by_constant * slope[:, :1]
+        new_curvature = new_curvature - by_constant * shared[:, old:]
     gain = times * (new_slope**2 / (2 * new_curvature.clamp(min=1e-6))).sum().item()
     return gain, 0.5 * new_slope.numel() * math.log(max(2, values * times))
 
@@ -99,4 +106,4 @@ def padded(gaussians: Gaussians, degree: int) -> Gaussians:
     """Return the same Gaussians with room for spherical harmonics up to `degree`, the new ones zero."""
     count = (degree + 1) ** 2
     room = torch.zeros(len(gaussians), count - gaussians.sh.shape[1], gaussians.sh.shape[2])
-    return Gaussians(**{**gaussians.tensors(), "sh": torch.cat([gaussians.sh, room], dim=1)})
+    return dataclasses.replace(gaussians, sh=torch.cat([gaussians.sh, room], dim=1))

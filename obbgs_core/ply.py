@@ -4,6 +4,9 @@ Viewers of 3DGS files take a colour for `0.5 + SH(direction)`, clipped to 0..1 a
 `softplus(SH(direction))` in scene-linear light, so f_dc and f_rest hold display colours, `(radiance / white)^(1/2.2)`
 fitted with spherical harmonics, and our own coefficients follow as radiance_sh_<coefficient>_<channel>, which viewers
 ignore. Everything else means the same there and here: metres, logarithms of sigmas, logits, quaternions w, x, y, z.
+
+Where our radiance turns with the Sun instead of the view, a comment of the header says so, and f_dc holds the colours
+under the one Sun that the comment names.
 """
 
 import math
@@ -20,6 +23,7 @@ from obbgs_core.gaussians import Gaussians
 
 DISPLAY_GAMMA = 2.2
 FIT_DIRECTIONS = 64  # four for each coefficient of degree 3
+TURNS_WITH_SUN = "comment radiance_sh turn with the Sun"
 
 
 def display_sh(gaussians: Gaussians, white_radiance: float) -> Tensor:
@@ -54,10 +58,21 @@ def _fit(count: int) -> tuple[Tensor, Tensor]:
     return directions.float(), torch.linalg.pinv(sh.sh_basis(directions, count)).float()
 
 
-def save_ply(gaussians: Gaussians, path: Path, white_radiance: float = 1.0) -> None:
-    """Write the model; the file appears whole or not at all. `white_radiance` is what viewers show as white."""
+def save_ply(
+    gaussians: Gaussians, path: Path, white_radiance: float = 1.0, sun_dir: Tensor | None = None
+) -> None:
+    """Write the model; the file appears whole or not at all.
+
+    Args:
+        white_radiance: what viewers show as white.
+        sun_dir: [3] unit, body frame: the Sun that viewers show the model under, if its radiance turns with the Sun.
+
+    Raises:
+        ValueError: the radiance turns with the Sun, and sun_dir is not given.
+    """
+    gaussians = gaussians.detach()
     count, coefficients, channels = gaussians.sh.shape
-    shown = display_sh(gaussians.detach(), white_radiance)
+    shown = display_sh(gaussians.lit_from(sun_dir), white_radiance)
     rest = shown[:, 1:].transpose(1, 2).flatten(1)  # all of red, then of green, then of blue
     table: dict[str, Tensor] = {}
     for i, axis in enumerate("xyz"):
@@ -71,22 +86,25 @@ def save_ply(gaussians: Gaussians, path: Path, white_radiance: float = 1.0) -> N
     table |= {f"rot_{i}": gaussians.quats[:, i] for i in range(4)}
     for k in range(coefficients):
         table |= {f"radiance_sh_{k}_{c}": gaussians.sh[:, k, c] for c in range(channels)}
-    comment = (
-        f"f_dc and f_rest: (radiance / {white_radiance:.9g})^(1/{DISPLAY_GAMMA}); radiance_sh: scene-linear"
-    )
-    write_whole(path, _ply(table, comment))
+    comments = [
+        f"comment f_dc and f_rest: (radiance / {white_radiance:.9g})^(1/{DISPLAY_GAMMA}); radiance_sh: scene-linear"
+    ]
+    if gaussians.sh_direction == "sun" and sun_dir is not None:
+        x, y, z = sun_dir.tolist()
+        comments.append(f"{TURNS_WITH_SUN}; f_dc: with the Sun towards {x:.6f} {y:.6f} {z:.6f}, body frame")
+    write_whole(path, _ply(table, *comments))
 
 
 def save_surface_ply(points: Tensor, normals: Tensor, path: Path) -> None:
     """Write oriented points [M, 3] m, [M, 3]; the file appears whole or not at all."""
     table = {axis: points[:, i] for i, axis in enumerate("xyz")}
     table |= {axis: normals[:, i] for i, axis in enumerate(("nx", "ny", "nz"))}
-    write_whole(path, _ply(table, "metres, target body frame; normals outwards"))
+    write_whole(path, _ply(table, "comment metres, target body frame; normals outwards"))
 
 
-def _ply(table: dict[str, Tensor], comment: str) -> bytes:
+def _ply(table: dict[str, Tensor], *comments: str) -> bytes:
     values = torch.stack(list(table.values()), dim=1).detach().cpu().numpy().astype("<f4")
-    header = ["ply", "format binary_little_endian 1.0", f"comment {comment}"]
+    header = ["ply", "format binary_little_endian 1.0", *comments]
     header += [f"element vertex {len(values)}", *(f"property float {name}" for name in table), "end_header\n"]
     return "\n".join(header).encode("ascii") + values.tobytes()
 
@@ -119,4 +137,5 @@ def load_ply(path: Path) -> Gaussians:
         log_scales=torch.stack([table[f"scale_{i}"] for i in range(3)], 1),
         opacity_logits=table["opacity"],
         sh=torch.stack([table[name] for name in radiance], 1).reshape(counts[0], -1, channels),
+        sh_direction="sun" if any(line.startswith(TURNS_WITH_SUN) for line in lines) else "view",
     )

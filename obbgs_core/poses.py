@@ -1,5 +1,7 @@
 """Pose refinement: six small numbers a bracket beside the Gaussians, held by the pose tag's own covariance."""
 
+import dataclasses
+
 import torch
 from torch import Tensor
 
@@ -75,12 +77,10 @@ class PoseCorrections:
         moved = adjoint @ motion
         self.value -= torch.where(self.sigma > 0, moved * weight, 0.0)
         rigid = rigid_motions(motion[None])[0]
-        return Gaussians(
+        return dataclasses.replace(  # a turn this small does not show in the radiance
+            gaussians,
             means=gaussians.means @ rigid[:3, :3].T + rigid[:3, 3],
             quats=multiply(from_rotation_vectors(motion[:3]).expand(len(gaussians), 4), gaussians.quats),
-            log_scales=gaussians.log_scales,
-            opacity_logits=gaussians.opacity_logits,
-            sh=gaussians.sh,  # a turn this small does not show in the radiance
         )
 
     def state(self) -> dict:

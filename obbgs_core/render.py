@@ -1,5 +1,6 @@
 """One door to rendering: `render`. All of it in our C++, or in plain PyTorch as the truth, or composited by gsplat."""
 
+import dataclasses
 import functools
 import logging
 import math
@@ -75,8 +76,11 @@ def render(gaussians: Gaussians, cameras: Cameras, backend: str = "auto", normal
         backend: `native` (C++, float32), `reference` (plain PyTorch, any dtype), `gsplat` (CUDA), or `auto`.
 
     Raises:
-        ValueError: an unknown backend, or one that is not available here.
+        ValueError: an unknown backend, or one that is not available here; the radiance turns with the Sun and the
+            cameras do not say where it is.
     """
+    if gaussians.sh_direction == "sun" and cameras.sun_dir is None:
+        raise ValueError("the model's radiance turns with the Sun: give Cameras(sun_dir=[C, 3]), body frame")
     composite = _backend(backend, gaussians.means)
     if isinstance(composite, str):
         return _render_native(composite, gaussians, cameras, normals)
@@ -88,7 +92,7 @@ def render(gaussians: Gaussians, cameras: Cameras, backend: str = "auto", normal
     screen = ScreenGradients()
     images, alphas, medians = [], [], []
     for c in range(len(cameras)):
-        features = [sh.radiance(gaussians.sh, directions[c]), projected.depths[c][:, None]]
+        features = [_radiance(gaussians, cameras, c, directions[c]), projected.depths[c][:, None]]
         if normals:
             features.append(_normals(gaussians, directions[c]))
         image, transmittance, median = composite(
@@ -165,9 +169,18 @@ def _repaired(gaussians: Gaussians) -> tuple[Gaussians, Tensor]:
     numbers = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     sound = torch.stack([torch.isfinite(t).reshape(len(t), -1).all(dim=1) for t in numbers]).all(dim=0)
     tensors = gaussians.tensors().items()
-    return Gaussians(
-        **{n: torch.where(sound.reshape(-1, *[1] * (t.ndim - 1)), t, torch.zeros_like(t)) for n, t in tensors}
-    ), sound
+    repaired = {
+        n: torch.where(sound.reshape(-1, *[1] * (t.ndim - 1)), t, torch.zeros_like(t)) for n, t in tensors
+    }
+    return dataclasses.replace(gaussians, **repaired), sound
+
+
+def _radiance(gaussians: Gaussians, cameras: Cameras, c: int, directions: Tensor) -> Tensor:
+    """Return each Gaussian's radiance [N, C] in one camera, which sees it along `directions` [N, 3]."""
+    if gaussians.sh_direction == "sun":
+        assert cameras.sun_dir is not None  # `render` has looked
+        directions = cameras.sun_dir[c].detach().to(directions).expand(len(gaussians), 3)
+    return sh.radiance(gaussians.sh, directions)
 
 
 def _normals(gaussians: Gaussians, directions: Tensor) -> Tensor:
@@ -261,8 +274,9 @@ def _pixels_touched(means2d: Tensor, conics: Tensor, opacities: Tensor, depths: 
 
 def _render_native(kernel: str, gaussians: Gaussians, cameras: Cameras, normals: bool) -> Rendered:
     screen = ScreenGradients()
+    sun_dir = cameras.sun_dir if gaussians.sh_direction == "sun" else None
     images = _Native.apply(
-        *gaussians.tensors().values(), cameras.world_to_camera, cameras, kernel, normals, screen
+        *gaussians.tensors().values(), cameras.world_to_camera, cameras, sun_dir, kernel, normals, screen
     )
     radiance, alpha, depth, median_depth, means2d, radii, *more = images
     return Rendered(radiance, alpha, depth, median_depth, means2d, radii, more[0] if more else None, screen)
@@ -273,10 +287,22 @@ class _Native(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx, means, quats, log_scales, opacity_logits, sh, world_to_camera, cameras, kernel, normals, screen
+        ctx,
+        means,
+        quats,
+        log_scales,
+        opacity_logits,
+        sh,
+        world_to_camera,
+        cameras,
+        sun_dir,
+        kernel,
+        normals,
+        screen,
     ):
         inputs = (means, quats, log_scales, opacity_logits, sh, world_to_camera)
         arrays = [t.detach().float().contiguous() for t in (*inputs, cameras.K)]
+        arrays.append(None if sun_dir is None else sun_dir.detach().float().contiguous())
         count, n, height, width = len(cameras), means.shape[0], cameras.height, cameras.width
         radiance = torch.empty(count, height, width, sh.shape[2])
         alpha, depth, median_depth = (torch.empty(count, height, width) for _ in range(3))
@@ -321,7 +347,7 @@ class _Native(torch.autograd.Function):
         )
         ctx.screen.means2d.update(enumerate(screen_means2d))
         ctx.screen.pixels.update(enumerate(pixels))
-        return *(g.to(t.dtype) for g, t in zip(gradients, inputs, strict=True)), None, None, None, None
+        return *(g.to(t.dtype) for g, t in zip(gradients, inputs, strict=True)), *[None] * 5
 
 
 def _composite_gsplat(means2d, conics, opacities, depths, features, cameras, screen, camera_index):

@@ -3,7 +3,8 @@
 gsply quantises and packs; this file turns our light into display colours (see `ply`) and our axes into SPZ's. SPZ takes
 y up and z backwards where 3DGS PLYs are taken for y down and z forwards, so y and z change sign, as in Niantic's own
 converter: both files then look alike in a viewer. What turns the display colours back into radiance, white and the
-number of channels, is the comment of the gzip header.
+number of channels, is the comment of the gzip header. A model whose radiance turns with the Sun is written as it looks
+under one Sun.
 
 Rounding errors: means half of 2^-bits m with as many bits as the model's extent allows, sigmas 3 %, opacities 1/510,
 display colours 1/270. Sigmas are held to 45 um .. 380 m, display colours to 1.44, that is 2.2 times the white radiance.
@@ -31,13 +32,19 @@ GZIP_HAS_COMMENT = 0x10
 COMMENT = re.compile(rb"obbgs white_radiance=(\S+) channels=([13])")
 
 
-def save_spz(gaussians: Gaussians, path: Path, white_radiance: float = 1.0) -> None:
+def save_spz(
+    gaussians: Gaussians, path: Path, white_radiance: float = 1.0, sun_dir: torch.Tensor | None = None
+) -> None:
     """Write the model; the file appears whole or not at all, and is the same for the same model.
 
+    Args:
+        sun_dir: [3] unit, body frame: the Sun that a model whose radiance turns with it is shown under.
+
     Raises:
+        ValueError: the radiance turns with the Sun, and sun_dir is not given.
         ExportError: the model is empty, not finite, or reaches farther than 24 bits of fixed point allow.
     """
-    gaussians = gaussians.detach()
+    gaussians = gaussians.detach().lit_from(sun_dir)
     if len(gaussians) == 0:
         raise ExportError("there is no Gaussian to write")
     for name, tensor in gaussians.tensors().items():

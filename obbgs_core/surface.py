@@ -7,7 +7,6 @@ import torch.nn.functional as F
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from obbgs_core import sh
 from obbgs_core.cameras import Cameras
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.render import project, render
@@ -39,11 +38,12 @@ def surface_points(
         cameras: the training cameras, or any others; frames of one bracket see the same, one of them is enough.
 
     Raises:
-        ValueError: no camera, or a count under 1.
+        ValueError: no camera, or a count under 1; the radiance turns with the Sun, and the cameras do not say where
+            it is.
     """
     if len(cameras) == 0 or count < 1:
         raise ValueError(f"expected a camera and a count of at least 1, got {len(cameras)} and {count}")
-    gaussians = _lit(gaussians)
+    gaussians = _lit(gaussians, cameras)
     if len(gaussians) == 0:
         return torch.zeros(0, 3), torch.zeros(0, 3)
     generator = torch.Generator().manual_seed(seed)
@@ -71,12 +71,15 @@ def surface_points(
     return points, _fitted_normals(points, cameras.centres[patch[:, 0].long()] - points)
 
 
-def _lit(gaussians: Gaussians) -> Gaussians:
+def _lit(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
     """Return the Gaussians that shine at all: black ones in front of black sky contradict no picture."""
     if len(gaussians) == 0:
         return gaussians
-    radiance = sh.radiance(gaussians.sh[:, :1], torch.zeros_like(gaussians.means)).mean(dim=-1)
-    return gaussians.select(radiance > BLACKEST * radiance.quantile(BRIGHT_QUANTILE))
+    radiance = gaussians.mean_radiance(cameras.sun_dir).mean(dim=-1)
+    bare = gaussians.lit_from(
+        None if cameras.sun_dir is None else cameras.sun_dir[0]
+    )  # depths are all that follows
+    return bare.select(radiance > BLACKEST * radiance.quantile(BRIGHT_QUANTILE))
 
 
 @torch.no_grad()

@@ -51,8 +51,9 @@ float* data_of(const Array& array, const char* name, size_t count) {
 class Rasterization {
  public:
   Rasterization(const std::string& kernel, int width, int height, float near_m, Array means, Array quats, Array log_scales,
-                Array opacity_logits, Array sh, Array world_to_camera, Array K)
+                Array opacity_logits, Array sh, Array world_to_camera, Array K, std::optional<Array> sun_dir)
       : arrays_{means, quats, log_scales, opacity_logits, sh, world_to_camera, K} {
+    if (sun_dir) arrays_.push_back(*sun_dir);
     const size_t n = opacity_logits.size(), cameras = world_to_camera.size() / 16;
     const size_t coefficients = sh.ndim() == 3 ? sh.shape(1) : 0, channels = sh.ndim() == 3 ? sh.shape(2) : 0;
     if (width < 1 || height < 1 || width > 16384 || height > 16384) throw std::invalid_argument("width and height must be 1 to 16384");
@@ -63,7 +64,8 @@ class Rasterization {
     scene_ = {int(n), int(cameras), int(coefficients), int(channels), width, height, near_m, false,
               data_of(means, "means", 3 * n), data_of(quats, "quats", 4 * n), data_of(log_scales, "log_scales", 3 * n),
               opacity_logits.data(), data_of(sh, "sh", n * coefficients * channels),
-              data_of(world_to_camera, "world_to_camera", 16 * cameras), data_of(K, "K", 9 * cameras)};
+              data_of(world_to_camera, "world_to_camera", 16 * cameras), data_of(K, "K", 9 * cameras),
+              sun_dir ? data_of(*sun_dir, "sun_dir", 3 * cameras) : nullptr};
     for (const Kernel& k : available_kernels())
       if (kernel.empty() || kernel == k.name) { kernel_ = k; break; }
     if (!kernel_.project) throw std::invalid_argument("no kernel " + kernel + " on this processor");
@@ -152,7 +154,10 @@ NB_MODULE(_rasterizer, m) {
     return names;
   });
   nb::class_<Rasterization>(m, "Rasterization")
-      .def(nb::init<const std::string&, int, int, float, Array, Array, Array, Array, Array, Array, Array>())
+      .def(nb::init<const std::string&, int, int, float, Array, Array, Array, Array, Array, Array, Array, std::optional<Array>>(),
+           nb::arg("kernel"), nb::arg("width"), nb::arg("height"), nb::arg("near_m"), nb::arg("means"), nb::arg("quats"),
+           nb::arg("log_scales"), nb::arg("opacity_logits"), nb::arg("sh"), nb::arg("world_to_camera"), nb::arg("K"),
+           nb::arg("sun_dir").none())
       .def("forward", &Rasterization::forward, nb::arg("threads"), nb::arg("radiance"), nb::arg("alpha"), nb::arg("depth"),
            nb::arg("median_depth"), nb::arg("normals").none(), nb::arg("means2d"), nb::arg("radii"))
       .def("backward", &Rasterization::backward, nb::arg("threads"), nb::arg("radiance"), nb::arg("depth"), nb::arg("normals").none(),

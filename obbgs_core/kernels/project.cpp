@@ -84,6 +84,7 @@ struct Model {
 
 struct Camera {
   float R[3][3], t[3], fx, fy, cx, cy, limit_x, limit_y;
+  const float* sun_dir;  // [3] or null
 
   Camera(const Scene& s, int index) {
     const float *w = s.world_to_camera + 16 * index, *K = s.K + 9 * index;
@@ -97,6 +98,7 @@ struct Camera {
     cy = K[5];
     limit_x = kFovMargin * std::max(cx, s.width - cx) / fx;
     limit_y = kFovMargin * std::max(cy, s.height - cy) / fy;
+    sun_dir = s.sun_dir ? s.sun_dir + 3 * index : nullptr;
   }
 };
 
@@ -217,7 +219,12 @@ struct Shading {
     for (int j = 0; j < 3; ++j) direction[j] = m.mean[j] + (c.R[0][j] * c.t[0] + c.R[1][j] * c.t[1] + c.R[2][j] * c.t[2]);
     distance = larger(sqrt(dot(direction, direction)), kMinNorm);
     for (vf& d : direction) d = d / distance;
-    sh_basis(direction, s.sh_count, basis);
+    if (c.sun_dir) {
+      const vf sun[3] = {c.sun_dir[0], c.sun_dir[1], c.sun_dir[2]};
+      sh_basis(sun, s.sh_count, basis);
+    } else {
+      sh_basis(direction, s.sh_count, basis);
+    }
     for (int f = 0; f < s.channels; ++f) {
       raw[f] = 0.0f;
       for (int k = 0; k < s.sh_count; ++k) raw[f] = fma(basis[k], g.get(s.sh, s.sh_count * s.channels, k * s.channels + f), raw[f]);
@@ -318,6 +325,7 @@ void project_backward(const Scene& s, const Frame& frame, const float* records, 
       const Group group(s, first);
       const Model m(s, group);
       const int coefficients = s.sh_count * s.channels;
+      const bool turning = s.sh_count > 1 && !s.sun_dir;  // the radiance turns with the line of sight
       vf d_mean[3], d_A[3][3], d_R[3][3], d_logit = 0.0f, d_sh[48];
       for (int i = 0; i < 3; ++i) {
         d_mean[i] = 0.0f;
@@ -405,10 +413,10 @@ void project_backward(const Scene& s, const Frame& frame, const float* records, 
           for (int b = 0; b < s.sh_count; ++b) {
             const int i = b * s.channels + f;
             d_sh[i] = d_sh[i] + zero_unless(on, d_raw * shading.basis[b]);
-            if (s.sh_count > 1) weight[b] = weight[b] + d_raw * group.get(s.sh, coefficients, i);
+            if (turning) weight[b] = weight[b] + d_raw * group.get(s.sh, coefficients, i);
           }
         }
-        if (s.sh_count > 1) {  // through the unit direction
+        if (turning) {  // through the unit direction
           vf d_unit[3];
           sh_basis_backward(shading.direction, s.sh_count, weight, d_unit);
           const vf radial = dot(d_unit, shading.direction);

@@ -24,6 +24,7 @@ struct Scene {
   float near_m;
   bool normals;
   const float *means, *quats, *log_scales, *opacity_logits, *sh, *world_to_camera, *K;
+  const float* sun_dir;  // [cameras, 3] where the harmonics are taken; null: along each line of sight
 
   int features() const { return channels + 1 + 3 * normals; }  // radiance, depth, normal: in this order
   int tiles_x() const { return (width + kTile - 1) / kTile; }

@@ -9,6 +9,7 @@ import argparse
 import dataclasses
 import json
 import sys
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -109,6 +110,13 @@ def cases(name: str, size: int, seeds: int):
     yield "all frames black", in_eclipse(plain, 0.0, 1.0), {}, 0
 
 
+def moving_sun(session: Path):
+    """Yield a session whose Sun moves, with the model held static and with the one that is chosen."""
+    target = targets.from_session(session)
+    yield "moving Sun, held static", target, {"sun_span_deg": 0.0}, 0
+    yield "moving Sun", target, {}, 0
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -119,10 +127,17 @@ def main() -> None:
     parser.add_argument("--steps-share", type=float, default=0.5)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument(
+        "--session",
+        type=Path,
+        metavar="DIR",
+        help="only a moving Sun: a session of `hil dataset` with its truth",
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     failures = 0
-    for condition, target, changes, seed in cases(arguments.target, arguments.size, arguments.seeds):
+    rows = cases(arguments.target, arguments.size, arguments.seeds)
+    for condition, target, changes, seed in moving_sun(arguments.session) if arguments.session else rows:
         row: dict = {"condition": condition}
         try:
             row |= measure(configure("obbgs", arguments.steps_share, **changes), target, seed)

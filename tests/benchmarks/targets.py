@@ -5,6 +5,7 @@ alpha [120, 400, 400] (255 = full), world_to_camera [120, 4, 4], K [3, 3] px and
 dimension is 2 units. Nothing else of the project reads them.
 """
 
+import dataclasses
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ground.evaluate import Truth
+from ground.reconstruct import exposed, sensor_of, split, training_frame
+from ground.session import open_session
 from obbgs_core.cameras import Cameras
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.gaussians import Gaussians
@@ -99,13 +103,44 @@ def load(
     return Target(name, sensor, training, held_out, clean, covers, cloud)
 
 
+def from_session(folder: Path) -> Target:
+    """Return a simulated session with its truth, such as `hil dataset` makes, in the same units.
+
+    Raises:
+        SessionError: there is no such session, or no truth beside it.
+    """
+    session = open_session(folder)
+    truth, sensor = Truth(session), sensor_of(session.camera)
+    units_per_m = 2 / truth.largest_dimension_m
+    sides: list[list[TrainingFrame]] = []
+    training, held_out = split(session)
+    for records in (training, held_out):
+        sides.append([])
+        for record in records:
+            frame = training_frame(session, record)
+            pose = frame.world_to_camera.clone()
+            pose[:3, 3] *= units_per_m
+            sides[-1].append(dataclasses.replace(frame, world_to_camera=pose, pose_sigma=None))
+    true = [truth.radiance(record) for record in held_out]
+    clean = [exposed(light, sensor, r.exposure_time_s) for (light, _), r in zip(true, held_out, strict=True)]
+    alpha, cloud = [alpha for _, alpha in true], truth.cloud_m * units_per_m
+    return Target(session.path.parent.name, sensor, sides[0], sides[1], clean, alpha, cloud)
+
+
 @torch.no_grad()
 def predicted(gaussians: Gaussians, frame: TrainingFrame, sensor: Sensor, exposure_s: float) -> Tensor:
     """Return the model's image of a frame [H, W, C] in 0..1."""
     height, width = frame.dn.shape[:2]
-    cameras = Cameras(frame.world_to_camera[None], frame.K[None], width, height)
+    cameras = _cameras([frame], width, height)
     radiance = render(gaussians, cameras).radiance[0]
     return (sensor.expected_dn(radiance, exposure_s) / sensor.white_dn).clamp(0, 1)
+
+
+def _cameras(frames: list[TrainingFrame], width: int, height: int) -> Cameras:
+    suns = [f.sun_dir for f in frames if f.sun_dir is not None]
+    sun_dir = torch.stack(suns) if len(suns) == len(frames) else None
+    poses, K = torch.stack([f.world_to_camera for f in frames]), torch.stack([f.K for f in frames])
+    return Cameras(poses, K, width, height, sun_dir=sun_dir)
 
 
 def clean_psnr_db(gaussians: Gaussians, target: Target, reference_exposure_s: float | None = None) -> float:
@@ -136,8 +171,7 @@ def cloud_figures(gaussians: Gaussians, target: Target, seed: int = 0) -> dict[s
     """Return Chamfer, Hausdorff, completeness of the centres; completeness, accuracy of 100,000 surface points."""
     centres = cloud_distances(gaussians.means.double().numpy(), target.cloud)
     height, width = target.training[0].dn.shape[:2]
-    poses = torch.stack([f.world_to_camera for f in target.training])
-    cameras = Cameras(poses, torch.stack([f.K for f in target.training]), width, height)
+    cameras = _cameras(target.training, width, height)
     points, _ = surface_points(gaussians, cameras, SURFACE_POINTS, seed)
     figures = {
         "chamfer": centres["chamfer"],

@@ -1,5 +1,7 @@
 """The compiled rasterizer against the readable reference, and the reference against autograd's finite differences."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -53,8 +55,8 @@ def looking_at_origin(
 def outputs_and_gradients(gaussians: Gaussians, cameras: Cameras, backend: str, normals: bool = False):
     leaves = {name: value.clone().requires_grad_() for name, value in gaussians.tensors().items()}
     pose = cameras.world_to_camera.clone().requires_grad_()
-    moved = Cameras(pose, cameras.K, cameras.width, cameras.height, cameras.near_m)
-    out = render(Gaussians(**leaves), moved, backend, normals=normals)
+    moved = dataclasses.replace(cameras, world_to_camera=pose)
+    out = render(dataclasses.replace(gaussians, **leaves), moved, backend, normals=normals)
     g = torch.Generator().manual_seed(5)
     images = [out.radiance, out.alpha[..., None], out.depth[..., None]] + ([out.normals] if normals else [])
     loss = sum((i * torch.rand(i.shape, generator=g).to(i.dtype)).sum() for i in images)
@@ -101,6 +103,101 @@ def test_native_gradients_match_the_reference_in_float64(sh_count, channels):
         torch.testing.assert_close(
             ours[name].double(), gradient, rtol=0, atol=2e-4 * float(gradient.abs().max()), msg=name
         )
+
+
+def under_the_sun(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
+    directions = torch.randn(len(cameras), 3, generator=torch.Generator().manual_seed(9))
+    suns = torch.nn.functional.normalize(directions, dim=1).to(gaussians.means)
+    return dataclasses.replace(gaussians, sh_direction="sun"), dataclasses.replace(cameras, sun_dir=suns)
+
+
+@needs_native
+@pytest.mark.parametrize("kernel", native_kernels())
+@pytest.mark.parametrize(("sh_count", "channels"), [(4, 1), (4, 3), (9, 3), (16, 1)])
+def test_under_the_sun_kernels_match_the_reference_in_float64(kernel, sh_count, channels):
+    single = random_gaussians(60, channels, seed=sh_count, sh_count=sh_count)
+    single.log_scales += 1.0  # flat tops, as above
+    single, cameras = under_the_sun(single, looking_at_origin(3, 48))
+    double = dataclasses.replace(single, **{name: value.double() for name, value in single.tensors().items()})
+    exact = dataclasses.replace(
+        cameras,
+        world_to_camera=cameras.world_to_camera.double(),
+        K=cameras.K.double(),
+        sun_dir=cameras.sun_dir.double(),
+    )
+    truth, expected = outputs_and_gradients(double, exact, "reference", normals=True)
+    ours, gradients = outputs_and_gradients(single, cameras, f"native-{kernel}", normals=True)
+    for name in ("radiance", "alpha", "depth", "normals"):
+        # float32 rounding; one contribution on the 1/255 cutoff may fall on either side
+        error = (getattr(ours, name).double() - getattr(truth, name)).abs()
+        assert error.max() < 2e-2 and error.mean() < 1e-5, name
+    for name, gradient in expected.items():
+        torch.testing.assert_close(
+            gradients[name].double(), gradient, rtol=0, atol=2e-4 * float(gradient.abs().max()), msg=name
+        )
+
+
+def test_under_the_sun_the_reference_gradient_matches_finite_differences():
+    gaussians = random_gaussians(4, 1, seed=3, dtype=torch.float64)
+    gaussians.log_scales += 1.5  # wide and faint, as above
+    gaussians.opacity_logits = torch.full_like(gaussians.opacity_logits, 0.5)
+    gaussians, cameras = under_the_sun(gaussians, looking_at_origin(2, 5, dtype=torch.float64))
+
+    def image(means, quats, log_scales, opacity_logits, sh, pose):
+        moved = dataclasses.replace(cameras, world_to_camera=pose)
+        out = render(Gaussians(means, quats, log_scales, opacity_logits, sh, "sun"), moved, "reference")
+        return out.radiance, out.alpha, out.depth
+
+    leaves = [t.clone().requires_grad_() for t in (*gaussians.tensors().values(), cameras.world_to_camera)]
+    assert torch.autograd.gradcheck(image, leaves, eps=1e-6, atol=1e-5)
+
+
+@pytest.mark.parametrize("backend", ["reference", *(["native"] if native_kernels() else [])])
+def test_under_one_sun_a_model_is_the_constant_one_that_it_is_baked_into(backend):
+    gaussians, cameras = under_the_sun(random_gaussians(100), looking_at_origin(2, 40))
+    for c in range(2):
+        suns = cameras.sun_dir[c].expand(2, 3)
+        lit = render(gaussians, dataclasses.replace(cameras, sun_dir=suns), backend).radiance
+        baked = gaussians.lit_from(cameras.sun_dir[c])
+        assert baked.sh.shape[1] == 1
+        plain = dataclasses.replace(cameras, sun_dir=None)
+        torch.testing.assert_close(render(baked, plain, backend).radiance, lit, rtol=0, atol=1e-5)
+    with pytest.raises(ValueError, match="give sun_dir"):
+        gaussians.lit_from(None)
+
+
+def test_lamberts_cosine_is_what_degree_one_under_the_sun_means():
+    albedo, normal = 2.0, np.array([0.0, 0.6, 0.8])
+    wide = Gaussians(  # covers the whole picture, so that every pixel shows its radiance
+        torch.zeros(1, 3),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 3), 3.0),
+        torch.tensor([9.0]),
+        torch.zeros(1, 4, 1),
+        "sun",
+    )
+    wide.sh[0, 1:, 0] = torch.tensor(-albedo * normal[[1, 2, 0]] / 0.4886025119029199 * [1, -1, 1])
+    rng = np.random.default_rng(0)
+    for sun in rng.normal(size=(20, 3)):
+        sun /= np.linalg.norm(sun)
+        lit = dataclasses.replace(
+            looking_at_origin(1, 9), sun_dir=torch.tensor(sun, dtype=torch.float32)[None]
+        )
+        out = render(wide, lit)
+        seen = float(out.radiance[0, 4, 4, 0] / out.alpha[0, 4, 4])
+        # softplus lies above max(0, .) by at most ln 2 / 10, at the terminator
+        assert -1e-4 < seen - albedo * max(0.0, float(normal @ sun)) < 0.0694
+
+
+@pytest.mark.parametrize("backend", ["reference", *(["native"] if native_kernels() else [])])
+def test_a_model_under_the_sun_needs_to_know_where_it_is(backend):
+    gaussians, cameras = under_the_sun(random_gaussians(3), looking_at_origin(2, 16))
+    with pytest.raises(ValueError, match=r"give Cameras\(sun_dir"):
+        render(gaussians, dataclasses.replace(cameras, sun_dir=None), backend)
+    with pytest.raises(ValueError, match=r"sun_dir must be \[2, 3\], got \[3\]"):
+        dataclasses.replace(cameras, sun_dir=cameras.sun_dir[0])
+    with pytest.raises(ValueError, match="sh_direction must be view or sun, got 'moon'"):
+        dataclasses.replace(gaussians, sh_direction="moon")
 
 
 @needs_native

@@ -1,0 +1,363 @@
+"""A Sun that moves over the target: an ellipsoid whose light is known in closed form, from pictures to the outputs."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import onnxruntime
+import plyfile
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from flightsw.errors import TriageError
+from flightsw.icd.frame import Frame, PoseTag, encode_frame, matrix_to_quat
+from flightsw.icd.mission import Mission
+from flightsw.triage import Renderer, rank_frames
+from ground.card import model_card
+from ground.evaluate import evaluate
+from ground.reconstruct import reconstruct, sensor_of, sun_direction, training_frame
+from ground.report import write_report
+from ground.session import SessionWriter, open_session
+from obbgs_core.cameras import Cameras
+from obbgs_core.errors import ReconstructionError
+from obbgs_core.export_onnx import export_onnx
+from obbgs_core.frames import Batches, TrainingFrame, sun_span_deg
+from obbgs_core.gaussians import Gaussians
+from obbgs_core.methods import preset
+from obbgs_core.metrics import psnr_db
+from obbgs_core.optimize import Trainer, train
+from obbgs_core.parsimony import next_degree_gain
+from obbgs_core.ply import display_sh, load_ply, save_ply
+from obbgs_core.render import render
+from obbgs_core.sensor import Sensor
+from obbgs_core.spz import load_spz, save_spz
+from obbgs_core.surface import surface_points
+
+SIZE_PX, RANGE_M = 48, 60.0
+SEMI_AXES_M = np.array([1.5, 1.0, 0.7])
+K = np.array([[600.0, 0, SIZE_PX / 2], [0, 600.0, SIZE_PX / 2], [0, 0, 1]])
+SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=4.0, read_noise_dn=8.0)
+EXPOSURES_S = (5e-5, 1e-4, 2e-4)
+QUICK = {"steps": 240, "start_count": 800, "max_gaussians": 1200, "pyramid": ((0.0, 0.5), (0.3, 1.0))}
+
+
+def lambertian_ellipsoid(world_to_camera: np.ndarray, sun_dir: np.ndarray) -> np.ndarray:
+    """Return the radiance [H, W] of a matt ellipsoid of two albedos under the Sun alone: rays met in closed form.
+
+    It is convex, so it casts no shadow on itself beyond max(0, n·s).
+    """
+    fine = 3  # rays along a pixel's side
+    at = (np.arange(SIZE_PX * fine) + 0.5) / fine
+    u, v = np.meshgrid(at, at)
+    R, t = world_to_camera[:3, :3], world_to_camera[:3, 3]
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1) @ R
+    origin, towards = -(R.T @ t) / SEMI_AXES_M, rays / SEMI_AXES_M  # in these units it is the unit sphere
+    a, b, c = (towards**2).sum(-1), towards @ origin, origin @ origin - 1
+    hit = b * b - a * c > 0
+    point = origin + ((-b - np.sqrt(np.where(hit, b * b - a * c, 0))) / a)[..., None] * towards
+    normal = point / SEMI_AXES_M
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    albedo = np.where(point[..., 0] * point[..., 2] > 0, 0.9, 0.5)
+    light = np.where(hit, albedo * np.maximum(0, normal @ sun_dir), 0)
+    return light.reshape(SIZE_PX, fine, SIZE_PX, fine).mean(axis=(1, 3))
+
+
+def views(
+    count: int, still: bool = False, seed: int = 0, brackets_of: int = 1
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return poses [4, 4] from everywhere and Suns [3] within 100 degrees of the camera, or one Sun for all."""
+    rng, out = np.random.default_rng(seed), []
+    while len(out) < count:
+        pose = np.eye(4)
+        pose[:3, :3], pose[2, 3] = Rotation.random(rng=rng).as_matrix(), RANGE_M
+        sun = np.array([0.0, 0.6, 0.8]) if still else rng.normal(size=3)
+        sun /= np.linalg.norm(sun)
+        if -pose[2, :3] @ sun > math.cos(math.radians(100)):
+            out += [(pose, sun)] * brackets_of
+    return out
+
+
+def read_out(radiance: np.ndarray, exposure_s: float, rng: np.random.Generator) -> np.ndarray:
+    expected = 64 + radiance * exposure_s * 4e7
+    noise = rng.normal(size=radiance.shape) * np.sqrt((expected - 64) / 4 + 64)
+    return np.clip(np.round(expected + noise), 0, 4095)
+
+
+def photographed(seen: list[tuple[np.ndarray, np.ndarray]], seed: int = 0) -> list[TrainingFrame]:
+    rng, frames = np.random.default_rng(seed), []
+    for i, (pose, sun) in enumerate(seen):
+        dn = read_out(lambertian_ellipsoid(pose, sun), EXPOSURES_S[i % 3], rng)
+        frames.append(
+            TrainingFrame(
+                torch.from_numpy(dn[..., None]).float(),
+                EXPOSURES_S[i % 3],
+                torch.tensor(pose).float(),
+                torch.tensor(K).float(),
+                i,
+                sun_dir=torch.tensor(sun).float(),
+            )
+        )
+    return frames
+
+
+def clean_db(gaussians: Gaussians, seen: list[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Return the mean PSNR of the model's radiance against the ellipsoid's, 1 = 1."""
+    values = []
+    for pose, sun in seen:
+        camera = Cameras(
+            torch.tensor(pose[None]).float(),
+            torch.tensor(K[None]).float(),
+            SIZE_PX,
+            SIZE_PX,
+            sun_dir=torch.tensor(sun[None]).float(),
+        )
+        true = torch.from_numpy(lambertian_ellipsoid(pose, sun)).float()[..., None]
+        values.append(psnr_db(render(gaussians, camera).radiance[0], true))
+    return sum(values) / len(values)
+
+
+def lit_model(count: int, sh_count: int = 4, channels: int = 3, seed: int = 0) -> Gaussians:
+    g = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=torch.randn(count, 3, generator=g) * 0.6,
+        quats=torch.randn(count, 4, generator=g),
+        log_scales=torch.rand(count, 3, generator=g) * 1.5 - 3.5,
+        opacity_logits=torch.randn(count, generator=g) * 2 + 1,
+        sh=torch.rand(count, sh_count, channels, generator=g) * 2 - 0.5,
+        sh_direction="sun",
+    )
+
+
+@pytest.fixture(scope="module")
+def moving() -> list[TrainingFrame]:
+    return photographed(views(60))
+
+
+@pytest.fixture(scope="module")
+def under_the_sun(moving):
+    return train(moving, SENSOR, preset("obbgs", **QUICK), seed=1)
+
+
+def test_under_a_moving_sun_the_model_turns_with_it_and_beats_the_static_one_on_unseen_views(
+    moving, under_the_sun
+):
+    static = train(moving, SENSOR, preset("obbgs", **QUICK, sun_span_deg=0.0), seed=1)
+    unseen = views(12, seed=99)
+    assert under_the_sun.gaussians.sh_direction == "sun" and static.gaussians.sh_direction == "view"
+    assert under_the_sun.appearance.startswith("turns with the sun (step 12, degree 1: with the sun it would")
+    assert under_the_sun.sun_span_deg > 150
+    gain_db = clean_db(under_the_sun.gaussians, unseen) - clean_db(static.gaussians, unseen)
+    assert gain_db > 3
+
+
+def test_the_static_model_is_kept_when_the_sun_stands_still_or_is_not_known():
+    still = photographed(views(30, still=True))
+    unknown = [dataclasses.replace(frame, sun_dir=None) for frame in still]
+    partly = [
+        dataclasses.replace(frame, sun_dir=frame.sun_dir if frame.id else None) for frame in moving_few()
+    ]
+    results = [train(frames, SENSOR, preset("obbgs", **QUICK), seed=1) for frames in (still, unknown, partly)]
+    for result in results:
+        assert result.gaussians.sh_direction == "view" and result.sun_span_deg == pytest.approx(0, abs=1e-4)
+        assert "sun" not in result.appearance
+    for name, tensor in results[0].gaussians.tensors().items():  # a Sun that stands still changes nothing
+        assert torch.equal(tensor, getattr(results[1].gaussians, name)), name
+
+
+def moving_few() -> list[TrainingFrame]:
+    return photographed(views(12))
+
+
+@pytest.mark.parametrize("angle_deg", [0.5, 4.0, 30.0, 179.0])
+def test_the_span_is_the_largest_angle_between_two_suns(angle_deg):
+    frames = moving_few()[:4]
+    angles = np.radians([0, angle_deg, angle_deg / 2, angle_deg / 3])
+    suns = [torch.tensor([math.cos(a), math.sin(a), 0.0]) for a in angles]
+    lit = [dataclasses.replace(f, sun_dir=s) for f, s in zip(frames, suns, strict=True)]
+    assert sun_span_deg(lit) == pytest.approx(angle_deg, abs=1e-2)  # float32 directions
+    with pytest.raises(ReconstructionError, match=r"frame 2 .* expected a unit vector"):
+        Trainer(
+            [*lit[:2], dataclasses.replace(lit[2], sun_dir=torch.ones(3))], SENSOR, preset("obbgs", **QUICK)
+        )
+
+
+def shown(model: Gaussians, spread_deg: float) -> list[TrainingFrame]:
+    """Return noisy frames of a model, their Suns within a cone of `spread_deg` about z."""
+    rng, frames = np.random.default_rng(3), []
+    for i, (pose, _) in enumerate(views(24, still=True)):
+        off = rng.normal(size=2) * math.tan(math.radians(spread_deg / 2)) / 2
+        sun = torch.nn.functional.normalize(torch.tensor([*off, 1.0]), dim=0).float()
+        world_to_camera, matrix = torch.tensor(pose).float(), torch.tensor(K).float()
+        camera = Cameras(world_to_camera[None], matrix[None], SIZE_PX, SIZE_PX, sun_dir=sun[None])
+        dn = read_out(render(model, camera).radiance[0].numpy(), 1e-4, rng)
+        frames.append(
+            TrainingFrame(torch.from_numpy(dn).float(), 1e-4, world_to_camera, matrix, i, sun_dir=sun)
+        )
+    return frames
+
+
+def test_light_that_follows_the_sun_asks_for_its_harmonics_and_constant_light_does_not():
+    lit = lit_model(8, channels=1, seed=2)
+    lit.opacity_logits[:], lit.log_scales[:] = 2.0, -1.5
+    lit.sh[:, 0] = 2.0
+    plain = dataclasses.replace(lit, sh=lit.sh[:, :1])
+    for truth, spread_deg, pays in ((lit, 60, True), (plain, 60, False), (plain, 8, False)):
+        batches = Batches(shown(truth, spread_deg), preset("obbgs"), torch.Generator().manual_seed(0))
+        gain, cost = next_degree_gain(plain, batches, SENSOR, 1.0, torch.Generator().manual_seed(0))
+        assert (gain > cost) == pays, (gain, cost)
+
+
+def test_a_killed_training_under_the_sun_resumes_to_the_same_bits(moving, under_the_sun, tmp_path):
+    first = Trainer(moving, SENSOR, preset("obbgs", **QUICK), seed=1)
+    for _ in range(30):  # the Sun joined at step 12
+        first.step()
+    assert first.gaussians.sh_direction == "sun"
+    first.save(tmp_path / "checkpoint")
+    resumed = train(moving, SENSOR, preset("obbgs", **QUICK), 1, checkpoint=tmp_path / "checkpoint")
+    assert resumed.appearance == under_the_sun.appearance and len(resumed.history) == 240
+    assert resumed.gaussians.sh_direction == "sun"
+    for name, tensor in under_the_sun.gaussians.tensors().items():
+        assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
+    moved = [dataclasses.replace(moving[0], sun_dir=-moving[0].sun_dir), *moving[1:]]
+    assert not Trainer(moved, SENSOR, preset("obbgs", **QUICK), 1).resume(tmp_path / "checkpoint")
+
+
+@pytest.mark.parametrize(("sh_count", "channels"), [(4, 1), (4, 3), (9, 3)])
+def test_a_model_under_the_sun_comes_back_exactly_and_viewers_see_it_under_the_stated_one(
+    tmp_path, sh_count, channels
+):
+    gaussians, sun = lit_model(17, sh_count, channels), torch.tensor([0.48, -0.6, 0.64])
+    save_ply(gaussians, tmp_path / "m.ply", 1.5, sun)
+    again = load_ply(tmp_path / "m.ply")
+    assert again.sh_direction == "sun"
+    for name, tensor in gaussians.tensors().items():
+        assert torch.equal(getattr(again, name), tensor), name
+    file = plyfile.PlyData.read(str(tmp_path / "m.ply"))
+    assert any("the Sun towards 0.480000 -0.600000 0.640000, body frame" in line for line in file.comments)
+    shown = np.stack([file["vertex"][f"f_dc_{i}"] for i in range(3)], axis=1)
+    baked = gaussians.lit_from(sun)
+    np.testing.assert_allclose(shown, display_sh(baked, 1.5)[:, 0].numpy(), atol=1e-6)
+    assert "f_rest_0" not in file["vertex"].data.dtype.names
+    save_spz(gaussians, tmp_path / "m.spz", 1.5, sun)
+    save_spz(baked, tmp_path / "baked.spz", 1.5)
+    assert (tmp_path / "m.spz").read_bytes() == (tmp_path / "baked.spz").read_bytes()
+    assert load_spz(tmp_path / "m.spz").sh_direction == "view"
+    for save, path in ((save_ply, tmp_path / "n.ply"), (save_spz, tmp_path / "n.spz")):
+        with pytest.raises(ValueError, match="give sun_dir"):
+            save(gaussians, path)
+        assert not path.exists()
+
+
+@pytest.mark.parametrize(("sh_count", "channels"), [(4, 1), (9, 3)])
+def test_onnxruntime_agrees_with_our_renderer_under_many_suns(tmp_path, sh_count, channels):
+    gaussians = lit_model(400, sh_count, channels)
+    export_onnx(gaussians, SENSOR, tmp_path / "m.onnx", SIZE_PX, SIZE_PX, EXPOSURES_S)
+    session = onnxruntime.InferenceSession(str(tmp_path / "m.onnx"))
+    assert {i.name: i.shape for i in session.get_inputs()}["sun_dir"] == [3]
+    images = []
+    for pose, sun in views(8):
+        pose[2, 3] = 40.0
+        camera = Cameras(
+            torch.tensor(pose[None]).float(),
+            torch.tensor(K[None]).float(),
+            SIZE_PX,
+            SIZE_PX,
+            sun_dir=torch.tensor(sun[None]).float(),
+        )
+        feed = {
+            "world_to_camera": pose.astype(np.float32),
+            "K": K.astype(np.float32),
+            "exposure_time_s": np.array(5e-5, dtype=np.float32),
+            "sun_dir": sun.astype(np.float32),
+        }
+        images.append(session.run(["image"], feed)[0])
+        ours = (SENSOR.expected_dn(render(gaussians, camera).radiance[0], 5e-5) / SENSOR.white_dn).clamp(0, 1)
+        assert psnr_db(torch.tensor(images[-1]), ours) >= 50  # dB, the project's bar
+    feed["sun_dir"] = -feed["sun_dir"]
+    assert np.abs(session.run(["image"], feed)[0] - images[-1]).max() > 0.05  # the input counts
+    export_onnx(
+        gaussians.lit_from(torch.tensor(sun).float()), SENSOR, tmp_path / "s.onnx", 48, 48, EXPOSURES_S
+    )
+    static = onnxruntime.InferenceSession(str(tmp_path / "s.onnx"))
+    assert [i.name for i in static.get_inputs()] == ["world_to_camera", "K", "exposure_time_s"]
+
+
+def test_the_surface_does_not_depend_on_which_picture_had_which_sun(under_the_sun):
+    seen = views(20)
+    poses = torch.tensor(np.array([pose for pose, _ in seen])).float()
+    suns = torch.tensor(np.array([sun for _, sun in seen])).float()
+    cameras = Cameras(poses, torch.tensor(K).float().expand(20, 3, 3), SIZE_PX, SIZE_PX, sun_dir=suns)
+    points, _ = surface_points(under_the_sun.gaussians, cameras, 2000)
+    others = dataclasses.replace(cameras, sun_dir=suns.roll(7, dims=0))
+    assert len(points) == 2000 and torch.equal(
+        surface_points(under_the_sun.gaussians, others, 2000)[0], points
+    )
+    beyond = np.abs(np.linalg.norm(points.numpy() / SEMI_AXES_M, axis=1) - 1)
+    assert np.median(beyond) < 0.2  # of the middle axis: two pixels
+    with pytest.raises(ValueError, match="give sun_dir"):
+        surface_points(under_the_sun.gaussians, dataclasses.replace(cameras, sun_dir=None), 10)
+
+
+def lambertian_session(folder, mission: Mission, brackets: int) -> list[Frame]:
+    camera = dataclasses.replace(
+        mission.camera,
+        fx_px=K[0, 0],
+        fy_px=K[1, 1],
+        cx_px=K[0, 2],
+        cy_px=K[1, 2],
+    )
+    mission = dataclasses.replace(mission, camera=camera)
+    writer, rng, frames = SessionWriter(folder, mission), np.random.default_rng(0), []
+    for i, (pose, sun) in enumerate(views(3 * brackets, brackets_of=3)):
+        dn = read_out(lambertian_ellipsoid(pose, sun), EXPOSURES_S[i % 3], rng).astype(np.uint16)
+        position = -pose[:3, :3].T @ pose[:3, 3]
+        tag = PoseTag(matrix_to_quat(pose[:3, :3]), position, np.eye(6) * 1e-12, sun, False, True)
+        time_ns = 1_784_631_150_000_000_000 + i * 10**9
+        frame = Frame(i, i // 3, i % 3, 3, EXPOSURES_S[i % 3], time_ns, tag, dn, 12, 64.0, 0)
+        writer.add(frame, encode_frame(frame))
+        frames.append(frame)
+    writer.save({}, 0)
+    return frames
+
+
+def test_a_session_under_a_moving_sun_gives_outputs_that_know_it(tmp_path, small_mission):
+    frames = lambertian_session(tmp_path / "session", small_mission, 32)
+    session = open_session(tmp_path / "session")
+    np.testing.assert_allclose(
+        training_frame(session, session.frames[4]).sun_dir, frames[4].pose.sun_dir_body, atol=1e-6
+    )
+    changes = QUICK | {"steps": 160}
+    folder = reconstruct(tmp_path / "session", "run", "obbgs", changes, blind_reference=True)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["sh_direction"] == "sun" and metrics["sun_span_deg"] > 90
+    assert metrics["onnx_parity_db"] >= 50
+    shown = torch.tensor(metrics["shown_under_sun_dir_body"])
+    assert any(torch.allclose(sun_direction(r), shown, atol=1e-5) for r in session.frames)
+    assert load_ply(folder / "model.ply").sh_direction == load_ply(folder / "blind.ply").sh_direction == "sun"
+    known = evaluate(tmp_path / "session", "run")["psnr_noisy_db"]
+    lines = (tmp_path / "session" / "frames.jsonl").read_text().splitlines()
+    wrong = [json.loads(line) for line in lines]
+    for entry in wrong:  # each frame is given the opposite Sun: the held-out views must suffer
+        entry["sun_dir_body"] = [-x for x in entry["sun_dir_body"]]
+    (tmp_path / "session" / "frames.jsonl").write_text("".join(json.dumps(e) + "\n" for e in wrong))
+    assert evaluate(tmp_path / "session", "run")["psnr_noisy_db"] < known - 3
+    card = model_card("2026-07-21T00:00:00+00:00", metrics)
+    assert "Radiance turns with the sun (step 8" in card and "hold every Sun" in card
+    assert "turns with the sun" in write_report(tmp_path / "session", "run").read_text()
+
+    store = tmp_path / "store"
+    store.mkdir()
+    for frame in frames[:9]:
+        (store / f"{frame.frame_id:08d}.obf").write_bytes(encode_frame(frame))
+    turned = dataclasses.replace(frames[3].pose, sun_dir_body=-frames[3].pose.sun_dir_body)
+    (store / "00000003.obf").write_bytes(encode_frame(dataclasses.replace(frames[3], pose=turned)))
+    ranked, unreadable = rank_frames(folder / "model.onnx", store, K)
+    by_id = {r.frame_id: r.mean_chi2 for r in ranked}
+    assert unreadable == 0 and by_id[3] > 3 * max(
+        by_id[4], by_id[5]
+    )  # the same picture but for the wrong Sun
+    with pytest.raises(TriageError, match="give sun_dir"):
+        Renderer(folder / "model.onnx").expected_dn(np.eye(4), K, 1e-4)
+    assert sensor_of(session.camera).black_dn == 64
