@@ -223,13 +223,17 @@ def test_a_short_packet_neither_overtakes_a_long_one_nor_waits_for_it(url):
     assert wire.received == b"".join(packets)
 
 
-def test_can_fd_has_40_ms_of_messages_under_way_while_the_other_side_is_busy():
+def test_can_fd_has_20_ms_under_way_and_no_more_than_an_adapter_and_a_terminal_hold():
     """Half of the channels wait behind the others' data with their first frames."""
     wire = Wire(FD)
     framed = frame_packet(bytes(1100))
     wire.flight.write(40 * framed)
     _, down = wire.flight.exchange([])
-    assert len(down) / 2 * len(framed) * 10 / FD.payload_baud_rate > 0.04
+    assert len(down) / 2 * len(framed) * 10 / FD.payload_baud_rate > 0.02
+    text_bytes = sum(map(len, map(format_slcan, down)))
+    _, up = wire.ground.exchange(down)
+    text_bytes += sum(map(len, map(format_slcan, wire.flight.exchange(up)[1])))
+    assert text_bytes < 32_768 + 19_456  # as measured of a pseudo-terminal; the adapter is the virtual one
     assert len({frame.arbitration_id for frame in down}) == len(down)
 
 
