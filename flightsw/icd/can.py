@@ -19,7 +19,7 @@ from flightsw.icd.link_url import SLCAN_BITRATES, LinkUrl
 # The ground's identifiers are the lower ones and win the bus: flow control and commands pass first.
 GROUND_IDS, FLIGHT_IDS = tuple(range(0x0C0, 0x0D0)), tuple(range(0x0D0, 0x0E0))
 # Some channels wait for their flow control while another's data are on the bus. So many must be under way that
-# the bus stays busy while the ground stores a frame (10 ms and more): 1100 bytes take 20 ms, on FD 2.5 ms. And no
+# the bus stays busy while the ground stores a frame (8 ms and more): 1100 bytes take 20 ms, on FD 2.5 ms. And no
 # more than adapter and terminal hold for a ground that does not read: 16 such messages are 39 kB of slcan text.
 CLASSIC_CHANNELS, FD_CHANNELS = 8, 16
 MAX_MESSAGE_BYTES = 4200  # the longest packet (4096 bytes) as COBS with its CRC
