@@ -1,5 +1,6 @@
 """flightsw: capture, downlink, serve, triage, plan, fsck."""
 
+import contextlib
 import dataclasses
 import json
 import logging
@@ -18,10 +19,10 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from flightsw.cameras import open_camera
+from flightsw.cameras import Camera, open_camera
 from flightsw.commands import ReplayCounter
 from flightsw.downlink import DownlinkProgress, run_downlink
-from flightsw.errors import FlightError
+from flightsw.errors import CaptureError, FlightError
 from flightsw.fsck import fsck
 from flightsw.icd.mission import BracketSection, ConfigError, Mission, load_mission
 from flightsw.link import Link, open_link
@@ -248,24 +249,38 @@ def _run(
     as_json: bool,
     key_file: Path | None = None,
 ) -> None:
-    """Capture and downlink side by side, whichever are asked for; print what became of every frame."""
+    """Capture and downlink side by side, whichever are asked for; print what became of every frame.
+
+    Key, link and camera come before the store: wrong ones leave none behind.
+    """
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     signal.signal(signal.SIGINT, lambda *_: stop.set())
-    store = open_store(store_dir, mission)
     captured = CaptureCounts()
     sent = DownlinkProgress()
-    with _progress() as progress:
+    with contextlib.ExitStack() as opened, _progress() as progress:
+        counter = link = camera = no_camera = None
+        if link_url is not None:
+            counter = ReplayCounter(key_file) if key_file is not None else None
+            if counter is not None:
+                opened.callback(counter.close)
+            link = opened.enter_context(open_link(link_url))
+        if camera_url is not None:
+            try:
+                camera = opened.enter_context(contextlib.closing(open_camera(camera_url, mission.camera)))
+            except CaptureError as error:
+                if link is None:
+                    raise
+                no_camera = error  # what is stored goes down all the same
+        store = open_store(store_dir, mission)
         capturing = threading.Event()
         thread = None
-        if link_url is not None:
+        if link is not None:
             task = progress.add_task("sent", total=None)
 
             def report_sent(now: DownlinkProgress) -> None:
                 progress.update(task, completed=now.delivered, total=now.delivered + now.waiting)
 
-            counter = ReplayCounter(key_file) if key_file is not None else None
-            link = open_link(link_url)  # a port that is not there is known before the first exposure
             if camera_url is not None:
                 capturing.set()
             thread = _Downlink(
@@ -273,10 +288,12 @@ def _run(
             )
             thread.start()
         try:
-            if camera_url is not None:
+            if no_camera is not None:
+                raise no_camera
+            if camera is not None:
                 shots = len(list(plan(mission)))
                 note = thread.note_capture if thread is not None else lambda counts: None
-                captured = _capture(mission, camera_url, store, progress, shots, stop, note)
+                captured = _capture(mission, camera, store, progress, shots, stop, note)
         except FlightError:
             if thread is not None:
                 thread.camera_failed = True
@@ -285,9 +302,6 @@ def _run(
             capturing.clear()
             if thread is not None:
                 thread.join()
-                link.close()
-                if thread.counter is not None:
-                    thread.counter.close()
         if thread is not None:
             if thread.error:
                 raise thread.error
@@ -315,7 +329,7 @@ def _run(
 
 def _capture(
     mission: Mission,
-    camera_url: str,
+    camera: Camera,
     store: FrameStore,
     progress: Progress,
     shots: int,
@@ -323,7 +337,6 @@ def _capture(
     on_counts: Callable[[CaptureCounts], None],
 ) -> CaptureCounts:
     task = progress.add_task("captured", total=shots)
-    camera = open_camera(camera_url, mission.camera)
 
     def wait_until(utc_ns: int) -> None:
         if camera.waits:
@@ -334,18 +347,15 @@ def _capture(
         progress.update(task, completed=counts.planned)
         on_counts(counts)
 
-    try:
-        return capture(
-            mission,
-            camera,
-            store,
-            on_frame=on_frame,
-            should_stop=stop.is_set,
-            wait_until=wait_until,
-            settings=lambda: load_settings(store.folder, mission),
-        )
-    finally:
-        camera.close()
+    return capture(
+        mission,
+        camera,
+        store,
+        on_frame=on_frame,
+        should_stop=stop.is_set,
+        wait_until=wait_until,
+        settings=lambda: load_settings(store.folder, mission),
+    )
 
 
 class _Downlink(threading.Thread):

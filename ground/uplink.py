@@ -30,6 +30,14 @@ JOB_NAME = re.compile(r"(\d{20})\.json", re.ASCII)
 MAX_MODEL_BYTES = 64 * 1024 * 1024  # as the dictionary's `model.size_bytes`
 LOOK_S = 0.2  # between looks at the folder
 ASK_INTERVALS = 2  # timer intervals before a command that was not answered is sent again
+UNREADABLE = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    OverflowError,
+    RecursionError,
+)  # a damaged command file
 END_INTERVALS = 4  # the same for one whose end is not known: the spacecraft answers with its reports
 NS = 1_000_000_000
 
@@ -283,7 +291,7 @@ class Uplinker:
         for counter in counters - set(self.jobs):
             try:
                 self.jobs[counter] = self._read(counter)
-            except (OSError, ValueError, KeyError, TypeError) as error:
+            except UNREADABLE as error:
                 log.error("command %d cannot be read: %s", counter, error)
                 (self._folder / f"{counter:020d}.json").unlink(missing_ok=True)
         for counter, job in list(self.jobs.items()):

@@ -16,9 +16,12 @@ import isotp
 from flightsw.icd.framing import DELIMITER
 from flightsw.icd.link_url import SLCAN_BITRATES, LinkUrl
 
-# Four channels a direction: some wait for their flow control while another's data are on the bus. The
-# ground's identifiers are the lower ones and win the bus: flow control and commands pass first.
-GROUND_IDS, FLIGHT_IDS = tuple(range(0x0C0, 0x0C8)), tuple(range(0x0C8, 0x0D0))
+# The ground's identifiers are the lower ones and win the bus: flow control and commands pass first.
+GROUND_IDS, FLIGHT_IDS = tuple(range(0x0C0, 0x0D0)), tuple(range(0x0D0, 0x0E0))
+# Some channels wait for their flow control while another's data are on the bus. So many must be under way that
+# the bus stays busy while the ground stores a frame (8 ms and more): 1100 bytes take 20 ms, on FD 2.5 ms. And no
+# more than adapter and terminal hold for a ground that does not read: 16 such messages are 39 kB of slcan text.
+CLASSIC_CHANNELS, FD_CHANNELS = 8, 16
 MAX_MESSAGE_BYTES = 4200  # the longest packet (4096 bytes) as COBS with its CRC
 ANSWER_S = 0.2  # for the other side to answer at all, on a busy computer too
 CONSECUTIVE_FRAME = 2  # the type in its first half byte, ISO 15765-2
@@ -41,14 +44,16 @@ class IsoTpChannels:
         self.frames_repeated = 0  # came twice in a row
         self.frames_foreign = 0  # of other nodes
         self._payload_bytes_per_s = url.payload_baud_rate / 10
-        self._single_bytes = 62 if url.fd else 7
+        self._channel_count = FD_CHANNELS if url.fd else CLASSIC_CHANNELS
+        self._single_bytes = 62 if url.fd else 7  # more needs flow control
         self._waiting: deque[bytes] = deque()
         self._outgoing: list[isotp.CanMessage] = []
         self._incoming: deque[isotp.CanMessage] = deque()  # of the channel that is processed
         self._last_data = dict.fromkeys(other_ids, b"")
+        count = self._channel_count
         self._channels = {
             other_id: self._channel(own_id, other_id, url.fd)
-            for own_id, other_id in zip(own_ids, other_ids, strict=True)
+            for own_id, other_id in zip(own_ids[:count], other_ids[:count], strict=True)
         }
 
     def _channel(self, own_id: int, other_id: int, fd: bool) -> isotp.TransportLayerLogic:
@@ -60,7 +65,7 @@ class IsoTpChannels:
             "can_fd": fd,
             "bitrate_switch": fd,
             "max_frame_size": MAX_MESSAGE_BYTES,
-            "rx_consecutive_frame_timeout": self._answer_ms(MAX_MESSAGE_BYTES),
+            "rx_consecutive_frame_timeout": self._answer_ms(MAX_MESSAGE_BYTES),  # the others' may come first
             "logger_name": _isotp_log,
             "wait_func": lambda seconds: None,  # the check of these parameters would sleep
         }
@@ -73,7 +78,9 @@ class IsoTpChannels:
         )
 
     def _answer_ms(self, message_bytes: int) -> int:
-        return int(1000 * (ANSWER_S + 3 * message_bytes / self._payload_bytes_per_s))
+        """Return how long an answer may take behind such messages of all the other channels."""
+        queued_s = self._channel_count * message_bytes / self._payload_bytes_per_s
+        return int(1000 * (ANSWER_S + 3 * queued_s))
 
     def _note_error(self, error: Exception) -> None:
         if isinstance(error, isotp.FlowControlTimeoutError | isotp.OverflowError):
@@ -109,10 +116,9 @@ class IsoTpChannels:
             self._incoming.extend(self._without_repeats(number, run))
             received += self._process(channel)
         for channel in self._channels.values():  # time-outs
-            received += self._process(channel)
-        while self._start():
-            for channel in self._channels.values():
+            if channel.transmitting() or channel.is_rx_active():
                 received += self._process(channel)
+        self._start()
         frames_out = self._outgoing.copy()
         self._outgoing.clear()
         return bytes(received), frames_out
@@ -133,21 +139,20 @@ class IsoTpChannels:
             self._last_data[number] = frame.data
             yield frame
 
-    def _start(self) -> bool:
-        """Give waiting messages to free channels; tell whether one started."""
-        started = False
-        while self._waiting and (idle := [c for c in self._channels.values() if not c.transmitting()]):
-            if len(self._waiting[0]) <= self._single_bytes and len(idle) < len(self._channels):
-                break  # without flow control it would overtake the one before it
+    def _start(self) -> None:
+        """Give waiting messages to free channels."""
+        idle = [channel for channel in self._channels.values() if not channel.transmitting()]
+        while self._waiting and idle:
             message = self._waiting.popleft()
-            idle[0].params.set(
-                "rx_flowcontrol_timeout", self._answer_ms(len(self._channels) * len(message)), validate=False
-            )
-            idle[0].send(message)
-            started = True
-            if len(message) <= self._single_bytes:
-                break  # it takes the channel until it is processed
-        return started
+            if len(idle) < len(self._channels):
+                # without flow control it would overtake those under way; COBS leaves no zero byte in a packet
+                message = message.ljust(self._single_bytes + 1, DELIMITER)
+            channel = idle[0]
+            channel.params.set("rx_flowcontrol_timeout", self._answer_ms(len(message)), validate=False)
+            channel.send(message)
+            channel.process()
+            if channel.transmitting():
+                idle.remove(channel)
 
     def _process(self, channel: isotp.TransportLayerLogic) -> bytes:
         received = bytearray()
@@ -155,7 +160,7 @@ class IsoTpChannels:
         while self._incoming:
             channel.process()
         while (message := channel.recv()) is not None:
-            received += message + DELIMITER
+            received += message.rstrip(DELIMITER) + DELIMITER  # without what lengthened it
         return bytes(received)
 
 

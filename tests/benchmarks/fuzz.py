@@ -20,6 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 try:
     import atheris
@@ -32,7 +33,7 @@ if atheris is not None and "--inside" in sys.argv:
     # what is imported from here on reports its coverage; atheris cannot look into the editable install's loader
     sys.meta_path[:] = [f for f in finders if type(f).__name__ != "ScikitBuildRedirectingFinder"]
     hook = atheris.instrument_imports(  # type: ignore[attr-defined]
-        include=["flightsw", "cfdppy", "spacepackets", "isotp"]
+        include=["flightsw", "ground", "cfdppy", "spacepackets", "isotp"]
     )
     hook.__enter__()
 
@@ -40,7 +41,8 @@ import zlib
 
 import isotp
 
-from flightsw.icd.auth import Key, seal, unseal
+from flightsw.commands import Commander, ReplayCounter
+from flightsw.icd.auth import Key, seal, seal_file, unseal, unseal_file
 from flightsw.icd.can import (
     FD_SIZES,
     FLIGHT_IDS,
@@ -51,12 +53,26 @@ from flightsw.icd.can import (
     format_slcan,
 )
 from flightsw.icd.command import Command, Report
-from flightsw.icd.frame import CRC, MAX_PIXELS, decode_frame
+from flightsw.icd.frame import CRC, HEADER, MAX_PIXELS, decode_frame
 from flightsw.icd.framing import Deframer, PacketStream, frame_packet, max_frame_bytes
 from flightsw.icd.link_url import parse_link_url
-from flightsw.icd.packet import APID_FILES, TELECOMMAND, TELEMETRY, PacketError, unpack_packet
-from flightsw.icd.telemetry import DICTIONARY
+from flightsw.icd.mission import ConfigError, load_mission
+from flightsw.icd.packet import (
+    APID_EVENTS,
+    APID_FILES,
+    APID_FRAME_HEADERS,
+    APID_HOUSEKEEPING,
+    APID_REPORTS,
+    TELECOMMAND,
+    TELEMETRY,
+    PacketError,
+    unpack_packet,
+)
+from flightsw.icd.telemetry import DICTIONARY, NUMBERS, Item
 from flightsw.icd.transfer import Receiver, Sender, parse_pdu
+from flightsw.store import open_store
+from ground.telemetry import TelemetryLog
+from ground.uplink import Uplinker, parse_command
 
 if hook is not None:
     hook.__exit__(None, None, None)
@@ -313,7 +329,171 @@ def telemetry(containers: list[bytes]) -> Target:
     return target
 
 
-TARGETS = {f.__name__: f for f in (framing, container, cfdp, pipeline, slcan, iso_tp, telemetry)}
+def auth(containers: list[bytes]) -> Target:
+    """The texts of a key and its counter, sealed packets and sealed files."""
+    key = Key(7, bytes(range(32)))
+    sealed, file = seal(key, 7, b"content"), seal_file(key.secret, b"content")
+    target = Target([key.text.encode(), key.counter_text(7).encode(), sealed, file], lambda data: None)
+
+    def check(data: bytes) -> None:
+        accepted = target.accepted
+        text = data.decode("utf-8", "replace")
+        try:
+            again = Key.parse(text, "key")
+            accepted["keys"] = accepted.get("keys", 0) + 1
+            assert Key.parse(again.text, "key") == again
+        except ConfigError as error:
+            assert not any(part in str(error) for part in text.split() if len(part) > 16), (
+                "the secret is told"
+            )
+        try:
+            assert 0 <= key.parse_counter(text, "counter") < 1 << 64
+            assert key.fingerprint in text, "another key's counter was accepted"
+            accepted["counters"] = accepted.get("counters", 0) + 1
+        except ConfigError:
+            pass
+        for opened, original in ((partial(unseal, key), sealed), (partial(unseal_file, key.secret), file)):
+            try:
+                opened(data)
+            except PacketError:
+                continue
+            assert data == original, "something sealed was accepted that nobody sealed"
+            accepted["sealed"] = accepted.get("sealed", 0) + 1
+
+    target.check = check
+    return target
+
+
+def commander(containers: list[bytes]) -> Target:
+    """Commands on board: packets from anybody, and nonsense from the one who has the key."""
+    folder, key = Path(tempfile.mkdtemp()), Key(7, bytes(range(32)))
+    (folder / "key").write_text(key.text)
+    (folder / "key.received").write_text(key.counter_text(0))
+    mission = load_mission("mission.yaml")
+    arguments = [{"exposure_times_ms": (0.1, 0.2)}, {"near": 2}, {"order": "triage"}, {"command": "delete"}]
+    names = ["bracket", "near", "priority", "arm"]
+    plain = [Command(name, given).pack() for name, given in zip(names, arguments, strict=True)]
+    plain += [Command(name, {}).pack() for name in ("ping", "safe", "resume")]
+    plain.append(Command("delete", {"first_frame": 0, "last_frame": 5}).pack())
+    seeds = [joined(plain[:4]), joined(plain[4:]), *(seal(key, 1 << 40, command) for command in plain)]
+    target = Target(seeds, lambda data: None)
+    on_board = Commander(ReplayCounter(folder / "key"), open_store(folder / "store", mission), mission)
+
+    def check(data: bytes) -> None:
+        before = (on_board.last_counter, on_board.settings)
+        handled = on_board.refused + on_board.repeated
+        on_board.receive(data)
+        if data not in seeds:
+            assert (on_board.last_counter, on_board.settings) == before, (
+                "a command was obeyed that nobody sealed"
+            )
+            assert on_board.refused + on_board.repeated == handled + 1
+        for part in chunks(data)[:8]:
+            counted = on_board.accepted + on_board.refused
+            on_board.receive(seal(key, on_board.last_counter + 1, part))
+            assert on_board.accepted + on_board.refused == counted + 1
+        target.accepted = {"commands": on_board.accepted, "refused": on_board.refused}
+        on_board.reports.clear()  # as the downlink takes them out
+
+    target.check = check
+    return target
+
+
+def sample(item: Item) -> Any:
+    """Return a value that an item of the dictionary may have."""
+    if item.states:
+        return item.states[0][1]
+    number = item.range[0] if item.range else 1
+    return {"text": "a", "bytes": bytes(item.count)}.get(
+        item.kind, number if item.type in NUMBERS else (number,)
+    )
+
+
+def ground_telemetry(containers: list[bytes]) -> Target:
+    """What the ground writes down of telemetry: every line must be JSON that can be read again."""
+    folder = Path(tempfile.mkdtemp())
+    apids = [APID_HOUSEKEEPING, APID_EVENTS, APID_REPORTS, APID_FRAME_HEADERS, 0x7FF]
+    report = Report(1, 7, "accepted", "ping").pack()
+    event = DICTIONARY.events["transfer_failed"].pack(utc_ns=5, file="a", reason="b")
+    values = {item.name: sample(item) for item in DICTIONARY.telemetry["housekeeping"].items}
+    housekeeping = DICTIONARY.telemetry["housekeeping"].pack(**values)
+    seeds = [bytes([number]) + data for number, data in enumerate((housekeeping, event, report))]
+    seeds.append(bytes([3]) + containers[0][: HEADER.size])
+    target = Target(seeds, lambda data: None)
+
+    def check(data: bytes) -> None:
+        uplinker = Uplinker(folder, MAX_PACKET_BYTES, INTERVAL_S)
+        heard = []
+        log = TelemetryLog(folder, heard.append, lambda report: uplinker.take_report(report, 0.0))
+        for apid in (apids[data[0] % len(apids)], *apids) if data else ():
+            log.add(apid, data[1:])
+        lines = 0
+        for path in folder.glob("*.jsonl"):
+            content = path.read_bytes()
+            path.unlink()
+            lines += len([json.loads(line) for line in content.splitlines()])
+        assert log.write_failures == 0
+        assert lines + log.refused == (1 + len(apids) if data else 0), "a packet was neither kept nor counted"
+        assert len(heard) == len(log.events)
+        target.accepted["packets"] = target.accepted.get("packets", 0) + lines
+
+    target.check = check
+    return target
+
+
+def uplink(containers: list[bytes]) -> Target:
+    """The operator's command line, and the files that `ground uplink` leaves for the listener."""
+    session = Path(tempfile.mkdtemp())
+    job = session / "uplink" / f"{7:020d}.json"
+    job.parent.mkdir()
+    text = json.dumps({"packet": bytes(60).hex(), "command": "ping", "expires_utc_ns": 1 << 62}).encode()
+    words = [
+        "ping",
+        "bracket\0000.05,0.1",
+        "near\0002",
+        "priority\000triage",
+        "arm\000delete",
+        "delete\0001\0002",
+    ]
+    hostile = [text.replace(str(1 << 62).encode(), b"Infinity"), b"[" * MAX_INPUT_BYTES]
+    target = Target([text, *hostile, *(word.encode() for word in words)], lambda data: None)
+
+    def check(data: bytes) -> None:
+        name, *arguments = data.decode("utf-8", "replace").split("\0")
+        try:
+            command, _ = parse_command(name, arguments)
+            if name != "model":  # its arguments come from the file
+                packed = command.pack()
+                assert Command.unpack(packed).pack() == packed
+            target.accepted["command_lines"] = target.accepted.get("command_lines", 0) + 1
+        except ValueError:
+            pass
+        job.write_bytes(data)
+        uplinker = Uplinker(session, MAX_PACKET_BYTES, INTERVAL_S, utc_ns=lambda: 0)
+        packet = uplinker.next_command(0.0)
+        assert packet is not None or not job.exists() or uplinker.jobs == {}
+        if packet is not None:
+            assert json.loads(data)["packet"].lower().replace(" ", "") == packet.hex()
+            target.accepted["jobs"] = target.accepted.get("jobs", 0) + 1
+
+    target.check = check
+    return target
+
+
+PARSERS = (
+    framing,
+    container,
+    cfdp,
+    pipeline,
+    slcan,
+    iso_tp,
+    telemetry,
+    auth,
+    commander,
+    ground_telemetry,
+    uplink,
+)
+TARGETS = {f.__name__: f for f in PARSERS}
 
 
 def mutated(seeds: list[bytes], source: random.Random) -> bytes:
@@ -412,7 +592,9 @@ def main() -> int:
     for name in [arguments.target] if arguments.target else TARGETS:
         command = [sys.executable, "-m", "tests.benchmarks.fuzz", "--inside", "--target", name]
         command += ["--bytes", str(arguments.bytes)] + ["--unguided"] * (not guided)
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+        with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as scratch:
+            environment = os.environ | {"TMPDIR": scratch}
+            done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=environment)
         rows = [line[4:] for line in done.stdout.splitlines() if line.startswith("ROW ")]
         if not rows:
             failed += 1

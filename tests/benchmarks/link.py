@@ -85,7 +85,13 @@ def measure(case: str, trial: Trial, frames: int, size_px: int, limit_s: float) 
         "flight_rss_mb": round(result.flight_rss_mb, 1),
         "flight_cpu_share": None if trial.kills else round(result.flight_cpu_share, 3),
         "done_to_the_line": {name: count for name, count in done.items() if count},
-        "counted_by_ground": {name: result.ground[name] for name in counted if result.ground.get(name)},
+        "counted_by_ground": {
+            name: count
+            for name, count in (
+                {n: result.ground.get(n) for n in counted} | result.ground["link_losses"]
+            ).items()
+            if count
+        },
         "load": round(os.getloadavg()[0], 1),
     }
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+NOWHERE = ("--camera", "hil:///nowhere.sock")
 
 
 def run(*arguments: str, tool: str = "flightsw") -> subprocess.CompletedProcess:
@@ -48,6 +49,14 @@ def test_every_command_has_help_with_an_example(tool, command):
         (["downlink", "--link", "serial:///dev/nowhere?baud=9600", "--store", "{tmp}"], 1, "/dev/nowhere"),
         (["downlink", "--link", "carrier://pigeon", "--store", "{tmp}"], 2, "carrier://pigeon"),
         (["triage", "--model", "nowhere.onnx", "--frames", "{tmp}"], 1, "nowhere.onnx"),
+        (["serve", *NOWHERE, "--link", "serial:///dev/nowhere", "--store", "{tmp}"], 1, "/dev/nowhere"),
+        (
+            ["serve", *NOWHERE, "--link", "serial:///dev/null", "--key", "no.key", "--store", "{tmp}"],
+            2,
+            "no.key",
+        ),
+        (["serve", "--camera", "ftp://x", "--link", "can://nowhere", "--store", "{tmp}"], 1, "nowhere"),
+        (["fsck", "--store", "{tmp}"], 1, "is no frame store"),
         (["frobnicate"], 2, "frobnicate"),
     ],
 )
@@ -55,3 +64,4 @@ def test_what_goes_wrong_is_one_clear_line_and_an_exit_code(tmp_path, arguments,
     done = run(*[a.replace("{tmp}", str(tmp_path / "store")) for a in arguments])
     assert done.returncode == code, done.stderr
     assert message in done.stderr and "Traceback" not in done.stderr
+    assert not (tmp_path / "store").exists(), "a command that cannot start leaves no store behind"

@@ -194,13 +194,23 @@ def test_a_new_keys_first_command_is_not_answered_with_the_end_of_an_old_one(ses
     assert outcome(session, counter) is None
 
 
-def test_strange_files_in_the_folder_are_left_alone_and_damaged_jobs_removed(session, key_file):
+@pytest.mark.parametrize(
+    "content",
+    [
+        '{"packet": "zz"}',
+        '{"packet": "00", "command": "ping", "expires_utc_ns": Infinity}',
+        "[" * 100_000,
+        "7",
+    ],
+    ids=["hex", "infinity", "deep", "number"],
+)
+def test_strange_files_in_the_folder_are_left_alone_and_damaged_jobs_removed(session, key_file, content):
     folder = session / "uplink"
     folder.mkdir()
     (folder / "../outside.json").write_text("{}")
     for name in ("notes.txt", "1.json", f"{5:020d}.json.part"):
         (folder / name).write_text("{}")
-    (folder / f"{6:020d}.json").write_text('{"packet": "zz"}')
+    (folder / f"{6:020d}.json").write_text(content)
     assert Uplinker(session, 1000, INTERVAL_S).next_command(0.0) is None
     assert {path.name for path in folder.iterdir()} == {"notes.txt", "1.json", f"{5:020d}.json.part"}
 

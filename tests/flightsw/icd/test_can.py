@@ -208,6 +208,35 @@ def test_a_frame_that_comes_twice_harms_nothing(url):
     assert wire.ground.frames_discarded == 0
 
 
+@BOTH
+def test_a_short_packet_neither_overtakes_a_long_one_nor_waits_for_it(url):
+    wire = Wire(url)
+    packets = [frame_packet(bytes(range(1, 200))), frame_packet(b"end"), frame_packet(bytes(range(1, 200)))]
+    wire.flight.write(b"".join(packets))
+    _, down = wire.flight.exchange([])
+    assert [frame.data[0] >> 4 for frame in down] == [1, 1, 1]  # three first frames: all are under way
+    wire.received, up = wire.ground.exchange(down)
+    while up:
+        _, down = wire.flight.exchange(up)
+        packets_now, up = wire.ground.exchange(down)
+        wire.received += packets_now
+    assert wire.received == b"".join(packets)
+
+
+def test_can_fd_has_20_ms_under_way_and_no_more_than_an_adapter_and_a_terminal_hold():
+    """Half of the channels wait behind the others' data with their first frames."""
+    wire = Wire(FD)
+    framed = frame_packet(bytes(1100))
+    wire.flight.write(40 * framed)
+    _, down = wire.flight.exchange([])
+    assert len(down) / 2 * len(framed) * 10 / FD.payload_baud_rate > 0.02
+    text_bytes = sum(map(len, map(format_slcan, down)))
+    _, up = wire.ground.exchange(down)
+    text_bytes += sum(map(len, map(format_slcan, wire.flight.exchange(up)[1])))
+    assert text_bytes < 32_768 + 19_456  # as measured of a pseudo-terminal; the adapter is the virtual one
+    assert len({frame.arbitration_id for frame in down}) == len(down)
+
+
 def test_frames_of_other_nodes_are_not_for_us():
     wire = Wire(CLASSIC)
     other = [
