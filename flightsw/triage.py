@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 TILE_ROWS, TILE_COLUMNS = 20, 40  # px, as in the ground's densification
 FACTS = ("black_dn", "white_dn", "dn_per_radiance_s", "electrons_per_dn", "read_noise_dn")
-ALIKE_RAD = 0.6  # views so far apart share exp(-1/2) of what they show: about how far a face can be seen from
+ALIKE_RAD = 0.7  # views so far apart share exp(-1/2) of what they show: about how far a face can be seen from
 NOISE_CHI2 = 1.25  # below it is the worst tile of pure noise: 1 on average, a deviation of 0.05 for 800 px
 REPEAT = 0.05  # what a view that was sent already is still worth: its noise differs
 NICENESS = 10  # of the ranking thread: the link goes first

@@ -1,8 +1,8 @@
 """What triage is worth when a quarter of the frames comes down: python -m tests.benchmarks.triage --session DIR ...
 
-DIR is the session/ of a `hil dataset` with its truth; without one the shipped target is rendered in `--scenario`. The
-pass is on board whole. The oldest eighth of its frames comes down first and trains a first model; its ONNX export goes
-up, is verified and ranks the stored frames in the flight software's own worker and order, until a quarter is down; in
+DIR is the session/ of a `hil dataset`, with its truth; without one `--mesh` is rendered in `--scenario`. The whole pass
+is on board. The oldest eighth of its frames comes down first and trains a first model; its ONNX export goes up, is
+verified, and ranks the stored frames in the flight software's own worker and order until a quarter is down, in
 `--rounds` with a new model each. Then one model is trained on each choice of as many frames, all else equal:
 
 - triage: as above; residual: in the order of the residual alone; novelty: of the novelty of the view alone
@@ -217,9 +217,12 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="one JSON object a row")
     parser.add_argument("--session", type=Path, nargs="+", help="sessions of `hil dataset`")
     parser.add_argument("--scenario", default="fly-around", help="what to render without --session")
+    parser.add_argument(
+        "--mesh", type=Path, default=spacecraft.SHIPPED, help="its target; default the shipped one"
+    )
     parser.add_argument("--out", type=Path, default=Path("triage"), help="where to render")
     parser.add_argument("--choices", default="oldest,triage,random,even,even-after", help=", ".join(CHOICES))
-    parser.add_argument("--rounds", type=int, default=2, help="models uplinked")
+    parser.add_argument("--rounds", type=int, default=1, help="models uplinked")
     parser.add_argument("--seeds", type=int, default=3, help="of training; random frames are drawn anew")
     parser.add_argument("--steps-share", type=float, default=0.5)
     parser.add_argument("--threads", type=int, default=1)
@@ -231,8 +234,8 @@ def main() -> None:
     sessions = arguments.session
     if not sessions:
         config = DatasetConfig(scenario=arguments.scenario, frames=120, size_px=200)
-        folder = arguments.out / arguments.scenario
-        make_dataset(config, spacecraft.SHIPPED, folder, arguments.out / "renders")
+        folder = arguments.out / f"{arguments.mesh.stem}-{Path(arguments.scenario).stem}"
+        make_dataset(config, arguments.mesh, folder, arguments.out / "renders")
         sessions = [folder / "session"]
     for session in sessions:
         the_pass = load(session)
