@@ -119,7 +119,7 @@ def triage(
     top: Annotated[int, typer.Option(help="How many to print.")] = 20,
     json_: AsJson = False,
 ) -> None:
-    """Rank stored frames by how badly the model predicts them.
+    """Rank stored frames by how badly the model predicts them and how new their view is, as the downlink would.
 
     Example: flightsw triage --model model.onnx --frames store
     """

@@ -34,7 +34,7 @@ from flightsw.icd.transfer import UPLINK, Receiver, Sender, timer_s
 from flightsw.link import Link
 from flightsw.settings import Settings
 from flightsw.store import FrameStore, sync_folder
-from flightsw.triage import ModelVerified, Ranked, TriageWorker
+from flightsw.triage import ModelVerified, Ranked, TriageWorker, sending_order, sent_view
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +42,7 @@ WAIT_S = 0.02  # longest wait for the port before timers and outbox are looked a
 OUTBOX_S = 0.2  # between looks at the outbox, which another process may fill
 RETRY_S = 5.0  # before a frame that cannot be read is tried again
 AHEAD = 2  # files put before their data are on the wire: few, so that the order can change
+PLACED = 32  # frames whose place by triage is decided one by one at a look: more than go until the next
 HEADERS_A_LOOK = 20  # frame headers queued at once: a full outbox must not hold the files back
 GOODBYE_S = 0.5  # for the last telemetry at the end
 RANKING_S = 30.0  # for which pictures wait to be ranked by a new model: what goes first is lost to the others
@@ -155,6 +156,7 @@ class _Downlink:
         self._scores: dict[int, Ranked] = {}
         self._given_to_worker: set[int] = set()
         self._being_ranked: set[int] = set()
+        self._sent_views: dict[int, tuple[float, ...]] = {}  # of frames delivered and in flight
         self._model_sha256 = b""
         self._uploads: Receiver | None = None  # of the model file that was announced last
         self._upload_counter = 0
@@ -163,6 +165,9 @@ class _Downlink:
         if self._is_model_looked_at:
             self._worker.verify(self._model_path)
         self.waiting = store.outbox()
+        for frame_id in {frame.frame_id for frame in store.frames}.difference(self.waiting):
+            with contextlib.suppress(OSError), open(store.path(frame_id), "rb") as container:
+                self._note_sent(frame_id, container.read(HEADER.size))
         self.events.add("started", frames_stored=len(store.frames), outbox_frames=len(self.waiting))
 
     @property
@@ -193,9 +198,14 @@ class _Downlink:
                     self._worker.rank(self._store.path(frame_id))
         in_flight = set(self._sender.in_flight)
         self._queue = deque(
-            frame_id
-            for frame_id in self._ordered(self.waiting, now_s)
-            if picture_name(frame_id) not in in_flight and self._retry_s.get(frame_id, now_s) <= now_s
+            self._ordered(
+                [
+                    frame_id
+                    for frame_id in self.waiting
+                    if picture_name(frame_id) not in in_flight and self._retry_s.get(frame_id, now_s) <= now_s
+                ],
+                now_s,
+            )
         )
 
     def fill(self, now_s: float) -> None:
@@ -209,6 +219,7 @@ class _Downlink:
             if container is not None:
                 self._sizes_bytes[frame_id] = len(container)
                 sender.put(picture_name(frame_id), container, self._store.next_transaction(), now_s)
+                self._note_sent(frame_id, container[: HEADER.size])
 
     def turn(self, now_s: float) -> bool:
         """Send and receive what the port takes and gives at once; tell whether a transfer ended."""
@@ -231,6 +242,7 @@ class _Downlink:
                 self._confirm(int(outcome.name.removesuffix(".obf")))
             else:
                 self._failed += 1
+                self._sent_views.pop(int(outcome.name.removesuffix(".obf")), None)
                 log.info("%s: transfer failed (%s), put again", outcome.name, outcome.reason)
                 self.events.add("transfer_failed", file=outcome.name, reason=outcome.reason)
         return bool(outcomes)
@@ -317,15 +329,19 @@ class _Downlink:
             return frame_ids
         if self._is_model_looked_at or (self._being_ranked and now_s < self._hold_until_s):
             return []
-        frame_ids = [frame_id for frame_id in frame_ids if frame_id not in self._being_ranked]
+        ready = [frame_id for frame_id in frame_ids if frame_id not in self._being_ranked]
+        scores = [self._scores[frame_id] for frame_id in ready if frame_id in self._scores]
+        ordered = sending_order(scores, list(self._sent_views.values()), PLACED)
+        unranked = [frame_id for frame_id in ready if frame_id not in self._scores]
+        comparable = [score.frame_id for score in ordered if score.comparable]
+        return [*comparable, *unranked, *(score.frame_id for score in ordered if not score.comparable)]
 
-        def place(frame_id: int) -> tuple[int, float]:
-            score = self._scores.get(frame_id)
-            if score is None:
-                return 1, frame_id
-            return (0, -score.worst_chi2) if score.comparable else (2, frame_id)
-
-        return sorted(frame_ids, key=place)
+    def _note_sent(self, frame_id: int, header: bytes) -> None:
+        """Keep what a frame that is under way shows: others like it are worth less."""
+        with contextlib.suppress(PacketError):
+            view = sent_view(header)
+            if view is not None:
+                self._sent_views[frame_id] = view
 
     def _read(self, frame_id: int, now_s: float) -> bytes | None:
         try:

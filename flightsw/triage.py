@@ -1,4 +1,9 @@
-"""Which frames are worth sending first: those that the uplinked model predicts worst. onnxruntime and numpy only."""
+"""Which frames are worth sending first: those that the uplinked model predicts worst, and that show something new.
+
+The residual alone sends the best lit side again and again: it has the most light and so the largest chi², and the
+exposures of a bracket come one after the other. So a residual counts less the closer its view is to one that the ground
+has, or gets before. onnxruntime and numpy only.
+"""
 
 import hashlib
 import logging
@@ -6,13 +11,14 @@ import math
 import os
 import queue
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from flightsw.errors import TriageError
-from flightsw.icd.frame import Frame, decode_frame
+from flightsw.icd.frame import FLAG_ECLIPSE, FLAG_POSE_VALID, Frame, decode_frame, read_header
 from flightsw.icd.packet import PacketError
 from flightsw.model_file import verified_model
 
@@ -20,6 +26,9 @@ log = logging.getLogger(__name__)
 
 TILE_ROWS, TILE_COLUMNS = 20, 40  # px, as in the ground's densification
 FACTS = ("black_dn", "white_dn", "dn_per_radiance_s", "electrons_per_dn", "read_noise_dn")
+ALIKE_RAD = 0.7  # views so far apart share exp(-1/2) of what they show: about how far a face can be seen from
+NOISE_CHI2 = 1.25  # below it is the worst tile of pure noise: 1 on average, a deviation of 0.05 for 800 px
+REPEAT = 0.05  # what a view that was sent already is still worth: its noise differs
 NICENESS = 10  # of the ranking thread: the link goes first
 INPUTS = {"world_to_camera": [4, 4], "K": [3, 3], "exposure_time_s": []}
 SUN_INPUT = {"sun_dir": [3]}  # of a model whose radiance turns with the Sun
@@ -27,10 +36,10 @@ SUN_INPUT = {"sun_dir": [3]}  # of a model whose radiance turns with the Sun
 
 @dataclass(frozen=True)
 class Ranked:
-    """One frame's place: the mean chi² of its worst tile (1 is noise), and where that tile is.
+    """What the model makes of one frame: the mean chi² of its worst tile (1 is noise), and where that tile is.
 
     A frame taken in eclipse or with a pose that is not valid is not `comparable`: its chi² says nothing about
-    the model.
+    the model. `view` is the direction from the target to the camera, then to the Sun: two unit vectors, body frame.
     """
 
     frame_id: int
@@ -40,6 +49,12 @@ class Ranked:
     tile_row_px: int
     tile_column_px: int
     comparable: bool
+    view: tuple[float, ...]
+
+    @property
+    def residual_sigmas(self) -> float:
+        """The root mean square residual of the worst tile beyond what noise can do, in sigmas of a pixel's noise."""
+        return math.sqrt(max(self.worst_chi2 - NOISE_CHI2, 0.0))
 
 
 class Renderer:
@@ -125,9 +140,9 @@ class Renderer:
 
 
 def rank_frames(model: Path, frames: Path, K: np.ndarray) -> tuple[list[Ranked], int]:
-    """Return the stored frames, worst predicted first, and how many containers could not be read.
+    """Return the stored frames in the order in which they are worth sending, and how many could not be read.
 
-    Frames that are not comparable come last, whatever their chi².
+    The order is that of the downlink if nothing was sent yet.
 
     Args:
         frames: a folder of .obf containers, or a store that has one.
@@ -149,7 +164,64 @@ def rank_frames(model: Path, frames: Path, K: np.ndarray) -> tuple[list[Ranked],
             unreadable += 1
             continue
         ranked.append(_rank(renderer, frame, path, K))
-    return sorted(ranked, key=lambda r: (not r.comparable, -r.worst_chi2, r.frame_id)), unreadable
+    return sending_order(ranked, []), unreadable
+
+
+def sending_order(
+    ranked: Sequence[Ranked], sent: Sequence[tuple[float, ...]], first: int | None = None
+) -> list[Ranked]:
+    """Return frames in the order in which they are worth sending.
+
+    One by one, the frame comes next whose residual (sigmas, worst tile) times the novelty of its view is largest. The
+    novelty is 1 - exp(-d²/2 ALIKE_RAD²), at least REPEAT, with d the distance of camera and Sun direction from the
+    nearest view sent or placed before. Exposures need no rule: of a bracket the one with most signal over noise has
+    the largest residual, unless it is saturated, and the others are then repeats. Frames that are not comparable come
+    last, oldest first.
+
+    Args:
+        sent: the views of frames that are on the ground or under way.
+        first: so many places are decided one by one, the others at once; None: all. It bounds the time.
+    """
+    candidates = sorted((r for r in ranked if r.comparable), key=lambda r: r.frame_id)
+    rest = sorted((r for r in ranked if not r.comparable), key=lambda r: r.frame_id)
+    if not candidates:
+        return rest
+    views = np.array([r.view for r in candidates])
+    residuals = np.array([r.residual_sigmas for r in candidates])
+    nearest2 = np.full(len(candidates), np.inf)  # squared distance from the nearest view sent or placed
+    if sent:
+        others = np.array(sent)
+        nearest2 = ((others**2).sum(axis=1) - 2 * views @ others.T).min(axis=1) + (views**2).sum(axis=1)
+    waiting = np.ones(len(candidates), dtype=bool)
+    placed: list[int] = []
+    while waiting.any():
+        novelty = np.maximum(1 - np.exp(-nearest2 / (2 * ALIKE_RAD**2)), REPEAT)
+        worth = np.where(waiting, residuals * novelty, -1)
+        if first is not None and len(placed) >= first:
+            placed += np.argsort(-worth, kind="stable")[: waiting.sum()].tolist()
+            break
+        best = int(worth.argmax())
+        placed.append(best)
+        waiting[best] = False
+        nearest2 = np.minimum(nearest2, ((views - views[best]) ** 2).sum(axis=1))
+    return [candidates[i] for i in placed] + rest
+
+
+def sent_view(header: bytes) -> tuple[float, ...] | None:
+    """Return the view of the frame with this header of its container; None in eclipse or without a valid pose.
+
+    Raises:
+        PacketError: not a header.
+    """
+    values = read_header(header)
+    if values["flags"] & FLAG_ECLIPSE or not values["flags"] & FLAG_POSE_VALID:
+        return None
+    return _view(np.array(values["position_body_m"]), np.array(values["sun_dir_body"]))
+
+
+def _view(position_body_m: np.ndarray, sun_dir_body: np.ndarray) -> tuple[float, ...]:
+    to_camera = position_body_m / max(float(np.linalg.norm(position_body_m)), 1e-9)
+    return (*to_camera.tolist(), *sun_dir_body.tolist())
 
 
 def _rank(renderer: Renderer, frame: Frame, path: Path, K: np.ndarray) -> Ranked:
@@ -175,6 +247,7 @@ def _rank(renderer: Renderer, frame: Frame, path: Path, K: np.ndarray) -> Ranked
         int(row) * TILE_ROWS,
         int(column) * TILE_COLUMNS,
         frame.pose.valid and not frame.pose.in_eclipse,
+        _view(frame.pose.position_body_m, frame.pose.sun_dir_body),
     )
 
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import tempfile
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,20 +16,29 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flightsw.cli import app
+from flightsw.downlink import run_downlink
 from flightsw.errors import TriageError
-from flightsw.icd.frame import Frame, PoseTag, encode_frame
+from flightsw.icd.frame import HEADER, Frame, PoseTag, encode_frame, quat_to_matrix
 from flightsw.icd.mission import load_mission
+from flightsw.link import open_link
 from flightsw.model_file import MAX_MODEL_BYTES, verified_model
+from flightsw.settings import Settings, save_settings
+from flightsw.store import FrameStore
 from flightsw.triage import (
     TILE_COLUMNS,
     TILE_ROWS,
     ModelVerified,
+    Ranked,
     Renderer,
     TriageWorker,
     chi2_map,
     rank_frames,
+    sending_order,
+    sent_view,
     tile_means,
 )
+from ground.ingest import listen
+from hil.virtual_link import VirtualSerial
 from obbgs_core.export_onnx import export_onnx
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
@@ -59,10 +69,15 @@ def model(tmp_path) -> Path:
 CAMERA_EXPOSURES = (5e-5, 2e-4)
 
 
-def frame_of(renderer: Renderer, frame_id: int, patch_dn: float, seed: int) -> Frame:
-    pose = PoseTag(
-        np.array([1.0, 0, 0, 0]), np.array([0.0, 0, -300]), np.eye(6), np.array([0, 0, 1.0]), False, True
-    )
+FRONT, LEFT, TOP = np.array([[1.0, 0, 0, 0], [1, 0, 1, 0], [1, 1, 0, 0]]) / np.sqrt([[1], [2], [2]])
+
+
+def frame_of(
+    renderer: Renderer, frame_id: int, patch_dn: float, seed: int, quat: np.ndarray = FRONT
+) -> Frame:
+    """A frame of the ball from 300 m, with noise and a patch that the model does not know."""
+    position = quat_to_matrix(quat).T @ np.array([0.0, 0, -300])
+    pose = PoseTag(quat, position, np.eye(6), np.array([0, 0, 1.0]), False, True)
     dn = renderer.expected_dn(pose.world_to_camera, K, 1e-4)[..., 0]
     variance = np.maximum(dn - 64, 0) / 4 + 64
     dn = dn + np.random.default_rng(seed).normal(size=dn.shape) * np.sqrt(variance)
@@ -252,3 +267,85 @@ def test_a_folder_without_frames_and_frames_of_another_size_are_named(model, tmp
     (tmp_path / "frames" / "00000000.obf").write_bytes(encode_frame(small))
     with pytest.raises(TriageError, match="72x40"):
         rank_frames(model, tmp_path, K)
+
+
+def ranked(frame_id: int, worst_chi2: float, view: tuple[float, ...], comparable: bool = True) -> Ranked:
+    return Ranked(frame_id, Path(f"{frame_id:08d}.obf"), worst_chi2, 1.0, 0, 0, comparable, view)
+
+
+SUN = (0.0, 0.0, 1.0)
+
+
+def test_a_new_view_goes_before_repeats_of_a_worse_predicted_one():
+    front, near_front, side, back = (1.0, 0.0, 0.0), (0.995, 0.0998, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)
+    frames = [
+        ranked(0, 100.0, front + SUN),
+        ranked(1, 90.0, near_front + SUN),
+        ranked(2, 20.0, side + SUN),
+        ranked(3, 1.1, back + SUN),  # new, but all noise
+        ranked(4, 95.0, (*front, *side)),  # the same view in another light is another view
+    ]
+    assert [r.frame_id for r in sending_order(frames, [])] == [0, 4, 2, 1, 3]
+    assert [r.frame_id for r in sending_order(frames, [front + SUN])] == [4, 2, 0, 1, 3]
+
+
+directions = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
+views = st.builds(
+    lambda v, s: (*(np.array([v, s]) / np.linalg.norm([v, s], axis=1)[:, None]).ravel(),), *[directions] * 2
+)
+
+
+@given(
+    st.lists(st.tuples(st.floats(0, 1e6), views, st.booleans()), max_size=30),
+    st.lists(views, max_size=5),
+    st.integers(0, 40),
+)
+def test_every_frame_has_one_place_and_the_bound_on_time_changes_no_earlier_one(facts, sent, first):
+    frames = [ranked(i, *fact) for i, fact in enumerate(facts)]
+    order = [r.frame_id for r in sending_order(frames, sent)]
+    assert sorted(order) == list(range(len(frames)))
+    comparable = [frames[i].comparable for i in order]
+    assert comparable == sorted(comparable, reverse=True)
+    bounded = [r.frame_id for r in sending_order(frames, sent, first)]
+    assert bounded[:first] == order[:first] and sorted(bounded) == sorted(order)
+    if any(comparable) and not sent:
+        assert frames[order[0]].residual_sigmas == max(r.residual_sigmas for r in frames if r.comparable)
+
+
+def test_the_view_of_a_sent_frame_is_that_of_its_ranking_and_none_in_eclipse(model, tmp_path):
+    frame = frame_of(Renderer(model), 0, 0.0, 0, LEFT)
+    container = encode_frame(frame)
+    (tmp_path / "00000000.obf").write_bytes(container)
+    (score,), _ = rank_frames(model, tmp_path, K)
+    # looking along the body's x axis, turned by 90 degrees about y: the camera stands on that axis
+    assert (
+        score.view == pytest.approx((1, 0, 0, 0, 0, 1)) and sent_view(container[: HEADER.size]) == score.view
+    )
+    dark = encode_frame(replace(frame, pose=replace(frame.pose, in_eclipse=True)))
+    assert sent_view(dark[: HEADER.size]) is None
+
+
+def test_over_the_link_an_informative_view_comes_before_repeats_of_what_the_ground_has(model, tmp_path):
+    renderer, session = Renderer(model), tmp_path / "session"
+    store = FrameStore(tmp_path / "store")
+    # 0 has come down already; 1 and 2 repeat its view, worse predicted than 4 from the side; 3 from the top is noise
+    for frame_id, (patch_dn, quat) in enumerate(
+        [(150.0, FRONT), (140.0, FRONT), (160.0, FRONT), (0.0, TOP), (60.0, LEFT)]
+    ):
+        store.put(frame_of(renderer, frame_id, patch_dn, frame_id, quat))
+    store.mark_delivered(0)
+    (store.folder / "model.onnx").write_bytes(model.read_bytes())
+    save_settings(store.folder, Settings(priority="triage"))
+    with VirtualSerial(3_000_000) as line, open_link(line.flight_url) as link:
+        ended = threading.Event()
+        ground = threading.Thread(
+            target=listen, args=(line.ground_url, session, MISSION), kwargs={"should_stop": ended.is_set}
+        )
+        ground.start()
+        try:
+            run_downlink(store, link, MISSION, exit_when_empty=True)
+        finally:
+            ended.set()
+            ground.join(30)
+    received = [json.loads(text)["id"] for text in (session / "frames.jsonl").read_text().splitlines()]
+    assert received == [4, 2, 1, 3]
