@@ -23,7 +23,7 @@ class SimulatedClock:
         ValueError: the factor is negative or not finite, or flight would not wait so long from bracket to bracket.
     """
 
-    def __init__(self, mission: Mission, factor: float = 0.0):
+    def __init__(self, mission: Mission, factor: float = 0.0, clock_s: Callable[[], float] = time.monotonic):
         if not (math.isfinite(factor) and factor >= 0):
             raise ValueError(f"a real-time factor is 0 (lock step) or positive, got {factor}")
         interval_s = mission.bracket.interval_s
@@ -35,14 +35,15 @@ class SimulatedClock:
             )
         self.factor = factor
         self.late_frames = 0
+        self._clock_s = clock_s
         self._start: tuple[float, int] | None = None  # our seconds, UTC ns
         self._lock = threading.Lock()
 
-    def release(self, end_utc_ns: int, wait: Callable[[float], object] = time.sleep) -> None:
+    def release(self, end_utc_ns: int, wait: Callable[[float], object]) -> None:
         """Return when an exposure whose picture is ready has ended; `wait` takes the seconds until then."""
         if not self.factor:
             return
-        ready_s = time.monotonic()
+        ready_s = self._clock_s()
         with self._lock:
             if self._start is None:
                 self._start = ready_s, end_utc_ns

@@ -170,12 +170,12 @@ def fly(
         open(out / "flight.log", "w") as flight_log,
         open(out / "flight.json", "w") as flight_result,
     ):
-        common = ["--mission", str(mission_path), "--json"]
         listen = ["listen", "--link", line.ground_url, "--session", str(session), "--exit-after", str(frames)]
         capture = ["capture", "--bracket", bracket, "--count", str(mission.bracket.count)]
         capture += ["--camera", camera.url, "--store", str(store), "--link", line.flight_url]
-        ground = _start("ground", [*listen, *common], ground_log, ground_log)
-        flight = _start("flightsw", [*capture, *common], flight_result, flight_log)
+        ground = _start("ground", [*listen, "--mission", str(mission_path)], ground_log, ground_log)
+        capture += ["--mission", str(mission_path), "--json"]
+        flight = _start("flightsw", capture, flight_result, flight_log)
         cut = _Cut(line, config.cut_s, frames // 2)
         patience_s = PATIENCE_S
         if config.real_time:
@@ -195,7 +195,7 @@ def fly(
         link_figures = _link_figures(line, config, cut)
         camera_figures = {
             "kind": config.camera,
-            "real_time_factor": config.real_time,
+            "pace": f"{config.real_time:g} times real time" if config.real_time else "lock step",
             "exposures": camera.exposures,
             "late_frames": camera.late_frames,
             "failures": camera.failures,
