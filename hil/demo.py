@@ -73,11 +73,38 @@ def run_demo(out: Path, mission_path: Path, mesh: Path, config: DemoConfig, cons
 
     Raises:
         DemoError: a process failed or stalled, or a frame was lost or altered on its way.
+        And what `simulate_pass` raises.
+    """
+    began_s = time.monotonic()
+    simulation = simulate_pass(out, mission_path, mesh, config, console)
+    console.print("[bold]4/4 Model[/] trained with known exposure, and once more blind to it")
+    session, wanted = out / "session", load_mission(mission_path).reconstruct
+    command = [_tool("ground"), "reconstruct", "--session", str(session), "--name", "demo"]
+    command += ["--blind-reference", "--method", wanted.method, "--seed", str(wanted.seed)]
+    if wanted.steps:
+        command += ["--steps", str(wanted.steps)]
+    finished = subprocess.run([*command, "--json"], stdout=subprocess.PIPE, text=True)
+    if finished.returncode:
+        raise DemoError("the reconstruction failed; its message is above")
+    seconds = round(time.monotonic() - began_s, 1)
+    figures = {**json.loads(finished.stdout), **simulation, "seconds": seconds}
+    (out / MARKER).write_text(json.dumps(figures, indent=2) + "\n")
+    console.print(_summary(figures))
+    console.print(f"Report: {session / 'runs/demo/report.html'}", soft_wrap=True)
+    return figures
+
+
+def simulate_pass(
+    out: Path, mission_path: Path, mesh: Path, config: DemoConfig, console: Console
+) -> dict[str, dict]:
+    """Render the sky, fly the pass and write its truth, all below `out`; return what was simulated, by part.
+
+    Raises:
+        DemoError: a process failed or stalled, or a frame was lost or altered on its way.
         ConfigError, MeshError, BlenderError: the mission, the scenario, the mesh or Blender is not usable.
         ValueError: flight cannot follow the real-time factor.
         CaptureError, OSError: the GigE camera cannot be served: no Aravis, or its port is taken.
     """
-    began_s = time.monotonic()
     world = load_world(load_mission(mission_path), config.scenario)
     SimulatedClock(world.mission, config.real_time)  # a factor that cannot be is known at once
     _clear(out)
@@ -102,29 +129,7 @@ def run_demo(out: Path, mission_path: Path, mesh: Path, config: DemoConfig, cons
         simulation = fly(out, world, mission_path, farm.radiance, config, console)
         console.print("[bold]3/4 Truth[/] the simulator's own record, for the evaluation only")
         write_truth(out / "session", mission, farm, pose_at=world.pose_at, simulation=simulation)
-    console.print("[bold]4/4 Model[/] trained with known exposure, and once more blind to it")
-    session = out / "session"
-    command = [
-        _tool("ground"),
-        "reconstruct",
-        "--session",
-        str(session),
-        "--name",
-        "demo",
-        "--blind-reference",
-    ]
-    command += ["--method", mission.reconstruct.method, "--seed", str(mission.reconstruct.seed)]
-    if mission.reconstruct.steps:
-        command += ["--steps", str(mission.reconstruct.steps)]
-    finished = subprocess.run([*command, "--json"], stdout=subprocess.PIPE, text=True)
-    if finished.returncode:
-        raise DemoError("the reconstruction failed; its message is above")
-    seconds = round(time.monotonic() - began_s, 1)
-    figures = {**json.loads(finished.stdout), **simulation, "seconds": seconds}
-    (out / MARKER).write_text(json.dumps(figures, indent=2) + "\n")
-    console.print(_summary(figures))
-    console.print(f"Report: {session / 'runs/demo/report.html'}", soft_wrap=True)
-    return figures
+    return simulation
 
 
 def _clear(out: Path) -> None:
@@ -158,7 +163,7 @@ def fly(
         radiance: gives the sky [H, W, C] for a true pose.
 
     Raises:
-        DemoError: see `run_demo`.
+        DemoError: see `simulate_pass`.
     """
     store, session, mission = out / "flight", out / "session", world.mission
     frames = mission.bracket.count * len(mission.bracket.exposure_times_ms)
@@ -176,7 +181,7 @@ def fly(
         ground = _start("ground", [*listen, "--mission", str(mission_path)], ground_log, ground_log)
         capture += ["--mission", str(mission_path), "--json"]
         flight = _start("flightsw", capture, flight_result, flight_log)
-        cut = _Cut(line, config.cut_s, frames // 2)
+        cut = _Cut(line, config.cut_s, frames)
         patience_s = PATIENCE_S
         if config.real_time:
             patience_s += mission.bracket.interval_s / config.real_time
@@ -236,18 +241,18 @@ def _open_camera(
 
 
 class _Cut:
-    """One cut of the link, of `seconds`, as soon as the ground holds `at_frames`; none for 0 s."""
+    """One cut of the link, of `seconds`, as soon as the ground holds half of the frames; none for 0 s."""
 
-    def __init__(self, line: VirtualLink, seconds: float, at_frames: int):
+    def __init__(self, line: VirtualLink, seconds: float, frames: int):
         self.count = 0
-        self._line, self._seconds, self._at_frames = line, seconds, at_frames
+        self._line, self._seconds, self._frames = line, seconds, frames
         self._since_s = 0.0
 
     def update(self, received: int) -> None:
         now_s = time.monotonic()
         if self._line.is_cut and now_s - self._since_s > self._seconds:
             self._line.mend()
-        elif self._seconds and not self.count and received >= self._at_frames:
+        elif self._seconds and not self.count and self._frames // 2 <= received < self._frames:
             self._line.cut()
             self._since_s, self.count = now_s, 1
 

@@ -398,9 +398,9 @@ def test_a_triggered_frame_that_is_not_ready_in_time_is_late_and_counted_by_the_
         camera = open_camera(server.url, mission.camera)
         assert isinstance(camera, GigeCamera)
         began_s = time.monotonic()
-        for elapsed_s in (0, 1, 60):
+        for elapsed_s in (0, 1, 150):
             camera.expose(1e-4, mission.orbit.start_utc_ns + elapsed_s * 1_000_000_000)
-        assert time.monotonic() - began_s >= 0.6  # the last one was not given before its time
+        assert time.monotonic() - began_s >= 1.5  # the last one was not given before its time
         late = aravis().call("arv_camera_get_integer", camera._camera, b"LateFrameCount")
         camera.close()
     assert (server.exposures, server.late_frames, late) == (3, 1, 1)

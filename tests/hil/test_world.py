@@ -179,9 +179,9 @@ def test_the_camera_holds_pictures_back_and_says_how_many_were_late():
     with CameraServer(MISSION, sky, "hil://127.0.0.1:0", real_time=100.0) as server:
         camera = open_camera(server.url, MISSION.camera)
         began_s = time.monotonic()
-        for elapsed_s in (0, 1, 60):  # 0.6 s in all; the second is not ready after 0.01 s
+        for elapsed_s in (0, 1, 150):  # 1.5 s in all; the second is not ready after 0.01 s
             camera.expose(1e-4, MISSION.orbit.start_utc_ns + elapsed_s * NS)
-        assert time.monotonic() - began_s >= 0.6
+        assert time.monotonic() - began_s >= 1.5
         camera.close()
         with socket.create_connection(server.url.removeprefix("hil://").rsplit(":", 1)) as other:
             slow = iter((0.0,))
