@@ -269,7 +269,8 @@ def _link_figures(line: VirtualLink, config: DemoConfig, cut: _Cut) -> dict:
     }
     for name in vars(lanes["down"]):
         if FAULT_WORDS & set(name.split("_")):
-            figures[name] = getattr(lanes["down"], name) + getattr(lanes["up"], name)
+            key = name.replace("frames_", "can_frames_")  # not the camera's
+            figures[key] = getattr(lanes["down"], name) + getattr(lanes["up"], name)
     return figures
 
 
@@ -374,7 +375,7 @@ def _summary(f: dict) -> Table:
             "link",
             f"{link['kind']}, faults {link['faults']}, {link['cuts']} cuts: {link['bytes_down']:,} bytes down",
         ),
-        ("done to packets or CAN frames", done or "nothing"),
+        ("done on the link", done or "nothing"),
         (
             "tags against truth",
             f"{navigation['position_error_m']:.3f} m, {navigation['rotation_error_deg']:.4f} deg "

@@ -103,7 +103,7 @@ def test_every_frame_crosses_a_faulty_can_bus_from_a_gige_camera(
     link = figures["link"]
     assert link["cuts"] == 1
     for name in ("destroyed", "flipped", "duplicated", "reordered", "cut"):
-        assert link[f"frames_{name}"] > 0
+        assert link[f"can_frames_{name}"] > 0
     assert link["segments_resent"] > 0
 
 
