@@ -75,6 +75,7 @@ class Truth:
             facts = json.loads((self.folder / "truth.json").read_text())
             self._radiance = {entry["id"]: entry["radiance"] for entry in facts["frames"]}
             self.largest_dimension_m = float(facts["largest_dimension_m"])
+            self.simulation: dict[str, dict] = facts.get("simulation", {})  # what was simulated, by part
             self.cloud_m = read_points(self.folder / facts["cloud"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise SessionError(f"{self.folder} is damaged: {error}") from error

@@ -73,6 +73,7 @@ def write_report(session_dir: Path, name: str) -> Path:
         _training(run),
         _histogram(run),
         _link(run),
+        _simulation(truth),
         _configuration(run),
     ]
     title = (
@@ -283,6 +284,19 @@ def _link(run: Run) -> str:
     ]
     note = "What the ground counted. Segments that were lost or damaged are asked for again, and counted as resent."
     return _section("Losses on the link", note, _two_tables([(label, f"{count:,}") for label, count in rows]))
+
+
+def _simulation(truth: Truth | None) -> str:
+    """Return what the simulator says it did; nothing without a simulator."""
+    if truth is None or not truth.simulation:
+        return ""
+    rows = [
+        (f"{part}: {_spelled(name)}", f"{value:,}" if isinstance(value, int) else html.escape(f"{value}"))
+        for part, facts in truth.simulation.items()
+        for name, value in facts.items()
+    ]
+    note = "The simulator's own record of scenario, camera, link and navigation; faults are counted in both directions."
+    return _section("The simulated world", note, _two_tables(rows))
 
 
 def _spelled(key: str) -> str:

@@ -23,6 +23,18 @@ app = typer.Typer(
 MissionFile = Annotated[Path, typer.Option("--mission", help="The mission file.")]
 Mesh = Annotated[Path, typer.Option("--mesh", help="GLB, OBJ or STL; default the shipped spacecraft.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+ScenarioName = Annotated[
+    str,
+    typer.Option(
+        "--scenario", help="A ready-made scenario or a YAML file; default the mission's own orbits."
+    ),
+]
+RealTime = Annotated[
+    float,
+    typer.Option(
+        "--real-time", help="How many times as fast as ours simulated time runs; 0: as fast as it goes."
+    ),
+]
 
 
 @app.command()
@@ -30,15 +42,31 @@ def demo(
     out: Annotated[Path, typer.Option(help="Everything is written below this folder.")] = Path("demo"),
     mission: MissionFile = Path("mission.yaml"),
     mesh: Mesh = spacecraft.SHIPPED,
+    camera: Annotated[str, typer.Option(help="hil (a socket) or gige (GigE Vision on 127.0.0.1).")] = "hil",
+    link: Annotated[str, typer.Option(help="serial, slcan or slcan-fd (CAN at 1 Mbit/s).")] = "serial",
+    faults: Annotated[
+        str,
+        typer.Option(help="none, or standard: 2 % lost, flipped, doubled, swapped each, and a cut of 5 s."),
+    ] = "none",
+    scenario: ScenarioName = "",
+    real_time: RealTime = 0.0,
+    navigation_noise: Annotated[
+        int | None,
+        typer.Option(help="Seed of navigation errors with the mission's sigmas; default no errors."),
+    ] = None,
     json_: AsJson = False,
 ) -> None:
-    """Run the whole loop: sky, camera, flight, serial line, ground, model, report.
+    """Run the whole loop: sky, camera, flight, link, ground, model, report.
 
-    Example: hil demo --out demo --mesh spacecraft.glb
+    Example: hil demo --camera gige --link slcan --faults standard --scenario tumbling --out demo
     """
-    from hil.demo import run_demo
+    from flightsw.icd.mission import build
+    from hil.demo import DemoConfig, run_demo
 
-    figures = run_demo(out, mission, mesh, Console(stderr=json_))
+    chosen = {"camera": camera, "link": link, "faults": faults}
+    more = {"scenario": scenario, "navigation_noise": navigation_noise, "real_time": real_time}
+    config = build(DemoConfig, chosen, "demo", **more)
+    figures = run_demo(out, mission, mesh, config, Console(stderr=json_))
     if json_:
         print(json.dumps(figures))
 
@@ -52,25 +80,39 @@ def camera(
     mesh: Mesh = spacecraft.SHIPPED,
     cache: Annotated[Path, typer.Option(help="Rendered frames are kept here.")] = Path("renders"),
     gige: Annotated[bool, typer.Option("--gige", help="Serve GigE Vision on 127.0.0.1 instead.")] = False,
+    scenario: ScenarioName = "",
+    inputs: Annotated[
+        Path,
+        typer.Option(help="With --scenario: flight's mission.yaml and navigation states are written here."),
+    ] = Path("scenario"),
+    real_time: RealTime = 0.0,
 ) -> None:
     """Serve the simulated camera until stopped; prints its URL. Frames are rendered when they are asked for.
 
     With --gige any GenICam client sees the sky: `arv-viewer-0.8`, `arv-camera-test-0.8 -n 127.0.0.1`, `flightsw`.
 
-    Example: hil camera --listen hil:///tmp/camera.sock --mesh target.glb
+    Example: hil camera --listen hil:///tmp/camera.sock --scenario v-bar --mesh target.glb
     """
     from hil.blender import RenderFarm
     from hil.gige_camera import GigeCameraServer
     from hil.virtual_camera import CameraServer
+    from hil.world import load_world, write_flight_inputs
 
-    loaded = load_mission(mission)
+    world = load_world(load_mission(mission), scenario)
+    if scenario:
+        print(f"flight takes --mission {write_flight_inputs(world, inputs)}", file=sys.stderr)
     stop = _stop_event()
-    with RenderFarm(loaded, mesh, cache, workers=1) as farm:
-        serving = GigeCameraServer(loaded, farm.radiance) if gige else CameraServer(loaded, farm, listen)
+    with RenderFarm(world.mission, mesh, cache, workers=1) as farm:
+        more = {"pose_at": world.pose_at, "real_time": real_time}
+        if gige:
+            serving = GigeCameraServer(world.mission, farm.radiance, **more)
+        else:
+            serving = CameraServer(world.mission, farm.radiance, listen, **more)
         with serving as server:
             print(server.url, flush=True)
             stop.wait()
-            print(f"{server.exposures} exposures served", file=sys.stderr)
+            counts = f"{server.late_frames} late, {server.failures} failed"
+            print(f"{server.exposures} exposures served, {counts}", file=sys.stderr)
 
 
 @app.command()

@@ -5,9 +5,12 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TextIO
+from typing import IO, Literal
 
+import numpy as np
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -19,68 +22,114 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, load_mission
 from hil.blender import RenderFarm
+from hil.clock import SimulatedClock
+from hil.gige_camera import GigeCameraServer
+from hil.link_trial import STANDARD_CUT_S, STANDARD_FAULTS
 from hil.scenario import true_exposures
 from hil.truth import write_truth
 from hil.virtual_camera import CameraServer
-from hil.virtual_link import VirtualSerial
+from hil.virtual_can import VirtualCan
+from hil.virtual_link import Faults, VirtualLink, VirtualSerial
+from hil.world import World, load_world, write_flight_inputs
 
 MARKER = "demo.json"  # says that a folder's flight/ and session/ are a demo's own and may be made anew
 PATIENCE_S = 60.0  # the pass has stalled when nothing was captured or received for this long
+FAULT_SEED = 1
+FAULT_WORDS = {"lost", "destroyed", "flipped", "duplicated", "reordered", "cut", "overrun"}
 
 
 class DemoError(RuntimeError):
     """A step of the loop failed; the message says which, and where its log is."""
 
 
-def run_demo(out: Path, mission_path: Path, mesh: Path, console: Console) -> dict:
+@dataclass(frozen=True)
+class DemoConfig:
+    """What the loop is made of."""
+
+    camera: Literal["hil", "gige"] = "hil"
+    link: Literal["serial", "slcan", "slcan-fd"] = "serial"  # the mission's baud rate, or CAN at 1 Mbit/s
+    faults: Literal["none", "standard"] = "none"  # standard: 2 % of each, and a cut in the middle
+    scenario: str = ""  # a ready-made one or a YAML file; empty: the mission's own orbits and attitude
+    navigation_noise: int | None = None  # seed of errors with the mission's sigmas; none: tags without error
+    real_time: float = 0.0  # how many times as fast as ours the simulated clock runs; 0: lock step
+
+    def open_link(self, mission: Mission) -> VirtualLink:
+        """Return the link, not yet running."""
+        faults = STANDARD_FAULTS if self.faults == "standard" else Faults()
+        if self.link == "serial":
+            return VirtualSerial(mission.link.baud_rate, faults, FAULT_SEED)
+        return VirtualCan(fd=self.link == "slcan-fd", faults=faults, seed=FAULT_SEED)
+
+    @property
+    def cut_s(self) -> float:
+        return STANDARD_CUT_S if self.faults == "standard" else 0.0
+
+
+def run_demo(out: Path, mission_path: Path, mesh: Path, config: DemoConfig, console: Console) -> dict:
     """Run the loop below `out` and return its figures; frames that are rendered already are used again.
 
     Raises:
         DemoError: a process failed or stalled, or a frame was lost or altered on its way.
-        ConfigError, MeshError, BlenderError: the mission, the mesh or Blender is not usable.
+        And what `simulate_pass` raises.
     """
     began_s = time.monotonic()
-    mission = load_mission(mission_path)
+    simulation = simulate_pass(out, mission_path, mesh, config, console)
+    console.print("[bold]4/4 Model[/] trained with known exposure, and once more blind to it")
+    session, wanted = out / "session", load_mission(mission_path).reconstruct
+    command = [_tool("ground"), "reconstruct", "--session", str(session), "--name", "demo"]
+    command += ["--blind-reference", "--method", wanted.method, "--seed", str(wanted.seed)]
+    if wanted.steps:
+        command += ["--steps", str(wanted.steps)]
+    finished = subprocess.run([*command, "--json"], stdout=subprocess.PIPE, text=True)
+    if finished.returncode:
+        raise DemoError("the reconstruction failed; its message is above")
+    seconds = round(time.monotonic() - began_s, 1)
+    figures = {**json.loads(finished.stdout), **simulation, "seconds": seconds}
+    (out / MARKER).write_text(json.dumps(figures, indent=2) + "\n")
+    console.print(_summary(figures))
+    console.print(f"Report: {session / 'runs/demo/report.html'}", soft_wrap=True)
+    return figures
+
+
+def simulate_pass(
+    out: Path, mission_path: Path, mesh: Path, config: DemoConfig, console: Console
+) -> dict[str, dict]:
+    """Render the sky, fly the pass and write its truth, all below `out`; return what was simulated, by part.
+
+    Raises:
+        DemoError: a process failed or stalled, or a frame was lost or altered on its way.
+        ConfigError, MeshError, BlenderError: the mission, the scenario, the mesh or Blender is not usable.
+        ValueError: flight cannot follow the real-time factor.
+        CaptureError, OSError: the GigE camera cannot be served: no Aravis, or its port is taken.
+    """
+    world = load_world(load_mission(mission_path), config.scenario)
+    SimulatedClock(world.mission, config.real_time)  # a factor that cannot be is known at once
     _clear(out)
-    exposures = true_exposures(mission)
+    if config.scenario or config.navigation_noise is not None:
+        mission_path = write_flight_inputs(world, out / "scenario", config.navigation_noise)
+        world = replace(world, mission=load_mission(mission_path))
+    mission = world.mission
+    exposures = true_exposures(mission, world.pose_at)
     size = f"{mission.camera.width}x{mission.camera.height}"
     console.print(
         f"[bold]1/4 Sky[/]   {len(exposures)} exposures of {mesh.name} at {size}, rendered by Blender"
+        + (f", scenario {config.scenario}" if config.scenario else "")
     )
     with RenderFarm(mission, mesh, out / "renders") as farm:
         with _bar(console) as progress:
             task = progress.add_task("render", total=len(exposures))
             farm.prerender([e.pose for e in exposures], lambda: progress.advance(task))
         console.print(
-            f"[bold]2/4 Pass[/]  flight and ground, a serial line at {mission.link.baud_rate} baud between"
+            f"[bold]2/4 Pass[/]  flight and ground, {config.camera} camera, {config.link} link between, "
+            f"faults: {config.faults}"
         )
-        link = _fly(out, mission, mission_path, farm, len(exposures), console)
+        simulation = fly(out, world, mission_path, farm.radiance, config, console)
         console.print("[bold]3/4 Truth[/] the simulator's own record, for the evaluation only")
-        write_truth(out / "session", mission, farm)
-    console.print("[bold]4/4 Model[/] trained with known exposure, and once more blind to it")
-    session = out / "session"
-    command = [
-        _tool("ground"),
-        "reconstruct",
-        "--session",
-        str(session),
-        "--name",
-        "demo",
-        "--blind-reference",
-    ]
-    command += ["--method", mission.reconstruct.method, "--seed", str(mission.reconstruct.seed)]
-    if mission.reconstruct.steps:
-        command += ["--steps", str(mission.reconstruct.steps)]
-    finished = subprocess.run([*command, "--json"], stdout=subprocess.PIPE, text=True)
-    if finished.returncode:
-        raise DemoError("the reconstruction failed; its message is above")
-    figures = {**json.loads(finished.stdout), **link, "seconds": round(time.monotonic() - began_s, 1)}
-    (out / MARKER).write_text(json.dumps(figures, indent=2) + "\n")
-    console.print(_summary(figures))
-    console.print(f"Report: {session / 'runs/demo/report.html'}", soft_wrap=True)
-    return figures
+        write_truth(out / "session", mission, farm, pose_at=world.pose_at, simulation=simulation)
+    return simulation
 
 
 def _clear(out: Path) -> None:
@@ -90,7 +139,7 @@ def _clear(out: Path) -> None:
         DemoError: the folder holds a session that no demo made.
     """
     ours = (out / MARKER).exists()
-    for name in ("flight", "session"):
+    for name in ("flight", "session", "scenario"):
         if (out / name).exists():
             if not ours:
                 raise DemoError(f"{out / name} was not made by a demo; choose another folder with OUT=DIR")
@@ -99,37 +148,45 @@ def _clear(out: Path) -> None:
     (out / MARKER).write_text("{}\n")
 
 
-def _fly(
-    out: Path, mission: Mission, mission_path: Path, farm: RenderFarm, frames: int, console: Console
-) -> dict[str, int]:
-    """Run flight and ground until every frame is across; return what crossed the line.
+def fly(
+    out: Path,
+    world: World,
+    mission_path: Path,
+    radiance: Callable[[PoseTag], np.ndarray],
+    config: DemoConfig,
+    console: Console,
+) -> dict[str, dict]:
+    """Run flight and ground until every frame is across; return what was simulated, by part.
+
+    Args:
+        mission_path: the file of the world's mission.
+        radiance: gives the sky [H, W, C] for a true pose.
 
     Raises:
-        DemoError: see `run_demo`.
+        DemoError: see `simulate_pass`.
     """
-    store, session = out / "flight", out / "session"
+    store, session, mission = out / "flight", out / "session", world.mission
+    frames = mission.bracket.count * len(mission.bracket.exposure_times_ms)
     bracket = ",".join(f"{time_ms:g}" for time_ms in mission.bracket.exposure_times_ms)
     with (
-        VirtualSerial(mission.link.baud_rate) as line,
-        CameraServer(mission, farm, out / "camera.sock") as camera,
+        config.open_link(mission) as line,
+        _open_camera(out, world, radiance, config) as camera,
         open(out / "ground.log", "w") as ground_log,
         open(out / "flight.log", "w") as flight_log,
+        open(out / "flight.json", "w") as flight_result,
     ):
         listen = ["listen", "--link", line.ground_url, "--session", str(session), "--exit-after", str(frames)]
-        capture = [
-            "capture",
-            "--bracket",
-            bracket,
-            "--count",
-            str(mission.bracket.count),
-            "--camera",
-            camera.url,
-        ]
-        capture += ["--store", str(store), "--link", line.flight_url]
-        ground = _start("ground", [*listen, "--mission", str(mission_path)], ground_log)
-        flight = _start("flightsw", [*capture, "--mission", str(mission_path)], flight_log)
+        capture = ["capture", "--bracket", bracket, "--count", str(mission.bracket.count)]
+        capture += ["--camera", camera.url, "--store", str(store), "--link", line.flight_url]
+        ground = _start("ground", [*listen, "--mission", str(mission_path)], ground_log, ground_log)
+        capture += ["--mission", str(mission_path), "--json"]
+        flight = _start("flightsw", capture, flight_result, flight_log)
+        cut = _Cut(line, config.cut_s, frames)
+        patience_s = PATIENCE_S
+        if config.real_time:
+            patience_s += mission.bracket.interval_s / config.real_time
         try:
-            _watch(store, session, flight, ground, frames, console)
+            _watch(store, session, flight, ground, frames, cut, patience_s, console)
         finally:
             for process in (flight, ground):
                 if process.poll() is None:
@@ -140,23 +197,102 @@ def _fly(
                 raise DemoError(
                     f"a process of the pass failed: {_last_line(Path(log.name))} (log: {log.name})"
                 )
-        down = line.statistics()["down"]
-    captured, received = _digests(store / "index.jsonl", "frame_id"), _digests(session / "frames.jsonl", "id")
-    if captured != received:
-        different = {i for i in captured if captured[i] != received.get(i)}
+        link_figures = _link_figures(line, config, cut)
+        camera_figures = {
+            "kind": config.camera,
+            "pace": f"{config.real_time:g} times real time" if config.real_time else "lock step",
+            "exposures": camera.exposures,
+            "late_frames": camera.late_frames,
+            "failures": camera.failures,
+        }
+    captured, received = _records(store / "index.jsonl", "frame_id"), _records(session / "frames.jsonl", "id")
+    different = {i for i in captured if i not in received or captured[i]["sha256"] != received[i]["sha256"]}
+    if different or len(captured) != frames or len(received) != frames:
         raise DemoError(
-            f"{len(different)} of {len(captured)} frames were lost or altered: {sorted(different)[:5]}"
+            f"{len(different)} of {len(captured)} captured frames (planned: {frames}) were lost or altered, "
+            f"{len(received)} received: {sorted(different)[:5]}"
         )
+    done = json.loads((out / "flight.json").read_text())
+    names = ("segments_sent", "segments_resent", "transfers_failed")
     return {
-        "frames_captured": len(captured),
-        "frames_received": len(received),
-        "line_bytes_down": down.bytes_out,
-        "line_bytes_lost": down.lost_bytes + down.cut_bytes,
+        "scenario": {
+            "name": config.scenario or "the mission's own orbits and attitude",
+            "brackets": mission.bracket.count,
+            "interval_s": round(mission.bracket.interval_s, 1),
+        },
+        "frames": {
+            "captured": len(captured),
+            "received": len(received),
+            "without_valid_pose": done["capture"]["pose_invalid"],
+        },
+        "camera": camera_figures | {"packets_lost": done["capture"]["packets_lost"]},
+        "link": link_figures | {name: done["downlink"][name] for name in names},
+        "navigation": _navigation_figures(world, config, list(received.values())),
     }
 
 
-def _start(tool: str, arguments: list[str], log: TextIO) -> subprocess.Popen:
-    return subprocess.Popen([_tool(tool), *arguments], stdout=log, stderr=subprocess.STDOUT)
+def _open_camera(
+    out: Path, world: World, radiance: Callable[[PoseTag], np.ndarray], config: DemoConfig
+) -> CameraServer | GigeCameraServer:
+    more = {"pose_at": world.pose_at, "real_time": config.real_time}
+    if config.camera == "gige":
+        return GigeCameraServer(world.mission, radiance, **more)
+    return CameraServer(world.mission, radiance, out / "camera.sock", **more)
+
+
+class _Cut:
+    """One cut of the link, of `seconds`, as soon as the ground holds half of the frames; none for 0 s."""
+
+    def __init__(self, line: VirtualLink, seconds: float, frames: int):
+        self.count = 0
+        self._line, self._seconds, self._frames = line, seconds, frames
+        self._since_s = 0.0
+
+    def update(self, received: int) -> None:
+        now_s = time.monotonic()
+        if self._line.is_cut and now_s - self._since_s > self._seconds:
+            self._line.mend()
+        elif self._seconds and not self.count and self._frames // 2 <= received < self._frames:
+            self._line.cut()
+            self._since_s, self.count = now_s, 1
+
+
+def _link_figures(line: VirtualLink, config: DemoConfig, cut: _Cut) -> dict:
+    """Return what crossed the link, and what it did to packets (CAN: frames) in both directions."""
+    lanes = line.statistics()
+    figures = {
+        "kind": config.link,
+        "faults": config.faults,
+        "cuts": cut.count,
+        "cut_s": config.cut_s,
+        "bytes_down": lanes["down"].bytes_out,
+    }
+    for name in vars(lanes["down"]):
+        if FAULT_WORDS & set(name.split("_")):
+            key = name.replace("frames_", "can_frames_")  # not the camera's
+            figures[key] = getattr(lanes["down"], name) + getattr(lanes["up"], name)
+    return figures
+
+
+def _navigation_figures(world: World, config: DemoConfig, records: list[dict]) -> dict:
+    """Return how far the received tags are from the truth, root mean squares: of position [3] and of rotation."""
+    noise = "none" if config.navigation_noise is None else f"seed {config.navigation_noise}"
+    position_m, turn_rad = [], []
+    for record in records:
+        true = world.pose_at(record["mid_exposure_utc_ns"])
+        position_m.append(np.linalg.norm(true.position_body_m - record["position_body_m"]))
+        half_turn = min(1.0, abs(true.quat_body_to_camera @ record["quat_body_to_camera"]))
+        turn_rad.append(2 * np.arccos(half_turn))
+    return {
+        "source": world.mission.navigation.source.partition(":")[0],
+        "noise": noise,
+        "position_error_m": round(float(np.sqrt(np.mean(np.square(position_m)))), 4),
+        "rotation_error_deg": round(float(np.degrees(np.sqrt(np.mean(np.square(turn_rad))))), 5),
+    }
+
+
+def _start(tool: str, arguments: list[str], out: IO, log: IO) -> subprocess.Popen:
+    return subprocess.Popen([_tool(tool), *arguments], stdout=out, stderr=log)
 
 
 def _watch(
@@ -165,22 +301,29 @@ def _watch(
     flight: subprocess.Popen,
     ground: subprocess.Popen,
     frames: int,
+    cut: _Cut,
+    patience_s: float,
     console: Console,
 ) -> None:
-    """Show what is captured and received until both processes have ended, one has failed, or nothing moves."""
-    seen, moved_s = (0, 0), time.monotonic()
+    """Show what is captured and received until both processes have ended, one has failed, or nothing moves.
+
+    Cuts and mends the link on the way.
+    """
+    seen, moved_s = (0, 0, 0), time.monotonic()
     with _bar(console) as progress:
         tasks = [progress.add_task(name, total=frames) for name in ("captured", "received")]
         while flight.poll() is None or ground.poll() is None:
             if flight.poll() or ground.poll():  # a failure; the other side would wait for ever
                 return
-            counts = (_lines(store / "index.jsonl"), _lines(session / "frames.jsonl"))
-            for task, count in zip(tasks, counts, strict=True):
+            captured, received = _lines(store / "index.jsonl"), _lines(session / "frames.jsonl")
+            for task, count in zip(tasks, (captured, received), strict=True):
                 progress.update(task, completed=count)
+            counts = (captured, received, len(list(session.glob("thumbnails/*.png"))))
             if counts != seen:
                 seen, moved_s = counts, time.monotonic()
-            if time.monotonic() - moved_s > PATIENCE_S:
-                raise DemoError(f"the pass stalled at {counts[0]} captured, {counts[1]} received of {frames}")
+            if time.monotonic() - moved_s > patience_s:
+                raise DemoError(f"the pass stalled at {captured} captured, {received} received of {frames}")
+            cut.update(received)
             time.sleep(0.2)
         for task in tasks:
             progress.update(task, completed=frames)
@@ -190,10 +333,11 @@ def _lines(path: Path) -> int:
     return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
-def _digests(path: Path, key: str) -> dict[int, str]:
+def _records(path: Path, key: str) -> dict[int, dict]:
+    """Return the JSON lines of a file by their number."""
     lines = path.read_text().splitlines() if path.exists() else []
     records = [json.loads(line) for line in lines]
-    return {record[key]: record["sha256"] for record in records}
+    return {record[key]: record for record in records}
 
 
 def _last_line(log: Path) -> str:
@@ -218,9 +362,25 @@ def _bar(console: Console) -> Progress:
 
 def _summary(f: dict) -> Table:
     table = Table(title="The pass and its model", show_header=False)
+    frames, camera, link, navigation = f["frames"], f["camera"], f["link"], f["navigation"]
+    done = ", ".join(
+        f"{value:,} {name.replace('_', ' ')}"
+        for name, value in link.items()
+        if value and FAULT_WORDS & set(name.split("_"))
+    )
     for label, value in (
-        ("frames captured / received", f"{f['frames_captured']} / {f['frames_received']}, sha256 equal"),
-        ("bytes down the line / lost", f"{f['line_bytes_down']:,} / {f['line_bytes_lost']:,}"),
+        ("frames captured / received", f"{frames['captured']} / {frames['received']}, sha256 equal"),
+        ("camera", f"{camera['kind']}: {camera['late_frames']} frames late, {camera['failures']} failures"),
+        (
+            "link",
+            f"{link['kind']}, faults {link['faults']}, {link['cuts']} cuts: {link['bytes_down']:,} bytes down",
+        ),
+        ("done on the link", done or "nothing"),
+        (
+            "tags against truth",
+            f"{navigation['position_error_m']:.3f} m, {navigation['rotation_error_deg']:.4f} deg "
+            f"(injected noise: {navigation['noise']})",
+        ),
         (
             "clean held-out PSNR",
             f"{f['psnr_clean_db']:.2f} dB ({f['psnr_clean_blind_db']:.2f} dB blind to exposure)",

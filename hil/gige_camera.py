@@ -7,6 +7,7 @@ trigger is pulled.
 
 import ctypes
 import dataclasses
+import functools
 import logging
 import socket
 import threading
@@ -22,6 +23,7 @@ from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import CameraSection, Mission
 from flightsw.pose import pose_tag
 from hil.blender import BlenderError
+from hil.clock import SimulatedClock
 from hil.sensor import expose
 
 log = logging.getLogger(__name__)
@@ -45,24 +47,37 @@ class GigeCameraServer:
     """A GigE Vision camera at 127.0.0.1 until closed; `url` is what `flightsw --camera` takes.
 
     A software trigger exposes at the time in the feature SimulatedStartUtcNs, or at the simulated time of now, which
-    runs from the mission's start in real time. Without a trigger the camera runs free at its frame rate; a frame that
-    is not ready in time is left out and counted in LateFrameCount. Pictures carry the simulated time of the shutter.
+    runs from the mission's start in real time or `real_time` times as fast. Without a trigger the camera runs free at
+    its frame rate. LateFrameCount counts what was not ready in time: free running, such a frame is left out; with a
+    real-time factor a triggered one comes late. Pictures carry the simulated time of the shutter.
 
     Args:
         radiance: gives the sky [H, W, C] for a true pose.
+        pose_at: UTC ns to the true pose; by default the mission's own orbits and attitude.
+        real_time: with a factor a picture that was asked for by its time leaves no earlier than its exposure has
+            ended on the simulated clock; 0 is lock step.
 
     Raises:
         CaptureError: Aravis is not installed.
+        ValueError: the factor is none that flight can follow.
         OSError: another GigE Vision camera or client holds the port.
     """
 
-    def __init__(self, mission: Mission, radiance: Callable[[PoseTag], np.ndarray], seed: int = 0):
+    def __init__(
+        self,
+        mission: Mission,
+        radiance: Callable[[PoseTag], np.ndarray],
+        seed: int = 0,
+        pose_at: Callable[[int], PoseTag] | None = None,
+        real_time: float = 0.0,
+    ):
         self.mission, self.radiance, self.seed = mission, radiance, seed
+        self.pose_at = pose_at or functools.partial(pose_tag, mission)
+        self.clock = SimulatedClock(mission, real_time)
         self.url = f"gige://{LOOPBACK}"
-        self.exposures = self.late_frames = self.failures = 0
+        self.exposures = self.failures = 0
         self._aravis = aravis()
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:  # the fake camera would stay silent
-            probe.bind((LOOPBACK, GVCP_PORT))
+        _require_free_port()  # the fake camera would stay silent
         self._device = self._aravis.call(
             "arv_gv_fake_camera_new_full", LOOPBACK.encode(), b"OBGF", str(DESCRIPTION).encode()
         )
@@ -75,6 +90,10 @@ class GigeCameraServer:
         self._started_s = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="gige camera", daemon=True)
         self._thread.start()
+
+    @property
+    def late_frames(self) -> int:
+        return self.clock.late_frames
 
     def __enter__(self) -> "GigeCameraServer":
         return self
@@ -115,20 +134,25 @@ class GigeCameraServer:
             elif self._read(TRIGGER_MODE):
                 if self._read(TRIGGER):
                     self._write(TRIGGER, 0)
-                    self._take(self._read(START_UTC_NS, 8) or self._simulated_utc_ns())
+                    asked_utc_ns = self._read(START_UTC_NS, 8)
+                    self._take(asked_utc_ns or self._simulated_utc_ns(), timed=bool(asked_utc_ns))
             elif now_s >= due_s:
-                self._take(self._simulated_utc_ns())
+                self._take(self._simulated_utc_ns(), timed=False)
                 period_s = max(self._read(FRAME_PERIOD_US), 1000) / 1e6
                 late = int((time.monotonic() - due_s) / period_s)
-                self.late_frames += late
+                self.clock.late_frames += late
                 self._write(LATE_FRAMES, self.late_frames)
                 due_s += (late + 1) * period_s
 
     def _simulated_utc_ns(self) -> int:
-        return self.mission.orbit.start_utc_ns + round((time.monotonic() - self._started_s) * NS)
+        elapsed_s = (time.monotonic() - self._started_s) * (self.clock.factor or 1.0)
+        return self.mission.orbit.start_utc_ns + round(elapsed_s * NS)
 
-    def _take(self, start_utc_ns: int) -> None:
-        """Expose, and hand the picture to the fake camera; a sky that fails leaves the client without a picture."""
+    def _take(self, start_utc_ns: int, timed: bool) -> None:
+        """Expose, and hand the picture to the fake camera, not before its time if that was given.
+
+        A sky that fails leaves the client without a picture.
+        """
         exposure_s = self._read(EXPOSURE_US) / 1e6
         mid_ns = start_utc_ns + round(exposure_s * NS / 2)
         gain = 10 ** (self._read(GAIN_TENTH_DB) / 200)
@@ -139,7 +163,7 @@ class GigeCameraServer:
             electrons_per_dn=camera.electrons_per_dn / gain,
         )
         try:
-            radiance = self.radiance(pose_tag(self.mission, mid_ns))
+            radiance = self.radiance(self.pose_at(mid_ns))
             rng = np.random.default_rng((self.seed, mid_ns))
             dn = expose(radiance, exposure_s, amplified, rng)
             self._picture = self._encode(dn, camera)
@@ -147,6 +171,9 @@ class GigeCameraServer:
             self.failures += 1
             log.warning("no picture: %s", error)
             return
+        if timed:
+            self.clock.release(start_utc_ns + round(exposure_s * NS), self._stop.wait)
+            self._write(LATE_FRAMES, self.late_frames)
         self._picture_utc_ns = start_utc_ns
         self._sent.clear()
         self._write(FAKE_TRIGGER, 1)
@@ -190,3 +217,14 @@ class GigeCameraServer:
     def _write(self, address: int, value: int) -> None:
         data = value.to_bytes(4, "big")
         self._aravis.call("arv_fake_camera_write_memory", self._camera, address, len(data), data)
+
+
+def _require_free_port() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((LOOPBACK, GVCP_PORT))
+        except OSError as error:
+            raise OSError(
+                f"UDP port {GVCP_PORT} of {LOOPBACK} is in use: a machine has one simulated GigE camera, and another "
+                "camera or client runs; stop it, or take the hil camera"
+            ) from error

@@ -79,6 +79,10 @@ def noise_containers(count: int, size_px: int) -> list[bytes]:
     return containers
 
 
+STANDARD_FAULTS = Faults(loss=0.02, bit_flip=0.02, duplicate=0.02, reorder=0.02)
+STANDARD_CUT_S = 5.0  # one cut, when half of the frames are there
+
+
 class TrialError(RuntimeError):
     """A process of the trial failed, or the frames did not arrive as they were."""
 

@@ -3,6 +3,7 @@
 import functools
 import hashlib
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -28,15 +29,15 @@ class TrueExposure:
     pose: PoseTag
 
 
-def true_exposures(mission: Mission) -> list[TrueExposure]:
-    """Return the exposures that the mission's bracket section asks for, with the pose at each mid-exposure.
+def true_exposures(mission: Mission, pose_at: Callable[[int], PoseTag] | None = None) -> list[TrueExposure]:
+    """Return the exposures that the mission's bracket section asks for, with the true pose at each mid-exposure.
 
-    The truth is the mission's own orbits and attitude; the simulator adds no navigation error of its own.
+    Args:
+        pose_at: UTC ns to the true pose; by default the mission's own orbits and attitude.
     """
+    pose_at = pose_at or functools.partial(pose_tag, mission)
     return [
-        TrueExposure(
-            shot.exposure_time_s, shot.mid_exposure_utc_ns, pose_tag(mission, shot.mid_exposure_utc_ns)
-        )
+        TrueExposure(shot.exposure_time_s, shot.mid_exposure_utc_ns, pose_at(shot.mid_exposure_utc_ns))
         for shot in plan(mission)
     ]
 
@@ -136,7 +137,7 @@ class Sky:
     def __init__(self, scenario: Scenario):
         self.scenario = scenario
         self.orbit = scenario.orbit
-        self._gcrs_to_body = attitude(
+        self.gcrs_to_body = attitude(
             scenario.attitude,
             self.orbit.target_tle,
             self.orbit.start_utc_ns,
@@ -157,7 +158,7 @@ class Sky:
         chaser = propagate(self.orbit.chaser_tle, utc_ns)
         relative_m = chaser.position_m - target.position_m
         gcrs_to_camera = look_along(-relative_m, down=-np.cross(chaser.position_m, chaser.velocity_m_s))
-        gcrs_to_body = self._gcrs_to_body(utc_ns)
+        gcrs_to_body = self.gcrs_to_body(utc_ns)
         sun = sun_direction_gcrs(utc_ns)
         range_m = float(np.linalg.norm(relative_m))
         sunlit = sunlit_fraction(target.position_m, utc_ns)

@@ -24,6 +24,7 @@ def write_truth(
     points: int = CLOUD_POINTS,
     pose_at: Callable[[int], PoseTag] | None = None,
     geometry: bool = False,
+    simulation: dict[str, dict] | None = None,
 ) -> None:
     """Write `session`/truth for the frames that reached the session; an existing truth folder is replaced.
 
@@ -33,6 +34,7 @@ def write_truth(
     Args:
         pose_at: UTC ns to the true pose; by default the mission's own orbits and attitude.
         geometry: write each frame's depth (planar, m, inf for nothing) and normals (body axes) too.
+        simulation: what was simulated, by part (camera, link, ...) and quantity, for the report.
     """
     pose_at = pose_at or (lambda utc_ns: pose_tag(mission, utc_ns))
     folder, part = session / "truth", session / "truth.part"
@@ -70,6 +72,7 @@ def write_truth(
         "cloud": "cloud.ply",
         "mesh": "mesh.ply",
         "largest_dimension_m": float(np.ptp(vertices, axis=0).max()),
+        "simulation": simulation or {},
     }
     (part / "truth.json").write_text(json.dumps(facts))
     shutil.rmtree(folder, ignore_errors=True)

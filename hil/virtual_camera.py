@@ -1,7 +1,8 @@
 """The camera that flight sees: a socket server that renders and exposes the simulated sky at the asked time.
 
 Protocol hil://: one JSON line a request, one JSON line a reply, then `nbytes` of little-endian uint16 pixels.
-Simulated time is in lock step: the request says when the shutter opens, and the reply comes when it is done.
+The request says when the shutter opens. In lock step the reply comes when the picture is done; with a real-time factor
+no earlier than the exposure has ended on the simulated clock, and `late_frames` counts those that were not ready then.
 """
 
 import json
@@ -9,14 +10,18 @@ import logging
 import os
 import socketserver
 import threading
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from flightsw.errors import FlightError
+from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission
 from flightsw.pose import pose_tag
-from hil.blender import BlenderError, RenderFarm
+from hil.blender import BlenderError
+from hil.clock import SimulatedClock
 from hil.sensor import expose
 
 log = logging.getLogger(__name__)
@@ -27,16 +32,31 @@ class CameraServer:
     """Serves the mission's camera until closed; `url` is what `flightsw --camera` takes.
 
     Args:
+        radiance: gives the sky [H, W, C] for a true pose.
         listen: path of a Unix socket, or hil:///path/to/socket, or hil://host:port (port 0 takes a free one).
+        pose_at: UTC ns to the true pose; by default the mission's own orbits and attitude.
+        real_time: how many times as fast as ours the simulated clock runs; 0 is lock step.
 
     Raises:
-        ValueError: `listen` is none of these, its path is too long or holds a file that is not a socket.
+        ValueError: `listen` is none of these, its path is too long or holds a file that is not a socket; or the
+            factor is none that flight can follow.
         OSError: the address is taken or not this machine's.
     """
 
-    def __init__(self, mission: Mission, farm: RenderFarm, listen: Path | str, seed: int = 0):
-        self.mission, self.farm, self.seed = mission, farm, seed
-        self.exposures = 0
+    def __init__(
+        self,
+        mission: Mission,
+        radiance: Callable[[PoseTag], np.ndarray],
+        listen: Path | str,
+        seed: int = 0,
+        pose_at: Callable[[int], PoseTag] | None = None,
+        real_time: float = 0.0,
+    ):
+        self.mission, self.radiance, self.seed = mission, radiance, seed
+        self.pose_at = pose_at or partial(pose_tag, mission)
+        self.clock = SimulatedClock(mission, real_time)
+        self.exposures = self.failures = 0
+        self._closing = threading.Event()
         camera = self
 
         class Handler(socketserver.StreamRequestHandler):
@@ -63,7 +83,12 @@ class CameraServer:
     def __enter__(self) -> "CameraServer":
         return self
 
+    @property
+    def late_frames(self) -> int:
+        return self.clock.late_frames
+
     def __exit__(self, *_) -> None:
+        self._closing.set()
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -82,6 +107,7 @@ class CameraServer:
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             return {"ok": False, "error": f"bad request: {type(error).__name__}: {error}"}, b""
         except (FlightError, BlenderError) as error:
+            self.failures += 1
             return {"ok": False, "error": str(error)}, b""
 
     def _info(self) -> dict:
@@ -98,16 +124,18 @@ class CameraServer:
         if not 0 < exposure_time_s <= 60:
             raise ValueError(f"exposure_time_s must be in 0 to 60, got {exposure_time_s}")
         mid_ns = start_utc_ns + round(exposure_time_s * 5e8)
-        radiance = self.farm.radiance(pose_tag(self.mission, mid_ns))
+        radiance = self.radiance(self.pose_at(mid_ns))
         rng = np.random.default_rng((self.seed, mid_ns))
         dn = expose(radiance, exposure_time_s, self.mission.camera, rng)
         pixels = np.ascontiguousarray(dn, dtype="<u2").tobytes()
+        self.clock.release(start_utc_ns + round(exposure_time_s * 1e9), self._closing.wait)
         self.exposures += 1
         header = {
             "ok": True,
             **self._info(),
             "exposure_time_s": exposure_time_s,
             "mid_exposure_utc_ns": mid_ns,
+            "late_frames": self.late_frames,
         }
         return {**header, "nbytes": len(pixels)}, pixels
 

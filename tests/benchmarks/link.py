@@ -12,7 +12,14 @@ import os
 import tempfile
 from pathlib import Path
 
-from hil.link_trial import Trial, TrialResult, noise_containers, run_trial
+from hil.link_trial import (
+    STANDARD_CUT_S,
+    STANDARD_FAULTS,
+    Trial,
+    TrialResult,
+    noise_containers,
+    run_trial,
+)
 from hil.virtual_link import Faults
 
 TWO_PERCENT = Faults(bit_flip=0.02, duplicate=0.02, reorder=0.02)
@@ -23,6 +30,10 @@ CASES = {
     "30 % loss": {"faults": Faults(loss=0.3)},
     "flips, duplicates, reordering 2 % each": {"faults": TWO_PERCENT},
     "5 s cut": {"cut_s": 5.0},
+    "standard: 2 % each of loss, flips, duplicates, reordering, and a cut": {
+        "faults": STANDARD_FAULTS,
+        "cut_s": STANDARD_CUT_S,
+    },
     "each side killed three times": {"kills": 3},
     "each side's disk full and freed": {"full_disks": True},
     "all together": {"faults": Faults(0.1, 0.02, 0.02, 0.02), "cut_s": 5.0, "kills": 3, "full_disks": True},

@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ def camera(mission, radiance: float = 0.4, delay_s: float = 0.0) -> Iterator[Cam
         picture[12:36, 12:36] = radiance
         return picture
 
-    with CameraServer(mission, SimpleNamespace(radiance=sky), "hil://127.0.0.1:0") as server:
+    with CameraServer(mission, sky, "hil://127.0.0.1:0") as server:
         yield server
 
 

@@ -32,7 +32,7 @@ def main() -> None:
     ):
         farm.prerender([e.pose for e in true_exposures(mission)])
         store = FrameStore(Path(folder) / "store")
-        with CameraServer(mission, farm, Path(folder) / "camera.sock", seed=1) as server:
+        with CameraServer(mission, farm.radiance, Path(folder) / "camera.sock", seed=1) as server:
             camera = open_camera(server.url, mission.camera)
             print(capture(mission, camera, store))
             camera.close()

@@ -147,7 +147,7 @@ def test_the_ground_changes_the_bracket_and_uplinks_a_model_and_the_downlink_fol
     with (
         VirtualSerial(460_800) as line,
         Tools(tmp_path) as tools,
-        CameraServer(mission, sky, tmp_path / "camera.sock") as camera,  # type: ignore[arg-type]
+        CameraServer(mission, sky.radiance, tmp_path / "camera.sock") as camera,
     ):
         assert tools.run("ground", "key", key).returncode == 0
         common = ("--mission", mission_file)

@@ -1,4 +1,4 @@
-"""The whole loop, small: Blender, camera, flight, pseudo-terminal, ground, model, report; each a process of its own."""
+"""The whole loop, small: Blender, camera, flight, link, ground, model, report; each a process of its own."""
 
 import json
 import re
@@ -8,6 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
+
+from flightsw.icd.mission import load_mission
+from hil import cli, spacecraft
+from hil.demo import DemoConfig, DemoError, fly, simulate_pass
+from hil.scenario import Sky, load_scenario
+from hil.world import load_world
 
 ROOT = Path(__file__).parents[2]
 
@@ -34,9 +41,18 @@ def test_demo_ends_in_a_report_with_every_frame_across(mission, tmp_path):
     assert done.returncode == 0, done.stderr
     figures = json.loads(done.stdout)
     assert figures["frames_captured"] == figures["frames_received"] == 15
-    assert figures["line_bytes_lost"] == 0 and figures["onnx_parity_db"] >= 45
+    assert figures["link"]["lost_bytes"] == figures["link"]["cuts"] == 0 and figures["onnx_parity_db"] >= 45
+    assert figures["navigation"] == {
+        "source": "sgp4",
+        "noise": "none",
+        "position_error_m": 0.0,
+        "rotation_error_deg": 0.0,
+    }
     run = out / "session" / "runs" / "demo"
     assert all((run / name).exists() for name in ("model.ply", "model.onnx", "metrics.json", "report.html"))
+    page = (run / "report.html").read_text()
+    for words in ("The simulated world", "camera: late frames", "link: kind", "navigation: position error m"):
+        assert words in page
     metrics = json.loads((run / "metrics.json").read_text())
     for key in (
         "psnr_clean_db",
@@ -57,6 +73,82 @@ def test_demo_ends_in_a_report_with_every_frame_across(mission, tmp_path):
     assert sorted(stored) == sorted(arrived)
     kept = [np.load(path).files for path in (out / "renders").iterdir()]  # for the next run
     assert sum("radiance" in names for names in kept) == 15
+
+
+@pytest.fixture
+def quick(mission, tmp_path) -> Path:
+    """The small mission with two brackets of two."""
+    text = mission.read_text().replace("count: 5", "count: 2").replace("[0.05, 0.1, 0.2]", "[0.05, 0.2]")
+    path = tmp_path / "quick.yaml"
+    path.write_text(text)
+    return path
+
+
+def plate(pose) -> np.ndarray:
+    """A sky that is a bright plate in the middle, wherever the camera is."""
+    picture = np.zeros((48, 48, 1))
+    picture[18:30, 18:30] = 0.4
+    return picture
+
+
+def test_every_frame_crosses_a_faulty_can_bus_from_a_gige_camera(
+    quick, tmp_path, the_only_camera_on_loopback
+):
+    config = DemoConfig(camera="gige", link="slcan", faults="standard")
+    world = load_world(load_mission(quick))
+    figures = fly(tmp_path, world, quick, plate, config, Console(stderr=True))
+    assert figures["frames"] == {"captured": 4, "received": 4, "without_valid_pose": 0}
+    assert figures["camera"]["exposures"] == 4
+    assert figures["camera"]["packets_lost"] == figures["camera"]["failures"] == 0
+    link = figures["link"]
+    assert link["cuts"] == 1
+    for name in ("destroyed", "flipped", "duplicated", "reordered", "cut"):
+        assert link[f"can_frames_{name}"] > 0
+    assert link["segments_resent"] > 0
+
+
+def test_a_pass_that_does_not_move_is_an_error(quick, tmp_path, monkeypatch):
+    monkeypatch.setattr("hil.demo.PATIENCE_S", 2.0)
+    monkeypatch.setattr("hil.demo._Cut.update", lambda cut, received: cut._line.cut())
+    world = load_world(load_mission(quick))
+    with pytest.raises(DemoError, match="0 received of 4"):
+        fly(tmp_path, world, quick, plate, DemoConfig(), Console(stderr=True))
+
+
+def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_path):
+    out = tmp_path / "demo"
+    config = DemoConfig(link="slcan-fd", scenario="tumbling", real_time=3000.0, navigation_noise=3)
+    simulation = simulate_pass(out, quick, spacecraft.SHIPPED, config, Console(stderr=True))
+    assert simulation["frames"] == {"captured": 4, "received": 4, "without_valid_pose": 0}
+    # a sixth of a millisecond from frame to frame of a bracket: nobody stores a frame so fast
+    assert 2 <= simulation["camera"]["late_frames"] <= 3
+    assert 0.005 < simulation["navigation"]["position_error_m"] < 0.1
+    sky = Sky(load_scenario("tumbling"))
+    truth = json.loads((out / "session" / "truth" / "truth.json").read_text())
+    assert truth["simulation"] == simulation
+    lines = (out / "session" / "frames.jsonl").read_text().splitlines()
+    tags = {tag["id"]: tag for tag in map(json.loads, lines)}
+    assert len(truth["frames"]) == 4
+    for entry in truth["frames"]:
+        tag = tags[entry["id"]]
+        true = sky.state(tag["mid_exposure_utc_ns"]).pose.world_to_camera
+        np.testing.assert_allclose(entry["world_to_camera"], true, atol=1e-9)
+        assert 1e-4 < np.abs(np.array(tag["world_to_camera"]) - true).max() < 0.5  # m: navigation errs
+
+
+def test_what_cannot_be_flown_is_refused_before_anything_is_written(mission, tmp_path, monkeypatch, capsys):
+    for chosen, reason in (
+        (("--link", "radio"), "demo.link: expected one of serial, slcan, slcan-fd"),
+        (("--camera", "usb"), "demo.camera: expected one of hil, gige"),
+        (("--scenario", "fly_around"), "expected a YAML file or one of approach"),
+        (("--real-time", "-1"), "0 (lock step) or positive"),
+    ):
+        command = ["hil", "demo", "--out", str(tmp_path / "d"), "--mission", str(mission), *chosen]
+        monkeypatch.setattr(sys, "argv", command)
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert ended.value.code == 2 and reason in capsys.readouterr().err
+    assert not (tmp_path / "d").exists()
 
 
 def test_a_session_that_is_no_demos_is_never_overwritten(mission, tmp_path):

@@ -3,13 +3,11 @@
 import contextlib
 import ctypes
 import dataclasses
-import fcntl
 import json
 import re
 import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,24 +32,14 @@ LISTENING = "0100007F:0F74"  # 127.0.0.1:3956 in /proc/net/udp
 FAKE_CAMERA, CAMERA_TEST = "arv-fake-gv-camera-0.8", "arv-camera-test-0.8"
 
 
-def _missing() -> str:
-    try:
-        aravis()
-    except CaptureError as error:
-        return str(error)
+pytestmark = pytest.mark.usefixtures("the_only_camera_on_loopback")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def aravis_tools() -> None:
     tools = [tool for tool in (FAKE_CAMERA, CAMERA_TEST) if shutil.which(tool) is None]
-    return f"{', '.join(tools)} missing; on Debian: apt-get install aravis-tools" if tools else ""
-
-
-pytestmark = pytest.mark.skipif(bool(_missing()), reason=_missing() or "Aravis is there")
-
-
-@pytest.fixture(autouse=True)
-def the_only_camera_on_loopback() -> Iterator[None]:
-    """GigE Vision has one port, 3956: two test runs on one machine take turns."""
-    with open(Path(tempfile.gettempdir()) / "obbgs-gige-test.lock", "wb") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
+    if tools:
+        pytest.skip(f"{', '.join(tools)} missing; on Debian: apt-get install aravis-tools")
 
 
 @contextlib.contextmanager
@@ -395,6 +383,27 @@ def test_the_simulated_pass_is_the_same_through_gige_as_in_the_missions_time(tmp
     for pose, stored in zip(poses, store.frames, strict=True):
         frame = decode_frame(store.read(stored.frame_id))
         np.testing.assert_allclose(frame.pose.position_body_m, pose, atol=1e-9)
+
+
+def test_a_triggered_frame_that_is_not_ready_in_time_is_late_and_counted_by_the_camera():
+    """The second picture takes longer than the simulated second at 100 times real time, the third does not."""
+    mission = simulated()
+    slow = iter((0.0, 0.1, 0.0))
+
+    def sky(pose):
+        time.sleep(next(slow))
+        return np.full((SIZE_PX, SIZE_PX, 1), 0.2)
+
+    with GigeCameraServer(mission, sky, real_time=100.0) as server:
+        camera = open_camera(server.url, mission.camera)
+        assert isinstance(camera, GigeCamera)
+        began_s = time.monotonic()
+        for elapsed_s in (0, 1, 150):
+            camera.expose(1e-4, mission.orbit.start_utc_ns + elapsed_s * 1_000_000_000)
+        assert time.monotonic() - began_s >= 1.5  # the last one was not given before its time
+        late = aravis().call("arv_camera_get_integer", camera._camera, b"LateFrameCount")
+        camera.close()
+    assert (server.exposures, server.late_frames, late) == (3, 1, 1)
 
 
 def test_a_taken_port_is_an_error_and_not_a_silent_camera():
