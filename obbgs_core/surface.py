@@ -15,11 +15,11 @@ from obbgs_core.rotations import quats_to_matrices
 BLACKEST = 3e-4  # of the bright surface's radiance; fainter Gaussians show no light, so no surface was measured there
 BRIGHT_QUANTILE = 0.97
 STEEPEST = 4.0  # tangent of the largest angle between line of sight and a Gaussian's normal, 76 degrees
-STEEPEST_DEPTH = 16.0  # the same of the depth map itself; steeper is an edge
+STEEPEST_DEPTH = 24.0  # the same of the depth map itself; steeper is an edge
 SAME_DEPTH_PX = 2.0  # depths agree within so many pixels' width
 AGREEING_VIEWS = 2  # that must see a point, besides its own
 NORMAL_NEIGHBOURS = 64  # fewer follow the noise of the depth maps, more round the edges off
-CANDIDATES = 600_000  # pixels that are looked up in every view
+CANDIDATES = 900_000  # pixels that are looked up in every view
 
 
 @torch.no_grad()
