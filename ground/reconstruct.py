@@ -21,7 +21,7 @@ from torch import Tensor
 
 from flightsw.icd.mission import CameraSection
 from ground.session import FrameRecord, Session, SessionError, open_session
-from obbgs_core.cameras import Cameras
+from obbgs_core.cameras import Cameras, stacked_suns
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.export_onnx import export_onnx
 from obbgs_core.frames import TrainingFrame
@@ -234,14 +234,13 @@ def camera_of(session: Session, record: FrameRecord) -> Cameras:
 def cameras_of(session: Session, records: list[FrameRecord]) -> Cameras:
     """Return the cameras of some frames, with their Sun where all tags know it."""
     poses = torch.stack([torch.tensor(r.world_to_camera, dtype=torch.float32) for r in records])
-    suns = [sun for record in records if (sun := sun_direction(record)) is not None]
     camera = session.camera
     return Cameras(
         poses,
         torch.tensor(camera.K).expand(len(records), 3, 3),
         camera.width,
         camera.height,
-        sun_dir=torch.stack(suns) if len(suns) == len(records) else None,
+        sun_dir=stacked_suns([sun_direction(record) for record in records]),
     )
 
 

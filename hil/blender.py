@@ -160,8 +160,7 @@ class RenderFarm:
     """
 
     def __init__(self, mission: Mission, mesh: Path, cache: Path, workers: int = 2):
-        if not mesh.is_file():
-            raise MeshError(f"{mesh}: no such file")
+        check_mesh(mesh)
         self.mission, self.mesh, self.cache = mission, mesh, cache
         cache.mkdir(parents=True, exist_ok=True)
         self._count = workers
@@ -283,6 +282,12 @@ class RenderFarm:
         if not path.exists():
             worker.ask(**self._request(pose, op), out=str(path))
         return path
+
+
+def check_mesh(mesh: Path) -> None:
+    """Raise MeshError when there is no such file; whether Blender can load it, Blender says."""
+    if not mesh.is_file():
+        raise MeshError(f"{mesh}: no such file")
 
 
 def mesh_sha256(mesh: Path) -> str:

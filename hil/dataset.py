@@ -265,8 +265,7 @@ def _gain(farm: RenderFarm, states: list[SceneState], model: SensorModel, exposu
 
 def _digest(config: DatasetConfig, scenario_sha256: str, mesh: Path) -> str:
     """Return the digest of all that shapes a data set: settings, scenario, mesh, and the code that makes pixels."""
-    if not mesh.is_file():
-        raise blender.MeshError(f"{mesh}: no such file")
+    blender.check_mesh(mesh)
     settings = {**dataclasses.asdict(config), "targets": None, "scenario": scenario_sha256}
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode() + mesh_sha256(mesh).encode())
     for source in (blender.WORKER, Path(sensor.__file__), Path(truth.__file__), Path(__file__)):

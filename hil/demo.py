@@ -24,7 +24,7 @@ from rich.table import Table
 
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, load_mission
-from hil.blender import RenderFarm
+from hil.blender import RenderFarm, check_mesh
 from hil.clock import SimulatedClock
 from hil.gige_camera import GigeCameraServer
 from hil.link_trial import STANDARD_CUT_S, STANDARD_FAULTS
@@ -106,7 +106,10 @@ def simulate_pass(
         CaptureError, OSError: the GigE camera cannot be served: no Aravis, or its port is taken.
     """
     world = load_world(load_mission(mission_path), config.scenario)
-    SimulatedClock(world.mission, config.real_time)  # a factor that cannot be is known at once
+    SimulatedClock(
+        world.mission, config.real_time
+    )  # a factor that cannot be is known before anything is removed
+    check_mesh(mesh)
     _clear(out)
     if config.scenario or config.navigation_noise is not None:
         mission_path = write_flight_inputs(world, out / "scenario", config.navigation_noise)

@@ -1,6 +1,7 @@
 """Pinhole cameras: OpenCV axes, pixel centres at +0.5."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -46,8 +47,20 @@ class Cameras:
         R, t = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3:]
         return -(R.transpose(1, 2) @ t)[..., 0]
 
+    def one(self, index: int) -> "Cameras":
+        """Return one of the cameras, still of shape [1, ...]."""
+        sun_dir = None if self.sun_dir is None else self.sun_dir[index : index + 1]
+        pose, K = self.world_to_camera[index : index + 1], self.K[index : index + 1]
+        return dataclasses.replace(self, world_to_camera=pose, K=K, sun_dir=sun_dir)
+
     def scaled(self, factor: float) -> "Cameras":
         """Return the cameras of images resized by `factor` (0.5: half as wide and high, rounded up)."""
         K = self.K * torch.tensor([[factor], [factor], [1.0]], dtype=self.K.dtype, device=self.K.device)
         width, height = -int(-self.width * factor // 1), -int(-self.height * factor // 1)
         return dataclasses.replace(self, K=K, width=width, height=height)
+
+
+def stacked_suns(directions: Sequence[Tensor | None]) -> Tensor | None:
+    """Return the Sun's directions of some cameras as one [C, 3], or nothing where one of them is not known."""
+    known = [direction for direction in directions if direction is not None]
+    return torch.stack(known) if known and len(known) == len(directions) else None

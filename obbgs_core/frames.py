@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_core.cameras import Cameras
+from obbgs_core.cameras import Cameras, stacked_suns
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.methods import MethodConfig
 
@@ -47,11 +47,18 @@ class Batch:
 
 def sun_span_deg(frames: list[TrainingFrame]) -> float:
     """Return the largest angle between the Sun's directions in two frames; 0 where it is not known in all."""
-    known = [f.sun_dir.double() for f in frames if f.sun_dir is not None]
-    if not known or len(known) < len(frames):
+    directions = stacked_suns([f.sun_dir for f in frames])
+    if directions is None:
         return 0.0
-    directions = torch.stack(known)
+    directions = directions.double()
     return math.degrees(torch.cdist(directions, directions).max().div(2).clamp(max=1).asin().mul(2).item())
+
+
+def cameras_of(frames: list[TrainingFrame]) -> Cameras:
+    """Return the cameras of some frames of one size, with their Sun where it is known in all."""
+    height, width = frames[0].dn.shape[:2]
+    poses, K = torch.stack([f.world_to_camera for f in frames]), torch.stack([f.K for f in frames])
+    return Cameras(poses, K, width, height, sun_dir=stacked_suns([f.sun_dir for f in frames]))
 
 
 def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[TrainingFrame], float | None]:
@@ -83,9 +90,18 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
 
 
 class Batches:
-    """Draws frames without replacement, one of each exposure in turn when the method asks for brackets."""
+    """Draws frames without replacement, one of each exposure in turn when the method asks for brackets.
 
-    def __init__(self, frames: list[TrainingFrame], config: MethodConfig, rng: torch.Generator):
+    sky: where some of the frames, by index, surely show nothing [H, W] bool.
+    """
+
+    def __init__(
+        self,
+        frames: list[TrainingFrame],
+        config: MethodConfig,
+        rng: torch.Generator,
+        sky: dict[int, Tensor] | None = None,
+    ):
         self.frames, self.rng = frames, rng
         self.frames_per_step = min(config.frames_per_step, len(frames))
         groups: dict[float, list[int]] = {}
@@ -94,8 +110,9 @@ class Batches:
         self.groups = list(groups.values())
         self.waiting: list[list[int]] = [[] for _ in self.groups]
         self.turn = 0
+        self.sky = sky or {}
         self.levels: dict[int, list[Tensor]] = {}
-        self.sky: dict[int, Tensor] = {}  # [H, W] bool of some of the frames, by index
+        self.sky_levels: dict[int, dict[int, Tensor]] = {}
 
     def state(self) -> dict:
         return {"waiting": [list(w) for w in self.waiting], "turn": self.turn}
@@ -121,27 +138,22 @@ class Batches:
         factor = round(1 / scale)
         if factor not in self.levels:
             self.levels[factor] = [_shrunk(f.dn, factor) for f in self.frames]
+            self.sky_levels[factor] = {
+                i: F.avg_pool2d(sky[None].float(), factor, ceil_mode=True)[0] for i, sky in self.sky.items()
+            }
         frames = [self.frames[i] for i in indices]
-        height, width = frames[0].dn.shape[:2]
-        poses = torch.stack([f.world_to_camera for f in frames])
-        suns = [f.sun_dir for f in frames if f.sun_dir is not None]
-        sun_dir = torch.stack(suns) if len(suns) == len(frames) else None
-        cameras = Cameras(poses, torch.stack([f.K for f in frames]), width, height, sun_dir=sun_dir)
+        cameras, dn = cameras_of(frames), torch.stack([self.levels[factor][i] for i in indices])
+        nobody_looked = torch.zeros(dn.shape[1:3])
         return Batch(
             indices,
             cameras.scaled(1 / factor) if factor > 1 else cameras,
-            torch.stack([self.levels[factor][i] for i in indices]),
+            dn,
             torch.tensor([f.exposure_time_s for f in frames]).view(-1, 1, 1, 1),
             factor * factor,
-            torch.stack([self._sky(i, factor) for i in indices]) if self.sky else None,
+            torch.stack([self.sky_levels[factor].get(i, nobody_looked) for i in indices])
+            if self.sky
+            else None,
         )
-
-    def _sky(self, index: int, factor: int) -> Tensor:
-        """Return a frame's share of empty sky at a scale [H, W]; 0 where nobody looked."""
-        height, width = self.levels[factor][index].shape[:2]
-        if index not in self.sky:
-            return torch.zeros(height, width)
-        return F.avg_pool2d(self.sky[index][None].float(), factor, ceil_mode=True)[0]
 
 
 def _shrunk(dn: Tensor, factor: int) -> Tensor:

@@ -52,9 +52,8 @@ def silhouette(
     bright = signal > BRIGHT_SIGMA
     sure, likely = torch.zeros_like(bright), bright.clone()
     means = {w: F.avg_pool2d(signal, w, 1, w // 2) * w for w in WINDOWS_PX}
-    faint = {
-        w: _mean_of(signal, ~bright, w) for w in WINDOWS_PX
-    }  # what is bright does not light its neighbours
+    # what is bright does not light its neighbours
+    faint = {w: _mean_of(signal, ~bright, w) for w in WINDOWS_PX}
     for w in WINDOWS_PX:  # light is there, not only nearby
         sure |= (means[w] > SURE_SIGMA) & (means[3] > LIKELY_SIGMA)
         likely |= (faint[w] > LIKELY_SIGMA) & (faint[5] > 0)

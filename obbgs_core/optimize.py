@@ -126,14 +126,11 @@ class Trainer:
             self.frames, list(outlines.values()), sensor, config, self.rng
         )
         self.sun_span_deg = sun_span_deg(self.frames)
-        self.appearance = (
-            "constant" if self.gaussians.sh.shape[1] == 1 else "turns with the view, as configured"
-        )
+        self.why_appearance = "as configured" if config.sh_degree else ""
         self.adam = Adam(self.gaussians)
         self.growth = Growth(len(self.gaussians), config.pixel_weighted)
-        self.batches = Batches(self.frames, config, self.rng)
-        if config.sky_weight:
-            self.batches.sky = {i: outline.sky for i, outline in outlines.items()}
+        sky = {i: outline.sky for i, outline in outlines.items()} if config.sky_weight else None
+        self.batches = Batches(self.frames, config, self.rng, sky)
         self.poses = PoseCorrections(self.frames) if config.refine_poses else None
         self.boxes: list[obb.Obb] = []
         self.chi2, self.psnr_db, self.steps_done = math.nan, math.nan, 0
@@ -213,12 +210,19 @@ class Trainer:
             self.seconds,
         )
 
+    @property
+    def appearance(self) -> str:
+        """What the radiance turns with, and why."""
+        constant = self.gaussians.sh.shape[1] == 1
+        what = "constant" if constant else f"turns with the {self.gaussians.sh_direction}"
+        return f"{what} ({self.why_appearance})" if self.why_appearance else what
+
     def save(self, path: Path) -> None:
         """Write everything the next step depends on, whole or not at all."""
         state = {
             "fingerprint": self.fingerprint,
             "gaussians": dataclasses.asdict(self.gaussians.detach()),
-            "appearance": self.appearance,
+            "why_appearance": self.why_appearance,
             "adam": {"first": self.adam.first, "second": self.adam.second, "steps": self.adam.steps},
             "growth": (self.growth.gradient, self.growth.weight),
             "boxes": [(box.centre, box.axes, box.half_extents) for box in self.boxes],
@@ -240,7 +244,8 @@ class Trainer:
         if state["fingerprint"] != self.fingerprint:
             log.warning("%s belongs to another training: it is not used", path)
             return False
-        self.gaussians, self.appearance = trainable(Gaussians(**state["gaussians"])), state["appearance"]
+        self.gaussians = trainable(Gaussians(**state["gaussians"]))
+        self.why_appearance = state["why_appearance"]
         self.adam.first, self.adam.second = state["adam"]["first"], state["adam"]["second"]
         self.adam.steps = state["adam"]["steps"]
         self.growth = Growth(len(self.gaussians), self.config.pixel_weighted)
@@ -350,7 +355,7 @@ class Trainer:
         degree = math.isqrt(self.gaussians.sh.shape[1])
         if degree > self.config.most_sh_degree:
             return
-        what, tested = self.appearance.split(" (")[0], []
+        tested = []
         for direction in directions if degree == 1 else (self.gaussians.sh_direction,):
             turning = dataclasses.replace(self.gaussians, sh_direction=direction)
             gain, cost = next_degree_gain(turning, self.batches, self.sensor, scale, self.rng)
@@ -358,9 +363,8 @@ class Trainer:
             if gain > cost:
                 self.gaussians = trainable(padded(turning, degree))
                 self.adam.widen(self.gaussians)
-                what = f"turns with the {direction}"
                 break
-        self.appearance = f"{what} (step {self.steps_done + 1}, degree {degree}: {'; '.join(tested)})"
+        self.why_appearance = f"step {self.steps_done + 1}, degree {degree}: {'; '.join(tested)}"
         log.info("radiance %s", self.appearance)
 
     def _look(self, rendered: Rendered, batch: Batch) -> None:

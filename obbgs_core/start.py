@@ -32,11 +32,10 @@ def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.S
     for exposure_s in sorted({f.exposure_time_s for f in frames}, reverse=True):
         if len(chosen) < FEWEST_VIEWS:
             chosen += [i for i, f in enumerate(frames) if f.exposure_time_s == exposure_s]
-    outlines = {}
-    for i in chosen:
-        f = frames[i]
-        outlines[i] = hull.silhouette(f.dn, sensor, f.world_to_camera, f.K, _pose_error_px(f))
-    return outlines
+    return {
+        i: hull.silhouette(f.dn, sensor, f.world_to_camera, f.K, _pose_error_px(f))
+        for i, f in ((i, frames[i]) for i in chosen)
+    }
 
 
 def _pose_error_px(frame: TrainingFrame) -> int:

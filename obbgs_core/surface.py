@@ -49,7 +49,7 @@ def surface_points(
     generator = torch.Generator().manual_seed(seed)
     views, patches = [], []
     for c in range(len(cameras)):
-        depth, slope = depth_map(gaussians, _one(cameras, c))
+        depth, slope = depth_map(gaussians, cameras.one(c))
         near, far = _neighbourhood(depth)
         pixels, share = _candidates(
             depth, slope, near, far, cameras.K[c], -(-CANDIDATES // len(cameras)), generator
@@ -76,9 +76,8 @@ def _lit(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
     if len(gaussians) == 0:
         return gaussians
     radiance = gaussians.mean_radiance(cameras.sun_dir).mean(dim=-1)
-    bare = gaussians.lit_from(
-        None if cameras.sun_dir is None else cameras.sun_dir[0]
-    )  # depths are all that follows
+    any_sun = None if cameras.sun_dir is None else cameras.sun_dir[0]  # only depths are asked for
+    bare = gaussians.lit_from(any_sun)
     return bare.select(radiance > BLACKEST * radiance.quantile(BRIGHT_QUANTILE))
 
 
@@ -86,8 +85,9 @@ def _lit(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
 def depth_map(gaussians: Gaussians, camera: Cameras) -> tuple[Tensor, Tensor]:
     """Return the depth [H, W] m (infinite where the pixel is not solid) and its slope [H, W, 2] m/px of one camera.
 
-    The depth is where the ray meets the Gaussian that stops half the light: not at its centre's depth but at its peak
-    along the ray. The peaks of all rays form, to first order, a plane; for a thin disc that is the disc itself.
+    The depth is where the ray meets the Gaussian that stops half the light: not at its centre's depth, but one
+    deviation before its peak along the ray, where a solid's surface lies. The peaks of all rays form, to first order,
+    a plane; for a thin disc that is the disc itself.
 
     Source: Zhang et al., RaDe-GS: Rasterizing Depth in Gaussian Splatting, 2024.
     """
@@ -96,43 +96,34 @@ def depth_map(gaussians: Gaussians, camera: Cameras) -> tuple[Tensor, Tensor]:
     depths, order = projected.depths[0].sort()
     middles = (depths[1:] + depths[:-1]) / 2
     stopping = order[torch.searchsorted(middles, median.contiguous())]  # [H, W] whose depth the median is
-    slope = _slopes(gaussians, camera)[stopping]  # [H, W, 2]
+    slopes, deviations_m = _planes(gaussians, camera)
+    slope = slopes[stopping]  # [H, W, 2]
     v, u = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     from_centre = torch.stack([u, v], dim=-1) - projected.means2d[0][stopping]
-    depth = median + (slope * from_centre).sum(dim=-1) - _half_depths(gaussians, camera)[stopping]
+    depth = median + (slope * from_centre).sum(dim=-1) - deviations_m[stopping]
     return torch.where((median > 0) & (depth > camera.near_m), depth, torch.inf), slope
 
 
-def _half_depths(gaussians: Gaussians, camera: Cameras) -> Tensor:
-    """Return one deviation of each Gaussian along its ray [N] m: a solid's surface lies so far before the peak."""
-    R, t = camera.world_to_camera[0, :3, :3], camera.world_to_camera[0, :3, 3]
-    p = gaussians.means @ R.T + t
-    axes = R @ quats_to_matrices(gaussians.quats)
-    along = (axes.transpose(1, 2) @ p[..., None])[
-        ..., 0
-    ] / gaussians.scales  # the ray in each Gaussian's sigmas
-    return p[:, 2] / along.norm(dim=1)
+def _planes(gaussians: Gaussians, camera: Cameras) -> tuple[Tensor, Tensor]:
+    """Return how the depth of each Gaussian's peak changes across the image [N, 2] m/px, and its deviation in depth.
 
-
-def _slopes(gaussians: Gaussians, camera: Cameras) -> Tensor:
-    """Return how the depth of each Gaussian's peak changes across the image [N, 2] m/px.
-
-    It counts in full for a disc and less the rounder a Gaussian is: the tilt of a round one is noise of the training
-    (completeness of a model whose shortest sigma was 0.6 of the middle one: 77 % so, 76 % with full slopes).
+    The deviation [N] m is of the Gaussian along the ray to its centre. The slope counts in full for a disc and less the
+    rounder a Gaussian is: the tilt of a round one is noise of the training (completeness of a model whose shortest
+    sigma was 0.6 of the middle one: 77 % so, 76 % with full slopes).
     """
     R, t, K = camera.world_to_camera[0, :3, :3], camera.world_to_camera[0, :3, 3], camera.K[0]
     p = gaussians.means @ R.T + t
     axes = R @ quats_to_matrices(gaussians.quats)  # of each Gaussian, in the camera
-    scales = gaussians.log_scales - gaussians.log_scales.max(dim=1, keepdim=True).values
+    along = (axes.transpose(1, 2) @ p[..., None])[..., 0]  # the ray in each Gaussian's axes
+    scales = (gaussians.log_scales - gaussians.log_scales.max(dim=1, keepdim=True).values).clamp(min=-9).exp()
     # the plane's normal is Sigma^-1 p, here times the square of the largest sigma
-    normal = (axes @ ((axes.transpose(1, 2) @ p[..., None]) / scales.clamp(min=-9).exp()[..., None] ** 2))[
-        ..., 0
-    ]
+    normal = (axes @ (along / scales**2)[..., None])[..., 0]
     slope = -normal[:, :2] * p[:, 2:] / (normal * p).sum(dim=1, keepdim=True)  # over depth, per tangent
-    shortest, middle, _ = scales.exp().sort(dim=1).values.unbind(dim=1)
+    shortest, middle, _ = scales.sort(dim=1).values.unbind(dim=1)
     slope = slope * (1 - (shortest / middle) ** 2)[:, None]
     slope = slope * (STEEPEST / slope.norm(dim=1, keepdim=True).clamp(min=STEEPEST))
-    return (slope * p[:, 2:] / torch.stack([K[0, 0], K[1, 1]])).nan_to_num(0, 0, 0)
+    slopes = (slope * p[:, 2:] / torch.stack([K[0, 0], K[1, 1]])).nan_to_num(0, 0, 0)
+    return slopes, p[:, 2] / (along / gaussians.scales).norm(dim=1)
 
 
 @dataclass(frozen=True)
@@ -185,11 +176,6 @@ def _fitted_normals(points: Tensor, to_camera: Tensor) -> Tensor:
     to_camera = F.normalize(to_camera, dim=1)
     to_camera = to_camera + to_camera[neighbours].mean(dim=1)
     return torch.where((normals * to_camera).sum(dim=1, keepdim=True) < 0, -normals, normals)
-
-
-def _one(cameras: Cameras, c: int) -> Cameras:
-    pose, K = cameras.world_to_camera[c : c + 1], cameras.K[c : c + 1]
-    return Cameras(pose, K, cameras.width, cameras.height, cameras.near_m)
 
 
 def _neighbourhood(depth: Tensor) -> tuple[Tensor, Tensor]:

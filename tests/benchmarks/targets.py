@@ -18,8 +18,7 @@ from torch import Tensor
 from ground.evaluate import Truth
 from ground.reconstruct import exposed, sensor_of, split, training_frame
 from ground.session import open_session
-from obbgs_core.cameras import Cameras
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.metrics import cloud_distances, psnr_db, ssim
 from obbgs_core.render import render
@@ -130,17 +129,8 @@ def from_session(folder: Path) -> Target:
 @torch.no_grad()
 def predicted(gaussians: Gaussians, frame: TrainingFrame, sensor: Sensor, exposure_s: float) -> Tensor:
     """Return the model's image of a frame [H, W, C] in 0..1."""
-    height, width = frame.dn.shape[:2]
-    cameras = _cameras([frame], width, height)
-    radiance = render(gaussians, cameras).radiance[0]
+    radiance = render(gaussians, cameras_of([frame])).radiance[0]
     return (sensor.expected_dn(radiance, exposure_s) / sensor.white_dn).clamp(0, 1)
-
-
-def _cameras(frames: list[TrainingFrame], width: int, height: int) -> Cameras:
-    suns = [f.sun_dir for f in frames if f.sun_dir is not None]
-    sun_dir = torch.stack(suns) if len(suns) == len(frames) else None
-    poses, K = torch.stack([f.world_to_camera for f in frames]), torch.stack([f.K for f in frames])
-    return Cameras(poses, K, width, height, sun_dir=sun_dir)
 
 
 def clean_psnr_db(gaussians: Gaussians, target: Target, reference_exposure_s: float | None = None) -> float:
@@ -170,9 +160,7 @@ def image_figures(
 def cloud_figures(gaussians: Gaussians, target: Target, seed: int = 0) -> dict[str, float]:
     """Return Chamfer, Hausdorff, completeness of the centres; completeness, accuracy of 100,000 surface points."""
     centres = cloud_distances(gaussians.means.double().numpy(), target.cloud)
-    height, width = target.training[0].dn.shape[:2]
-    cameras = _cameras(target.training, width, height)
-    points, _ = surface_points(gaussians, cameras, SURFACE_POINTS, seed)
+    points, _ = surface_points(gaussians, cameras_of(target.training), SURFACE_POINTS, seed)
     figures = {
         "chamfer": centres["chamfer"],
         "hausdorff": centres["hausdorff"],

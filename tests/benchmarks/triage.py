@@ -32,9 +32,8 @@ from ground.reconstruct import SURFACE_POINTS, camera_of, exposed, sensor_of, sp
 from ground.session import FrameRecord, Session, open_session
 from hil import spacecraft
 from hil.dataset import DatasetConfig, make_dataset
-from obbgs_core.cameras import Cameras
 from obbgs_core.export_onnx import export_onnx
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.metrics import cloud_distances, psnr_db
 from obbgs_core.optimize import train
@@ -192,14 +191,8 @@ def figures(the_pass: Pass, gaussians: Gaussians) -> dict[str, float]:
         radiance = render(gaussians, camera_of(the_pass.session, record)).radiance[0]
         psnrs_db.append(psnr_db(exposed(radiance, the_pass.sensor, record.exposure_time_s), exact))
     scale = 2 / the_pass.truth.largest_dimension_m
-    cloud, camera = the_pass.truth.cloud_m * scale, the_pass.session.camera
-    frames = list(the_pass.training.values())
-    cameras = Cameras(
-        torch.stack([f.world_to_camera for f in frames]),
-        torch.stack([f.K for f in frames]),
-        camera.width,
-        camera.height,
-    )
+    cloud = the_pass.truth.cloud_m * scale
+    cameras = cameras_of(list(the_pass.training.values()))
     points, _ = surface_points(gaussians, cameras, SURFACE_POINTS)
     surface = cloud_distances(points.double().numpy() * scale, cloud)["completeness"] if len(points) else 0.0
     return {

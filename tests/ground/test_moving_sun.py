@@ -102,19 +102,22 @@ def photographed(seen: list[tuple[np.ndarray, np.ndarray]], seed: int = 0) -> li
     return frames
 
 
+def camera_of(pose: np.ndarray, sun: np.ndarray) -> Cameras:
+    return Cameras(
+        torch.tensor(pose[None]).float(),
+        torch.tensor(K[None]).float(),
+        SIZE_PX,
+        SIZE_PX,
+        sun_dir=torch.tensor(sun[None]).float(),
+    )
+
+
 def clean_db(gaussians: Gaussians, seen: list[tuple[np.ndarray, np.ndarray]]) -> float:
     """Return the mean PSNR of the model's radiance against the ellipsoid's, 1 = 1."""
     values = []
     for pose, sun in seen:
-        camera = Cameras(
-            torch.tensor(pose[None]).float(),
-            torch.tensor(K[None]).float(),
-            SIZE_PX,
-            SIZE_PX,
-            sun_dir=torch.tensor(sun[None]).float(),
-        )
         true = torch.from_numpy(lambertian_ellipsoid(pose, sun)).float()[..., None]
-        values.append(psnr_db(render(gaussians, camera).radiance[0], true))
+        values.append(psnr_db(render(gaussians, camera_of(pose, sun)).radiance[0], true))
     return sum(values) / len(values)
 
 
@@ -259,13 +262,6 @@ def test_onnxruntime_agrees_with_our_renderer_under_many_suns(tmp_path, sh_count
     images = []
     for pose, sun in views(8):
         pose[2, 3] = 40.0
-        camera = Cameras(
-            torch.tensor(pose[None]).float(),
-            torch.tensor(K[None]).float(),
-            SIZE_PX,
-            SIZE_PX,
-            sun_dir=torch.tensor(sun[None]).float(),
-        )
         feed = {
             "world_to_camera": pose.astype(np.float32),
             "K": K.astype(np.float32),
@@ -273,7 +269,8 @@ def test_onnxruntime_agrees_with_our_renderer_under_many_suns(tmp_path, sh_count
             "sun_dir": sun.astype(np.float32),
         }
         images.append(session.run(["image"], feed)[0])
-        ours = (SENSOR.expected_dn(render(gaussians, camera).radiance[0], 5e-5) / SENSOR.white_dn).clamp(0, 1)
+        radiance = render(gaussians, camera_of(pose, sun)).radiance[0]
+        ours = (SENSOR.expected_dn(radiance, 5e-5) / SENSOR.white_dn).clamp(0, 1)
         assert psnr_db(torch.tensor(images[-1]), ours) >= 50  # dB, the project's bar
     feed["sun_dir"] = -feed["sun_dir"]
     assert np.abs(session.run(["image"], feed)[0] - images[-1]).max() > 0.05  # the input counts

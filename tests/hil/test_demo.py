@@ -164,6 +164,9 @@ def test_a_mesh_that_is_none_and_a_broken_mission_are_one_clear_line(mission, tm
     )
     assert done.returncode == 2 and "not a mesh that Blender can load" in done.stderr
     assert "Traceback" not in done.stderr
+    missing = ("--mission", str(mission), "--mesh", str(tmp_path / "nowhere.glb"))
+    done = hil("demo", "--out", str(tmp_path / "f"), *missing)
+    assert done.returncode == 2 and "no such file" in done.stderr and not (tmp_path / "f").exists()
     done = hil("demo", "--out", str(tmp_path / "e"), "--mission", "nowhere.yaml")
     assert (
         done.returncode == 2
