@@ -1,5 +1,6 @@
 """Points on the surface that the cameras see, with normals: depth maps of the model, fused."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -20,6 +21,9 @@ SAME_DEPTH_PX = 2.0  # depths agree within so many pixels' width
 AGREEING_VIEWS = 2  # that must see a point, besides its own
 NORMAL_NEIGHBOURS = 64  # fewer follow the noise of the depth maps, more round the edges off
 CANDIDATES = 900_000  # pixels that are looked up in every view
+POINTS_TO_CHOOSE_FROM = 4  # at least so many for each that is returned
+FINEST_CELL = 1e-5  # of the surface's extent
+CELL_HALVINGS = 18  # of the ratio of the two cell sizes between which the right one lies
 
 
 @torch.no_grad()
@@ -29,9 +33,9 @@ def surface_points(
     """Return points [count, 3] m and unit normals [count, 3] towards the cameras, evenly spread over the seen surface.
 
     A pixel of a depth map counts where it is solid, on no depth edge and not seen at a grazing angle, where two other
-    views see a surface at its depth, and no more views look through it than see it. Points are drawn from those pixels
-    in inverse proportion to how many pixels of all views fall on a unit of area, each at a random place on its pixel's
-    patch of plane. The same seed gives the same points. Both are empty, [0, 3], where no surface passes.
+    views see a surface at its depth, and no more views look through it than see it. Each gives points at random places
+    on its patch of plane; of those, one is kept in every cell of a cubic grid as fine as the count allows. The same
+    seed gives the same points. Both are empty, [0, 3], where no surface passes.
 
     Args:
         gaussians: on the CPU, as the cameras.
@@ -51,23 +55,20 @@ def surface_points(
     for c in range(len(cameras)):
         depth, slope = depth_map(gaussians, cameras.one(c))
         near, far = _neighbourhood(depth)
-        pixels, share = _candidates(
-            depth, slope, near, far, cameras.K[c], -(-CANDIDATES // len(cameras)), generator
-        )
-        views.append(_View(near, far, share))
+        pixels = _candidates(depth, slope, near, far, cameras.K[c], -(-CANDIDATES // len(cameras)), generator)
+        views.append(_View(near, far))
         patches.append(torch.cat([torch.full((len(pixels), 1), float(c)), pixels], dim=1))
     patch = torch.cat(patches)  # [P, 6]: camera, u, v, depth, slopes
-    good, pixels_per_m2 = _confirmed(*_back_project(patch, cameras), views, cameras)
-    if not good.any():
+    patch = patch[_confirmed(_back_project(patch, cameras), views, cameras)]
+    if len(patch) == 0:
         return torch.zeros(0, 3), torch.zeros(0, 3)
-    patch, weight = patch[good], (1 / pixels_per_m2[good]).double().cumsum(0)
-    # systematic sampling: evenly spaced in the summed weight, so that no patch is drawn much more often than its share
-    marks = (torch.arange(count) + torch.rand(1, generator=generator).double()) / count * weight[-1]
-    patch = patch[torch.searchsorted(weight, marks).clamp(max=len(patch) - 1)]
-    shift = torch.rand(count, 2, generator=generator) - 0.5
+    patch = patch.repeat(math.ceil(POINTS_TO_CHOOSE_FROM * count / len(patch)), 1)
+    shift = torch.rand(len(patch), 2, generator=generator) - 0.5
     patch[:, 3] += (patch[:, 4:] * shift).sum(dim=1)
     patch[:, 1:3] += shift
-    points, _ = _back_project(patch, cameras)
+    points = _back_project(patch, cameras)
+    chosen = _evenly(points, count, generator)
+    points, patch = points[chosen], patch[chosen]
     return points, _fitted_normals(points, cameras.centres[patch[:, 0].long()] - points)
 
 
@@ -132,14 +133,40 @@ class _View:
 
     near: Tensor  # [H, W] m, least depth of a pixel and its neighbours, infinite where all is sky
     far: Tensor  # [H, W] m, greatest such depth, 0 where all is sky
-    share: float  # of its usable pixels that are candidates
 
 
-def _confirmed(
-    points: Tensor, normals: Tensor, views: list[_View], cameras: Cameras
-) -> tuple[Tensor, Tensor]:
-    """Return which points [P] the views confirm, and how many candidates of all views fall on a m² there [P]."""
-    agreeing, through, per_m2 = (torch.zeros(len(points)) for _ in range(3))
+def _evenly(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Return which `count` of the points [P, 3] to keep: those nearest to the middles of a cubic grid's cells.
+
+    The grid is turned at random: a plate that lay between two layers of cells would get twice its share.
+    """
+    points = points @ quats_to_matrices(torch.randn(1, 4, generator=generator))[0]
+    corner = points.amin(dim=0)
+    extent = max(1e-9, float((points - corner).max()))
+    finest, coarsest = FINEST_CELL * extent, extent
+    for _ in range(CELL_HALVINGS):
+        size = math.sqrt(finest * coarsest)
+        enough = len(_cells((points - corner) / size).unique()) >= count
+        finest, coarsest = (size, coarsest) if enough else (finest, size)
+    place = (points - corner) / finest
+    order = (place - place.floor() - 0.5).norm(dim=1).argsort()
+    cells, order_in = _cells(place)[order].sort(stable=True)
+    first = torch.ones(len(points), dtype=torch.bool)
+    first[1:] = cells[1:] != cells[:-1]
+    rank = torch.rand(len(points), generator=generator) - first.float()  # those of a cell come first
+    return order[order_in[rank.argsort()[:count]]]
+
+
+def _cells(place: Tensor) -> Tensor:
+    """Return one number [P] for each cell of width 1 that places [P, 3], all positive, fall in."""
+    column = place.long()
+    wide = column.amax(dim=0) + 1
+    return (column[:, 0] * wide[1] + column[:, 1]) * wide[2] + column[:, 2]
+
+
+def _confirmed(points: Tensor, views: list[_View], cameras: Cameras) -> Tensor:
+    """Return which points [P] the views confirm."""
+    agreeing, through = torch.zeros(len(points)), torch.zeros(len(points))
     for c, view in enumerate(views):
         R, t, K = cameras.world_to_camera[c, :3, :3], cameras.world_to_camera[c, :3, 3], cameras.K[c]
         p = points @ R.T + t
@@ -154,11 +181,9 @@ def _confirmed(
         agrees = seen & (z >= near - tolerance_m) & (z <= far + tolerance_m)
         agreeing += agrees
         through += seen & (z < near - tolerance_m)
-        cosine = (-(normals @ R.T * p).sum(dim=1) / p.norm(dim=1)).clamp(min=1 / STEEPEST)
-        per_m2 += torch.where(agrees, view.share * K[0, 0] * K[1, 1] / z**2 * cosine, 0)
     # a point's own view is among those that agree
     others = min(AGREEING_VIEWS, len(cameras) - 1)
-    return (agreeing > others) & (through <= agreeing) & (per_m2 > 0), per_m2
+    return (agreeing > others) & (through <= agreeing)
 
 
 def _fitted_normals(points: Tensor, to_camera: Tensor) -> Tensor:
@@ -187,8 +212,8 @@ def _neighbourhood(depth: Tensor) -> tuple[Tensor, Tensor]:
 
 def _candidates(
     depth: Tensor, slope: Tensor, near: Tensor, far: Tensor, K: Tensor, limit: int, generator: torch.Generator
-) -> tuple[Tensor, float]:
-    """Return pixels on no depth edge [P, 5] (u, v, depth, slopes), at most `limit`, and the share that they are."""
+) -> Tensor:
+    """Return pixels on no depth edge [P, 5] (u, v, depth, slopes), at most `limit`."""
     pixel_m = depth / K[0, 0]
     flat = depth.isfinite() & (far - near <= 2 * STEEPEST_DEPTH * pixel_m)  # across two pixels
     flat &= slope.norm(dim=-1) < 0.99 * STEEPEST * pixel_m  # not held to it
@@ -196,22 +221,16 @@ def _candidates(
     chosen = torch.randperm(len(rows), generator=generator)[:limit]
     rows, columns = rows[chosen], columns[chosen]
     pixels = torch.stack([columns + 0.5, rows + 0.5, depth[rows, columns]], dim=1)
-    return torch.cat([pixels, slope[rows, columns]], dim=1), len(chosen) / max(1, int(flat.sum()))
+    return torch.cat([pixels, slope[rows, columns]], dim=1)
 
 
-def _back_project(patch: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Return body-frame points [P, 3] and unit normals [P, 3] of patches [P, 6] (camera, u, v, depth, slopes)."""
+def _back_project(patch: Tensor, cameras: Cameras) -> Tensor:
+    """Return body-frame points [P, 3] of patches [P, 6] (camera, u, v, depth, slopes)."""
     camera = patch[:, 0].long()
     K, pose = cameras.K[camera], cameras.world_to_camera[camera]
-    u, v, z, slope_u, slope_v = patch[:, 1:].unbind(dim=1)
+    u, v, z = patch[:, 1:4].unbind(dim=1)
     ray = torch.stack(
         [(u - K[:, 0, 2]) / K[:, 0, 0], (v - K[:, 1, 2]) / K[:, 1, 1], torch.ones_like(u)], dim=1
     )
-    point = z[:, None] * ray
-    along_u, along_v = slope_u[:, None] * ray, slope_v[:, None] * ray  # tangents of the patch
-    along_u[:, 0] += z / K[:, 0, 0]
-    along_v[:, 1] += z / K[:, 1, 1]
-    normal = F.normalize(torch.linalg.cross(along_v, along_u), dim=1)  # towards the camera
     R, t = pose[:, :3, :3], pose[:, :3, 3]
-    turn = R.transpose(1, 2)
-    return (turn @ (point - t)[..., None])[..., 0], (turn @ normal[..., None])[..., 0]
+    return (R.transpose(1, 2) @ (z[:, None] * ray - t)[..., None])[..., 0]

@@ -59,16 +59,20 @@ def test_a_sphere_of_discs_gives_the_sphere_evenly():
     points, normals = surface_points(sphere(), cameras_around(20), 20_000)
     assert points.shape == normals.shape == (20_000, 3)
     radii = points.norm(dim=1, keepdim=True)
-    disc_stands_off_m = (1.5 * 0.055) ** 2 / 2  # of the sphere that it touches, at 1.5 sigma
+    disc_stands_off_m = (2 * 0.055) ** 2 / 2  # of the sphere that it touches, at two sigma: rims count too
     assert (radii - 1).abs().mean() < disc_stands_off_m and (radii - 1).abs().max() < 0.05
     angles = torch.rad2deg(torch.acos((normals * points / radii).sum(dim=1).clamp(-1, 1)))
     assert angles.mean() < 2 and angles.max() < 20
     torch.testing.assert_close(normals.norm(dim=1), torch.ones(20_000))
     cells = KDTree(evenly_on_a_sphere(150).numpy())
     counts = np.bincount(cells.query((points / radii).numpy())[1], minlength=150)
-    assert counts.std() < 0.2 * counts.mean() and counts.min() > 0.5 * counts.mean()
+    assert counts.std() < 0.1 * counts.mean() and counts.min() > 0.75 * counts.mean()
     gaps, _ = KDTree(points.numpy()).query(evenly_on_a_sphere(5000).numpy())
-    assert gaps.max() < 0.06  # a pixel is 0.02 m wide
+    at_random = torch.nn.functional.normalize(
+        torch.randn(20_000, 3, generator=torch.Generator().manual_seed(0))
+    )
+    gaps_at_random, _ = KDTree(at_random.numpy()).query(evenly_on_a_sphere(5000).numpy())
+    assert gaps.max() < 0.75 * gaps_at_random.max()  # 0.026 and 0.041 m; a pixel is 0.02 m wide
 
 
 def test_a_solid_of_round_gaussians_ends_a_deviation_before_their_centres():
