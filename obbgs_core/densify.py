@@ -88,10 +88,11 @@ class Adam:
 @torch.no_grad()
 def grow(
     gaussians: Gaussians, adam: Adam, growing: Tensor, split_over_m: float, rng: torch.Generator
-) -> Gaussians:
+) -> tuple[Gaussians, Tensor]:
     """Return the model with the growing Gaussians [N] bool cloned (small ones) or split in two (large ones).
 
-    Splitting draws the halves' centres from the Gaussian itself and shrinks them, as in Kerbl et al. 2023.
+    Those that were not split stand first in it, unchanged; their old indices are returned too. Splitting draws the
+    halves' centres from the Gaussian itself and shrinks them, as in Kerbl et al. 2023.
     """
     large = gaussians.scales.max(dim=1).values > split_over_m
     clones = torch.nonzero(growing & ~large)[:, 0]
@@ -105,7 +106,7 @@ def grow(
         half.log_scales = half.log_scales - math.log(SPLIT_SHRINK)
         parts.append(half)
     adam.follow(kept, len(clones) + 2 * len(splits))
-    return trainable(Gaussians.concatenate(parts))
+    return trainable(Gaussians.concatenate(parts)), kept
 
 
 @torch.no_grad()
@@ -143,7 +144,7 @@ def densify(
     rng: torch.Generator,
 ) -> Gaussians:
     """Grow where screen gradients [N] are large, within the budget; prune what is faint or far too large."""
-    gaussians = grow(gaussians, adam, chosen(gradient, gaussians, config), config.split_over * radius, rng)
+    gaussians, _ = grow(gaussians, adam, chosen(gradient, gaussians, config), config.split_over * radius, rng)
     with torch.no_grad():
         wanted = gaussians.opacities > config.prune_opacity
         wanted &= gaussians.scales.max(dim=1).values < config.prune_over * radius
@@ -163,13 +164,10 @@ def densify_boxes(
     """Apply the clone/split rule inside the boxes only; what grows starts its gradient record anew."""
     inside = torch.stack([box.contains(gaussians.means.detach()) for box in boxes]).any(dim=0)
     growing = chosen(growth.mean(), gaussians, config) & inside
-    split = (gaussians.scales.detach().max(dim=1).values > config.split_over * radius) & growing
-    kept = torch.nonzero(~split)[:, 0]
-    gradient, weight = growth.gradient[kept], growth.weight[kept]
-    gaussians = grow(gaussians, adam, growing, config.split_over * radius, rng)
-    growth = Growth(len(gaussians), config.pixel_weighted)
-    growth.gradient[: len(kept)], growth.weight[: len(kept)] = gradient, weight
-    return gaussians, growth
+    gaussians, kept = grow(gaussians, adam, growing, config.split_over * radius, rng)
+    anew = Growth(len(gaussians), config.pixel_weighted)
+    anew.gradient[: len(kept)], anew.weight[: len(kept)] = growth.gradient[kept], growth.weight[kept]
+    return gaussians, anew
 
 
 def chosen(gradient: Tensor, gaussians: Gaussians, config: MethodConfig) -> Tensor:

@@ -122,7 +122,8 @@ def test_growth_clones_the_small_splits_the_large_and_carries_the_moments():
     adam.first["means"][:] = torch.arange(10.0)[:, None]
     chosen = torch.zeros(10, dtype=torch.bool)
     chosen[[2, 3]] = True
-    grown = grow(gaussians, adam, chosen, split_over_m=0.5, rng=torch.Generator().manual_seed(0))
+    grown, unsplit = grow(gaussians, adam, chosen, split_over_m=0.5, rng=torch.Generator().manual_seed(0))
+    assert unsplit.tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
     assert len(grown) == 12  # one clone added, one split into two
     torch.testing.assert_close(grown.means[9], gaussians.means[2])
     torch.testing.assert_close(grown.scales[10:], gaussians.scales[[3, 3]] / 1.6)
