@@ -16,7 +16,7 @@ from obbgs_core.methods import PRESETS, preset
 from obbgs_core.optimize import Trainer
 from tests.benchmarks import targets
 
-CURVE_STEPS = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)  # shares of the steps
+CURVE_STEPS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)  # shares of the steps
 
 
 def configure(name: str, steps_share: float, **changes):
