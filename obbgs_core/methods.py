@@ -21,8 +21,8 @@ class MethodConfig:
     pyramid: tuple[tuple[float, float], ...] = ((0.0, 1.0),)  # (from this share of the steps, image scale)
     sh_degree: int = 3
     max_gaussians: int = 500_000
-    gaussians_per_frame: int = (
-        0  # > 0: never more than this many for each frame, or few frames are fitted by heart
+    pixels_per_gaussian: int = (
+        0  # > 0: so many lit ones of the long exposures for each, or they are learnt by heart
     )
     grow_from: float = 500 / 30_000  # share of the steps
     grow_until: float = 0.5
@@ -109,7 +109,7 @@ PRESETS: dict[str, MethodConfig] = {
             pyramid=((0.0, 0.25), (0.15, 0.5), (0.4, 1.0)),
             sh_degree=0,
             max_gaussians=10_000,
-            gaussians_per_frame=150,
+            pixels_per_gaussian=7,
             grow_from=0.08,
             grow_until=0.7,
             grow_interval=60,

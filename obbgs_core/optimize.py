@@ -115,13 +115,12 @@ class Trainer:
                 f"{self.dark_frames} of {len(checked)} frames are black (eclipse, or exposures too short): only "
                 f"{len(self.frames)} rise above the noise, {FEWEST_FRAMES} are needed"
             )
-        if config.gaussians_per_frame:
-            most = min(config.max_gaussians, config.gaussians_per_frame * len(self.frames))
-            config = dataclasses.replace(
-                config, max_gaussians=most, start_count=min(config.start_count, most)
-            )
-            self.config = config
         outlines = silhouettes(self.frames, sensor)
+        if config.pixels_per_gaussian:
+            lit_pixels = sum(int(outline.sure.sum()) for outline in outlines.values())
+            most = min(config.max_gaussians, max(1, lit_pixels // config.pixels_per_gaussian))
+            fewer = min(config.start_count, most)
+            self.config = config = dataclasses.replace(config, max_gaussians=most, start_count=fewer)
         self.gaussians, self.radius, self.start = first_gaussians(
             self.frames, list(outlines.values()), sensor, config, self.rng
         )

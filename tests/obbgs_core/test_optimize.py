@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import uniform_filter
 from scipy.spatial.transform import Rotation
 
 from obbgs_core.cameras import Cameras
@@ -102,6 +103,17 @@ def test_the_time_limit_ends_the_training_and_says_so(frames):
     assert (
         result.stop_reason == "time limit of 0 s" and len(result.history) == 0 and len(result.gaussians) > 0
     )
+
+
+def test_a_model_has_no_more_gaussians_than_the_lit_pixels_of_the_long_exposures_pay_for(frames):
+    long_s = sorted({f.exposure_time_s for f in frames})[1:]  # six frames of the longest alone are too few
+    dark_dn = SENSOR.black_dn + 3 * SENSOR.read_noise_dn
+    lit = [uniform_filter(f.dn[..., 0].numpy(), 3) > dark_dn for f in frames if f.exposure_time_s in long_s]
+    wanted = QUICK | {"start_count": 100_000, "max_gaussians": 100_000}
+    few = Trainer(frames, SENSOR, preset("obbgs", **wanted | {"pixels_per_gaussian": 20}))
+    assert len(few.gaussians) <= few.config.max_gaussians == pytest.approx(np.sum(lit) / 20, rel=0.15)
+    many = Trainer(frames, SENSOR, preset("obbgs", **wanted | {"pixels_per_gaussian": 0}))
+    assert many.config.max_gaussians == 100_000
 
 
 def test_the_chi2_of_a_good_model_is_near_one(frames):
