@@ -11,10 +11,24 @@
 namespace obbgs {
 namespace {
 
+using Clock = std::chrono::steady_clock;
+
+// Waking a thread costs some tenths of a millisecond: it pays to look this long for what is about to happen.
+constexpr std::chrono::microseconds kPatience{300};
+
+// Returns whether done() comes true soon; meanwhile whoever waits for this core gets it.
+template <typename Done>
+bool soon(Done done) {
+  for (const auto until = Clock::now() + kPatience; !done();) {
+    if (Clock::now() > until) return false;
+    std::this_thread::yield();
+  }
+  return true;
+}
+
 class Pool {
  public:
   void run(int units, int threads, const std::function<void(int)>& work) {
-    using Clock = std::chrono::steady_clock;
     const int helpers = std::min(threads, units) - 1;
     std::unique_lock<std::mutex> only(callers_, std::try_to_lock);
     if (helpers < 1 || !only || alone_ > 0) {
@@ -37,6 +51,9 @@ class Pool {
     const auto drained = Clock::now();
     std::unique_lock<std::mutex> lock(mutex_);
     wanted_ = 0;
+    lock.unlock();
+    soon([this] { return active_ == 0; });
+    lock.lock();
     idle_.wait(lock, [this] { return active_ == 0; });
     const bool late = Clock::now() - drained > (drained - begun) / 2 + std::chrono::microseconds(200);
     penalty_ = late ? std::min(2 * penalty_ + 4, 100) : penalty_ / 2;
@@ -57,6 +74,9 @@ class Pool {
   void wait_for_work() {
     std::unique_lock<std::mutex> lock(mutex_);
     for (;;) {
+      lock.unlock();
+      soon([this] { return wanted_ > 0; });
+      lock.lock();
       wake_.wait(lock, [this] { return wanted_ > 0; });
       --wanted_;
       ++active_;
@@ -70,9 +90,9 @@ class Pool {
   std::mutex callers_, mutex_;
   std::condition_variable wake_, idle_;
   const std::function<void(int)>* work_ = nullptr;
-  std::atomic<int> next_{0};
+  std::atomic<int> next_{0}, wanted_{0}, active_{0};  // the last two change under the mutex
   std::exception_ptr error_;
-  int units_ = 0, wanted_ = 0, active_ = 0, started_ = 0;
+  int units_ = 0, started_ = 0;
   int alone_ = 0, penalty_ = 0;  // loops to run alone yet, and after the next late helper
 };
 
