@@ -1,4 +1,4 @@
-"""What each ingredient of obbgs is worth, one taken away at a time: python -m tests.benchmarks.ablation"""
+"""What each ingredient is worth, one taken away (or added) at a time: python -m tests.benchmarks.ablation"""
 
 import argparse
 import json
@@ -8,8 +8,8 @@ import torch
 from tests.benchmarks import targets
 from tests.benchmarks.methods import configure, measure
 
-WITHOUT: dict[str, dict] = {
-    "obbgs": {},
+OURS: dict[str, dict] = {
+    "as it is": {},
     "- exposure known": {"exposure_aware": False},
     "- sensor likelihood": {"loss": "l1_ssim", "ssim_weight": 0.2, "edge_weight": 0.2},
     "- Sobel": {"edge_weight": 0.0},
@@ -29,10 +29,21 @@ WITHOUT: dict[str, dict] = {
     "+ pose refinement": {"refine_poses": True},
 }
 
+PUBLISHED: dict[str, dict] = {
+    "as it is": {},
+    "- Sobel": {"edge_weight": 0.0},
+    "- OBB growth": {"obb_interval": 0},
+    "- bracket steps": {"bracket_steps": False},
+    "one frame a step": {"bracket_steps": False, "frames_per_step": 1},
+    "- Pixel-GS weights": {"pixel_weighted": False},
+    "- outlier filter": {"outlier_filter": False},
+}
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true", help="one JSON object a row")
+    parser.add_argument("--method", choices=("obbgs", "jiang2025"), default="obbgs")
     parser.add_argument("--targets", default="all", help="comma-separated names, or all")
     parser.add_argument("--size", type=int, default=400)
     parser.add_argument("--steps-share", type=float, default=1.0)
@@ -42,12 +53,11 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     for target_name in targets.names() if arguments.targets == "all" else arguments.targets.split(","):
         target = targets.load(target_name, arguments.size)
-        for name, changes in WITHOUT.items():
+        for name, changes in (OURS if arguments.method == "obbgs" else PUBLISHED).items():
             if arguments.only and name not in arguments.only.split(","):
                 continue
-            row = {"ablation": name} | measure(
-                configure("obbgs", arguments.steps_share, **changes), target, 0
-            )
+            config = configure(arguments.method, arguments.steps_share, **changes)
+            row = {"method": arguments.method, "ablation": name} | measure(config, target, 0)
             print(
                 json.dumps(row) if arguments.json else "  ".join(f"{k} {v}" for k, v in row.items()),
                 flush=True,
