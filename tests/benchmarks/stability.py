@@ -96,7 +96,7 @@ def cases(name: str, size: int, seeds: int):
     for degrees in POSE_ERRORS_DEG:
         wrong = with_pose_error(plain, degrees, 0)
         yield f"pose error {degrees:g} deg", wrong, {}, 0
-        yield f"pose error {degrees:g} deg, refined", wrong, {"refine_poses": True}, 0
+        yield f"pose error {degrees:g} deg, refined", wrong, {"refine_poses": "always"}, 0
     rng = np.random.default_rng(0)
     for percent in LOST_PERCENT:
         lost = set(rng.permutation(len(plain.training))[: len(plain.training) * percent // 100].tolist())
