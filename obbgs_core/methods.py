@@ -131,6 +131,7 @@ PRESETS: dict[str, MethodConfig] = {
             sh_weight=1.0,
             flat_weight=3.0,
             sky_weight=0.2,
+            refine_poses="auto",
             weigh_at=(0.3, 0.5, 0.7, 0.85),
             keep_opacity=0.5,
             most_sh_degree=1,
