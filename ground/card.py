@@ -42,6 +42,9 @@ def model_card(session_created_utc: str, metrics: dict) -> str:
         f"- Residual chi² on the target: {metrics['chi2']:.2f} (1 is pure noise).",
         *appearance(metrics),
     ]
+    for key, text in (("growth", "Growth ran {}."), ("poses", "Poses {}.")):
+        if key in metrics:  # older runs did not note it
+            lines.append("- " + text.format(metrics[key]))
     for key, text in (
         ("psnr_noisy_db", "Held-out PSNR against the noisy frames: {:.2f} dB."),
         ("psnr_clean_db", "Held-out PSNR against the noiseless exposures: {:.2f} dB."),

@@ -103,6 +103,8 @@ def reconstruct(
             "sh_degree": math.isqrt(result.gaussians.sh.shape[1]) - 1,
             "sh_direction": result.gaussians.sh_direction,
             "appearance": result.appearance,
+            "growth": result.growth,
+            "poses": result.poses,
             "sun_span_deg": round(result.sun_span_deg, 2),
             "shown_under_sun_dir_body": None
             if shown_under is None

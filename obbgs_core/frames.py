@@ -13,6 +13,8 @@ from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.methods import MethodConfig
 
 FEWEST_FRAMES = 3
+HELD_OUT_INTERVAL, FEWEST_HELD_OUT = 7, 3  # brackets; a prime keeps step with no cycle of exposures
+FEWEST_TO_HOLD_OUT = 24  # frames: of fewer, each is needed
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,22 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
     return [dataclasses.replace(f, exposure_time_s=reference_s) for f in frames], reference_s
 
 
+def bracket_numbers(frames: list[TrainingFrame]) -> list[int]:
+    """Return the bracket of each frame, counted from 0; a frame that names none is one by itself."""
+    numbers: dict[int, int] = {}
+    keys = [f.id if f.bracket is None else -1 - f.bracket for f in frames]
+    return [numbers.setdefault(key, len(numbers)) for key in keys]
+
+
+def held_out_brackets(frames: list[TrainingFrame]) -> list[list[int]]:
+    """Return the frames, by index, of every seventh bracket; none where frames or brackets are few."""
+    numbers = bracket_numbers(frames)
+    chosen = range(HELD_OUT_INTERVAL // 2, max(numbers) + 1, HELD_OUT_INTERVAL)
+    if len(frames) < FEWEST_TO_HOLD_OUT or len(chosen) < FEWEST_HELD_OUT:
+        return []
+    return [[i for i, number in enumerate(numbers) if number == wanted] for wanted in chosen]
+
+
 class Batches:
     """Draws frames without replacement, one of each exposure in turn when the method asks for brackets.
 
@@ -104,20 +122,29 @@ class Batches:
     ):
         self.frames, self.rng = frames, rng
         self.frames_per_step = min(config.frames_per_step, len(frames))
-        groups: dict[float, list[int]] = {}
-        for index, frame in enumerate(frames):
-            groups.setdefault(frame.exposure_time_s if config.bracket_steps else 0.0, []).append(index)
-        self.groups = list(groups.values())
-        self.waiting: list[list[int]] = [[] for _ in self.groups]
+        self.by_exposure = config.bracket_steps
         self.turn = 0
+        self.hold_out([])
         self.sky = sky or {}
         self.levels: dict[int, list[Tensor]] = {}
         self.sky_levels: dict[int, dict[int, Tensor]] = {}
 
+    def hold_out(self, brackets: list[list[int]]) -> None:
+        """From now on draw from all frames but those of these brackets."""
+        self.held_out = brackets
+        left_out = {index for bracket in brackets for index in bracket}
+        groups: dict[float, list[int]] = {}
+        for index, frame in enumerate(self.frames):
+            if index not in left_out:
+                groups.setdefault(frame.exposure_time_s if self.by_exposure else 0.0, []).append(index)
+        self.groups = list(groups.values())
+        self.waiting: list[list[int]] = [[] for _ in self.groups]
+
     def state(self) -> dict:
-        return {"waiting": [list(w) for w in self.waiting], "turn": self.turn}
+        return {"held_out": self.held_out, "waiting": [list(w) for w in self.waiting], "turn": self.turn}
 
     def restore(self, state: dict) -> None:
+        self.hold_out(state["held_out"])
         self.waiting, self.turn = [list(w) for w in state["waiting"]], state["turn"]
 
     def take(self, scale: float) -> Batch:

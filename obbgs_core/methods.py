@@ -27,6 +27,7 @@ class MethodConfig:
     grow_from: float = 500 / 30_000  # share of the steps
     grow_until: float = 0.5
     grow_interval: int = 100
+    grow_patience: int = 0  # > 0: growth ends when held-out likelihood rose in none of so many intervals
     grow_grad2d: float = 0.0002  # mean screen gradient, per NDC
     grow_share: float = (
         0.0  # > 0: grow this share of the Gaussians, largest gradients first, instead of a threshold
@@ -46,9 +47,9 @@ class MethodConfig:
     lr_opacity_logits: float = 0.05
     lr_sh: float = 0.0025
     lr_end: float = 1.0  # all other rates fall to this share of theirs
-    lr_poses: float = 0.05  # in deviations of the pose tag
-    refine_poses: bool = False  # six numbers a bracket, held by the tag's covariance
-    poses_from: float = 0.3  # share of the steps: before, the model is too coarse to correct anything
+    lr_poses: float = 0.3  # in deviations of the pose tag
+    refine_poses: str = "never"  # never | always | auto (if held-out brackets say so): six numbers a bracket
+    poses_from: float = 0.25  # share of the steps: before, the model is too coarse to correct anything
     sh_weight: float = 0.0  # on the mean square of what turns with the view: a prior for matt surface
     flat_weight: float = 0.0  # on the mean shortest scale: flat Gaussians are surface
     sky_weight: float = (
@@ -73,6 +74,8 @@ class MethodConfig:
             raise ValueError(f"loss must be l1_ssim or likelihood, got {self.loss!r}")
         if self.start not in ("random", "hull"):
             raise ValueError(f"start must be random or hull, got {self.start!r}")
+        if self.refine_poses not in ("never", "always", "auto"):
+            raise ValueError(f"refine_poses must be never, always or auto, got {self.refine_poses!r}")
         for name in ("steps", "frames_per_step", "start_count", "max_gaussians"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -128,6 +131,7 @@ PRESETS: dict[str, MethodConfig] = {
             sh_weight=1.0,
             flat_weight=3.0,
             sky_weight=0.2,
+            refine_poses="auto",
             weigh_at=(0.3, 0.5, 0.7, 0.85),
             keep_opacity=0.5,
             most_sh_degree=1,

@@ -21,10 +21,18 @@ from obbgs_core.cameras import Cameras
 from obbgs_core.densify import Adam, Growth, densify, densify_boxes, keep, outliers, trainable
 from obbgs_core.errors import Diverged, ReconstructionError
 from obbgs_core.files import write_whole
-from obbgs_core.frames import FEWEST_FRAMES, Batch, Batches, TrainingFrame, sun_span_deg, usable
+from obbgs_core.frames import (
+    FEWEST_FRAMES,
+    Batch,
+    Batches,
+    TrainingFrame,
+    held_out_brackets,
+    sun_span_deg,
+    usable,
+)
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.hull import shows_light
-from obbgs_core.losses import fit_figures, likelihood_loss, published_loss
+from obbgs_core.losses import ON_TARGET_ALPHA, fit_figures, likelihood_loss, published_loss
 from obbgs_core.methods import MethodConfig
 from obbgs_core.parsimony import likelihood_gains, next_degree_gain, padded, price
 from obbgs_core.poses import PoseCorrections
@@ -35,6 +43,8 @@ from obbgs_core.start import first_gaussians, silhouettes
 log = logging.getLogger(__name__)
 CHI2_MEMORY = 0.98  # of the running chi² a step
 CHECKPOINT_EVERY_S = 20.0
+SETTLING_STEPS = 20  # of a held-out bracket's correction
+WORTH_REFINING = 1.5  # times its price: of exact tags 0.5 to 1.3 was measured, at 1 px of error 2.9 to 5.4
 FLAT_COST = 0.25  # of a step's cost that does not shrink with the image
 
 
@@ -61,6 +71,8 @@ class TrainResult:
     dark_frames: int = 0  # left out: nothing in them rises above the noise
     sun_span_deg: float = 0.0  # largest angle between two frames' Suns, body frame
     appearance: str = ""  # what the radiance turns with, and why
+    growth: str = ""  # when growth ended, and why
+    poses: str = ""  # whether the poses were refined, and why
     seconds: float = 0.0
 
 
@@ -130,7 +142,14 @@ class Trainer:
         self.growth = Growth(len(self.gaussians), config.pixel_weighted)
         sky = {i: outline.sky for i, outline in outlines.items()} if config.sky_weight else None
         self.batches = Batches(self.frames, config, self.rng, sky)
-        self.poses = PoseCorrections(self.frames) if config.refine_poses else None
+        self.grow_until, self.growth_ended = config.grow_until, "as configured"
+        self.best: tuple[float, Tensor] | None = None  # image scale and losses of the held-out brackets
+        self.intervals_since_best = 0
+        self.poses = PoseCorrections(self.frames) if config.refine_poses == "always" else None
+        held_out = held_out_brackets(self.frames)
+        self.poses_decided = _decided_at_once(config, self.frames, held_out)
+        if config.grow_patience or not self.poses_decided:
+            self.batches.hold_out(held_out)
         self.boxes: list[obb.Obb] = []
         self.chi2, self.psnr_db, self.steps_done = math.nan, math.nan, 0
         self.history: list[StepInfo] = []
@@ -145,16 +164,17 @@ class Trainer:
         began = time.monotonic()
         config, share = self.config, self.steps_done / self.config.steps
         batch = self.batches.take(_image_scale(config, share))
-        rendered = render(self.gaussians, self._cameras(batch))
+        rendered = render(self.gaussians, _cameras(batch, self.poses))
         loss, residual = _image_loss(rendered, batch, self.sensor, config)
         if not torch.isfinite(loss):
             raise Diverged(self.steps_done, loss.item())
         (loss + self._priors(batch, share, rendered)).backward()
-        if config.grow_from <= share < config.grow_until:
+        if config.grow_from <= share < self.grow_until:
             self._observe(rendered, batch, residual)
         self.adam.step(self.gaussians, _rates(config, share, self.radius))
         if self.poses is not None:
             self.poses.step(config.lr_poses * (1 - share) if share >= config.poses_from else 0.0)
+        self._ask_held_out(share)
         self._change_number(share, batch)
         self._look(rendered, batch)
         self.steps_done += 1
@@ -180,7 +200,7 @@ class Trainer:
         if (
             config.chi2_end
             and self.chi2 <= config.chi2_end
-            and self.steps_done >= config.grow_until * config.steps
+            and self.steps_done >= self.grow_until * config.steps
         ):
             return f"residual chi² reached the noise ({self.chi2:.3f})"
         if self.steps_done >= config.steps:
@@ -206,6 +226,8 @@ class Trainer:
             self.dark_frames,
             self.sun_span_deg,
             self.appearance,
+            f"until step {min(self.steps_done, round(self.grow_until * self.config.steps))} ({self.growth_ended})",
+            self.poses_decided or "as tagged (training ended before this was decided)",
             self.seconds,
         )
 
@@ -228,6 +250,8 @@ class Trainer:
             "batches": self.batches.state(),
             "rng": self.rng.get_state(),
             "poses": self.poses.state() if self.poses is not None else None,
+            "decisions": (self.poses_decided, self.grow_until, self.growth_ended),
+            "best": (self.best, self.intervals_since_best),
             "numbers": (self.chi2, self.psnr_db, self.steps_done, self.seconds),
             "history": [dataclasses.astuple(info) for info in self.history],
         }
@@ -252,8 +276,11 @@ class Trainer:
         self.boxes = [obb.Obb(*box) for box in state["boxes"]]
         self.batches.restore(state["batches"])
         self.rng.set_state(state["rng"])
+        self.poses = PoseCorrections(self.frames) if state["poses"] is not None else None
         if self.poses is not None:
             self.poses.restore(state["poses"])
+        self.poses_decided, self.grow_until, self.growth_ended = state["decisions"]
+        self.best, self.intervals_since_best = state["best"]
         self.chi2, self.psnr_db, self.steps_done, self.seconds = state["numbers"]
         self.history = [StepInfo(*info) for info in state["history"]]
         return True
@@ -270,13 +297,86 @@ class Trainer:
             digest.update(
                 repr((f.exposure_time_s, None if f.sun_dir is None else f.sun_dir.tolist())).encode()
             )
+            digest.update(repr((f.bracket, None if f.pose_sigma is None else f.pose_sigma.tolist())).encode())
         return digest.hexdigest()
 
-    def _cameras(self, batch: Batch) -> Cameras:
-        if self.poses is None:
-            return batch.cameras
-        corrected = self.poses.corrected(batch.indices, batch.cameras.world_to_camera)
-        return dataclasses.replace(batch.cameras, world_to_camera=corrected)
+    def _ask_held_out(self, share: float) -> None:
+        """Decide by the held-out brackets what is due; when all is decided they join the training."""
+        config = self.config
+        if not self.poses_decided and share >= config.poses_from:
+            self._decide_poses(share)
+        waits = config.grow_patience > 0 and share < self.grow_until
+        due = share >= config.grow_from and (self.steps_done + 1) % config.grow_interval == 0
+        if self.batches.held_out and waits and due:
+            self._judge_growth(share)
+            waits = share < self.grow_until
+        if self.batches.held_out and self.poses_decided and not waits:
+            self.batches.hold_out([])
+
+    def _decide_poses(self, share: float) -> None:
+        """Refine the poses if corrections of the held-out brackets' would earn their parameters.
+
+        The model has not seen these brackets, so it cannot have bent to their tags. What settling a bracket's
+        correction on the model gains, nats over its chi² (a coarse model errs by more than noise, alike in
+        neighbouring pixels: Lebreton et al. 1992), is compared with the price of its numbers (Schwarz 1978).
+        """
+        model, poses, worth = self.gaussians.detach(), PoseCorrections(self.frames), []
+        for batch in self._held_out(share):
+            tagged, _, _ = self._settled(model, poses, batch, 0)
+            settled, chi2, values = self._settled(model, poses, batch, SETTLING_STEPS)
+            if numbers := int((poses.sigma[poses.of_frame[batch.indices[0]]] > 0).sum()):
+                worth.append(
+                    (tagged - settled) * batch.dn.numel() / chi2 / (0.5 * numbers * math.log(values))
+                )
+        mean, error = _mean_and_error(torch.tensor(worth))
+        pays = mean - error > WORTH_REFINING
+        self.poses = poses if pays else None
+        self.poses_decided = (
+            f"{'refined' if pays else 'as tagged'} (step {self.steps_done + 1}: correcting a held-out bracket gains "
+            f"{mean:.1f} ± {error:.1f} times its price)"
+        )
+        log.info("poses %s", self.poses_decided)
+
+    def _judge_growth(self, share: float) -> None:
+        """End the growth when the held-out brackets have not been explained better for some intervals."""
+        model, scale = self.gaussians.detach(), _image_scale(self.config, share)
+        poses, steps = PoseCorrections(self.frames), 0 if self.poses is None else SETTLING_STEPS
+        fits = [self._settled(model, poses, batch, steps) for batch in self._held_out(share)]
+        losses = torch.tensor([loss for loss, _, _ in fits])
+        if self.best is None or self.best[0] != scale:
+            self.best, self.intervals_since_best = (scale, losses), 0
+            return
+        gain, error = _mean_and_error(self.best[1] - losses)
+        if gain > error:
+            self.best, self.intervals_since_best = (scale, losses), 0
+            return
+        self.intervals_since_best += 1
+        if self.intervals_since_best >= self.config.grow_patience:
+            self.grow_until = share
+            self.growth_ended = (
+                f"held-out loss {losses.mean():.4f}, {gain:.4f} ± {error:.4f} less than "
+                f"{self.intervals_since_best} intervals before"
+            )
+            log.info("step %d: growth ends, %s", self.steps_done + 1, self.growth_ended)
+
+    def _held_out(self, share: float) -> list[Batch]:
+        return [self.batches.batch(b, _image_scale(self.config, share)) for b in self.batches.held_out]
+
+    def _settled(
+        self, model: Gaussians, poses: PoseCorrections, batch: Batch, steps: int
+    ) -> tuple[float, float, int]:
+        """Settle a bracket's correction on the model; return the loss, the chi² and the values on the target there."""
+        images = (batch.exposure_time_s, batch.dn, self.sensor, batch.averaged_pixels)
+        for k in range(steps):
+            loss, _ = likelihood_loss(render(model, _cameras(batch, poses)).radiance, *images)
+            (loss + poses.prior(batch)).backward()
+            poses.step(self.config.lr_poses * (1 - k / steps))
+        with torch.no_grad():
+            rendered = render(model, _cameras(batch, poses))
+            loss = likelihood_loss(rendered.radiance, *images)[0] + (poses.prior(batch) if steps else 0)
+        chi2, _ = fit_figures(rendered.radiance, rendered.alpha, *images)
+        on_target = int((rendered.alpha > ON_TARGET_ALPHA).sum()) * batch.averaged_pixels * batch.dn.shape[-1]
+        return loss.item(), chi2, max(2, on_target)
 
     def _priors(self, batch: Batch, share: float, rendered: Rendered) -> Tensor:
         """Return what is asked of the Gaussians besides the images: thin ones, solid or absent ones, likely poses."""
@@ -312,7 +412,7 @@ class Trainer:
     def _change_number(self, share: float, batch: Batch) -> None:
         """Grow, prune and weigh the Gaussians at the method's intervals."""
         config, now = self.config, self.steps_done + 1
-        growing = config.grow_from <= share < config.grow_until
+        growing = config.grow_from <= share < self.grow_until
         if growing and now % config.grow_interval == 0:
             self.gaussians = densify(
                 self.gaussians, self.adam, self.growth.mean(), self.radius, config, self.rng
@@ -328,6 +428,7 @@ class Trainer:
                 self.gaussians.opacity_logits.clamp_(max=math.log(0.01 / 0.99))
         scale, sun_moves = math.sqrt(1 / batch.averaged_pixels), 0 < config.sun_span_deg < self.sun_span_deg
         if any(now == round(at * config.steps) for at in config.weigh_at):
+            self.best = None  # a model just weighed explains less for a while
             self._weigh(scale)
             self._raise_degree(scale, *(("sun", "view") if sun_moves else ("view",)))
         elif sun_moves and now == round(config.sun_from * config.steps):
@@ -378,6 +479,27 @@ class Trainer:
         )
         if not math.isnan(chi2):
             self.chi2 = chi2 if math.isnan(self.chi2) else CHI2_MEMORY * self.chi2 + (1 - CHI2_MEMORY) * chi2
+
+
+def _cameras(batch: Batch, poses: PoseCorrections | None) -> Cameras:
+    if poses is None:
+        return batch.cameras
+    corrected = poses.corrected(batch.indices, batch.cameras.world_to_camera)
+    return dataclasses.replace(batch.cameras, world_to_camera=corrected)
+
+
+def _decided_at_once(config: MethodConfig, frames: list[TrainingFrame], held_out: list[list[int]]) -> str:
+    """Return whether the poses are refined, and why, where no training is needed to know."""
+    if config.refine_poses != "auto":
+        return {"never": "as tagged", "always": "refined"}[config.refine_poses]
+    if not any(f.pose_sigma is not None and f.pose_sigma.any() for f in frames):
+        return "as tagged (the tags are exact)"
+    return "" if held_out else "as tagged (too few brackets to hold any out)"
+
+
+def _mean_and_error(values: Tensor) -> tuple[float, float]:
+    """Return the mean of values [P] and its own deviation."""
+    return values.mean().item(), values.std().item() / math.sqrt(len(values))
 
 
 def _image_scale(config: MethodConfig, share: float) -> float:

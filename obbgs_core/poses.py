@@ -5,7 +5,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from obbgs_core.frames import Batch, TrainingFrame
+from obbgs_core.frames import Batch, TrainingFrame, bracket_numbers
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.rotations import from_rotation_vectors, multiply
 
@@ -16,18 +16,16 @@ class PoseCorrections:
     Frames of one bracket share their correction: the error of a navigation solution hardly changes within it.
     """
 
-    def __init__(self, frames: list[TrainingFrame], betas: tuple[float, float] = (0.9, 0.99)):
-        numbers: dict[int, int] = {}
-        keys = [f.id if f.bracket is None else -1 - f.bracket for f in frames]
-        self.of_frame = [numbers.setdefault(key, len(numbers)) for key in keys]
-        self.sigma = torch.zeros(len(numbers), 6)
+    def __init__(self, frames: list[TrainingFrame], memory: float = 0.99):
+        self.of_frame = bracket_numbers(frames)
+        count = max(self.of_frame) + 1
+        self.sigma = torch.zeros(count, 6)
         for frame, number in zip(frames, self.of_frame, strict=True):
             if frame.pose_sigma is not None:
                 self.sigma[number] = frame.pose_sigma
-        self.value = torch.zeros(len(numbers), 6, requires_grad=True)
-        self.first, self.second = torch.zeros(len(numbers), 6), torch.zeros(len(numbers), 6)
-        self.visits = torch.zeros(len(numbers), 1)
-        self.betas = betas
+        self.value = torch.zeros(count, 6, requires_grad=True)
+        self.second, self.visits = torch.zeros(count, 6), torch.zeros(count, 1)
+        self.memory = memory
 
     def corrected(self, indices: list[int], world_to_camera: Tensor) -> Tensor:
         """Return the poses [B, 4, 4] of frames with their corrections in front; gradients reach the corrections."""
@@ -41,18 +39,20 @@ class PoseCorrections:
 
     @torch.no_grad()
     def step(self, rate: float) -> None:
-        """Move what has a gradient, Adam with a count of its own for every bracket; `rate` is in deviations."""
+        """Move what has a gradient against it, over its root mean square; `rate` is in deviations.
+
+        This is Adam without its first moment: a bracket is seen a few dozen times, and momentum overshoots.
+        """
         gradient = self.value.grad
         if gradient is None:
             return
         seen = gradient.abs().sum(1, keepdim=True) > 0
-        b1, b2 = self.betas
         self.visits += seen
-        self.first = torch.where(seen, b1 * self.first + (1 - b1) * gradient, self.first)
-        self.second = torch.where(seen, b2 * self.second + (1 - b2) * gradient**2, self.second)
-        count = self.visits.clamp(min=1)
-        first, second = self.first / (1 - b1**count), self.second / (1 - b2**count)
-        self.value -= torch.where(seen, rate * first / (second.sqrt() + 1e-15), 0.0)
+        self.second = torch.where(
+            seen, self.memory * self.second + (1 - self.memory) * gradient**2, self.second
+        )
+        second = self.second / (1 - self.memory ** self.visits.clamp(min=1))
+        self.value -= torch.where(seen, rate * gradient / (second.sqrt() + 1e-15), 0.0)
         self.value.grad = None
 
     @torch.no_grad()
@@ -84,7 +84,7 @@ class PoseCorrections:
         )
 
     def state(self) -> dict:
-        return {name: getattr(self, name).detach().clone() for name in ("value", "first", "second", "visits")}
+        return {name: getattr(self, name).detach().clone() for name in ("value", "second", "visits")}
 
     def restore(self, state: dict) -> None:
         for name, tensor in state.items():

@@ -26,7 +26,7 @@ OURS: dict[str, dict] = {
     "+ solid opacities": {"solid_weight": 0.3},
     "+ outlier filter": {"outlier_filter": True},
     "+ degree 1 from the start": {"sh_degree": 1},
-    "+ pose refinement": {"refine_poses": True},
+    "+ pose refinement": {"refine_poses": "always"},
 }
 
 PUBLISHED: dict[str, dict] = {

@@ -95,8 +95,8 @@ def cases(name: str, size: int, seeds: int):
         yield f"seed {seed}", plain, {}, seed
     for degrees in POSE_ERRORS_DEG:
         wrong = with_pose_error(plain, degrees, 0)
-        yield f"pose error {degrees:g} deg", wrong, {}, 0
-        yield f"pose error {degrees:g} deg, refined", wrong, {"refine_poses": True}, 0
+        yield f"pose error {degrees:g} deg", wrong, {"refine_poses": "never"}, 0
+        yield f"pose error {degrees:g} deg, refined if it pays", wrong, {"refine_poses": "auto"}, 0
     rng = np.random.default_rng(0)
     for percent in LOST_PERCENT:
         lost = set(rng.permutation(len(plain.training))[: len(plain.training) * percent // 100].tolist())

@@ -88,6 +88,7 @@ def test_every_output_is_there_and_the_card_says_what_they_are(trained):
     card = (folder / "model_card.md").read_text()
     assert f"{metrics['gaussians']:,} Gaussians" in card and metrics["stop_reason"] in card
     assert f"{metrics['psnr_clean_db']:.2f} dB" in card and "0.05 to 0.2 ms" in card
+    assert f"Growth ran {metrics['growth']}." in card and f"Poses {metrics['poses']}." in card
     for name in ("ply", "spz", "onnx"):
         size_bytes = (folder / f"model.{name}").stat().st_size
         assert metrics[f"{name}_bytes"] == size_bytes and f"| {size_bytes:,} |" in card

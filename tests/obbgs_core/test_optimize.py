@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from obbgs_core.cameras import Cameras
 from obbgs_core.errors import Diverged, ReconstructionError, TooFewFrames
-from obbgs_core.frames import Batches, TrainingFrame
+from obbgs_core.frames import Batches, TrainingFrame, held_out_brackets
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.methods import preset, with_quality
 from obbgs_core.optimize import Trainer, train
@@ -69,7 +69,7 @@ def frames() -> list[TrainingFrame]:
 
 
 def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path):
-    config = preset("obbgs", **QUICK, refine_poses=True, weigh_at=(0.5,))
+    config = preset("obbgs", **QUICK, refine_poses="always", weigh_at=(0.5,))
     tagged = [dataclasses.replace(f, pose_sigma=torch.full((6,), 1e-3)) for f in frames]
     whole = train(tagged, SENSOR, config, seed=3)
     first = Trainer(tagged, SENSOR, config, seed=3)
@@ -94,6 +94,8 @@ def test_a_checkpoint_of_another_training_is_not_used(frames, tmp_path):
     Trainer(frames, SENSOR, preset("obbgs", **QUICK), seed=1).save(tmp_path / "c")
     assert not Trainer(frames, SENSOR, preset("obbgs", **QUICK), seed=2).resume(tmp_path / "c")
     assert not Trainer(frames[:-1], SENSOR, preset("obbgs", **QUICK), seed=1).resume(tmp_path / "c")
+    doubted = [dataclasses.replace(f, pose_sigma=torch.full((6,), 1e-9)) for f in frames]
+    assert not Trainer(doubted, SENSOR, preset("obbgs", **QUICK), seed=1).resume(tmp_path / "c")
     assert not Trainer(frames, SENSOR, preset("obbgs", **QUICK), seed=1).resume(tmp_path / "none")
     assert Trainer(frames, SENSOR, preset("obbgs", **QUICK), seed=1).resume(tmp_path / "c")
 
@@ -167,7 +169,7 @@ def test_pose_refinement_takes_tilt_out_of_the_poses():
         wrong.append(
             dataclasses.replace(frame, world_to_camera=error @ frame.world_to_camera, pose_sigma=sigma)
         )
-    changes = {"steps": 600, "start_count": 1500, "max_gaussians": 2000, "refine_poses": True}
+    changes = {"steps": 600, "start_count": 1500, "max_gaussians": 2000, "refine_poses": "always"}
     trainer = Trainer(wrong, SENSOR, preset("obbgs", **QUICK | changes))
     while not trainer.stop_reason():
         trainer.step()
@@ -180,6 +182,83 @@ def test_pose_refinement_takes_tilt_out_of_the_poses():
             turn = Rotation.from_matrix((poses[:3, :3] @ t.world_to_camera[:3, :3].T).numpy())
             errors.append(turn.as_rotvec()[:2])  # a roll moves this target's edge by a twentieth of a pixel
     assert np.sqrt(np.mean(np.square(after))) < 0.8 * np.sqrt(np.mean(np.square(before)))
+
+
+def tagged(frames: list[TrainingFrame], wrong: bool) -> list[TrainingFrame]:
+    """Return frames whose tags claim an error of 0.3 degrees, and have it or not."""
+    rng, sigma = torch.Generator().manual_seed(0), torch.tensor([0.005] * 3 + [1e-4] * 3)
+    errors = rigid_motions(torch.randn(len(frames), 6, generator=rng) * sigma * wrong)
+    return [
+        dataclasses.replace(f, world_to_camera=error @ f.world_to_camera, pose_sigma=sigma)
+        for f, error in zip(frames, errors, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("wrong", [True, False])
+def test_wrong_poses_are_refined_and_exact_ones_are_left_alone(wrong):
+    changes = QUICK | {"steps": 400, "start_count": 1500, "max_gaussians": 2000, "poses_from": 0.4}
+    frames = tagged(photographed(target(80, seed=5), 42), wrong)
+    trainer = Trainer(frames, SENSOR, preset("obbgs", **changes, refine_poses="auto"))
+    while not trainer.poses_decided:
+        assert trainer.batches.held_out == [[i] for i in range(3, 42, 7)]
+        trainer.step()
+    assert trainer.batches.held_out == [] and trainer.steps_done == 161
+    assert trainer.poses_decided.startswith("refined" if wrong else "as tagged")
+    assert (trainer.poses is not None) == wrong
+    assert trainer.result("").poses == trainer.poses_decided
+
+
+def test_without_doubt_about_the_poses_or_frames_to_spare_nothing_is_held_out():
+    exact = photographed(target(), 24)
+    config = preset("obbgs", **QUICK, refine_poses="auto")
+    for frames, why in ((exact, "the tags are exact"), (tagged(exact, True)[:23], "too few brackets")):
+        trainer = Trainer(frames, SENSOR, config)
+        assert why in trainer.poses_decided and not trainer.batches.held_out and trainer.poses is None
+    assert "before this was decided" in Trainer(tagged(exact, True), SENSOR, config).result("").poses
+
+
+def test_brackets_are_held_out_whole():
+    exact = photographed(target(), 72)
+    frames = [dataclasses.replace(f, bracket=i // 3) for i, f in enumerate(exact)]
+    brackets = held_out_brackets(frames)
+    assert brackets == [[9, 10, 11], [30, 31, 32], [51, 52, 53]]
+    batches = Batches(frames, preset("obbgs"), torch.Generator().manual_seed(0))
+    batches.hold_out(brackets)
+    drawn = [i for _ in range(42) for i in batches.take(1.0).indices]
+    assert (
+        sorted(drawn[:63]) == sorted(drawn[63:]) == sorted(set(range(72)) - {i for b in brackets for i in b})
+    )
+    assert held_out_brackets(frames[:51]) == []  # 17 brackets hold only two to hold out
+
+
+def test_growth_ends_when_the_held_out_frames_are_explained_no_better():
+    frames = photographed(target(6, seed=1), 28)
+    changes = QUICK | {"steps": 200, "grow_interval": 4, "grow_share": 0.02, "weigh_at": ()}
+    trainer = Trainer(frames, SENSOR, preset("obbgs", **changes, grow_patience=2))
+    sizes = []
+    while not trainer.stop_reason():
+        trainer.step()
+        sizes.append(len(trainer.gaussians))
+    ended = round(trainer.grow_until * 200)
+    assert 16 < ended < 140, "it ends before the share of the steps that is configured"
+    assert trainer.result("").growth.startswith(f"until step {ended} (held-out loss ")
+    assert len(set(sizes[:ended])) > 1 and len(set(sizes[ended:])) == 1 and not trainer.batches.held_out
+
+
+@pytest.mark.parametrize("killed_at", [12, 19, 35])
+def test_a_training_killed_about_its_decisions_resumes_to_the_same_model(tmp_path, killed_at):
+    frames = tagged(photographed(target(), 28), True)
+    changes = {"refine_poses": "auto", "poses_from": 0.35, "grow_patience": 2, "grow_interval": 5}
+    config = preset("obbgs", **QUICK | changes, weigh_at=(0.5,))
+    whole = train(frames, SENSOR, config, seed=3)
+    first = Trainer(frames, SENSOR, config, seed=3)
+    for _ in range(killed_at):
+        first.step()
+    first.save(tmp_path / "checkpoint")
+    resumed = train(frames, SENSOR, config, 3, checkpoint=tmp_path / "checkpoint")
+    assert (resumed.poses, resumed.growth) == (whole.poses, whole.growth)
+    for name, tensor in whole.gaussians.tensors().items():
+        assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
 
 
 def test_settling_the_gauge_changes_no_image():
