@@ -13,8 +13,6 @@ from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.methods import MethodConfig
 
 FEWEST_FRAMES = 3
-HELD_OUT_INTERVAL, FEWEST_HELD_OUT = 7, 3  # brackets; a prime keeps step with no cycle of exposures
-FEWEST_TO_HOLD_OUT = 24  # frames: of fewer, each is needed
 
 
 @dataclass(frozen=True)
@@ -96,15 +94,6 @@ def bracket_numbers(frames: list[TrainingFrame]) -> list[int]:
     numbers: dict[int, int] = {}
     keys = [f.id if f.bracket is None else -1 - f.bracket for f in frames]
     return [numbers.setdefault(key, len(numbers)) for key in keys]
-
-
-def held_out_brackets(frames: list[TrainingFrame]) -> list[list[int]]:
-    """Return the frames, by index, of every seventh bracket; none where frames or brackets are few."""
-    numbers = bracket_numbers(frames)
-    chosen = range(HELD_OUT_INTERVAL // 2, max(numbers) + 1, HELD_OUT_INTERVAL)
-    if len(frames) < FEWEST_TO_HOLD_OUT or len(chosen) < FEWEST_HELD_OUT:
-        return []
-    return [[i for i, number in enumerate(numbers) if number == wanted] for wanted in chosen]
 
 
 class Batches:

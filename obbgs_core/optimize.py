@@ -16,8 +16,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from obbgs_core import obb
-from obbgs_core.cameras import Cameras
+from obbgs_core import held_out, obb
 from obbgs_core.densify import Adam, Growth, densify, densify_boxes, keep, outliers, trainable
 from obbgs_core.errors import Diverged, ReconstructionError
 from obbgs_core.files import write_whole
@@ -26,13 +25,12 @@ from obbgs_core.frames import (
     Batch,
     Batches,
     TrainingFrame,
-    held_out_brackets,
     sun_span_deg,
     usable,
 )
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.hull import shows_light
-from obbgs_core.losses import ON_TARGET_ALPHA, fit_figures, likelihood_loss, published_loss
+from obbgs_core.losses import fit_figures, likelihood_loss, published_loss
 from obbgs_core.methods import MethodConfig
 from obbgs_core.parsimony import likelihood_gains, next_degree_gain, padded, price
 from obbgs_core.poses import PoseCorrections
@@ -43,7 +41,6 @@ from obbgs_core.start import first_gaussians, silhouettes
 log = logging.getLogger(__name__)
 CHI2_MEMORY = 0.98  # of the running chi² a step
 CHECKPOINT_EVERY_S = 20.0
-SETTLING_STEPS = 20  # of a held-out bracket's correction
 WORTH_REFINING = 1.5  # times its price: of exact tags 0.5 to 1.3 was measured, at 1 px of error 2.9 to 5.4
 FLAT_COST = 0.25  # of a step's cost that does not shrink with the image
 
@@ -146,10 +143,10 @@ class Trainer:
         self.best: tuple[float, Tensor] | None = None  # image scale and losses of the held-out brackets
         self.intervals_since_best = 0
         self.poses = PoseCorrections(self.frames) if config.refine_poses == "always" else None
-        held_out = held_out_brackets(self.frames)
-        self.poses_decided = _decided_at_once(config, self.frames, held_out)
+        brackets = held_out.held_out_brackets(self.frames)
+        self.poses_decided = _decided_at_once(config, self.frames, brackets)
         if config.grow_patience or not self.poses_decided:
-            self.batches.hold_out(held_out)
+            self.batches.hold_out(brackets)
         self.boxes: list[obb.Obb] = []
         self.chi2, self.psnr_db, self.steps_done = math.nan, math.nan, 0
         self.history: list[StepInfo] = []
@@ -164,7 +161,8 @@ class Trainer:
         began = time.monotonic()
         config, share = self.config, self.steps_done / self.config.steps
         batch = self.batches.take(_image_scale(config, share))
-        rendered = render(self.gaussians, _cameras(batch, self.poses))
+        cameras = batch.cameras if self.poses is None else self.poses.cameras(batch)
+        rendered = render(self.gaussians, cameras)
         loss, residual = _image_loss(rendered, batch, self.sensor, config)
         if not torch.isfinite(loss):
             raise Diverged(self.steps_done, loss.item())
@@ -314,23 +312,12 @@ class Trainer:
             self.batches.hold_out([])
 
     def _decide_poses(self, share: float) -> None:
-        """Refine the poses if corrections of the held-out brackets' would earn their parameters.
-
-        The model has not seen these brackets, so it cannot have bent to their tags. What settling a bracket's
-        correction on the model gains, nats over its chi² (a coarse model errs by more than noise, alike in
-        neighbouring pixels: Lebreton et al. 1992), is compared with the price of its numbers (Schwarz 1978).
-        """
-        model, poses, worth = self.gaussians.detach(), PoseCorrections(self.frames), []
-        for batch in self._held_out(share):
-            tagged, _, _ = self._settled(model, poses, batch, 0)
-            settled, chi2, values = self._settled(model, poses, batch, SETTLING_STEPS)
-            if numbers := int((poses.sigma[poses.of_frame[batch.indices[0]]] > 0).sum()):
-                worth.append(
-                    (tagged - settled) * batch.dn.numel() / chi2 / (0.5 * numbers * math.log(values))
-                )
-        mean, error = _mean_and_error(torch.tensor(worth))
+        """Refine the poses if corrections of the held-out brackets' would earn their parameters."""
+        model, brackets = self.gaussians.detach(), self._held_out(share)
+        rate = self.config.lr_poses
+        mean, error = held_out.worth_of_corrections(model, self.frames, brackets, self.sensor, rate)
         pays = mean - error > WORTH_REFINING
-        self.poses = poses if pays else None
+        self.poses = PoseCorrections(self.frames) if pays else None
         self.poses_decided = (
             f"{'refined' if pays else 'as tagged'} (step {self.steps_done + 1}: correcting a held-out bracket gains "
             f"{mean:.1f} ± {error:.1f} times its price)"
@@ -340,13 +327,12 @@ class Trainer:
     def _judge_growth(self, share: float) -> None:
         """End the growth when the held-out brackets have not been explained better for some intervals."""
         model, scale = self.gaussians.detach(), _image_scale(self.config, share)
-        poses, steps = PoseCorrections(self.frames), 0 if self.poses is None else SETTLING_STEPS
-        fits = [self._settled(model, poses, batch, steps) for batch in self._held_out(share)]
-        losses = torch.tensor([loss for loss, _, _ in fits])
+        rate, refined = self.config.lr_poses, self.poses is not None
+        losses = held_out.losses(model, self.frames, self._held_out(share), self.sensor, rate, refined)
         if self.best is None or self.best[0] != scale:
             self.best, self.intervals_since_best = (scale, losses), 0
             return
-        gain, error = _mean_and_error(self.best[1] - losses)
+        gain, error = held_out.mean_and_error(self.best[1] - losses)
         if gain > error:
             self.best, self.intervals_since_best = (scale, losses), 0
             return
@@ -361,22 +347,6 @@ class Trainer:
 
     def _held_out(self, share: float) -> list[Batch]:
         return [self.batches.batch(b, _image_scale(self.config, share)) for b in self.batches.held_out]
-
-    def _settled(
-        self, model: Gaussians, poses: PoseCorrections, batch: Batch, steps: int
-    ) -> tuple[float, float, int]:
-        """Settle a bracket's correction on the model; return the loss, the chi² and the values on the target there."""
-        images = (batch.exposure_time_s, batch.dn, self.sensor, batch.averaged_pixels)
-        for k in range(steps):
-            loss, _ = likelihood_loss(render(model, _cameras(batch, poses)).radiance, *images)
-            (loss + poses.prior(batch)).backward()
-            poses.step(self.config.lr_poses * (1 - k / steps))
-        with torch.no_grad():
-            rendered = render(model, _cameras(batch, poses))
-            loss = likelihood_loss(rendered.radiance, *images)[0] + (poses.prior(batch) if steps else 0)
-        chi2, _ = fit_figures(rendered.radiance, rendered.alpha, *images)
-        on_target = int((rendered.alpha > ON_TARGET_ALPHA).sum()) * batch.averaged_pixels * batch.dn.shape[-1]
-        return loss.item(), chi2, max(2, on_target)
 
     def _priors(self, batch: Batch, share: float, rendered: Rendered) -> Tensor:
         """Return what is asked of the Gaussians besides the images: thin ones, solid or absent ones, likely poses."""
@@ -481,25 +451,13 @@ class Trainer:
             self.chi2 = chi2 if math.isnan(self.chi2) else CHI2_MEMORY * self.chi2 + (1 - CHI2_MEMORY) * chi2
 
 
-def _cameras(batch: Batch, poses: PoseCorrections | None) -> Cameras:
-    if poses is None:
-        return batch.cameras
-    corrected = poses.corrected(batch.indices, batch.cameras.world_to_camera)
-    return dataclasses.replace(batch.cameras, world_to_camera=corrected)
-
-
-def _decided_at_once(config: MethodConfig, frames: list[TrainingFrame], held_out: list[list[int]]) -> str:
+def _decided_at_once(config: MethodConfig, frames: list[TrainingFrame], brackets: list[list[int]]) -> str:
     """Return whether the poses are refined, and why, where no training is needed to know."""
     if config.refine_poses != "auto":
         return {"never": "as tagged", "always": "refined"}[config.refine_poses]
     if not any(f.pose_sigma is not None and f.pose_sigma.any() for f in frames):
         return "as tagged (the tags are exact)"
-    return "" if held_out else "as tagged (too few brackets to hold any out)"
-
-
-def _mean_and_error(values: Tensor) -> tuple[float, float]:
-    """Return the mean of values [P] and its own deviation."""
-    return values.mean().item(), values.std().item() / math.sqrt(len(values))
+    return "" if brackets else "as tagged (too few brackets to hold any out)"
 
 
 def _image_scale(config: MethodConfig, share: float) -> float:

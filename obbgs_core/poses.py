@@ -5,6 +5,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
+from obbgs_core.cameras import Cameras
 from obbgs_core.frames import Batch, TrainingFrame, bracket_numbers
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.rotations import from_rotation_vectors, multiply
@@ -31,6 +32,11 @@ class PoseCorrections:
         """Return the poses [B, 4, 4] of frames with their corrections in front; gradients reach the corrections."""
         numbers = torch.tensor([self.of_frame[i] for i in indices])
         return rigid_motions(self.value[numbers] * self.sigma[numbers]) @ world_to_camera
+
+    def cameras(self, batch: Batch) -> Cameras:
+        """Return a step's cameras with their corrections."""
+        corrected = self.corrected(batch.indices, batch.cameras.world_to_camera)
+        return dataclasses.replace(batch.cameras, world_to_camera=corrected)
 
     def prior(self, batch: Batch) -> Tensor:
         """Return the corrections' share of a step's mean loss: half their squares over all the step's values."""

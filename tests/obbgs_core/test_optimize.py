@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from obbgs_core.cameras import Cameras
 from obbgs_core.errors import Diverged, ReconstructionError, TooFewFrames
-from obbgs_core.frames import Batches, TrainingFrame, held_out_brackets
+from obbgs_core.frames import Batches, TrainingFrame
 from obbgs_core.gaussians import Gaussians
+from obbgs_core.held_out import held_out_brackets
 from obbgs_core.methods import preset, with_quality
 from obbgs_core.optimize import Trainer, train
 from obbgs_core.parsimony import likelihood_gains, next_degree_gain
