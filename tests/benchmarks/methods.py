@@ -60,43 +60,25 @@ def measure(
 
 
 def draw(rows: list[dict], path: Path) -> None:
-    """Draw clean PSNR and Chamfer distance against seconds, one line a training."""
-    from plotly.subplots import make_subplots
+    """Draw clean PSNR and Chamfer distance against seconds, one line a training, as PNG or SVG by the file's name."""
+    from matplotlib.figure import Figure
 
-    figure = make_subplots(rows=1, cols=2, subplot_titles=("clean held-out PSNR, dB", "Chamfer distance"))
-    colours = (
-        "#1f6feb",
-        "#d1652a",
-        "#2a9d8f",
-        "#8e44ad",
-        "#c0392b",
-        "#7f8c8d",
-        "#16a085",
-        "#f39c12",
-        "#34495e",
-    )
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    axes = figure.subplots(1, 2)
     names = list(dict.fromkeys(row["method"] for row in rows))
     for row in rows:
         seconds, psnr_db, chamfer = zip(*row["curve"], strict=True)
-        colour = colours[names.index(row["method"]) % len(colours)]
+        number = names.index(row["method"])
         first = row is next(r for r in rows if r["method"] == row["method"])
-        for column, values in ((1, psnr_db), (2, chamfer)):
-            figure.add_scatter(
-                x=seconds,
-                y=values,
-                name=row["method"],
-                legendgroup=row["method"],
-                showlegend=first and column == 1,
-                mode="lines+markers",
-                line={"color": colour},
-                hovertext=row["target"],
-                row=1,
-                col=column,
-            )
-    figure.update_xaxes(type="log", title="seconds of training")
-    figure.update_yaxes(type="log", row=1, col=2)
-    figure.update_layout(template="plotly_white", height=480, width=1100)
-    figure.write_html(path, include_plotlyjs=True)
+        for axis, values in zip(axes, (psnr_db, chamfer), strict=True):
+            label = row["method"] if first else None
+            axis.plot(seconds, values, marker=".", color=f"C{number}", label=label)
+    for axis, title in zip(axes, ("clean held-out PSNR, dB", "Chamfer distance of the centres"), strict=True):
+        axis.set(xscale="log", xlabel="seconds of training", title=title)
+        axis.grid(alpha=0.3)
+    axes[1].set_yscale("log")
+    axes[0].legend()
+    figure.savefig(path, dpi=110)
 
 
 def main() -> None:
@@ -114,8 +96,20 @@ def main() -> None:
     parser.add_argument("--published-share", type=float, help="the same for all methods but obbgs")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--curve", action="store_true", help="measure on the way")
-    parser.add_argument("--chart", type=Path, help="draw the curves into this HTML file")
+    parser.add_argument("--chart", type=Path, help="draw the curves into this file, PNG or SVG")
+    parser.add_argument(
+        "--rows",
+        type=Path,
+        nargs="+",
+        help="draw what --curve --json printed into these files; train nothing",
+    )
     arguments = parser.parse_args()
+    if arguments.rows:
+        if arguments.chart is None:
+            parser.error("--rows needs --chart FILE")
+        lines = [line for path in arguments.rows for line in path.read_text().splitlines()]
+        draw([row for row in map(json.loads, lines) if "curve" in row], arguments.chart)
+        return
     torch.set_num_threads(arguments.threads)
     names = arguments.methods.split(",")
     if arguments.methods == "all":
