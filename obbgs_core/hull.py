@@ -51,25 +51,36 @@ def silhouette(
     signal = ((dn.mean(dim=-1) - sky_dn) / sigma_dn)[None, None]  # in sigmas
     bright = signal > BRIGHT_SIGMA
     sure, likely = torch.zeros_like(bright), bright.clone()
-    means = {w: F.avg_pool2d(signal, w, 1, w // 2) * w for w in WINDOWS_PX}
+    means = {w: _mean(signal, w) * w for w in WINDOWS_PX}
     # what is bright does not light its neighbours
     faint = {w: _mean_of(signal, ~bright, w) for w in WINDOWS_PX}
     for w in WINDOWS_PX:  # light is there, not only nearby
         sure |= (means[w] > SURE_SIGMA) & (means[3] > LIKELY_SIGMA)
         likely |= (faint[w] > LIKELY_SIGMA) & (faint[5] > 0)
     likely |= (means[3] > SURE_SIGMA) & (signal > EDGE_SIGMA)
-    sure &= F.avg_pool2d(sure.float(), 3, 1, 1) > SPECK
+    sure &= _mean(sure.float(), 3) > SPECK
     lit = likely | (faint[5] > 0) | (faint[9] > SKY_SIGMA)
-    size = 2 * dilate_px + 1
-    likely, lit = (F.max_pool2d(mask.float(), size, 1, dilate_px) > 0 for mask in (likely, lit))
+    likely, lit = _dilated(likely, dilate_px), _dilated(lit, dilate_px)
     return Silhouette(sure[0, 0], likely[0, 0], ~lit[0, 0], world_to_camera, K)
 
 
 def _mean_of(signal: Tensor, chosen: Tensor, window: int) -> Tensor:
     """Return the mean of the chosen pixels around each [1, 1, H, W], in sigmas of that mean; 0 where they are few."""
-    share = F.avg_pool2d(chosen.float(), window, 1, window // 2)
-    total = F.avg_pool2d(signal * chosen, window, 1, window // 2) * window
+    share, total = _mean(chosen.float(), window), _mean(signal * chosen, window) * window
     return torch.where(share * window**2 > FEWEST_CHOSEN - 0.5, total / share.clamp(min=1e-6).sqrt(), 0.0)
+
+
+def _mean(image: Tensor, window: int) -> Tensor:
+    """Return the mean of the window around each pixel [1, 1, H, W], 0 beyond the border; along rows, then columns."""
+    rows = F.avg_pool2d(image, (1, window), 1, (0, window // 2))
+    return F.avg_pool2d(rows, (window, 1), 1, (window // 2, 0))
+
+
+def _dilated(mask: Tensor, reach_px: int) -> Tensor:
+    """Return where a mask [1, 1, H, W] is set within `reach_px` rows and columns of each pixel."""
+    size = 2 * reach_px + 1
+    rows = F.max_pool2d(mask.float(), (1, size), 1, (0, reach_px))
+    return F.max_pool2d(rows, (size, 1), 1, (reach_px, 0)) > 0
 
 
 def shows_light(dn: Tensor, sensor: Sensor) -> bool:
@@ -165,7 +176,7 @@ def agreement(silhouettes: list[Silhouette], points: Tensor, reach_m: float) -> 
         if reach_m > 0:
             pixels = math.ceil(float(s.K[0, 0]) * reach_m / max(float(s.world_to_camera[2, 3]), 1e-6))
             pixels = min(pixels, min(height, width) // 4)
-            mask = F.max_pool2d(mask[None, None].float(), 2 * pixels + 1, 1, pixels)[0, 0] > 0
+            mask = _dilated(mask[None, None], pixels)[0, 0]
         lit = mask[v.long().clamp(0, height - 1), u.long().clamp(0, width - 1)]
         votes += (lit & inside).float()
         seen += inside.float()
