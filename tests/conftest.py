@@ -4,6 +4,7 @@ import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
 import skyfield.api
@@ -12,6 +13,8 @@ from flightsw.icd.frame import Frame, PoseTag
 from flightsw.icd.mission import Mission, load_mission
 
 SIZE_PX = 48
+hypothesis.settings.register_profile("obbgs", deadline=None)  # timings live in benchmarks
+hypothesis.settings.load_profile("obbgs")
 
 
 @pytest.fixture

@@ -163,7 +163,7 @@ def test_a_running_program_notices_that_the_index_was_written_again(folder, make
 
 
 @given(data=st.data())
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_bytes_of_damage_end_in_a_store_that_opens(folder, tmp_path, data):
     copy = tmp_path / "copy"
     shutil.rmtree(copy, ignore_errors=True)

@@ -223,7 +223,7 @@ def test_any_line_is_a_state_or_a_navigation_error(line):
 
 
 @given(st.lists(st.binary(max_size=40), max_size=10))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_rubbish_between_states_is_counted_and_passed_over(tmp_path_factory, rubbish):
     path = tmp_path_factory.mktemp("navigation") / "states.jsonl"
     lines = [junk.replace(b"\n", b"?") + b"\n" for junk in rubbish]

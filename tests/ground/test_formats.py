@@ -59,7 +59,7 @@ def session(tmp_path, small_mission, make_frame):
 # --- axes ---
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(quat=unit_quats, place=st.tuples(*[st.floats(-1e3, 1e3)] * 3))
 def test_opengl_poses_come_back_to_rounding(quat, place):
     pose = np.eye(4)

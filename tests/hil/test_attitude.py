@@ -23,7 +23,7 @@ def gcrs_momentum(state: np.ndarray, inertia: np.ndarray) -> np.ndarray:
     return quat_to_matrix(state[:4] / np.linalg.norm(state[:4])) @ (inertia * state[4:])
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     small=st.floats(0.5, 1.0),
     middle=st.floats(1.0, 1.4),

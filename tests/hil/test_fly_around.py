@@ -34,7 +34,7 @@ def flown_rtn_m(chaser: tuple[str, ...], times_s: np.ndarray) -> np.ndarray:
     return np.array(places)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(da=st.floats(-20, 20), dl=metres, dex=metres, dey=metres, dix=metres, diy=metres)
 def test_the_linear_motion_solves_the_clohessy_wiltshire_equations(da, dl, dex, dey, dix, diy):
     elements, n = RelativeElements(da, dl, dex, dey, dix, diy), 0.0011
@@ -73,7 +73,7 @@ def test_the_default_width_keeps_the_range_constant():
     assert np.abs(ranges - 800).max() < 12
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(
     radial=st.floats(50, 800),
     width=st.floats(0, 800),

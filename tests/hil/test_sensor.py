@@ -93,7 +93,7 @@ def test_the_full_well_clips_before_the_converter():
     assert flat(sensor, 1e3, 1e-3, 0, 8).max() == 64 + 2000 < sensor.white_dn
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(row=st.integers(40, 60), times=st.floats(1.0, 30.0), ambient=st.floats(0, 900))
 def test_blooming_conserves_charge_and_stays_in_its_column(row, times, ambient):
     well_e = 1000.0
@@ -218,7 +218,7 @@ def test_stars_are_as_many_and_as_bright_as_on_the_sky():
     assert picture.sum() / 64**2 == pytest.approx(irradiances[seen][inside].sum())  # radiance x solid angle
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(level=st.floats(0, 2), factor=st.sampled_from([1, 2, 4, 8]), seed=st.integers(0, 99))
 def test_a_longer_exposure_never_darkens_and_is_the_same_as_a_brighter_scene(level, factor, seed):
     sensor = dataclasses.replace(PRESETS["spacecam"], prnu=0.0, dark_e_s=0.0, hot_pixels=0.0)

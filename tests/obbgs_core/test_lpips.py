@@ -115,7 +115,7 @@ def test_distances_are_those_of_the_authors_package(kind, network, name, random_
     assert found == pytest.approx(DISTANCES[kind, network][PAIRS.index(name)], rel=FLOAT32)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 2**32 - 1), st.integers(32, 60), st.integers(32, 60), st.sampled_from([1, 3]))
 def test_distance_is_zero_for_equal_images_positive_and_the_same_both_ways(
     random_weights, seed, height, width, channels

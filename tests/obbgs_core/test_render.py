@@ -244,7 +244,7 @@ def test_results_repeat_bit_for_bit_with_any_number_of_threads():
 
 
 @needs_native
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5), st.floats(-1.0, 1.0)),
     st.tuples(*[st.floats(-1, 1)] * 4),

@@ -108,7 +108,7 @@ def test_the_compact_model_renders_like_the_original(tmp_path, sh_count, channel
     assert (tmp_path / "m.spz").stat().st_size < (tmp_path / "m.ply").stat().st_size / 4
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.floats(-3, 6), st.integers(0, 1000))
 def test_a_model_of_any_size_keeps_its_means(tmp_path_factory, log10_extent, seed):
     path = tmp_path_factory.mktemp("spz") / "m.spz"

@@ -156,7 +156,7 @@ def test_an_adapter_s_answers_are_no_errors_but_its_bell_is():
         st.integers(1, 4096).flatmap(lambda n: st.binary(min_size=n, max_size=n)), min_size=1, max_size=12
     )
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_packets_of_any_length_arrive_whole_and_in_order(url, packets):
     wire = Wire(url)
     framed = b"".join(map(frame_packet, packets))
@@ -249,7 +249,7 @@ def test_frames_of_other_nodes_are_not_for_us():
 
 @BOTH
 @given(st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_hostile_frames_neither_raise_nor_take_memory_nor_yield_more_than_they_carry(url, data):
     ground = IsoTpChannels(GROUND_IDS, FLIGHT_IDS, url)
     carried = yielded = 0

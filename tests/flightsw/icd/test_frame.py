@@ -23,7 +23,7 @@ from flightsw.icd.frame import (
 )
 
 finite = st.floats(-1e6, 1e6)
-own_fixture = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+own_fixture = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def assert_equal(a: Frame, b: Frame) -> None:
@@ -49,7 +49,6 @@ def sealed(body: bytes) -> bytes:
     channels=st.sampled_from([1, 3]),
     seed=st.integers(0, 99),
 )
-@settings(deadline=None)
 def test_decode_of_encode_is_the_frame(frame_id, mid_ns, exposure_s, position, shape, channels, seed):
     rng = np.random.default_rng(seed)
     quat, root = rng.normal(size=4), rng.normal(size=(6, 6))
@@ -194,7 +193,6 @@ def test_a_header_alone_says_what_the_frame_is(make_frame):
 
 
 @given(st.binary(max_size=HEADER.size + 4), st.integers(0, HEADER.size - 1))
-@settings(deadline=None)
 def test_any_bytes_are_a_header_or_a_packet_error(data, at):
     for candidate in (data, b"OBGF" + data, (data + bytes(HEADER.size))[: HEADER.size]):
         try:

@@ -115,7 +115,7 @@ def test_the_version_that_the_mends_are_for_is_installed():
     seed=st.integers(0, 10_000),
     sizes=st.lists(st.integers(0, 3000), min_size=1, max_size=6),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_every_file_arrives_intact_whatever_is_lost(loss, seed, sizes):
     rng = random.Random(seed)
     wire = Wire(lambda pdu, number: rng.random() < loss, lambda pdu, number: rng.random() < loss)
@@ -255,7 +255,7 @@ def test_random_bytes_are_a_pdu_or_a_packet_error(data):
 
 
 @given(st.integers(0, 2**32))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_damaged_pdus_that_passed_the_crc_neither_raise_nor_yield_a_wrong_file(seed):
     rng = random.Random(seed)
 
