@@ -1,5 +1,6 @@
 """A finished run against the held-out frames and, where a simulator left it, the truth."""
 
+import dataclasses
 import json
 import logging
 import math
@@ -63,7 +64,7 @@ def open_run(session_dir: Path, name: str) -> Run:
 
 
 class Truth:
-    """A simulator's truth folder: clean radiance by frame, and the visible surface.
+    """A simulator's truth folder: clean radiance and pose by frame, and the visible surface.
 
     Raises:
         SessionError: it is there but damaged.
@@ -74,6 +75,7 @@ class Truth:
         try:
             facts = json.loads((self.folder / "truth.json").read_text())
             self._radiance = {entry["id"]: entry["radiance"] for entry in facts["frames"]}
+            self._poses = {entry["id"]: np.array(entry["world_to_camera"]) for entry in facts["frames"]}
             self.largest_dimension_m = float(facts["largest_dimension_m"])
             self.simulation: dict[str, dict] = facts.get("simulation", {})  # what was simulated, by part
             self.cloud_m = read_points(self.folder / facts["cloud"])
@@ -83,6 +85,10 @@ class Truth:
     @staticmethod
     def exists(session: Session) -> bool:
         return (session.path / "truth" / "truth.json").is_file()
+
+    def posed(self, record: FrameRecord) -> FrameRecord:
+        """Return a frame's record with its true pose in place of the tag's."""
+        return dataclasses.replace(record, world_to_camera=self._poses[record.id])
 
     def radiance(self, record: FrameRecord) -> tuple[torch.Tensor, torch.Tensor]:
         """Return scene-linear radiance [H, W, C] and coverage [H, W] in 0..1 of a frame."""
@@ -107,8 +113,9 @@ def read_points(path: Path) -> np.ndarray:
 def evaluate(session_dir: Path, name: str) -> dict:
     """Score a run, add the figures to its metrics.json and return them all.
 
-    Keys: psnr_noisy_db against the frames themselves; with truth also psnr_clean_db (expected image against the
-    noiseless exposure, full scale 1, mean over held-out frames), psnr_clean_<exposure>_db, psnr_clean_foreground_db
+    Keys: psnr_noisy_db against the frames themselves; with truth also, from the true poses, so that an error of a
+    held-out frame's tag does not count as the model's: psnr_clean_db (expected image against the noiseless exposure,
+    full scale 1, mean over held-out frames), psnr_clean_<exposure>_db, psnr_clean_foreground_db
     (the target's bounding box), ssim_clean, lpips_clean (AlexNet, where its weights were fetched), psnr_radiance_db
     (scene-linear, its brightest pixel 1), the clean PSNR of the blind training (psnr_clean_blind_db), and chamfer,
     hausdorff, accuracy, completeness of the Gaussians' centres and *_surface of the 100,000 points of surface.ply,
@@ -146,7 +153,7 @@ def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:
     by_exposure: dict[float, list[float]] = {}
     foreground, similarity, blind, linear = [], [], [], []
     pairs: list[tuple[torch.Tensor, torch.Tensor]] = []
-    for record in run.held_out:
+    for record in map(truth.posed, run.held_out):
         true, coverage = truth.radiance(record)
         clean = exposed(true, run.sensor, record.exposure_time_s)
         with torch.no_grad():

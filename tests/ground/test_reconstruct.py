@@ -58,6 +58,20 @@ def test_knowing_the_exposure_is_worth_decibels_and_the_model_30_db(trained):
     assert metrics["chamfer"] < 0.15  # of a half size of 1, from 14 views of 72 pixels
 
 
+def test_errors_of_held_out_tags_do_not_count_as_the_models(trained, tmp_path):
+    session, metrics = trained
+    shutil.copytree(session, tmp_path / "session")
+    lines = []
+    for line in (session / "frames.jsonl").read_text().splitlines():
+        record = json.loads(line)
+        record["world_to_camera"][0][3] += 5.0  # m, several pixels
+        lines.append(json.dumps(record))
+    (tmp_path / "session" / "frames.jsonl").write_text("\n".join(lines) + "\n")
+    wrong = evaluate(tmp_path / "session", "run")
+    assert wrong["psnr_clean_db"] == pytest.approx(metrics["psnr_clean_db"], abs=0.05)
+    assert wrong["psnr_noisy_db"] < metrics["psnr_noisy_db"] - 3
+
+
 def test_the_run_folder_holds_what_it_should(trained):
     session, metrics = trained
     folder = session / "runs" / "run"
