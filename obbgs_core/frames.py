@@ -116,7 +116,7 @@ class Batches:
         self.hold_out([])
         self.sky = sky or {}
         self.levels: dict[int, list[Tensor]] = {}
-        self.sky_levels: dict[int, dict[int, Tensor]] = {}
+        self.sky_levels: dict[int, list[Tensor]] = {}
 
     def hold_out(self, brackets: list[list[int]]) -> None:
         """From now on draw from all frames but those of these brackets."""
@@ -154,22 +154,25 @@ class Batches:
         factor = round(1 / scale)
         if factor not in self.levels:
             self.levels[factor] = [_shrunk(f.dn, factor) for f in self.frames]
-            self.sky_levels[factor] = {
-                i: F.avg_pool2d(sky[None].float(), factor, ceil_mode=True)[0] for i, sky in self.sky.items()
-            }
+            self.sky_levels[factor] = self._sky_shares(factor)
         frames = [self.frames[i] for i in indices]
-        cameras, dn = cameras_of(frames), torch.stack([self.levels[factor][i] for i in indices])
-        nobody_looked = torch.zeros(dn.shape[1:3])
+        cameras = cameras_of(frames)
         return Batch(
             indices,
             cameras.scaled(1 / factor) if factor > 1 else cameras,
-            dn,
+            torch.stack([self.levels[factor][i] for i in indices]),
             torch.tensor([f.exposure_time_s for f in frames]).view(-1, 1, 1, 1),
             factor * factor,
-            torch.stack([self.sky_levels[factor].get(i, nobody_looked) for i in indices])
-            if self.sky
-            else None,
+            torch.stack([self.sky_levels[factor][i] for i in indices]) if self.sky else None,
         )
+
+    def _sky_shares(self, factor: int) -> list[Tensor]:
+        """Return each frame's share of empty sky [H, W], one tensor of zeros for all where nobody looked."""
+        nobody_looked = torch.zeros(self.levels[factor][0].shape[:2])
+        shares = {
+            i: F.avg_pool2d(sky[None].float(), factor, ceil_mode=True)[0] for i, sky in self.sky.items()
+        }
+        return [shares.get(i, nobody_looked) for i in range(len(self.frames))]
 
 
 def _shrunk(dn: Tensor, factor: int) -> Tensor:

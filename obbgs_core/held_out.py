@@ -13,7 +13,7 @@ from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 
 INTERVAL, FEWEST = 7, 3  # brackets; a prime keeps step with no cycle of exposures
-FEWEST_FRAMES = 24  # in all: of fewer, each is needed
+FEWEST_IN_ALL = 24  # frames: of fewer, each is needed
 SETTLING_STEPS = 20  # of a held-out bracket's correction
 
 
@@ -21,7 +21,7 @@ def held_out_brackets(frames: list[TrainingFrame]) -> list[list[int]]:
     """Return the frames, by index, of every seventh bracket; none where frames or brackets are few."""
     numbers = bracket_numbers(frames)
     chosen = range(INTERVAL // 2, max(numbers) + 1, INTERVAL)
-    if len(frames) < FEWEST_FRAMES or len(chosen) < FEWEST:
+    if len(frames) < FEWEST_IN_ALL or len(chosen) < FEWEST:
         return []
     return [[i for i, number in enumerate(numbers) if number == wanted] for wanted in chosen]
 

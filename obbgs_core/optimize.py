@@ -20,14 +20,7 @@ from obbgs_core import held_out, obb
 from obbgs_core.densify import Adam, Growth, densify, densify_boxes, keep, outliers, trainable
 from obbgs_core.errors import Diverged, ReconstructionError
 from obbgs_core.files import write_whole
-from obbgs_core.frames import (
-    FEWEST_FRAMES,
-    Batch,
-    Batches,
-    TrainingFrame,
-    sun_span_deg,
-    usable,
-)
+from obbgs_core.frames import FEWEST_FRAMES, Batch, Batches, TrainingFrame, sun_span_deg, usable
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.hull import shows_light
 from obbgs_core.losses import fit_figures, likelihood_loss, published_loss
@@ -292,10 +285,8 @@ class Trainer:
             digest.update(
                 f.dn.numpy().tobytes() + f.world_to_camera.numpy().tobytes() + f.K.numpy().tobytes()
             )
-            digest.update(
-                repr((f.exposure_time_s, None if f.sun_dir is None else f.sun_dir.tolist())).encode()
-            )
-            digest.update(repr((f.bracket, None if f.pose_sigma is None else f.pose_sigma.tolist())).encode())
+            known = [None if tag is None else tag.tolist() for tag in (f.sun_dir, f.pose_sigma)]
+            digest.update(repr((f.exposure_time_s, f.bracket, known)).encode())
         return digest.hexdigest()
 
     def _ask_held_out(self, share: float) -> None:
@@ -329,10 +320,9 @@ class Trainer:
         model, scale = self.gaussians.detach(), _image_scale(self.config, share)
         rate, refined = self.config.lr_poses, self.poses is not None
         losses = held_out.losses(model, self.frames, self._held_out(share), self.sensor, rate, refined)
-        if self.best is None or self.best[0] != scale:
-            self.best, self.intervals_since_best = (scale, losses), 0
-            return
-        gain, error = held_out.mean_and_error(self.best[1] - losses)
+        gain, error = math.inf, 0.0
+        if self.best is not None and self.best[0] == scale:
+            gain, error = held_out.mean_and_error(self.best[1] - losses)
         if gain > error:
             self.best, self.intervals_since_best = (scale, losses), 0
             return

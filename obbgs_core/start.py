@@ -28,13 +28,12 @@ def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.S
     Shadowed faces are brightest there. Where they are few the next longest join in: a view that misses a shadowed face
     does less harm than no view.
     """
-    chosen: list[int] = []
+    chosen: dict[int, TrainingFrame] = {}
     for exposure_s in sorted({f.exposure_time_s for f in frames}, reverse=True):
         if len(chosen) < FEWEST_VIEWS:
-            chosen += [i for i, f in enumerate(frames) if f.exposure_time_s == exposure_s]
+            chosen |= {i: f for i, f in enumerate(frames) if f.exposure_time_s == exposure_s}
     return {
-        i: hull.silhouette(f.dn, sensor, f.world_to_camera, f.K, _pose_error_px(f))
-        for i, f in ((i, frames[i]) for i in chosen)
+        i: hull.silhouette(f.dn, sensor, f.world_to_camera, f.K, _pose_error_px(f)) for i, f in chosen.items()
     }
 
 

@@ -65,14 +65,13 @@ def draw(rows: list[dict], path: Path) -> None:
 
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     axes = figure.subplots(1, 2)
-    names = list(dict.fromkeys(row["method"] for row in rows))
+    colours: dict[str, str] = {}
     for row in rows:
         seconds, psnr_db, chamfer = zip(*row["curve"], strict=True)
-        number = names.index(row["method"])
-        first = row is next(r for r in rows if r["method"] == row["method"])
+        label = None if row["method"] in colours else row["method"]
+        colour = colours.setdefault(row["method"], f"C{len(colours)}")
         for axis, values in zip(axes, (psnr_db, chamfer), strict=True):
-            label = row["method"] if first else None
-            axis.plot(seconds, values, marker=".", color=f"C{number}", label=label)
+            axis.plot(seconds, values, marker=".", color=colour, label=label)
     for axis, title in zip(axes, ("clean held-out PSNR, dB", "Chamfer distance of the centres"), strict=True):
         axis.set(xscale="log", xlabel="seconds of training", title=title)
         axis.grid(alpha=0.3)
