@@ -195,7 +195,8 @@ def _frames(run: Run) -> str:
 
 def _held_out(run: Run, truth: Truth | None) -> str:
     m = run.metrics
-    by_key = {(r.bracket, r.exposure_time_s): r for r in run.held_out}
+    records = [truth.posed(r) for r in run.held_out] if truth else run.held_out
+    by_key = {(r.bracket, r.exposure_time_s): r for r in records}
     reference = "truth" if truth else "frame"
     names = [reference, "render", "error"] + (["blind render", "blind error"] if run.blind else [])
     views = _spread(sorted({r.bracket for r in run.held_out}), HELD_OUT_VIEWS)

@@ -113,7 +113,7 @@ def from_session(folder: Path) -> Target:
     units_per_m = 2 / truth.largest_dimension_m
     sides: list[list[TrainingFrame]] = []
     training, held_out = split(session)
-    for records in (training, held_out):
+    for records in (training, map(truth.posed, held_out)):
         sides.append([])
         for record in records:
             frame = training_frame(session, record)

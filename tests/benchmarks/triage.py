@@ -186,7 +186,7 @@ def trained(the_pass: Pass, frame_ids: list[int], steps_share: float, seed: int)
 def figures(the_pass: Pass, gaussians: Gaussians) -> dict[str, float]:
     """Return clean PSNR over the held-out views and of the worst of them, and the geometry."""
     psnrs_db = []
-    for record in the_pass.held_out:
+    for record in map(the_pass.truth.posed, the_pass.held_out):
         exact = exposed(the_pass.truth.radiance(record)[0], the_pass.sensor, record.exposure_time_s)
         radiance = render(gaussians, camera_of(the_pass.session, record)).radiance[0]
         psnrs_db.append(psnr_db(exposed(radiance, the_pass.sensor, record.exposure_time_s), exact))
