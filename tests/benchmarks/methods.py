@@ -106,8 +106,13 @@ def main() -> None:
     if arguments.rows:
         if arguments.chart is None:
             parser.error("--rows needs --chart FILE")
+        if absent := [str(path) for path in arguments.rows if not path.is_file()]:
+            parser.error(f"no such file: {', '.join(absent)}")
         lines = [line for path in arguments.rows for line in path.read_text().splitlines()]
-        draw([row for row in map(json.loads, lines) if "curve" in row], arguments.chart)
+        rows = [row for row in map(json.loads, lines) if "curve" in row]
+        if not rows:
+            parser.error("no row of these files has a curve; print them with --curve --json")
+        draw(rows, arguments.chart)
         return
     torch.set_num_threads(arguments.threads)
     names = arguments.methods.split(",")
