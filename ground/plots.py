@@ -8,9 +8,11 @@ import plotly.graph_objects as go
 import torch
 from plotly.subplots import make_subplots
 
-from ground.session import FrameRecord, Session
+from ground.reconstruct import cameras_of, sun_direction
+from ground.session import Session
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
+from obbgs_core.shading import mean_radiance
 
 POINTS_SHOWN = 15_000  # more make the page heavy and the view no clearer
 LEAST_OPACITY = 0.2  # fainter Gaussians would only fog the view
@@ -23,14 +25,15 @@ EXPOSURE_COLOURS = ("#1f6feb", "#2a9d8f", "#d1652a", "#8e44ad", "#c0392b")
 RADIANCE_SCALE = [[0.0, "#33465c"], [0.5, "#93a8bd"], [1.0, "#fff4d9"]]
 
 
-def model_figure(gaussians: Gaussians, frames: Sequence[FrameRecord]) -> tuple[go.Figure, int]:
+def model_figure(gaussians: Gaussians, session: Session) -> tuple[go.Figure, int]:
     """Return the centres coloured by mean radiance, camera directions and Sun, and how many centres are shown."""
+    frames = session.frames
     solid = torch.nonzero(gaussians.opacities > LEAST_OPACITY)[:, 0]
     if len(solid) > POINTS_SHOWN:
         solid = solid[torch.randperm(len(solid), generator=torch.Generator().manual_seed(0))[:POINTS_SHOWN]]
     points = gaussians.means[solid].numpy()
-    suns = torch.tensor(np.array([record.sun_dir_body for record in frames]), dtype=torch.float32)
-    radiance = gaussians.select(solid).mean_radiance(suns).mean(dim=1).numpy()
+    lit = [record for record in frames if sun_direction(record) is not None] or list(frames)
+    radiance = mean_radiance(gaussians.select(solid), cameras_of(session, lit)).mean(dim=1).numpy()
     brightness = np.sqrt(radiance)
     reach_m = float(np.quantile(np.linalg.norm(points, axis=1), 0.995)) if len(points) else 1.0
     figure = go.Figure()

@@ -101,7 +101,7 @@ def reconstruct(
             "method": method,
             "gaussians": len(result.gaussians),
             "sh_degree": math.isqrt(result.gaussians.sh.shape[1]) - 1,
-            "sh_direction": result.gaussians.sh_direction,
+            "shading": result.gaussians.shading,
             "appearance": result.appearance,
             "growth": result.growth,
             "poses": result.poses,
@@ -272,7 +272,7 @@ def onnx_parity_db(
             "K": K,
             "exposure_time_s": np.array(record.exposure_time_s, dtype=np.float32),
         }
-        if gaussians.sh_direction == "sun":
+        if gaussians.shading != "view":
             feed["sun_dir"] = record.sun_dir_body.astype(np.float32)
         image = np.asarray(runtime.run(["image"], feed)[0])
         ours = predicted_image(gaussians, session, record, sensor, record.exposure_time_s).numpy()

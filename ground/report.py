@@ -236,7 +236,7 @@ def _held_out(run: Run, truth: Truth | None) -> str:
 
 
 def _model(run: Run) -> str:
-    figure, shown = model_figure(run.gaussians, run.session.frames)
+    figure, shown = model_figure(run.gaussians, run.session)
     ranges_m = [_range_m(record) for record in run.session.frames]
     note = (
         f"{shown:,} of {len(run.gaussians):,} Gaussians (the solid ones), target body frame. The camera's directions "

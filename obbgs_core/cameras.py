@@ -47,6 +47,18 @@ class Cameras:
         R, t = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3:]
         return -(R.transpose(1, 2) @ t)[..., 0]
 
+    def known_suns(self) -> Tensor:
+        """Return sun_dir.
+
+        Raises:
+            ValueError: it is not given.
+        """
+        if self.sun_dir is None:
+            raise ValueError(
+                "the model's radiance turns with the Sun: give Cameras(sun_dir=[C, 3]), body frame"
+            )
+        return self.sun_dir
+
     def one(self, index: int) -> "Cameras":
         """Return one of the cameras, still of shape [1, ...]."""
         sun_dir = None if self.sun_dir is None else self.sun_dir[index : index + 1]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from obbgs_core import compiled
-from obbgs_core.gaussians import Gaussians
+from obbgs_core.gaussians import TENSORS, Gaussians
 from obbgs_core.methods import MethodConfig
 from obbgs_core.obb import Obb
 from obbgs_core.render import Rendered
@@ -47,8 +47,9 @@ class Adam:
 
     def __init__(self, gaussians: Gaussians, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
         self.betas, self.eps, self.steps = betas, eps, 0
-        self.first = {name: torch.zeros_like(t) for name, t in gaussians.tensors().items()}
-        self.second = {name: torch.zeros_like(t) for name, t in gaussians.tensors().items()}
+        parameters = _parameters(gaussians)
+        self.first = {name: torch.zeros_like(t) for name, t in parameters.items()}
+        self.second = {name: torch.zeros_like(t) for name, t in parameters.items()}
 
     @torch.no_grad()
     def step(self, gaussians: Gaussians, rates: dict[str, float]) -> None:
@@ -56,7 +57,7 @@ class Adam:
         self.steps += 1
         b1, b2 = self.betas
         correction = math.sqrt(1 - b2**self.steps) / (1 - b1**self.steps)
-        for name, parameter in gaussians.tensors().items():
+        for name, parameter in _parameters(gaussians).items():
             if parameter.grad is None:
                 continue
             values, gradient, rate = parameter.detach(), parameter.grad.contiguous(), rates[name] * correction
@@ -80,9 +81,9 @@ class Adam:
     def follow(self, kept: Tensor, added: int) -> None:
         """Keep the moments of the Gaussians `kept` (index) and start `added` new ones at rest."""
         for moments in (self.first, self.second):
-            for name, value in moments.items():
-                rest = torch.zeros(added, *value.shape[1:], dtype=value.dtype)
-                moments[name] = torch.cat([value[kept], rest])
+            for name in TENSORS:
+                rest = torch.zeros(added, *moments[name].shape[1:], dtype=moments[name].dtype)
+                moments[name] = torch.cat([moments[name][kept], rest])
 
 
 @torch.no_grad()
@@ -119,8 +120,13 @@ def keep(gaussians: Gaussians, adam: Adam, mask: Tensor) -> Gaussians:
 
 def trainable(gaussians: Gaussians) -> Gaussians:
     """Return the same values as leaves that collect gradients."""
-    leaves = {n: t.detach().clone().requires_grad_() for n, t in gaussians.tensors().items()}
+    leaves = {n: t.detach().clone().requires_grad_() for n, t in _parameters(gaussians).items()}
     return dataclasses.replace(gaussians, **leaves)
+
+
+def _parameters(gaussians: Gaussians) -> dict[str, Tensor]:
+    """Return all that is optimised, by name."""
+    return gaussians.tensors() | {"ambient": gaussians.ambient}
 
 
 @torch.no_grad()

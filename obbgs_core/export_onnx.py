@@ -22,6 +22,7 @@ from obbgs_core.render import DILATION_PX2, FOV_MARGIN, MAX_ALPHA, MIN_ALPHA, MI
 from obbgs_core.rotations import quats_to_matrices
 from obbgs_core.sensor import Sensor
 from obbgs_core.sh import C0, SOFTNESS
+from obbgs_core.shading import SHADOW_BIAS, SHADOW_MAP_PX, SUN_DISTANCE, normals_towards, solid_ball
 
 OPSET = 18
 TILE = 16  # px: 8 costs more calls, 32 more pixels that a Gaussian does not reach
@@ -48,8 +49,8 @@ def export_onnx(
     """Write the renderer; the file appears whole or not at all.
 
     Inputs: world_to_camera [4, 4], K [3, 3] px, exposure_time_s [] and, where the radiance turns with the Sun, sun_dir
-    [3] (towards it, unit, body frame), all float32. Outputs: image [H, W, C], expected
-    digital numbers over full scale, 0..1; alpha [H, W]; depth [H, W] m (0 where nothing is).
+    [3] (towards it, unit, body frame), all float32. Outputs: image [H, W, C], expected digital numbers over full scale,
+    0..1; alpha [H, W]; depth [H, W] m (0 where nothing is). By Lambert's law the graph casts that Sun's shadows first.
 
     Args:
         exposures_s: the exposure times the model was trained on; their range goes into the metadata.
@@ -65,10 +66,15 @@ def export_onnx(
         if not tensor.isfinite().all():
             raise ExportError(f"{name} holds values that are not finite")
     graph = _Graph()
-    projected = _project(graph, gaussians, width, height)
-    composed = _composite(graph, projected, gaussians.sh.shape[2], width, height)
+    camera = _camera_view(graph, width, height)
+    projected = _project(graph, gaussians, camera)
+    radiance = _radiance(graph, gaussians, camera)
+    ones = np.ones((len(gaussians), 1), dtype=np.float32)
+    depth = graph.op("Unsqueeze", projected.depth, graph.ints(1))
+    features = graph.op("Concat", radiance, depth, ones, axis=1)
+    composed = _composite(graph, projected, features, gaussians.sh.shape[2] + 2, camera)
     _finish(graph, composed, gaussians.sh.shape[2], sensor)
-    turns_with_sun = gaussians.sh_direction == "sun"
+    turns_with_sun = gaussians.shading != "view"
     model = helper.make_model(
         helper.make_graph(
             graph.nodes,
@@ -163,6 +169,55 @@ def _numpy(tensor: Tensor) -> np.ndarray:
 
 
 @dataclass(frozen=True)
+class _View:
+    """Names of a pinhole camera's numbers, and its size."""
+
+    R: str  # [3, 3]
+    t: str  # [1, 3] m
+    fx: str
+    fy: str
+    cx: str
+    cy: str
+    width: int
+    height: int
+
+
+def _camera_view(g: _Graph, width: int, height: int) -> _View:
+    """The camera that the inputs describe."""
+    pose = "world_to_camera"
+    R = g.op("Slice", pose, g.ints(0, 0), g.ints(3, 3), g.ints(0, 1))
+    t = g.op("Reshape", g.op("Slice", pose, g.ints(0, 3), g.ints(3, 4), g.ints(0, 1)), g.ints(1, 3))
+    fx, fy, cx, cy = (g.column("K", *at) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return _View(R, t, fx, fy, cx, cy, width, height)
+
+
+def _sun_view(g: _Graph, gaussians: Gaussians) -> _View:
+    """The camera at the Sun, as `shading.sun_cameras` places it."""
+    centre, radius = solid_ball(gaussians)
+    forward = g.op("Neg", "sun_dir")
+    upright = g.op("Less", g.op("Abs", g.op("Gather", forward, g.ints(0), axis=0)), 0.9)
+    x_axis, y_axis = np.eye(3, dtype=np.float32)[:2]
+    right = _cross(g, g.op("Where", upright, x_axis, y_axis), forward)
+    right = g.op("Div", right, g.op("ReduceL2", right, g.ints(0)))
+    rows = [g.op("Unsqueeze", row, g.ints(0)) for row in (right, _cross(g, forward, right), forward)]
+    R = g.op("Concat", *rows, axis=0)
+    place = g.op("Sub", _numpy(centre), g.op("Mul", SUN_DISTANCE * radius, forward))
+    t = g.op("Reshape", g.op("Neg", g.op("MatMul", R, place)), g.ints(1, 3))
+    half_px = SHADOW_MAP_PX / 2
+    focal, middle = (g._name(np.array([v], dtype=np.float32)) for v in (half_px * SUN_DISTANCE, half_px))
+    return _View(R, t, focal, focal, middle, middle, SHADOW_MAP_PX, SHADOW_MAP_PX)
+
+
+def _cross(g: _Graph, a: str, b: str) -> str:
+    after, before = np.array([1, 2, 0]), np.array([2, 0, 1])
+    left, right = (
+        g.op("Mul", g.op("Gather", a, i, axis=0), g.op("Gather", b, j, axis=0))
+        for i, j in ((after, before), (before, after))
+    )
+    return g.op("Sub", left, right)
+
+
+@dataclass(frozen=True)
 class _Projected:
     """Names of what every Gaussian is on the image plane."""
 
@@ -170,28 +225,23 @@ class _Projected:
     centres: list[str]  # x and y, [N] px
     reaches: list[str]  # half width and height of its box, [N] px; negative where it is not drawn
     splats: str  # [N, 7]: centre, square root of the conic (2 x 2), logarithm of the opacity
-    features: str  # [N, C + 2]: radiance, depth, one
 
 
-def _project(g: _Graph, gaussians: Gaussians, width: int, height: int) -> _Projected:
+def _project(g: _Graph, gaussians: Gaussians, view: _View) -> _Projected:
     """EWA projection of every Gaussian, as `render.project`."""
     RS = quats_to_matrices(gaussians.quats) * gaussians.scales[:, None, :]
-    means = g._name(_numpy(gaussians.means))
-    pose = "world_to_camera"
-    R = g.op("Slice", pose, g.ints(0, 0), g.ints(3, 3), g.ints(0, 1))
-    t = g.op("Reshape", g.op("Slice", pose, g.ints(0, 3), g.ints(3, 4), g.ints(0, 1)), g.ints(1, 3))
-    Rt = g.op("Transpose", R, perm=[1, 0])
-    p = g.op("Add", g.op("MatMul", means, Rt), t)  # [N, 3]
+    Rt = g.op("Transpose", view.R, perm=[1, 0])
+    p = g.op("Add", g.op("MatMul", _numpy(gaussians.means), Rt), view.t)  # [N, 3]
     px, py, pz = (g.op("Gather", p, np.array(i, dtype=np.int64), axis=1) for i in range(3))
     drawn = g.op("Greater", pz, NEAR_M)
     z = g.op("Where", drawn, pz, 1.0)
-    fx, fy, cx, cy = g.column("K", 0, 0), g.column("K", 1, 1), g.column("K", 0, 2), g.column("K", 1, 2)
+    fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
     x, y = g.op("Div", px, z), g.op("Div", py, z)
     mean_x = g.op("Add", g.op("Mul", fx, x), cx)
     mean_y = g.op("Add", g.op("Mul", fy, y), cy)
-    x, y = _clamped(g, x, fx, cx, width), _clamped(g, y, fy, cy, height)
+    x, y = _clamped(g, x, fx, cx, view.width), _clamped(g, y, fy, cy, view.height)
     # rows of J W R S, [N, 3]: J = [[fx/z, 0, -fx x/z], [0, fy/z, -fy y/z]]
-    turned = g.op("MatMul", R, g._name(_numpy(RS)))  # [N, 3, 3]
+    turned = g.op("MatMul", view.R, g._name(_numpy(RS)))  # [N, 3, 3]
     rows = [g.op("Gather", turned, np.array(i, dtype=np.int64), axis=1) for i in range(3)]
     M = []
     for f, tangent, row in ((fx, x, rows[0]), (fy, y, rows[1])):
@@ -226,13 +276,11 @@ def _project(g: _Graph, gaussians: Gaussians, width: int, height: int) -> _Proje
     skew = g.op("Neg", g.op("Mul", steep, g.op("Div", xy, yy)))
     flat = g.op("Reciprocal", g.op("Sqrt", yy))
     columns = (mean_x, mean_y, steep, skew, g.op("Mul", flat, 0.0), flat, np.log(opacities))
-    radiance, ones = _radiance(g, gaussians, means, R, t), np.ones((len(gaussians), 1), dtype=np.float32)
     return _Projected(
         depth=pz,
         centres=[mean_x, mean_y],
         reaches=[reach_x, reach_y],
         splats=g.op("Concat", *(g.op("Unsqueeze", column, last) for column in columns), axis=1),
-        features=g.op("Concat", radiance, g.op("Unsqueeze", pz, last), ones, axis=1),
     )
 
 
@@ -243,22 +291,73 @@ def _clamped(g: _Graph, tangent: str, focal: str, centre: str, size: int) -> str
     return g.op("Max", g.op("Min", tangent, limit), g.op("Neg", limit))
 
 
-def _radiance(g: _Graph, gaussians: Gaussians, means: str, R: str, t: str) -> str:
-    """Radiance [N, C] seen from the camera, or under the Sun; a constant when it depends on neither."""
+def _radiance(g: _Graph, gaussians: Gaussians, camera: _View) -> str:
+    """Radiance [N, C] towards the camera, as `shading.radiance_along`; a constant where it depends on nothing."""
     sh = _numpy(gaussians.sh)
+    constant = (np.logaddexp(0, SOFTNESS * C0 * sh[:, 0]) / SOFTNESS).astype(np.float32)
+    if gaussians.shading == "lambert":
+        return g.op("Mul", constant, g.op("Unsqueeze", _light(g, gaussians, camera), g.ints(1)))
     if sh.shape[1] == 1:
-        value = np.logaddexp(0, SOFTNESS * C0 * sh[:, 0]) / SOFTNESS
-        return g._name(value.astype(np.float32))
-    if gaussians.sh_direction == "sun":
+        return g._name(constant)
+    if gaussians.shading == "sun":
         direction = g.op("Reshape", "sun_dir", g.ints(1, 3))
     else:
-        centre = g.op("Neg", g.op("MatMul", t, R))  # [1, 3]
-        direction = g.op("Sub", means, centre)
-        length = g.op("Sqrt", g.op("ReduceSum", g.op("Mul", direction, direction), g.ints(1), keepdims=1))
-        direction = g.op("Div", direction, g.op("Max", length, 1e-12))
+        direction = _directions(g, gaussians, camera)
     basis = _sh_basis(g, direction, sh.shape[1])  # [N, K, 1], or [1, K, 1] under the Sun
-    value = g.op("ReduceSum", g.op("Mul", basis, sh), g.ints(1), keepdims=0)
+    return _softplus(g, g.op("ReduceSum", g.op("Mul", basis, sh), g.ints(1), keepdims=0))
+
+
+def _directions(g: _Graph, gaussians: Gaussians, camera: _View) -> str:
+    """Unit vectors from the camera to each Gaussian [N, 3]."""
+    centre = g.op("Neg", g.op("MatMul", camera.t, camera.R))  # [1, 3]
+    direction = g.op("Sub", _numpy(gaussians.means), centre)
+    length = g.op("Sqrt", g.op("ReduceSum", g.op("Mul", direction, direction), g.ints(1), keepdims=1))
+    return g.op("Div", direction, g.op("Max", length, 1e-12))
+
+
+def _softplus(g: _Graph, value: str) -> str:
     return g.op("Div", g.op("Softplus", g.op("Mul", value, SOFTNESS)), SOFTNESS)
+
+
+def _light(g: _Graph, gaussians: Gaussians, camera: _View) -> str:
+    """Light that arrives at each Gaussian [N], in units of the Sun's: Lambert's law, shadows, ambient light."""
+    normals = _numpy(normals_towards(gaussians, gaussians.means))  # the side does not count yet
+    along = g.op("ReduceSum", g.op("Mul", _directions(g, gaussians, camera), normals), g.ints(1), keepdims=0)
+    facing = g.op("Neg", g.op("Sign", along))
+    cosine = g.op("Mul", g.op("MatMul", normals, "sun_dir"), facing)
+    light = g.op("Mul", _softplus(g, cosine), _lit_shares(g, gaussians))
+    return g.op("Add", light, float(gaussians.ambient))
+
+
+def _lit_shares(g: _Graph, gaussians: Gaussians) -> str:
+    """Share of the Sun that reaches each Gaussian [N], as `shading.lit_shares`."""
+    view = _sun_view(g, gaussians)
+    projected = _project(g, gaussians, view)
+    depth = g.op("Unsqueeze", projected.depth, g.ints(1))
+    surface = _composite(g, projected, depth, 1, view, median=True)  # [1, H, W]
+    first = g.op("Where", g.op("Greater", surface, 0.0), surface, 3e38)
+    first = g.op("Pad", first, g.ints(0, 2, 2, 0, 2, 2), np.array(3e38, dtype=np.float32))
+    first = g.op("Reshape", first, g.ints(-1))
+    forward = g.op("Gather", view.R, g.ints(2), axis=0)  # [1, 3]
+    RS = quats_to_matrices(gaussians.quats) * gaussians.scales[:, None, :]
+    deviation = g.op(
+        "ReduceL2",
+        g.op("Squeeze", g.op("MatMul", forward, g._name(_numpy(RS))), g.ints(1)),
+        g.ints(1),
+        keepdims=0,
+    )
+    pixel = g.op("Div", g.op("Gather", g.op("Reshape", view.t, g.ints(-1)), g.ints(2), axis=0), view.fx)
+    bias = g.op("Mul", SHADOW_BIAS, g.op("Add", deviation, pixel))
+    before = g.op("Sub", projected.depth, bias)
+    side = SHADOW_MAP_PX + 4
+    column, row = (
+        g.op("Clip", g.op("Add", g.op("Floor", centre), 2.0), 1.0, side - 2.0) for centre in projected.centres
+    )
+    at = g.op("Cast", g.op("Add", g.op("Mul", row, float(side)), column), to=TensorProto.INT64)
+    around = np.array([[dv * side + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)])
+    near = g.op("Gather", first, g.op("Add", around, g.op("Unsqueeze", at, g.ints(0))), axis=0)  # [9, N]
+    lit = g.op("Cast", g.op("GreaterOrEqual", near, before), to=TensorProto.FLOAT)
+    return g.op("ReduceMean", lit, g.ints(0), keepdims=0)
 
 
 # Real spherical harmonics as polynomials: for each one the terms (coefficient, powers of x, y, z), as in `sh.sh_basis`.
@@ -311,12 +410,18 @@ def _sh_basis(g: _Graph, direction: str, count: int) -> str:
     return g.op("Unsqueeze", basis, g.ints(2))
 
 
-def _composite(g: _Graph, projected: _Projected, channels: int, width: int, height: int) -> str:
-    """Composite every tile that is reached; return the image [C + 2, H, W]: radiance, depth sum, alpha."""
+def _composite(
+    g: _Graph, projected: _Projected, features: str, channels: int, view: _View, median: bool = False
+) -> str:
+    """Composite features [N, channels] in every tile that is reached; return the image [channels, H, W].
+
+    With `median`, a pixel takes the features of the Gaussian that stops half of the light instead, 0 where none does.
+    """
+    width, height = view.width, view.height
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     count = g.op("Shape", projected.depth)
     order = g.op("TopK", projected.depth, count, outputs=2, axis=0, largest=0, sorted=1)
-    splats, features = (g.op("Gather", v, order, axis=0) for v in (projected.splats, projected.features))
+    splats, features = (g.op("Gather", v, order, axis=0) for v in (projected.splats, features))
     reached = []
     for centre, reach, tiles in zip(projected.centres, projected.reaches, (tiles_x, tiles_y), strict=True):
         start = (np.arange(tiles, dtype=np.float32) * TILE)[:, None]  # [tiles, 1]
@@ -332,18 +437,20 @@ def _composite(g: _Graph, projected: _Projected, channels: int, width: int, heig
     # the first tile is always composited, so that the loop is never empty
     active = g.op("Concat", g._name(np.zeros((2, 1), dtype=np.int64)), active, axis=1)
     tile_y, tile_x = (g.op("Gather", active, np.array(i, dtype=np.int64), axis=0) for i in range(2))
-    body = _tile_body(splats, features, in_rows, in_columns, channels)
-    tiles = g.op("Scan", tile_y, tile_x, body=body, num_scan_inputs=2)  # [A, C + 2, TILE²]
+    body = _tile_body(splats, features, in_rows, in_columns, channels, median)
+    tiles = g.op("Scan", tile_y, tile_x, body=body, num_scan_inputs=2)  # [A, channels, TILE²]
     index = g.op("Unsqueeze", g.op("Add", g.op("Mul", tile_y, g.ints(tiles_x)), tile_x), g.ints(1))
-    sky = np.zeros((tiles_y * tiles_x, channels + 2, TILE * TILE), dtype=np.float32)
+    sky = np.zeros((tiles_y * tiles_x, channels, TILE * TILE), dtype=np.float32)
     image = g.op("ScatterND", sky, index, tiles)
-    image = g.op("Reshape", image, g.ints(tiles_y, tiles_x, channels + 2, TILE, TILE))
+    image = g.op("Reshape", image, g.ints(tiles_y, tiles_x, channels, TILE, TILE))
     image = g.op("Transpose", image, perm=[2, 0, 3, 1, 4])
-    image = g.op("Reshape", image, g.ints(channels + 2, tiles_y * TILE, tiles_x * TILE))
+    image = g.op("Reshape", image, g.ints(channels, tiles_y * TILE, tiles_x * TILE))
     return g.op("Slice", image, g.ints(0, 0), g.ints(height, width), g.ints(1, 2))
 
 
-def _tile_body(splats: str, features: str, in_rows: str, in_columns: str, channels: int) -> onnx.GraphProto:
+def _tile_body(
+    splats: str, features: str, in_rows: str, in_columns: str, channels: int, median: bool
+) -> onnx.GraphProto:
     """One tile: the Gaussians that reach it, already in depth order, composited front to back."""
     b = _Graph("tile_")
     in_row, in_column = (
@@ -372,15 +479,19 @@ def _tile_body(splats: str, features: str, in_rows: str, in_columns: str, channe
     before = b.op("CumSum", b.op("Log", b.op("Sub", 1.0, alpha)), np.array(0, dtype=np.int64), exclusive=1)
     before = b.op("Exp", before)
     weight = b.op("Mul", alpha, before)
-    opaque = b.op("Less", b.op("Sub", before, weight), MIN_TRANSMITTANCE)
-    weight = b.op("Where", opaque, 0.0, weight)
+    after = b.op("Sub", before, weight)
+    if median:
+        crossing = b.op("And", b.op("Greater", before, 0.5), b.op("LessOrEqual", after, 0.5))
+        weight = b.op("Cast", crossing, to=TensorProto.FLOAT)
+    else:
+        weight = b.op("Where", b.op("Less", after, MIN_TRANSMITTANCE), 0.0, weight)
     chosen_features = b.op("Transpose", b.op("Gather", features, chosen, axis=0), perm=[1, 0])
     b.op("MatMul", chosen_features, weight, name="tile_image")
     return helper.make_graph(
         b.nodes,
         "tile",
         [helper.make_tensor_value_info(n, TensorProto.INT64, []) for n in ("tile_row", "tile_column")],
-        [helper.make_tensor_value_info("tile_image", TensorProto.FLOAT, [channels + 2, TILE * TILE])],
+        [helper.make_tensor_value_info("tile_image", TensorProto.FLOAT, [channels, TILE * TILE])],
         b.constants,
     )
 

@@ -1,15 +1,15 @@
 """The model: N anisotropic Gaussians with opacity and scene-linear radiance."""
 
 import dataclasses
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
 from obbgs_core.rotations import quats_to_matrices
-from obbgs_core.sh import C0, radiance, sh_basis
 
+Shading = Literal["view", "sun", "lambert"]
 TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
 
@@ -18,10 +18,13 @@ class Gaussians:
     """Stored parameters (optimised) and, as properties, what they stand for.
 
     means [N, 3] m, body frame; quats [N, 4] w, x, y, z (normalised on use); log_scales [N, 3] of metres;
-    opacity_logits [N]; sh [N, K, C] radiance coefficients (see `sh.radiance`), C = 1 or 3. The harmonics are taken at
-    `sh_direction`: `view`, from the camera to the Gaussian, or `sun`, from the target towards the Sun. Of degree 1 the
-    latter are, softly, max(0, b0 + B·s): Lambert's cosine with a normal and an albedo of each Gaussian's own. The
-    shadow that one part casts on another is not modelled.
+    opacity_logits [N]; sh [N, K, C] coefficients, C = 1 or 3. What they stand for is the `shading`:
+
+    - `view`: radiance (see `sh.radiance`), the harmonics taken along the line from the camera to the Gaussian;
+    - `sun`: radiance, the harmonics taken towards the Sun: of degree 1, softly, max(0, b0 + B·s);
+    - `lambert`: K = 1, an albedo. Radiance is albedo·(max(0, n·s)·V(s) + ambient): n the shortest axis on the camera's
+      side, s the Sun, V the share of it that other Gaussians let through (`render.sunlit_shares`), all of the light in
+      units of the Sun's. The maximum is as soft as `sh.radiance`, and ambient [] is one number for all.
     """
 
     means: Tensor
@@ -29,7 +32,8 @@ class Gaussians:
     log_scales: Tensor
     opacity_logits: Tensor
     sh: Tensor
-    sh_direction: Literal["view", "sun"] = "view"
+    shading: Shading = "view"
+    ambient: Tensor = field(default_factory=lambda: torch.zeros(()))
 
     def __post_init__(self):
         n = self.means.shape[0]
@@ -43,8 +47,10 @@ class Gaussians:
                 raise ValueError(f"{name} must be {list(shape)}, got {list(getattr(self, name).shape)}")
         if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[2] not in (1, 3):
             raise ValueError(f"sh must be [{n}, K, 1 or 3], got {list(self.sh.shape)}")
-        if self.sh_direction not in ("view", "sun"):
-            raise ValueError(f"sh_direction must be view or sun, got {self.sh_direction!r}")
+        if self.shading not in get_args(Shading):
+            raise ValueError(f"shading must be one of {', '.join(get_args(Shading))}, got {self.shading!r}")
+        if self.shading == "lambert" and self.sh.shape[1] != 1:
+            raise ValueError(f"an albedo is sh [{n}, 1, 1 or 3], got {list(self.sh.shape)}")
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -65,7 +71,7 @@ class Gaussians:
         return RS @ RS.transpose(1, 2)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The stored parameters by name."""
+        """What is stored of each Gaussian, by name."""
         return {name: getattr(self, name) for name in TENSORS}
 
     def select(self, index: Tensor) -> "Gaussians":
@@ -73,35 +79,10 @@ class Gaussians:
         return dataclasses.replace(self, **{name: value[index] for name, value in self.tensors().items()})
 
     def detach(self) -> "Gaussians":
-        return dataclasses.replace(self, **{name: value.detach() for name, value in self.tensors().items()})
+        values = {name: value.detach() for name, value in self.tensors().items()}
+        return dataclasses.replace(self, **values, ambient=self.ambient.detach())
 
     @staticmethod
     def concatenate(parts: "list[Gaussians]") -> "Gaussians":
         tensors = {name: torch.cat([getattr(p, name) for p in parts]) for name in TENSORS}
         return dataclasses.replace(parts[0], **tensors)
-
-    def mean_radiance(self, sun_dir: Tensor | None) -> Tensor:
-        """Return the radiance [N, C] in the mean over the views or, if it turns with the Sun, over `sun_dir` [S, 3].
-
-        Raises:
-            ValueError: the radiance turns with the Sun, and no direction is given.
-        """
-        suns = [None] if self.sh_direction == "view" or sun_dir is None else sun_dir
-        under = [radiance(self.lit_from(sun).sh[:, :1], torch.zeros_like(self.means)) for sun in suns]
-        return torch.stack(under).mean(dim=0)
-
-    def lit_from(self, sun_dir: Tensor | None) -> "Gaussians":
-        """Return the model as it looks with the Sun towards `sun_dir` [3] (unit, body frame): of no direction.
-
-        A model whose radiance turns with the view is returned as it is.
-
-        Raises:
-            ValueError: the radiance turns with the Sun, and no direction is given.
-        """
-        if self.sh_direction == "view":
-            return self
-        if sun_dir is None:
-            raise ValueError("the model's radiance turns with the Sun: give sun_dir, the Sun's direction")
-        basis = sh_basis(sun_dir.reshape(1, 3).to(self.sh), self.sh.shape[1])
-        constant = (basis[0, :, None] * self.sh).sum(dim=1, keepdim=True) / C0
-        return dataclasses.replace(self, sh=constant, sh_direction="view")

@@ -46,6 +46,7 @@ class MethodConfig:
     lr_log_scales: float = 0.005
     lr_opacity_logits: float = 0.05
     lr_sh: float = 0.0025
+    lr_ambient: float = 0.001  # of the Sun
     lr_end: float = 1.0  # all other rates fall to this share of theirs
     lr_poses: float = 0.3  # in deviations of the pose tag
     refine_poses: str = "never"  # never | always | auto (if held-out brackets say so): six numbers a bracket
@@ -67,6 +68,10 @@ class MethodConfig:
         0.0  # > 0: the radiance may turn with the Sun where its direction spans more than this
     )
     sun_from: float = 0.05  # share of the steps at which a Sun that moves may first join, before any growth
+    sun_shading: str = (
+        "lambert"  # lambert (albedo, normal, cast shadows) | linear (harmonics towards the Sun)
+    )
+    shadow_interval: int = 60  # steps after which they are cast anew
     chi2_end: float = 0.0  # > 0: stop when the mean squared normalised residual falls to this
 
     def __post_init__(self):
@@ -74,6 +79,8 @@ class MethodConfig:
             raise ValueError(f"loss must be l1_ssim or likelihood, got {self.loss!r}")
         if self.start not in ("random", "hull"):
             raise ValueError(f"start must be random or hull, got {self.start!r}")
+        if self.sun_shading not in ("lambert", "linear"):
+            raise ValueError(f"sun_shading must be lambert or linear, got {self.sun_shading!r}")
         if self.refine_poses not in ("never", "always", "auto"):
             raise ValueError(f"refine_poses must be never, always or auto, got {self.refine_poses!r}")
         for name in ("steps", "frames_per_step", "start_count", "max_gaussians"):

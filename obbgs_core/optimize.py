@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from obbgs_core import held_out, obb
+from obbgs_core.cameras import Cameras
 from obbgs_core.densify import Adam, Growth, densify, densify_boxes, keep, outliers, trainable
 from obbgs_core.errors import Diverged, ReconstructionError
 from obbgs_core.files import write_whole
@@ -27,8 +28,9 @@ from obbgs_core.losses import fit_figures, likelihood_loss, published_loss
 from obbgs_core.methods import MethodConfig
 from obbgs_core.parsimony import likelihood_gains, next_degree_gain, padded, price
 from obbgs_core.poses import PoseCorrections
-from obbgs_core.render import Rendered, render
+from obbgs_core.render import Rendered, render, sunlit_shares
 from obbgs_core.sensor import Sensor
+from obbgs_core.shading import lambertian
 from obbgs_core.start import first_gaussians, silhouettes
 
 log = logging.getLogger(__name__)
@@ -141,6 +143,7 @@ class Trainer:
         if config.grow_patience or not self.poses_decided:
             self.batches.hold_out(brackets)
         self.boxes: list[obb.Obb] = []
+        self.shadows: dict[tuple[float, ...], Tensor] = {}  # share of each Sun that reaches each Gaussian
         self.chi2, self.psnr_db, self.steps_done = math.nan, math.nan, 0
         self.history: list[StepInfo] = []
         self.seconds = time.monotonic() - began
@@ -155,7 +158,7 @@ class Trainer:
         config, share = self.config, self.steps_done / self.config.steps
         batch = self.batches.take(_image_scale(config, share))
         cameras = batch.cameras if self.poses is None else self.poses.cameras(batch)
-        rendered = render(self.gaussians, cameras)
+        rendered = render(self.gaussians, cameras, sunlit=self._sunlit(cameras))
         loss, residual = _image_loss(rendered, batch, self.sensor, config)
         if not torch.isfinite(loss):
             raise Diverged(self.steps_done, loss.item())
@@ -163,6 +166,7 @@ class Trainer:
         if config.grow_from <= share < self.grow_until:
             self._observe(rendered, batch, residual)
         self.adam.step(self.gaussians, _rates(config, share, self.radius))
+        self.gaussians.ambient.detach().clamp_(min=0)
         if self.poses is not None:
             self.poses.step(config.lr_poses * (1 - share) if share >= config.poses_from else 0.0)
         self._ask_held_out(share)
@@ -225,8 +229,9 @@ class Trainer:
     @property
     def appearance(self) -> str:
         """What the radiance turns with, and why."""
-        constant = self.gaussians.sh.shape[1] == 1
-        what = "constant" if constant else f"turns with the {self.gaussians.sh_direction}"
+        what = "constant" if self.gaussians.sh.shape[1] == 1 else f"turns with the {self.gaussians.shading}"
+        if self.gaussians.shading == "lambert":
+            what = f"follows Lambert's law with cast shadows, ambient {self.gaussians.ambient.item():.3f} of the Sun"
         return f"{what} ({self.why_appearance})" if self.why_appearance else what
 
     def save(self, path: Path) -> None:
@@ -237,6 +242,7 @@ class Trainer:
             "why_appearance": self.why_appearance,
             "adam": {"first": self.adam.first, "second": self.adam.second, "steps": self.adam.steps},
             "growth": (self.growth.gradient, self.growth.weight),
+            "shadows": [(torch.tensor(sun), shares) for sun, shares in self.shadows.items()],
             "boxes": [(box.centre, box.axes, box.half_extents) for box in self.boxes],
             "batches": self.batches.state(),
             "rng": self.rng.get_state(),
@@ -265,6 +271,7 @@ class Trainer:
         self.growth = Growth(len(self.gaussians), self.config.pixel_weighted)
         self.growth.gradient, self.growth.weight = state["growth"]
         self.boxes = [obb.Obb(*box) for box in state["boxes"]]
+        self.shadows = {tuple(sun.tolist()): shares for sun, shares in state["shadows"]}
         self.batches.restore(state["batches"])
         self.rng.set_state(state["rng"])
         self.poses = PoseCorrections(self.frames) if state["poses"] is not None else None
@@ -341,7 +348,7 @@ class Trainer:
     def _priors(self, batch: Batch, share: float, rendered: Rendered) -> Tensor:
         """Return what is asked of the Gaussians besides the images: thin ones, solid or absent ones, likely poses."""
         config, total = self.config, torch.zeros(())
-        if config.sh_weight and self.gaussians.sh.shape[1] > 1 and self.gaussians.sh_direction == "view":
+        if config.sh_weight and self.gaussians.sh.shape[1] > 1 and self.gaussians.shading == "view":
             total = total + config.sh_weight * self.gaussians.sh[:, 1:].square().mean()
         if batch.sky is not None:
             total = total + config.sky_weight * (rendered.alpha * batch.sky).mean()
@@ -353,6 +360,22 @@ class Trainer:
         if self.poses is not None:
             total = total + self.poses.prior(batch)
         return total
+
+    def _sunlit(self, cameras: Cameras) -> Tensor | None:
+        """Return the share of each camera's Sun that reaches each Gaussian [C, N]; none where that does not count.
+
+        Shadows move slowly: they are cast anew only every so many steps, and when the number of Gaussians changes.
+        """
+        if self.gaussians.shading != "lambert":
+            return None
+        stale = self.steps_done % self.config.shadow_interval == 0
+        if stale or any(len(shares) != len(self.gaussians) for shares in self.shadows.values()):
+            self.shadows = {}
+        suns = cameras.known_suns()
+        for sun in suns:
+            if tuple(sun.tolist()) not in self.shadows:
+                self.shadows[tuple(sun.tolist())] = sunlit_shares(self.gaussians, sun[None])[0]
+        return torch.stack([self.shadows[tuple(sun.tolist())] for sun in suns])
 
     def _observe(self, rendered: Rendered, batch: Batch, residual: Tensor) -> None:
         """Record the screen gradients, and the boxes behind each frame's worst tile."""
@@ -413,13 +436,16 @@ class Trainer:
         twice (a tumbling target, view by 1.66 to 1.52 Mnats: 30.6 dB on held-out views; with the Sun 33.9 dB).
         """
         degree = math.isqrt(self.gaussians.sh.shape[1])
-        if degree > self.config.most_sh_degree:
+        if degree > self.config.most_sh_degree or self.gaussians.shading == "lambert":
             return
         tested = []
-        for direction in directions if degree == 1 else (self.gaussians.sh_direction,):
-            turning = dataclasses.replace(self.gaussians, sh_direction=direction)
+        for direction in directions if degree == 1 else (self.gaussians.shading,):
+            turning = dataclasses.replace(self.gaussians, shading=direction)
             gain, cost = next_degree_gain(turning, self.batches, self.sensor, scale, self.rng)
             tested.append(f"with the {direction} it would gain {gain:.0f} nats at a price of {cost:.0f}")
+            if gain > cost and direction == "sun" and self.config.sun_shading == "lambert":
+                self.gaussians = trainable(lambertian(self.gaussians))
+                break
             if gain > cost:
                 self.gaussians = trainable(padded(turning, degree))
                 self.adam.widen(self.gaussians)
@@ -473,6 +499,7 @@ def _rates(config: MethodConfig, share: float, radius: float) -> dict[str, float
         "log_scales": config.lr_log_scales * fall,
         "opacity_logits": config.lr_opacity_logits * fall,
         "sh": config.lr_sh * fall,
+        "ambient": config.lr_ambient * fall,
     }
 
 

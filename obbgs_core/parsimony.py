@@ -67,7 +67,7 @@ def next_degree_gain(
         shared += probe * probe[:, :1]
         values, times = values + view.values, view.times
     new_slope, new_curvature = slope[:, old:], curvature[:, old:]
-    if model.sh_direction == "sun":
+    if model.shading == "sun":
         by_constant = shared[:, old:] / curvature[:, :1].clamp(min=1e-6)
         new_slope = new_slope - by_constant * slope[:, :1]
         new_curvature = new_curvature - by_constant * shared[:, old:]

@@ -5,11 +5,10 @@ Viewers of 3DGS files take a colour for `0.5 + SH(direction)`, clipped to 0..1 a
 fitted with spherical harmonics, and our own coefficients follow as radiance_sh_<coefficient>_<channel>, which viewers
 ignore. Everything else means the same there and here: metres, logarithms of sigmas, logits, quaternions w, x, y, z.
 
-Where our radiance turns with the Sun instead of the view, a comment of the header says so, and f_dc holds the colours
-under the one Sun that the comment names.
+Where our radiance turns with the Sun instead of the view, a comment of the header says so, and f_dc and f_rest hold the
+colours under the one Sun that the comment names.
 """
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -19,16 +18,17 @@ from torch import Tensor
 from obbgs_core import sh
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.files import write_whole
-from obbgs_core.gaussians import Gaussians
+from obbgs_core.gaussians import Gaussians, Shading
+from obbgs_core.render import lit_from
 
 DISPLAY_GAMMA = 2.2
-FIT_DIRECTIONS = 64  # four for each coefficient of degree 3
 TURNS_WITH_SUN = "comment radiance_sh turn with the Sun"
+LAMBERT = "comment radiance_sh are albedos in units of the Sun's light, ambient light "
 
 
 def display_sh(gaussians: Gaussians, white_radiance: float) -> Tensor:
     """Return coefficients [N, K, 3] of display colours, as 3DGS viewers take them; `white_radiance` shows as 1."""
-    directions, to_coefficients = _fit(gaussians.sh.shape[1])
+    directions, to_coefficients = sh.fit(gaussians.sh.shape[1])
     shown = torch.stack(
         [(sh.radiance(gaussians.sh, d.expand(len(gaussians), 3)) / white_radiance) for d in directions], dim=1
     )
@@ -38,24 +38,12 @@ def display_sh(gaussians: Gaussians, white_radiance: float) -> Tensor:
 
 def radiance_sh(display: Tensor, white_radiance: float, channels: int) -> Tensor:
     """Return our coefficients [N, K, channels] for coefficients of display colours [N, K, 3]."""
-    directions, to_coefficients = _fit(display.shape[1])
+    directions, to_coefficients = sh.fit(display.shape[1])
     shown = 0.5 + torch.einsum("dk,nkc->ndc", sh.sh_basis(directions, display.shape[1]), display)
     if channels == 1:
         shown = shown.mean(dim=2, keepdim=True)
     before_softplus = sh.C0 * sh.from_radiance(white_radiance * shown.clamp(min=0) ** DISPLAY_GAMMA)
     return torch.einsum("kd,ndc->nkc", to_coefficients, before_softplus)
-
-
-def _fit(count: int) -> tuple[Tensor, Tensor]:
-    """Return directions [D, 3] spread over the sphere, and the matrix [K, D] from values there to coefficients."""
-    if count == 1:
-        return torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1 / sh.C0]])
-    i = torch.arange(FIT_DIRECTIONS, dtype=torch.float64)
-    z = 1 - (2 * i + 1) / FIT_DIRECTIONS
-    angle = math.pi * (1 + math.sqrt(5)) * i  # a Fibonacci lattice
-    reach = (1 - z * z).sqrt()
-    directions = torch.stack([reach * angle.cos(), reach * angle.sin(), z], dim=1)
-    return directions.float(), torch.linalg.pinv(sh.sh_basis(directions, count)).float()
 
 
 def save_ply(
@@ -72,7 +60,7 @@ def save_ply(
     """
     gaussians = gaussians.detach()
     count, coefficients, channels = gaussians.sh.shape
-    shown = display_sh(gaussians.lit_from(sun_dir), white_radiance)
+    shown = display_sh(lit_from(gaussians, sun_dir), white_radiance)
     rest = shown[:, 1:].transpose(1, 2).flatten(1)  # all of red, then of green, then of blue
     table: dict[str, Tensor] = {}
     for i, axis in enumerate("xyz"):
@@ -89,9 +77,10 @@ def save_ply(
     comments = [
         f"comment f_dc and f_rest: (radiance / {white_radiance:.9g})^(1/{DISPLAY_GAMMA}); radiance_sh: scene-linear"
     ]
-    if gaussians.sh_direction == "sun" and sun_dir is not None:
+    if gaussians.shading != "view" and sun_dir is not None:
         x, y, z = sun_dir.tolist()
-        comments.append(f"{TURNS_WITH_SUN}; f_dc: with the Sun towards {x:.6f} {y:.6f} {z:.6f}, body frame")
+        kind = f"{LAMBERT}{gaussians.ambient:.9g}" if gaussians.shading == "lambert" else TURNS_WITH_SUN
+        comments.append(f"{kind}; f_dc: with the Sun towards {x:.6f} {y:.6f} {z:.6f}, body frame")
     write_whole(path, _ply(table, *comments))
 
 
@@ -131,11 +120,17 @@ def load_ply(path: Path) -> Gaussians:
     )
     radiance = [name for name in names if name.startswith("radiance_sh_")]
     channels = 1 + max(int(name.split("_")[3]) for name in radiance)
+    shading: Shading = "sun" if any(line.startswith(TURNS_WITH_SUN) for line in lines) else "view"
+    ambient = torch.zeros(())
+    for line in lines:
+        if line.startswith(LAMBERT):
+            shading, ambient = "lambert", torch.tensor(float(line.removeprefix(LAMBERT).partition(";")[0]))
     return Gaussians(
         means=torch.stack([table[a] for a in "xyz"], 1),
         quats=torch.stack([table[f"rot_{i}"] for i in range(4)], 1),
         log_scales=torch.stack([table[f"scale_{i}"] for i in range(3)], 1),
         opacity_logits=table["opacity"],
         sh=torch.stack([table[name] for name in radiance], 1).reshape(counts[0], -1, channels),
-        sh_direction="sun" if any(line.startswith(TURNS_WITH_SUN) for line in lines) else "view",
+        shading=shading,
+        ambient=ambient,
     )

@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from obbgs_core import compiled, sh
+from obbgs_core import compiled
 from obbgs_core.cameras import Cameras
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.rotations import quats_to_matrices
+from obbgs_core.shading import bare, lit_shares, normals_towards, radiance_along, sun_cameras, without_sun
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +67,13 @@ class ScreenGradients:
             self.pixels[camera_index] = pixels
 
 
-def render(gaussians: Gaussians, cameras: Cameras, backend: str = "auto", normals: bool = False) -> Rendered:
+def render(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    backend: str = "auto",
+    normals: bool = False,
+    sunlit: Tensor | None = None,
+) -> Rendered:
     """Render radiance, alpha, depth and (on request) normals of all cameras.
 
     Front-to-back compositing of Kerbl et al. 2023 on a black sky: alpha = min(0.99, opacity·exp(-d²/2)), contributions
@@ -74,16 +81,21 @@ def render(gaussians: Gaussians, cameras: Cameras, backend: str = "auto", normal
 
     Args:
         backend: `native` (C++, float32), `reference` (plain PyTorch, any dtype), `gsplat` (CUDA), or `auto`.
+        sunlit: [C, N] share of each camera's Sun that reaches each Gaussian, for a model that obeys Lambert's law and
+            a caller that knows it; by default its shadows are cast first (`sunlit_shares`).
 
     Raises:
         ValueError: an unknown backend, or one that is not available here; the radiance turns with the Sun and the
             cameras do not say where it is.
     """
-    if gaussians.sh_direction == "sun" and cameras.sun_dir is None:
-        raise ValueError("the model's radiance turns with the Sun: give Cameras(sun_dir=[C, 3]), body frame")
+    suns = None if gaussians.shading == "view" else cameras.known_suns()
+    if gaussians.shading != "lambert":
+        sunlit = None
+    elif suns is not None and sunlit is None:
+        sunlit = sunlit_shares(gaussians, suns, backend)
     composite = _backend(backend, gaussians.means)
     if isinstance(composite, str):
-        return _render_native(composite, gaussians, cameras, normals)
+        return _render_native(composite, gaussians, cameras, suns, sunlit, normals)
     projected = project(gaussians, cameras)
     gaussians, _ = _repaired(gaussians)
     directions = gaussians.means[None] - cameras.centres[:, None]  # [C, N, 3]
@@ -92,9 +104,10 @@ def render(gaussians: Gaussians, cameras: Cameras, backend: str = "auto", normal
     screen = ScreenGradients()
     images, alphas, medians = [], [], []
     for c in range(len(cameras)):
-        features = [_radiance(gaussians, cameras, c, directions[c]), projected.depths[c][:, None]]
+        sun, share = (None if each is None else each[c] for each in (suns, sunlit))
+        features = [radiance_along(gaussians, directions[c], sun, share), projected.depths[c][:, None]]
         if normals:
-            features.append(_normals(gaussians, directions[c]))
+            features.append(normals_towards(gaussians, directions[c]))
         image, transmittance, median = composite(
             projected.means2d[c],
             projected.conics[c],
@@ -120,6 +133,33 @@ def render(gaussians: Gaussians, cameras: Cameras, backend: str = "auto", normal
         normals=image[..., channels + 1 :] if normals else None,
         screen=screen,
     )
+
+
+@torch.no_grad()
+def sunlit_shares(gaussians: Gaussians, sun_dir: Tensor, backend: str = "auto") -> Tensor:
+    """Return the share of the Sun that reaches each Gaussian [S, N] from directions [S, 3]: one picture from each.
+
+    Source: Williams, Casting Curved Shadows on Curved Surfaces, 1978; its edges softened as in Reeves et al. 1987.
+    """
+    directions, which = sun_dir.unique(dim=0, return_inverse=True)
+    suns, shape = sun_cameras(gaussians, directions), bare(gaussians)
+    shares = []
+    for s in range(len(directions)):
+        seen = render(shape, suns.one(s), backend)
+        shares.append(lit_shares(gaussians, suns.one(s), seen.means2d, seen.median_depth))
+    return torch.cat(shares)[which]
+
+
+def lit_from(gaussians: Gaussians, sun_dir: Tensor | None) -> Gaussians:
+    """Return the model as it looks with the Sun towards `sun_dir` [3] (unit, body frame), as `shading.without_sun`.
+
+    Raises:
+        ValueError: the radiance turns with the Sun, and no direction is given.
+    """
+    sunlit = None
+    if gaussians.shading == "lambert" and sun_dir is not None:
+        sunlit = sunlit_shares(gaussians, sun_dir[None])[0]
+    return without_sun(gaussians, sun_dir, sunlit)
 
 
 def project(gaussians: Gaussians, cameras: Cameras) -> Projected:
@@ -173,22 +213,6 @@ def _repaired(gaussians: Gaussians) -> tuple[Gaussians, Tensor]:
         n: torch.where(sound.reshape(-1, *[1] * (t.ndim - 1)), t, torch.zeros_like(t)) for n, t in tensors
     }
     return dataclasses.replace(gaussians, **repaired), sound
-
-
-def _radiance(gaussians: Gaussians, cameras: Cameras, c: int, directions: Tensor) -> Tensor:
-    """Return each Gaussian's radiance [N, C] in one camera, which sees it along `directions` [N, 3]."""
-    if gaussians.sh_direction == "sun":
-        assert cameras.sun_dir is not None  # `render` has looked
-        directions = cameras.sun_dir[c].detach().to(directions).expand(len(gaussians), 3)
-    return sh.radiance(gaussians.sh, directions)
-
-
-def _normals(gaussians: Gaussians, directions: Tensor) -> Tensor:
-    """Return each Gaussian's shortest axis [N, 3], turned towards the camera, body frame."""
-    axes = quats_to_matrices(gaussians.quats)
-    shortest = gaussians.log_scales.argmin(dim=1)
-    normal = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
-    return -normal * torch.sign((normal * directions).sum(-1, keepdim=True))
 
 
 def _backend(name: str, like: Tensor):
@@ -272,12 +296,17 @@ def _pixels_touched(means2d: Tensor, conics: Tensor, opacities: Tensor, depths: 
     return torch.where(depths > 0, math.pi * q / determinant.sqrt(), torch.zeros_like(q))
 
 
-def _render_native(kernel: str, gaussians: Gaussians, cameras: Cameras, normals: bool) -> Rendered:
+def _render_native(
+    kernel: str,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    suns: Tensor | None,
+    sunlit: Tensor | None,
+    normals: bool,
+) -> Rendered:
     screen = ScreenGradients()
-    sun_dir = cameras.sun_dir if gaussians.sh_direction == "sun" else None
-    images = _Native.apply(
-        *gaussians.tensors().values(), cameras.world_to_camera, cameras, sun_dir, kernel, normals, screen
-    )
+    tensors = (*gaussians.tensors().values(), cameras.world_to_camera, gaussians.ambient)
+    images = _Native.apply(*tensors, cameras, suns, sunlit, kernel, normals, screen)
     radiance, alpha, depth, median_depth, means2d, radii, *more = images
     return Rendered(radiance, alpha, depth, median_depth, means2d, radii, more[0] if more else None, screen)
 
@@ -294,15 +323,17 @@ class _Native(torch.autograd.Function):
         opacity_logits,
         sh,
         world_to_camera,
+        ambient,
         cameras,
         sun_dir,
+        sunlit,
         kernel,
         normals,
         screen,
     ):
-        inputs = (means, quats, log_scales, opacity_logits, sh, world_to_camera)
-        arrays = [t.detach().float().contiguous() for t in (*inputs, cameras.K)]
-        arrays.append(None if sun_dir is None else sun_dir.detach().float().contiguous())
+        inputs = (means, quats, log_scales, opacity_logits, sh, world_to_camera, ambient)
+        arrays = [t.detach().float().contiguous() for t in (*inputs[:6], cameras.K)]
+        arrays += [None if each is None else each.detach().float().contiguous() for each in (sun_dir, sunlit)]
         count, n, height, width = len(cameras), means.shape[0], cameras.height, cameras.width
         radiance = torch.empty(count, height, width, sh.shape[2])
         alpha, depth, median_depth = (torch.empty(count, height, width) for _ in range(3))
@@ -310,7 +341,7 @@ class _Native(torch.autograd.Function):
         normal_images = [torch.empty(count, height, width, 3)] if normals else []
         module = compiled.module_for()
         assert module is not None  # a kernel's name comes from it
-        rasterization = module.Rasterization(kernel, width, height, cameras.near_m, *arrays)
+        rasterization = module.Rasterization(kernel, width, height, cameras.near_m, *arrays, ambient.item())
         rasterization.forward(
             torch.get_num_threads(),
             radiance,
@@ -330,7 +361,7 @@ class _Native(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, radiance, alpha, depth, median_depth, means2d, radii, normals=None):
-        inputs, images = ctx.saved_tensors[:6], ctx.saved_tensors[6:]
+        inputs, images = ctx.saved_tensors[:7], ctx.saved_tensors[7:]
         gradients = [torch.empty(t.shape) for t in inputs]
         count, n = inputs[5].shape[0], inputs[0].shape[0]
         screen_means2d, pixels = torch.empty(count, n, 2), torch.empty(count, n)
@@ -347,7 +378,7 @@ class _Native(torch.autograd.Function):
         )
         ctx.screen.means2d.update(enumerate(screen_means2d))
         ctx.screen.pixels.update(enumerate(pixels))
-        return *(g.to(t.dtype) for g, t in zip(gradients, inputs, strict=True)), *[None] * 5
+        return *(g.to(t.dtype) for g, t in zip(gradients, inputs, strict=True)), *[None] * 6
 
 
 def _composite_gsplat(means2d, conics, opacities, depths, features, cameras, screen, camera_index):

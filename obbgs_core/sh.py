@@ -1,10 +1,13 @@
 """Spherical harmonics up to degree 3, and the radiance they stand for."""
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 C0 = 0.28209479177387814
+FIT_DIRECTIONS = 64  # four for each coefficient of degree 3
 SOFTNESS = 10.0  # softplus(x, beta=10) differs from max(x, 0) by at most 0.07, at zero
 
 
@@ -17,13 +20,30 @@ def radiance(sh: Tensor, directions: Tensor) -> Tensor:
         sh: [N, K, C] with K = 1, 4, 9 or 16.
     """
     basis = sh_basis(directions, sh.shape[1])
-    return F.softplus((basis[:, :, None] * sh).sum(dim=1), beta=SOFTNESS)
+    return softplus((basis[:, :, None] * sh).sum(dim=1))
+
+
+def softplus(x: Tensor) -> Tensor:
+    """Return max(x, 0), softly."""
+    return F.softplus(x, beta=SOFTNESS)
 
 
 def from_radiance(value: Tensor) -> Tensor:
     """Return the degree-0 coefficient whose radiance is `value` (at least 1e-4)."""
     value = value.clamp(min=1e-4)
     return (value + torch.log(-torch.expm1(-SOFTNESS * value)) / SOFTNESS) / C0
+
+
+def fit(count: int) -> tuple[Tensor, Tensor]:
+    """Return directions [D, 3] spread over the sphere, and the matrix [K, D] from values there to coefficients."""
+    if count == 1:
+        return torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1 / C0]])
+    i = torch.arange(FIT_DIRECTIONS, dtype=torch.float64)
+    z = 1 - (2 * i + 1) / FIT_DIRECTIONS
+    angle = math.pi * (1 + math.sqrt(5)) * i  # a Fibonacci lattice
+    reach = (1 - z * z).sqrt()
+    directions = torch.stack([reach * angle.cos(), reach * angle.sin(), z], dim=1)
+    return directions.float(), torch.linalg.pinv(sh_basis(directions, count)).float()
 
 
 def sh_basis(d: Tensor, count: int) -> Tensor:

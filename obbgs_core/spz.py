@@ -23,6 +23,7 @@ from obbgs_core.errors import ExportError, ReconstructionError
 from obbgs_core.files import write_whole
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.ply import display_sh, radiance_sh
+from obbgs_core.render import lit_from
 
 FLIP = torch.tensor([1.0, -1.0, -1.0])  # half a turn about x, its own inverse
 LARGEST_FIXED_POINT = 2**23 - 1
@@ -44,7 +45,7 @@ def save_spz(
         ValueError: the radiance turns with the Sun, and sun_dir is not given.
         ExportError: the model is empty, not finite, or reaches farther than 24 bits of fixed point allow.
     """
-    gaussians = gaussians.detach().lit_from(sun_dir)
+    gaussians = lit_from(gaussians.detach(), sun_dir)
     if len(gaussians) == 0:
         raise ExportError("there is no Gaussian to write")
     for name, tensor in gaussians.tensors().items():

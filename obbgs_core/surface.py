@@ -12,6 +12,7 @@ from obbgs_core.cameras import Cameras
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.render import project, render
 from obbgs_core.rotations import quats_to_matrices
+from obbgs_core.shading import bare, mean_radiance
 
 BLACKEST = 3e-4  # of the bright surface's radiance; fainter Gaussians show no light, so no surface was measured there
 BRIGHT_QUANTILE = 0.97
@@ -76,10 +77,8 @@ def _lit(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
     """Return the Gaussians that shine at all: black ones in front of black sky contradict no picture."""
     if len(gaussians) == 0:
         return gaussians
-    radiance = gaussians.mean_radiance(cameras.sun_dir).mean(dim=-1)
-    any_sun = None if cameras.sun_dir is None else cameras.sun_dir[0]  # only depths are asked for
-    bare = gaussians.lit_from(any_sun)
-    return bare.select(radiance > BLACKEST * radiance.quantile(BRIGHT_QUANTILE))
+    light = mean_radiance(gaussians, cameras).mean(dim=-1)
+    return bare(gaussians).select(light > BLACKEST * light.quantile(BRIGHT_QUANTILE))
 
 
 @torch.no_grad()

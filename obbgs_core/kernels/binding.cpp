@@ -51,21 +51,24 @@ float* data_of(const Array& array, const char* name, size_t count) {
 class Rasterization {
  public:
   Rasterization(const std::string& kernel, int width, int height, float near_m, Array means, Array quats, Array log_scales,
-                Array opacity_logits, Array sh, Array world_to_camera, Array K, std::optional<Array> sun_dir)
+                Array opacity_logits, Array sh, Array world_to_camera, Array K, std::optional<Array> sun_dir, std::optional<Array> sunlit, float ambient)
       : arrays_{means, quats, log_scales, opacity_logits, sh, world_to_camera, K} {
     if (sun_dir) arrays_.push_back(*sun_dir);
+    if (sunlit) arrays_.push_back(*sunlit);
     const size_t n = opacity_logits.size(), cameras = world_to_camera.size() / 16;
     const size_t coefficients = sh.ndim() == 3 ? sh.shape(1) : 0, channels = sh.ndim() == 3 ? sh.shape(2) : 0;
     if (width < 1 || height < 1 || width > 16384 || height > 16384) throw std::invalid_argument("width and height must be 1 to 16384");
     if (coefficients != 1 && coefficients != 4 && coefficients != 9 && coefficients != 16)
       throw std::invalid_argument("expected 1, 4, 9 or 16 coefficients, got " + std::to_string(coefficients));
     if (channels != 1 && channels != 3) throw std::invalid_argument("expected 1 or 3 channels, got " + std::to_string(channels));
+    if (sunlit && !sun_dir) throw std::invalid_argument("sunlit needs sun_dir");
     if (n * cameras > (size_t(1) << 31)) throw std::invalid_argument("more than 2^31 Gaussians times cameras");
     scene_ = {int(n), int(cameras), int(coefficients), int(channels), width, height, near_m, false,
               data_of(means, "means", 3 * n), data_of(quats, "quats", 4 * n), data_of(log_scales, "log_scales", 3 * n),
               opacity_logits.data(), data_of(sh, "sh", n * coefficients * channels),
               data_of(world_to_camera, "world_to_camera", 16 * cameras), data_of(K, "K", 9 * cameras),
-              sun_dir ? data_of(*sun_dir, "sun_dir", 3 * cameras) : nullptr};
+              sun_dir ? data_of(*sun_dir, "sun_dir", 3 * cameras) : nullptr,
+              sunlit ? data_of(*sunlit, "sunlit", n * cameras) : nullptr, ambient};
     for (const Kernel& k : available_kernels())
       if (kernel.empty() || kernel == k.name) { kernel_ = k; break; }
     if (!kernel_.project) throw std::invalid_argument("no kernel " + kernel + " on this processor");
@@ -86,7 +89,7 @@ class Rasterization {
   void backward(int threads, Array radiance, Array depth, std::optional<Array> normals, std::optional<Strided> grad_radiance,
                 std::optional<Strided> grad_alpha, std::optional<Strided> grad_depth, std::optional<Strided> grad_normals,
                 std::optional<Array> grad_means2d, Array means, Array quats, Array log_scales, Array opacity_logits, Array sh,
-                Array world_to_camera, Array screen_means2d, Array pixels) const {
+                Array world_to_camera, Array ambient, Array screen_means2d, Array pixels) const {
     const obbgs::Scene& s = scene_;
     if (!frame_.tile_begin.size()) throw std::logic_error("backward before forward");
     const size_t n = s.gaussians, splats = n * s.cameras;
@@ -97,7 +100,8 @@ class Rasterization {
         grad_means2d ? data_of(*grad_means2d, "grad_means2d", 2 * splats) : nullptr,
         data_of(means, "means", 3 * n), data_of(quats, "quats", 4 * n), data_of(log_scales, "log_scales", 3 * n),
         data_of(opacity_logits, "opacity_logits", n), data_of(sh, "sh", n * s.sh_count * s.channels),
-        data_of(world_to_camera, "world_to_camera", 16 * size_t(s.cameras)), data_of(screen_means2d, "screen_means2d", 2 * splats),
+        data_of(world_to_camera, "world_to_camera", 16 * size_t(s.cameras)), data_of(ambient, "ambient", 1),
+        data_of(screen_means2d, "screen_means2d", 2 * splats),
         data_of(pixels, "pixels", splats)};
     nb::gil_scoped_release release;
     struct alignas(64) Record { float sums[obbgs::kRecord]; };
@@ -154,16 +158,17 @@ NB_MODULE(_rasterizer, m) {
     return names;
   });
   nb::class_<Rasterization>(m, "Rasterization")
-      .def(nb::init<const std::string&, int, int, float, Array, Array, Array, Array, Array, Array, Array, std::optional<Array>>(),
+      .def(nb::init<const std::string&, int, int, float, Array, Array, Array, Array, Array, Array, Array, std::optional<Array>,
+                    std::optional<Array>, float>(),
            nb::arg("kernel"), nb::arg("width"), nb::arg("height"), nb::arg("near_m"), nb::arg("means"), nb::arg("quats"),
            nb::arg("log_scales"), nb::arg("opacity_logits"), nb::arg("sh"), nb::arg("world_to_camera"), nb::arg("K"),
-           nb::arg("sun_dir").none())
+           nb::arg("sun_dir").none(), nb::arg("sunlit").none(), nb::arg("ambient"))
       .def("forward", &Rasterization::forward, nb::arg("threads"), nb::arg("radiance"), nb::arg("alpha"), nb::arg("depth"),
            nb::arg("median_depth"), nb::arg("normals").none(), nb::arg("means2d"), nb::arg("radii"))
       .def("backward", &Rasterization::backward, nb::arg("threads"), nb::arg("radiance"), nb::arg("depth"), nb::arg("normals").none(),
            nb::arg("grad_radiance").none(), nb::arg("grad_alpha").none(), nb::arg("grad_depth").none(), nb::arg("grad_normals").none(),
            nb::arg("grad_means2d").none(), nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("opacity_logits"),
-           nb::arg("sh"), nb::arg("world_to_camera"), nb::arg("screen_means2d"), nb::arg("pixels"))
+           nb::arg("sh"), nb::arg("world_to_camera"), nb::arg("ambient"), nb::arg("screen_means2d"), nb::arg("pixels"))
       .def_prop_ro("pairs", &Rasterization::pairs)
       .def_prop_ro("bytes", &Rasterization::bytes);
   bind_training(m);

@@ -84,7 +84,7 @@ struct Model {
 
 struct Camera {
   float R[3][3], t[3], fx, fy, cx, cy, limit_x, limit_y;
-  const float* sun_dir;  // [3] or null
+  const float *sun_dir, *sunlit;  // [3] and [gaussians], or null
 
   Camera(const Scene& s, int index) {
     const float *w = s.world_to_camera + 16 * index, *K = s.K + 9 * index;
@@ -99,6 +99,7 @@ struct Camera {
     limit_x = kFovMargin * std::max(cx, s.width - cx) / fx;
     limit_y = kFovMargin * std::max(cy, s.height - cy) / fy;
     sun_dir = s.sun_dir ? s.sun_dir + 3 * index : nullptr;
+    sunlit = s.sunlit ? s.sunlit + size_t(index) * s.gaussians : nullptr;
   }
 };
 
@@ -210,41 +211,46 @@ inline void sh_basis_backward(const vf* d, int count, const vf* weight, vf* grad
   gradient[2] = gz;
 }
 
+inline vf softplus(vf x) {
+  const vf scaled = x * kSoftness, e = exp(-absolute(scaled));
+  const vf soft = larger(scaled, 0.0f) + atanh_third(e / (e + 2.0f)) * 2.0f;  // log1p(e) = 2 atanh(e / (2 + e))
+  return select(vf(kLinear) < scaled, x, soft * (1.0f / kSoftness));
+}
+inline vf softplus_slope(vf x) {
+  const vf scaled = x * kSoftness;
+  return select(vf(kLinear) < scaled, 1.0f, vf(1.0f) / (vf(1.0f) + exp(-scaled)));
+}
+
 // How a Gaussian shines towards a camera.
 struct Shading {
   vf direction[3], distance, basis[16], raw[3], facing;  // facing: sign that turns the normal away from `direction`
-  vf normal[3];
+  vf normal[3], sun[3], cosine, sunlit, light;           // cosine and sunlit: only where Lambert's law holds
 
   Shading(const Scene& s, const Group& g, const Model& m, const Camera& c) {
     for (int j = 0; j < 3; ++j) direction[j] = m.mean[j] + (c.R[0][j] * c.t[0] + c.R[1][j] * c.t[1] + c.R[2][j] * c.t[2]);
     distance = larger(sqrt(dot(direction, direction)), kMinNorm);
     for (vf& d : direction) d = d / distance;
-    if (c.sun_dir) {
-      const vf sun[3] = {c.sun_dir[0], c.sun_dir[1], c.sun_dir[2]};
-      sh_basis(sun, s.sh_count, basis);
-    } else {
-      sh_basis(direction, s.sh_count, basis);
-    }
+    if (c.sun_dir)
+      for (int j = 0; j < 3; ++j) sun[j] = c.sun_dir[j];
+    sh_basis(c.sun_dir ? sun : direction, s.sh_count, basis);
     for (int f = 0; f < s.channels; ++f) {
       raw[f] = 0.0f;
       for (int k = 0; k < s.sh_count; ++k) raw[f] = fma(basis[k], g.get(s.sh, s.sh_count * s.channels, k * s.channels + f), raw[f]);
     }
-    if (s.normals) {
+    light = 1.0f;
+    if (s.normals || c.sunlit) {
       for (int i = 0; i < 3; ++i) normal[i] = dot(m.R[i], m.shortest);
       const vf along = dot(normal, direction);
       facing = zero_unless(along < vf(0.0f), 1.0f) - zero_unless(vf(0.0f) < along, 1.0f);
     }
+    if (c.sunlit) {
+      sunlit = g.get(c.sunlit, 1, 0);
+      cosine = dot(normal, sun) * facing;
+      light = fma(softplus(cosine), sunlit, s.ambient);
+    }
   }
 
-  vf radiance(int f) const {  // softplus(raw)
-    const vf scaled = raw[f] * kSoftness, e = exp(-absolute(scaled));
-    const vf soft = larger(scaled, 0.0f) + atanh_third(e / (e + 2.0f)) * 2.0f;  // log1p(e) = 2 atanh(e / (2 + e))
-    return select(vf(kLinear) < scaled, raw[f], soft * (1.0f / kSoftness));
-  }
-  vf radiance_slope(int f) const {
-    const vf scaled = raw[f] * kSoftness;
-    return select(vf(kLinear) < scaled, 1.0f, vf(1.0f) / (vf(1.0f) + exp(-scaled)));
-  }
+  vf radiance(int f) const { return softplus(raw[f]) * light; }
 };
 
 }  // namespace
@@ -319,8 +325,10 @@ void project_backward(const Scene& s, const Frame& frame, const float* records, 
   std::vector<Camera> cameras;
   for (int c = 0; c < s.cameras; ++c) cameras.emplace_back(s, c);
   std::vector<float> poses(size_t(chunks) * s.cameras * 12);  // a chunk's share of each pose gradient: R, then t
+  std::vector<float> ambient(chunks);
   parallel_for(chunks, worthwhile(threads, size_t(s.cameras) * s.gaussians, kGrain), [&](int chunk) {
     std::vector<vf> pose(size_t(s.cameras) * 12, vf(0.0f));
+    vf d_ambient = 0.0f;
     for (int first = chunk * kChunk; first < std::min(s.gaussians, (chunk + 1) * kChunk); first += kLanes) {
       const Group group(s, first);
       const Model m(s, group);
@@ -406,15 +414,20 @@ void project_backward(const Scene& s, const Frame& frame, const float* records, 
 
         vf d_direction[3] = {0.0f, 0.0f, 0.0f};
         const Shading shading(s, group, m, camera);
-        vf weight[16];
+        vf weight[16], d_light = 0.0f, d_cosine = 0.0f;
         for (int b = 0; b < s.sh_count; ++b) weight[b] = 0.0f;
         for (int f = 0; f < s.channels; ++f) {
-          const vf d_raw = get(kFirstFeature + f) * shading.radiance_slope(f);
+          const vf d_radiance = get(kFirstFeature + f), d_raw = d_radiance * softplus_slope(shading.raw[f]) * shading.light;
+          if (s.sunlit) d_light = d_light + d_radiance * softplus(shading.raw[f]);
           for (int b = 0; b < s.sh_count; ++b) {
             const int i = b * s.channels + f;
             d_sh[i] = d_sh[i] + zero_unless(on, d_raw * shading.basis[b]);
             if (turning) weight[b] = weight[b] + d_raw * group.get(s.sh, coefficients, i);
           }
+        }
+        if (s.sunlit) {
+          d_cosine = d_light * shading.sunlit * softplus_slope(shading.cosine);
+          d_ambient = d_ambient + zero_unless(on, d_light);
         }
         if (turning) {  // through the unit direction
           vf d_unit[3];
@@ -422,11 +435,13 @@ void project_backward(const Scene& s, const Frame& frame, const float* records, 
           const vf radial = dot(d_unit, shading.direction);
           for (int j = 0; j < 3; ++j) d_direction[j] = (d_unit[j] - shading.direction[j] * radial) / shading.distance;
         }
-        if (features > s.channels + 1)
-          for (int i = 0; i < 3; ++i) {
-            const vf d_normal = zero_unless(on, get(kFirstFeature + s.channels + 1 + i) * shading.facing);
-            for (int a = 0; a < 3; ++a) d_R[i][a] = d_R[i][a] + d_normal * m.shortest[a];
-          }
+        const bool normals = features > s.channels + 1;
+        for (int i = 0; i < 3 && (normals || s.sunlit); ++i) {
+          vf d_normal = normals ? get(kFirstFeature + s.channels + 1 + i) : vf(0.0f);
+          if (s.sunlit) d_normal = d_normal + d_cosine * shading.sun[i];
+          d_normal = zero_unless(on, d_normal * shading.facing);
+          for (int a = 0; a < 3; ++a) d_R[i][a] = d_R[i][a] + d_normal * m.shortest[a];
+        }
 
         // p = R mean + t; direction = mean + R^T t
         vf* d_pose = &pose[size_t(c) * 12];
@@ -463,7 +478,11 @@ void project_backward(const Scene& s, const Frame& frame, const float* records, 
       for (int i = 0; i < coefficients; ++i) group.put(out.sh, coefficients, i, d_sh[i]);
     }
     for (int i = 0; i < s.cameras * 12; ++i) poses[size_t(chunk) * s.cameras * 12 + i] = sum(pose[i]);
+    ambient[chunk] = sum(d_ambient);
   });
+  double all_ambient = 0;
+  for (const float part : ambient) all_ambient += part;
+  *out.ambient = float(all_ambient);
   for (int c = 0; c < s.cameras; ++c) {
     double total[12] = {};
     for (int chunk = 0; chunk < chunks; ++chunk)

@@ -25,6 +25,8 @@ struct Scene {
   bool normals;
   const float *means, *quats, *log_scales, *opacity_logits, *sh, *world_to_camera, *K;
   const float* sun_dir;  // [cameras, 3] where the harmonics are taken; null: along each line of sight
+  const float* sunlit;   // [cameras, gaussians] share of the Sun that arrives: sh is an albedo, lit by Lambert's law; or null
+  float ambient;         // light on every side besides
 
   int features() const { return channels + 1 + 3 * normals; }  // radiance, depth, normal: in this order
   int tiles_x() const { return (width + kTile - 1) / kTile; }
@@ -101,7 +103,7 @@ struct ImageGradients {
 
 struct SceneGradients {
   const float* means2d_in;  // [cameras, gaussians, 2] gradient of the projected means from elsewhere, or null
-  float *means, *quats, *log_scales, *opacity_logits, *sh, *world_to_camera;
+  float *means, *quats, *log_scales, *opacity_logits, *sh, *world_to_camera, *ambient;
   float *means2d, *pixels;  // [cameras, gaussians, 2] loss per px, [cameras, gaussians] pixels touched
 };
 

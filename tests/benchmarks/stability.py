@@ -111,9 +111,10 @@ def cases(name: str, size: int, seeds: int):
 
 
 def moving_sun(session: Path):
-    """Yield a session whose Sun moves, with the model held static and with the one that is chosen."""
+    """Yield a session whose Sun moves, with each way that the model may take it."""
     target = targets.from_session(session)
     yield "moving Sun, held static", target, {"sun_span_deg": 0.0}, 0
+    yield "moving Sun, linear", target, {"sun_shading": "linear"}, 0
     yield "moving Sun", target, {}, 0
 
 

@@ -1,4 +1,4 @@
-"""A Sun that moves over the target: an ellipsoid whose light is known in closed form, from pictures to the outputs."""
+"""A Sun that moves over the target: ellipsoids whose light is known in closed form, from pictures to the outputs."""
 
 import dataclasses
 import json
@@ -30,37 +30,52 @@ from obbgs_core.metrics import psnr_db
 from obbgs_core.optimize import Trainer, train
 from obbgs_core.parsimony import next_degree_gain
 from obbgs_core.ply import display_sh, load_ply, save_ply
-from obbgs_core.render import render
+from obbgs_core.render import lit_from, render
 from obbgs_core.sensor import Sensor
 from obbgs_core.spz import load_spz, save_spz
 from obbgs_core.surface import surface_points
 
 SIZE_PX, RANGE_M = 48, 60.0
 SEMI_AXES_M = np.array([1.5, 1.0, 0.7])
+ALONE = ((np.zeros(3), SEMI_AXES_M),)  # centre and semi-axes, m
+TOGETHER = (*ALONE, (np.array([0.2, 0.3, 1.5]), np.array([0.6, 0.6, 0.3])))
 K = np.array([[600.0, 0, SIZE_PX / 2], [0, 600.0, SIZE_PX / 2], [0, 0, 1]])
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=4.0, read_noise_dn=8.0)
 EXPOSURES_S = (5e-5, 1e-4, 2e-4)
 QUICK = {"steps": 240, "start_count": 800, "max_gaussians": 1200, "pyramid": ((0.0, 0.5), (0.3, 1.0))}
 
 
-def lambertian_ellipsoid(world_to_camera: np.ndarray, sun_dir: np.ndarray) -> np.ndarray:
-    """Return the radiance [H, W] of a matt ellipsoid of two albedos under the Sun alone: rays met in closed form.
+def hits(origin: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """Return how far rays [..., 3] go to the unit sphere, infinity where they miss it or it lies behind."""
+    a, b, c = (towards**2).sum(-1), (towards * origin).sum(-1), (origin**2).sum(-1) - 1
+    root = np.sqrt(np.maximum(0, b * b - a * c))
+    return np.where((b * b > a * c) & (-b - root > 0), (-b - root) / a, np.inf)
 
-    It is convex, so it casts no shadow on itself beyond max(0, n·s).
+
+def lambertian_ellipsoids(world_to_camera: np.ndarray, sun_dir: np.ndarray, bodies=ALONE) -> np.ndarray:
+    """Return the radiance [H, W] of matt ellipsoids (centre, semi-axes) of two albedos under the Sun alone.
+
+    Rays are met in closed form, those to the Sun too: the bodies cast shadows on one another.
     """
     fine = 3  # rays along a pixel's side
     at = (np.arange(SIZE_PX * fine) + 0.5) / fine
     u, v = np.meshgrid(at, at)
     R, t = world_to_camera[:3, :3], world_to_camera[:3, 3]
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1) @ R
-    origin, towards = -(R.T @ t) / SEMI_AXES_M, rays / SEMI_AXES_M  # in these units it is the unit sphere
-    a, b, c = (towards**2).sum(-1), towards @ origin, origin @ origin - 1
-    hit = b * b - a * c > 0
-    point = origin + ((-b - np.sqrt(np.where(hit, b * b - a * c, 0))) / a)[..., None] * towards
-    normal = point / SEMI_AXES_M
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    albedo = np.where(point[..., 0] * point[..., 2] > 0, 0.9, 0.5)
-    light = np.where(hit, albedo * np.maximum(0, normal @ sun_dir), 0)
+    eye, light, nearest = -(R.T @ t), np.zeros(u.shape), np.full(u.shape, np.inf)
+    for centre, axes in bodies:
+        reach = hits((eye - centre) / axes, rays / axes)
+        point = eye + np.where(np.isfinite(reach), reach, 0)[..., None] * rays
+        normal = (point - centre) / axes**2
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        shaded = np.zeros(u.shape, dtype=bool)
+        for other, other_axes in bodies:
+            if other is not centre:
+                shaded |= np.isfinite(hits((point - other) / other_axes, sun_dir / other_axes))
+        albedo = np.where(point[..., 0] * point[..., 2] > 0, 0.9, 0.5)
+        seen = reach < nearest
+        light = np.where(seen, np.where(shaded, 0, albedo * np.maximum(0, normal @ sun_dir)), light)
+        nearest = np.minimum(nearest, reach)
     return light.reshape(SIZE_PX, fine, SIZE_PX, fine).mean(axis=(1, 3))
 
 
@@ -85,10 +100,12 @@ def read_out(radiance: np.ndarray, exposure_s: float, rng: np.random.Generator) 
     return np.clip(np.round(expected + noise), 0, 4095)
 
 
-def photographed(seen: list[tuple[np.ndarray, np.ndarray]], seed: int = 0) -> list[TrainingFrame]:
+def photographed(
+    seen: list[tuple[np.ndarray, np.ndarray]], seed: int = 0, bodies=ALONE
+) -> list[TrainingFrame]:
     rng, frames = np.random.default_rng(seed), []
     for i, (pose, sun) in enumerate(seen):
-        dn = read_out(lambertian_ellipsoid(pose, sun), EXPOSURES_S[i % 3], rng)
+        dn = read_out(lambertian_ellipsoids(pose, sun, bodies), EXPOSURES_S[i % 3], rng)
         frames.append(
             TrainingFrame(
                 torch.from_numpy(dn[..., None]).float(),
@@ -112,16 +129,17 @@ def camera_of(pose: np.ndarray, sun: np.ndarray) -> Cameras:
     )
 
 
-def clean_db(gaussians: Gaussians, seen: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Return the mean PSNR of the model's radiance against the ellipsoid's, 1 = 1."""
+def clean_db(gaussians: Gaussians, seen: list[tuple[np.ndarray, np.ndarray]], bodies=ALONE) -> float:
+    """Return the mean PSNR of the model's radiance against the ellipsoids', 1 = 1."""
     values = []
     for pose, sun in seen:
-        true = torch.from_numpy(lambertian_ellipsoid(pose, sun)).float()[..., None]
+        true = torch.from_numpy(lambertian_ellipsoids(pose, sun, bodies)).float()[..., None]
         values.append(psnr_db(render(gaussians, camera_of(pose, sun)).radiance[0], true))
     return sum(values) / len(values)
 
 
 def lit_model(count: int, sh_count: int = 4, channels: int = 3, seed: int = 0) -> Gaussians:
+    """Return a random model under the Sun: of harmonics, or matt where it has but one coefficient."""
     g = torch.Generator().manual_seed(seed)
     return Gaussians(
         means=torch.randn(count, 3, generator=g) * 0.6,
@@ -129,7 +147,8 @@ def lit_model(count: int, sh_count: int = 4, channels: int = 3, seed: int = 0) -
         log_scales=torch.rand(count, 3, generator=g) * 1.5 - 3.5,
         opacity_logits=torch.randn(count, generator=g) * 2 + 1,
         sh=torch.rand(count, sh_count, channels, generator=g) * 2 - 0.5,
-        sh_direction="sun",
+        shading="sun" if sh_count > 1 else "lambert",
+        ambient=torch.tensor(0.0 if sh_count > 1 else 0.0625),
     )
 
 
@@ -148,11 +167,28 @@ def test_under_a_moving_sun_the_model_turns_with_it_and_beats_the_static_one_on_
 ):
     static = train(moving, SENSOR, preset("obbgs", **QUICK, sun_span_deg=0.0), seed=1)
     unseen = views(12, seed=99)
-    assert under_the_sun.gaussians.sh_direction == "sun" and static.gaussians.sh_direction == "view"
-    assert under_the_sun.appearance.startswith("turns with the sun (step 12, degree 1: with the sun it would")
+    assert under_the_sun.gaussians.shading == "lambert" and static.gaussians.shading == "view"
+    assert under_the_sun.appearance.startswith("follows Lambert's law with cast shadows, ambient 0.0")
+    assert "(step 12, degree 1: with the sun it would" in under_the_sun.appearance
     assert under_the_sun.sun_span_deg > 150
     gain_db = clean_db(under_the_sun.gaussians, unseen) - clean_db(static.gaussians, unseen)
     assert gain_db > 3
+
+
+def test_parts_that_shade_one_another_are_understood_by_lamberts_law_and_not_by_the_linear_one():
+    frames, unseen = photographed(views(60), bodies=TOGETHER), views(12, seed=99)
+    longer = QUICK | {"steps": 960}
+    linear = train(frames, SENSOR, preset("obbgs", **longer, sun_shading="linear"), seed=1)
+    cast = train(frames, SENSOR, preset("obbgs", **longer), seed=1)
+    assert linear.gaussians.shading == "sun" and linear.appearance.startswith("turns with the sun (step 48")
+    assert clean_db(cast.gaussians, unseen, TOGETHER) > clean_db(linear.gaussians, unseen, TOGETHER) + 0.8
+    without = []
+    for pose, sun in unseen:  # the same model with nothing in the Sun's way
+        true = torch.from_numpy(lambertian_ellipsoids(pose, sun, TOGETHER)).float()[..., None]
+        everywhere = torch.ones(1, len(cast.gaussians))
+        lit = render(cast.gaussians, camera_of(pose, sun), sunlit=everywhere).radiance[0]
+        without.append(psnr_db(lit, true))
+    assert clean_db(cast.gaussians, unseen, TOGETHER) > np.mean(without) + 2
 
 
 def test_the_static_model_is_kept_when_the_sun_stands_still_or_is_not_known():
@@ -163,7 +199,7 @@ def test_the_static_model_is_kept_when_the_sun_stands_still_or_is_not_known():
     ]
     results = [train(frames, SENSOR, preset("obbgs", **QUICK), seed=1) for frames in (still, unknown, partly)]
     for result in results:
-        assert result.gaussians.sh_direction == "view" and result.sun_span_deg == pytest.approx(0, abs=1e-4)
+        assert result.gaussians.shading == "view" and result.sun_span_deg == pytest.approx(0, abs=1e-4)
         assert "sun" not in result.appearance
     for name, tensor in results[0].gaussians.tensors().items():  # a Sun that stands still changes nothing
         assert torch.equal(tensor, getattr(results[1].gaussians, name)), name
@@ -216,44 +252,47 @@ def test_a_killed_training_under_the_sun_resumes_to_the_same_bits(moving, under_
     first = Trainer(moving, SENSOR, preset("obbgs", **QUICK), seed=1)
     for _ in range(30):  # the Sun joined at step 12
         first.step()
-    assert first.gaussians.sh_direction == "sun"
+    assert first.gaussians.shading == "lambert" and len(first.shadows) > 10
     first.save(tmp_path / "checkpoint")
     resumed = train(moving, SENSOR, preset("obbgs", **QUICK), 1, checkpoint=tmp_path / "checkpoint")
     assert resumed.appearance == under_the_sun.appearance and len(resumed.history) == 240
-    assert resumed.gaussians.sh_direction == "sun"
+    assert resumed.gaussians.shading == "lambert"
+    assert torch.equal(resumed.gaussians.ambient, under_the_sun.gaussians.ambient)
     for name, tensor in under_the_sun.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
     moved = [dataclasses.replace(moving[0], sun_dir=-moving[0].sun_dir), *moving[1:]]
     assert not Trainer(moved, SENSOR, preset("obbgs", **QUICK), 1).resume(tmp_path / "checkpoint")
 
 
-@pytest.mark.parametrize(("sh_count", "channels"), [(4, 1), (4, 3), (9, 3)])
+@pytest.mark.parametrize(("sh_count", "channels"), [(4, 1), (4, 3), (9, 3), (1, 1), (1, 3)])
 def test_a_model_under_the_sun_comes_back_exactly_and_viewers_see_it_under_the_stated_one(
     tmp_path, sh_count, channels
 ):
     gaussians, sun = lit_model(17, sh_count, channels), torch.tensor([0.48, -0.6, 0.64])
     save_ply(gaussians, tmp_path / "m.ply", 1.5, sun)
     again = load_ply(tmp_path / "m.ply")
-    assert again.sh_direction == "sun"
+    assert again.shading == gaussians.shading and again.ambient == gaussians.ambient
     for name, tensor in gaussians.tensors().items():
         assert torch.equal(getattr(again, name), tensor), name
     file = plyfile.PlyData.read(str(tmp_path / "m.ply"))
     assert any("the Sun towards 0.480000 -0.600000 0.640000, body frame" in line for line in file.comments)
     shown = np.stack([file["vertex"][f"f_dc_{i}"] for i in range(3)], axis=1)
-    baked = gaussians.lit_from(sun)
+    baked = lit_from(gaussians, sun)
     np.testing.assert_allclose(shown, display_sh(baked, 1.5)[:, 0].numpy(), atol=1e-6)
-    assert "f_rest_0" not in file["vertex"].data.dtype.names
+    assert ("f_rest_0" in file["vertex"].data.dtype.names) == (
+        gaussians.shading == "lambert"
+    )  # two sides differ
     save_spz(gaussians, tmp_path / "m.spz", 1.5, sun)
     save_spz(baked, tmp_path / "baked.spz", 1.5)
     assert (tmp_path / "m.spz").read_bytes() == (tmp_path / "baked.spz").read_bytes()
-    assert load_spz(tmp_path / "m.spz").sh_direction == "view"
+    assert load_spz(tmp_path / "m.spz").shading == "view"
     for save, path in ((save_ply, tmp_path / "n.ply"), (save_spz, tmp_path / "n.spz")):
         with pytest.raises(ValueError, match="give sun_dir"):
             save(gaussians, path)
         assert not path.exists()
 
 
-@pytest.mark.parametrize(("sh_count", "channels"), [(4, 1), (9, 3)])
+@pytest.mark.parametrize(("sh_count", "channels"), [(4, 1), (9, 3), (1, 1), (1, 3)])
 def test_onnxruntime_agrees_with_our_renderer_under_many_suns(tmp_path, sh_count, channels):
     gaussians = lit_model(400, sh_count, channels)
     export_onnx(gaussians, SENSOR, tmp_path / "m.onnx", SIZE_PX, SIZE_PX, EXPOSURES_S)
@@ -275,10 +314,20 @@ def test_onnxruntime_agrees_with_our_renderer_under_many_suns(tmp_path, sh_count
     feed["sun_dir"] = -feed["sun_dir"]
     assert np.abs(session.run(["image"], feed)[0] - images[-1]).max() > 0.05  # the input counts
     export_onnx(
-        gaussians.lit_from(torch.tensor(sun).float()), SENSOR, tmp_path / "s.onnx", 48, 48, EXPOSURES_S
+        lit_from(gaussians, torch.tensor(sun).float()), SENSOR, tmp_path / "s.onnx", 48, 48, EXPOSURES_S
     )
     static = onnxruntime.InferenceSession(str(tmp_path / "s.onnx"))
     assert [i.name for i in static.get_inputs()] == ["world_to_camera", "K", "exposure_time_s"]
+
+
+def test_baked_under_one_sun_a_matt_model_looks_much_the_same(under_the_sun):
+    alike_db = []
+    for pose, sun in views(6, seed=5):
+        direction = torch.tensor(sun).float()
+        lit = render(under_the_sun.gaussians, camera_of(pose, sun)).radiance[0]
+        baked = render(lit_from(under_the_sun.gaussians, direction), camera_of(pose, sun)).radiance[0]
+        alike_db.append(psnr_db(baked, lit))
+    assert np.mean(alike_db) > 26  # harmonics of degree 1 for two sides
 
 
 def test_the_surface_does_not_depend_on_which_picture_had_which_sun(under_the_sun):
@@ -293,7 +342,7 @@ def test_the_surface_does_not_depend_on_which_picture_had_which_sun(under_the_su
     )
     beyond = np.abs(np.linalg.norm(points.numpy() / SEMI_AXES_M, axis=1) - 1)
     assert np.median(beyond) < 0.2  # of the middle axis: two pixels
-    with pytest.raises(ValueError, match="give sun_dir"):
+    with pytest.raises(ValueError, match=r"give Cameras\(sun_dir"):
         surface_points(under_the_sun.gaussians, dataclasses.replace(cameras, sun_dir=None), 10)
 
 
@@ -308,7 +357,7 @@ def lambertian_session(folder, mission: Mission, brackets: int) -> list[Frame]:
     mission = dataclasses.replace(mission, camera=camera)
     writer, rng, frames = SessionWriter(folder, mission), np.random.default_rng(0), []
     for i, (pose, sun) in enumerate(views(3 * brackets, brackets_of=3)):
-        dn = read_out(lambertian_ellipsoid(pose, sun), EXPOSURES_S[i % 3], rng).astype(np.uint16)
+        dn = read_out(lambertian_ellipsoids(pose, sun), EXPOSURES_S[i % 3], rng).astype(np.uint16)
         position = -pose[:3, :3].T @ pose[:3, 3]
         tag = PoseTag(matrix_to_quat(pose[:3, :3]), position, np.eye(6) * 1e-12, sun, False, True)
         time_ns = 1_784_631_150_000_000_000 + i * 10**9
@@ -325,14 +374,14 @@ def test_a_session_under_a_moving_sun_gives_outputs_that_know_it(tmp_path, small
     np.testing.assert_allclose(
         training_frame(session, session.frames[4]).sun_dir, frames[4].pose.sun_dir_body, atol=1e-6
     )
-    changes = QUICK
+    changes = QUICK | {"steps": 480}  # a short training has not turned its Gaussians yet
     folder = reconstruct(tmp_path / "session", "run", "obbgs", changes, blind_reference=True)
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics["sh_direction"] == "sun" and metrics["sun_span_deg"] > 90
+    assert metrics["shading"] == "lambert" and metrics["sun_span_deg"] > 90
     assert metrics["onnx_parity_db"] >= 50
     shown = torch.tensor(metrics["shown_under_sun_dir_body"])
     assert any(torch.allclose(sun_direction(r), shown, atol=1e-5) for r in session.frames)
-    assert load_ply(folder / "model.ply").sh_direction == load_ply(folder / "blind.ply").sh_direction == "sun"
+    assert load_ply(folder / "model.ply").shading == load_ply(folder / "blind.ply").shading == "lambert"
     known = evaluate(tmp_path / "session", "run")["psnr_noisy_db"]
     lines = (tmp_path / "session" / "frames.jsonl").read_text().splitlines()
     wrong = [json.loads(line) for line in lines]
@@ -341,8 +390,8 @@ def test_a_session_under_a_moving_sun_gives_outputs_that_know_it(tmp_path, small
     (tmp_path / "session" / "frames.jsonl").write_text("".join(json.dumps(e) + "\n" for e in wrong))
     assert evaluate(tmp_path / "session", "run")["psnr_noisy_db"] < known - 3
     card = model_card("2026-07-21T00:00:00+00:00", metrics)
-    assert "Radiance turns with the sun (step 12" in card and "hold every Sun" in card
-    assert "turns with the sun" in write_report(tmp_path / "session", "run").read_text()
+    assert "Radiance follows Lambert's law with cast shadows, ambient 0." in card and "hold every Sun" in card
+    assert "with the sun it would gain" in write_report(tmp_path / "session", "run").read_text()
 
     store = tmp_path / "store"
     store.mkdir()

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from obbgs_core.cameras import Cameras
 from obbgs_core.gaussians import Gaussians
-from obbgs_core.render import native_kernels, project, render
+from obbgs_core.render import lit_from, native_kernels, project, render, sunlit_shares
 from obbgs_core.rotations import multiply, quats_to_matrices
 
 needs_native = pytest.mark.skipif(not native_kernels(), reason="the compiled rasterizer is not installed")
@@ -52,11 +52,16 @@ def looking_at_origin(
     )
 
 
-def outputs_and_gradients(gaussians: Gaussians, cameras: Cameras, backend: str, normals: bool = False):
-    leaves = {name: value.clone().requires_grad_() for name, value in gaussians.tensors().items()}
+def outputs_and_gradients(
+    gaussians: Gaussians, cameras: Cameras, backend: str, normals: bool = False, sunlit=None
+):
+    parameters = gaussians.tensors()
+    if gaussians.shading == "lambert":
+        parameters["ambient"] = gaussians.ambient
+    leaves = {name: value.clone().requires_grad_() for name, value in parameters.items()}
     pose = cameras.world_to_camera.clone().requires_grad_()
     moved = dataclasses.replace(cameras, world_to_camera=pose)
-    out = render(dataclasses.replace(gaussians, **leaves), moved, backend, normals=normals)
+    out = render(dataclasses.replace(gaussians, **leaves), moved, backend, normals, sunlit)
     g = torch.Generator().manual_seed(5)
     images = [out.radiance, out.alpha[..., None], out.depth[..., None]] + ([out.normals] if normals else [])
     loss = sum((i * torch.rand(i.shape, generator=g).to(i.dtype)).sum() for i in images)
@@ -105,28 +110,35 @@ def test_native_gradients_match_the_reference_in_float64(sh_count, channels):
         )
 
 
-def under_the_sun(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
+def under_the_sun(gaussians: Gaussians, cameras: Cameras, shading="sun") -> tuple[Gaussians, Cameras]:
     directions = torch.randn(len(cameras), 3, generator=torch.Generator().manual_seed(9))
     suns = torch.nn.functional.normalize(directions, dim=1).to(gaussians.means)
-    return dataclasses.replace(gaussians, sh_direction="sun"), dataclasses.replace(cameras, sun_dir=suns)
+    ambient = torch.tensor(0.3 if shading == "lambert" else 0.0).to(gaussians.means)
+    lit = dataclasses.replace(gaussians, shading=shading, ambient=ambient)
+    return lit, dataclasses.replace(cameras, sun_dir=suns)
 
 
 @needs_native
 @pytest.mark.parametrize("kernel", native_kernels())
-@pytest.mark.parametrize(("sh_count", "channels"), [(4, 1), (4, 3), (9, 3), (16, 1)])
-def test_under_the_sun_kernels_match_the_reference_in_float64(kernel, sh_count, channels):
+@pytest.mark.parametrize(
+    ("shading", "sh_count", "channels"),
+    [("sun", 4, 1), ("sun", 4, 3), ("sun", 9, 3), ("sun", 16, 1), ("lambert", 1, 1), ("lambert", 1, 3)],
+)
+def test_under_the_sun_kernels_match_the_reference_in_float64(kernel, shading, sh_count, channels):
     single = random_gaussians(60, channels, seed=sh_count, sh_count=sh_count)
     single.log_scales += 1.0  # flat tops, as above
-    single, cameras = under_the_sun(single, looking_at_origin(3, 48))
-    double = dataclasses.replace(single, **{name: value.double() for name, value in single.tensors().items()})
+    single, cameras = under_the_sun(single, looking_at_origin(3, 48), shading)
+    sunlit = torch.rand(3, 60, generator=torch.Generator().manual_seed(2))
+    parameters = single.tensors() | {"ambient": single.ambient}
+    double = dataclasses.replace(single, **{name: value.double() for name, value in parameters.items()})
     exact = dataclasses.replace(
         cameras,
         world_to_camera=cameras.world_to_camera.double(),
         K=cameras.K.double(),
         sun_dir=cameras.sun_dir.double(),
     )
-    truth, expected = outputs_and_gradients(double, exact, "reference", normals=True)
-    ours, gradients = outputs_and_gradients(single, cameras, f"native-{kernel}", normals=True)
+    truth, expected = outputs_and_gradients(double, exact, "reference", True, sunlit)
+    ours, gradients = outputs_and_gradients(single, cameras, f"native-{kernel}", True, sunlit)
     for name in ("radiance", "alpha", "depth", "normals"):
         # float32 rounding; one contribution on the 1/255 cutoff may fall on either side
         error = (getattr(ours, name).double() - getattr(truth, name)).abs()
@@ -137,18 +149,22 @@ def test_under_the_sun_kernels_match_the_reference_in_float64(kernel, sh_count, 
         )
 
 
-def test_under_the_sun_the_reference_gradient_matches_finite_differences():
-    gaussians = random_gaussians(4, 1, seed=3, dtype=torch.float64)
+@pytest.mark.parametrize(("shading", "sh_count"), [("sun", 4), ("lambert", 1)])
+def test_under_the_sun_the_reference_gradient_matches_finite_differences(shading, sh_count):
+    gaussians = random_gaussians(4, 1, seed=3, dtype=torch.float64, sh_count=sh_count)
     gaussians.log_scales += 1.5  # wide and faint, as above
     gaussians.opacity_logits = torch.full_like(gaussians.opacity_logits, 0.5)
-    gaussians, cameras = under_the_sun(gaussians, looking_at_origin(2, 5, dtype=torch.float64))
+    gaussians, cameras = under_the_sun(gaussians, looking_at_origin(2, 5, dtype=torch.float64), shading)
+    sunlit = torch.tensor([[0.2, 1.0, 0.0, 0.7], [1.0, 0.4, 0.6, 0.0]], dtype=torch.float64)
 
-    def image(means, quats, log_scales, opacity_logits, sh, pose):
+    def image(means, quats, log_scales, opacity_logits, sh, pose, ambient):
         moved = dataclasses.replace(cameras, world_to_camera=pose)
-        out = render(Gaussians(means, quats, log_scales, opacity_logits, sh, "sun"), moved, "reference")
+        model = Gaussians(means, quats, log_scales, opacity_logits, sh, shading, ambient)
+        out = render(model, moved, "reference", sunlit=sunlit)
         return out.radiance, out.alpha, out.depth
 
-    leaves = [t.clone().requires_grad_() for t in (*gaussians.tensors().values(), cameras.world_to_camera)]
+    leaves = (*gaussians.tensors().values(), cameras.world_to_camera, gaussians.ambient)
+    leaves = [t.clone().requires_grad_() for t in leaves]
     assert torch.autograd.gradcheck(image, leaves, eps=1e-6, atol=1e-5)
 
 
@@ -158,12 +174,12 @@ def test_under_one_sun_a_model_is_the_constant_one_that_it_is_baked_into(backend
     for c in range(2):
         suns = cameras.sun_dir[c].expand(2, 3)
         lit = render(gaussians, dataclasses.replace(cameras, sun_dir=suns), backend).radiance
-        baked = gaussians.lit_from(cameras.sun_dir[c])
+        baked = lit_from(gaussians, cameras.sun_dir[c])
         assert baked.sh.shape[1] == 1
         plain = dataclasses.replace(cameras, sun_dir=None)
         torch.testing.assert_close(render(baked, plain, backend).radiance, lit, rtol=0, atol=1e-5)
     with pytest.raises(ValueError, match="give sun_dir"):
-        gaussians.lit_from(None)
+        lit_from(gaussians, None)
 
 
 def test_lamberts_cosine_is_what_degree_one_under_the_sun_means():
@@ -189,6 +205,64 @@ def test_lamberts_cosine_is_what_degree_one_under_the_sun_means():
         assert -1e-4 < seen - albedo * max(0.0, float(normal @ sun)) < 0.0694
 
 
+def plate(half_m: float, spacing_m: float, height_m: float = 0.0) -> Gaussians:
+    """Return a square opaque plate of discs in the plane z = height_m."""
+    line = torch.arange(-half_m, half_m + spacing_m / 2, spacing_m)
+    x, y = torch.meshgrid(line, line, indexing="ij")
+    means = torch.stack([x.flatten(), y.flatten(), torch.full((x.numel(),), height_m)], dim=1)
+    log_scales = torch.tensor([0.6 * spacing_m, 0.6 * spacing_m, 1e-4]).log().expand(len(means), 3)
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(len(means), 4)
+    return Gaussians(means, quats, log_scales, torch.full((len(means),), 6.0), torch.ones(len(means), 1, 1))
+
+
+@pytest.mark.parametrize("backend", ["reference", *(["native"] if native_kernels() else [])])
+def test_a_plates_shadow_on_another_lies_where_geometry_puts_it(backend):
+    ground, roof = plate(1.0, 0.08), plate(0.32, 0.08, 0.8)
+    both = Gaussians.concatenate([ground, roof])
+    suns = torch.tensor([[0.0, 0.0, 1.0], [0.5, 0.2, 1.0], [0.1, 0.0, -1.0]])
+    suns = torch.nn.functional.normalize(suns, dim=1)
+    shares = sunlit_shares(both, torch.cat([suns, suns[1:2]]), backend)
+    assert torch.equal(shares[1], shares[3]) and shares.shape == (4, len(both))
+    for sun, share in zip(suns, shares, strict=False):
+        above, other = (roof, ground) if sun[2] > 0 else (ground, roof)
+        lit, shaded = (share[len(ground) :], share[: len(ground)])[:: 1 if sun[2] > 0 else -1]
+        assert (lit == 1).all()  # what is nearer to the Sun: no plate shades itself
+        rise_m = above.means[0, 2] - other.means[0, 2]
+        met = (
+            other.means[:, :2] + rise_m / sun[2] * sun[:2]
+        )  # where the ray to the Sun crosses the upper plate
+        half_m = 0.32 if above is roof else 1.0
+        inside_m = half_m - met.abs().amax(dim=1)  # of its edge
+        assert (shaded[inside_m > 0.05] == 0).all() and (shaded[inside_m < -0.15] == 1).all()
+        assert (inside_m > 0.05).sum() > 25
+
+
+def test_lamberts_law_needs_an_albedo_and_the_sun():
+    gaussians, cameras = under_the_sun(random_gaussians(5, sh_count=1), looking_at_origin(2, 16), "lambert")
+    with pytest.raises(ValueError, match=r"give Cameras\(sun_dir"):
+        render(gaussians, dataclasses.replace(cameras, sun_dir=None))
+    with pytest.raises(ValueError, match="an albedo is sh"):
+        dataclasses.replace(gaussians, sh=torch.zeros(5, 4, 3))
+    lost = dataclasses.replace(gaussians, means=gaussians.means * torch.tensor(float("nan")))
+    assert render(lost, cameras).radiance.isfinite().all()
+    assert render(gaussians.select(torch.tensor([], dtype=torch.long)), cameras).radiance.sum() == 0
+
+
+def test_light_on_a_plate_obeys_lamberts_law_on_both_sides():
+    wall = dataclasses.replace(plate(1.0, 0.05), shading="lambert", ambient=torch.tensor(0.1))
+    albedo = float(torch.nn.functional.softplus(0.28209479177387814 * 10 * torch.tensor(1.0))) / 10
+    above, below = (looking_at_origin(1, 31) for _ in range(2))
+    above.world_to_camera[0] = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 4], [0, 0, 0, 1]])
+    below.world_to_camera[0] = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]])
+    for cosine in (1.0, 0.7, 0.3, -0.3, -1.0):
+        sun = torch.tensor([[(1 - cosine**2) ** 0.5, 0.0, cosine]])
+        for camera, towards in ((above, cosine), (below, -cosine)):
+            out = render(wall, dataclasses.replace(camera, sun_dir=sun))
+            seen = float(out.radiance[0, 15, 15, 0] / out.alpha[0, 15, 15]) / albedo - 0.1
+            # softplus lies above max(0, .) by at most ln 2 / 10, at the terminator
+            assert -1e-3 < seen - max(0.0, towards) < 0.006, (cosine, towards)
+
+
 @pytest.mark.parametrize("backend", ["reference", *(["native"] if native_kernels() else [])])
 def test_a_model_under_the_sun_needs_to_know_where_it_is(backend):
     gaussians, cameras = under_the_sun(random_gaussians(3), looking_at_origin(2, 16))
@@ -196,8 +270,8 @@ def test_a_model_under_the_sun_needs_to_know_where_it_is(backend):
         render(gaussians, dataclasses.replace(cameras, sun_dir=None), backend)
     with pytest.raises(ValueError, match=r"sun_dir must be \[2, 3\], got \[3\]"):
         dataclasses.replace(cameras, sun_dir=cameras.sun_dir[0])
-    with pytest.raises(ValueError, match="sh_direction must be view or sun, got 'moon'"):
-        dataclasses.replace(gaussians, sh_direction="moon")
+    with pytest.raises(ValueError, match="shading must be one of view, sun, lambert, got 'moon'"):
+        dataclasses.replace(gaussians, shading="moon")
 
 
 @needs_native
