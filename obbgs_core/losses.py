@@ -12,12 +12,14 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from obbgs_core import compiled
+from obbgs_core.cameras import Cameras
 from obbgs_core.sensor import Sensor
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Wang et al. 2004
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 
 
+SOLID_ALPHA = 0.9  # where a depth has a normal
 ON_TARGET_ALPHA = 0.05  # where the model shows at least this much, the fit is judged
 
 
@@ -150,6 +152,28 @@ def fit_figures(
 def charbonnier(normalised_residual: Tensor, knee: float = 2.0) -> Tensor:
     """Return the mean robust penalty: half the square below `knee` sigma, linear beyond."""
     return (knee * knee * ((1 + (normalised_residual / knee) ** 2).sqrt() - 1)).mean()
+
+
+def normal_disagreement(depth: Tensor, alpha: Tensor, normals: Tensor, cameras: Cameras) -> Tensor:
+    """Return the mean of 1 - cos(rendered normal, normal of the rendered depths), where 3x3 pixels are solid.
+
+    Args:
+        depth, alpha: [C, H, W], m; normals: composited [C, H, W, 3], body frame; as `render` returns them.
+
+    Source: Huang et al., 2D Gaussian Splatting, 2024, equation 14.
+    """
+    height, width = depth.shape[1:]
+    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    pixels = torch.stack([u, v, torch.ones_like(u)], dim=-1)
+    rays = torch.einsum("hwj,cij->chwi", pixels, torch.linalg.inv(cameras.K))
+    points = rays * depth[..., None]
+    across = points[:, 1:-1, 2:] - points[:, 1:-1, :-2]
+    down = points[:, 2:, 1:-1] - points[:, :-2, 1:-1]
+    of_depth = F.normalize(torch.linalg.cross(down, across), dim=-1, eps=1e-9)
+    of_depth = torch.einsum("chwi,cij->chwj", of_depth, cameras.world_to_camera[:, :3, :3])
+    rendered = F.normalize(normals[:, 1:-1, 1:-1], dim=-1, eps=1e-6)
+    solid = F.avg_pool2d((alpha.detach() > SOLID_ALPHA).float()[:, None], 3, 1)[:, 0] > 0.99
+    return (solid * (1 - (of_depth * rendered).sum(dim=-1))).mean()
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:

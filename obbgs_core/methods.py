@@ -56,6 +56,8 @@ class MethodConfig:
     sky_weight: float = (
         0.0  # on the alpha of pixels that show no light: space is empty where nothing says otherwise
     )
+    normal_weight: float = 0.0  # on the disagreement of rendered normals with those of rendered depths
+    normal_from: float = 0.4  # share of the steps
     solid_weight: float = 0.0  # on opacity·(1 - opacity): solid or gone
     solid_from: float = 0.5  # share of the steps
     weigh_at: tuple[float, ...] = ()  # shares of the steps at which each Gaussian must earn its parameters

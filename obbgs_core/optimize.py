@@ -24,7 +24,7 @@ from obbgs_core.files import write_whole
 from obbgs_core.frames import FEWEST_FRAMES, Batch, Batches, TrainingFrame, sun_span_deg, usable
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.hull import shows_light
-from obbgs_core.losses import fit_figures, likelihood_loss, published_loss
+from obbgs_core.losses import fit_figures, likelihood_loss, normal_disagreement, published_loss
 from obbgs_core.methods import MethodConfig
 from obbgs_core.parsimony import likelihood_gains, next_degree_gain, padded, price
 from obbgs_core.poses import PoseCorrections
@@ -158,11 +158,12 @@ class Trainer:
         config, share = self.config, self.steps_done / self.config.steps
         batch = self.batches.take(_image_scale(config, share))
         cameras = batch.cameras if self.poses is None else self.poses.cameras(batch)
-        rendered = render(self.gaussians, cameras, sunlit=self._sunlit(cameras))
+        with_normals = config.normal_weight > 0 and share >= config.normal_from
+        rendered = render(self.gaussians, cameras, normals=with_normals, sunlit=self._sunlit(cameras))
         loss, residual = _image_loss(rendered, batch, self.sensor, config)
         if not torch.isfinite(loss):
             raise Diverged(self.steps_done, loss.item())
-        (loss + self._priors(batch, share, rendered)).backward()
+        (loss + self._priors(batch, share, rendered, cameras)).backward()
         if config.grow_from <= share < self.grow_until:
             self._observe(rendered, batch, residual)
         self.adam.step(self.gaussians, _rates(config, share, self.radius))
@@ -345,7 +346,7 @@ class Trainer:
     def _held_out(self, share: float) -> list[Batch]:
         return [self.batches.batch(b, _image_scale(self.config, share)) for b in self.batches.held_out]
 
-    def _priors(self, batch: Batch, share: float, rendered: Rendered) -> Tensor:
+    def _priors(self, batch: Batch, share: float, rendered: Rendered, cameras: Cameras) -> Tensor:
         """Return what is asked of the Gaussians besides the images: thin ones, solid or absent ones, likely poses."""
         config, total = self.config, torch.zeros(())
         if config.sh_weight and self.gaussians.sh.shape[1] > 1 and self.gaussians.shading == "view":
@@ -354,6 +355,9 @@ class Trainer:
             total = total + config.sky_weight * (rendered.alpha * batch.sky).mean()
         if config.flat_weight:
             total = total + config.flat_weight * self.gaussians.scales.amin(dim=1).mean() / self.radius
+        if rendered.normals is not None:
+            images = (rendered.depth, rendered.alpha, rendered.normals)
+            total = total + config.normal_weight * normal_disagreement(*images, cameras)
         if config.solid_weight and share >= config.solid_from:
             opacities = self.gaussians.opacities
             total = total + config.solid_weight * (opacities * (1 - opacities)).mean()

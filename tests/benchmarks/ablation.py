@@ -24,6 +24,7 @@ OURS: dict[str, dict] = {
     "- falling rates": {"lr_end": 1.0},
     "- growth": {"grow_until": 0.0},
     "+ solid opacities": {"solid_weight": 0.3},
+    "+ normals of depth": {"normal_weight": 0.1},
     "+ outlier filter": {"outlier_filter": True},
     "+ degree 1 from the start": {"sh_degree": 1},
     "+ pose refinement": {"refine_poses": "always"},

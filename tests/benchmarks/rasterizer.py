@@ -1,9 +1,9 @@
 """Milliseconds of the rasterizer by Gaussians, pixels, backend and threads: python -m tests.benchmarks.rasterizer
 
-Times are medians over repeats of `render` and of the whole gradient to the model; `fastest_ms` is the fastest repeat of
-both together, which other work on the machine disturbs least. `reference_ms` is the plain PyTorch backend on the same
-Gaussians, measured on a window of the image and scaled by the pixels: its cost is the same for each. `bytes` is the
-kernels' own memory.
+Times are medians over repeats of `render` and of the whole gradient to the model; `mean_ms` and `fastest_ms` are of
+both together, the latter disturbed least by other work on the machine. One and two threads take turns. `reference_ms`
+is the plain PyTorch backend on the same Gaussians, measured on a window of the image and scaled by the pixels: its cost
+is the same for each. `bytes` is the kernels' own memory.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from obbgs_core.cameras import Cameras
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.render import native_kernels, render
 
-REPEATS = 9
+REPEATS = 25
 REFERENCE_PAIRS = (
     8_000_000  # Gaussians times pixels that the reference is measured on: seconds and about a gigabyte
 )
@@ -66,33 +66,41 @@ def measure_reference(count: int, width: int) -> float:
     return (forward_ms + backward_ms) * width**2 / window**2
 
 
-def measure(backend: str, count: int, width: int, threads: int, distance: float = DISTANCE) -> dict:
-    """Return one row: medians, the fastest repeat, memory and the share of pixels that the object covers."""
-    torch.set_num_threads(threads)
-    gaussians, cameras, times = scene(count), camera(width, distance), []
+def measure(
+    backend: str, count: int, width: int, threads: tuple[int, ...] = (1,), distance: float = DISTANCE
+) -> list[dict]:
+    """Return a row for each number of threads, measured in turns, so that other work on the machine slows all alike."""
+    gaussians, cameras, rows = scene(count), camera(width, distance), []
+    times: dict[int, list[tuple[float, float]]] = {number: [] for number in threads}
     for repeat in range(REPEATS + 2):
-        out, forward_ms, backward_ms = once(gaussians, cameras, backend)
-        if repeat > 1:
-            times.append((forward_ms, backward_ms))
-    return {
-        "backend": backend,
-        "gaussians": count,
-        "width": width,
-        "forward_ms": round(statistics.median(f for f, _ in times), 2),
-        "backward_ms": round(statistics.median(b for _, b in times), 2),
-        "threads": threads,
-        "fastest_ms": round(min(f + b for f, b in times), 2),
-        "bytes": out.radiance.grad_fn.rasterization.bytes,  # pyright: ignore
-        "covered": round(float((out.alpha > 0).float().mean()), 3),
-    }
+        for number in threads:
+            torch.set_num_threads(number)
+            out, forward_ms, backward_ms = once(gaussians, cameras, backend)
+            if repeat > 1:
+                times[number].append((forward_ms, backward_ms))
+    for number, both in times.items():
+        row = {
+            "backend": backend,
+            "gaussians": count,
+            "width": width,
+            "forward_ms": round(statistics.median(f for f, _ in both), 2),
+            "backward_ms": round(statistics.median(b for _, b in both), 2),
+            "threads": number,
+            "mean_ms": round(statistics.mean(f + b for f, b in both), 2),
+            "fastest_ms": round(min(f + b for f, b in both), 2),
+            "bytes": out.radiance.grad_fn.rasterization.bytes,  # pyright: ignore
+            "covered": round(float((out.alpha > 0).float().mean()), 3),
+        }
+        rows.append(row)
+    return rows
 
 
 def chart(path: str) -> None:
     """Write an HTML page: cost against pixels and against Gaussians, one thread, best kernel."""
     from plotly.subplots import make_subplots
 
-    by_width = [measure("native", 20_000, width, 1) for width in (100, 200, 400, 800, 1600)]
-    by_count = [measure("native", count, 400, 1) for count in (2000, 5000, 20_000, 50_000, 100_000, 200_000)]
+    by_width = [measure("native", 20_000, width)[0] for width in (100, 200, 400, 800, 1600)]
+    by_count = [measure("native", count, 400)[0] for count in (2000, 5000, 20_000, 50_000, 100_000, 200_000)]
     titles = ("20,000 Gaussians", "400 x 400 pixels")
     figure = make_subplots(cols=2, subplot_titles=titles, shared_yaxes=True)
     sides = [
@@ -140,11 +148,11 @@ def main() -> None:
     kernels = [f"native-{kernel}" for kernel in native_kernels()]
     for count, width in sizes:
         reference_ms = round(measure_reference(count, width))
-        rows = [measure(kernel, count, width, 1) for kernel in kernels]
+        rows = [row for kernel in kernels for row in measure(kernel, count, width)]
         if not arguments.quick:
-            rows.append(measure("native", count, width, 2))
+            rows += measure("native", count, width, (1, 2))
         if (count, width) == (20_000, 800):  # the object covers a tenth of the pixels
-            rows.append(measure("native", count, width, 1, distance=2.7 * DISTANCE))
+            rows += measure("native", count, width, distance=2.7 * DISTANCE)
         for row in rows:
             row["reference_ms"] = reference_ms
             line = json.dumps(row) if arguments.json else "  ".join(f"{k} {v}" for k, v in row.items())
