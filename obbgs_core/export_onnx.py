@@ -192,7 +192,7 @@ def _camera_view(g: _Graph, width: int, height: int) -> _View:
 
 
 def _sun_view(g: _Graph, gaussians: Gaussians) -> _View:
-    """The camera at the Sun, as `shading.sun_cameras` places it."""
+    """The camera at the Sun, as `shading.sun_camera` places it."""
     centre, radius = solid_ball(gaussians)
     forward = g.op("Neg", "sun_dir")
     upright = g.op("Less", g.op("Abs", g.op("Gather", forward, g.ints(0), axis=0)), 0.9)

@@ -73,7 +73,7 @@ class MethodConfig:
     sun_shading: str = (
         "lambert"  # lambert (albedo, normal, cast shadows) | linear (harmonics towards the Sun)
     )
-    shadow_interval: int = 60  # steps after which they are cast anew
+    shadow_interval: int = 120  # steps after which they are cast anew
     chi2_end: float = 0.0  # > 0: stop when the mean squared normalised residual falls to this
 
     def __post_init__(self):

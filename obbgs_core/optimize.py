@@ -28,9 +28,9 @@ from obbgs_core.losses import fit_figures, likelihood_loss, normal_disagreement,
 from obbgs_core.methods import MethodConfig
 from obbgs_core.parsimony import likelihood_gains, next_degree_gain, padded, price
 from obbgs_core.poses import PoseCorrections
-from obbgs_core.render import Rendered, render, sunlit_shares
+from obbgs_core.render import Rendered, render, shadow_map
 from obbgs_core.sensor import Sensor
-from obbgs_core.shading import lambertian
+from obbgs_core.shading import ShadowMap, lambertian, lit_shares
 from obbgs_core.start import first_gaussians, silhouettes
 
 log = logging.getLogger(__name__)
@@ -143,7 +143,7 @@ class Trainer:
         if config.grow_patience or not self.poses_decided:
             self.batches.hold_out(brackets)
         self.boxes: list[obb.Obb] = []
-        self.shadows: dict[tuple[float, ...], Tensor] = {}  # share of each Sun that reaches each Gaussian
+        self.shadow_maps: dict[tuple[float, ...], ShadowMap] = {}  # by the Sun's direction
         self.chi2, self.psnr_db, self.steps_done = math.nan, math.nan, 0
         self.history: list[StepInfo] = []
         self.seconds = time.monotonic() - began
@@ -243,7 +243,9 @@ class Trainer:
             "why_appearance": self.why_appearance,
             "adam": {"first": self.adam.first, "second": self.adam.second, "steps": self.adam.steps},
             "growth": (self.growth.gradient, self.growth.weight),
-            "shadows": [(torch.tensor(sun), shares) for sun, shares in self.shadows.items()],
+            "shadow_maps": [
+                (sun, m.sun.world_to_camera, m.sun.K, m.surface_m) for sun, m in self.shadow_maps.items()
+            ],
             "boxes": [(box.centre, box.axes, box.half_extents) for box in self.boxes],
             "batches": self.batches.state(),
             "rng": self.rng.get_state(),
@@ -272,7 +274,8 @@ class Trainer:
         self.growth = Growth(len(self.gaussians), self.config.pixel_weighted)
         self.growth.gradient, self.growth.weight = state["growth"]
         self.boxes = [obb.Obb(*box) for box in state["boxes"]]
-        self.shadows = {tuple(sun.tolist()): shares for sun, shares in state["shadows"]}
+        for sun, pose, K, surface_m in state["shadow_maps"]:
+            self.shadow_maps[sun] = ShadowMap(Cameras(pose, K, *reversed(surface_m.shape)), surface_m)
         self.batches.restore(state["batches"])
         self.rng.set_state(state["rng"])
         self.poses = PoseCorrections(self.frames) if state["poses"] is not None else None
@@ -368,18 +371,17 @@ class Trainer:
     def _sunlit(self, cameras: Cameras) -> Tensor | None:
         """Return the share of each camera's Sun that reaches each Gaussian [C, N]; none where that does not count.
 
-        Shadows move slowly: they are cast anew only every so many steps, and when the number of Gaussians changes.
+        What the Sun sees moves slowly: it is looked up in pictures that are taken only every so many steps.
         """
         if self.gaussians.shading != "lambert":
             return None
-        stale = self.steps_done % self.config.shadow_interval == 0
-        if stale or any(len(shares) != len(self.gaussians) for shares in self.shadows.values()):
-            self.shadows = {}
-        suns = cameras.known_suns()
-        for sun in suns:
-            if tuple(sun.tolist()) not in self.shadows:
-                self.shadows[tuple(sun.tolist())] = sunlit_shares(self.gaussians, sun[None])[0]
-        return torch.stack([self.shadows[tuple(sun.tolist())] for sun in suns])
+        if self.steps_done % self.config.shadow_interval == 0:
+            self.shadow_maps = {}
+        suns = {tuple(sun_dir.tolist()): sun_dir for sun_dir in cameras.known_suns()}
+        for key in suns.keys() - self.shadow_maps.keys():
+            self.shadow_maps[key] = shadow_map(self.gaussians, suns[key])
+        maps = [self.shadow_maps[tuple(sun_dir.tolist())] for sun_dir in cameras.known_suns()]
+        return lit_shares(self.gaussians, maps)
 
     def _observe(self, rendered: Rendered, batch: Batch, residual: Tensor) -> None:
         """Record the screen gradients, and the boxes behind each frame's worst tile."""

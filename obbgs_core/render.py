@@ -13,7 +13,15 @@ from obbgs_core import compiled
 from obbgs_core.cameras import Cameras
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.rotations import quats_to_matrices
-from obbgs_core.shading import bare, lit_shares, normals_towards, radiance_along, sun_cameras, without_sun
+from obbgs_core.shading import (
+    ShadowMap,
+    bare,
+    lit_shares,
+    normals_towards,
+    radiance_along,
+    sun_camera,
+    without_sun,
+)
 
 log = logging.getLogger(__name__)
 
@@ -136,18 +144,19 @@ def render(
 
 
 @torch.no_grad()
-def sunlit_shares(gaussians: Gaussians, sun_dir: Tensor, backend: str = "auto") -> Tensor:
-    """Return the share of the Sun that reaches each Gaussian [S, N] from directions [S, 3]: one picture from each.
+def shadow_map(gaussians: Gaussians, sun_dir: Tensor, backend: str = "auto") -> ShadowMap:
+    """Return what the Sun sees from `sun_dir` [3].
 
-    Source: Williams, Casting Curved Shadows on Curved Surfaces, 1978; its edges softened as in Reeves et al. 1987.
+    Source: Williams, Casting Curved Shadows on Curved Surfaces, 1978; edges softened as by Reeves et al. 1987.
     """
+    sun = sun_camera(gaussians, sun_dir)
+    return ShadowMap(sun, render(bare(gaussians), sun, backend).median_depth[0])
+
+
+def sunlit_shares(gaussians: Gaussians, sun_dir: Tensor, backend: str = "auto") -> Tensor:
+    """Return the share of the Sun that reaches each Gaussian [S, N] from directions [S, 3]."""
     directions, which = sun_dir.unique(dim=0, return_inverse=True)
-    suns, shape = sun_cameras(gaussians, directions), bare(gaussians)
-    shares = []
-    for s in range(len(directions)):
-        seen = render(shape, suns.one(s), backend)
-        shares.append(lit_shares(gaussians, suns.one(s), seen.means2d, seen.median_depth))
-    return torch.cat(shares)[which]
+    return lit_shares(gaussians, [shadow_map(gaussians, each, backend) for each in directions])[which]
 
 
 def lit_from(gaussians: Gaussians, sun_dir: Tensor | None) -> Gaussians:

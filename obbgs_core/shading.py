@@ -1,6 +1,9 @@
 """How Gaussians shine: harmonics of the view or of the Sun, or Lambert's law with a normal and cast shadows."""
 
 import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -15,7 +18,7 @@ HALF_LIT = 2.0  # albedo of a Gaussian, over its mean radiance as the Sun goes r
 FIRST_AMBIENT = 0.02
 SHADOW_MAP_PX = 256  # along a side of the picture that the Sun takes
 SUN_DISTANCE = 1000.0  # in radii of the model: its rays are parallel to 0.06 degrees
-SOLID_SHARE = 0.99  # of the centres: what strays farther out casts no shadow
+SOLID_SHARE = 0.99  # of the centres: what strays farther out neither casts nor catches a shadow
 SHADOW_BIAS = (
     3.0  # pixels of that picture, and deviations of the Gaussian towards the Sun: it does not shade itself
 )
@@ -112,47 +115,53 @@ def solid_ball(gaussians: Gaussians) -> tuple[Tensor, float]:
     means = means[means.isfinite().all(dim=1)]
     if len(means) == 0:
         return means.new_zeros(3), 1.0
-    centre = (means.quantile(1 - SOLID_SHARE, dim=0) + means.quantile(SOLID_SHARE, dim=0)) / 2
-    return centre, max(1e-6, 1.1 * float((means - centre).norm(dim=1).quantile(SOLID_SHARE)))
+    centre = means.mean(dim=0)
+    distances = (means - centre).norm(dim=1)
+    return centre, max(1e-6, 1.1 * float(distances.kthvalue(math.ceil(SOLID_SHARE * len(means))).values))
 
 
-def sun_cameras(gaussians: Gaussians, sun_dir: Tensor) -> Cameras:
-    """Return cameras that see the whole model from where the Sun is, one for each of its directions [S, 3]."""
+def sun_camera(gaussians: Gaussians, sun_dir: Tensor) -> Cameras:
+    """Return a camera that sees the whole model from where the Sun is, `sun_dir` [3]."""
     centre, radius = solid_ball(gaussians)
     distance_m, half_px = SUN_DISTANCE * radius, SHADOW_MAP_PX / 2
-    forward = -F.normalize(sun_dir.detach().to(centre), dim=1)
-    aside = torch.where(
-        forward[:, :1].abs() < 0.9, centre.new_tensor([1.0, 0, 0]), centre.new_tensor([0, 1.0, 0])
-    )
-    right = F.normalize(torch.linalg.cross(aside, forward), dim=1)
-    R = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
-    pose = torch.eye(4).to(centre).repeat(len(R), 1, 1)
-    pose[:, :3, :3] = R
-    pose[:, :3, 3] = -(R @ (centre - distance_m * forward)[..., None])[..., 0]
+    forward = -F.normalize(sun_dir.detach().to(centre), dim=0)
+    aside = centre.new_tensor([1.0, 0.0, 0.0] if abs(float(forward[0])) < 0.9 else [0.0, 1.0, 0.0])
+    right = F.normalize(torch.linalg.cross(aside, forward), dim=0)
+    pose = torch.eye(4).to(centre)
+    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ (centre - distance_m * forward)
     focal_px = half_px * SUN_DISTANCE
     K = centre.new_tensor([[focal_px, 0, half_px], [0, focal_px, half_px], [0, 0, 1]])
-    return Cameras(pose, K.expand(len(R), 3, 3), SHADOW_MAP_PX, SHADOW_MAP_PX)
+    return Cameras(pose[None], K[None], SHADOW_MAP_PX, SHADOW_MAP_PX)
 
 
-def lit_shares(gaussians: Gaussians, suns: Cameras, means2d: Tensor, surface_m: Tensor) -> Tensor:
-    """Return the share of the Sun that reaches each Gaussian [S, N]: of nine pixels around it, where it lies first.
+@dataclass(frozen=True)
+class ShadowMap:
+    """What the Sun sees: a camera in its place, and the surface's depths there [H, W] m, 0 where there is none."""
 
-    Args:
-        suns: of `sun_cameras`; means2d [S, N, 2] px and the surface's depths [S, H, W] m (0: none) in their pictures.
-    """
-    R, t = suns.world_to_camera[:, :3, :3], suns.world_to_camera[:, :3, 3]
-    depth_m = (gaussians.means.detach() @ R[:, 2, :, None])[..., 0] + t[:, 2:]  # [S, N]
-    axes = torch.einsum("si,nij->snj", R[:, 2], quats_to_matrices(gaussians.quats.detach()))
-    deviation_m = (axes * gaussians.scales.detach()).norm(dim=2)
-    pixel_m = t[:, 2:] / suns.K[:, 0, :1]
-    before_m = depth_m - SHADOW_BIAS * (deviation_m + pixel_m)
-    first_m = F.pad(torch.where(surface_m > 0, surface_m, torch.inf), (2, 2, 2, 2), value=torch.inf)
-    columns, rows = first_m.shape[2], first_m.shape[1]
-    u, v = (means2d.nan_to_num(-1e6).floor() + 2).unbind(dim=2)
-    u, v = u.clamp(1, columns - 2).long(), v.clamp(1, rows - 2).long()  # outside the picture all is lit
-    around = [
-        first_m.flatten(1).gather(1, (v + dv) * columns + u + du) >= before_m
-        for dv in (-1, 0, 1)
-        for du in (-1, 0, 1)
-    ]
-    return torch.stack(around).float().mean(dim=0)
+    sun: Cameras
+    surface_m: Tensor
+
+
+def lit_shares(gaussians: Gaussians, maps: Sequence[ShadowMap]) -> Tensor:
+    """Return the share of each Sun that reaches each Gaussian [S, N]: of nine pixels around it, where it lies first."""
+    gaussians = gaussians.detach()
+    axes_m = quats_to_matrices(gaussians.quats) * gaussians.scales[:, None]  # [N, 3, 3]
+    shares = []
+    for each in maps:
+        R, t = each.sun.world_to_camera[0, :3, :3], each.sun.world_to_camera[0, :3, 3]
+        focal_px, middle_px = each.sun.K[0, 0, 0], each.sun.K[0, 0, 2]
+        x, y, depth_m = (gaussians.means @ R.T + t).unbind(dim=1)
+        deviation_m = (R[2] @ axes_m).norm(dim=1)
+        before_m = depth_m - SHADOW_BIAS * (deviation_m + t[2] / focal_px)
+        first_m = torch.where(each.surface_m > 0, each.surface_m, torch.inf)
+        first_m = F.pad(first_m[None], (2, 2, 2, 2), value=torch.inf)[0]  # outside the picture all is lit
+        side = len(first_m)
+        column, row = (
+            ((focal_px * along / depth_m + middle_px).nan_to_num(-1e6).floor() + 2).clamp(1, side - 2).long()
+            for along in (x, y)
+        )
+        around = torch.tensor([dv * side + du for dv in (-1, 0, 1) for du in (-1, 0, 1)], device=row.device)
+        near_m = first_m.flatten()[(row * side + column)[:, None] + around]
+        shares.append((near_m >= before_m[:, None]).float().mean(dim=1))
+    return torch.stack(shares)

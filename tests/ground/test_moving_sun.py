@@ -252,7 +252,7 @@ def test_a_killed_training_under_the_sun_resumes_to_the_same_bits(moving, under_
     first = Trainer(moving, SENSOR, preset("obbgs", **QUICK), seed=1)
     for _ in range(30):  # the Sun joined at step 12
         first.step()
-    assert first.gaussians.shading == "lambert" and len(first.shadows) > 10
+    assert first.gaussians.shading == "lambert" and len(first.shadow_maps) > 10
     first.save(tmp_path / "checkpoint")
     resumed = train(moving, SENSOR, preset("obbgs", **QUICK), 1, checkpoint=tmp_path / "checkpoint")
     assert resumed.appearance == under_the_sun.appearance and len(resumed.history) == 240
