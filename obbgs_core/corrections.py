@@ -66,7 +66,7 @@ class ExposureCorrections(Corrections):
         super().step(rate)
         seen = self.visits > 0
         if seen.any():
-            self.value -= torch.where(seen, self.value[seen].mean(), 0.0)
+            self.value.sub_(torch.where(seen, self.value[seen].mean(), 0.0))
 
     @property
     def rms(self) -> float:
