@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from obbgs_core.cameras import Cameras, stacked_suns
+from obbgs_core.corrections import ExposureCorrections
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.methods import MethodConfig
 
@@ -40,7 +41,7 @@ class Batch:
     indices: list[int]  # into the training frames
     cameras: Cameras
     dn: Tensor  # [B, H, W, C]
-    exposure_time_s: Tensor  # [B, 1, 1, 1]
+    exposure_time_s: Tensor  # [B, 1, 1, 1], with what is known of its error
     averaged_pixels: int  # sensor pixels in one pixel of dn
     sky: Tensor | None = None  # [B, H, W] share of each pixel that is seen to be empty, where anyone looked
 
@@ -100,6 +101,7 @@ class Batches:
     """Draws frames without replacement, one of each exposure in turn when the method asks for brackets.
 
     sky: where some of the frames, by index, surely show nothing [H, W] bool.
+    exposures: what the tags' exposure times are corrected by, where the method allows them an error.
     """
 
     def __init__(
@@ -113,6 +115,8 @@ class Batches:
         self.frames_per_step = min(config.frames_per_step, len(frames))
         self.by_exposure = config.bracket_steps
         self.turn = 0
+        doubted = config.exposure_aware and config.exposure_sigma > 0
+        self.exposures = ExposureCorrections(len(frames), config.exposure_sigma) if doubted else None
         self.hold_out([])
         self.sky = sky or {}
         self.levels: dict[int, list[Tensor]] = {}
@@ -130,11 +134,15 @@ class Batches:
         self.waiting: list[list[int]] = [[] for _ in self.groups]
 
     def state(self) -> dict:
-        return {"held_out": self.held_out, "waiting": [list(w) for w in self.waiting], "turn": self.turn}
+        exposures = self.exposures.state() if self.exposures is not None else None
+        waiting = [list(w) for w in self.waiting]
+        return {"held_out": self.held_out, "waiting": waiting, "turn": self.turn, "exposures": exposures}
 
     def restore(self, state: dict) -> None:
         self.hold_out(state["held_out"])
         self.waiting, self.turn = [list(w) for w in state["waiting"]], state["turn"]
+        if self.exposures is not None:
+            self.exposures.restore(state["exposures"])
 
     def take(self, scale: float) -> Batch:
         """Return the next frames, averaged to `scale` (1/whole number) of their size."""
@@ -157,11 +165,14 @@ class Batches:
             self.sky_levels[factor] = self._sky_shares(factor)
         frames = [self.frames[i] for i in indices]
         cameras = cameras_of(frames)
+        exposure_time_s = torch.tensor([f.exposure_time_s for f in frames]).view(-1, 1, 1, 1)
+        if self.exposures is not None:
+            exposure_time_s = exposure_time_s * self.exposures.factors(indices)
         return Batch(
             indices,
             cameras.scaled(1 / factor) if factor > 1 else cameras,
             torch.stack([self.levels[factor][i] for i in indices]),
-            torch.tensor([f.exposure_time_s for f in frames]).view(-1, 1, 1, 1),
+            exposure_time_s,
             factor * factor,
             torch.stack([self.sky_levels[factor][i] for i in indices]) if self.sky else None,
         )

@@ -68,14 +68,17 @@ def _settled(
     model: Gaussians, poses: PoseCorrections, batch: Batch, sensor: Sensor, rate: float, steps: int
 ) -> tuple[float, float, int]:
     """Settle a bracket's correction on the model; return the loss, the chi² and the values on the target there."""
-    images = (batch.exposure_time_s, batch.dn, sensor, batch.averaged_pixels)
+    # no step has seen a held-out frame, so its exposure time is the tag's; none of these steps may correct it
+    images = (batch.exposure_time_s.detach(), batch.dn, sensor, batch.averaged_pixels)
     for k in range(steps):
         loss, _ = likelihood_loss(render(model, poses.cameras(batch)).radiance, *images)
-        (loss + poses.prior(batch)).backward()
+        (loss + poses.prior(batch.indices, batch.dn.numel())).backward()
         poses.step(rate * (1 - k / steps))
     with torch.no_grad():
         rendered = render(model, poses.cameras(batch))
-        loss = likelihood_loss(rendered.radiance, *images)[0] + (poses.prior(batch) if steps else 0)
+        loss = likelihood_loss(rendered.radiance, *images)[0]
+        if steps:
+            loss = loss + poses.prior(batch.indices, batch.dn.numel())
     chi2, _ = fit_figures(rendered.radiance, rendered.alpha, *images)
     on_target = int((rendered.alpha > ON_TARGET_ALPHA).sum()) * batch.averaged_pixels * batch.dn.shape[-1]
     return loss.item(), chi2, max(2, on_target)

@@ -37,7 +37,7 @@ def likelihood_loss(
 
     Args:
         radiance: predicted [B, H, W, C]; the loss has a gradient by it.
-        exposure_time_s: [B, 1, 1, 1].
+        exposure_time_s: [B, 1, 1, 1]; the loss has a gradient by it.
         dn: read [B, H, W, C].
         averaged_pixels: sensor pixels averaged into each pixel of dn; the noise is smaller by its root.
 
@@ -235,7 +235,7 @@ def _sensor_model(native, sensor: Sensor, averaged_pixels: int = 1):
 
 def _gains(sensor: Sensor, exposure_time_s: Tensor) -> Tensor:
     """Return the DN per radiance of each frame [B]."""
-    return (sensor.dn_per_radiance_s * exposure_time_s).flatten()
+    return (sensor.dn_per_radiance_s * exposure_time_s.detach()).flatten()
 
 
 def _swept(
@@ -244,23 +244,29 @@ def _swept(
     """Return a compiled loss, with its gradient when one is wanted, and its residual."""
     values = radiance.detach().contiguous()
     residual = torch.empty_like(values)
-    gradient = torch.empty_like(values) if radiance.requires_grad else None
+    wanted = radiance.requires_grad or exposure_time_s.requires_grad
+    gradient = torch.empty_like(values) if wanted else None
     gains, threads = _gains(sensor, exposure_time_s), torch.get_num_threads()
     loss = sweep(values, dn.contiguous(), gains, model, *weights, residual, gradient, threads)
     if gradient is None:
         return radiance.new_tensor(loss), residual
-    return _KnownGradient.apply(radiance, loss, gradient), residual
+    return _KnownGradient.apply(radiance, exposure_time_s, loss, gradient), residual
 
 
 class _KnownGradient(torch.autograd.Function):
-    """A scalar that was computed together with its gradient by `images`."""
+    """A scalar of radiance times exposure time that was computed together with its gradient by the radiance."""
 
     @staticmethod
-    def forward(ctx, images: Tensor, value: float, gradient: Tensor) -> Tensor:
-        ctx.save_for_backward(gradient)
-        return images.new_tensor(value)
+    def forward(ctx, radiance: Tensor, exposure_time_s: Tensor, value: float, gradient: Tensor) -> Tensor:
+        ctx.save_for_backward(radiance, exposure_time_s, gradient)
+        return radiance.new_tensor(value)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, upstream: Tensor):
-        return ctx.saved_tensors[0] * upstream, None, None
+        radiance, exposure_time_s, gradient = ctx.saved_tensors
+        by_exposure = None
+        if ctx.needs_input_grad[1]:
+            light = (gradient * radiance).sum(dim=(1, 2, 3), keepdim=True)
+            by_exposure = light / exposure_time_s * upstream
+        return gradient * upstream, by_exposure, None, None

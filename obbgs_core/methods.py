@@ -1,6 +1,7 @@
 """The methods as data: what each published method, and ours, does differently. No subclasses."""
 
 import dataclasses
+import math
 from dataclasses import dataclass, replace
 
 
@@ -51,6 +52,7 @@ class MethodConfig:
     lr_poses: float = 0.3  # in deviations of the pose tag
     refine_poses: str = "never"  # never | always | auto (if held-out brackets say so): six numbers a bracket
     poses_from: float = 0.25  # share of the steps: before, the model is too coarse to correct anything
+    exposure_sigma: float = 0.0  # of ln(exposure time): > 0 corrects each frame's, unless exposure is ignored
     sh_weight: float = 0.0  # on the mean square of what turns with the view: a prior for matt surface
     flat_weight: float = 0.0  # on the mean shortest scale: flat Gaussians are surface
     sky_weight: float = (
@@ -85,6 +87,8 @@ class MethodConfig:
             raise ValueError(f"sun_shading must be lambert or linear, got {self.sun_shading!r}")
         if self.refine_poses not in ("never", "always", "auto"):
             raise ValueError(f"refine_poses must be never, always or auto, got {self.refine_poses!r}")
+        if not 0 <= self.exposure_sigma < math.inf:
+            raise ValueError(f"exposure_sigma must be 0 (exact) or a deviation, got {self.exposure_sigma}")
         for name in ("steps", "frames_per_step", "start_count", "max_gaussians"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")

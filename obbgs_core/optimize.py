@@ -65,6 +65,7 @@ class TrainResult:
     appearance: str = ""  # what the radiance turns with, and why
     growth: str = ""  # when growth ended, and why
     poses: str = ""  # whether the poses were refined, and why
+    exposures: str = ""  # by how much the exposure times were corrected
     seconds: float = 0.0
 
 
@@ -170,6 +171,8 @@ class Trainer:
         self.gaussians.ambient.detach().clamp_(min=0)
         if self.poses is not None:
             self.poses.step(config.lr_poses * (1 - share) if share >= config.poses_from else 0.0)
+        if self.batches.exposures is not None:
+            self.batches.exposures.step(config.lr_poses * (1 - share) if share >= config.poses_from else 0.0)
         self._ask_held_out(share)
         self._change_number(share, batch)
         self._look(rendered, batch)
@@ -224,6 +227,7 @@ class Trainer:
             self.appearance,
             f"until step {min(self.steps_done, round(self.grow_until * self.config.steps))} ({self.growth_ended})",
             self.poses_decided or "as tagged (training ended before this was decided)",
+            self.exposures,
             self.seconds,
         )
 
@@ -234,6 +238,14 @@ class Trainer:
         if self.gaussians.shading == "lambert":
             what = f"follows Lambert's law with cast shadows, ambient {self.gaussians.ambient.item():.3f} of the Sun"
         return f"{what} ({self.why_appearance})" if self.why_appearance else what
+
+    @property
+    def exposures(self) -> str:
+        """By how much the exposure times were corrected."""
+        found = self.batches.exposures
+        if found is None:
+            return "as tagged"
+        return f"corrected by {found.rms:.2%} rms, where tags may err by {found.sigma:.2%}"
 
     def save(self, path: Path) -> None:
         """Write everything the next step depends on, whole or not at all."""
@@ -364,8 +376,9 @@ class Trainer:
         if config.solid_weight and share >= config.solid_from:
             opacities = self.gaussians.opacities
             total = total + config.solid_weight * (opacities * (1 - opacities)).mean()
-        if self.poses is not None:
-            total = total + self.poses.prior(batch)
+        for corrections in (self.poses, self.batches.exposures):
+            if corrections is not None:
+                total = total + corrections.prior(batch.indices, batch.dn.numel())
         return total
 
     def _sunlit(self, cameras: Cameras) -> Tensor | None:

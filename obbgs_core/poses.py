@@ -6,60 +6,34 @@ import torch
 from torch import Tensor
 
 from obbgs_core.cameras import Cameras
+from obbgs_core.corrections import Corrections
 from obbgs_core.frames import Batch, TrainingFrame, bracket_numbers
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.rotations import from_rotation_vectors, multiply
 
 
-class PoseCorrections:
+class PoseCorrections(Corrections):
     """Corrections [P, 6] in units of the tag's deviations: rotation about, then shift along, the camera's axes.
 
     Frames of one bracket share their correction: the error of a navigation solution hardly changes within it.
     """
 
-    def __init__(self, frames: list[TrainingFrame], memory: float = 0.99):
-        self.of_frame = bracket_numbers(frames)
-        count = max(self.of_frame) + 1
-        self.sigma = torch.zeros(count, 6)
+    def __init__(self, frames: list[TrainingFrame]):
+        super().__init__(bracket_numbers(frames), 6)
+        self.sigma = torch.zeros_like(self.value)
         for frame, number in zip(frames, self.of_frame, strict=True):
             if frame.pose_sigma is not None:
                 self.sigma[number] = frame.pose_sigma
-        self.value = torch.zeros(count, 6, requires_grad=True)
-        self.second, self.visits = torch.zeros(count, 6), torch.zeros(count, 1)
-        self.memory = memory
 
     def corrected(self, indices: list[int], world_to_camera: Tensor) -> Tensor:
         """Return the poses [B, 4, 4] of frames with their corrections in front; gradients reach the corrections."""
         numbers = torch.tensor([self.of_frame[i] for i in indices])
-        return rigid_motions(self.value[numbers] * self.sigma[numbers]) @ world_to_camera
+        return rigid_motions(self.of(indices) * self.sigma[numbers]) @ world_to_camera
 
     def cameras(self, batch: Batch) -> Cameras:
         """Return a step's cameras with their corrections."""
         corrected = self.corrected(batch.indices, batch.cameras.world_to_camera)
         return dataclasses.replace(batch.cameras, world_to_camera=corrected)
-
-    def prior(self, batch: Batch) -> Tensor:
-        """Return the corrections' share of a step's mean loss: half their squares over all the step's values."""
-        numbers = torch.tensor([self.of_frame[i] for i in batch.indices])
-        return 0.5 * self.value[numbers].square().sum() / batch.dn.numel()
-
-    @torch.no_grad()
-    def step(self, rate: float) -> None:
-        """Move what has a gradient against it, over its root mean square; `rate` is in deviations.
-
-        This is Adam without its first moment: a bracket is seen a few dozen times, and momentum overshoots.
-        """
-        gradient = self.value.grad
-        if gradient is None:
-            return
-        seen = gradient.abs().sum(1, keepdim=True) > 0
-        self.visits += seen
-        self.second = torch.where(
-            seen, self.memory * self.second + (1 - self.memory) * gradient**2, self.second
-        )
-        second = self.second / (1 - self.memory ** self.visits.clamp(min=1))
-        self.value -= torch.where(seen, rate * gradient / (second.sqrt() + 1e-15), 0.0)
-        self.value.grad = None
 
     @torch.no_grad()
     def settle(self, gaussians: Gaussians, frames: list[TrainingFrame]) -> Gaussians:
@@ -88,14 +62,6 @@ class PoseCorrections:
             means=gaussians.means @ rigid[:3, :3].T + rigid[:3, 3],
             quats=multiply(from_rotation_vectors(motion[:3]).expand(len(gaussians), 4), gaussians.quats),
         )
-
-    def state(self) -> dict:
-        return {name: getattr(self, name).detach().clone() for name in ("value", "second", "visits")}
-
-    def restore(self, state: dict) -> None:
-        for name, tensor in state.items():
-            setattr(self, name, tensor.clone())
-        self.value.requires_grad_()
 
 
 def rigid_motions(xi: Tensor) -> Tensor:

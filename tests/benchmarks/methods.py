@@ -50,7 +50,8 @@ def measure(
         "steps": trainer.steps_done,
     }
     row |= {"seconds": round(result.seconds, 2), "start": result.start, "stop": result.stop_reason}
-    row |= {"appearance": result.appearance, "growth": result.growth, "poses": result.poses}
+    row |= {"appearance": result.appearance, "growth": result.growth}
+    row |= {"poses": result.poses, "exposures": result.exposures}
     row |= targets.image_figures(result.gaussians, target, result.reference_exposure_s)
     row |= targets.cloud_figures(result.gaussians, target, seed)
     row = {key: round(value, 5) if isinstance(value, float) else value for key, value in row.items()}

@@ -38,6 +38,7 @@ LOADS: dict[str, dict] = {
     **{f"{count} frames": {"frames": count} for count in (12, 24, 48)},
 }
 POSE_ERRORS_DEG = (0.05, 0.1, 0.3, 1.0)
+EXPOSURE_ERRORS = (0.01, 0.03, 0.1)  # of ln(exposure time), frame by frame
 LOST_PERCENT = (10, 30, 50, 70)
 
 
@@ -97,6 +98,10 @@ def cases(name: str, size: int, seeds: int):
         wrong = with_pose_error(plain, degrees, 0)
         yield f"pose error {degrees:g} deg", wrong, {"refine_poses": "never"}, 0
         yield f"pose error {degrees:g} deg, refined if it pays", wrong, {"refine_poses": "auto"}, 0
+    for error in EXPOSURE_ERRORS:
+        wrong = targets.load(name, size, exposure_error=error)
+        yield f"exposure error {error:.0%}", wrong, {"exposure_sigma": 0.0}, 0
+        yield f"exposure error {error:.0%}, corrected", wrong, {"exposure_sigma": error}, 0
     rng = np.random.default_rng(0)
     for percent in LOST_PERCENT:
         lost = set(rng.permutation(len(plain.training))[: len(plain.training) * percent // 100].tolist())

@@ -58,6 +58,7 @@ def load(
     bracket_s: tuple[float, ...] = BRACKET_S,
     frames: int = 120,
     seed: int = 0,
+    exposure_error: float = 0.0,
 ) -> Target:
     """Return a target seen by an 8-bit camera of the paper: Gaussian noise of `sigma` (full scale 1), clipped.
 
@@ -65,6 +66,7 @@ def load(
         size: pixels along a side; 400, or 200 and 100 by averaging.
         bracket_s: exposure times; view i takes number i mod len(bracket_s).
         frames: how many of the 120 views, spread evenly.
+        exposure_error: deviation of ln(true / tagged exposure time) of the training frames.
 
     Raises:
         FileNotFoundError: no such target.
@@ -85,15 +87,18 @@ def load(
         K = K * torch.tensor([[1 / factor], [1 / factor], [1.0]])
     sensor = Sensor(0.0, 255.0, 255.0 * gain, 1e9, 255.0 * sigma)
     noise = np.random.default_rng(seed)
+    shutter = np.random.default_rng([seed, 1])  # a stream of its own: the noise stays the same
     training, held_out, clean, covers = [], [], [], []
     for i in np.unique(np.linspace(0, len(radiance) - 1, frames).round().astype(int)).tolist():
         exposure_s = bracket_s[i % len(bracket_s)]
-        exact = (radiance[i] * gain * exposure_s).clamp(0, 1)
+        kept = i % HELD_OUT == HELD_OUT - 1
+        factor = 1.0 if kept else float(np.exp(shutter.normal(0, exposure_error)))
+        exact = (radiance[i] * gain * exposure_s * factor).clamp(0, 1)
         shape = tuple(exact.shape)
         noisy = exact.numpy() + noise.normal(0, sigma, shape)
         dn = torch.from_numpy(np.clip(np.round(noisy * 255), 0, 255).astype(np.float32))
         frame = TrainingFrame(dn, exposure_s, poses[i], K, i)
-        if i % HELD_OUT == HELD_OUT - 1:
+        if kept:
             held_out.append(frame)
             clean.append(exact)
             covers.append(alpha[i])

@@ -140,6 +140,25 @@ def test_the_compiled_likelihood_is_the_readable_one(sensor, channels, averaged_
 
 
 @needs_native
+@pytest.mark.parametrize("channels", [1, 3])
+def test_the_compiled_losses_have_the_readable_ones_gradient_by_exposure_time(channels):
+    sensor = SENSORS["black level"]
+    radiance, exposures_s, dn = bracket(sensor, channels=channels)
+    for ours, truth, settings in (
+        (likelihood_loss, likelihood_loss_reference, (sensor, 4, 0.05)),
+        (published_loss, published_loss_reference, (sensor, 0.2, 0.2)),
+    ):
+        _, gradient = value_and_gradient(lambda t, f=ours, s=settings: f(radiance, t, dn, *s)[0], exposures_s)
+        light, time_s = radiance.double().requires_grad_(), exposures_s.double().requires_grad_()
+        truth(light, time_s, dn.double(), *settings)[0].backward()
+        assert light.grad is not None and time_s.grad is not None
+        # a sum over pixels of either sign: roundings of its terms, not of what is left of them
+        terms = (light.grad * light).detach().abs().sum(dim=(1, 2, 3), keepdim=True) / exposures_s
+        assert ((gradient - time_s.grad).abs() <= 1e-6 * terms).all()
+        assert (time_s.grad.abs() > 1e-3 * terms).all()
+
+
+@needs_native
 def test_the_compiled_likelihood_follows_the_clipped_normal_far_below_zero():
     sensor = SENSORS["clipped at zero"]
     radiance = torch.linspace(-0.5, 0.5, 3 * 1000).view(1, 3, 1000, 1)  # -21 to 9 sigma

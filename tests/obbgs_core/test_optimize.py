@@ -70,7 +70,7 @@ def frames() -> list[TrainingFrame]:
 
 
 def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path):
-    config = preset("obbgs", **QUICK, refine_poses="always", weigh_at=(0.5,))
+    config = preset("obbgs", **QUICK, refine_poses="always", exposure_sigma=0.02, weigh_at=(0.5,))
     tagged = [dataclasses.replace(f, pose_sigma=torch.full((6,), 1e-3)) for f in frames]
     whole = train(tagged, SENSOR, config, seed=3)
     first = Trainer(tagged, SENSOR, config, seed=3)
@@ -86,6 +86,7 @@ def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path):
         lambda info: steps.append(info.step),
         checkpoint=tmp_path / "training.checkpoint",
     )
+    assert resumed.exposures == whole.exposures and whole.exposures.startswith("corrected by ")
     assert steps == list(range(24, 41)) and [i.step for i in resumed.history] == list(range(1, 41))
     for name, tensor in whole.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
@@ -183,6 +184,52 @@ def test_pose_refinement_takes_tilt_out_of_the_poses():
             turn = Rotation.from_matrix((poses[:3, :3] @ t.world_to_camera[:3, :3].T).numpy())
             errors.append(turn.as_rotvec()[:2])  # a roll moves this target's edge by a twentieth of a pixel
     assert np.sqrt(np.mean(np.square(after))) < 0.8 * np.sqrt(np.mean(np.square(before)))
+
+
+def test_exposure_times_that_the_tags_have_wrong_are_found():
+    true, sigma = photographed(target(80, seed=5), 24), 0.1
+    wrong = np.random.default_rng(0).normal(0, sigma, len(true))  # of ln(true / tagged exposure time)
+    frames = [
+        dataclasses.replace(f, exposure_time_s=f.exposure_time_s / math.exp(error))
+        for f, error in zip(true, wrong, strict=True)
+    ]
+    changes = {"steps": 400, "start_count": 1500, "max_gaussians": 2000, "bracket_steps": False}
+    trainer = Trainer(frames, SENSOR, preset("obbgs", **QUICK | changes, exposure_sigma=sigma))
+    while not trainer.stop_reason():
+        trainer.step()
+    assert trainer.batches.exposures is not None
+    found = trainer.batches.exposures.factors(list(range(len(true)))).detach().log().flatten().numpy()
+    assert np.corrcoef(found, wrong)[0, 1] > 0.9
+    assert np.std(found - wrong) < 0.5 * np.std(wrong)
+    assert abs(found.mean()) < 1e-6, "a factor common to all frames belongs to the radiance"
+    rms = np.sqrt(np.mean(found**2))
+    assert trainer.result("").exposures == f"corrected by {rms:.2%} rms, where tags may err by 10.00%"
+
+
+def test_exposure_times_are_exact_unless_doubted_and_a_blind_method_has_none_to_correct(frames):
+    assert train(frames, SENSOR, preset("obbgs", **QUICK | {"steps": 1})).exposures == "as tagged"
+    models = [
+        train(frames, SENSOR, preset("obbgs", **QUICK, exposure_aware=False, exposure_sigma=sigma))
+        for sigma in (0.0, 0.1)
+    ]
+    assert models[1].exposures == "as tagged"
+    for name, tensor in models[0].gaussians.tensors().items():
+        assert torch.equal(tensor, getattr(models[1].gaussians, name)), name
+    with pytest.raises(ValueError, match="exposure_sigma must be 0"):
+        preset("obbgs", exposure_sigma=-0.1)
+
+
+def test_no_exposure_time_is_corrected_by_what_is_held_out():
+    frames = tagged(photographed(target(), 28), True)
+    changes = QUICK | {"refine_poses": "auto", "poses_from": 0.5}
+    trainer = Trainer(frames, SENSOR, preset("obbgs", **changes, exposure_sigma=0.05))
+    held_out = {i for bracket in held_out_brackets(frames) for i in bracket}
+    while not trainer.poses_decided:
+        trainer.step()
+    exposures = trainer.batches.exposures
+    assert exposures is not None and exposures.value.grad is None
+    corrected = set(torch.nonzero(exposures.value.detach()[:, 0]).flatten().tolist())
+    assert corrected and not corrected & held_out
 
 
 def tagged(frames: list[TrainingFrame], wrong: bool) -> list[TrainingFrame]:
