@@ -43,7 +43,11 @@ def model_card(session_created_utc: str, metrics: dict) -> str:
         f"- Residual chi² on the target: {metrics['chi2']:.2f} (1 is pure noise).",
         *appearance(metrics),
     ]
-    for key, text in (("growth", "Growth ran {}."), ("poses", "Poses {}.")):
+    for key, text in (
+        ("growth", "Growth ran {}."),
+        ("poses", "Poses {}."),
+        ("exposures", "Exposure times {}."),
+    ):
         if key in metrics:  # older runs did not note it
             lines.append("- " + text.format(metrics[key]))
     for key, text in (

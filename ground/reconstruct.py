@@ -105,6 +105,7 @@ def reconstruct(
             "appearance": result.appearance,
             "growth": result.growth,
             "poses": result.poses,
+            "exposures": result.exposures,
             "sun_span_deg": round(result.sun_span_deg, 2),
             "shown_under_sun_dir_body": None
             if shown_under is None

@@ -30,7 +30,7 @@ from obbgs_core.parsimony import likelihood_gains, next_degree_gain, padded, pri
 from obbgs_core.poses import PoseCorrections
 from obbgs_core.render import Rendered, render, shadow_map
 from obbgs_core.sensor import Sensor
-from obbgs_core.shading import ShadowMap, lambertian, lit_shares
+from obbgs_core.shading import SHADOW_MAP_PX, ShadowMap, lambertian, lit_shares
 from obbgs_core.start import first_gaussians, silhouettes
 
 log = logging.getLogger(__name__)
@@ -256,7 +256,7 @@ class Trainer:
             "adam": {"first": self.adam.first, "second": self.adam.second, "steps": self.adam.steps},
             "growth": (self.growth.gradient, self.growth.weight),
             "shadow_maps": [
-                (sun, m.sun.world_to_camera, m.sun.K, m.surface_m) for sun, m in self.shadow_maps.items()
+                (sun, m.sun.world_to_camera, m.sun.K, m.first_m) for sun, m in self.shadow_maps.items()
             ],
             "boxes": [(box.centre, box.axes, box.half_extents) for box in self.boxes],
             "batches": self.batches.state(),
@@ -286,8 +286,8 @@ class Trainer:
         self.growth = Growth(len(self.gaussians), self.config.pixel_weighted)
         self.growth.gradient, self.growth.weight = state["growth"]
         self.boxes = [obb.Obb(*box) for box in state["boxes"]]
-        for sun, pose, K, surface_m in state["shadow_maps"]:
-            self.shadow_maps[sun] = ShadowMap(Cameras(pose, K, *reversed(surface_m.shape)), surface_m)
+        for sun, pose, K, first_m in state["shadow_maps"]:
+            self.shadow_maps[sun] = ShadowMap(Cameras(pose, K, SHADOW_MAP_PX, SHADOW_MAP_PX), first_m)
         self.batches.restore(state["batches"])
         self.rng.set_state(state["rng"])
         self.poses = PoseCorrections(self.frames) if state["poses"] is not None else None

@@ -19,6 +19,7 @@ from obbgs_core.shading import (
     lit_shares,
     normals_towards,
     radiance_along,
+    shadow_map_of,
     sun_camera,
     without_sun,
 )
@@ -150,7 +151,7 @@ def shadow_map(gaussians: Gaussians, sun_dir: Tensor, backend: str = "auto") -> 
     Source: Williams, Casting Curved Shadows on Curved Surfaces, 1978; edges softened as by Reeves et al. 1987.
     """
     sun = sun_camera(gaussians, sun_dir)
-    return ShadowMap(sun, render(bare(gaussians), sun, backend).median_depth[0])
+    return shadow_map_of(sun, render(bare(gaussians), sun, backend).median_depth[0])
 
 
 def sunlit_shares(gaussians: Gaussians, sun_dir: Tensor, backend: str = "auto") -> Tensor:

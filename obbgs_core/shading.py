@@ -137,10 +137,18 @@ def sun_camera(gaussians: Gaussians, sun_dir: Tensor) -> Cameras:
 
 @dataclass(frozen=True)
 class ShadowMap:
-    """What the Sun sees: a camera in its place, and the surface's depths there [H, W] m, 0 where there is none."""
+    """What the Sun sees: a camera in its place, and how deep its light goes [H + 4, W + 4] m, two pixels around it."""
 
     sun: Cameras
-    surface_m: Tensor
+    first_m: Tensor
+
+
+def shadow_map_of(sun: Cameras, surface_m: Tensor) -> ShadowMap:
+    """Return what a camera of `sun_camera` sees, given the surface's depths there [H, W] m, 0 where there is none."""
+    first_m = torch.where(surface_m > 0, surface_m, torch.inf)
+    return ShadowMap(
+        sun, F.pad(first_m[None], (2, 2, 2, 2), value=torch.inf)[0]
+    )  # outside the picture all is lit
 
 
 def lit_shares(gaussians: Gaussians, maps: Sequence[ShadowMap]) -> Tensor:
@@ -154,14 +162,12 @@ def lit_shares(gaussians: Gaussians, maps: Sequence[ShadowMap]) -> Tensor:
         x, y, depth_m = (gaussians.means @ R.T + t).unbind(dim=1)
         deviation_m = (R[2] @ axes_m).norm(dim=1)
         before_m = depth_m - SHADOW_BIAS * (deviation_m + t[2] / focal_px)
-        first_m = torch.where(each.surface_m > 0, each.surface_m, torch.inf)
-        first_m = F.pad(first_m[None], (2, 2, 2, 2), value=torch.inf)[0]  # outside the picture all is lit
-        side = len(first_m)
+        side = len(each.first_m)
         column, row = (
             ((focal_px * along / depth_m + middle_px).nan_to_num(-1e6).floor() + 2).clamp(1, side - 2).long()
             for along in (x, y)
         )
         around = torch.tensor([dv * side + du for dv in (-1, 0, 1) for du in (-1, 0, 1)], device=row.device)
-        near_m = first_m.flatten()[(row * side + column)[:, None] + around]
+        near_m = each.first_m.flatten()[(row * side + column)[:, None] + around]
         shares.append((near_m >= before_m[:, None]).float().mean(dim=1))
     return torch.stack(shares)

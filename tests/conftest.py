@@ -1,6 +1,7 @@
 """What several packages' tests need: a mission and frames for it."""
 
 import importlib.util
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from flightsw.icd.frame import Frame, PoseTag
 from flightsw.icd.mission import Mission, load_mission
 
 SIZE_PX = 48
+os.environ.setdefault(
+    "OMP_WAIT_POLICY", "passive"
+)  # before torch: threads that spin are 20 times slower on busy cores
 hypothesis.settings.register_profile("obbgs", deadline=None)  # timings live in benchmarks
 hypothesis.settings.load_profile("obbgs")
 
