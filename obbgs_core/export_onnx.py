@@ -22,7 +22,7 @@ from obbgs_core.render import DILATION_PX2, FOV_MARGIN, MAX_ALPHA, MIN_ALPHA, MI
 from obbgs_core.rotations import quats_to_matrices
 from obbgs_core.sensor import Sensor
 from obbgs_core.sh import C0, SOFTNESS
-from obbgs_core.shading import SHADOW_BIAS, SHADOW_MAP_PX, SUN_DISTANCE, normals_towards, solid_ball
+from obbgs_core.shading import DARK_FROM, LIT_UNTIL, SHADOW_MAP_PX, SUN_DISTANCE, normals_towards, solid_ball
 
 OPSET = 18
 TILE = 16  # px: 8 costs more calls, 32 more pixels that a Gaussian does not reach
@@ -347,17 +347,29 @@ def _lit_shares(g: _Graph, gaussians: Gaussians) -> str:
         keepdims=0,
     )
     pixel = g.op("Div", g.op("Gather", g.op("Reshape", view.t, g.ints(-1)), g.ints(2), axis=0), view.fx)
-    bias = g.op("Mul", SHADOW_BIAS, g.op("Add", deviation, pixel))
-    before = g.op("Sub", projected.depth, bias)
+    unit = g.op("Add", deviation, pixel)
     side = SHADOW_MAP_PX + 4
-    column, row = (
-        g.op("Clip", g.op("Add", g.op("Floor", centre), 2.0), 1.0, side - 2.0) for centre in projected.centres
-    )
-    at = g.op("Cast", g.op("Add", g.op("Mul", row, float(side)), column), to=TensorProto.INT64)
+    u, v = (g.op("Clip", g.op("Add", centre, 2.0), 1.5, side - 1.5) for centre in projected.centres)
+    row_and_column = g.op("Add", g.op("Mul", g.op("Floor", v), float(side)), g.op("Floor", u))
+    at = g.op("Cast", row_and_column, to=TensorProto.INT64)
     around = np.array([[dv * side + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)])
     near = g.op("Gather", first, g.op("Add", around, g.op("Unsqueeze", at, g.ints(0))), axis=0)  # [9, N]
-    lit = g.op("Cast", g.op("GreaterOrEqual", near, before), to=TensorProto.FLOAT)
-    return g.op("ReduceMean", lit, g.ints(0), keepdims=0)
+    behind = g.op("Div", g.op("Sub", projected.depth, near), unit)
+    lit = g.op("Div", g.op("Sub", DARK_FROM, behind), DARK_FROM - LIT_UNTIL)
+    lit = g.op("Clip", lit, 0.0, 1.0)
+    rows, columns = (_spline_weights(g, place, axis) for place, axis in ((v, 1), (u, 0)))
+    weights = g.op("Reshape", g.op("Mul", rows, columns), g.ints(9, -1))
+    return g.op("ReduceSum", g.op("Mul", lit, weights), g.ints(0), keepdims=0)
+
+
+def _spline_weights(g: _Graph, place: str, axis: int) -> str:
+    """Weights [3, 1, N] or [1, 3, N] of the pixel that holds a place [N] and its neighbours, as `shading` has them."""
+    off = g.op("Sub", g.op("Sub", place, g.op("Floor", place)), 0.5)
+    before, after = g.op("Sub", 0.5, off), g.op("Add", 0.5, off)
+    sides = [g.op("Mul", 0.5, g.op("Mul", each, each)) for each in (before, after)]
+    weights = [sides[0], g.op("Sub", 0.75, g.op("Mul", off, off)), sides[1]]
+    stacked = g.op("Concat", *(g.op("Unsqueeze", each, g.ints(0)) for each in weights), axis=0)  # [3, N]
+    return g.op("Unsqueeze", stacked, g.ints(axis))
 
 
 # Real spherical harmonics as polynomials: for each one the terms (coefficient, powers of x, y, z), as in `sh.sh_basis`.

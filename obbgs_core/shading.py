@@ -17,11 +17,12 @@ from obbgs_core.sh import C0, fit, from_radiance, radiance, sh_basis, softplus
 HALF_LIT = 2.0  # albedo of a Gaussian, over its mean radiance as the Sun goes round
 FIRST_AMBIENT = 0.02
 SHADOW_MAP_PX = 256  # along a side of the picture that the Sun takes
-SUN_DISTANCE = 1000.0  # in radii of the model: its rays are parallel to 0.06 degrees
+SUN_DISTANCE = 300.0  # in radii of the model: its rays are parallel to 0.2 degrees, as wide as the Sun is
 SOLID_SHARE = 0.99  # of the centres: what strays farther out neither casts nor catches a shadow
-SHADOW_BIAS = (
-    3.0  # pixels of that picture, and deviations of the Gaussian towards the Sun: it does not shade itself
-)
+LIT_UNTIL, DARK_FROM = (
+    2.0,
+    4.0,
+)  # pixels there plus own deviations behind what the Sun sees: nothing shades itself
 
 
 def radiance_along(
@@ -152,7 +153,10 @@ def shadow_map_of(sun: Cameras, surface_m: Tensor) -> ShadowMap:
 
 
 def lit_shares(gaussians: Gaussians, maps: Sequence[ShadowMap]) -> Tensor:
-    """Return the share of each Sun that reaches each Gaussian [S, N]: of nine pixels around it, where it lies first."""
+    """Return the share of each Sun that reaches each Gaussian [S, N]: of nine pixels around it, where it lies first.
+
+    Pixels are weighted by a spline and the share falls over a range of depths: steps would turn a last bit into light.
+    """
     gaussians = gaussians.detach()
     axes_m = quats_to_matrices(gaussians.quats) * gaussians.scales[:, None]  # [N, 3, 3]
     shares = []
@@ -161,13 +165,22 @@ def lit_shares(gaussians: Gaussians, maps: Sequence[ShadowMap]) -> Tensor:
         focal_px, middle_px = each.sun.K[0, 0, 0], each.sun.K[0, 0, 2]
         x, y, depth_m = (gaussians.means @ R.T + t).unbind(dim=1)
         deviation_m = (R[2] @ axes_m).norm(dim=1)
-        before_m = depth_m - SHADOW_BIAS * (deviation_m + t[2] / focal_px)
+        unit_m = deviation_m + t[2] / focal_px
         side = len(each.first_m)
-        column, row = (
-            ((focal_px * along / depth_m + middle_px).nan_to_num(-1e6).floor() + 2).clamp(1, side - 2).long()
-            for along in (x, y)
-        )
-        around = torch.tensor([dv * side + du for dv in (-1, 0, 1) for du in (-1, 0, 1)], device=row.device)
-        near_m = each.first_m.flatten()[(row * side + column)[:, None] + around]
-        shares.append((near_m >= before_m[:, None]).float().mean(dim=1))
+        u, v = (focal_px * along / depth_m + middle_px + 2 for along in (x, y))
+        u, v = (
+            place.nan_to_num(1.5).clamp(1.5, side - 1.5) for place in (u, v)
+        )  # outside the picture all is lit
+        around = torch.tensor([dv * side + du for dv in (-1, 0, 1) for du in (-1, 0, 1)], device=u.device)
+        near_m = each.first_m.flatten()[(v.long() * side + u.long())[:, None] + around]
+        behind = (depth_m[:, None] - near_m) / unit_m[:, None]
+        lit = ((DARK_FROM - behind) / (DARK_FROM - LIT_UNTIL)).clamp(0, 1)
+        weight = _spline_weights(v)[:, :, None] * _spline_weights(u)[:, None]
+        shares.append((lit * weight.flatten(1)).sum(dim=1))
     return torch.stack(shares)
+
+
+def _spline_weights(place: Tensor) -> Tensor:
+    """Return the weights [N, 3] of the pixel that holds a place [N] px and its neighbours: a quadratic B-spline."""
+    off = place - place.floor() - 0.5
+    return torch.stack([0.5 * (0.5 - off) ** 2, 0.75 - off**2, 0.5 * (0.5 + off) ** 2], dim=1)

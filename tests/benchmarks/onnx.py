@@ -1,7 +1,7 @@
 """Time, memory and agreement of the exported renderer on one core of onnxruntime: python -m tests.benchmarks.onnx
 
-Rows are balls of Gaussians, or the model of a run with `--model model.ply`. Time and memory are those of a process
-of its own that holds only numpy and onnxruntime, as on board, bound to one core.
+Rows are balls of Gaussians, the last one matt under Suns that move, or the model of a run with `--model model.ply`.
+Time and memory are those of a process of its own that holds only numpy and onnxruntime, as on board, bound to one core.
 """
 
 import argparse
@@ -37,8 +37,15 @@ def run_on_one_core(model: str, folder: str) -> None:
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     outputs: dict[str, list] = {"image": [], "alpha": [], "depth": []}
     wall_ms, cpu_ms = [], []
-    for pose in [views["poses"][0], *views["poses"]]:  # the first is to warm up
-        feed = {"world_to_camera": pose, "K": views["K"], "exposure_time_s": views["exposure_time_s"]}
+    takes_sun = "sun_dir" in [each.name for each in session.get_inputs()]
+    for i in [0, *range(VIEWS)]:  # the first is to warm up
+        feed = {
+            "world_to_camera": views["poses"][i],
+            "K": views["K"],
+            "exposure_time_s": views["exposure_time_s"],
+        }
+        if takes_sun:
+            feed["sun_dir"] = views["suns"][i]
         wall, cpu = time.perf_counter(), time.process_time()
         rendered = session.run(list(outputs), feed)
         wall_ms.append(1e3 * (time.perf_counter() - wall))
@@ -81,18 +88,20 @@ def measure(gaussians, distance: float) -> dict:
     parity_db is against float32 and 20 views; parity_float64_db is one view against the reference in float64, and
     render_float64_db is the same for our own float32: what the number format itself costs.
     """
+    import dataclasses
+
     import torch
 
     from obbgs_core.cameras import Cameras
     from obbgs_core.export_onnx import export_onnx
-    from obbgs_core.gaussians import Gaussians
     from obbgs_core.metrics import psnr_db
     from obbgs_core.render import render
     from obbgs_core.sensor import Sensor
 
-    poses = random_poses(distance)
+    poses, suns = random_poses(distance), random_poses(0.0, seed=1)[:, 2, :3].copy()
     K = np.array([[FOCAL_PX, 0, WIDTH / 2], [0, FOCAL_PX, WIDTH / 2], [0, 0, 1]], dtype=np.float32)
-    cameras = Cameras(torch.tensor(poses), torch.tensor(K).expand(VIEWS, 3, 3), WIDTH, WIDTH)
+    matrices = torch.tensor(K).expand(VIEWS, 3, 3)
+    cameras = Cameras(torch.tensor(poses), matrices, WIDTH, WIDTH, sun_dir=torch.tensor(suns))
     ours = render(gaussians, cameras)
     full_scale = float(ours.radiance[ours.radiance > 0].quantile(0.99))
     sensor = Sensor(64, 4095, 4031 / (full_scale * EXPOSURE_S), electrons_per_dn=4, read_noise_dn=8)
@@ -102,20 +111,25 @@ def measure(gaussians, distance: float) -> dict:
 
     with tempfile.TemporaryDirectory() as folder:
         exported = export_onnx(gaussians, sensor, Path(folder) / "m.onnx", WIDTH, WIDTH, [EXPOSURE_S])
-        np.savez(Path(folder) / "views.npz", poses=poses, K=K, exposure_time_s=np.float32(EXPOSURE_S))
+        exposure_time_s = np.float32(EXPOSURE_S)
+        np.savez(Path(folder) / "views.npz", poses=poses, suns=suns, K=K, exposure_time_s=exposure_time_s)
         code = "import sys; from tests.benchmarks.onnx import run_on_one_core; run_on_one_core(*sys.argv[1:])"
         command = [sys.executable, "-c", code, str(exported.path), folder]
         figures = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
         with np.load(Path(folder) / "outputs.npz") as arrays:
             images, alphas, depths = (torch.tensor(arrays[name]) for name in ("image", "alpha", "depth"))
-    double = Gaussians(**{name: tensor.double() for name, tensor in gaussians.tensors().items()})
-    first = Cameras(cameras.world_to_camera[:1].double(), cameras.K[:1].double(), WIDTH, WIDTH)
+    parameters = gaussians.tensors() | {"ambient": gaussians.ambient}
+    double = dataclasses.replace(gaussians, **{name: value.double() for name, value in parameters.items()})
+    first = dataclasses.replace(
+        cameras.one(0), world_to_camera=cameras.world_to_camera[:1].double(), K=cameras.K[:1].double()
+    )
     exact = image(render(double, first, "reference").radiance[0])
     own = image(ours.radiance)
     covered = ours.alpha > 0.5
     return {
         "gaussians": len(gaussians),
         "width": WIDTH,
+        "shading": gaussians.shading,
         **figures,
         "file_mb": round(exported.size_bytes / 1e6, 2),
         "parity_db": round(min(psnr_db(a, b) for a, b in zip(images, own, strict=True)), 1),
@@ -133,6 +147,10 @@ def main() -> None:
     parser.add_argument("--model", type=Path, help="measure this model.ply of a run")
     arguments = parser.parse_args()
 
+    import dataclasses
+
+    import torch
+
     from obbgs_core.ply import load_ply
     from tests.benchmarks.rasterizer import scene
 
@@ -144,6 +162,8 @@ def main() -> None:
     else:
         cases = [(scene(count), 3.0) for count in (1000, 5000, 20_000)]
         cases.append((scene(5000), 200.0))  # a few pixels: every Gaussian in one tile
+        matt = dataclasses.replace(scene(5000), shading="lambert", ambient=torch.tensor(0.05))
+        cases.append((matt, 3.0))  # casts shadows first
     for gaussians, distance in cases:
         row = measure(gaussians, distance)
         if math.isnan(row["parity_db"]):

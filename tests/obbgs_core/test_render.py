@@ -227,14 +227,14 @@ def test_a_plates_shadow_on_another_lies_where_geometry_puts_it(backend):
     for sun, share in zip(suns, shares, strict=False):
         above, other = (roof, ground) if sun[2] > 0 else (ground, roof)
         lit, shaded = (share[len(ground) :], share[: len(ground)])[:: 1 if sun[2] > 0 else -1]
-        assert (lit == 1).all()  # what is nearer to the Sun: no plate shades itself
+        assert (lit > 0.9999).all()  # what is nearer to the Sun: no plate shades itself
         rise_m = above.means[0, 2] - other.means[0, 2]
         met = (
             other.means[:, :2] + rise_m / sun[2] * sun[:2]
         )  # where the ray to the Sun crosses the upper plate
         half_m = 0.32 if above is roof else 1.0
         inside_m = half_m - met.abs().amax(dim=1)  # of its edge
-        assert (shaded[inside_m > 0.05] == 0).all() and (shaded[inside_m < -0.15] == 1).all()
+        assert (shaded[inside_m > 0.05] < 1e-4).all() and (shaded[inside_m < -0.15] > 0.9999).all()
         assert (inside_m > 0.05).sum() > 25
 
 
