@@ -22,7 +22,7 @@ from obbgs_core.render import DILATION_PX2, FOV_MARGIN, MAX_ALPHA, MIN_ALPHA, MI
 from obbgs_core.rotations import quats_to_matrices
 from obbgs_core.sensor import Sensor
 from obbgs_core.sh import C0, SOFTNESS
-from obbgs_core.shading import DARK_FROM, LIT_UNTIL, SHADOW_MAP_PX, SUN_DISTANCE, normals_towards, solid_ball
+from obbgs_core.shading import DARK_FROM, LIT_UNTIL, SHADOW_MAP_PX, SUN_DISTANCE, shortest_axes, solid_ball
 
 OPSET = 18
 TILE = 16  # px: 8 costs more calls, 32 more pixels that a Gaussian does not reach
@@ -321,7 +321,7 @@ def _softplus(g: _Graph, value: str) -> str:
 
 def _light(g: _Graph, gaussians: Gaussians, camera: _View) -> str:
     """Light that arrives at each Gaussian [N], in units of the Sun's: Lambert's law, shadows, ambient light."""
-    normals = _numpy(normals_towards(gaussians, gaussians.means))  # the side does not count yet
+    normals = _numpy(shortest_axes(gaussians))
     along = g.op("ReduceSum", g.op("Mul", _directions(g, gaussians, camera), normals), g.ints(1), keepdims=0)
     facing = g.op("Neg", g.op("Sign", along))
     cosine = g.op("Mul", g.op("MatMul", normals, "sun_dir"), facing)

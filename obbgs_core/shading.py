@@ -19,10 +19,8 @@ FIRST_AMBIENT = 0.02
 SHADOW_MAP_PX = 256  # along a side of the picture that the Sun takes
 SUN_DISTANCE = 300.0  # in radii of the model: its rays are parallel to 0.2 degrees, as wide as the Sun is
 SOLID_SHARE = 0.99  # of the centres: what strays farther out neither casts nor catches a shadow
-LIT_UNTIL, DARK_FROM = (
-    2.0,
-    4.0,
-)  # pixels there plus own deviations behind what the Sun sees: nothing shades itself
+# pixels of that picture plus own deviations that a Gaussian may lie behind what the Sun sees: nothing shades itself
+LIT_UNTIL, DARK_FROM = 2.0, 4.0
 
 
 def radiance_along(
@@ -47,19 +45,22 @@ def radiance_along(
 
 def lambertian(gaussians: Gaussians) -> Gaussians:
     """Return Gaussians of constant radiance as matt ones of the albedo that, half lit, looks alike."""
-    albedo = from_radiance(
-        HALF_LIT * radiance(gaussians.sh.detach()[:, :1], torch.zeros_like(gaussians.means))
-    )
-    ambient = torch.tensor(FIRST_AMBIENT)
+    seen = radiance(gaussians.sh.detach()[:, :1], torch.zeros_like(gaussians.means))
+    albedo, ambient = from_radiance(HALF_LIT * seen), torch.tensor(FIRST_AMBIENT)
     return dataclasses.replace(gaussians, sh=albedo[:, None], shading="lambert", ambient=ambient)
 
 
 def normals_towards(gaussians: Gaussians, directions: Tensor) -> Tensor:
     """Return each Gaussian's shortest axis [N, 3], turned against `directions` [N, 3]: to the camera's side."""
+    normal = shortest_axes(gaussians)
+    return -normal * torch.sign((normal * directions).sum(-1, keepdim=True))
+
+
+def shortest_axes(gaussians: Gaussians) -> Tensor:
+    """Return the unit axis of each Gaussian's smallest deviation [N, 3], of either sign."""
     axes = quats_to_matrices(gaussians.quats)
     shortest = gaussians.log_scales.argmin(dim=1)
-    normal = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
-    return -normal * torch.sign((normal * directions).sum(-1, keepdim=True))
+    return axes.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
 
 
 def mean_radiance(gaussians: Gaussians, cameras: Cameras) -> Tensor:
@@ -94,15 +95,13 @@ def without_sun(gaussians: Gaussians, sun_dir: Tensor | None, sunlit: Tensor | N
         raise ValueError("the model's radiance turns with the Sun: give sun_dir, the Sun's direction")
     if gaussians.shading == "sun":
         basis = sh_basis(sun_dir.reshape(1, 3).to(gaussians.sh), gaussians.sh.shape[1])
-        return dataclasses.replace(
-            gaussians, sh=(basis[0, :, None] * gaussians.sh).sum(dim=1, keepdim=True) / C0, shading="view"
-        )
+        constant = (basis[0, :, None] * gaussians.sh).sum(dim=1, keepdim=True) / C0
+        return dataclasses.replace(gaussians, sh=constant, shading="view")
     directions, to_coefficients = fit(4)
     seen = [radiance_along(gaussians, d.expand(len(gaussians), 3), sun_dir, sunlit) for d in directions]
     before_softplus = C0 * from_radiance(torch.stack(seen, dim=1))
-    return dataclasses.replace(
-        gaussians, sh=torch.einsum("kd,ndc->nkc", to_coefficients, before_softplus), shading="view"
-    )
+    fitted = torch.einsum("kd,ndc->nkc", to_coefficients, before_softplus)
+    return dataclasses.replace(gaussians, sh=fitted, shading="view")
 
 
 def bare(gaussians: Gaussians) -> Gaussians:
@@ -147,9 +146,8 @@ class ShadowMap:
 def shadow_map_of(sun: Cameras, surface_m: Tensor) -> ShadowMap:
     """Return what a camera of `sun_camera` sees, given the surface's depths there [H, W] m, 0 where there is none."""
     first_m = torch.where(surface_m > 0, surface_m, torch.inf)
-    return ShadowMap(
-        sun, F.pad(first_m[None], (2, 2, 2, 2), value=torch.inf)[0]
-    )  # outside the picture all is lit
+    around = (2, 2, 2, 2)  # outside the picture all is lit
+    return ShadowMap(sun, F.pad(first_m[None], around, value=torch.inf)[0])
 
 
 def lit_shares(gaussians: Gaussians, maps: Sequence[ShadowMap]) -> Tensor:
@@ -167,10 +165,10 @@ def lit_shares(gaussians: Gaussians, maps: Sequence[ShadowMap]) -> Tensor:
         deviation_m = (R[2] @ axes_m).norm(dim=1)
         unit_m = deviation_m + t[2] / focal_px
         side = len(each.first_m)
-        u, v = (focal_px * along / depth_m + middle_px + 2 for along in (x, y))
         u, v = (
-            place.nan_to_num(1.5).clamp(1.5, side - 1.5) for place in (u, v)
-        )  # outside the picture all is lit
+            (focal_px * along / depth_m + middle_px + 2).nan_to_num(1.5).clamp(1.5, side - 1.5)
+            for along in (x, y)
+        )
         around = torch.tensor([dv * side + du for dv in (-1, 0, 1) for du in (-1, 0, 1)], device=u.device)
         near_m = each.first_m.flatten()[(v.long() * side + u.long())[:, None] + around]
         behind = (depth_m[:, None] - near_m) / unit_m[:, None]
