@@ -16,9 +16,10 @@ def appearance(metrics: dict) -> list[str]:
         f"- Radiance {metrics['appearance']}. The Sun's direction spans {metrics['sun_span_deg']:.1f} degrees in the "
         "target's frame."
     ]
-    if metrics["shading"] != "view":
+    shading = metrics.get("shading", metrics.get("sh_direction"))  # as older runs called it
+    if shading != "view":
         x, y, z = metrics["shown_under_sun_dir_body"]
-        shadows = "cast" if metrics["shading"] == "lambert" else "not modelled"
+        shadows = "cast" if shading == "lambert" else "not modelled"
         lines.append(
             f"- Shadows of parts on one another are {shadows}. model.ply and model.onnx hold every Sun; "
             f"model.spz, and what viewers show of model.ply, are lit from ({x:.3f}, {y:.3f}, {z:.3f}), target body "

@@ -273,8 +273,8 @@ def onnx_parity_db(
             "K": K,
             "exposure_time_s": np.array(record.exposure_time_s, dtype=np.float32),
         }
-        if gaussians.shading != "view":
-            feed["sun_dir"] = record.sun_dir_body.astype(np.float32)
+        if (sun_dir := sun_direction(record)) is not None and gaussians.shading != "view":
+            feed["sun_dir"] = sun_dir.numpy()
         image = np.asarray(runtime.run(["image"], feed)[0])
         ours = predicted_image(gaussians, session, record, sensor, record.exposure_time_s).numpy()
         worst = min(worst, -10 * math.log10(max(float(np.mean((image - ours) ** 2)), 1e-12)))

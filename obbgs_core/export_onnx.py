@@ -194,7 +194,7 @@ def _camera_view(g: _Graph, width: int, height: int) -> _View:
 def _sun_view(g: _Graph, gaussians: Gaussians) -> _View:
     """The camera at the Sun, as `shading.sun_camera` places it."""
     centre, radius = solid_ball(gaussians)
-    forward = g.op("Neg", "sun_dir")
+    forward = g.op("Neg", g.op("Div", "sun_dir", g.op("ReduceL2", "sun_dir", g.ints(0))))
     upright = g.op("Less", g.op("Abs", g.op("Gather", forward, g.ints(0), axis=0)), 0.9)
     x_axis, y_axis = np.eye(3, dtype=np.float32)[:2]
     right = _cross(g, g.op("Where", upright, x_axis, y_axis), forward)

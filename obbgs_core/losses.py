@@ -155,7 +155,7 @@ def charbonnier(normalised_residual: Tensor, knee: float = 2.0) -> Tensor:
 
 
 def normal_disagreement(depth: Tensor, alpha: Tensor, normals: Tensor, cameras: Cameras) -> Tensor:
-    """Return the mean of 1 - cos(rendered normal, normal of the rendered depths), where 3x3 pixels are solid.
+    """Return 1 - cos(rendered normal, normal of rendered depths), summed where 3x3 pixels are solid, over all pixels.
 
     Args:
         depth, alpha: [C, H, W], m; normals: composited [C, H, W, 3], body frame; as `render` returns them.
@@ -163,7 +163,8 @@ def normal_disagreement(depth: Tensor, alpha: Tensor, normals: Tensor, cameras: 
     Source: Huang et al., 2D Gaussian Splatting, 2024, equation 14.
     """
     height, width = depth.shape[1:]
-    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    rows, columns = (torch.arange(count).to(depth) + 0.5 for count in (height, width))
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
     pixels = torch.stack([u, v, torch.ones_like(u)], dim=-1)
     rays = torch.einsum("hwj,cij->chwi", pixels, torch.linalg.inv(cameras.K))
     points = rays * depth[..., None]

@@ -67,7 +67,9 @@ class MethodConfig:
     keep_opacity: float = (
         1.0  # more opaque Gaussians are kept whatever they earn: dark surface explains no light
     )
-    most_sh_degree: int = 0  # the degree may rise to this where the likelihood pays for it
+    most_sh_degree: int = (
+        0  # the degree may rise to this where the likelihood pays; 0: radiance turns with nothing
+    )
     sun_span_deg: float = (
         0.0  # > 0: the radiance may turn with the Sun where its direction spans more than this
     )
@@ -89,7 +91,7 @@ class MethodConfig:
             raise ValueError(f"refine_poses must be never, always or auto, got {self.refine_poses!r}")
         if not 0 <= self.exposure_sigma < math.inf:
             raise ValueError(f"exposure_sigma must be 0 (exact) or a deviation, got {self.exposure_sigma}")
-        for name in ("steps", "frames_per_step", "start_count", "max_gaussians"):
+        for name in ("steps", "frames_per_step", "start_count", "max_gaussians", "shadow_interval"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
 

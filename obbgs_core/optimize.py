@@ -362,7 +362,7 @@ class Trainer:
         return [self.batches.batch(b, _image_scale(self.config, share)) for b in self.batches.held_out]
 
     def _priors(self, batch: Batch, share: float, rendered: Rendered, cameras: Cameras) -> Tensor:
-        """Return what is asked of the Gaussians besides the images: thin ones, solid or absent ones, likely poses."""
+        """Return what is asked of the Gaussians besides the images: thin and solid ones, likely poses and exposures."""
         config, total = self.config, torch.zeros(())
         if config.sh_weight and self.gaussians.sh.shape[1] > 1 and self.gaussians.shading == "view":
             total = total + config.sh_weight * self.gaussians.sh[:, 1:].square().mean()

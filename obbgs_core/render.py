@@ -150,8 +150,14 @@ def shadow_map(gaussians: Gaussians, sun_dir: Tensor, backend: str = "auto") -> 
 
     Source: Williams, Casting Curved Shadows on Curved Surfaces, 1978; edges softened as by Reeves et al. 1987.
     """
-    sun = sun_camera(gaussians, sun_dir)
-    return shadow_map_of(sun, render(bare(gaussians), sun, backend).median_depth[0])
+    shape, device = bare(gaussians), gaussians.means.device
+    if device.type != "cpu":  # gsplat gives no median depth: the picture is taken on the CPU
+        shape = dataclasses.replace(shape, **{name: value.cpu() for name, value in shape.tensors().items()})
+        backend = "auto"
+    sun = sun_camera(shape, sun_dir.to(shape.means.device))
+    surface_m = render(shape, sun, backend).median_depth[0]
+    there = dataclasses.replace(sun, world_to_camera=sun.world_to_camera.to(device), K=sun.K.to(device))
+    return shadow_map_of(there, surface_m.to(device))
 
 
 def sunlit_shares(gaussians: Gaussians, sun_dir: Tensor, backend: str = "auto") -> Tensor:

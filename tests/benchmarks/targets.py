@@ -92,8 +92,8 @@ def load(
     for i in np.unique(np.linspace(0, len(radiance) - 1, frames).round().astype(int)).tolist():
         exposure_s = bracket_s[i % len(bracket_s)]
         kept = i % HELD_OUT == HELD_OUT - 1
-        factor = 1.0 if kept else float(np.exp(shutter.normal(0, exposure_error)))
-        exact = (radiance[i] * gain * exposure_s * factor).clamp(0, 1)
+        longer = 1.0 if kept else float(np.exp(shutter.normal(0, exposure_error)))
+        exact = (radiance[i] * gain * exposure_s * longer).clamp(0, 1)
         shape = tuple(exact.shape)
         noisy = exact.numpy() + noise.normal(0, sigma, shape)
         dn = torch.from_numpy(np.clip(np.round(noisy * 255), 0, 255).astype(np.float32))
