@@ -14,9 +14,13 @@ class Corrections:
         self.second, self.visits = torch.zeros(rows, numbers), torch.zeros(rows, 1)
         self.memory = memory
 
+    def rows(self, indices: list[int]) -> Tensor:
+        """Return the rows [B] of frames."""
+        return torch.tensor([self.of_frame[i] for i in indices])
+
     def of(self, indices: list[int]) -> Tensor:
         """Return the corrections [B, n] of frames."""
-        return self.value[torch.tensor([self.of_frame[i] for i in indices])]
+        return self.value[self.rows(indices)]
 
     def prior(self, indices: list[int], values: int) -> Tensor:
         """Return the corrections' share of a step's mean loss: half their squares over all the step's values."""

@@ -47,9 +47,8 @@ class Adam:
 
     def __init__(self, gaussians: Gaussians, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
         self.betas, self.eps, self.steps = betas, eps, 0
-        parameters = _parameters(gaussians)
-        self.first = {name: torch.zeros_like(t) for name, t in parameters.items()}
-        self.second = {name: torch.zeros_like(t) for name, t in parameters.items()}
+        self.first = {name: torch.zeros_like(t) for name, t in gaussians.parameters().items()}
+        self.second = {name: torch.zeros_like(t) for name, t in gaussians.parameters().items()}
 
     @torch.no_grad()
     def step(self, gaussians: Gaussians, rates: dict[str, float]) -> None:
@@ -57,7 +56,7 @@ class Adam:
         self.steps += 1
         b1, b2 = self.betas
         correction = math.sqrt(1 - b2**self.steps) / (1 - b1**self.steps)
-        for name, parameter in _parameters(gaussians).items():
+        for name, parameter in gaussians.parameters().items():
             if parameter.grad is None:
                 continue
             values, gradient, rate = parameter.detach(), parameter.grad.contiguous(), rates[name] * correction
@@ -120,13 +119,8 @@ def keep(gaussians: Gaussians, adam: Adam, mask: Tensor) -> Gaussians:
 
 def trainable(gaussians: Gaussians) -> Gaussians:
     """Return the same values as leaves that collect gradients."""
-    leaves = {n: t.detach().clone().requires_grad_() for n, t in _parameters(gaussians).items()}
+    leaves = {n: t.detach().clone().requires_grad_() for n, t in gaussians.parameters().items()}
     return dataclasses.replace(gaussians, **leaves)
-
-
-def _parameters(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Return all that is optimised, by name."""
-    return gaussians.tensors() | {"ambient": gaussians.ambient}
 
 
 @torch.no_grad()

@@ -19,7 +19,6 @@ from obbgs_core.errors import ExportError
 from obbgs_core.files import write_whole
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.render import DILATION_PX2, FOV_MARGIN, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
-from obbgs_core.rotations import quats_to_matrices
 from obbgs_core.sensor import Sensor
 from obbgs_core.sh import C0, SOFTNESS
 from obbgs_core.shading import DARK_FROM, LIT_UNTIL, SHADOW_MAP_PX, SUN_DISTANCE, shortest_axes, solid_ball
@@ -127,6 +126,7 @@ class _Graph:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
         self.prefix, self.count = prefix, 0
+        self.known: dict[tuple[str, tuple[int, ...], bytes], str] = {}  # constants that are there already
 
     def op(
         self, kind: str, *inputs: "str | float | np.ndarray", outputs: int = 1, name: str = "", **attributes
@@ -143,9 +143,11 @@ class _Graph:
         if isinstance(value, str):
             return value
         array = np.asarray(value, dtype=np.float32) if not isinstance(value, np.ndarray) else value
-        name = self._fresh()
-        self.constants.append(numpy_helper.from_array(array, name))
-        return name
+        key = (array.dtype.str, array.shape, array.tobytes())
+        if key not in self.known:
+            self.known[key] = self._fresh()
+            self.constants.append(numpy_helper.from_array(array, self.known[key]))
+        return self.known[key]
 
     def _fresh(self) -> str:
         self.count += 1
@@ -208,10 +210,10 @@ def _sun_view(g: _Graph, gaussians: Gaussians) -> _View:
     return _View(R, t, focal, focal, middle, middle, SHADOW_MAP_PX, SHADOW_MAP_PX)
 
 
-def _cross(g: _Graph, a: str, b: str) -> str:
+def _cross(g: _Graph, a: str, b: str, axis: int = 0) -> str:
     after, before = np.array([1, 2, 0]), np.array([2, 0, 1])
     left, right = (
-        g.op("Mul", g.op("Gather", a, i, axis=0), g.op("Gather", b, j, axis=0))
+        g.op("Mul", g.op("Gather", a, i, axis=axis), g.op("Gather", b, j, axis=axis))
         for i, j in ((after, before), (before, after))
     )
     return g.op("Sub", left, right)
@@ -225,11 +227,11 @@ class _Projected:
     centres: list[str]  # x and y, [N] px
     reaches: list[str]  # half width and height of its box, [N] px; negative where it is not drawn
     splats: str  # [N, 7]: centre, square root of the conic (2 x 2), logarithm of the opacity
+    toward: str  # [N, 3] m: what each axis, one sigma long, reaches in depth
 
 
 def _project(g: _Graph, gaussians: Gaussians, view: _View) -> _Projected:
     """EWA projection of every Gaussian, as `render.project`."""
-    RS = quats_to_matrices(gaussians.quats) * gaussians.scales[:, None, :]
     Rt = g.op("Transpose", view.R, perm=[1, 0])
     p = g.op("Add", g.op("MatMul", _numpy(gaussians.means), Rt), view.t)  # [N, 3]
     px, py, pz = (g.op("Gather", p, np.array(i, dtype=np.int64), axis=1) for i in range(3))
@@ -241,7 +243,7 @@ def _project(g: _Graph, gaussians: Gaussians, view: _View) -> _Projected:
     mean_y = g.op("Add", g.op("Mul", fy, y), cy)
     x, y = _clamped(g, x, fx, cx, view.width), _clamped(g, y, fy, cy, view.height)
     # rows of J W R S, [N, 3]: J = [[fx/z, 0, -fx x/z], [0, fy/z, -fy y/z]]
-    turned = g.op("MatMul", view.R, g._name(_numpy(RS)))  # [N, 3, 3]
+    turned = g.op("MatMul", view.R, _numpy(gaussians.axes))  # [N, 3, 3]
     rows = [g.op("Gather", turned, np.array(i, dtype=np.int64), axis=1) for i in range(3)]
     M = []
     for f, tangent, row in ((fx, x, rows[0]), (fy, y, rows[1])):
@@ -253,12 +255,7 @@ def _project(g: _Graph, gaussians: Gaussians, view: _View) -> _Projected:
     xy = g.op("ReduceSum", g.op("Mul", M[0], M[1]), last, keepdims=0)
     yy = g.op("Add", g.op("ReduceSum", g.op("Mul", M[1], M[1]), last, keepdims=0), DILATION_PX2)
     # det(M Mᵀ + dI) as a sum of squares: xx·yy - xy² would cancel for needles
-    after, before = np.array([1, 2, 0]), np.array([2, 0, 1])
-    left, right = (
-        g.op("Mul", g.op("Gather", M[0], i, axis=1), g.op("Gather", M[1], j, axis=1))
-        for i, j in ((after, before), (before, after))
-    )
-    cross = g.op("ReduceSumSquare", g.op("Sub", left, right), last, keepdims=0)
+    cross = g.op("ReduceSumSquare", _cross(g, M[0], M[1], axis=1), last, keepdims=0)
     dilated = g.op("Mul", g.op("Sub", g.op("Add", xx, yy), DILATION_PX2), DILATION_PX2)
     determinant = g.op("Add", cross, dilated)
     opacities = np.maximum(_numpy(gaussians.opacities), np.float32(1e-12))  # its logarithm is finite
@@ -281,6 +278,7 @@ def _project(g: _Graph, gaussians: Gaussians, view: _View) -> _Projected:
         centres=[mean_x, mean_y],
         reaches=[reach_x, reach_y],
         splats=g.op("Concat", *(g.op("Unsqueeze", column, last) for column in columns), axis=1),
+        toward=rows[2],
     )
 
 
@@ -338,15 +336,8 @@ def _lit_shares(g: _Graph, gaussians: Gaussians) -> str:
     first = g.op("Where", g.op("Greater", surface, 0.0), surface, 3e38)
     first = g.op("Pad", first, g.ints(0, 2, 2, 0, 2, 2), np.array(3e38, dtype=np.float32))
     first = g.op("Reshape", first, g.ints(-1))
-    forward = g.op("Gather", view.R, g.ints(2), axis=0)  # [1, 3]
-    RS = quats_to_matrices(gaussians.quats) * gaussians.scales[:, None, :]
-    deviation = g.op(
-        "ReduceL2",
-        g.op("Squeeze", g.op("MatMul", forward, g._name(_numpy(RS))), g.ints(1)),
-        g.ints(1),
-        keepdims=0,
-    )
     pixel = g.op("Div", g.op("Gather", g.op("Reshape", view.t, g.ints(-1)), g.ints(2), axis=0), view.fx)
+    deviation = g.op("ReduceL2", projected.toward, g.ints(1), keepdims=0)
     unit = g.op("Add", deviation, pixel)
     side = SHADOW_MAP_PX + 4
     u, v = (g.op("Clip", g.op("Add", centre, 2.0), 1.5, side - 1.5) for centre in projected.centres)

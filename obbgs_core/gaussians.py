@@ -65,22 +65,31 @@ class Gaussians:
         """[N] in 0..1."""
         return self.opacity_logits.sigmoid()
 
+    @property
+    def axes(self) -> Tensor:
+        """[N, 3, 3] m, body frame: R S, its columns the axes, one sigma long."""
+        return quats_to_matrices(self.quats) * self.scales[:, None, :]
+
     def covariances(self) -> Tensor:
         """[N, 3, 3] m², body frame: R S S^T R^T."""
-        RS = quats_to_matrices(self.quats) * self.scales[:, None, :]
-        return RS @ RS.transpose(1, 2)
+        return self.axes @ self.axes.transpose(1, 2)
 
     def tensors(self) -> dict[str, Tensor]:
         """What is stored of each Gaussian, by name."""
         return {name: getattr(self, name) for name in TENSORS}
+
+    def parameters(self) -> dict[str, Tensor]:
+        """All that is optimised, by name: what is stored of each Gaussian, and the ambient light."""
+        return self.tensors() | {"ambient": self.ambient}
 
     def select(self, index: Tensor) -> "Gaussians":
         """Return the Gaussians that an index or mask picks."""
         return dataclasses.replace(self, **{name: value[index] for name, value in self.tensors().items()})
 
     def detach(self) -> "Gaussians":
-        values = {name: value.detach() for name, value in self.tensors().items()}
-        return dataclasses.replace(self, **values, ambient=self.ambient.detach())
+        return dataclasses.replace(
+            self, **{name: value.detach() for name, value in self.parameters().items()}
+        )
 
     @staticmethod
     def concatenate(parts: "list[Gaussians]") -> "Gaussians":

@@ -390,10 +390,12 @@ class Trainer:
             return None
         if self.steps_done % self.config.shadow_interval == 0:
             self.shadow_maps = {}
-        suns = {tuple(sun_dir.tolist()): sun_dir for sun_dir in cameras.known_suns()}
-        for key in suns.keys() - self.shadow_maps.keys():
-            self.shadow_maps[key] = shadow_map(self.gaussians, suns[key])
-        maps = [self.shadow_maps[tuple(sun_dir.tolist())] for sun_dir in cameras.known_suns()]
+        maps = []
+        for sun_dir in cameras.known_suns():
+            sun = tuple(sun_dir.tolist())
+            if sun not in self.shadow_maps:
+                self.shadow_maps[sun] = shadow_map(self.gaussians, sun_dir)
+            maps.append(self.shadow_maps[sun])
         return lit_shares(self.gaussians, maps)
 
     def _observe(self, rendered: Rendered, batch: Batch, residual: Tensor) -> None:
@@ -462,13 +464,14 @@ class Trainer:
             turning = dataclasses.replace(self.gaussians, shading=direction)
             gain, cost = next_degree_gain(turning, self.batches, self.sensor, scale, self.rng)
             tested.append(f"with the {direction} it would gain {gain:.0f} nats at a price of {cost:.0f}")
-            if gain > cost and direction == "sun" and self.config.sun_shading == "lambert":
+            if gain <= cost:
+                continue
+            if direction == "sun" and self.config.sun_shading == "lambert":
                 self.gaussians = trainable(lambertian(self.gaussians))
-                break
-            if gain > cost:
+            else:
                 self.gaussians = trainable(padded(turning, degree))
                 self.adam.widen(self.gaussians)
-                break
+            break
         self.why_appearance = f"step {self.steps_done + 1}, degree {degree}: {'; '.join(tested)}"
         log.info("radiance %s", self.appearance)
 

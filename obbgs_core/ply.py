@@ -120,10 +120,12 @@ def load_ply(path: Path) -> Gaussians:
     )
     radiance = [name for name in names if name.startswith("radiance_sh_")]
     channels = 1 + max(int(name.split("_")[3]) for name in radiance)
-    shading: Shading = "sun" if any(line.startswith(TURNS_WITH_SUN) for line in lines) else "view"
+    shading: Shading = "view"
     ambient = torch.zeros(())
     for line in lines:
-        if line.startswith(LAMBERT):
+        if line.startswith(TURNS_WITH_SUN):
+            shading = "sun"
+        elif line.startswith(LAMBERT):
             shading, ambient = "lambert", torch.tensor(float(line.removeprefix(LAMBERT).partition(";")[0]))
     return Gaussians(
         means=torch.stack([table[a] for a in "xyz"], 1),

@@ -27,8 +27,7 @@ class PoseCorrections(Corrections):
 
     def corrected(self, indices: list[int], world_to_camera: Tensor) -> Tensor:
         """Return the poses [B, 4, 4] of frames with their corrections in front; gradients reach the corrections."""
-        numbers = torch.tensor([self.of_frame[i] for i in indices])
-        return rigid_motions(self.of(indices) * self.sigma[numbers]) @ world_to_camera
+        return rigid_motions(self.of(indices) * self.sigma[self.rows(indices)]) @ world_to_camera
 
     def cameras(self, batch: Batch) -> Cameras:
         """Return a step's cameras with their corrections."""

@@ -12,7 +12,6 @@ from torch import Tensor
 from obbgs_core import compiled
 from obbgs_core.cameras import Cameras
 from obbgs_core.gaussians import Gaussians
-from obbgs_core.rotations import quats_to_matrices
 from obbgs_core.shading import (
     ShadowMap,
     bare,
@@ -152,7 +151,9 @@ def shadow_map(gaussians: Gaussians, sun_dir: Tensor, backend: str = "auto") -> 
     """
     shape, device = bare(gaussians), gaussians.means.device
     if device.type != "cpu":  # gsplat gives no median depth: the picture is taken on the CPU
-        shape = dataclasses.replace(shape, **{name: value.cpu() for name, value in shape.tensors().items()})
+        shape = dataclasses.replace(
+            shape, **{name: value.cpu() for name, value in shape.parameters().items()}
+        )
         backend = "auto"
     sun = sun_camera(shape, sun_dir.to(shape.means.device))
     surface_m = render(shape, sun, backend).median_depth[0]
@@ -203,8 +204,7 @@ def project(gaussians: Gaussians, cameras: Cameras) -> Projected:
     )
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * x / z, zero, fy / z, -fy * y / z], dim=-1).unflatten(-1, (2, 3))
-    RS = quats_to_matrices(gaussians.quats) * gaussians.scales[:, None, :]  # Sigma = RS RS^T
-    M = J @ (R[:, None] @ RS[None])  # [C, N, 2, 3]
+    M = J @ (R[:, None] @ gaussians.axes[None])  # [C, N, 2, 3]; Sigma' = M M^T
     xx = (M[..., 0, :] ** 2).sum(-1) + DILATION_PX2
     xy = (M[..., 0, :] * M[..., 1, :]).sum(-1)
     yy = (M[..., 1, :] ** 2).sum(-1) + DILATION_PX2

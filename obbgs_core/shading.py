@@ -156,13 +156,12 @@ def lit_shares(gaussians: Gaussians, maps: Sequence[ShadowMap]) -> Tensor:
     Pixels are weighted by a spline and the share falls over a range of depths: steps would turn a last bit into light.
     """
     gaussians = gaussians.detach()
-    axes_m = quats_to_matrices(gaussians.quats) * gaussians.scales[:, None]  # [N, 3, 3]
-    shares = []
+    axes, shares = gaussians.axes, []
     for each in maps:
         R, t = each.sun.world_to_camera[0, :3, :3], each.sun.world_to_camera[0, :3, 3]
         focal_px, middle_px = each.sun.K[0, 0, 0], each.sun.K[0, 0, 2]
         x, y, depth_m = (gaussians.means @ R.T + t).unbind(dim=1)
-        deviation_m = (R[2] @ axes_m).norm(dim=1)
+        deviation_m = (R[2] @ axes).norm(dim=1)
         unit_m = deviation_m + t[2] / focal_px
         side = len(each.first_m)
         u, v = (

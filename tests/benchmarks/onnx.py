@@ -5,6 +5,7 @@ Time and memory are those of a process of its own that holds only numpy and onnx
 """
 
 import argparse
+import dataclasses
 import json
 import math
 import os
@@ -88,8 +89,6 @@ def measure(gaussians, distance: float) -> dict:
     parity_db is against float32 and 20 views; parity_float64_db is one view against the reference in float64, and
     render_float64_db is the same for our own float32: what the number format itself costs.
     """
-    import dataclasses
-
     import torch
 
     from obbgs_core.cameras import Cameras
@@ -118,8 +117,8 @@ def measure(gaussians, distance: float) -> dict:
         figures = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
         with np.load(Path(folder) / "outputs.npz") as arrays:
             images, alphas, depths = (torch.tensor(arrays[name]) for name in ("image", "alpha", "depth"))
-    parameters = gaussians.tensors() | {"ambient": gaussians.ambient}
-    double = dataclasses.replace(gaussians, **{name: value.double() for name, value in parameters.items()})
+    parameters = gaussians.parameters().items()
+    double = dataclasses.replace(gaussians, **{name: value.double() for name, value in parameters})
     first = dataclasses.replace(
         cameras.one(0), world_to_camera=cameras.world_to_camera[:1].double(), K=cameras.K[:1].double()
     )
@@ -146,8 +145,6 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="one JSON object a row")
     parser.add_argument("--model", type=Path, help="measure this model.ply of a run")
     arguments = parser.parse_args()
-
-    import dataclasses
 
     import torch
 

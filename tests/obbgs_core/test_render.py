@@ -56,9 +56,7 @@ def looking_at_origin(
 def outputs_and_gradients(
     gaussians: Gaussians, cameras: Cameras, backend: str, normals: bool = False, sunlit=None
 ):
-    parameters = gaussians.tensors()
-    if gaussians.shading == "lambert":
-        parameters["ambient"] = gaussians.ambient
+    parameters = gaussians.parameters() if gaussians.shading == "lambert" else gaussians.tensors()
     leaves = {name: value.clone().requires_grad_() for name, value in parameters.items()}
     pose = cameras.world_to_camera.clone().requires_grad_()
     moved = dataclasses.replace(cameras, world_to_camera=pose)
@@ -130,8 +128,8 @@ def test_under_the_sun_kernels_match_the_reference_in_float64(kernel, shading, s
     single.log_scales += 1.0  # flat tops, as above
     single, cameras = under_the_sun(single, looking_at_origin(3, 48), shading)
     sunlit = torch.rand(3, 60, generator=torch.Generator().manual_seed(2))
-    parameters = single.tensors() | {"ambient": single.ambient}
-    double = dataclasses.replace(single, **{name: value.double() for name, value in parameters.items()})
+    parameters = single.parameters().items()
+    double = dataclasses.replace(single, **{name: value.double() for name, value in parameters})
     exact = dataclasses.replace(
         cameras,
         world_to_camera=cameras.world_to_camera.double(),
