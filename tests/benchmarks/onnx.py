@@ -148,11 +148,15 @@ def main() -> None:
 
     import torch
 
+    from obbgs_core.errors import ReconstructionError
     from obbgs_core.ply import load_ply
     from tests.benchmarks.rasterizer import scene
 
     if arguments.model:
-        gaussians = load_ply(arguments.model)
+        try:
+            gaussians = load_ply(arguments.model)
+        except (OSError, ReconstructionError) as error:
+            parser.error(str(error))
         radius = float((gaussians.means - gaussians.means.median(dim=0).values).norm(dim=1).quantile(0.99))
         gaussians.means = gaussians.means - gaussians.means.median(dim=0).values
         cases = [(gaussians, 3 * radius)]

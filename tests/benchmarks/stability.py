@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ground.session import SessionError
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.metrics import psnr_db
@@ -115,9 +116,8 @@ def cases(name: str, size: int, seeds: int):
     yield "all frames black", in_eclipse(plain, 0.0, 1.0), {}, 0
 
 
-def moving_sun(session: Path):
-    """Yield a session whose Sun moves, with each way that the model may take it."""
-    target = targets.from_session(session)
+def moving_sun(target: targets.Target):
+    """Yield a target whose Sun moves, with each way that the model may take it."""
     yield "moving Sun, held static", target, {"sun_span_deg": 0.0}, 0
     yield "moving Sun, linear", target, {"sun_shading": "linear"}, 0
     yield "moving Sun", target, {}, 0
@@ -143,7 +143,12 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     failures = 0
     rows = cases(arguments.target, arguments.size, arguments.seeds)
-    for condition, target, changes, seed in moving_sun(arguments.session) if arguments.session else rows:
+    if arguments.session:
+        try:
+            rows = moving_sun(targets.from_session(arguments.session))
+        except SessionError as error:
+            parser.error(str(error))
+    for condition, target, changes, seed in rows:
         row: dict = {"condition": condition}
         try:
             row |= measure(configure("obbgs", arguments.steps_share, **changes), target, seed)
