@@ -19,24 +19,36 @@ SPLIT_SHRINK = 1.6  # a split's halves are this much smaller (Kerbl et al. 2023)
 
 @dataclass
 class Growth:
-    """Running screen-space gradients [N], in px or weighted by the pixels each Gaussian covers (Pixel-GS)."""
+    """Running screen-space gradients [N], by view or weighted by the pixels each Gaussian covers (Pixel-GS).
+
+    radius_px: [N] the longest three sigma that each Gaussian had in a picture.
+    """
 
     count: int
     pixel_weighted: bool
     gradient: Tensor = field(init=False)
     weight: Tensor = field(init=False)
+    radius_px: Tensor = field(init=False)
 
     def __post_init__(self):
-        self.gradient, self.weight = torch.zeros(self.count), torch.zeros(self.count)
+        self.gradient, self.weight, self.radius_px = (torch.zeros(self.count) for _ in range(3))
 
     @torch.no_grad()
-    def observe(self, rendered: Rendered, half_size_px: float) -> None:
-        """Add one step's gradients, per unit of normalised device coordinates as the published thresholds are."""
+    def observe(self, rendered: Rendered, half_size_px: float, depth_weight: Tensor | None = None) -> None:
+        """Add one step's gradients, per unit of normalised device coordinates as the published thresholds are.
+
+        Args:
+            depth_weight: [C, N] factor on the gradients of each camera's Gaussians.
+        """
         for camera, gradient in rendered.screen.means2d.items():
             pixels = rendered.screen.pixels[camera]
             weight = pixels if self.pixel_weighted else (pixels > 0).float()
-            self.gradient += gradient.norm(dim=-1) * half_size_px * weight
+            size = gradient.norm(dim=-1) * half_size_px
+            if depth_weight is not None:
+                size = size * depth_weight[camera]
+            self.gradient += size * weight
             self.weight += weight
+            self.radius_px = torch.maximum(self.radius_px, rendered.radii[camera].to(self.radius_px))
 
     def mean(self) -> Tensor:
         return self.gradient / self.weight.clamp(min=1e-9)
@@ -51,8 +63,8 @@ class Adam:
         self.second = {name: torch.zeros_like(t) for name, t in gaussians.parameters().items()}
 
     @torch.no_grad()
-    def step(self, gaussians: Gaussians, rates: dict[str, float]) -> None:
-        """Move every parameter that has a gradient, and drop the gradients."""
+    def step(self, gaussians: Gaussians, rates: dict[str, float | Tensor]) -> None:
+        """Move every parameter that has a gradient, and drop the gradients; a rate may differ within a parameter."""
         self.steps += 1
         b1, b2 = self.betas
         correction = math.sqrt(1 - b2**self.steps) / (1 - b1**self.steps)
@@ -61,14 +73,20 @@ class Adam:
                 continue
             values, gradient, rate = parameter.detach(), parameter.grad.contiguous(), rates[name] * correction
             first, second = self.first[name], self.second[name]
-            if native := compiled.module_for(values):  # the same in one pass over memory
+            native = compiled.module_for(values)
+            if native is not None and not isinstance(rate, Tensor):  # the same in one pass over memory
                 threads = torch.get_num_threads()
                 native.adam_step(values, gradient, first, second, rate, b1, b2, self.eps, threads)
             else:
                 first.lerp_(gradient, 1 - b1)
                 second.mul_(b2).addcmul_(gradient, gradient, value=1 - b2)
-                values.addcdiv_(first, second.sqrt().add_(self.eps), value=-rate)
+                values.sub_(rate * first / second.sqrt().add_(self.eps))
             parameter.grad = None
+
+    def rest(self, name: str) -> None:
+        """Forget what is known of a parameter's gradients, whose values were changed by hand."""
+        self.first[name].zero_()
+        self.second[name].zero_()
 
     def widen(self, gaussians: Gaussians) -> None:
         """Follow coefficients of radiance that were added: theirs start at rest."""
@@ -138,16 +156,26 @@ def outliers(gaussians: Gaussians, spread: float = 4.0, faint: float = 0.1) -> T
 def densify(
     gaussians: Gaussians,
     adam: Adam,
-    gradient: Tensor,
-    radius: float,
+    growth: Growth,
+    unit_m: float,
     config: MethodConfig,
+    share: float,
     rng: torch.Generator,
 ) -> Gaussians:
-    """Grow where screen gradients [N] are large, within the budget; prune what is faint or far too large."""
-    gaussians, _ = grow(gaussians, adam, chosen(gradient, gaussians, config), config.split_over * radius, rng)
+    """Grow where screen gradients are large, within the budget; prune what is faint or too large.
+
+    Args:
+        unit_m: the method's unit of length.
+        share: of the steps that are done.
+    """
+    growing = chosen(growth.mean(), gaussians, config)
+    gaussians, kept = grow(gaussians, adam, growing, config.split_over * unit_m, rng)
     with torch.no_grad():
         wanted = gaussians.opacities > config.prune_opacity
-        wanted &= gaussians.scales.max(dim=1).values < config.prune_over * radius
+        if share >= config.prune_over_from:
+            wanted &= gaussians.scales.max(dim=1).values < config.prune_over * unit_m
+            if config.prune_radius_px:
+                wanted[: len(kept)] &= growth.radius_px[kept] <= config.prune_radius_px
         wanted &= torch.isfinite(gaussians.means).all(dim=1)
     return keep(gaussians, adam, wanted) if wanted.any() else gaussians
 
@@ -157,16 +185,17 @@ def densify_boxes(
     adam: Adam,
     growth: Growth,
     boxes: list[Obb],
-    radius: float,
+    unit_m: float,
     config: MethodConfig,
     rng: torch.Generator,
 ) -> tuple[Gaussians, Growth]:
     """Apply the clone/split rule inside the boxes only; what grows starts its gradient record anew."""
     inside = torch.stack([box.contains(gaussians.means.detach()) for box in boxes]).any(dim=0)
     growing = chosen(growth.mean(), gaussians, config) & inside
-    gaussians, kept = grow(gaussians, adam, growing, config.split_over * radius, rng)
+    gaussians, kept = grow(gaussians, adam, growing, config.split_over * unit_m, rng)
     anew = Growth(len(gaussians), config.pixel_weighted)
-    anew.gradient[: len(kept)], anew.weight[: len(kept)] = growth.gradient[kept], growth.weight[kept]
+    for name in ("gradient", "weight", "radius_px"):
+        getattr(anew, name)[: len(kept)] = getattr(growth, name)[kept]
     return gaussians, anew
 
 

@@ -55,6 +55,13 @@ def sun_span_deg(frames: list[TrainingFrame]) -> float:
     return math.degrees(torch.cdist(directions, directions).max().div(2).clamp(max=1).asin().mul(2).item())
 
 
+def camera_extent_m(frames: list[TrainingFrame]) -> float:
+    """Return 1.1 times the largest distance of a camera from the mean of all: the length unit of 3DGS (Kerbl 2023)."""
+    poses = torch.stack([f.world_to_camera for f in frames]).double()
+    centres = -(poses[:, :3, :3].transpose(1, 2) @ poses[:, :3, 3:])[..., 0]
+    return 1.1 * (centres - centres.mean(dim=0)).norm(dim=1).max().item()
+
+
 def cameras_of(frames: list[TrainingFrame]) -> Cameras:
     """Return the cameras of some frames of one size, with their Sun where it is known in all."""
     height, width = frames[0].dn.shape[:2]

@@ -4,23 +4,39 @@ import dataclasses
 import math
 from dataclasses import dataclass, replace
 
+CHOICES = {
+    "loss": ("l1_ssim", "likelihood"),
+    "length_unit": ("target", "cameras"),
+    "start": ("random", "hull"),
+    "start_colour": ("seen", "grey"),
+    "sun_shading": ("lambert", "linear"),
+    "refine_poses": ("never", "always", "auto"),
+}
+
 
 @dataclass(frozen=True)
 class MethodConfig:
-    """Everything that shapes a training run; rates are per step, lengths in units of the target's radius."""
+    """Everything that shapes a training run; rates are per step, lengths in the method's own unit."""
 
     name: str
     exposure_aware: bool = False  # False: exposure ignored, as the methods were published
+    length_unit: str = "target"  # target (its radius) | cameras (how far they stand apart, as in 3DGS)
     loss: str = "l1_ssim"  # l1_ssim | likelihood (sensor model, saturated pixels censored)
     ssim_weight: float = 0.2
     edge_weight: float = 0.0  # Sobel
     frames_per_step: int = 1
     bracket_steps: bool = False  # the frames of a step are one of each exposure
     start: str = "random"  # random | hull
+    start_colour: str = (
+        "seen"  # seen (radiance where the points project) | grey (half of full scale, as in 3DGS)
+    )
     start_count: int = 100_000
     steps: int = 30_000
     pyramid: tuple[tuple[float, float], ...] = ((0.0, 1.0),)  # (from this share of the steps, image scale)
     sh_degree: int = 3
+    sh_interval: int = (
+        0  # > 0: radiance is constant at first, and its degree rises by one after so many steps
+    )
     max_gaussians: int = 500_000
     pixels_per_gaussian: int = (
         0  # > 0: so many lit ones of the long exposures for each, or they are learnt by heart
@@ -33,12 +49,17 @@ class MethodConfig:
     grow_share: float = (
         0.0  # > 0: grow this share of the Gaussians, largest gradients first, instead of a threshold
     )
-    pixel_weighted: bool = False  # Pixel-GS
+    pixel_weighted: bool = False  # Pixel-GS: gradients are averaged over pixels instead of views
+    depth_scale: float = (
+        0.0  # > 0: gradients of Gaussians nearer to the camera than this count less (Pixel-GS)
+    )
     obb_interval: int = 0  # > 0: extra growth inside the boxes of the worst tiles, every so many steps
     obb_mean_centre: bool = False
     split_over: float = 0.01  # Gaussians larger than this are split, smaller ones cloned
     prune_opacity: float = 0.005
     prune_over: float = 0.2  # larger Gaussians are removed
+    prune_radius_px: float = 0.0  # > 0: and those whose three sigma are longer than this in a picture
+    prune_over_from: float = 0.0  # share of the steps: before, size is no reason
     opacity_reset_interval: int = 3000  # 0: never
     outlier_filter: bool = False
     lr_means: float = 1.6e-4
@@ -47,6 +68,7 @@ class MethodConfig:
     lr_log_scales: float = 0.005
     lr_opacity_logits: float = 0.05
     lr_sh: float = 0.0025
+    lr_sh_rest: float = 1.0  # times lr_sh, of the coefficients above degree 0
     lr_ambient: float = 0.001  # of the Sun
     lr_end: float = 1.0  # all other rates fall to this share of theirs
     lr_poses: float = 0.3  # in deviations of the pose tag
@@ -81,14 +103,10 @@ class MethodConfig:
     chi2_end: float = 0.0  # > 0: stop when the mean squared normalised residual falls to this
 
     def __post_init__(self):
-        if self.loss not in ("l1_ssim", "likelihood"):
-            raise ValueError(f"loss must be l1_ssim or likelihood, got {self.loss!r}")
-        if self.start not in ("random", "hull"):
-            raise ValueError(f"start must be random or hull, got {self.start!r}")
-        if self.sun_shading not in ("lambert", "linear"):
-            raise ValueError(f"sun_shading must be lambert or linear, got {self.sun_shading!r}")
-        if self.refine_poses not in ("never", "always", "auto"):
-            raise ValueError(f"refine_poses must be never, always or auto, got {self.refine_poses!r}")
+        for name, known in CHOICES.items():
+            if getattr(self, name) not in known:
+                expected = f"{', '.join(known[:-1])} or {known[-1]}"
+                raise ValueError(f"{name} must be {expected}, got {getattr(self, name)!r}")
         if not 0 <= self.exposure_sigma < math.inf:
             raise ValueError(f"exposure_sigma must be 0 (exact) or a deviation, got {self.exposure_sigma}")
         for name in ("steps", "frames_per_step", "start_count", "max_gaussians", "shadow_interval"):
@@ -96,12 +114,21 @@ class MethodConfig:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
 
 
-_3DGS = MethodConfig(name="3dgs")
+_3DGS = MethodConfig(
+    name="3dgs",
+    length_unit="cameras",
+    start_colour="grey",
+    sh_interval=1000,
+    lr_sh_rest=1 / 20,
+    prune_over=0.1,
+    prune_radius_px=20.0,
+    prune_over_from=3000 / 30_000,  # after the first reset of the opacities
+)
 PRESETS: dict[str, MethodConfig] = {
     c.name: c
     for c in (
         _3DGS,
-        replace(_3DGS, name="pixel-gs", pixel_weighted=True),
+        replace(_3DGS, name="pixel-gs", pixel_weighted=True, depth_scale=0.37),
         replace(_3DGS, name="mvgs", frames_per_step=4),
         replace(
             _3DGS,

@@ -21,7 +21,15 @@ from obbgs_core.cameras import Cameras
 from obbgs_core.densify import Adam, Growth, densify, densify_boxes, keep, outliers, trainable
 from obbgs_core.errors import Diverged, ReconstructionError
 from obbgs_core.files import write_whole
-from obbgs_core.frames import FEWEST_FRAMES, Batch, Batches, TrainingFrame, sun_span_deg, usable
+from obbgs_core.frames import (
+    FEWEST_FRAMES,
+    Batch,
+    Batches,
+    TrainingFrame,
+    camera_extent_m,
+    sun_span_deg,
+    usable,
+)
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.hull import shows_light
 from obbgs_core.losses import fit_figures, likelihood_loss, normal_disagreement, published_loss
@@ -129,6 +137,7 @@ class Trainer:
         self.gaussians, self.radius, self.start = first_gaussians(
             self.frames, list(outlines.values()), sensor, config, self.rng
         )
+        self.unit_m = camera_extent_m(self.frames) if config.length_unit == "cameras" else self.radius
         self.sun_span_deg = sun_span_deg(self.frames)
         self.why_appearance = "as configured" if config.sh_degree else ""
         self.adam = Adam(self.gaussians)
@@ -167,7 +176,8 @@ class Trainer:
         (loss + self._priors(batch, share, rendered, cameras)).backward()
         if config.grow_from <= share < self.grow_until:
             self._observe(rendered, batch, residual)
-        self.adam.step(self.gaussians, _rates(config, share, self.radius))
+        self._freeze_later_degrees()
+        self.adam.step(self.gaussians, _rates(config, share, self.unit_m, self.gaussians.sh.shape[1]))
         self.gaussians.ambient.detach().clamp_(min=0)
         if self.poses is not None:
             self.poses.step(config.lr_poses * (1 - share) if share >= config.poses_from else 0.0)
@@ -254,7 +264,7 @@ class Trainer:
             "gaussians": dataclasses.asdict(self.gaussians.detach()),
             "why_appearance": self.why_appearance,
             "adam": {"first": self.adam.first, "second": self.adam.second, "steps": self.adam.steps},
-            "growth": (self.growth.gradient, self.growth.weight),
+            "growth": (self.growth.gradient, self.growth.weight, self.growth.radius_px),
             "shadow_maps": [
                 (sun, m.sun.world_to_camera, m.sun.K, m.first_m) for sun, m in self.shadow_maps.items()
             ],
@@ -284,7 +294,7 @@ class Trainer:
         self.adam.first, self.adam.second = state["adam"]["first"], state["adam"]["second"]
         self.adam.steps = state["adam"]["steps"]
         self.growth = Growth(len(self.gaussians), self.config.pixel_weighted)
-        self.growth.gradient, self.growth.weight = state["growth"]
+        self.growth.gradient, self.growth.weight, self.growth.radius_px = state["growth"]
         self.boxes = [obb.Obb(*box) for box in state["boxes"]]
         for sun, pose, K, first_m in state["shadow_maps"]:
             self.shadow_maps[sun] = ShadowMap(Cameras(pose, K, SHADOW_MAP_PX, SHADOW_MAP_PX), first_m)
@@ -381,6 +391,13 @@ class Trainer:
                 total = total + corrections.prior(batch.indices, batch.dn.numel())
         return total
 
+    def _freeze_later_degrees(self) -> None:
+        """Keep the coefficients of radiance still whose degree has not come yet (Kerbl et al. 2023)."""
+        gradient = self.gaussians.sh.grad
+        if self.config.sh_interval and gradient is not None:
+            degree = self.steps_done // self.config.sh_interval
+            gradient[:, (degree + 1) ** 2 :] = 0
+
     def _sunlit(self, cameras: Cameras) -> Tensor | None:
         """Return the share of each camera's Sun that reaches each Gaussian [C, N]; none where that does not count.
 
@@ -400,7 +417,11 @@ class Trainer:
 
     def _observe(self, rendered: Rendered, batch: Batch, residual: Tensor) -> None:
         """Record the screen gradients, and the boxes behind each frame's worst tile."""
-        self.growth.observe(rendered, max(batch.cameras.width, batch.cameras.height) / 2)
+        depth_weight = None
+        if self.config.depth_scale:
+            near_m = self.config.depth_scale * self.unit_m
+            depth_weight = (_depths_m(self.gaussians.means, batch.cameras) / near_m).clamp(0, 1) ** 2
+        self.growth.observe(rendered, max(batch.cameras.width, batch.cameras.height) / 2, depth_weight)
         if not self.config.obb_interval:
             return
         error = residual.abs()
@@ -419,17 +440,18 @@ class Trainer:
         growing = config.grow_from <= share < self.grow_until
         if growing and now % config.grow_interval == 0:
             self.gaussians = densify(
-                self.gaussians, self.adam, self.growth.mean(), self.radius, config, self.rng
+                self.gaussians, self.adam, self.growth, self.unit_m, config, share, self.rng
             )
             self.growth, self.boxes = Growth(len(self.gaussians), config.pixel_weighted), []
         elif growing and self.boxes and now % config.obb_interval == 0:
             self.gaussians, self.growth = densify_boxes(
-                self.gaussians, self.adam, self.growth, self.boxes, self.radius, config, self.rng
+                self.gaussians, self.adam, self.growth, self.boxes, self.unit_m, config, self.rng
             )
             self.boxes = []
         if config.opacity_reset_interval and growing and now % config.opacity_reset_interval == 0:
             with torch.no_grad():
                 self.gaussians.opacity_logits.clamp_(max=math.log(0.01 / 0.99))
+            self.adam.rest("opacity_logits")
         scale, sun_moves = math.sqrt(1 / batch.averaged_pixels), 0 < config.sun_span_deg < self.sun_span_deg
         if any(now == round(at * config.steps) for at in config.weigh_at):
             self.best = None  # a model just weighed explains less for a while
@@ -513,16 +535,28 @@ def _image_loss(
     return loss * len(batch.cameras), residual  # a sum over the step's frames, as published
 
 
-def _rates(config: MethodConfig, share: float, radius: float) -> dict[str, float]:
+def _rates(config: MethodConfig, share: float, unit_m: float, coefficients: int) -> dict[str, float | Tensor]:
+    """Return the rate of each parameter at a share of the steps; of the radiance one a coefficient if they differ."""
     fall = config.lr_end**share
+    lr_sh: float | Tensor = config.lr_sh * fall
+    if config.lr_sh_rest != 1 and coefficients > 1:
+        factors = torch.full((1, coefficients, 1), config.lr_sh_rest)
+        factors[:, 0] = 1
+        lr_sh = lr_sh * factors
     return {
-        "means": config.lr_means ** (1 - share) * config.lr_means_end**share * radius,
+        "means": config.lr_means ** (1 - share) * config.lr_means_end**share * unit_m,
         "quats": config.lr_quats * fall,
         "log_scales": config.lr_log_scales * fall,
         "opacity_logits": config.lr_opacity_logits * fall,
-        "sh": config.lr_sh * fall,
+        "sh": lr_sh,
         "ambient": config.lr_ambient * fall,
     }
+
+
+def _depths_m(means: Tensor, cameras: Cameras) -> Tensor:
+    """Return how far before each camera's plane the Gaussians lie [C, N], m."""
+    along = cameras.world_to_camera[:, 2]
+    return along[:, :3] @ means.detach().T + along[:, 3:]
 
 
 def _seconds_left(history: list[StepInfo], config: MethodConfig, done: int, seconds: float) -> float:

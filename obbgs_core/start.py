@@ -85,7 +85,12 @@ def _at(
     spacing = torch.from_numpy(distances).float()[:, 1:].mean(dim=1).clamp(min=1e-6)
     count, channels = len(points), frames[0].dn.shape[2]
     coefficients = torch.zeros(count, (config.sh_degree + 1) ** 2, channels)
-    coefficients[:, 0] = sh.from_radiance(_seen_radiance(points, frames, sensor))
+    if config.start_colour == "grey":
+        exposure_s = math.exp(sum(math.log(f.exposure_time_s) for f in frames) / len(frames))
+        half = 0.5 * (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * exposure_s)
+        coefficients[:, 0] = sh.from_radiance(torch.tensor(half))
+    else:
+        coefficients[:, 0] = sh.from_radiance(_seen_radiance(points, frames, sensor))
     quats = torch.zeros(count, 4)
     quats[:, 0] = 1
     logits = torch.full((count,), math.log(opacity / (1 - opacity)))
