@@ -91,7 +91,9 @@ def motions(poses: PoseCorrections) -> Tensor:
 def settled(frames: list[TrainingFrame], steps: int = 40) -> PoseCorrections:
     """Return the corrections that explain frames best where the model is known."""
     poses, gaussians = PoseCorrections(frames), model()
-    batch = Batches(frames, preset("obbgs"), torch.Generator()).batch(list(range(len(frames))), 1.0)
+    batch = Batches(frames, SENSOR.white_dn, preset("obbgs"), torch.Generator()).batch(
+        list(range(len(frames))), 1.0
+    )
     for k in range(steps):
         radiance = render(gaussians, poses.cameras(batch)).radiance
         loss, _ = likelihood_loss(radiance, batch.exposure_time_s, batch.dn, SENSOR, batch.averaged_pixels)
@@ -157,7 +159,7 @@ def test_an_error_along_a_correlation_is_found_where_single_deviations_would_not
     for covariance in (whole, torch.diag(whole.diagonal())):
         found = motions(settled(tagged(wrong, covariance)))
         left_m.append((found - errors)[:, 5].square().mean().sqrt().item())
-    assert left_m[0] < 0.5 * left_m[1]  # 0.14 of it: 1 - 0.995² of the variance is not told by the tilt
+    assert left_m[0] < 0.5 * left_m[1]  # a tenth of it; a tenth of the deviation is what the tilt cannot tell
 
 
 @pytest.mark.parametrize("exact", [[0, 4], [2, 3, 4, 5]])
@@ -198,7 +200,7 @@ def test_the_price_of_a_correction_counts_only_the_directions_that_may_be_correc
     worth = []
     for variances in (deviations**2, deviations**2 + 1e-12):
         doubted = tagged(wrong, axes @ torch.diag(variances) @ axes.T)
-        batches = Batches(doubted, preset("obbgs"), torch.Generator())
+        batches = Batches(doubted, SENSOR.white_dn, preset("obbgs"), torch.Generator())
         brackets = [batches.batch([i], 1.0) for i in range(len(doubted))]
         worth.append(worth_of_corrections(model(), doubted, brackets, SENSOR, 0.3)[0])
     assert worth[0] > 10 and worth[0] / worth[1] == pytest.approx(6 / 2, rel=0.1)
@@ -249,7 +251,7 @@ def exactly_turned() -> Tensor:
     ],
 )
 def test_settling_the_gauge_changes_no_image_however_much_is_exact(frames, covariance, freedom):
-    """The motions are of 0.01 rad and m at most, their products of 1e-4: a hundredth of a pixel."""
+    """What is left is of second order: a millionth of the mean radiance, 0.04; a compensation left out costs 7e-4."""
     doubted = tagged(frames, covariance)
     poses, gaussians = PoseCorrections(doubted), model()
     rng = torch.Generator().manual_seed(0)
@@ -269,7 +271,7 @@ def test_settling_the_gauge_changes_no_image_however_much_is_exact(frames, covar
         assert float(poses.value.detach().norm()) < size_before - 0.01
     else:
         torch.testing.assert_close(after_gaussians.means, gaussians.means)
-    assert (before - images(after_gaussians)).abs().mean() < 1e-3
+    assert (before - images(after_gaussians)).abs().mean() < 1e-5
 
 
 def test_the_gauge_is_settled_by_the_whole_covariance(frames):
