@@ -11,6 +11,7 @@ z; a step of more than `max_gap_s` is a gap):
     {"utc_ns": 1784631150000000000, "quat_body_to_camera": [4], "position_body_m": [3, camera centre],
      "covariance": [[6x6: position (m, body), rotation vector (rad, camera)]]}
 
+A pose's covariance is that of its errors: position minus the true one, and the rotation vector a in R = exp(a) R_true.
 Without attitudes, the target turns as the mission says and the chaser points its camera at the target.
 """
 
@@ -33,6 +34,8 @@ from flightsw.icd.mission import NavigationSection
 MAX_LINE_BYTES = 16_384
 MAX_STATES = 4096  # kept behind the newest one
 POLL_S = 0.01
+COVARIANCE_TOLERANCE = 1e-6  # of the mean variances: what six printed digits and float32 leave
+SMALLEST_VARIANCE = 1e-60  # for a vector without variance, any entry of whose covariance would then show
 NS = 1_000_000_000
 
 
@@ -114,10 +117,17 @@ def _quaternion(value: Any) -> np.ndarray:
 
 
 def _covariance(value: Any) -> np.ndarray:
+    """Return a covariance [6, 6] of two vectors, symmetric; each vector's mean variance is the scale of its errors."""
     matrix = _vector(value, 6, 6)
-    scale = np.abs(matrix).max()
-    if np.abs(matrix - matrix.T).max() > 1e-9 * scale or np.linalg.eigvalsh(matrix)[0] < -1e-9 * scale:
-        raise ValueError("a covariance must be symmetric and positive semi-definite")
+    mean_variances = np.diag(matrix).reshape(2, 3).mean(axis=1)
+    deviations = np.sqrt(np.maximum(mean_variances, SMALLEST_VARIANCE)).repeat(3)
+    scaled = matrix / np.outer(deviations, deviations)
+    asymmetry, smallest = np.abs(scaled - scaled.T).max(), np.linalg.eigvalsh(scaled)[0]
+    if asymmetry > COVARIANCE_TOLERANCE or smallest < -COVARIANCE_TOLERANCE:
+        raise ValueError(
+            f"a covariance must be symmetric and positive semi-definite; asymmetric by {asymmetry:.2g} and with an "
+            f"eigenvalue of {smallest:.2g} of its mean variances"
+        )
     return (matrix + matrix.T) / 2
 
 

@@ -200,9 +200,6 @@ def sensor_of(camera: CameraSection) -> Sensor:
 def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
     dn = session.dn(record).astype(np.float32)
     world_to_camera = torch.tensor(record.world_to_camera, dtype=torch.float32)
-    body_to_camera = record.world_to_camera[:3, :3]
-    position_m2 = body_to_camera @ record.covariance[:3, :3] @ body_to_camera.T
-    variances = np.concatenate([np.diag(record.covariance)[3:], np.diag(position_m2)])
     return TrainingFrame(
         dn=torch.from_numpy(dn.reshape(*dn.shape[:2], session.camera.channels)),
         exposure_time_s=record.exposure_time_s,
@@ -210,9 +207,26 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
         K=torch.tensor(session.camera.K),
         id=record.id,
         bracket=record.bracket,
-        pose_sigma=torch.from_numpy(np.sqrt(np.clip(variances, 0, None)).astype(np.float32)),
+        pose_covariance=torch.from_numpy(
+            motion_covariance(record.covariance, record.world_to_camera[:3, :3])
+        ),
         sun_dir=sun_direction(record),
     )
+
+
+def motion_covariance(tag_covariance: np.ndarray, body_to_camera: np.ndarray) -> np.ndarray:
+    """Return the covariance [6, 6] of the motion that makes a tagged pose the true one, from that of the tag's errors.
+
+    The motion stands in front of world_to_camera: rotation vector about (rad), then shift along (m) the camera's axes.
+    The tag's errors are position minus the true one, dp (m, body), and the rotation vector a (rad, camera) in
+    R_tag = exp(a) R_true. As t = -R p, the motion is the rotation -a and the shift t_true - exp(-a) t_tag = R_true dp,
+    to first order R_tag dp. The turn is about the camera's centre, whose position it leaves alone: no term of the range
+    couples the two. Their signs differ, and with them the sign of the correlation between position and rotation.
+    """
+    motion_by_tag = np.zeros((6, 6))
+    motion_by_tag[:3, 3:] = -np.eye(3)
+    motion_by_tag[3:, :3] = body_to_camera
+    return motion_by_tag @ tag_covariance @ motion_by_tag.T
 
 
 def sun_direction(record: FrameRecord) -> Tensor | None:

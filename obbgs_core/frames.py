@@ -12,6 +12,7 @@ from obbgs_core.cameras import Cameras, stacked_suns
 from obbgs_core.corrections import ExposureCorrections
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.methods import MethodConfig
+from obbgs_core.pose_covariance import flaw
 
 FEWEST_FRAMES = 3
 
@@ -20,7 +21,8 @@ FEWEST_FRAMES = 3
 class TrainingFrame:
     """One exposure: dn [H, W, C] float, known exposure time, pose [4, 4] body to camera, K [3, 3] px.
 
-    pose_sigma: deviations [6] of the pose tag, rad about and m along the camera axes; None: the pose is exact.
+    pose_covariance: [6, 6] float64, of the motion that in front of world_to_camera makes the tagged pose the true one:
+        rotation vector about the camera's axes (rad), then shift along them (m); None or zeros: the pose is exact.
     sun_dir: [3] towards the Sun, unit, body frame; None: not known.
     """
 
@@ -30,7 +32,7 @@ class TrainingFrame:
     K: Tensor
     id: int = 0
     bracket: int | None = None  # frames of one trigger share a pose correction
-    pose_sigma: Tensor | None = None
+    pose_covariance: Tensor | None = None
     sun_dir: Tensor | None = None
 
 
@@ -74,7 +76,7 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
 
     Raises:
         TooFewFrames: fewer than three.
-        ReconstructionError: sizes differ, or a value is not finite.
+        ReconstructionError: sizes differ, a value is not finite, or a pose covariance is none.
     """
     if len(frames) < FEWEST_FRAMES:
         raise TooFewFrames(f"a reconstruction needs at least {FEWEST_FRAMES} frames, got {len(frames)}")
@@ -90,6 +92,11 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
         if not (finite and torch.isfinite(f.K).all() and 0 < f.exposure_time_s < math.inf):
             raise ReconstructionError(
                 f"frame {f.id} holds a value or a pose that is not finite, or no exposure time; leave it out"
+            )
+        if f.pose_covariance is not None and (fault := flaw(f.pose_covariance)):
+            raise ReconstructionError(
+                f"frame {f.id} has a pose covariance that {fault}, expected a symmetric [6, 6] without negative "
+                "eigenvalues; leave the frame out, or send zeros if its pose is exact"
             )
     if exposure_aware:
         return frames, None

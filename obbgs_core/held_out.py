@@ -37,7 +37,7 @@ def worth_of_corrections(
     """
     poses, worth = PoseCorrections(frames), []
     for batch in brackets:
-        numbers = int((poses.sigma[poses.of_frame[batch.indices[0]]] > 0).sum())
+        numbers = int(poses.rank[poses.of_frame[batch.indices[0]]])
         if numbers:
             tagged, _, _ = _settled(model, poses, batch, sensor, rate, 0)
             settled, chi2, values = _settled(model, poses, batch, sensor, rate, SETTLING_STEPS)

@@ -318,7 +318,7 @@ class Trainer:
             digest.update(
                 f.dn.numpy().tobytes() + f.world_to_camera.numpy().tobytes() + f.K.numpy().tobytes()
             )
-            known = [None if tag is None else tag.tolist() for tag in (f.sun_dir, f.pose_sigma)]
+            known = [None if tag is None else tag.tolist() for tag in (f.sun_dir, f.pose_covariance)]
             digest.update(repr((f.exposure_time_s, f.bracket, known)).encode())
         return digest.hexdigest()
 
@@ -515,7 +515,7 @@ def _decided_at_once(config: MethodConfig, frames: list[TrainingFrame], brackets
     """Return whether the poses are refined, and why, where no training is needed to know."""
     if config.refine_poses != "auto":
         return {"never": "as tagged", "always": "refined"}[config.refine_poses]
-    if not any(f.pose_sigma is not None and f.pose_sigma.any() for f in frames):
+    if not any(f.pose_covariance is not None and f.pose_covariance.any() for f in frames):
         return "as tagged (the tags are exact)"
     return "" if brackets else "as tagged (too few brackets to hold any out)"
 

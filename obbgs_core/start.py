@@ -38,12 +38,20 @@ def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.S
 
 
 def _pose_error_px(frame: TrainingFrame) -> int:
-    """Return how far, px, one deviation of the pose tag moves the target in the image."""
-    if frame.pose_sigma is None:
+    """Return how far, px, one deviation of the pose tag moves the body's origin in the image, the way it moves most."""
+    if frame.pose_covariance is None:
         return 0
-    range_m = float(frame.world_to_camera[:3, 3].norm().clamp(min=1e-6))
-    tilt_rad = float(frame.pose_sigma[:2].max()) + float(frame.pose_sigma[3:5].max()) / range_m
-    return min(MOST_DILATION_PX, round(float(frame.K[0, 0]) * tilt_rad))
+    x, y, z = frame.world_to_camera[:3, 3].tolist()
+    z = max(z, 1e-6)
+    u, v = x / z, y / z
+    image_by_motion = [  # the interaction matrix of a point (Chaumette and Hutchinson 2006)
+        [-u * v, 1 + u * u, -v, 1 / z, 0, -u / z],
+        [-1 - v * v, u * v, u, 0, 1 / z, -v / z],
+    ]
+    pixel_by_motion = frame.K[:2, :2].double() @ torch.tensor(image_by_motion, dtype=torch.float64)
+    covariance_px2 = pixel_by_motion @ frame.pose_covariance.double() @ pixel_by_motion.T
+    worst_px2 = float(torch.linalg.eigvalsh(covariance_px2)[-1].clamp(min=0))
+    return min(MOST_DILATION_PX, round(math.sqrt(worst_px2)))
 
 
 def first_gaussians(

@@ -48,11 +48,13 @@ def with_pose_error(target: targets.Target, degrees: float, seed: int) -> target
     """Return the target with every training pose turned at random about each axis, and tagged as that uncertain."""
     rng = torch.Generator().manual_seed(seed)
     sigma = torch.tensor([np.radians(degrees)] * 3 + [1e-6] * 3, dtype=torch.float32)
-    frames = []
+    covariance, frames = torch.diag(sigma.double() ** 2), []
     for frame in target.training:
         error = rigid_motions(torch.randn(1, 6, generator=rng) * sigma)[0]
         frames.append(
-            dataclasses.replace(frame, world_to_camera=error @ frame.world_to_camera, pose_sigma=sigma)
+            dataclasses.replace(
+                frame, world_to_camera=error @ frame.world_to_camera, pose_covariance=covariance
+            )
         )
     return dataclasses.replace(target, training=frames)
 

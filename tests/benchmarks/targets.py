@@ -123,7 +123,7 @@ def from_session(folder: Path) -> Target:
             frame = training_frame(session, record)
             pose = frame.world_to_camera.clone()
             pose[:3, 3] *= units_per_m
-            sides[-1].append(dataclasses.replace(frame, world_to_camera=pose, pose_sigma=None))
+            sides[-1].append(dataclasses.replace(frame, world_to_camera=pose, pose_covariance=None))
     true = [truth.radiance(record) for record in held_out]
     clean = [exposed(light, sensor, r.exposure_time_s) for (light, _), r in zip(true, held_out, strict=True)]
     alpha, cloud = [alpha for _, alpha in true], truth.cloud_m * units_per_m

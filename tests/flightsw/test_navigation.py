@@ -52,6 +52,13 @@ def pose_line(utc_ns: int, covariance: np.ndarray | None = None) -> bytes:
     )
 
 
+def correlated(sigma_position_m: float, sigma_rad: float, correlation: float) -> np.ndarray:
+    """Return a covariance in which the position along x goes with the rotation about x."""
+    covariance = np.diag(np.repeat([sigma_position_m**2, sigma_rad**2], 3))
+    covariance[0, 3] = covariance[3, 0] = correlation * sigma_position_m * sigma_rad
+    return covariance
+
+
 def with_navigation(source: str, max_gap_s: float = 2.0, wait_s: float = 0.05) -> Mission:
     return dataclasses.replace(MISSION, navigation=NavigationSection(source, max_gap_s, wait_s))
 
@@ -208,12 +215,21 @@ def test_a_covariance_in_gcrs_is_turned_into_the_body_frame(tmp_path):
         {"covariance": [[0] * 6] * 5},
         {"covariance": (-np.eye(6)).tolist()},
         {"covariance": np.triu(np.ones((6, 6))).tolist()},
+        {"covariance": correlated(1.0, 1e-5, 2.0).tolist()},  # radians have no scale in common with metres
+        {"covariance": (correlated(1.0, 1e-5, 0.5) * (1 + 0.1 * np.triu(np.ones((6, 6)), 3))).tolist()},
     ],
 )
 def test_a_state_that_cannot_be_is_refused(change):
     entry = json.loads(pose_line(START_NS)) | change
     with pytest.raises(NavigationError):
         parse_state(json.dumps(entry).encode())
+
+
+def test_a_covariance_without_variance_along_some_direction_may_be_printed_in_seven_digits():
+    factor = np.random.default_rng(0).normal(size=(6, 4)) * np.repeat([100.0, 1e-5], 3)[:, None]
+    printed = np.array([[float(f"{x:.7g}") for x in row] for row in factor @ factor.T])
+    state = parse_state(pose_line(START_NS, printed))
+    np.testing.assert_allclose(state.covariance, printed, rtol=1e-12)
 
 
 @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode))

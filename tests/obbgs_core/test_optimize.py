@@ -79,7 +79,7 @@ def test_only_full_scale_is_saturated_in_a_smaller_picture():
 
 def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path):
     config = preset("obbgs", **QUICK, refine_poses="always", exposure_sigma=0.02, weigh_at=(0.5,))
-    tagged = [dataclasses.replace(f, pose_sigma=torch.full((6,), 1e-3)) for f in frames]
+    tagged = [dataclasses.replace(f, pose_covariance=1e-6 * torch.eye(6).double()) for f in frames]
     whole = train(tagged, SENSOR, config, seed=3)
     first = Trainer(tagged, SENSOR, config, seed=3)
     for _ in range(23):
@@ -104,7 +104,7 @@ def test_a_checkpoint_of_another_training_is_not_used(frames, tmp_path):
     Trainer(frames, SENSOR, preset("obbgs", **QUICK), seed=1).save(tmp_path / "c")
     assert not Trainer(frames, SENSOR, preset("obbgs", **QUICK), seed=2).resume(tmp_path / "c")
     assert not Trainer(frames[:-1], SENSOR, preset("obbgs", **QUICK), seed=1).resume(tmp_path / "c")
-    doubted = [dataclasses.replace(f, pose_sigma=torch.full((6,), 1e-9)) for f in frames]
+    doubted = [dataclasses.replace(f, pose_covariance=1e-18 * torch.eye(6).double()) for f in frames]
     assert not Trainer(doubted, SENSOR, preset("obbgs", **QUICK), seed=1).resume(tmp_path / "c")
     assert not Trainer(frames, SENSOR, preset("obbgs", **QUICK), seed=1).resume(tmp_path / "none")
     assert Trainer(frames, SENSOR, preset("obbgs", **QUICK), seed=1).resume(tmp_path / "c")
@@ -179,7 +179,11 @@ def test_pose_refinement_takes_tilt_out_of_the_poses():
     for frame in true:
         error = rigid_motions(torch.randn(1, 6, generator=rng) * sigma)[0]
         wrong.append(
-            dataclasses.replace(frame, world_to_camera=error @ frame.world_to_camera, pose_sigma=sigma)
+            dataclasses.replace(
+                frame,
+                world_to_camera=error @ frame.world_to_camera,
+                pose_covariance=torch.diag(sigma.double() ** 2),
+            )
         )
     changes = {"steps": 600, "start_count": 1500, "max_gaussians": 2000, "refine_poses": "always"}
     trainer = Trainer(wrong, SENSOR, preset("obbgs", **QUICK | changes))
@@ -247,7 +251,9 @@ def tagged(frames: list[TrainingFrame], wrong: bool) -> list[TrainingFrame]:
     rng, sigma = torch.Generator().manual_seed(0), torch.tensor([0.005] * 3 + [1e-4] * 3)
     errors = rigid_motions(torch.randn(len(frames), 6, generator=rng) * sigma * wrong)
     return [
-        dataclasses.replace(f, world_to_camera=error @ f.world_to_camera, pose_sigma=sigma)
+        dataclasses.replace(
+            f, world_to_camera=error @ f.world_to_camera, pose_covariance=torch.diag(sigma.double() ** 2)
+        )
         for f, error in zip(frames, errors, strict=True)
     ]
 
@@ -321,7 +327,7 @@ def test_a_training_killed_about_its_decisions_resumes_to_the_same_model(tmp_pat
 
 def test_settling_the_gauge_changes_no_image():
     model, frames = target(30, seed=6), photographed(target(30, seed=6), 6)
-    tagged = [dataclasses.replace(f, pose_sigma=torch.full((6,), 0.01)) for f in frames]
+    tagged = [dataclasses.replace(f, pose_covariance=1e-4 * torch.eye(6).double()) for f in frames]
     poses = PoseCorrections(tagged)
     with torch.no_grad():
         poses.value += 0.5 + 0.2 * torch.randn(poses.value.shape, generator=torch.Generator().manual_seed(0))
