@@ -25,6 +25,7 @@ import numpy as np
 from flightsw.icd.frame import Frame, PoseTag, decode_frame, encode_frame
 from flightsw.store import FrameStore
 from ground.session import open_session
+from hil.processes import tied
 from hil.virtual_can import VirtualCan
 from hil.virtual_link import Faults, VirtualLink, VirtualSerial
 
@@ -245,7 +246,7 @@ class _Pass:
     def run(self, limit_s: float) -> TrialResult:
         end_s = time.monotonic() + limit_s
         if not self._trial.full_disks:  # else frames are stored while the disks are full
-            subprocess.run(self._commands["capture"], check=True)
+            subprocess.run(tied(self._commands["capture"]), check=True)
         self._start("ground")
         self._wait(lambda: (self._session / "session.json").exists(), end_s)
         self._start("flight")
@@ -320,7 +321,7 @@ class _Pass:
             open(self._folder / f"{name}.log", "ab") as log,
             open(self._folder / f"{name}.json", "wb") as out,
         ):
-            self._running[name] = subprocess.Popen(self._commands[name], stdout=out, stderr=log)
+            self._running[name] = subprocess.Popen(tied(self._commands[name]), stdout=out, stderr=log)
 
     def _stop(self, name: str) -> dict[str, Any]:
         process = self._running[name]
