@@ -96,6 +96,8 @@ class Trial:
     faults: Faults = field(default_factory=Faults)
     cut_s: float = 0.0  # length of one cut in the middle
     kills: int = 0  # SIGKILLs of each side
+    stalls: int = 0  # how often each side is stopped (SIGSTOP) for `stall_s`
+    stall_s: float = 0.0
     full_disks: bool = False  # each side's disk, one after the other, while frames are still being stored
     one_shot: bool = False  # CAN controllers do not repeat what the bus lost
     seed: int = 0
@@ -294,6 +296,8 @@ class _Pass:
         for side in ("flight", "ground"):
             for _ in range(self._trial.kills):
                 moments.append((source.uniform(0, self._count - 1), self._kill(side, source.uniform(0, 0.3))))
+            for _ in range(self._trial.stalls):
+                moments.append((source.uniform(0, self._count - 1), self._stall(side)))
         return sorted(moments, key=lambda moment: moment[0])
 
     # Each action is a generator that yields the seconds until it goes on.
@@ -315,6 +319,11 @@ class _Pass:
         self._running[side].kill()
         self._running[side].wait()
         self._start(side)
+
+    def _stall(self, side: str) -> Iterator[float]:
+        self._running[side].send_signal(signal.SIGSTOP)
+        yield self._trial.stall_s
+        self._running[side].send_signal(signal.SIGCONT)
 
     def _start(self, name: str) -> None:
         with (
