@@ -83,7 +83,9 @@ def test_a_can_bus_without_faults_carries_a_pass_without_a_loss_or_a_repetition(
     assert set(result.ground["link_losses"].values()) == {0}
     for lane in result.lanes.values():
         assert lane["frames_lost"] == lane["frames_overrun"] == 0
-    down = result.lanes["down"]  # up, a second answer to an offer that was repeated may come when flight has gone
+    down = result.lanes[
+        "down"
+    ]  # up, a second answer to an offer that was repeated may come when flight has gone
     assert down["frames_in"] == down["frames_out"]
 
 
