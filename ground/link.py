@@ -39,6 +39,9 @@ log = logging.getLogger(__name__)
 OWN_IDS, OTHER_IDS = GROUND_IDS, FLIGHT_IDS  # of CAN frames
 REOPEN_S = 0.2  # between attempts to open a port that hung up
 READ_BYTES = 65_536
+CLOSE_S = 1.5  # for what was sent last to reach the other side, when a CAN port is closed
+CLOSE_STEP_S = 0.01
+ADAPTER_FRAMES = 128  # that an adapter may hold for the bus
 SILENT_S = 5.0  # without a byte from an slcan adapter before it is set up again: it may have been reset
 
 
@@ -224,7 +227,39 @@ class SerialLink(_Port):
         SerialLink.close(self)
 
 
-class SlcanLink(SerialLink):
+class _IsoTpPort(_Port):
+    """A port with messages under way, which are finished before it is closed.
+
+    Else the last words would be cut off: the rest of a message goes out only when the other side has answered its first
+    frame, and an adapter drops what it has not sent when it is closed.
+    """
+
+    _channels: IsoTpChannels
+    _last_frame_s = float("-inf")  # when a frame was given to the port
+
+    @property
+    def _has_unsent(self) -> bool:
+        raise NotImplementedError
+
+    def _finish(self) -> None:
+        """Go on until every message is out, or the other side has not answered for too long; count what remains."""
+        frame_bytes = 63 if self.url.fd else 7
+        quiet_s = 0.02 + ADAPTER_FRAMES * frame_bytes * 10 / self.url.payload_baud_rate
+        end_s = time.monotonic() + CLOSE_S + quiet_s
+        while self.connected and time.monotonic() < end_s:
+            is_out = not self._channels.messages_pending and not self._has_unsent
+            if is_out and self._clock_s() - self._last_frame_s > quiet_s:
+                break
+            self.exchange(CLOSE_STEP_S)
+        if count := self._channels.messages_pending:
+            log.warning("%s is closed with %d messages that nobody took", self.url.device, count)
+        self._channels.abandon()
+
+    def exchange(self, timeout_s: float) -> bytes:
+        raise NotImplementedError
+
+
+class SlcanLink(SerialLink, _IsoTpPort):
     """A CAN bus behind an slcan adapter on a serial port: each packet is one ISO-TP message."""
 
     def __init__(self, url: str, clock_s: Callable[[], float] = time.monotonic):
@@ -234,9 +269,14 @@ class SlcanLink(SerialLink):
         super().__init__(url, clock_s)
 
     def close(self) -> None:
+        self._finish()
         if self._port is not None:
             super().write(close_slcan())
         super().close()
+
+    @property
+    def _has_unsent(self) -> bool:
+        return bool(self._unsent)
 
     @property
     def ready(self) -> bool:
@@ -254,13 +294,13 @@ class SlcanLink(SerialLink):
 
     def write(self, data: bytes) -> None:
         self._channels.write(data)
-        self._send(self._channels.exchange([])[1])
+        self._send(self._channels.exchange([], self._clock_s())[1])
 
     def exchange(self, timeout_s: float) -> bytes:
         text = super().exchange(timeout_s)
-        packets, frames = self._channels.exchange(self._text.feed(text))
-        self._send(frames)
         now_s = self._clock_s()
+        packets, frames = self._channels.exchange(self._text.feed(text), now_s)
+        self._send(frames)
         if text:
             self._last_byte_s = now_s
         elif self.connected and now_s - self._last_byte_s > SILENT_S:
@@ -270,15 +310,16 @@ class SlcanLink(SerialLink):
 
     def _send(self, frames: list[CanMessage]) -> None:
         if frames:
+            self._last_frame_s = self._clock_s()
             super().write(b"".join(map(format_slcan, frames)))
 
     def _open(self) -> None:
         super()._open()
-        self._channels.reset()
+        self._channels.abandon()
         self._unsent = open_slcan(self.url)
 
 
-class SocketCanLink(_Port):
+class SocketCanLink(_IsoTpPort):
     """A CAN interface of the kernel: each packet is one ISO-TP message. Set its bit rates up with `ip link`."""
 
     _bus: can.BusABC | None = None
@@ -289,9 +330,14 @@ class SocketCanLink(_Port):
         super().__init__(url, clock_s)
 
     def close(self) -> None:
+        self._finish()
         if self._bus is not None:
             self._bus.shutdown()
             self._bus = None
+
+    @property
+    def _has_unsent(self) -> bool:
+        return bool(self._unsent)
 
     @property
     def connected(self) -> bool:
@@ -311,7 +357,7 @@ class SocketCanLink(_Port):
 
     def write(self, data: bytes) -> None:
         self._channels.write(data)
-        self._unsent.extend(self._channels.exchange([])[1])
+        self._unsent.extend(self._channels.exchange([], self._clock_s())[1])
         self._flush()
 
     def exchange(self, timeout_s: float) -> bytes:
@@ -328,7 +374,7 @@ class SocketCanLink(_Port):
                 message = self._bus.recv(0)
         except (OSError, can.CanError) as error:
             self._hang_up(error)
-        packets, frames_out = self._channels.exchange(frames)
+        packets, frames_out = self._channels.exchange(frames, self._clock_s())
         self._unsent.extend(frames_out)
         self._flush()
         return packets
@@ -344,18 +390,20 @@ class SocketCanLink(_Port):
                 self._hang_up(error)
                 return
             self.bytes_written += len(frame.data)
+            self._last_frame_s = self._clock_s()
             self._unsent.popleft()
 
     def _open(self) -> None:
         self._bus = can.Bus(self.url.device, interface="socketcan", fd=self.url.fd)
-        self._channels.reset()
+        self._channels.abandon()
         self._unsent.clear()
 
     def _drop(self) -> None:
         self._unsent.clear()
-        with contextlib.suppress(OSError, can.CanError):
-            self.close()
-        self._bus = None
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            with contextlib.suppress(OSError, can.CanError):
+                bus.shutdown()
 
 
 def _frame_of(message: can.Message) -> CanMessage:

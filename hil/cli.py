@@ -62,7 +62,9 @@ def demo(
     """
     from flightsw.icd.mission import build
     from hil.demo import DemoConfig, run_demo
+    from hil.processes import unwind_on_sigterm
 
+    unwind_on_sigterm()
     chosen = {"camera": camera, "link": link, "faults": faults}
     more = {"scenario": scenario, "navigation_noise": navigation_noise, "real_time": real_time}
     config = build(DemoConfig, chosen, "demo", **more)

@@ -1,11 +1,12 @@
 """The whole loop on one desk: sky, camera and wire here; flight and ground as processes of their own."""
 
+import contextlib
 import json
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Literal
@@ -28,6 +29,7 @@ from hil.blender import RenderFarm, check_mesh
 from hil.clock import SimulatedClock
 from hil.gige_camera import GigeCameraServer
 from hil.link_trial import STANDARD_CUT_S, STANDARD_FAULTS
+from hil.processes import end, tied
 from hil.scenario import true_exposures
 from hil.truth import write_truth
 from hil.virtual_camera import CameraServer
@@ -83,7 +85,7 @@ def run_demo(out: Path, mission_path: Path, mesh: Path, config: DemoConfig, cons
     command += ["--blind-reference", "--method", wanted.method, "--seed", str(wanted.seed)]
     if wanted.steps:
         command += ["--steps", str(wanted.steps)]
-    finished = subprocess.run([*command, "--json"], stdout=subprocess.PIPE, text=True)
+    finished = subprocess.run(tied([*command, "--json"]), stdout=subprocess.PIPE, text=True)
     if finished.returncode:
         raise DemoError("the reconstruction failed; its message is above")
     seconds = round(time.monotonic() - began_s, 1)
@@ -181,20 +183,16 @@ def fly(
         listen = ["listen", "--link", line.ground_url, "--session", str(session), "--exit-after", str(frames)]
         capture = ["capture", "--bracket", bracket, "--count", str(mission.bracket.count)]
         capture += ["--camera", camera.url, "--store", str(store), "--link", line.flight_url]
-        ground = _start("ground", [*listen, "--mission", str(mission_path)], ground_log, ground_log)
         capture += ["--mission", str(mission_path), "--json"]
-        flight = _start("flightsw", capture, flight_result, flight_log)
         cut = _Cut(line, config.cut_s, frames)
         patience_s = PATIENCE_S
         if config.real_time:
             patience_s += mission.bracket.interval_s / config.real_time
-        try:
+        with (
+            _process("ground", [*listen, "--mission", str(mission_path)], ground_log, ground_log) as ground,
+            _process("flightsw", capture, flight_result, flight_log) as flight,
+        ):
             _watch(store, session, flight, ground, frames, cut, patience_s, console)
-        finally:
-            for process in (flight, ground):
-                if process.poll() is None:
-                    process.terminate()
-                    process.wait(timeout=10)
         for process, log in ((flight, flight_log), (ground, ground_log)):
             if process.returncode:
                 raise DemoError(
@@ -294,8 +292,14 @@ def _navigation_figures(world: World, config: DemoConfig, records: list[dict]) -
     }
 
 
-def _start(tool: str, arguments: list[str], out: IO, log: IO) -> subprocess.Popen:
-    return subprocess.Popen([_tool(tool), *arguments], stdout=out, stderr=log)
+@contextlib.contextmanager
+def _process(tool: str, arguments: list[str], out: IO, log: IO) -> Iterator[subprocess.Popen]:
+    """Run one of our commands; what still runs at the end of the `with` is told to end."""
+    process = subprocess.Popen(tied([_tool(tool), *arguments]), stdout=out, stderr=log)
+    try:
+        yield process
+    finally:
+        end(process)
 
 
 def _watch(

@@ -25,6 +25,7 @@ import numpy as np
 from flightsw.icd.frame import Frame, PoseTag, decode_frame, encode_frame
 from flightsw.store import FrameStore
 from ground.session import open_session
+from hil.processes import tied
 from hil.virtual_can import VirtualCan
 from hil.virtual_link import Faults, VirtualLink, VirtualSerial
 
@@ -34,7 +35,7 @@ CAPTURE = """
 import sys, time
 from pathlib import Path
 from flightsw.errors import StoreError
-from flightsw.icd.frame import Frame, PoseTag, decode_frame, encode_frame
+from flightsw.icd.frame import decode_frame
 from flightsw.store import FrameStore
 for path in sorted(Path(sys.argv[2]).iterdir()):
     frame = decode_frame(path.read_bytes())
@@ -95,6 +96,8 @@ class Trial:
     faults: Faults = field(default_factory=Faults)
     cut_s: float = 0.0  # length of one cut in the middle
     kills: int = 0  # SIGKILLs of each side
+    stalls: int = 0  # how often each side is stopped (SIGSTOP) for `stall_s`
+    stall_s: float = 0.0
     full_disks: bool = False  # each side's disk, one after the other, while frames are still being stored
     one_shot: bool = False  # CAN controllers do not repeat what the bus lost
     seed: int = 0
@@ -244,8 +247,10 @@ class _Pass:
 
     def run(self, limit_s: float) -> TrialResult:
         end_s = time.monotonic() + limit_s
-        if not self._trial.full_disks:  # else frames are stored while the disks are full
-            subprocess.run(self._commands["capture"], check=True)
+        if not self._trial.full_disks:  # else a process of its own stores them, also while the disks are full
+            store = FrameStore(self._store)
+            for path in sorted((self._folder / "captured").iterdir()):
+                store.put(decode_frame(path.read_bytes()))
         self._start("ground")
         self._wait(lambda: (self._session / "session.json").exists(), end_s)
         self._start("flight")
@@ -293,6 +298,8 @@ class _Pass:
         for side in ("flight", "ground"):
             for _ in range(self._trial.kills):
                 moments.append((source.uniform(0, self._count - 1), self._kill(side, source.uniform(0, 0.3))))
+            for _ in range(self._trial.stalls):
+                moments.append((source.uniform(0, self._count - 1), self._stall(side)))
         return sorted(moments, key=lambda moment: moment[0])
 
     # Each action is a generator that yields the seconds until it goes on.
@@ -315,12 +322,17 @@ class _Pass:
         self._running[side].wait()
         self._start(side)
 
+    def _stall(self, side: str) -> Iterator[float]:
+        self._running[side].send_signal(signal.SIGSTOP)
+        yield self._trial.stall_s
+        self._running[side].send_signal(signal.SIGCONT)
+
     def _start(self, name: str) -> None:
         with (
             open(self._folder / f"{name}.log", "ab") as log,
             open(self._folder / f"{name}.json", "wb") as out,
         ):
-            self._running[name] = subprocess.Popen(self._commands[name], stdout=out, stderr=log)
+            self._running[name] = subprocess.Popen(tied(self._commands[name]), stdout=out, stderr=log)
 
     def _stop(self, name: str) -> dict[str, Any]:
         process = self._running[name]

@@ -8,6 +8,7 @@ first. What the faults mean here:
 - bit_flip hits a line of the adapter's text, which nothing protects (the bus itself has its CRC).
 - duplicate and reorder hit the lines that an adapter hands to its computer.
 - A cut bus swallows frames as if another node still acknowledged them.
+- While the other adapter is not open nobody acknowledges a frame: its controller keeps it and tries again.
 - A computer that does not read in time loses what its adapter cannot hold: an overrun.
 """
 
@@ -37,8 +38,8 @@ TICK_S = 0.0005
 class BusLaneStatistics:
     """What one direction did, in CAN frames.
 
-    frames_in + frames_duplicated = frames_out + frames_lost + frames_cut + frames_overrun + frames_held, at all
-    times; a destroyed frame that is sent again is still held.
+    frames_in + frames_duplicated = frames_out + frames_lost + frames_cut + frames_overrun + frames_abandoned +
+    frames_held, at all times; a destroyed frame that is sent again is still held.
     """
 
     frames_in: int = 0  # taken by the sending adapter
@@ -51,6 +52,7 @@ class BusLaneStatistics:
     frames_reordered: int = 0
     frames_cut: int = 0
     frames_overrun: int = 0
+    frames_abandoned: int = 0  # in an adapter whose own computer closed it
     frames_held: int = 0
     commands: int = 0
     refused: int = 0  # lines that the sending adapter did not understand or was not open for
@@ -103,7 +105,7 @@ class _Adapter:
             return
         if line == b"C":
             self.is_open = False
-            self.statistics.frames_lost += len(self.queue)
+            self.statistics.frames_abandoned += len(self.queue)
             self.queue.clear()
         elif line[:1] == b"S" and line[1:].isdigit() and int(line[1:]) < len(SLCAN_BITRATES):
             self._bitrate, self._fd = SLCAN_BITRATES[int(line[1:])], 0
@@ -169,7 +171,7 @@ class _Adapter:
     def _hand_over(self, frame: CanMessage) -> None:
         draw, faults, lane = self._random.random, self._bus.faults, self.partner.statistics
         if not self.is_open:
-            lane.frames_lost += 1
+            lane.frames_abandoned += 1
             return
         text, size = format_slcan(frame), len(frame.data)
         if draw() < faults.bit_flip:
@@ -252,7 +254,11 @@ class VirtualCan(VirtualLink):
     def _transmit(self, now_s: float) -> None:
         """Let the bus run until now."""
         while self._free_s <= now_s:
-            senders = [adapter for adapter in (self._flight, self._ground) if adapter.queue]
+            senders = [
+                adapter
+                for adapter in (self._flight, self._ground)
+                if adapter.queue and (adapter.partner.is_open or self.is_cut)
+            ]
             if not senders:
                 return
             sender = min(senders, key=lambda adapter: adapter.queue[0][1].arbitration_id)

@@ -40,6 +40,7 @@ DOWNLINK: Route = (FLIGHT, GROUND)
 UPLINK: Route = (GROUND, FLIGHT)
 TIMER_LIMIT = 8  # expirations in a row before a transaction ends; below 6 a lossy link ends good ones
 SILENCE_INTERVALS = 4  # a living receiver that owes us an answer sends something every interval
+SILENCE_S = 3.0  # at least, unless it waits for its disk
 BUFFER_BYTES = 20_480  # what a pseudo-terminal or driver holds before it makes the writer wait
 REMEMBERED = 4096  # closed transactions whose late PDUs are still answered
 POLL_S = 0.02  # between looks at the receiving side's timers
@@ -282,7 +283,7 @@ class Sender:
             if sending.queue:
                 sending.last_sign_s = now_s
                 return sending.queue.popleft()
-            if now_s - sending.last_sign_s > SILENCE_INTERVALS * self._interval_s:
+            if now_s - sending.last_sign_s > max(SILENCE_INTERVALS * self._interval_s, SILENCE_S):
                 self._close(transaction, sending, "no answer")
         return None
 

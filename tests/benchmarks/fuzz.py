@@ -275,12 +275,12 @@ def iso_tp(containers: list[bytes]) -> Target:
             IsoTpChannels(GROUND_IDS, FLIGHT_IDS, url),
         )
         flight.write(frame_packet(bytes(range(1, 200))) + frame_packet(b"short"))
-        _, sent = flight.exchange([])
+        _, sent = flight.exchange([], 0.0)
         parts = []
         while sent:
             parts += [bytes([frame.arbitration_id - FLIGHT_IDS[0]]) + frame.data for frame in sent]
-            _, answers = ground.exchange(sent)
-            _, sent = flight.exchange(answers)
+            _, answers = ground.exchange(sent, 0.0)
+            _, sent = flight.exchange(answers, 0.0)
         seeds.append(bytes([url.fd]) + joined(parts))
     target = Target(seeds, lambda data: None)
 
@@ -292,12 +292,12 @@ def iso_tp(containers: list[bytes]) -> Target:
             size = max(size for size in FD_SIZES if size <= max(len(part) - 1, 0))
             number = FLIGHT_IDS[0] + (part[0] % 9 if part else 0)
             packets, _ = channels.exchange(
-                [isotp.CanMessage(number, FD_SIZES.index(size), part[1 : 1 + size])]
+                [isotp.CanMessage(number, FD_SIZES.index(size), part[1 : 1 + size])], 0.0
             )
             carried, yielded = carried + size, yielded + len(packets) - packets.count(b"\0")
         target.accepted["message_bytes"] = target.accepted.get("message_bytes", 0) + yielded
         assert yielded <= carried
-        assert all(len(channel.rx_buffer) <= MAX_MESSAGE_BYTES for channel in channels._channels.values())
+        assert all(channel.received_bytes <= MAX_MESSAGE_BYTES for channel in channels._channels.values())
 
     target.check = check
     return target

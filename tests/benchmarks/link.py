@@ -20,6 +20,7 @@ from hil.link_trial import (
     noise_containers,
     run_trial,
 )
+from hil.processes import unwind_on_sigterm
 from hil.virtual_link import Faults
 
 TWO_PERCENT = Faults(bit_flip=0.02, duplicate=0.02, reorder=0.02)
@@ -114,6 +115,7 @@ def main() -> None:
     parser.add_argument("--link", choices=["serial", "can", "canfd"], help="only this one")
     parser.add_argument("--clean", action="store_true", help="only the passes without faults")
     arguments = parser.parse_args()
+    unwind_on_sigterm()
     frames = 16 if arguments.quick else 64
     for link in [arguments.link] if arguments.link else ["serial", "can", "canfd"]:
         cases = {case: Trial(link, seed=1, **settings) for case, settings in CASES.items()}

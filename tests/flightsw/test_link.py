@@ -231,9 +231,12 @@ def test_what_an_slcan_adapter_garbles_is_counted(side, terminal):
 @BOTH_SIDES
 def test_a_message_without_an_answer_is_given_up_and_counted(side, terminal):
     _, _, name = terminal
-    with side.open_link(f"slcan://{name}") as link:
+    now_s = [0.0]
+    with side.SlcanLink(f"slcan://{name}", lambda: now_s[0]) as link:
         link.write(frame_packet(bytes(range(100))))
-        exchange_until(link, lambda data: link.losses["messages_failed"])
+        for _ in range(1000):
+            now_s[0] += 0.01
+            link.exchange(0.0)
         assert link.losses["messages_failed"] == 1
         assert link.ready
 

@@ -120,6 +120,8 @@ def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_pat
     config = DemoConfig(link="slcan-fd", scenario="tumbling", real_time=3000.0, navigation_noise=3)
     simulation = simulate_pass(out, quick, spacecraft.SHIPPED, config, Console(stderr=True))
     assert simulation["frames"] == {"captured": 4, "received": 4, "without_valid_pose": 0}
+    link = simulation["link"]  # without faults, a CAN bus
+    assert link["can_frames_lost"] == link["can_frames_overrun"] == link["segments_resent"] == 0
     # a sixth of a millisecond from frame to frame of a bracket: nobody stores a frame so fast
     assert 2 <= simulation["camera"]["late_frames"] <= 3
     assert 0.005 < simulation["navigation"]["position_error_m"] < 0.1

@@ -63,11 +63,30 @@ def test_every_frame_arrives_once_and_unchanged(trial, case, frames):
     trial(case, frames)
 
 
-def test_a_clean_can_bus_carries_a_pass_without_a_loss_or_a_repetition(trial):
-    result = trial(Trial("can"), 8)
-    assert result.flight["downlink"]["segments_resent"] == result.flight["downlink"]["transfers_failed"] == 0
+@pytest.mark.parametrize(
+    ("case", "frames"),
+    [
+        (Trial("can"), 8),
+        (Trial("canfd"), 8),
+        (Trial("canfd", stalls=2, stall_s=0.3, seed=1), 48),
+        (Trial("canfd", stalls=1, stall_s=1.0, seed=2), 48),
+    ],
+    ids=lambda value: f"{value.link}-{value.stall_s:g}" if isinstance(value, Trial) else "",
+)
+def test_a_can_bus_without_faults_carries_a_pass_without_a_loss_or_a_repetition(trial, case, frames):
+    """Nor does it matter that a side is stopped for a while, as one that waits for its disk is."""
+    result = trial(case, frames)
+    downlink = result.flight["downlink"]
+    assert downlink["segments_resent"] == downlink["transfers_failed"] == 0
     assert result.ground["packets_missing"] == result.ground["crc_errors"] == 0
+    assert result.ground["packets_received"] == downlink["packets_sent"]  # flight's last words too
     assert set(result.ground["link_losses"].values()) == {0}
+    for lane in result.lanes.values():
+        assert lane["frames_lost"] == lane["frames_overrun"] == 0
+    down = result.lanes[
+        "down"
+    ]  # up, a second answer to an offer that was repeated may come when flight has gone
+    assert down["frames_in"] == down["frames_out"]
 
 
 def test_a_pass_that_cannot_end_is_an_error(trial):

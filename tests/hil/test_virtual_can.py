@@ -102,7 +102,12 @@ def contents(frames: list[CanMessage]) -> list[tuple[int, bytes]]:
 def assert_counts_add_up(line: VirtualCan) -> None:
     for lane in line.statistics().values():
         assert lane.frames_in + lane.frames_duplicated == (
-            lane.frames_out + lane.frames_lost + lane.frames_cut + lane.frames_overrun + lane.frames_held
+            lane.frames_out
+            + lane.frames_lost
+            + lane.frames_cut
+            + lane.frames_overrun
+            + lane.frames_abandoned
+            + lane.frames_held
         )
 
 
@@ -258,6 +263,44 @@ def test_a_computer_that_does_not_read_loses_what_its_adapter_cannot_hold():
         down = line.statistics()["down"]
         assert down.frames_overrun > 0
         assert down.frames_out == len(received) == len(frames) - down.frames_overrun
+        assert_counts_add_up(line)
+
+
+def written(line: VirtualCan, frames: list[CanMessage]) -> int:
+    """Open flight's adapter alone, give it frames, and return the port's descriptor."""
+    near = os.open(line.flight_device, os.O_RDWR | os.O_NOCTTY)
+    os.write(near, open_slcan(parse_link_url(line.flight_url)) + b"".join(map(format_slcan, frames)))
+    end_s = time.monotonic() + 5
+    while line.statistics()["down"].frames_in < len(frames) and time.monotonic() < end_s:
+        time.sleep(0.01)
+    time.sleep(0.05)  # far longer than the frames take on the bus
+    return near
+
+
+def test_a_frame_that_nobody_acknowledges_waits_until_the_other_adapter_is_open():
+    with VirtualCan() as line:
+        near = written(line, FRAMES[:20])
+        assert line.statistics()["down"].frames_out == 0
+        far = os.open(line.ground_device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        os.write(far, open_slcan(parse_link_url(line.ground_url)))
+        assert contents(send(line, [])) == contents(FRAMES[:20])
+        os.close(near)
+        os.close(far)
+        assert line.statistics()["down"].frames_lost == 0
+        assert_counts_add_up(line)
+
+
+def test_frames_in_an_adapter_that_its_computer_closes_are_abandoned_and_counted():
+    with VirtualCan() as line:
+        near = written(line, FRAMES[:20])
+        os.write(near, b"C\r")
+        end_s = time.monotonic() + 5
+        while line._flight.is_open and time.monotonic() < end_s:
+            time.sleep(0.01)
+        os.close(near)
+        time.sleep(0.05)
+        down = line.statistics()["down"]
+        assert (down.frames_abandoned, down.frames_lost, down.frames_held) == (20, 0, 0)
         assert_counts_add_up(line)
 
 

@@ -12,6 +12,7 @@ from flightsw.icd.can import (
     FLIGHT_IDS,
     GROUND_IDS,
     MAX_MESSAGE_BYTES,
+    OFFERS,
     IsoTpChannels,
     SlcanText,
     format_slcan,
@@ -45,16 +46,17 @@ class Wire:
         self.flight = IsoTpChannels(FLIGHT_IDS, GROUND_IDS, url)
         self.ground = IsoTpChannels(GROUND_IDS, FLIGHT_IDS, url)
         self.received = b""
+        self.now_s = 0.0
         self.down: list[isotp.CanMessage] = []
 
     def run(self, alter=lambda frames: frames) -> bytes:
         """Pass frames to and fro until both are quiet; return what the ground received."""
-        _, down = self.flight.exchange([])
+        _, down = self.flight.exchange([], self.now_s)
         while down:
             self.down += down
-            packets, up = self.ground.exchange(alter(down))
+            packets, up = self.ground.exchange(alter(down), self.now_s)
             self.received += packets
-            _, down = self.flight.exchange(up)
+            _, down = self.flight.exchange(up, self.now_s)
         return self.received
 
 
@@ -213,12 +215,12 @@ def test_a_short_packet_neither_overtakes_a_long_one_nor_waits_for_it(url):
     wire = Wire(url)
     packets = [frame_packet(bytes(range(1, 200))), frame_packet(b"end"), frame_packet(bytes(range(1, 200)))]
     wire.flight.write(b"".join(packets))
-    _, down = wire.flight.exchange([])
+    _, down = wire.flight.exchange([], 0.0)
     assert [frame.data[0] >> 4 for frame in down] == [1, 1, 1]  # three first frames: all are under way
-    wire.received, up = wire.ground.exchange(down)
+    wire.received, up = wire.ground.exchange(down, 0.0)
     while up:
-        _, down = wire.flight.exchange(up)
-        packets_now, up = wire.ground.exchange(down)
+        _, down = wire.flight.exchange(up, 0.0)
+        packets_now, up = wire.ground.exchange(down, 0.0)
         wire.received += packets_now
     assert wire.received == b"".join(packets)
 
@@ -228,13 +230,98 @@ def test_can_fd_has_20_ms_under_way_and_no_more_than_an_adapter_and_a_terminal_h
     wire = Wire(FD)
     framed = frame_packet(bytes(1100))
     wire.flight.write(40 * framed)
-    _, down = wire.flight.exchange([])
+    _, down = wire.flight.exchange([], 0.0)
     assert len(down) / 2 * len(framed) * 10 / FD.payload_baud_rate > 0.02
     text_bytes = sum(map(len, map(format_slcan, down)))
-    _, up = wire.ground.exchange(down)
-    text_bytes += sum(map(len, map(format_slcan, wire.flight.exchange(up)[1])))
+    _, up = wire.ground.exchange(down, 0.0)
+    text_bytes += sum(map(len, map(format_slcan, wire.flight.exchange(up, 0.0)[1])))
     assert text_bytes < 32_768 + 19_456  # as measured of a pseudo-terminal; the adapter is the virtual one
     assert len({frame.arbitration_id for frame in down}) == len(down)
+
+
+def pass_time(wire: Wire, seconds: float, look_s: float = 0.02) -> list[isotp.CanMessage]:
+    """Let both sides look at their ports, where nothing comes, for a while; return the frames that flight sends."""
+    frames = []
+    for _ in range(round(seconds / look_s)):
+        wire.now_s += look_s
+        frames += wire.flight.exchange([], wire.now_s)[1]
+        wire.ground.exchange([], wire.now_s)
+    return frames
+
+
+@BOTH
+def test_a_message_that_nobody_answers_is_offered_again_and_in_the_end_given_up_and_counted(url):
+    wire = Wire(url)
+    wire.flight.write(frame_packet(bytes(range(1, 100))))
+    _, offers = wire.flight.exchange([], wire.now_s)
+    offers += pass_time(wire, 10.0)
+    assert len(offers) == OFFERS
+    assert {(frame.data[0] >> 4, frame.data) for frame in offers} == {
+        (1, offers[0].data)
+    }  # first frames, all alike
+    assert wire.flight.messages_failed == 1 and wire.flight.ready
+
+
+@BOTH
+def test_an_offer_or_its_answer_that_is_lost_costs_time_and_no_message(url):
+    wire = Wire(url)
+    framed = frame_packet(bytes(range(1, 200)) * 3)
+    wire.flight.write(framed)
+    wire.flight.exchange([], wire.now_s)  # this offer is lost
+    second = pass_time(wire, 0.5)
+    assert len(second) == 1
+    wire.ground.exchange(second, wire.now_s)  # its answer is lost
+    third = pass_time(wire, 1.0)
+    assert len(third) == 1
+    _, answers = wire.ground.exchange(third, wire.now_s)
+    _, rest = wire.flight.exchange(answers, wire.now_s)
+    assert wire.ground.exchange(rest, wire.now_s)[0] == framed
+    assert wire.ground.frames_discarded == wire.flight.messages_failed == 0
+
+
+@BOTH
+def test_offers_that_waited_unread_together_are_answered_once(url):
+    """A second answer would be taken for that to the channel's next message, which would overtake others."""
+    wire = Wire(url)
+    wire.flight.write(frame_packet(bytes(range(1, 100))))
+    _, offers = wire.flight.exchange([], wire.now_s)
+    offers += pass_time(wire, 1.0)
+    assert len(offers) > 1
+    assert len(wire.ground.exchange(offers, wire.now_s)[1]) == 1
+
+
+@BOTH
+def test_time_in_which_a_side_does_not_look_at_its_port_ends_no_message(url):
+    wire = Wire(url)
+    framed = frame_packet(bytes(range(1, 200)) * 3)
+    wire.flight.write(framed)
+    _, first = wire.flight.exchange([], 0.0)
+    _, answer = wire.ground.exchange(first, 0.0)
+    _, rest = wire.flight.exchange(answer, 100.0)  # the answer lay in flight's port for 100 s
+    half = len(rest) // 2
+    assert wire.ground.exchange(rest[:half], 0.1)[0] == b""
+    assert wire.ground.exchange(rest[half:], 100.0)[0] == framed
+    assert wire.ground.frames_discarded == wire.flight.messages_failed == 0
+
+
+@BOTH
+def test_a_message_whose_rest_never_comes_is_dropped_and_counted(url):
+    wire = Wire(url)
+    wire.flight.write(frame_packet(bytes(range(1, 200)) * 3))
+    wire.run(lambda frames: frames[:1])
+    pass_time(wire, 10.0)
+    assert wire.ground.frames_discarded == 1
+
+
+@BOTH
+def test_long_packets_under_way_are_no_more_than_an_adapter_and_a_terminal_hold(url):
+    wire = Wire(url)
+    wire.flight.write(40 * frame_packet(bytes(4096)))
+    _, down = wire.flight.exchange([], 0.0)
+    text_bytes = sum(map(len, map(format_slcan, down)))
+    _, up = wire.ground.exchange(down, 0.0)
+    text_bytes += sum(map(len, map(format_slcan, wire.flight.exchange(up, 0.0)[1])))
+    assert text_bytes < 32_768 + 17_396  # as measured of a pseudo-terminal; the adapter is the virtual one
 
 
 def test_frames_of_other_nodes_are_not_for_us():
@@ -243,7 +330,7 @@ def test_frames_of_other_nodes_are_not_for_us():
         isotp.CanMessage(0x123, 3, b"\x02ab"),
         isotp.CanMessage(FLIGHT_IDS[0], 3, b"\x02ab", extended_id=True),
     ]
-    assert wire.ground.exchange(other) == (b"", [])
+    assert wire.ground.exchange(other, 0.0) == (b"", [])
     assert wire.ground.frames_foreign == 2
 
 
@@ -261,9 +348,9 @@ def test_hostile_frames_neither_raise_nor_take_memory_nor_yield_more_than_they_c
                 bytes([data.draw(st.sampled_from([0x03, 0x10, 0x20, 0x21, 0x22, 0x30, 0x32]))]) + content[1:]
             )
         frame = isotp.CanMessage(data.draw(st.sampled_from(FLIGHT_IDS[:2])), FD_SIZES.index(size), content)
-        packets, answers = ground.exchange([frame])
+        packets, answers = ground.exchange([frame], 0.0)
         carried, yielded = carried + size, yielded + len(packets) - packets.count(b"\0")
         assert len(answers) <= 1
     assert yielded <= carried
-    buffers = [len(channel.rx_buffer) for channel in ground._channels.values()]
+    buffers = [channel.received_bytes for channel in ground._channels.values()]
     assert max(buffers) <= MAX_MESSAGE_BYTES

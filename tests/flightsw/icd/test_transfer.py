@@ -106,6 +106,14 @@ def unmend(monkeypatch):
 # ---- what a file transfer promises ----
 
 
+def test_a_receiver_that_is_silent_for_two_and_a_half_seconds_is_waited_for():
+    """It may wait for its disk: whoever gives up on it sends the file again in vain."""
+    wire = Wire(lose_up=lambda pdu, number: isinstance(pdu, FinishedPdu) and wire.now_s < 2.5)
+    wire.sender.put("slow", content(1000), 1, 0.0)
+    wire.run(5.0)
+    assert wire.delivered == {"slow"} and wire.failed == []
+
+
 def test_the_version_that_the_mends_are_for_is_installed():
     assert importlib.metadata.version("cfdp-py") == "0.7.0"
 
