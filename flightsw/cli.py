@@ -308,7 +308,7 @@ def _run(
         except Exception as error:
             if thread is not None:  # it goes on until the outbox is empty or for ever: say now what is wrong
                 thread.camera_failed = True
-                log.error("no more exposures: %s", error or repr(error))
+                log.error("no more exposures: %s", str(error) or repr(error))
             raise
         finally:
             capturing.clear()
@@ -424,7 +424,7 @@ class _Downlink(threading.Thread):
         except Exception as error:  # of this thread nothing else would remain; the main thread raises it
             self.error = error
             if self.capturing.is_set():  # perhaps for hours
-                log.error("the downlink has ended, frames are only stored: %s", error or repr(error))
+                log.error("the downlink has ended, frames are only stored: %s", str(error) or repr(error))
 
     def note_capture(self, counts: CaptureCounts) -> None:
         self.captured = counts

@@ -1,6 +1,7 @@
 """hil: demo, camera, link, scenario, dataset, target."""
 
 import dataclasses
+import io
 import json
 import logging
 import signal
@@ -159,9 +160,11 @@ def link(
         line = VirtualSerial(baud, faults, seed, latency, flow_control=not overrun)
 
     def obey_standard_input() -> None:
-        for command in sys.stdin.buffer:
+        if isinstance(sys.stdin, io.TextIOWrapper):
+            sys.stdin.reconfigure(errors="replace")  # bytes that are no text are answered like any nonsense
+        for command in sys.stdin:
             try:
-                print(control(line, command.decode(errors="replace")), file=sys.stderr)
+                print(control(line, command), file=sys.stderr)
             except ValueError as error:
                 print(error, file=sys.stderr)
 
