@@ -81,6 +81,7 @@ def capture(
     """Take every planned exposure that the store does not hold yet, and return the counts.
 
     Args:
+        camera: a `ReconnectingCamera` logs its own losses; they are only counted here.
         wait_until: returns when it is time for an exposure (UTC, ns); it may return early to stop.
         settings: what the ground has commanded, read before each bracket (times) and each exposure (NEAR, safe mode).
 
@@ -112,7 +113,7 @@ def capture(
                 except StoreFull as error:
                     counts.refused += 1
                     log.warning("%s", error)
-                except CameraLost:  # the camera's own keeper says when it goes and when it is back
+                except CameraLost:
                     counts.failed += 1
                     counts.lost_with_camera += 1
                     short.add(shot.bracket_id)
