@@ -19,7 +19,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from flightsw.cameras import Camera, open_camera
+from flightsw.cameras import open_camera
+from flightsw.cameras.reconnecting import RETRY_S, ReconnectingCamera
 from flightsw.commands import ReplayCounter
 from flightsw.downlink import DownlinkProgress, run_downlink
 from flightsw.errors import CaptureError, FlightError
@@ -30,6 +31,7 @@ from flightsw.sequencer import CaptureCounts, capture, plan
 from flightsw.settings import load_settings
 from flightsw.store import FrameStore, open_store
 
+log = logging.getLogger(__name__)
 app = typer.Typer(add_completion=False, no_args_is_help=True, help="The flight side: what flies.")
 stderr = Console(stderr=True)
 LINGER_S = 0.5  # after the last delivery
@@ -267,7 +269,8 @@ def _run(
             link = opened.enter_context(open_link(link_url))
         if camera_url is not None:
             try:
-                camera = opened.enter_context(contextlib.closing(open_camera(camera_url, mission.camera)))
+                camera = ReconnectingCamera(open_camera(camera_url, mission.camera), stop.wait)
+                opened.callback(camera.close)
             except CaptureError as error:
                 if link is None:
                     raise
@@ -284,7 +287,15 @@ def _run(
             if camera_url is not None:
                 capturing.set()
             thread = _Downlink(
-                FrameStore(store_dir), link, mission, counter, exit_when_empty, capturing, stop, report_sent
+                FrameStore(store_dir),
+                link,
+                mission,
+                counter,
+                exit_when_empty,
+                capturing,
+                stop,
+                report_sent,
+                camera,
             )
             thread.start()
         try:
@@ -294,9 +305,10 @@ def _run(
                 shots = len(list(plan(mission)))
                 note = thread.note_capture if thread is not None else lambda counts: None
                 captured = _capture(mission, camera, store, progress, shots, stop, note)
-        except FlightError:
-            if thread is not None:
+        except Exception as error:
+            if thread is not None:  # it goes on until the outbox is empty or for ever: say now what is wrong
                 thread.camera_failed = True
+                log.error("no more exposures: %s", str(error) or repr(error))
             raise
         finally:
             capturing.clear()
@@ -309,7 +321,7 @@ def _run(
     left = FrameStore(store_dir)  # opened again: the downlink has its own
     result: dict[str, Any] = {"frames_stored": len(left.frames), "outbox": len(left.outbox())}
     if camera_url is not None:
-        result["capture"] = vars(captured)
+        result["capture"] = vars(captured) | {"camera_losses": camera.losses if camera else 0}
     if link_url is not None:
         result["downlink"] = dataclasses.asdict(sent)
     if as_json:
@@ -320,6 +332,13 @@ def _run(
                 f"captured {captured.stored} frames, {captured.already_stored} were there, {captured.failed} failed, "
                 f"{captured.refused} refused, {captured.pose_invalid} without a valid pose"
             )
+            if camera is not None and camera.losses:
+                times = "once" if camera.losses == 1 else f"{camera.losses} times"
+                print(
+                    f"the camera was lost {times}"
+                    f"{' and never came back' if camera.lost else ''}: {captured.lost_with_camera} exposures "
+                    f"of {captured.brackets_short} brackets were not taken"
+                )
         if link_url is not None:
             print(f"delivered {sent.delivered} frames, {sent.segments_resent} segments resent")
         print(f"{result['frames_stored']} frames in {store_dir}, {result['outbox']} still to be delivered")
@@ -329,7 +348,7 @@ def _run(
 
 def _capture(
     mission: Mission,
-    camera: Camera,
+    camera: ReconnectingCamera,
     store: FrameStore,
     progress: Progress,
     shots: int,
@@ -339,15 +358,16 @@ def _capture(
     task = progress.add_task("captured", total=shots)
 
     def wait_until(utc_ns: int) -> None:
-        if camera.waits:
-            stop.wait(max(0.0, (utc_ns - time.time_ns()) / 1e9))
+        while camera.waits and not stop.is_set() and (left_s := (utc_ns - time.time_ns()) / 1e9) > 0:
+            camera.reconnect()
+            stop.wait(min(left_s, RETRY_S) if camera.lost else left_s)
 
     def on_frame(counts: CaptureCounts) -> None:
         counts.packets_lost = camera.packets_lost
         progress.update(task, completed=counts.planned)
         on_counts(counts)
 
-    return capture(
+    counts = capture(
         mission,
         camera,
         store,
@@ -356,6 +376,9 @@ def _capture(
         wait_until=wait_until,
         settings=lambda: load_settings(store.folder, mission),
     )
+    if camera.lost:
+        log.error("the camera did not come back: %d exposures were not taken", counts.lost_with_camera)
+    return counts
 
 
 class _Downlink(threading.Thread):
@@ -371,11 +394,12 @@ class _Downlink(threading.Thread):
         capturing: threading.Event,
         stop: threading.Event,
         on_progress: Callable[[DownlinkProgress], None],
+        camera: ReconnectingCamera | None,
     ):
         super().__init__(name="downlink", daemon=True)
         self.store, self.link, self.mission, self.counter = store, link, mission, counter
         self.captured = CaptureCounts()
-        self.camera_failed = False
+        self.camera, self.camera_failed = camera, False
         self.exit_when_empty, self.capturing, self.stop, self.on_progress = (
             exit_when_empty,
             capturing,
@@ -384,7 +408,7 @@ class _Downlink(threading.Thread):
         )
         self.empty_since_s: float | None = None
         self.result = DownlinkProgress()
-        self.error: FlightError | None = None
+        self.error: Exception | None = None
 
     def run(self) -> None:
         try:
@@ -397,8 +421,10 @@ class _Downlink(threading.Thread):
                 counter=self.counter,
                 capture_values=self._capture_values,
             )
-        except FlightError as error:
+        except Exception as error:  # of this thread nothing else would remain; the main thread raises it
             self.error = error
+            if self.capturing.is_set():  # perhaps for hours
+                log.error("the downlink has ended, frames are only stored: %s", str(error) or repr(error))
 
     def note_capture(self, counts: CaptureCounts) -> None:
         self.captured = counts
@@ -406,7 +432,8 @@ class _Downlink(threading.Thread):
     def _capture_values(self) -> dict[str, Any]:
         """Return what capture knows of the housekeeping packet."""
         state = "capturing" if self.capturing.is_set() else "pass done" if self.captured.planned else "none"
-        state = "failed" if self.camera_failed else state
+        is_lost = self.camera is not None and self.camera.lost
+        state = "failed" if self.camera_failed or is_lost else state
         counts = {"frames_failed": self.captured.failed, "frames_refused": self.captured.refused}
         return {"camera": state} | counts
 
@@ -439,6 +466,7 @@ def _progress() -> Progress:
 def main() -> None:
     """Run the command line; one clear line for what went wrong, exit code 2 for usage and configuration, 1 for work."""
     logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", stream=sys.stderr)
+    threading.excepthook = log_dead_thread
     try:
         app()
     except ConfigError as error:
@@ -447,6 +475,12 @@ def main() -> None:
         sys.exit(_fail(error, 1))
     except ValueError as error:
         sys.exit(_fail(error, 2))
+
+
+def log_dead_thread(end: threading.ExceptHookArgs) -> None:
+    """Log what ended a thread as an error; while there is a link, the ground gets it as an event."""
+    name = end.thread.name if end.thread else "unknown"
+    log.error("the thread %s has ended: %r", name, end.exc_value, exc_info=end.exc_value)
 
 
 def _fail(error: Exception, code: int) -> int:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from flightsw.commands import Commander, ReplayCounter
-from flightsw.errors import StoreError
+from flightsw.errors import DownlinkError, FlightError, StoreError
 from flightsw.housekeeping import EventLog, ProcessMeter, disk_values
 from flightsw.icd.frame import HEADER, decode_frame, encode_thumbnail
 from flightsw.icd.framing import PacketStream
@@ -46,6 +46,9 @@ PLACED = 32  # frames whose place by triage is decided one by one at a look: mor
 HEADERS_A_LOOK = 20  # frame headers queued at once: a full outbox must not hold the files back
 GOODBYE_S = 0.5  # for the last telemetry at the end
 RANKING_S = 30.0  # for which pictures wait to be ranked by a new model: what goes first is lost to the others
+RESTART_S = 0.5  # from a failure to the new start
+RESTARTS = 5  # in a row, and no more
+SOUND_S = 60.0  # a downlink that ran for so long was in order: its next failure is the first in a row
 REFUSAL_S = 1.0  # between events of refused commands, which anybody can cause; all are counted
 
 
@@ -71,6 +74,7 @@ class DownlinkProgress:
     commands_accepted: int = 0
     commands_refused: int = 0
     commands_repeated: int = 0
+    restarts: int = 0  # after failures
 
 
 def run_downlink(
@@ -87,14 +91,16 @@ def run_downlink(
     """Send the outbox until told to stop, or until it is empty, and return the counts.
 
     A frame leaves the outbox only when the ground has reported it stored; a transfer that fails is put again.
-    `on_progress` is called after each delivery and about five times a second.
+    `on_progress` is called after each delivery and about five times a second. What fails is started again from what is
+    on the disk, with an event to the ground; nothing on board may end the link while frames wait.
 
     Args:
         counter: the key and its replay counter; without one every command is refused.
         capture_values: what capture knows of the housekeeping packet's items.
 
     Raises:
-        StoreError: the outbox cannot be read or changed.
+        StoreError: the outbox cannot be read or changed, six times in a row.
+        DownlinkError: the same for a reason that nobody foresaw.
     """
     downlink = _Downlink(store, link, mission, counter, capture_values, clock_s)
     logger = logging.getLogger("flightsw")
@@ -104,13 +110,18 @@ def run_downlink(
         next_look_s = float("-inf")
         while not should_stop():
             now_s = clock_s()
-            if now_s >= next_look_s:
-                next_look_s = now_s + OUTBOX_S
-                downlink.look(now_s)
-                on_progress(downlink.progress())
-            if downlink.turn(now_s):
-                on_progress(downlink.progress())
-            downlink.fill(now_s)
+            try:
+                if now_s >= next_look_s:
+                    next_look_s = now_s + OUTBOX_S
+                    downlink.look(now_s)
+                    on_progress(downlink.progress())
+                if downlink.turn(now_s):
+                    on_progress(downlink.progress())
+                downlink.fill(now_s)
+            except Exception as error:  # the outermost loop of the downlink's thread
+                downlink.start_again(error)
+                next_look_s = float("-inf")
+                continue
             if downlink.waiting:
                 empty_since_s = None
             elif empty_since_s is None:
@@ -141,18 +152,28 @@ class _Downlink:
         self._store, self._link, self._mission, self._clock_s = store, link, mission, clock_s
         self._capture_values = capture_values
         self._stream = PacketStream(TELEMETRY, mission.link.max_packet_bytes)
-        self._sender = Sender(self._stream.max_data_bytes, self.interval_s)
         self._commander = Commander(counter, store, mission, self._note_refusal, clock_s)
-        self._worker = TriageWorker(np.array(mission.camera.K), mission.camera.width, mission.camera.height)
         self._meter = ProcessMeter(clock_s)
         self._telemetry: deque[tuple[int, bytes]] = deque()
-        self._next_housekeeping_s = self._next_refusal_s = self._hold_until_s = float("-inf")
+        self._next_housekeeping_s = self._next_refusal_s = float("-inf")
+        self._announced: set[int] = set()
+        self._delivered = self._payload_bytes = self._failed = self._unreadable = 0
+        self._segments_sent = self._segments_resent = 0  # before the last start
+        self._restarts = self._restarts_in_a_row = 0
+        self._start()
+        self.events.add("started", frames_stored=len(store.frames), outbox_frames=len(self.waiting))
+
+    def _start(self) -> None:
+        """Begin with what is on the disk: no file in flight, no frame ranked."""
+        store, camera = self._store, self._mission.camera
+        self._started_s = self._clock_s()
+        self._sender = Sender(self._stream.max_data_bytes, self.interval_s)
+        self._worker = TriageWorker(np.array(camera.K), camera.width, camera.height)
+        self._hold_until_s = float("-inf")
         self._queue: deque[int] = deque()  # frames to be put, in order
         self._thumbnails: deque[int] = deque()  # frames whose thumbnail is to be put
-        self._announced: set[int] = set()
         self._sizes_bytes: dict[int, int] = {}  # of frames in flight
         self._retry_s: dict[int, float] = {}
-        self._delivered = self._payload_bytes = self._failed = self._unreadable = 0
         self._scores: dict[int, Ranked] = {}
         self._given_to_worker: set[int] = set()
         self._being_ranked: set[int] = set()
@@ -168,7 +189,31 @@ class _Downlink:
         for frame_id in {frame.frame_id for frame in store.frames}.difference(self.waiting):
             with contextlib.suppress(OSError), open(store.path(frame_id), "rb") as container:
                 self._note_sent(frame_id, container.read(HEADER.size))
-        self.events.add("started", frames_stored=len(store.frames), outbox_frames=len(self.waiting))
+
+    def start_again(self, error: Exception) -> None:
+        """Begin anew after a failure and a pause; the log's error is an event to the ground.
+
+        Raises:
+            StoreError, DownlinkError: it failed too often in a row.
+        """
+        if self._clock_s() - self._started_s > SOUND_S:
+            self._restarts_in_a_row = 0
+        while self._restarts_in_a_row < RESTARTS:
+            self._restarts += 1
+            self._restarts_in_a_row += 1
+            log.error("the downlink failed, restart %d: %r", self._restarts, error, exc_info=error)
+            self._segments_sent += self._sender.segments_sent
+            self._segments_resent += self._sender.segments_resent
+            self._worker.stop()
+            time.sleep(RESTART_S)
+            try:
+                return self._start()
+            except Exception as again:
+                error = again
+        if isinstance(error, FlightError):
+            raise error
+        problem = f"the downlink failed {RESTARTS + 1} times in a row, at last with {error!r}"
+        raise DownlinkError(f"{problem}; start flightsw again, the store keeps the frames") from error
 
     @property
     def settings(self) -> Settings:
@@ -434,8 +479,8 @@ class _Downlink:
             bytes_sent=self._link.bytes_written,
             bytes_received=self._link.bytes_read,
             packets_sent=self._stream.packets_sent,
-            segments_sent=self._sender.segments_sent,
-            segments_resent=self._sender.segments_resent,
+            segments_sent=self._segments_sent + self._sender.segments_sent,
+            segments_resent=self._segments_resent + self._sender.segments_resent,
             transfers_failed=self._failed,
             frames_unreadable=self._unreadable,
             skipped_bytes=deframer.skipped_bytes,
@@ -445,6 +490,7 @@ class _Downlink:
             commands_accepted=self._commander.accepted,
             commands_refused=self._commander.refused,
             commands_repeated=self._commander.repeated,
+            restarts=self._restarts,
         )
 
 

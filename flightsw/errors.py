@@ -13,6 +13,10 @@ class CaptureError(FlightError):
     """The camera did not deliver the exposure it was asked for."""
 
 
+class CameraLost(CaptureError):
+    """The camera does not answer any more; it may come back."""
+
+
 class StoreError(FlightError):
     """The frame store cannot be read or written."""
 
@@ -27,6 +31,10 @@ class NavigationError(FlightError):
 
 class LinkError(FlightError):
     """The link's port cannot be opened or was lost."""
+
+
+class DownlinkError(FlightError):
+    """The downlink failed again and again, each time for a reason that nobody foresaw."""
 
 
 class TriageError(FlightError):

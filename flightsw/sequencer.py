@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from flightsw.bracket import AutoBracket, Geometry
 from flightsw.cameras import Camera
-from flightsw.errors import CaptureError, FlightError, OrbitError, StoreFull
+from flightsw.errors import CameraLost, CaptureError, FlightError, OrbitError, StoreFull
 from flightsw.icd.frame import Frame, PoseTag, decode_frame
 from flightsw.icd.mission import Mission
 from flightsw.pose import PoseTagger, pose_tag
@@ -41,6 +41,8 @@ class CaptureCounts:
     stored: int = 0
     already_stored: int = 0
     failed: int = 0
+    lost_with_camera: int = 0  # of the failed ones: the camera did not answer
+    brackets_short: int = 0  # brackets that lack such exposures
     refused: int = 0  # taken, but the store is full
     skipped: int = 0  # not taken: safe mode
     in_eclipse: int = 0
@@ -79,6 +81,7 @@ def capture(
     """Take every planned exposure that the store does not hold yet, and return the counts.
 
     Args:
+        camera: a `ReconnectingCamera` logs its own losses; they are only counted here.
         wait_until: returns when it is time for an exposure (UTC, ns); it may return early to stop.
         settings: what the ground has commanded, read before each bracket (times) and each exposure (NEAR, safe mode).
 
@@ -89,6 +92,7 @@ def capture(
     counts = CaptureCounts()
     tagger = PoseTagger(mission)
     times = _BracketTimes(mission, store, settings)
+    reasons, short = _Reasons(), set()
     try:
         for shot in plan(mission, times.at):
             if should_stop():
@@ -109,10 +113,16 @@ def capture(
                 except StoreFull as error:
                     counts.refused += 1
                     log.warning("%s", error)
+                except CameraLost:
+                    counts.failed += 1
+                    counts.lost_with_camera += 1
+                    short.add(shot.bracket_id)
+                    counts.brackets_short = len(short)
                 except (CaptureError, ValueError) as error:
                     counts.failed += 1
-                    log.warning("bracket %d frame %d lost: %s", shot.bracket_id, shot.bracket_index, error)
+                    reasons.log(shot, error)
                 else:
+                    reasons.end()
                     times.observe(frame)
                     counts.stored += 1
                     counts.in_eclipse += frame.pose.in_eclipse
@@ -123,6 +133,7 @@ def capture(
             counts.navigation_gaps = tagger.navigation_gaps
             on_frame(counts)
     finally:
+        reasons.end()
         tagger.close()
     return counts
 
@@ -153,6 +164,26 @@ def expose(
         black_dn=section.black_dn,
         saturated_count=int((exposure.dn >= section.white_dn).sum()),
     )
+
+
+class _Reasons:
+    """Logs why exposures were lost: a reason that comes again and again has one line, and one with its count."""
+
+    def __init__(self) -> None:
+        self._last, self._repeats = "", 0
+
+    def log(self, shot: Shot, error: Exception) -> None:
+        if str(error) == self._last:
+            self._repeats += 1
+            return
+        self.end()
+        self._last = str(error)
+        log.warning("bracket %d frame %d lost: %s", shot.bracket_id, shot.bracket_index, error)
+
+    def end(self) -> None:
+        if self._repeats:
+            log.warning("%d more exposures lost for the same reason: %s", self._repeats, self._last)
+        self._last, self._repeats = "", 0
 
 
 class _BracketTimes:

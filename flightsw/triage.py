@@ -69,7 +69,7 @@ class Renderer:
         try:
             import onnxruntime
         except ImportError as error:
-            raise TriageError("triage needs onnxruntime: install obbgs[onnx]") from error
+            raise TriageError("triage needs onnxruntime: pip install 'obbgs[onnx]'") from error
         content = verified_model(path)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = threads
@@ -302,10 +302,12 @@ class TriageWorker:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)  # of this thread alone, on Linux
         while (task := self._tasks.get()) is not None:
             path, is_model = task
-            if is_model:
-                self._results.put(self._verified(path))
-            else:
-                self._results.put((path, self._ranked(path)))
+            try:
+                result = self._verified(path) if is_model else (path, self._ranked(path))
+            except Exception as error:  # the outermost loop of this thread: frames would wait for it for ever
+                log.error("triage failed at %s: %r", path.name, error, exc_info=error)
+                result = ModelVerified(path, b"", f"triage failed: {error!r}") if is_model else (path, None)
+            self._results.put(result)
 
     def _ranked(self, path: Path) -> Ranked | None:
         if self._renderer is None:

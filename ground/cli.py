@@ -20,6 +20,7 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from flightsw.icd.mission import ConfigError, load_mission
+from ground.extras import how_to_install
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, help="The ground station: frames in, a 3D model out."
@@ -87,7 +88,7 @@ def _shown(as_json: bool) -> Iterator[tuple[Any, Any]]:
     def on_status(status: Status) -> None:
         nonlocal next_line_s
         if live:
-            screen.update(view.draw(status))
+            screen.update(view.draw(status), refresh=True)
         elif status.now_s >= next_line_s:
             next_line_s = status.now_s + (1.0 if as_json else PLAIN_S)
             if as_json:
@@ -105,7 +106,7 @@ def _shown(as_json: bool) -> Iterator[tuple[Any, Any]]:
             text = f"{event['severity']}: {event['text']}"
             stderr.print(text, markup=False, highlight=False, soft_wrap=True)
 
-    screen = Live(console=stderr, refresh_per_second=4, transient=True)
+    screen = Live(console=stderr, auto_refresh=False, transient=True)  # drawn here: no thread that could die
     with screen if live else contextlib.nullcontext():
         yield on_status, on_event
 
@@ -353,6 +354,11 @@ def main() -> None:
         sys.exit(
             _fail("interrupted; nothing half-written was left, the same command goes on where it can", 1)
         )
+    except ModuleNotFoundError as error:
+        message = how_to_install(error, "ground")
+        if message is None:
+            raise
+        sys.exit(_fail(message, 2))
     except ConfigError as error:
         sys.exit(_fail(str(error), 2))
     except ValueError as error:

@@ -34,28 +34,27 @@ hang_ups
 
 
 class ConsoleView:
-    """Draws statuses; keeps the last seconds to tell rates."""
+    """Draws statuses; keeps those of the last seconds, and one before them, to tell rates."""
 
     def __init__(self) -> None:
-        self._history: deque[tuple[float, int, int, int]] = deque()
+        self._history: deque[tuple[float, int, int]] = deque()
 
-    def rates(self, status: Status) -> tuple[float, float, float]:
-        """Return bytes a second down, up and of stored frames, over the last five seconds."""
-        summary = status.summary
-        now = (status.now_s, summary.bytes_received, summary.bytes_sent, summary.payload_bytes)
+    def rates(self, status: Status) -> tuple[float, float] | None:
+        """Return bytes a second down and up, since the last status that is five seconds old or older.
+
+        Statuses may come rarely, as where there is no terminal: then since the one before. None for the first one.
+        """
+        now = (status.now_s, status.summary.bytes_received, status.summary.bytes_sent)
         self._history.append(now)
-        while self._history[0][0] < status.now_s - RATE_WINDOW_S:
+        while len(self._history) > 1 and self._history[1][0] <= status.now_s - RATE_WINDOW_S:
             self._history.popleft()
         then = self._history[0]
         elapsed_s = now[0] - then[0]
-        if elapsed_s <= 0:
-            return 0.0, 0.0, 0.0
-        down, up, payload = ((now[i] - then[i]) / elapsed_s for i in (1, 2, 3))
-        return down, up, payload
+        return ((now[1] - then[1]) / elapsed_s, (now[2] - then[2]) / elapsed_s) if elapsed_s > 0 else None
 
     def draw(self, status: Status) -> RenderableType:
         """Return the screen."""
-        down, up, _payload = self.rates(status)
+        down, up = self.rates(status) or (0.0, 0.0)
         top = Table.grid(expand=True, padding=(0, 1))
         top.add_column(ratio=1)
         top.add_column(ratio=1)
@@ -68,10 +67,11 @@ class ConsoleView:
 
     def line(self, status: Status) -> str:
         """Return the status in one line of text."""
-        down, up, _payload = self.rates(status)
+        rates = self.rates(status)
+        speed = f"{rates[0] / 1e3:.1f} kB/s down, {rates[1] / 1e3:.1f} up, " if rates else ""
         s = status.summary
         return (
-            f"{link_state(status)[0]}, {s.frames_in_session} frames, {down / 1e3:.1f} kB/s down, {up / 1e3:.1f} up, "
+            f"{link_state(status)[0]}, {s.frames_in_session} frames, {speed}"
             f"{s.crc_errors} CRC errors, {s.packets_missing} missing, {s.segments_resent} resent, "
             f"outbox {status.housekeeping.get('outbox_frames', '?')}"
         )

@@ -18,8 +18,9 @@ from typing import Any
 import imagecodecs
 import numpy as np
 
+from flightsw.icd.config import ConfigError, build, keys_below, parse_json
 from flightsw.icd.frame import Frame
-from flightsw.icd.mission import CameraSection, ConfigError, Mission, build
+from flightsw.icd.mission import CameraSection, Mission
 
 SCHEMA_VERSION = 1
 FRAME_FILE = re.compile(
@@ -121,7 +122,8 @@ def open_session(folder: str | Path) -> Session:
     folder = Path(folder)
     header = _read_header(folder)
     try:
-        camera = build(CameraSection, header["camera"], "camera")
+        with keys_below("session.camera", "mission.camera"):
+            camera = build(CameraSection, header["camera"], "session.camera")
         tles = {str(name): tuple(map(str, lines)) for name, lines in header["tles"].items()}
         losses = {str(name): int(count) for name, count in header["losses"].items()}
         facts = (
@@ -291,13 +293,13 @@ def write_whole(path: Path, content: bytes) -> None:
 def _read_header(folder: Path) -> dict[str, Any]:
     path = folder / "session.json"
     try:
-        header = json.loads(path.read_bytes())
+        header = parse_json(path.read_bytes(), "session")
     except (FileNotFoundError, NotADirectoryError) as error:
         raise SessionError(f"{folder} is not a session: it has no session.json") from error
     except OSError as error:
         raise SessionError(f"{path} cannot be read: {error}") from error
-    except ValueError as error:
-        raise SessionCorrupt(f"{path} is not JSON: {error}") from error
+    except ConfigError as error:
+        raise SessionCorrupt(f"{path}: {error}") from error
     if not isinstance(header, dict):
         raise SessionCorrupt(f"{path} should hold an object")
     if header.get("schema_version") != SCHEMA_VERSION:

@@ -1,13 +1,15 @@
 """hil: demo, camera, link, scenario, dataset, target."""
 
 import dataclasses
+import io
 import json
 import logging
 import signal
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -15,7 +17,8 @@ from rich.progress import TaskID
 
 from flightsw.errors import FlightError
 from flightsw.icd.mission import ConfigError, load_mission
-from hil import spacecraft
+from ground.extras import how_to_install
+from hil import SHIPPED
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, help="The simulated world around flight and ground."
@@ -41,7 +44,7 @@ RealTime = Annotated[
 def demo(
     out: Annotated[Path, typer.Option(help="Everything is written below this folder.")] = Path("demo"),
     mission: MissionFile = Path("mission.yaml"),
-    mesh: Mesh = spacecraft.SHIPPED,
+    mesh: Mesh = SHIPPED,
     camera: Annotated[str, typer.Option(help="hil (a socket) or gige (GigE Vision on 127.0.0.1).")] = "hil",
     link: Annotated[str, typer.Option(help="serial, slcan or slcan-fd (CAN at 1 Mbit/s).")] = "serial",
     faults: Annotated[
@@ -79,7 +82,7 @@ def camera(
         str, typer.Option(help="hil:///path/to/socket, or hil://host:port; port 0 takes a free one.")
     ] = "hil://127.0.0.1:0",
     mission: MissionFile = Path("mission.yaml"),
-    mesh: Mesh = spacecraft.SHIPPED,
+    mesh: Mesh = SHIPPED,
     cache: Annotated[Path, typer.Option(help="Rendered frames are kept here.")] = Path("renders"),
     gige: Annotated[bool, typer.Option("--gige", help="Serve GigE Vision on 127.0.0.1 instead.")] = False,
     scenario: ScenarioName = "",
@@ -112,7 +115,8 @@ def camera(
             serving = CameraServer(world.mission, farm.radiance, listen, **more)
         with serving as server:
             print(server.url, flush=True)
-            stop.wait()
+            while not stop.wait(1.0):
+                server.check()
             counts = f"{server.late_frames} late, {server.failures} failed"
             print(f"{server.exposures} exposures served, {counts}", file=sys.stderr)
 
@@ -158,6 +162,8 @@ def link(
         line = VirtualSerial(baud, faults, seed, latency, flow_control=not overrun)
 
     def obey_standard_input() -> None:
+        if isinstance(sys.stdin, io.TextIOWrapper):
+            sys.stdin.reconfigure(errors="replace")  # bytes that are no text are answered like any nonsense
         for command in sys.stdin:
             try:
                 print(control(line, command), file=sys.stderr)
@@ -204,7 +210,7 @@ def scenario(
         made = design(orbit.target_tle, wanted, orbit.start_utc_ns, span_s=0.0)  # at least one orbit
         out.write_text("\n".join(made.chaser_tle) + "\n")
         facts = {**dataclasses.asdict(made), "half_width_m": wanted.half_width_m, "written": str(out)}
-    print(json.dumps(facts) if json_ else "\n".join(f"{key:24} {value}" for key, value in facts.items()))
+    print(json.dumps(facts) if json_ else "\n".join(_lines(facts)))
 
 
 @app.command()
@@ -252,7 +258,7 @@ def dataset(
         times_ms = [float(text) for text in bracket.split(",")]
         settings = {"scenario": scenario, "frames": frames, "size_px": size, "bracket_ms": times_ms}
         config = build(DatasetConfig, {**settings, "sensor": sensor, "seed": seed}, "dataset")
-        jobs = [(mesh or spacecraft.SHIPPED, out)]
+        jobs = [(mesh or SHIPPED, out)]
     columns = (TextColumn("{task.description:>20}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Bar(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as bars:
         tasks: dict[str, TaskID] = {}
@@ -277,8 +283,36 @@ def target(out: Annotated[Path, typer.Option(help="The GLB to write.")] = Path("
 
     Example: hil target --out spacecraft.glb
     """
+    from hil import spacecraft
+
     spacecraft.write(out)
     print(out)
+
+
+UNITS = {"_m_per_orbit": " m per orbit", "_m": " m", "_s": " s", "_deg": " deg"}  # by the ends of names
+
+
+def _lines(facts: dict[str, Any]) -> Iterator[str]:
+    """Yield a line for each fact: name, number and unit; a range as `low to high`, a TLE in lines of its own."""
+    for key, value in facts.items():
+        if isinstance(value, dict):
+            yield f"{key.replace('_', ' ')}:"
+            yield from (f"  {line}" for line in _lines(value))
+            continue
+        suffix = next((suffix for suffix in UNITS if key.endswith(suffix)), "")
+        name, unit = key.removesuffix(suffix).replace("_", " "), UNITS.get(suffix, "")
+        if key.endswith("_tle"):
+            yield f"{name}:"
+            yield from value
+        elif isinstance(value, list | tuple):
+            yield f"{name:24} {' to '.join(map(_number, value))}{unit}"
+        else:
+            yield f"{name:24} {value if isinstance(value, str) else _number(value)}{unit}"
+
+
+def _number(value: float) -> str:
+    """Return a number to six figures and at most three decimals."""
+    return f"{round(value, 3) + 0.0:.6g}"
 
 
 def _stop_event() -> threading.Event:
@@ -295,6 +329,11 @@ def main() -> None:
         app()
     except KeyboardInterrupt:
         sys.exit(_fail("interrupted; run it again, finished rendering is kept", 1))
+    except ModuleNotFoundError as error:
+        message = how_to_install(error, "hil")
+        if message is None:
+            raise
+        sys.exit(_fail(message, 2))
     except (ConfigError, ValueError) as error:
         sys.exit(_fail(str(error), 2))
     except (FlightError, OSError) as error:

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import yaml
 
+from flightsw.icd.config import ConfigError, build, in_file, parse_yaml
 from flightsw.icd.frame import Frame, PoseTag, encode_frame
-from flightsw.icd.mission import ConfigError, Mission, build
+from flightsw.icd.mission import Mission
 from flightsw.sequencer import Shot, plan
 from ground.formats.nerf import export_nerf
 from ground.session import SessionWriter, open_session, write_whole
@@ -73,19 +73,18 @@ def load_dataset_config(name: str | Path) -> DatasetConfig:
     """Return a ready-made data set's configuration by its name, or the one in a YAML file.
 
     Raises:
-        ConfigError: there is none, or it is wrong; the message names the key.
+        ConfigError: there is none, or it is wrong; the message names the file and the key's path.
     """
     path = DATASETS / f"{name}.yaml"
     if not path.is_file():
         path = Path(name)
     try:
-        tree = yaml.safe_load(path.read_bytes())
+        content = path.read_bytes()
     except OSError as error:
         names = ", ".join(sorted(p.stem for p in DATASETS.glob("*.yaml")))
         raise ConfigError(str(name), f"no such data set: expected a YAML file or one of {names}") from error
-    except (yaml.YAMLError, ValueError) as error:
-        raise ConfigError(str(path), f"is not valid YAML: {' '.join(str(error).split())}") from error
-    return build(DatasetConfig, tree, "dataset")
+    with in_file(path):
+        return build(DatasetConfig, parse_yaml(content, "dataset"), "dataset")
 
 
 def target_meshes(config: DatasetConfig, folder: Path) -> list[Path]:

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import yaml
 
+from flightsw.icd.config import ConfigError, build, in_file, keys_below, parse_yaml
 from flightsw.icd.frame import PoseTag, matrix_to_quat
-from flightsw.icd.mission import BracketSection, ConfigError, Mission, OrbitSection, PoseSection, build
+from flightsw.icd.mission import BracketSection, Mission, OrbitSection, PoseSection
 from flightsw.orbit import OrbitState, propagate, sun_direction_gcrs, sunlit_fraction
 from flightsw.pose import look_along, pose_tag
 from flightsw.sequencer import plan
@@ -69,9 +69,8 @@ class Scenario:
                 "expected exactly one of chaser_tle, relative_elements and fly_around, "
                 f"got {sum(given)} of them",
             )
-        OrbitSection(
-            self.target_tle, self.chaser_tle or self.target_tle, self.start_utc
-        )  # raises what is wrong
+        with keys_below("scenario", "mission.orbit"):  # raises what is wrong
+            OrbitSection(self.target_tle, self.chaser_tle or self.target_tle, self.start_utc)
         for name, low, high in (
             ("duration_s", 1.0, 30 * 86_400.0),
             ("brackets", 1, 100_000),
@@ -222,7 +221,7 @@ def load_scenario(name: str | Path) -> Scenario:
     """Return a ready-made scenario by its name, or the one in a YAML file.
 
     Raises:
-        ConfigError: no such scenario, or the file is wrong; the message starts with the key's path.
+        ConfigError: no such scenario, or the file is wrong; the message names the file and the key's path.
     """
     path = SCENARIOS / f"{name}.yaml"
     if not path.is_file():
@@ -232,8 +231,6 @@ def load_scenario(name: str | Path) -> Scenario:
     except OSError as error:
         names = ", ".join(sorted(p.stem for p in SCENARIOS.glob("*.yaml")))
         raise ConfigError(str(name), f"no such scenario: expected a YAML file or one of {names}") from error
-    try:
-        tree = yaml.safe_load(content)
-    except (yaml.YAMLError, ValueError) as error:
-        raise ConfigError(str(path), f"is not valid YAML: {' '.join(str(error).split())}") from error
-    return build(Scenario, tree, "scenario", sha256=hashlib.sha256(content).hexdigest())
+    with in_file(path):
+        tree = parse_yaml(content, "scenario")
+        return build(Scenario, tree, "scenario", sha256=hashlib.sha256(content).hexdigest())

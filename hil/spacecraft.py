@@ -12,7 +12,7 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-SHIPPED = Path(__file__).parent / "assets" / "spacecraft.glb"
+from hil import SHIPPED as SHIPPED
 
 # name: base colour (linear), metallic, roughness
 MATERIALS = {

@@ -23,6 +23,7 @@ from flightsw.pose import pose_tag
 from hil.blender import BlenderError
 from hil.clock import SimulatedClock
 from hil.sensor import expose
+from hil.watched import WatchedThread
 
 log = logging.getLogger(__name__)
 MAX_SOCKET_PATH_BYTES = 107  # sun_path of Linux
@@ -65,7 +66,7 @@ class CameraServer:
                     for line in self.rfile:
                         header, pixels = camera.answer(line)
                         self.wfile.write(json.dumps(header).encode() + b"\n" + pixels)
-                except ConnectionError as error:
+                except OSError as error:
                     log.warning("a client left in the middle: %s", error)
 
         address = _address(listen)
@@ -77,7 +78,7 @@ class CameraServer:
             host, port = self._server.server_address[:2]
             self.url = f"hil://{host}:{port}"
         self._socket_file = address if isinstance(address, str) else None
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread = WatchedThread("camera server", self._server.serve_forever)
         self._thread.start()
 
     def __enter__(self) -> "CameraServer":
@@ -87,13 +88,20 @@ class CameraServer:
     def late_frames(self) -> int:
         return self.clock.late_frames
 
-    def __exit__(self, *_) -> None:
+    def check(self) -> None:
+        """Raise ServerError if nobody serves any more."""
+        self._thread.check()
+
+    def __exit__(self, kind: object, *_: object) -> None:
         self._closing.set()
-        self._server.shutdown()
+        if self._thread.is_alive():
+            self._server.shutdown()
         self._server.server_close()
         self._thread.join()
         if self._socket_file:
             Path(self._socket_file).unlink(missing_ok=True)
+        if kind is None:
+            self.check()
 
     def answer(self, line: bytes) -> tuple[dict, bytes]:
         """Return the reply to one request line: header and pixel bytes. A bad request gets ok=False, never a crash."""
@@ -109,6 +117,10 @@ class CameraServer:
         except (FlightError, BlenderError) as error:
             self.failures += 1
             return {"ok": False, "error": str(error)}, b""
+        except Exception as error:  # of a sky that fails in its own way; the client must hear of it
+            self.failures += 1
+            log.error("no picture: %r", error, exc_info=error)
+            return {"ok": False, "error": f"the simulated sky failed: {error!r}"}, b""
 
     def _info(self) -> dict:
         camera = self.mission.camera

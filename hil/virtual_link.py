@@ -7,7 +7,6 @@ import contextlib
 import os
 import random
 import select
-import threading
 import time
 import tty
 from collections import deque
@@ -16,6 +15,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Self
 
 from flightsw.icd.framing import DELIMITER
+from hil.watched import WatchedThread
 
 BITS_PER_BYTE = 10  # start bit, 8 data bits, stop bit
 BURST_S = 0.01  # what a late wake-up may catch up: small, so that the writer feels real back-pressure
@@ -88,7 +88,7 @@ class VirtualLink:
             os.set_blocking(master, False)
             self._masters.append(master)
             self._slaves.append(slave)  # kept open, or reading fails while nobody is attached
-        self._thread = threading.Thread(target=self._run, name=type(self).__name__, daemon=True)
+        self._thread = WatchedThread(f"simulated link ({type(self).__name__})", self._run)
 
     @property
     def flight_device(self) -> str:
@@ -113,12 +113,18 @@ class VirtualLink:
         self._thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def check(self) -> None:
+        """Raise ServerError if nothing crosses any more."""
+        self._thread.check()
+
+    def __exit__(self, kind: object, *_: object) -> None:
         self._stop = True
         self._thread.join()
         for descriptor in self._masters + self._slaves:
             with contextlib.suppress(OSError):
                 os.close(descriptor)
+        if kind is None:
+            self.check()
 
     def _run(self) -> None:
         raise NotImplementedError
@@ -314,6 +320,9 @@ def run_link(
     """Run a link until `should_stop` (looked at often) or Ctrl-C, and return its counts.
 
     `on_ready` is given the link once its two ends can be opened.
+
+    Raises:
+        ServerError: the link failed.
     """
     with line:
         on_ready(line)
@@ -321,6 +330,7 @@ def run_link(
         with contextlib.suppress(KeyboardInterrupt):
             while not should_stop():
                 time.sleep(0.05)
+                line.check()
                 if time.monotonic() - then_s >= every_s:
                     then_s = time.monotonic()
                     on_statistics(line.statistics())

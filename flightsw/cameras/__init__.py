@@ -29,7 +29,18 @@ class Camera(Protocol):
         ...
 
     def expose(self, exposure_time_s: float, start_utc_ns: int) -> Exposure:
-        """Open the shutter at a UTC time and return the exposure; CaptureError when the camera fails."""
+        """Open the shutter at a UTC time and return the exposure.
+
+        A camera that was lost is opened again first.
+
+        Raises:
+            CameraLost: it does not answer.
+            CaptureError: it answers, but not with a picture.
+        """
+        ...
+
+    def open(self) -> None:
+        """Open the camera unless it is open; CameraLost when it does not answer."""
         ...
 
     def close(self) -> None: ...

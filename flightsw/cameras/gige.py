@@ -11,7 +11,7 @@ import numpy as np
 
 from flightsw.cameras import Exposure
 from flightsw.cameras.aravis import BUFFER_STATUS, BUFFER_SUCCESS, PIXEL_FORMATS, AravisError, aravis
-from flightsw.errors import CaptureError
+from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.mission import CameraSection
 
 log = logging.getLogger(__name__)
@@ -32,7 +32,7 @@ class GigeCamera:
     three.
 
     Raises:
-        CaptureError: the camera does not answer, or cannot be what the mission expects.
+        CameraLost: the camera does not answer, or cannot be what the mission expects.
         ValueError: the URL names an unknown pixel format.
     """
 
@@ -54,7 +54,7 @@ class GigeCamera:
         self._camera = self._stream = None
         self._packets_before = (0, 0)
         self.simulated = False
-        self._open()
+        self.open()
 
     @property
     def waits(self) -> bool:
@@ -76,10 +76,10 @@ class GigeCamera:
         the camera's clock keeps UTC, otherwise from the moment of the trigger.
 
         Raises:
+            CameraLost: the camera does not answer any more.
             CaptureError: too late, no picture, a picture with packets missing, or of another size.
         """
-        if self._camera is None:
-            self._open()
+        self.open()
         late_s = (time.time_ns() - start_utc_ns) / NS
         if not self.simulated and late_s > LATE_S:
             raise CaptureError(f"the exposure was due {late_s:.1f} s ago")
@@ -87,9 +87,9 @@ class GigeCamera:
             return self._expose(exposure_time_s, start_utc_ns)
         except CaptureError as error:
             if isinstance(error, AravisError) or not self._alive():
-                log.warning("%s is lost; it is opened again for the next exposure", self._url)
                 # ten seconds of farewells that nobody answers: not in the way of the next exposure
                 threading.Thread(target=self._release(), name="gige farewell", daemon=True).start()
+                raise CameraLost(f"{self._url}: {error}") from error
             raise
 
     def close(self) -> None:
@@ -100,7 +100,14 @@ class GigeCamera:
                 log.warning("%s: %s", self._url, error)
         self._release()()
 
-    def _open(self) -> None:
+    def open(self) -> None:
+        """Open the camera and set it up, unless it is open.
+
+        Raises:
+            CameraLost: it does not answer, or refuses a setting.
+        """
+        if self._camera is not None:
+            return
         call, section = self._aravis.call, self._section
         try:
             self._camera = call("arv_camera_new", self._device)
@@ -117,7 +124,7 @@ class GigeCamera:
             call("arv_camera_start_acquisition", self._camera)
         except CaptureError as error:
             self._release()()
-            raise CaptureError(f"no camera at {self._url}: {error}") from error
+            raise CameraLost(f"no camera at {self._url}: {error}") from error
 
     def _release(self) -> Callable[[], None]:
         """Forget the camera, and return what gives it back to Aravis."""

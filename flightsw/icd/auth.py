@@ -13,7 +13,7 @@ from typing import Self
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from flightsw.icd.mission import ConfigError
+from flightsw.icd.config import ConfigError
 from flightsw.icd.packet import PacketError
 
 SECURITY_HEADER = struct.Struct(">H4xQ")  # SPI; IV of 12 bytes: zeros, counter

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from urllib.parse import parse_qs, urlsplit
 
-from flightsw.icd.mission import ConfigError
+from flightsw.icd.config import ConfigError
 
 DEFAULT_BAUD_RATE = 921_600
 EXPECTED = "expected serial:///dev/...?baud=921600, slcan:///dev/...?bitrate=1000000 or can://can0"

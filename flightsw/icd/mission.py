@@ -1,31 +1,15 @@
 """The mission file: one YAML read by flight, ground and simulator, checked key by key."""
 
-import dataclasses
 import hashlib
 import math
 import re
-import types
-import typing
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import yaml
-
-
-class ConfigError(ValueError):
-    """A key of the mission file is missing, unknown or wrong; `path` names it."""
-
-    def __init__(self, path: str, problem: str):
-        super().__init__(f"{path}: {problem}")
-        self.path = path
-
-
-def _require(condition: bool, path: str, problem: str) -> None:
-    if not condition:
-        raise ConfigError(path, problem)
-
+from flightsw.icd.config import ConfigError, build, in_file, parse_yaml
+from flightsw.icd.config import require as _require
 
 # The fields of a two-line element set that SGP4 reads: line, first and last column (from 1), name, form.
 DECIMAL = r" *-?\d*\.\d+ *"
@@ -373,102 +357,17 @@ class Mission:
     sha256: str = ""  # of the file's bytes, so a result can be traced to its mission
 
 
-class _StrictLoader(yaml.SafeLoader):
-    """A safe loader that refuses a key written twice, where YAML would keep the last silently."""
-
-    def construct_mapping(self, node, deep=False):
-        names = [str(key.value) for key, _ in node.value]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            problem = f"key written twice: {', '.join(twice)}"
-            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
-        return super().construct_mapping(node, deep=deep)
-
-
 def load_mission(path: str | Path) -> Mission:
     """Return the mission in a YAML file.
 
     Raises:
         ConfigError: the file cannot be read or is not YAML, a key is unknown, missing or of the wrong type, a TLE's
-            checksum is wrong. The message starts with the key's path.
+            checksum is wrong. The message names the file and the key's path.
     """
     try:
         content = Path(path).read_bytes()
     except OSError as error:
         raise ConfigError(str(path), f"cannot read the mission file: {error.strerror}") from error
-    tree = parse_yaml(content, str(path))
-    return build(Mission, tree, "mission", sha256=hashlib.sha256(content).hexdigest())
-
-
-def parse_yaml(content: bytes, path: str) -> Any:
-    """Return what a YAML text holds; a key written twice is an error.
-
-    Raises:
-        ConfigError: not YAML; `path` names it.
-    """
-    try:
-        return yaml.load(content, _StrictLoader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # 2026-13-01 is a ValueError of PyYAML's
-        raise ConfigError(path, f"is not valid YAML: {' '.join(str(error).split())}") from error
-
-
-def build(section: type, tree: Any, path: str, **given: Any) -> Any:
-    """Return the frozen dataclass `section` made from a YAML mapping; `given` fields do not come from the file.
-
-    Raises:
-        ConfigError: names the path of the first key that is wrong.
-    """
-    _require(isinstance(tree, dict), path, f"expected a mapping of keys, got {_describe(tree)}")
-    fields = {f.name: f for f in dataclasses.fields(section) if f.name not in given}
-    for key in tree:
-        _require(key in fields, f"{path}.{key}", f"unknown key; expected one of {', '.join(fields)}")
-    hints = typing.get_type_hints(section)
-    values = dict(given)
-    for name, f in fields.items():
-        if name in tree:
-            values[name] = _convert(tree[name], hints[name], f"{path}.{name}")
-        elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
-            raise ConfigError(f"{path}.{name}", "is missing")
-    return section(**values)
-
-
-def _describe(value: Any) -> str:
-    return "nothing" if value is None else repr(value)[:80]
-
-
-def _convert(value: Any, hint: Any, path: str) -> Any:
-    """Return `value` as the type of a field; no silent conversion but int to float and datetime to ISO text."""
-    if dataclasses.is_dataclass(hint):
-        return build(typing.cast(type, hint), value, path)
-    origin = typing.get_origin(hint)
-    if origin is Literal:
-        options = typing.get_args(hint)
-        _require(
-            value in options, path, f"expected one of {', '.join(map(str, options))}, got {_describe(value)}"
-        )
-        return value
-    if origin in (typing.Union, types.UnionType):
-        wanted_list = isinstance(value, list)
-        branches = typing.get_args(hint)
-        return _convert(value, branches[-1] if wanted_list else branches[0], path)
-    if origin is tuple:
-        _require(isinstance(value, list), path, f"expected a list, got {_describe(value)}")
-        item_hint = typing.get_args(hint)[0]
-        return tuple(_convert(item, item_hint, f"{path}[{i}]") for i, item in enumerate(value))
-    if hint is float:
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        _require(number and abs(value) < 1e300, path, f"expected a number, got {_describe(value)}")
-        return float(value)
-    if hint is bool:
-        _require(isinstance(value, bool), path, f"expected true or false, got {_describe(value)}")
-        return value
-    if hint is int:
-        _require(
-            isinstance(value, int) and not isinstance(value, bool),
-            path,
-            f"expected a whole number, got {_describe(value)}",
-        )
-        return value
-    if isinstance(value, datetime):  # YAML reads an unquoted time stamp as a datetime
-        value = value.isoformat()
-    _require(isinstance(value, str), path, f"expected text, got {_describe(value)}")
-    return value
+    with in_file(path):
+        tree = parse_yaml(content, "mission")
+        return build(Mission, tree, "mission", sha256=hashlib.sha256(content).hexdigest())

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from flightsw.icd.mission import ConfigError, build, parse_yaml
+from flightsw.icd.config import ConfigError, build, in_file, keys_below, parse_yaml
 from flightsw.icd.packet import PacketError, PacketTooShort
 
 NUMBERS = {"uint8": "B", "uint16": "H", "uint32": "I", "uint64": "Q", "int64": "q", "float64": "d"}
@@ -256,7 +256,8 @@ def _item(name: str, tree: Any, path: str) -> Item:
     if not all(type(number) is int and isinstance(label, str) for number, label in states):
         raise ConfigError(f"{path}.states", "expected whole numbers and their names")
     rest = {key: value for key, value in tree.items() if key != "states"}
-    return build(Item, rest, path, name=name, states=states)
+    with keys_below(path, name):
+        return build(Item, rest, path, name=name, states=states)
 
 
 def _taken(data: bytes, at: int, size: int) -> bytes:
@@ -270,4 +271,6 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
-DICTIONARY = parse_dictionary(Path(__file__).with_name("dictionary.yaml").read_bytes())
+_FILE = Path(__file__).with_name("dictionary.yaml")
+with in_file(_FILE):
+    DICTIONARY = parse_dictionary(_FILE.read_bytes())

@@ -13,7 +13,8 @@ from typing import Any
 import imagecodecs
 import numpy as np
 
-from flightsw.icd.mission import CameraSection, ConfigError, build
+from flightsw.icd.config import ConfigError, build, keys_below, parse_json
+from flightsw.icd.mission import CameraSection
 from ground.formats.views import (
     FormatError,
     Intrinsics,
@@ -132,9 +133,9 @@ def load_transforms(path: Path) -> dict[str, Any]:
         FormatError: it is not.
     """
     try:
-        tree = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise FormatError(f"{path}: cannot be read as JSON: {error}") from error
+        tree = parse_json(path.read_bytes(), "transforms")
+    except (OSError, ConfigError) as error:
+        raise FormatError(f"{path}: {error}") from error
     frames = tree.get("frames") if isinstance(tree, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise FormatError(f'{path}: expected an object with a list "frames"')
@@ -187,7 +188,8 @@ def read_calibration(tree: dict[str, Any], where: Path) -> CameraSection | None:
     if "calibration" not in tree:
         return None
     try:
-        camera: CameraSection = build(CameraSection, tree["calibration"], "calibration")
+        with keys_below("transforms.calibration", "mission.camera"):
+            camera: CameraSection = build(CameraSection, tree["calibration"], "transforms.calibration")
     except ConfigError as error:
         raise FormatError(f"{where}: {error}") from error
     step_dn = (camera.white_dn - camera.black_dn) / 255

@@ -3,12 +3,12 @@
 Every picture has the same exposure, which the data set does not state.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from flightsw.icd.config import ConfigError, parse_json
 from flightsw.icd.frame import quat_to_matrix
 from ground.formats.views import FormatError, Intrinsics, View
 
@@ -51,9 +51,9 @@ def _load(folder: Path, name: str) -> Any:
     for place in places:
         if (place / name).is_file():
             try:
-                return json.loads((place / name).read_bytes())
-            except ValueError as error:
-                raise FormatError(f"{place / name}: is not JSON: {error}") from error
+                return parse_json((place / name).read_bytes(), Path(name).stem)
+            except ConfigError as error:
+                raise FormatError(f"{place / name}: {error}") from error
     raise FormatError(f"{folder}: {name} is neither in it nor in the two folders above")
 
 

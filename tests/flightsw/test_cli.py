@@ -2,9 +2,12 @@
 
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
+
+from flightsw.cli import log_dead_thread
 
 ROOT = Path(__file__).parents[2]
 NOWHERE = ("--camera", "hil:///nowhere.sock")
@@ -65,3 +68,13 @@ def test_what_goes_wrong_is_one_clear_line_and_an_exit_code(tmp_path, arguments,
     assert done.returncode == code, done.stderr
     assert message in done.stderr and "Traceback" not in done.stderr
     assert not (tmp_path / "store").exists(), "a command that cannot start leaves no store behind"
+
+
+def test_a_thread_that_dies_is_an_error_in_the_log(monkeypatch, caplog):
+    monkeypatch.setattr(threading, "excepthook", log_dead_thread)
+    thread = threading.Thread(target=lambda: 1 / 0, name="farewell")
+    thread.start()
+    thread.join()
+    (record,) = caplog.records
+    assert record.levelname == "ERROR" and record.name.startswith("flightsw")  # so an event for the ground
+    assert record.getMessage() == "the thread farewell has ended: ZeroDivisionError('division by zero')"

@@ -1,13 +1,18 @@
 """What the flight side puts on the wire, in which order, without a port: a link of lists and a clock of ours."""
 
 import logging
+import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from spacepackets.cfdp.pdu import FileDataPdu, MetadataPdu
 
 from flightsw.commands import ReplayCounter
-from flightsw.downlink import GOODBYE_S, WAIT_S, run_downlink
+from flightsw.downlink import GOODBYE_S, RESTARTS, WAIT_S, run_downlink
+from flightsw.errors import DownlinkError, StoreError
 from flightsw.housekeeping import MAX_EVENTS, EventLog, ProcessMeter
 from flightsw.icd.frame import HEADER, read_header
 from flightsw.icd.framing import PacketStream
@@ -214,3 +219,90 @@ def test_the_process_meter_agrees_with_the_kernel():
     kilobytes = int(status["VmRSS"].split()[0])
     assert values["rss_bytes"] == pytest.approx(kilobytes * 1024, rel=0.02)
     assert values["uptime_s"] == 0 and values["cpu_percent"] > 0
+
+
+class FailingLink(ListLink):
+    """Its driver has a defect: `exchange` raises what nobody foresaw, once at each of some times."""
+
+    def __init__(self, *failures_s: float):
+        super().__init__()
+        self.failures_s = list(failures_s)
+
+    def exchange(self, timeout_s: float) -> bytes:
+        if self.failures_s and self.now_s >= self.failures_s[0]:
+            self.failures_s.pop(0)
+            raise ZeroDivisionError("a defect")
+        return super().exchange(timeout_s)
+
+
+@pytest.fixture
+def no_pause(monkeypatch):
+    monkeypatch.setattr("flightsw.downlink.RESTART_S", 0.0)
+
+
+def test_a_failure_that_nobody_foresaw_is_told_and_the_downlink_goes_on(store, small_mission, no_pause):
+    save_settings(store.folder, Settings("oldest"))
+    link = FailingLink(0.4, 0.4)
+    progress = fly(link, store, small_mission, 2.0)
+    assert progress.restarts == 2
+    events = link.unpacked(APID_EVENTS, "events")
+    assert [name for name, _ in events] == ["started", "error", "error", "stopped"]
+    texts = [values["problem"] for name, values in events if name == "error"]
+    assert texts == [
+        f"the downlink failed, restart {n}: ZeroDivisionError('a defect')" for n in (1, 2)
+    ]  # each with its number: a lost event shows
+    assert link.files() == [f"{n:08d}.obf" for n in range(3)] * 2  # what was in flight begins anew
+    packets = PacketStream(TELECOMMAND, 1100)
+    assert len(packets.decode(b"".join(link.written))) == progress.packets_sent
+    assert packets.packets_missing == 0  # the ground sees no gap
+    assert progress.segments_sent == sum(
+        isinstance(parse_pdu(data), FileDataPdu) for apid, data in link.packets() if apid == APID_FILES
+    )
+
+
+def test_a_downlink_that_fails_at_every_start_ends_with_an_error(store, small_mission, no_pause):
+    link = FailingLink(*[0.0] * 100)
+    with pytest.raises(
+        DownlinkError, match=r"6 times in a row, at last with ZeroDivisionError\('a defect'\)"
+    ):
+        fly(link, store, small_mission, 60.0)
+    assert len(link.failures_s) == 100 - (1 + RESTARTS)
+
+
+def test_rare_failures_never_end_the_downlink(store, small_mission, no_pause, monkeypatch):
+    monkeypatch.setattr("flightsw.downlink.SOUND_S", 1.0)
+    link = FailingLink(*(1.5 * number for number in range(1, RESTARTS + 3)))
+    assert fly(link, store, small_mission, 1.5 * (RESTARTS + 3)).restarts == RESTARTS + 2
+
+
+def test_an_outbox_that_stays_unreadable_ends_with_the_stores_error(store, small_mission, no_pause):
+    link = ListLink()
+
+    def damage(_progress) -> None:
+        if link.now_s > 0.5 and (store.folder / "outbox").is_dir():
+            shutil.rmtree(store.folder / "outbox")
+
+    with pytest.raises(StoreError, match="cannot read the outbox"):
+        fly(link, store, small_mission, 60.0, on_progress=damage)
+
+
+def test_a_dead_downlink_is_no_success_of_the_program(tmp_path, small_mission):
+    """`flightsw downlink` as a process whose port driver has a defect."""
+    code = """
+import sys, flightsw.downlink, flightsw.link
+def exchange(self, timeout_s): raise ZeroDivisionError("a defect")
+flightsw.link.SerialLink.exchange = exchange
+flightsw.downlink.RESTART_S = 0.0
+from flightsw.cli import main
+main()
+"""
+    flight, ground = os.openpty()
+    arguments = ["downlink", "--link", f"serial://{os.ttyname(ground)}?baud=9600", "--json"]
+    arguments += ["--mission", str(tmp_path / "small.yaml"), "--store", str(tmp_path / "store")]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=60
+    )
+    os.close(flight)
+    os.close(ground)
+    assert done.returncode == 1, done.stderr
+    assert "flightsw: the downlink failed 6 times in a row" in done.stderr

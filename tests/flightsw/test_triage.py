@@ -250,6 +250,28 @@ def test_the_worker_verifies_then_ranks_and_keeps_the_good_model_when_a_bad_one_
     assert {score for _, score in ranked} == set(expected)
 
 
+def test_what_fails_in_the_worker_is_told_and_the_next_frame_is_ranked_all_the_same(
+    model, tmp_path, caplog, monkeypatch
+):
+    def decode(container: bytes) -> Frame:
+        raise MemoryError
+
+    path = tmp_path / "00000000.obf"
+    path.write_bytes(encode_frame(frame_of(Renderer(model), 0, 0.0, seed=0)))
+    worker = TriageWorker(K, CAMERA.width, CAMERA.height)
+    monkeypatch.setattr("flightsw.triage.decode_frame", decode)
+    worker.verify(model)
+    worker.rank(path)
+    verified, failed = results(worker, 2)
+    assert verified.problem is None and failed == (path, None)
+    monkeypatch.undo()
+    worker.rank(path)
+    ((_, score),) = results(worker, 1)
+    worker.stop()
+    assert score.frame_id == 0
+    assert "triage failed at 00000000.obf" in caplog.text
+
+
 def test_a_model_for_another_camera_is_refused(model):
     worker = TriageWorker(K, CAMERA.width + 1, CAMERA.height)
     worker.verify(model)

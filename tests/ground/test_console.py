@@ -11,6 +11,7 @@ from flightsw.icd.frame import HEADER, encode_frame
 from flightsw.icd.packet import APID_EVENTS, APID_FRAME_HEADERS, APID_HOUSEKEEPING, APID_REPORTS
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import Incoming
+from ground.cli import PLAIN_S
 from ground.console import ConsoleView, link_state, shown
 from ground.ingest import ListenSummary, Status
 from ground.telemetry import TelemetryLog
@@ -110,6 +111,25 @@ def test_before_any_telemetry_there_is_a_screen_and_a_line_all_the_same():
     assert "no housekeeping yet" in screen(ConsoleView(), empty)
     assert "outbox ?" in ConsoleView().line(empty)
     assert "outbox 0" in ConsoleView().line(status())
+
+
+@pytest.mark.parametrize("every_s", [0.25, 1.0, 5.0, PLAIN_S])
+def test_the_rate_is_told_however_rarely_a_line_is_printed(every_s):
+    """`ground listen` without a terminal prints a line every ten seconds, longer than the rate's own window."""
+    view, texts = ConsoleView(), []
+    for number in range(round(30.0 / every_s)):
+        now_s = number * every_s
+        summary = ListenSummary(bytes_received=round(40_000 * now_s), bytes_sent=round(300 * now_s))
+        texts.append(view.line(status(now_s=now_s, summary=summary)))
+    assert "kB/s" not in texts[0]  # not known yet
+    assert all("40.0 kB/s down, 0.3 up" in text for text in texts[1:])
+
+
+def test_the_rate_is_of_the_last_seconds_only():
+    view = ConsoleView()
+    for now_s, received in ((0.0, 0), (10.0, 10**6), (12.0, 10**6), (16.0, 10**6 + 60_000)):
+        rates = view.rates(status(now_s=now_s, summary=ListenSummary(bytes_received=received)))
+    assert rates == (10_000.0, 0.0)  # since 10 s: the newest status that is at least 5 s old
 
 
 def test_a_model_and_the_lack_of_one_are_shown():

@@ -1,5 +1,8 @@
 """Relative orbits: the linear solution against its differential equation, the chaser's TLE against the solution."""
 
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -109,3 +112,25 @@ def test_the_chasers_tle_passes_the_missions_own_checks():
 def test_a_fly_around_needs_a_size():
     with pytest.raises(ConfigError, match="radial_m"):
         FlyAround(0.0)
+
+
+def test_the_command_prints_numbers_with_units_and_the_tle_as_it_is(tmp_path):
+    out = tmp_path / "chaser.tle"
+    command = [str(Path(sys.executable).with_name("hil")), "scenario", "--fly-around", "--radial", "200"]
+    root = Path(__file__).parents[2]
+    printed = subprocess.run(
+        [*command, "--out", str(out)], cwd=root, capture_output=True, text=True, check=True
+    )
+    lines = printed.stdout.splitlines()
+    tle = out.read_text().splitlines()
+    assert all(line in lines for line in tle)
+    rest = [line for line in lines if line not in tle and str(out) not in line]
+    assert not any(sign in line for line in rest for sign in "()[]{}'_")
+    assert all(len(number) <= 8 for line in rest for number in re.findall(r"[\d.]+", line))
+    table = {line[:24].strip(): line[24:].strip() for line in rest}
+    assert table["half width"] == "346.41 m" and table["dlambda"] == "0 m"
+    for name, unit in (("period", "s"), ("error rms", "m"), ("dex", "m"), ("drift", "m per orbit")):
+        number, _, shown = table[name].partition(" ")
+        assert float(number) != 0 and shown == unit
+    described = subprocess.run([*command[:2], "v-bar"], cwd=root, capture_output=True, text=True, check=True)
+    assert re.search(r"^range +[\d.]+ to [\d.]+ m$", described.stdout, re.MULTILINE)

@@ -385,6 +385,27 @@ def test_the_simulated_pass_is_the_same_through_gige_as_in_the_missions_time(tmp
         np.testing.assert_allclose(frame.pose.position_body_m, pose, atol=1e-9)
 
 
+def test_a_sky_that_fails_in_its_own_way_costs_one_picture_and_not_the_camera(monkeypatch):
+    monkeypatch.setattr("flightsw.cameras.gige.RENDER_S", 1.0)
+    failures = [ZeroDivisionError("a defect")]
+    plain = plate(0.4)
+
+    def sky(pose):
+        if failures:
+            raise failures.pop()
+        return plain(pose)
+
+    mission = simulated()
+    with GigeCameraServer(mission, sky) as server:
+        camera = open_camera(server.url, mission.camera)
+        with pytest.raises(CaptureError, match="no picture"):
+            camera.expose(1e-4, mission.orbit.start_utc_ns)
+        monkeypatch.undo()
+        assert camera.expose(1e-4, mission.orbit.start_utc_ns).dn.shape == (SIZE_PX, SIZE_PX)
+        camera.close()
+        assert (server.failures, server.exposures) == (1, 1)
+
+
 def test_a_triggered_frame_that_is_not_ready_in_time_is_late_and_counted_by_the_camera():
     """The second picture takes longer than the simulated second at 100 times real time, the third does not."""
     mission = simulated()

@@ -200,6 +200,9 @@ def test_the_link_command_prints_its_ends_obeys_its_input_and_prints_its_counts(
             assert all(end[1].startswith(f"{scheme}:///dev/") for end in ends)
             assert "'loss': 0.5" in answer(process, "loss 0.5")
             assert "expected cut, mend" in answer(process, "nonsense")
+            process.stdin.buffer.write(b"\xff is no UTF-8\n")  # an answer too, and not the last one
+            assert "expected cut, mend" in answer(process, "loss 0.5")
+            assert "'loss': 0.5" in process.stderr.readline()
             process.send_signal(signal.SIGUSR1)
             answers = (
                 answer(process, "latency 0.1") for _ in range(100)

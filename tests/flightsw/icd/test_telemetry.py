@@ -169,7 +169,7 @@ arm_s: 30
         ("arm_s: 30", "arm_s: 0", "positive arm_s"),
         ("arm_s: 30", "arm_s: 30\nmore: 1", "expected the keys"),
         ("events: {}", "", "expected the keys"),
-        ("events: {}", "events: {}\nevents: {}", "key written twice: events"),
+        ("events: {}", "events: {}\nevents: {}", "dictionary.events: is written twice"),
         ("events: {}", "events: []", "events: expected a mapping"),
         ("type: uint8", "type: uint9", "expected a type of the dictionary, got 'uint9'"),
         ("type: uint8", "type: 'text[0]'", "expected a type of the dictionary"),

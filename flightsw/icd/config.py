@@ -1,0 +1,187 @@
+"""Files that a person writes: YAML and JSON read strictly, and made into frozen dataclasses key by key."""
+
+import contextlib
+import dataclasses
+import json
+import types
+import typing
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+
+class ConfigError(ValueError):
+    """A key of a file or an option is missing, unknown, repeated or wrong.
+
+    `path` names the key, `problem` says what is wrong with it, `file` is where it stands, empty if not in a file.
+    """
+
+    def __init__(self, path: str, problem: str, file: str = ""):
+        super().__init__(f"{file}: {path}: {problem}" if file else f"{path}: {problem}")
+        self.path, self.problem, self.file = path, problem, file
+
+
+def require(condition: bool, path: str, problem: str) -> None:
+    """Raise a ConfigError unless the condition holds."""
+    if not condition:
+        raise ConfigError(path, problem)
+
+
+@contextlib.contextmanager
+def in_file(file: str | Path) -> Iterator[None]:
+    """Let every ConfigError raised inside name the file."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(error.path, error.problem, error.file or str(file)) from error.__cause__
+
+
+@contextlib.contextmanager
+def keys_below(path: str, own_path: str) -> Iterator[None]:
+    """Let a ConfigError about a key below `own_path`, as a section calls itself, name it below `path` instead."""
+    try:
+        yield
+    except ConfigError as error:
+        if not error.path.startswith(f"{own_path}."):
+            raise
+        moved = path + error.path.removeprefix(own_path)
+        raise ConfigError(moved, error.problem, error.file) from error.__cause__
+
+
+def parse_yaml(content: bytes, path: str) -> Any:
+    """Return what a YAML text holds; YAML itself would silently keep the last of two equal keys.
+
+    Raises:
+        ConfigError: not YAML, or a key is written twice; the path of the key starts with `path`.
+    """
+    try:
+        loader = yaml.SafeLoader(content)
+        try:
+            node = loader.get_single_node()
+            _refuse_repeated_keys(node, path, set())
+            return None if node is None else loader.construct_document(node)
+        finally:
+            loader.dispose()
+    except ConfigError:
+        raise
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # 2026-13-01 is a ValueError of PyYAML's
+        raise ConfigError(path, f"is not valid YAML: {' '.join(str(error).split())}") from error
+
+
+def _refuse_repeated_keys(node: yaml.Node | None, path: str, seen: set[int]) -> None:
+    if id(node) in seen:  # an alias: it may lead back to itself
+        return
+    seen.add(id(node))
+    if isinstance(node, yaml.MappingNode):
+        lines: dict[str, int] = {}
+        for key, value in node.value:
+            name, line = str(key.value), key.start_mark.line + 1
+            if name in lines:
+                raise ConfigError(f"{path}.{name}", f"is written twice, in lines {lines[name]} and {line}")
+            lines[name] = line
+            _refuse_repeated_keys(value, f"{path}.{name}", seen)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, item in enumerate(node.value):
+            _refuse_repeated_keys(item, f"{path}[{index}]", seen)
+
+
+def parse_json(content: bytes, path: str) -> Any:
+    """Return what a JSON text holds.
+
+    Raises:
+        ConfigError: not JSON, or a key is written twice; the path of the key starts with `path`.
+    """
+    repeated: list[tuple[dict, str]] = []  # an object and a key that it has twice, inner objects first
+
+    def collect(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        names = [name for name, _ in pairs]
+        tree = dict(pairs)
+        repeated.extend((tree, name) for name in tree if names.count(name) > 1)
+        return tree
+
+    try:
+        tree = json.loads(content, object_pairs_hook=collect)
+        if repeated:
+            holder, name = repeated[-1]  # no object around it repeats a key, so that it is still in the tree
+            raise ConfigError(f"{_path_to(holder, tree, path)}.{name}", "is written twice")
+    except ConfigError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(path, f"is not JSON: {error}") from error
+    return tree
+
+
+def _path_to(wanted: dict, tree: Any, path: str) -> str | None:
+    if tree is wanted:
+        return path
+    children = [(f"{path}.{name}", child) for name, child in tree.items()] if isinstance(tree, dict) else []
+    if isinstance(tree, list):
+        children = [(f"{path}[{index}]", child) for index, child in enumerate(tree)]
+    found = (_path_to(wanted, child, below) for below, child in children)
+    return next((place for place in found if place is not None), None)
+
+
+def build(section: type, tree: Any, path: str, **given: Any) -> Any:
+    """Return the frozen dataclass `section` made from a YAML mapping; `given` fields do not come from the file.
+
+    Raises:
+        ConfigError: names the path of the first key that is wrong.
+    """
+    require(isinstance(tree, dict), path, f"expected a mapping of keys, got {_describe(tree)}")
+    fields = {f.name: f for f in dataclasses.fields(section) if f.name not in given}
+    for key in tree:
+        require(key in fields, f"{path}.{key}", f"unknown key; expected one of {', '.join(fields)}")
+    hints = typing.get_type_hints(section)
+    values = dict(given)
+    for name, f in fields.items():
+        if name in tree:
+            values[name] = _convert(tree[name], hints[name], f"{path}.{name}")
+        elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
+            raise ConfigError(f"{path}.{name}", "is missing")
+    return section(**values)
+
+
+def _describe(value: Any) -> str:
+    return "nothing" if value is None else repr(value)[:80]
+
+
+def _convert(value: Any, hint: Any, path: str) -> Any:
+    """Return `value` as the type of a field; no silent conversion but int to float and datetime to ISO text."""
+    if dataclasses.is_dataclass(hint):
+        return build(typing.cast(type, hint), value, path)
+    origin = typing.get_origin(hint)
+    if origin is Literal:
+        options = typing.get_args(hint)
+        require(
+            value in options, path, f"expected one of {', '.join(map(str, options))}, got {_describe(value)}"
+        )
+        return value
+    if origin in (typing.Union, types.UnionType):
+        wanted_list = isinstance(value, list)
+        branches = typing.get_args(hint)
+        return _convert(value, branches[-1] if wanted_list else branches[0], path)
+    if origin is tuple:
+        require(isinstance(value, list), path, f"expected a list, got {_describe(value)}")
+        item_hint = typing.get_args(hint)[0]
+        return tuple(_convert(item, item_hint, f"{path}[{i}]") for i, item in enumerate(value))
+    if hint is float:
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        require(number and abs(value) < 1e300, path, f"expected a number, got {_describe(value)}")
+        return float(value)
+    if hint is bool:
+        require(isinstance(value, bool), path, f"expected true or false, got {_describe(value)}")
+        return value
+    if hint is int:
+        require(
+            isinstance(value, int) and not isinstance(value, bool),
+            path,
+            f"expected a whole number, got {_describe(value)}",
+        )
+        return value
+    if isinstance(value, datetime):  # YAML reads an unquoted time stamp as a datetime
+        value = value.isoformat()
+    require(isinstance(value, str), path, f"expected text, got {_describe(value)}")
+    return value

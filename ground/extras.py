@@ -1,0 +1,21 @@
+"""What to install when a module is missing that only some commands need; no more than that may be imported here."""
+
+EXTRAS = {
+    "ground": {"gsply", "onnx", "onnxruntime", "plotly", "plyfile", "scipy", "torch"},
+    "hil": {"trimesh"},  # and those of ground
+}
+
+
+def how_to_install(error: ModuleNotFoundError, extra: str) -> str | None:
+    """Return how to get a missing module that belongs to an extra of this package; None for any other module.
+
+    Args:
+        extra: the one to name, that of the tool: ground or hil.
+    """
+    module = (error.name or "").partition(".")[0]
+    if not any(module in modules for modules in EXTRAS.values()):
+        return None
+    return (
+        f"this command needs {module}, which is not installed: pip install 'obbgs[{extra}]', "
+        f"or in a clone of the project: pip install '.[{extra}]'"
+    )
