@@ -348,9 +348,12 @@ class LinkSection:
 
 @dataclass(frozen=True)
 class ReconstructSection:
-    method: str = "obbgs"
+    """How the ground trains; `settings` change the method's own, and the ground knows their names."""
+
+    method: Literal["obbgs", "jiang2025", "3dgs", "pixel-gs", "mvgs"] = "obbgs"
     seed: int = 7
     steps: int = 0  # of training; 0: the method's own number
+    settings: dict[str, Any] = field(default_factory=dict)  # such as sun_shading: linear
 
     def __post_init__(self):
         _require(
@@ -440,6 +443,9 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return build(typing.cast(type, hint), value, path)
     origin = typing.get_origin(hint)
+    if origin is dict:
+        _require(isinstance(value, dict), path, f"expected a mapping of keys, got {_describe(value)}")
+        return value
     if origin is Literal:
         options = typing.get_args(hint)
         _require(
