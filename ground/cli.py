@@ -20,6 +20,7 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from flightsw.icd.mission import ConfigError, ReconstructSection, load_mission
+from ground.progress import Stop, say, steps_shown
 from ground.summary import frames_row, model_rows, table
 
 app = typer.Typer(
@@ -235,28 +236,29 @@ def reconstruct_command(
     os.environ.setdefault(
         "OMP_WAIT_POLICY", "passive"
     )  # spinning threads cost more than they give; before torch
-    import torch
-
-    from ground.evaluate import evaluate
-    from ground.progress import Stop, steps_shown
-    from ground.reconstruct import Progress, reconstruct
-    from ground.report import write_report
-    from ground.settings import all_changes
     from obbgs_core.errors import Interrupted
 
-    section = load_mission(mission).reconstruct if mission else ReconstructSection()
-    wanted = method or section.method
-    changes = all_changes(section, wanted, quality, budget, steps, settings or [])
-    torch.set_num_threads(threads or os.cpu_count() or 1)
     stop, folder = Stop(), None
     try:
         with stop.on_signals(), steps_shown(stderr) as show:
+            import torch
+
+            from ground.evaluate import evaluate
+            from ground.reconstruct import Progress, reconstruct
+            from ground.report import write_report
+            from ground.settings import all_changes
+
+            section = load_mission(mission).reconstruct if mission else ReconstructSection()
+            wanted = method or section.method
+            changes = all_changes(section, wanted, quality, budget, steps, settings or [])
+            torch.set_num_threads(threads or os.cpu_count() or 1)
+            stop.obey()
 
             def on_progress(progress: Progress) -> None:
-                stop.patient = True
+                stop.ask()
                 show(progress.label, progress.info)
 
-            _say(f"reading the frames of {session}")
+            say(stderr, f"reading the frames of {session}")
             folder = reconstruct(
                 session,
                 name,
@@ -270,8 +272,8 @@ def reconstruct_command(
                 overwrite,
                 lambda: stop.asked,
             )
-            stop.patient = False
-            _say("scoring the model and writing its report")
+            stop.obey()
+            say(stderr, "scoring the model and writing its report")
             metrics = evaluate(session, name, out)
             report = write_report(session, name, out)
     except KeyboardInterrupt as error:
@@ -376,11 +378,6 @@ def _print_metrics(metrics: dict, as_json: bool) -> None:
         print(json.dumps(metrics))
         return
     Console().print(table("The model", [frames_row(metrics), *model_rows(metrics)]))
-
-
-def _say(text: str) -> None:
-    """Print a line of progress."""
-    stderr.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def main() -> None:

@@ -52,6 +52,11 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
         )
     training, held_out = split(session)
     metrics = json.loads((folder / "metrics.json").read_text())
+    if metrics.get("session_created_utc", session.created_utc) != session.created_utc:
+        raise SessionError(
+            f"{folder} is a run of the session of {metrics['session_created_utc']}, and {session.path} is that of "
+            f"{session.created_utc}"
+        )
     with_blind = (folder / "blind.ply").exists() and "blind_reference_exposure_s" in metrics
     return Run(
         folder,

@@ -166,7 +166,9 @@ def written_to(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         reason = error.strerror or str(error)
-        raise SessionError(f"cannot write to {folder}: {reason}; --out DIR names another folder") from error
+        raise SessionError(
+            f"cannot write to {folder}: {reason}; --out DIR names another folder of runs"
+        ) from error
 
 
 def _check_replaceable(folder: Path, overwrite: bool) -> None:
@@ -201,6 +203,7 @@ class _Outputs:
         """Return what `make` returns for the file's path, or nothing where it fails: that is noted."""
         if self._should_stop():
             raise Interrupted(f"interrupted before {name} was made; the training has ended and is kept")
+        log.info("making %s", name)
         try:
             return make(self.folder / name)
         except (
@@ -435,6 +438,7 @@ def _metrics(
         "frames_held_out": len(held_out),
         "exposures_s": _exposures_s(training),
         "bytes_received": session.bytes_received,
+        "session_created_utc": session.created_utc,
         "reference_exposure_s": result.reference_exposure_s,
     }
     if blind is not None:

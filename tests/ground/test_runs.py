@@ -211,6 +211,10 @@ def test_runs_go_to_another_folder_and_are_scored_there(session, tmp_path):
         assert done.exit_code == 0, done.output
         json.loads(done.stdout)
     assert (out / "a" / "report.html").exists() and not (session / "runs").exists()
+    header = json.loads((session / "session.json").read_text())
+    (session / "session.json").write_text(json.dumps(header | {"created_utc": "2030-01-01T00:00:00Z"}))
+    with pytest.raises(SessionError, match=r"is a run of the session of .* that of 2030-01-01T00:00:00Z"):
+        evaluate(session, "a", out)
 
 
 def test_a_folder_that_cannot_be_written_to_is_named(finished, tmp_path, monkeypatch, capsys):
@@ -354,13 +358,17 @@ def test_a_second_signal_does_not_wait_and_none_does_where_there_is_nothing_to_s
     stop = Stop()
     before = signal.getsignal(signal.SIGTERM)
     with stop.on_signals():
+        stop.obey()
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGTERM)
-        stop.patient = True
+        stop.ask()
+        assert not stop.asked
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop.asked
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            stop.obey()
     assert signal.getsignal(signal.SIGTERM) == before
 
 
@@ -386,7 +394,7 @@ def test_a_training_without_a_terminal_says_every_so_often_how_far_it_is(monkeyp
                     show(label, StepInfo(step, 100, 0.1, 30.0, 1.5, 1234, now_s, 50 - now_s))
     lines = text.getvalue().splitlines()
     assert [int(line.split()[3 if "known" in line else 4]) for line in lines] == [1, 21, 41, 51, 71, 91, 100]
-    assert lines[0] == ("known exposure: step 1 of 100, PSNR 30.0 dB, chi² 1.5, 1,234 Gaussians, 50 s left")
+    assert lines[0] == ("known exposure: step 1 of 100 PSNR 30.0 dB chi² 1.5 1234 Gaussians 50 s left")
 
 
 def test_the_result_is_a_table_with_units_and_json_as_ever(finished):
