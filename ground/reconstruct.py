@@ -202,13 +202,13 @@ class _Outputs:
     def make(self, name: str, make: Callable[[Path], T]) -> T | None:
         """Return what `make` returns for the file's path, or nothing where it fails: that is noted."""
         if self._should_stop():
-            raise Interrupted(f"interrupted before {name} was made; the training has ended and is kept")
+            raise Interrupted(f"interrupted before {name} was made; {self._kept()}")
         log.info("making %s", name)
         try:
             return make(self.folder / name)
-        except (
-            Exception
-        ) as error:  # whatever went wrong with one file, the model and the others are worth keeping
+        # whatever goes wrong with one file, the model and the others are worth keeping
+        except Exception as error:
+            (self.folder / f"{name}.part").unlink(missing_ok=True)  # half of it
             expected = isinstance(error, (ReconstructionError, OSError))
             if not expected:
                 log.info("%s failed", name, exc_info=True)
@@ -223,10 +223,13 @@ class _Outputs:
     def require(self, name: str) -> None:
         """Raise SessionError where an output is missing without which there is no run."""
         if name in self.missing:
-            raise SessionError(
-                f"{name} cannot be written: {self.missing[name]}; the training is kept in {self.folder}, and the same "
-                "command goes on from there"
-            )
+            raise SessionError(f"{name} cannot be written: {self.missing[name]}; {self._kept()}")
+
+    def _kept(self) -> str:
+        """Return what there is to go on with."""
+        if not _checkpoint(self.folder, KNOWN).exists():
+            return f"nor could the training be saved in {self.folder}"
+        return f"the same command goes on from the training that is saved in {self.folder}"
 
 
 def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:

@@ -117,7 +117,9 @@ def test_a_model_that_the_disk_does_not_take_is_kept_and_written_later(session, 
 
     with monkeypatch.context() as patched:
         patched.setattr("ground.reconstruct.save_ply", full)
-        with pytest.raises(SessionError, match="No space left on device; the training is kept in"):
+        with pytest.raises(
+            SessionError, match="No space left on device; the same command goes on from the training"
+        ):
             reconstruct(session, "run", "obbgs", QUICK)
     assert [path.name for path in (session / "runs").iterdir()] == [".run.part"]
     steps = []
@@ -163,7 +165,7 @@ def test_a_time_limit_that_is_none_is_wrong_usage(session, monkeypatch, capsys, 
 
 def test_a_run_holds_nothing_of_an_interrupted_one_before_it(session):
     part = session / "runs" / ".run.part"
-    with pytest.raises(Interrupted, match=r"before model\.spz was made; the training has ended and is kept"):
+    with pytest.raises(Interrupted, match=r"before model\.spz was made; the same command goes on"):
         reconstruct(
             session,
             "run",
