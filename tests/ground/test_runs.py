@@ -272,6 +272,7 @@ def test_a_mission_file_says_how_to_train_and_the_command_line_says_otherwise(se
     told = resolved("told")
     assert (told["method"]["name"], told["seed"], told["method"]["steps"]) == ("mvgs", 11, 6)
     assert told["method"]["start_count"] == 300 and told["method"]["weigh_at"] == [0.5]
+    hash(load_mission(path))  # flight plans with it as a key
     more = ["--set", "start_count=200", "--set", "sun_shading=linear", "--set", "lr_means=1e-3"]
     other = resolved("other", "--method", "obbgs", "--seed", "3", "--steps", "4", *more)
     assert (other["method"]["name"], other["seed"], other["method"]["steps"]) == ("obbgs", 3, 4)
