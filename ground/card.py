@@ -30,6 +30,7 @@ def appearance(metrics: dict) -> list[str]:
 
 def model_card(session_created_utc: str, metrics: dict) -> str:
     """Return the card as Markdown: figures that were not measured are left out."""
+    measured = metrics["chi2"] is not None  # not where no step was done
     exposures_ms = [1e3 * exposure_s for exposure_s in metrics["exposures_s"]]
     lines = [
         "# Model card",
@@ -39,9 +40,10 @@ def model_card(session_created_utc: str, metrics: dict) -> str:
         "",
         f"- Started from: {metrics['start']}. Stopped because: {metrics['stop_reason']}, after "
         f"{metrics['train_seconds']:.0f} s.",
+        *([f"- Budget: {metrics['budget']}."] if "budget" in metrics else []),  # older runs did not note it
         f"- Exposure times it was trained on: {exposures_ms[0]:g} to {exposures_ms[-1]:g} ms. Between them its images "
         "are as good as below; outside them it extrapolates linearly.",
-        f"- Residual chi² on the target: {metrics['chi2']:.2f} (1 is pure noise).",
+        *([f"- Residual chi² on the target: {metrics['chi2']:.2f} (1 is pure noise)."] if measured else []),
         *appearance(metrics),
     ]
     for key, text in (
@@ -59,6 +61,14 @@ def model_card(session_created_utc: str, metrics: dict) -> str:
     ):
         if key in metrics:
             lines.append("- " + text.format(metrics[key]))
+    if metrics.get("removed_not_finite"):
+        lines.append(f"- {metrics['removed_not_finite']:,} Gaussians stopped being numbers and were removed.")
+    if metrics.get("onnx_fits_uplink") is False:
+        lines.append("- model.onnx is too large for the uplink: a smaller budget makes a smaller one.")
+    lines += [
+        f"- {name} is missing: {reason}." for name, reason in metrics.get("missing_outputs", {}).items()
+    ]
     lines += ["", "| file | bytes | for |", "| --- | --- | --- |"]
-    lines += [f"| {name} | {metrics[key]:,} | {USES[name]} |" for name, key in SIZES.items()]
+    there = {name: metrics[key] for name, key in SIZES.items() if metrics[key] is not None}
+    lines += [f"| {name} | {size_bytes:,} | {USES[name]} |" for name, size_bytes in there.items()]
     return "\n".join([*lines, ""])

@@ -19,8 +19,10 @@ from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from flightsw.icd.mission import ConfigError, load_mission
+from flightsw.icd.mission import ConfigError, ReconstructSection, load_mission
 from ground.extras import how_to_install
+from ground.progress import Stop, say, steps_shown
+from ground.summary import frames_row, model_rows, table
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, help="The ground station: frames in, a 3D model out."
@@ -28,7 +30,10 @@ app = typer.Typer(
 stderr = Console(stderr=True)
 
 SessionDir = Annotated[Path, typer.Option("--session", help="The session folder.")]
-RunName = Annotated[str, typer.Option("--name", help="The run's name below runs/.")]
+RunName = Annotated[str, typer.Option("--name", help="The run's name.")]
+RunsDir = Annotated[
+    Path | None, typer.Option("--out", help="The folder of runs; default: runs/ in the session.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 PLAIN_S = 10.0  # between lines about the link where there is no terminal
 
@@ -196,81 +201,115 @@ def uplink(
 def reconstruct_command(
     session: SessionDir,
     name: RunName = "run",
-    method: Annotated[str, typer.Option(help="obbgs, jiang2025, 3dgs, pixel-gs or mvgs.")] = "obbgs",
-    quality: Annotated[str, typer.Option(help="draft, standard or best.")] = "standard",
+    out: RunsDir = None,
+    method: Annotated[
+        str | None, typer.Option(help="obbgs (default), jiang2025, 3dgs, pixel-gs or mvgs.")
+    ] = None,
+    quality: Annotated[str | None, typer.Option(help="draft, standard (default) or best.")] = None,
     budget: Annotated[
-        str, typer.Option(help="Most Gaussians; auto: as many as the frames pay for.")
+        str, typer.Option(help="Most Gaussians, a number; auto: as many as the frames pay for.")
     ] = "auto",
     steps: Annotated[int | None, typer.Option(min=1, help="Training steps.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="A setting of the method, key=value (YAML); may be given again."),
+    ] = None,
+    mission: Annotated[
+        Path | None,
+        typer.Option(help="A mission file: its reconstruct section, where no option says otherwise."),
+    ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for each training.")] = math.inf,
-    seed: Annotated[int, typer.Option(help="Same seed, same model.")] = 7,
+    seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same model; default 7.")] = None,
     blind_reference: Annotated[
         bool, typer.Option(help="Train once more blind to exposure, to compare.")
     ] = False,
+    overwrite: Annotated[bool, typer.Option(help="Replace a finished run of the same name.")] = False,
     threads: Annotated[int | None, typer.Option(min=1, help="Cores; default all.")] = None,
     json_: AsJson = False,
 ) -> None:
-    """Train a model on a session, export it, score it and write its report. A killed run goes on where it was.
+    """Train a model on a session, export it, score it and write its report.
 
-    Example: ground reconstruct --session pass-12 --name first --time-limit 120
+    Ctrl-C and SIGTERM save the training and end with exit code 1; the same command goes on from there, and so it does
+    after a kill.
+
+    Example: ground reconstruct --session pass-12 --name first --time-limit 120 --set sun_shading=linear
     """
     os.environ.setdefault(
         "OMP_WAIT_POLICY", "passive"
     )  # spinning threads cost more than they give; before torch
-    import torch
+    from obbgs_core.errors import Interrupted
 
-    from ground.evaluate import evaluate
-    from ground.reconstruct import Progress as Step
-    from ground.reconstruct import changes_for, reconstruct
-    from ground.report import write_report
+    stop, folder = Stop(), None
+    try:
+        with stop.on_signals(), steps_shown(stderr) as show:
+            import torch
 
-    torch.set_num_threads(threads or os.cpu_count() or 1)
-    changes = changes_for(method, quality, budget, steps)
-    with Progress(
-        TextColumn("{task.description:>18}"),
-        BarColumn(bar_width=24),
-        TextColumn("{task.fields[state]}"),
-        console=stderr,
-    ) as progress:
-        tasks: dict[str, Any] = {}
+            from ground.evaluate import evaluate
+            from ground.reconstruct import Progress, reconstruct
+            from ground.report import write_report
+            from ground.settings import all_changes
 
-        def show(step: Step) -> None:
-            if step.label not in tasks:
-                tasks[step.label] = progress.add_task(step.label, total=step.info.steps, state="")
-            if step.info.step % 5 == 0 or step.info.step == step.info.steps:
-                info = step.info
-                state = f"step {info.step} PSNR {info.psnr_db:.1f} dB chi² {info.chi2:.1f} {info.gaussians} Gaussians"
-                state += f" {info.seconds_left:.0f} s left"
-                progress.update(tasks[step.label], completed=info.step, state=state)
+            section = load_mission(mission).reconstruct if mission else ReconstructSection()
+            wanted = method or section.method
+            changes = all_changes(section, wanted, quality, budget, steps, settings or [])
+            torch.set_num_threads(threads or os.cpu_count() or 1)
+            stop.obey()
 
-        folder = reconstruct(session, name, method, changes, seed, time_limit, blind_reference, show)
-    metrics = evaluate(session, name)
-    report = write_report(session, name)
+            def on_progress(progress: Progress) -> None:
+                stop.ask()
+                show(progress.label, progress.info)
+
+            say(stderr, f"reading the frames of {session}")
+            folder = reconstruct(
+                session,
+                name,
+                wanted,
+                changes,
+                section.seed if seed is None else seed,
+                time_limit,
+                blind_reference,
+                on_progress,
+                out,
+                overwrite,
+                lambda: stop.asked,
+            )
+            stop.obey()
+            say(stderr, "scoring the model and writing its report")
+            metrics = evaluate(session, name, out)
+            report = write_report(session, name, out)
+    except KeyboardInterrupt as error:
+        done = f"the run is finished in {folder}: `ground evaluate` and `ground report` score it"
+        kept = done if folder else "the same command goes on from the last checkpoint, if there is one"
+        raise Interrupted(f"interrupted; {kept}") from error
     _print_metrics(metrics, json_)
     if not json_:
-        print(f"{folder}: model.ply, model.spz, surface.ply, model.onnx, model_card.md; report: {report}")
+        print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}\nreport: {report}")
 
 
 @app.command("evaluate")
-def evaluate_command(session: SessionDir, name: RunName = "run", json_: AsJson = False) -> None:
+def evaluate_command(
+    session: SessionDir, name: RunName = "run", out: RunsDir = None, json_: AsJson = False
+) -> None:
     """Score a finished run against held-out frames, and against the truth if a simulator left it.
 
     Example: ground evaluate --session demo/session --name demo --json
     """
     from ground.evaluate import evaluate
 
-    _print_metrics(evaluate(session, name), json_)
+    _print_metrics(evaluate(session, name, out), json_)
 
 
 @app.command("report")
-def report_command(session: SessionDir, name: RunName = "run", json_: AsJson = False) -> None:
+def report_command(
+    session: SessionDir, name: RunName = "run", out: RunsDir = None, json_: AsJson = False
+) -> None:
     """Write a run's report.html again.
 
     Example: ground report --session demo/session --name demo
     """
     from ground.report import write_report
 
-    path = write_report(session, name)
+    path = write_report(session, name, out)
     print(json.dumps({"report": str(path)}) if json_ else path)
 
 
@@ -339,8 +378,7 @@ def _print_metrics(metrics: dict, as_json: bool) -> None:
     if as_json:
         print(json.dumps(metrics))
         return
-    for key, value in metrics.items():
-        print(f"{key:28} {value}")
+    Console().print(table("The model", [frames_row(metrics), *model_rows(metrics)]))
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ import torch
 from plyfile import PlyData, PlyParseError
 
 from ground.card import model_card
-from ground.reconstruct import camera_of, exposed, predicted_image, sensor_of, split
+from ground.reconstruct import camera_of, exposed, predicted_image, run_folder, sensor_of, split, written_to
 from ground.session import FrameRecord, Session, SessionError, open_session, write_whole
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.lpips import WeightsMissing, lpips
@@ -38,28 +38,34 @@ class Run:
     metrics: dict
 
 
-def open_run(session_dir: Path, name: str) -> Run:
-    """Return a finished run.
+def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
+    """Return a finished run; `out` is the folder of runs, if not the session's own.
 
     Raises:
         SessionError: no such session or run.
     """
     session = open_session(session_dir)
-    folder = session.path / "runs" / name
+    folder = run_folder(session, name, out)
     if not (folder / "metrics.json").is_file():
         raise SessionError(
             f"{folder} is not a finished run; make one with `ground reconstruct --name {name}`"
         )
     training, held_out = split(session)
-    blind = load_ply(folder / "blind.ply") if (folder / "blind.ply").exists() else None
+    metrics = json.loads((folder / "metrics.json").read_text())
+    if metrics.get("session_created_utc", session.created_utc) != session.created_utc:
+        raise SessionError(
+            f"{folder} is a run of the session of {metrics['session_created_utc']}, and {session.path} is that of "
+            f"{session.created_utc}"
+        )
+    with_blind = (folder / "blind.ply").exists() and "blind_reference_exposure_s" in metrics
     return Run(
         folder,
         session,
         held_out or training,
         sensor_of(session.camera),
         load_ply(folder / "model.ply"),
-        blind,
-        json.loads((folder / "metrics.json").read_text()),
+        load_ply(folder / "blind.ply") if with_blind else None,
+        metrics,
     )
 
 
@@ -110,7 +116,7 @@ def read_points(path: Path) -> np.ndarray:
         raise SessionError(f"{path} is damaged: {error}") from error
 
 
-def evaluate(session_dir: Path, name: str) -> dict:
+def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     """Score a run, add the figures to its metrics.json and return them all.
 
     Keys: psnr_noisy_db against the frames themselves; with truth also, from the true poses, so that an error of a
@@ -122,9 +128,9 @@ def evaluate(session_dir: Path, name: str) -> dict:
     where the target's largest dimension is 2.
 
     Raises:
-        SessionError: no such session or run, or damaged truth.
+        SessionError: no such session or run, damaged truth, or a run that cannot be written to.
     """
-    run = open_run(session_dir, name)
+    run = open_run(session_dir, name, out)
     figures: dict[str, float] = {}
     figures["psnr_noisy_db"] = _mean(
         psnr_db(
@@ -138,14 +144,17 @@ def evaluate(session_dir: Path, name: str) -> dict:
         scale = 2 / truth.largest_dimension_m
         true_cloud = truth.cloud_m * scale
         centres = run.gaussians.means.double().numpy() * scale
-        surface = read_points(run.folder / "surface.ply") * scale
         figures |= cloud_distances(centres, true_cloud)
+        surface = np.zeros((0, 3))
+        if (run.folder / "surface.ply").exists():
+            surface = read_points(run.folder / "surface.ply") * scale
         if len(surface):
             on_surface = cloud_distances(surface, true_cloud)
             figures |= {f"{key}_surface": value for key, value in on_surface.items()}
     metrics = {**run.metrics, **{key: round(value, 5) for key, value in figures.items()}}
-    write_whole(run.folder / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
-    write_whole(run.folder / "model_card.md", model_card(run.session.created_utc, metrics).encode())
+    with written_to(run.folder):
+        write_whole(run.folder / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
+        write_whole(run.folder / "model_card.md", model_card(run.session.created_utc, metrics).encode())
     return metrics
 
 

@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import onnxruntime
@@ -21,12 +22,13 @@ from torch import Tensor
 
 from flightsw.icd.mission import CameraSection
 from ground.session import FrameRecord, Session, SessionError, open_session
+from ground.uplink import MAX_MODEL_BYTES
 from obbgs_core.cameras import Cameras, stacked_suns
-from obbgs_core.errors import ReconstructionError
+from obbgs_core.errors import Interrupted, ReconstructionError
 from obbgs_core.export_onnx import export_onnx
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.gaussians import Gaussians
-from obbgs_core.methods import MethodConfig, preset, with_quality
+from obbgs_core.methods import MethodConfig, preset
 from obbgs_core.optimize import StepInfo, TrainResult, train
 from obbgs_core.ply import save_ply, save_surface_ply
 from obbgs_core.render import native_kernels, render
@@ -35,6 +37,8 @@ from obbgs_core.spz import save_spz
 from obbgs_core.surface import surface_points
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
+KNOWN, BLIND = "known exposure", "blind to exposure"  # the trainings of a run
 HELD_OUT = 8  # every eighth bracket is never trained on
 LOG_EVERY = 10  # steps
 PARITY_VIEWS = 5
@@ -46,7 +50,7 @@ PACKAGES = ("obbgs", "torch", "numpy", "onnxruntime", "plotly")
 class Progress:
     """One step of one of the trainings of a run."""
 
-    label: str  # "known exposure" or "blind to exposure"
+    label: str  # KNOWN or BLIND
     info: StepInfo
 
 
@@ -59,106 +63,173 @@ def reconstruct(
     time_limit_s: float = math.inf,
     blind_reference: bool = False,
     on_progress: Callable[[Progress], None] = lambda progress: None,
+    out: Path | None = None,
+    overwrite: bool = False,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> Path:
-    """Train on a session and return the run folder, written whole or not at all; an older run of the name is replaced.
+    """Train on a session and return the run folder, written whole or not at all.
 
-    A run that was killed goes on from its last checkpoint when it is asked for again, to the same model.
+    A run that was killed goes on from its last checkpoint when it is asked for again, to the same model. A training
+    that has ended is never lost: what cannot be made of it is named under `missing_outputs` in metrics.json, with the
+    reason.
 
     Truth is never read here. With `blind_reference` the same training runs a second time with every exposure taken for
     their geometric mean, so that a report can show what knowing the exposure is worth.
 
+    Args:
+        out: the folder of runs; none: `runs` in the session.
+        overwrite: replace a finished run of the same name.
+        should_stop: asked after each step and each file; when it says yes, all is kept and the run is `Interrupted`.
+
     Raises:
-        SessionError: the session cannot be used, or the name is not a plain folder name.
+        SessionError: the session cannot be used, the name is not a plain folder name or taken, or the folder of runs
+            does not take the model.
         ReconstructionError: the frames do not allow a model (too few, all black).
-        ValueError: no such method or setting.
+        ValueError: no such method or setting, or a time limit that is none.
+        Interrupted: should_stop said so.
     """
-    if not name or Path(name).name != name or name.startswith("."):
-        raise SessionError(f"a run's name is a plain folder name, got {name!r}")
+    if not time_limit_s > 0:
+        raise ValueError(f"the time limit must be longer than 0 s, got {time_limit_s:g}")
     config = preset(method, **(changes or {}))
     session = open_session(session_dir)
+    folder = run_folder(session, name, out)
+    if folder.exists():
+        _check_replaceable(folder, overwrite)
     training, held_out = split(session)
     sensor = sensor_of(session.camera)
     frames = [training_frame(session, record) for record in training]
-    folder = session.path / "runs" / name
-    part = folder.with_name(f".{name}.part")
-    part.mkdir(parents=True, exist_ok=True)  # what an interrupted run left is gone on with
-    with _discarded_on_failure(part), _logged_to(part / "log"):
-        result = _train("known exposure", frames, sensor, config, seed, time_limit_s, on_progress, part)
-        blind = None
-        if blind_reference and config.exposure_aware:
-            ignoring = dataclasses.replace(config, exposure_aware=False)
-            blind = _train(
-                "blind to exposure", frames, sensor, ignoring, seed, time_limit_s, on_progress, part
-            )
-        exposures_s = sorted({record.exposure_time_s for record in training})
-        white_radiance = (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * exposures_s[0])
-        shown_under = _middle_sun(training)
-        _write_models(result.gaussians, blind, session, training, white_radiance, shown_under, part)
-        camera = session.camera
-        export_onnx(result.gaussians, sensor, part / "model.onnx", camera.width, camera.height, exposures_s)
-        views = (held_out or training)[:: max(1, len(held_out or training) // PARITY_VIEWS)][:PARITY_VIEWS]
-        metrics = {
-            "method": method,
-            "gaussians": len(result.gaussians),
-            "sh_degree": math.isqrt(result.gaussians.sh.shape[1]) - 1,
-            "shading": result.gaussians.shading,
-            "appearance": result.appearance,
-            "growth": result.growth,
-            "poses": result.poses,
-            "exposures": result.exposures,
-            "sun_span_deg": round(result.sun_span_deg, 2),
-            "shown_under_sun_dir_body": None
-            if shown_under is None
-            else [round(x, 6) for x in shown_under.tolist()],
-            "train_seconds": round(result.seconds, 3),
-            "stop_reason": result.stop_reason,
-            "start": result.start,
-            "removed_outliers": result.removed_outliers,
-            "dark_frames": result.dark_frames,
-            "chi2": result.history[-1].chi2,
-            "frames_received": len(session.frames),
-            # frames are numbered without gaps in flight, so a gap here is a frame that never came
-            "frames_captured": session.frames[-1].id - session.frames[0].id + 1,
-            "frames_trained": len(training),
-            "frames_held_out": len(held_out),
-            "exposures_s": exposures_s,
-            "bytes_received": session.bytes_received,
-            **{f"{name}_bytes": (part / f"model.{name}").stat().st_size for name in ("ply", "spz", "onnx")},
-            "onnx_parity_db": onnx_parity_db(part / "model.onnx", result.gaussians, session, views, sensor),
-            "reference_exposure_s": result.reference_exposure_s,
-        }
-        if blind is not None:
-            metrics |= {
-                "blind_gaussians": len(blind.gaussians),
-                "blind_train_seconds": round(blind.seconds, 3),
-                "blind_reference_exposure_s": blind.reference_exposure_s,
-            }
-        (part / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
-        _write_history({"known exposure": result, "blind to exposure": blind}, part / "metrics.jsonl")
-        (part / "config.yaml").write_text(yaml.safe_dump(_resolved(session, config, seed), sort_keys=False))
+    part = folder.with_name(f".{name}.part")  # what an interrupted run left there is gone on with
+    labels = [KNOWN, *([BLIND] if blind_reference and config.exposure_aware else [])]
+    with written_to(folder.parent):
+        part.mkdir(parents=True, exist_ok=True)
+        _clear(part, ["log", *(_checkpoint(part, label).name for label in labels)])
+        log_file = logging.FileHandler(part / "log")
+    with _discarded_on_failure(part), _logged_to(log_file):
+
+        def trained(label: str, config: MethodConfig) -> TrainResult:
+            def on_step(info: StepInfo) -> None:
+                on_progress(Progress(label, info))
+
+            checkpoint = _checkpoint(part, label)
+            made = train(frames, sensor, config, seed, on_step, time_limit_s, checkpoint, should_stop)
+            log.info("%s: start from %s; %s", label, made.start, made.stop_reason)
+            return made
+
+        outputs = _Outputs(part, should_stop)
+        result, blind = trained(KNOWN, config), None
+        if BLIND in labels:
+            try:
+                blind = trained(BLIND, dataclasses.replace(config, exposure_aware=False))
+            except ReconstructionError as error:
+                outputs.miss("blind.ply", str(error))
+        parity_db = _write_models(outputs, result, blind, session, training, held_out, sensor)
+        outputs.require("model.ply")
+        metrics = _metrics(method, result, blind, session, training, held_out)
+        metrics |= {"onnx_parity_db": parity_db} | _sizes(part) | {"missing_outputs": outputs.missing}
+        with written_to(folder.parent):
+            (part / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+            _write_history({KNOWN: result, BLIND: blind}, part / "metrics.jsonl")
+            resolved = _resolved(session, result.config, seed)
+            (part / "config.yaml").write_text(yaml.safe_dump(resolved, sort_keys=False))
         log.info("%d Gaussians in %.1f s: %s", len(result.gaussians), result.seconds, result.stop_reason)
-    for checkpoint in part.glob("*.checkpoint"):
-        checkpoint.unlink()
-    shutil.rmtree(folder, ignore_errors=True)
-    part.rename(folder)
+    with written_to(folder.parent):
+        replaced = folder.with_name(f".{name}.replaced")
+        shutil.rmtree(replaced, ignore_errors=True)
+        if folder.exists():
+            folder.rename(replaced)
+        part.rename(folder)
+        shutil.rmtree(replaced, ignore_errors=True)
+        for checkpoint in folder.glob("*.checkpoint"):
+            checkpoint.unlink()
     return folder
 
 
-def changes_for(method: str, quality: str, budget: str, steps: int | None) -> dict:
-    """Return the changes to a method's preset that a user's wishes come to.
+def run_folder(session: Session, name: str, out: Path | None = None) -> Path:
+    """Return where a run is, or will be: below the session's own folder of runs, or below another one.
 
     Raises:
-        ValueError: no such method or quality, or a budget that is neither `auto` nor a number.
+        SessionError: the name is not a plain folder name.
     """
-    wished = with_quality(preset(method), quality)
-    changes: dict = {"steps": steps or wished.steps, "start_count": wished.start_count}
-    changes["max_gaussians"] = wished.max_gaussians
-    if budget != "auto":
-        if not budget.isdigit() or int(budget) == 0:
-            raise ValueError(f"--budget must be auto or a number of Gaussians, got {budget!r}")
-        changes["max_gaussians"] = int(budget)
-        changes["start_count"] = min(wished.start_count, int(budget))
-    return changes
+    if not name or Path(name).name != name or name.startswith("."):
+        raise SessionError(f"a run's name is a plain folder name, got {name!r}")
+    return (session.path / "runs" if out is None else out) / name
+
+
+@contextlib.contextmanager
+def written_to(folder: Path) -> Iterator[None]:
+    """Say in one line that a folder of runs cannot be written to, and what to do.
+
+    Raises:
+        SessionError: in place of any OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise SessionError(
+            f"cannot write to {folder}: {reason}; --out DIR names another folder of runs"
+        ) from error
+
+
+def _check_replaceable(folder: Path, overwrite: bool) -> None:
+    """Raise SessionError where a run of the name is there, unless it may be overwritten."""
+    if not (folder / "metrics.json").is_file():
+        raise SessionError(
+            f"{folder} is there and is no finished run: it stays as it is; give another --name"
+        )
+    if not overwrite:
+        raise SessionError(f"{folder} is a finished run: --overwrite replaces it, --name makes another")
+
+
+def _checkpoint(part: Path, label: str) -> Path:
+    return part / f"{label.replace(' ', '-')}.checkpoint"
+
+
+def _clear(part: Path, kept: list[str]) -> None:
+    """Remove what an interrupted run left, but for what the present one goes on with."""
+    for path in part.iterdir():
+        if path.name not in kept:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+class _Outputs:
+    """What is made of a finished training: all that can be, and for the rest the reason why not."""
+
+    def __init__(self, folder: Path, should_stop: Callable[[], bool]):
+        self.folder, self.missing = folder, {}
+        self._should_stop = should_stop
+
+    def make(self, name: str, make: Callable[[Path], T]) -> T | None:
+        """Return what `make` returns for the file's path, or nothing where it fails: that is noted."""
+        if self._should_stop():
+            raise Interrupted(f"interrupted before {name} was made; {self._kept()}")
+        log.info("making %s", name)
+        try:
+            return make(self.folder / name)
+        # whatever goes wrong with one file, the model and the others are worth keeping
+        except Exception as error:
+            (self.folder / f"{name}.part").unlink(missing_ok=True)  # half of it
+            expected = isinstance(error, (ReconstructionError, OSError))
+            if not expected:
+                log.info("%s failed", name, exc_info=True)
+            self.miss(name, str(error) if expected else f"{type(error).__name__}: {error}")
+            return None
+
+    def miss(self, name: str, reason: str) -> None:
+        """Note that an output is not there."""
+        self.missing[name] = reason
+        log.warning("%s is not made: %s", name, reason)
+
+    def require(self, name: str) -> None:
+        """Raise SessionError where an output is missing without which there is no run."""
+        if name in self.missing:
+            raise SessionError(f"{name} cannot be written: {self.missing[name]}; {self._kept()}")
+
+    def _kept(self) -> str:
+        """Return what there is to go on with."""
+        if not _checkpoint(self.folder, KNOWN).exists():
+            return f"nor could the training be saved in {self.folder}"
+        return f"the same command goes on from the training that is saved in {self.folder}"
 
 
 def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
@@ -295,50 +366,117 @@ def onnx_parity_db(
     return round(worst, 2)
 
 
-def _train(
-    label: str,
-    frames: list[TrainingFrame],
-    sensor: Sensor,
-    config: MethodConfig,
-    seed: int,
-    time_limit_s: float,
-    on_progress: Callable[[Progress], None],
-    part: Path,
-) -> TrainResult:
-    checkpoint = part / f"{label.replace(' ', '-')}.checkpoint"
-    result = train(
-        frames,
-        sensor,
-        config,
-        seed,
-        lambda info: on_progress(Progress(label, info)),
-        time_limit_s,
-        checkpoint,
-    )
-    log.info("%s: start from %s; %s", label, result.start, result.stop_reason)
-    return result
-
-
 def _write_models(
-    gaussians: Gaussians,
+    outputs: _Outputs,
+    result: TrainResult,
     blind: TrainResult | None,
     session: Session,
     training: list[FrameRecord],
-    white_radiance: float,
-    shown_under: Tensor | None,
-    part: Path,
-) -> None:
-    """Write the model in full and compact, its blind twin, and points of its surface."""
-    save_ply(gaussians, part / "model.ply", white_radiance, shown_under)
-    save_spz(gaussians, part / "model.spz", white_radiance, shown_under)
+    held_out: list[FrameRecord],
+    sensor: Sensor,
+) -> float | None:
+    """Write the model in all its forms, its blind twin and points of its surface; return the ONNX renderer's parity."""
+    gaussians, camera = result.gaussians, session.camera
+    exposures_s = _exposures_s(training)
+    white_radiance = (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * exposures_s[0])
+    sun_dir = _middle_sun(training)
+    outputs.make("model.ply", lambda path: save_ply(gaussians, path, white_radiance, sun_dir))
     if blind is not None:
-        save_ply(blind.gaussians, part / "blind.ply", white_radiance, shown_under)
+        outputs.make("blind.ply", lambda path: save_ply(blind.gaussians, path, white_radiance, sun_dir))
+    outputs.make("model.spz", lambda path: save_spz(gaussians, path, white_radiance, sun_dir))
+    outputs.make("surface.ply", lambda path: _write_surface(gaussians, session, training, path))
+    exported = outputs.make(
+        "model.onnx",
+        lambda path: export_onnx(gaussians, sensor, path, camera.width, camera.height, exposures_s),
+    )
+    if exported is None:
+        return None
+    if exported.size_bytes > MAX_MODEL_BYTES:
+        log.warning(
+            "model.onnx has %d bytes and the spacecraft accepts %d: `ground uplink model` will refuse it",
+            exported.size_bytes,
+            MAX_MODEL_BYTES,
+        )
+    views = (held_out or training)[:: max(1, len(held_out or training) // PARITY_VIEWS)][:PARITY_VIEWS]
+    return outputs.make(
+        "onnx_parity_db", lambda _: onnx_parity_db(exported.path, gaussians, session, views, sensor)
+    )
+
+
+def _write_surface(gaussians: Gaussians, session: Session, training: list[FrameRecord], path: Path) -> None:
     one_a_bracket = {record.bracket: record for record in training}.values()
     cameras = cameras_of(session, list(one_a_bracket))
     points, normals = surface_points(gaussians, cameras, SURFACE_POINTS)
     if len(points) == 0:
         log.warning("the model has no solid surface that two cameras see: surface.ply is empty")
-    save_surface_ply(points, normals, part / "surface.ply")
+    save_surface_ply(points, normals, path)
+
+
+def _exposures_s(records: list[FrameRecord]) -> list[float]:
+    return sorted({record.exposure_time_s for record in records})
+
+
+def _metrics(
+    method: str,
+    result: TrainResult,
+    blind: TrainResult | None,
+    session: Session,
+    training: list[FrameRecord],
+    held_out: list[FrameRecord],
+) -> dict:
+    """Return how the trainings went, for metrics.json."""
+    sun_dir = _middle_sun(training)
+    chi2 = result.history[-1].chi2 if result.history else math.nan
+    metrics = {
+        "method": method,
+        "gaussians": len(result.gaussians),
+        "max_gaussians": result.config.max_gaussians,
+        "budget": result.budget,
+        "sh_degree": math.isqrt(result.gaussians.sh.shape[1]) - 1,
+        "shading": result.gaussians.shading,
+        "appearance": result.appearance,
+        "growth": result.growth,
+        "poses": result.poses,
+        "exposures": result.exposures,
+        "sun_span_deg": round(result.sun_span_deg, 2),
+        "shown_under_sun_dir_body": None if sun_dir is None else [round(x, 6) for x in sun_dir.tolist()],
+        "train_seconds": round(result.seconds, 3),
+        "train_steps": len(result.history),
+        "stop_reason": result.stop_reason,
+        "start": result.start,
+        "removed_outliers": result.removed_outliers,
+        "removed_not_finite": result.removed_not_finite,
+        "dark_frames": result.dark_frames,
+        "chi2": None if math.isnan(chi2) else chi2,
+        "frames_received": len(session.frames),
+        # frames are numbered without gaps in flight, so a gap here is a frame that never came
+        "frames_captured": session.frames[-1].id - session.frames[0].id + 1,
+        "frames_trained": len(training),
+        "frames_held_out": len(held_out),
+        "exposures_s": _exposures_s(training),
+        "bytes_received": session.bytes_received,
+        "session_created_utc": session.created_utc,
+        "reference_exposure_s": result.reference_exposure_s,
+    }
+    if blind is not None:
+        metrics |= {
+            "blind_gaussians": len(blind.gaussians),
+            "blind_budget": blind.budget,
+            "blind_removed_not_finite": blind.removed_not_finite,
+            "blind_train_seconds": round(blind.seconds, 3),
+            "blind_reference_exposure_s": blind.reference_exposure_s,
+        }
+    return metrics
+
+
+def _sizes(part: Path) -> dict:
+    """Return the bytes of each form of the model, nothing for one that is missing, and whether the uplink takes it."""
+    sizes = {}
+    for name in ("ply", "spz", "onnx"):
+        path = part / f"model.{name}"
+        sizes[f"{name}_bytes"] = path.stat().st_size if path.is_file() else None
+    onnx_bytes = sizes["onnx_bytes"]
+    return sizes | {"onnx_fits_uplink": None if onnx_bytes is None else onnx_bytes <= MAX_MODEL_BYTES}
 
 
 def _write_history(results: dict[str, TrainResult | None], path: Path) -> None:
@@ -385,13 +523,18 @@ def _discarded_on_failure(part: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _logged_to(path: Path) -> Iterator[None]:
-    handler = logging.FileHandler(path)
+def _logged_to(handler: logging.Handler) -> Iterator[None]:
+    """Write what is said in the block to a run's log, whatever the program around it listens to."""
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     root = logging.getLogger()
     root.addHandler(handler)
+    levels = {logging.getLogger(name): logging.getLogger(name).level for name in ("ground", "obbgs_core")}
+    for ours in levels:
+        ours.setLevel(min(logging.INFO, ours.getEffectiveLevel()))
     try:
         yield
     finally:
+        for ours, level in levels.items():
+            ours.setLevel(level)
         root.removeHandler(handler)
         handler.close()

@@ -16,7 +16,7 @@ from plotly.offline import get_plotlyjs
 
 from ground.evaluate import Run, Truth, bounding_box, clean_image, open_run
 from ground.plots import INK, histogram_figure, model_figure, training_figure
-from ground.reconstruct import predicted_image
+from ground.reconstruct import predicted_image, written_to
 from ground.session import FrameRecord, SessionError, write_whole
 from obbgs_core.metrics import COMPLETENESS_RADIUS, psnr_db
 from obbgs_core.sensor import Sensor
@@ -57,13 +57,13 @@ pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px;
 """
 
 
-def write_report(session_dir: Path, name: str) -> Path:
-    """Write report.html into a run's folder and return its path.
+def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
+    """Write report.html into a run's folder and return its path; `out` is the folder of runs, if not the session's own.
 
     Raises:
-        SessionError: no such session or run.
+        SessionError: no such session or run, or one that cannot be written to.
     """
-    run = open_run(session_dir, name)
+    run = open_run(session_dir, name, out)
     truth = Truth(run.session) if Truth.exists(run.session) else None
     sections = [
         _headline(run, truth),
@@ -87,7 +87,8 @@ def write_report(session_dir: Path, name: str) -> Path:
         f"received, session of {html.escape(run.session.created_utc)}.</p>{''.join(sections)}</main></body></html>"
     )
     path = run.folder / "report.html"
-    write_whole(path, page.encode())
+    with written_to(run.folder):
+        write_whole(path, page.encode())
     return path
 
 
@@ -114,8 +115,11 @@ def _headline(run: Run, truth: Truth | None) -> str:
     cards.append((f"{m['gaussians']:,}", "Gaussians"))
     cards.append((f"{m['train_seconds']:.0f} s", f"training; {html.escape(m['stop_reason'])}"))
     cards.append((f"{m['frames_received']} / {m['frames_captured']}", "frames received / captured"))
-    size = f"{m['onnx_bytes'] / 1e6:.2f} MB"
-    cards.append((f"{m['onnx_parity_db']:.0f} dB", f"ONNX renderer against ours, worst of its views; {size}"))
+    if m.get("onnx_bytes") is not None and m.get("onnx_parity_db") is not None:
+        size = f"{m['onnx_bytes'] / 1e6:.2f} MB"
+        cards.append(
+            (f"{m['onnx_parity_db']:.0f} dB", f"ONNX renderer against ours, worst of its views; {size}")
+        )
     body = "".join(f'<div class="card"><b>{value}</b><span>{label}</span></div>' for value, label in cards)
     note = (
         "Clean: against noiseless exposures of views that were never trained on, full scale = 1. Distances: in units "
@@ -123,7 +127,8 @@ def _headline(run: Run, truth: Truth | None) -> str:
         if truth
         else "No truth beside this session: figures are against the received frames themselves."
     )
-    notes = "".join(f"<li>{html.escape(line)}</li>" for line in m.get("notes", []))
+    lines = [*m.get("notes", []), *(f"{k} is missing: {v}" for k, v in m.get("missing_outputs", {}).items())]
+    notes = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
     callout = f'<ul class="notes">{notes}</ul>' if notes else ""
     return _section("Result", note, f'{callout}<div class="cards">{body}</div>{_details(m)}')
 
@@ -254,7 +259,10 @@ def _model(run: Run) -> str:
 def _training(run: Run) -> str:
     path = run.folder / "metrics.jsonl"
     try:
-        figure = training_figure([json.loads(line) for line in path.read_text().splitlines()])
+        history = [json.loads(line) for line in path.read_text().splitlines()]
+        if not history:
+            return _section("Training", "No step was done: the model is its untrained start.", "")
+        figure = training_figure(history)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SessionError(f"{path} is damaged: {error!r}") from error
     note = "Running mean over ten logged steps. The PSNR is of the noisy frames that the step trained on."

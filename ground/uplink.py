@@ -143,7 +143,11 @@ def _model_command(model: Path) -> tuple[bytes, Command]:
     except OSError as error:
         raise ConfigError(str(model), f"cannot read the model: {error.strerror}") from error
     if not 0 < len(content) <= MAX_MODEL_BYTES:
-        raise ConfigError(str(model), f"expected 1 to {MAX_MODEL_BYTES} bytes, got {len(content)}")
+        raise ConfigError(
+            str(model),
+            f"has {len(content):,} bytes and the spacecraft accepts 1 to {MAX_MODEL_BYTES:,}; `ground reconstruct` "
+            "makes a smaller model with a smaller --budget",
+        )
     arguments = {
         "size_bytes": len(content),
         "sha256": hashlib.sha256(content).digest(),

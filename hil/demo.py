@@ -25,6 +25,7 @@ from rich.table import Table
 
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, load_mission
+from ground.summary import model_rows, table
 from hil.blender import RenderFarm, check_mesh
 from hil.clock import SimulatedClock
 from hil.gige_camera import GigeCameraServer
@@ -80,11 +81,9 @@ def run_demo(out: Path, mission_path: Path, mesh: Path, config: DemoConfig, cons
     began_s = time.monotonic()
     simulation = simulate_pass(out, mission_path, mesh, config, console)
     console.print("[bold]4/4 Model[/] trained with known exposure, and once more blind to it")
-    session, wanted = out / "session", load_mission(mission_path).reconstruct
+    session = out / "session"
     command = [_tool("ground"), "reconstruct", "--session", str(session), "--name", "demo"]
-    command += ["--blind-reference", "--method", wanted.method, "--seed", str(wanted.seed)]
-    if wanted.steps:
-        command += ["--steps", str(wanted.steps)]
+    command += ["--blind-reference", "--mission", str(mission_path)]
     finished = subprocess.run(tied([*command, "--json"]), stdout=subprocess.PIPE, text=True)
     if finished.returncode:
         raise DemoError("the reconstruction failed; its message is above")
@@ -368,14 +367,13 @@ def _bar(console: Console) -> Progress:
 
 
 def _summary(f: dict) -> Table:
-    table = Table(title="The pass and its model", show_header=False)
     frames, camera, link, navigation = f["frames"], f["camera"], f["link"], f["navigation"]
     done = ", ".join(
         f"{value:,} {name.replace('_', ' ')}"
         for name, value in link.items()
         if value and FAULT_WORDS & set(name.split("_"))
     )
-    for label, value in (
+    rows = [
         ("frames captured / received", f"{frames['captured']} / {frames['received']}, sha256 equal"),
         ("camera", f"{camera['kind']}: {camera['late_frames']} frames late, {camera['failures']} failures"),
         (
@@ -388,14 +386,7 @@ def _summary(f: dict) -> Table:
             f"{navigation['position_error_m']:.3f} m, {navigation['rotation_error_deg']:.4f} deg "
             f"(injected noise: {navigation['noise']})",
         ),
-        (
-            "clean held-out PSNR",
-            f"{f['psnr_clean_db']:.2f} dB ({f['psnr_clean_blind_db']:.2f} dB blind to exposure)",
-        ),
-        ("Chamfer distance", f"{f['chamfer']:.4f} (largest dimension = 2)"),
-        ("Gaussians", f"{f['gaussians']:,}"),
-        ("ONNX renderer agrees to", f"{f['onnx_parity_db']:.1f} dB"),
-        ("training / everything", f"{f['train_seconds']:.0f} s / {f['seconds']:.0f} s"),
-    ):
-        table.add_row(label, value)
-    return table
+        *model_rows(f),
+        ("everything", f"{f['seconds']:.0f} s"),
+    ]
+    return table("The pass and its model", rows)

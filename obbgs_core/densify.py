@@ -53,6 +53,11 @@ class Growth:
     def mean(self) -> Tensor:
         return self.gradient / self.weight.clamp(min=1e-9)
 
+    def follow(self, kept: Tensor) -> None:
+        """Keep the records of the Gaussians `kept` (index or mask)."""
+        self.gradient, self.weight = self.gradient[kept], self.weight[kept]
+        self.count = len(self.gradient)
+
 
 class Adam:
     """Adam over the Gaussians' parameters whose moments follow the Gaussians when they are split or removed."""
@@ -135,6 +140,15 @@ def keep(gaussians: Gaussians, adam: Adam, mask: Tensor) -> Gaussians:
     return trainable(gaussians.select(index))
 
 
+@torch.no_grad()
+def finite(gaussians: Gaussians) -> Tensor:
+    """Return which Gaussians [N] have only finite parameters and sizes: images leave the others out silently."""
+    kept = gaussians.scales.isfinite().all(dim=1)
+    for tensor in gaussians.tensors().values():
+        kept &= tensor.reshape(len(gaussians), -1).isfinite().all(dim=1)
+    return kept
+
+
 def trainable(gaussians: Gaussians) -> Gaussians:
     """Return the same values as leaves that collect gradients."""
     leaves = {n: t.detach().clone().requires_grad_() for n, t in gaussians.parameters().items()}
@@ -176,7 +190,7 @@ def densify(
             wanted &= gaussians.scales.max(dim=1).values < config.prune_over * unit_m
             if config.prune_radius_px:
                 wanted[: len(kept)] &= growth.radius_px[kept] <= config.prune_radius_px
-        wanted &= torch.isfinite(gaussians.means).all(dim=1)
+        wanted &= finite(gaussians)
     return keep(gaussians, adam, wanted) if wanted.any() else gaussians
 
 

@@ -10,13 +10,16 @@ class TooFewFrames(ReconstructionError):
 
 
 class Diverged(ReconstructionError):
-    """The loss stopped being a number."""
+    """The loss stopped being a number, or what another `problem` says."""
 
-    def __init__(self, step: int, loss: float):
-        super().__init__(
-            f"the loss became {loss} at step {step}; try smaller learning rates or check the poses"
-        )
+    def __init__(self, step: int, loss: float, problem: str = ""):
+        problem = problem or f"the loss became {loss}"
+        super().__init__(f"{problem} at step {step}; try smaller learning rates or check the poses")
         self.step, self.loss = step, loss
+
+
+class Interrupted(Exception):
+    """Work was asked to stop before its end; the message says what is kept."""
 
 
 class ExportError(ReconstructionError):

@@ -26,7 +26,7 @@ from obbgs_core.shading import DARK_FROM, LIT_UNTIL, SHADOW_MAP_PX, SUN_DISTANCE
 OPSET = 18
 TILE = 16  # px: 8 costs more calls, 32 more pixels that a Gaussian does not reach
 FORMAT_VERSION = "1"
-MAX_MODEL_BYTES = 64 * 1024 * 1024  # what flightsw.model_file accepts
+MAX_PROTOBUF_BYTES = 2**31 - 1  # a protobuf message, and so an ONNX file, is no longer
 NEAR_M = 0.01
 
 
@@ -55,7 +55,7 @@ def export_onnx(
         exposures_s: the exposure times the model was trained on; their range goes into the metadata.
 
     Raises:
-        ExportError: the model is empty, not finite or larger than flight accepts, or there is no exposure time.
+        ExportError: the model is empty, not finite or larger than an ONNX file can be, or there is no exposure time.
     """
     if len(gaussians) == 0:
         raise ExportError("there is no Gaussian to export")
@@ -73,6 +73,12 @@ def export_onnx(
     features = graph.op("Concat", radiance, depth, ones, axis=1)
     composed = _composite(graph, projected, features, gaussians.sh.shape[2] + 2, camera)
     _finish(graph, composed, gaussians.sh.shape[2], sensor)
+    size_bytes = sum(len(constant.raw_data) for constant in graph.constants)
+    if size_bytes > MAX_PROTOBUF_BYTES:
+        raise ExportError(
+            f"{len(gaussians):,} Gaussians make an ONNX file of {size_bytes:,} bytes; the format ends at "
+            f"{MAX_PROTOBUF_BYTES:,}: train with a smaller budget"
+        )
     turns_with_sun = gaussians.shading != "view"
     model = helper.make_model(
         helper.make_graph(
@@ -110,11 +116,6 @@ def export_onnx(
     helper.set_model_props(model, {name: str(value) for name, value in facts.items()})
     onnx.checker.check_model(model, full_check=True)
     content = model.SerializeToString()
-    if len(content) > MAX_MODEL_BYTES:
-        raise ExportError(
-            f"{len(gaussians)} Gaussians make a model of {len(content)} bytes; the spacecraft accepts "
-            f"{MAX_MODEL_BYTES}: train with a smaller budget"
-        )
     write_whole(path, content)
     return Exported(path, len(content), len(gaussians))
 

@@ -12,6 +12,9 @@ CHOICES = {
     "sun_shading": ("lambert", "linear"),
     "refine_poses": ("never", "always", "auto"),
 }
+COUNTS = ("steps", "frames_per_step", "start_count", "max_gaussians", "grow_interval", "shadow_interval")
+SHARES = ("grow_from", "grow_until", "poses_from", "normal_from", "solid_from", "sun_from", "weigh_at")
+SHARES += ("prune_over_from", "keep_opacity", "prune_opacity")
 
 
 @dataclass(frozen=True)
@@ -107,11 +110,28 @@ class MethodConfig:
             if getattr(self, name) not in known:
                 expected = f"{', '.join(known[:-1])} or {known[-1]}"
                 raise ValueError(f"{name} must be {expected}, got {getattr(self, name)!r}")
-        if not 0 <= self.exposure_sigma < math.inf:
-            raise ValueError(f"exposure_sigma must be 0 (exact) or a deviation, got {self.exposure_sigma}")
-        for name in ("steps", "frames_per_step", "start_count", "max_gaussians", "shadow_interval"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name, value in vars(self).items():
+            for number in value if isinstance(value, tuple) and name != "pyramid" else (value,):
+                if not isinstance(number, (int, float)):
+                    continue
+                if not 0 <= number < math.inf:
+                    raise ValueError(f"{name} must be 0 or more, got {number}")
+                if name in COUNTS and number < 1:
+                    raise ValueError(f"{name} must be at least 1, got {number}")
+                if name in SHARES and number > 1:
+                    raise ValueError(f"{name} must be from 0 to 1, got {number}")
+                if name in ("sh_degree", "most_sh_degree") and number > 3:
+                    raise ValueError(f"{name} must be from 0 to 3, got {number}")
+        starts = [level[0] for level in self.pyramid]
+        if not (
+            all(len(level) == 2 and 0 < level[1] <= 1 for level in self.pyramid)
+            and starts == sorted(set(starts))
+            and starts[:1] == [0]
+        ):
+            raise ValueError(
+                "pyramid must be pairs of a share of the steps, from 0 upwards, and an image scale of 0 to 1, got "
+                f"{self.pyramid}"
+            )
 
 
 _3DGS = MethodConfig(
@@ -188,7 +208,7 @@ def preset(name: str, **changes) -> MethodConfig:
     """Return a preset with some fields changed.
 
     Raises:
-        ValueError: no such method or field.
+        ValueError: no such method or field, or a value that no training can have.
     """
     if name not in PRESETS:
         raise ValueError(f"no method {name!r}; expected one of {', '.join(PRESETS)}")

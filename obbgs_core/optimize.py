@@ -18,8 +18,8 @@ from torch import Tensor
 
 from obbgs_core import held_out, obb
 from obbgs_core.cameras import Cameras
-from obbgs_core.densify import Adam, Growth, densify, densify_boxes, keep, outliers, trainable
-from obbgs_core.errors import Diverged, ReconstructionError
+from obbgs_core.densify import Adam, Growth, densify, densify_boxes, finite, keep, outliers, trainable
+from obbgs_core.errors import Diverged, Interrupted, ReconstructionError
 from obbgs_core.files import write_whole
 from obbgs_core.frames import (
     FEWEST_FRAMES,
@@ -63,6 +63,7 @@ class StepInfo:
 @dataclass
 class TrainResult:
     gaussians: Gaussians
+    config: MethodConfig  # as used: with the budget that the frames pay for
     history: list[StepInfo] = field(default_factory=list)
     stop_reason: str = ""
     start: str = ""  # where the first Gaussians came from
@@ -75,6 +76,8 @@ class TrainResult:
     poses: str = ""  # whether the poses were refined, and why
     exposures: str = ""  # by how much the exposure times were corrected
     seconds: float = 0.0
+    budget: str = ""  # the most Gaussians, and why no more
+    removed_not_finite: int = 0  # Gaussians of which a parameter stopped being a number
 
 
 def train(
@@ -85,17 +88,23 @@ def train(
     on_step: Callable[[StepInfo], None] = lambda info: None,
     time_limit_s: float = math.inf,
     checkpoint: Path | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> TrainResult:
     """Fit Gaussians to frames.
 
     The same seed, thread count and machine give the same result bit for bit, also when the training was killed and
     called again with the same checkpoint file; a checkpoint of another training is not used. The time limit counts
-    the time spent before a kill too.
+    the time spent before a kill too. The checkpoint of a finished training stays, so that nothing that is done with the
+    model afterwards can lose it.
+
+    Args:
+        should_stop: asked after each step; when it says yes, the training is saved and ends in `Interrupted`.
 
     Raises:
         TooFewFrames: fewer than three frames.
         ReconstructionError: every frame is black, or frames differ in size.
-        Diverged: the loss stopped being finite.
+        Diverged: the loss, or all of the Gaussians, stopped being finite.
+        Interrupted: should_stop said so.
     """
     trainer = Trainer(frames, sensor, config, seed)
     if checkpoint is not None and trainer.resume(checkpoint):
@@ -103,10 +112,27 @@ def train(
     saved = time.monotonic()
     while not (reason := trainer.stop_reason(time_limit_s)):
         on_step(trainer.step())
-        if checkpoint is not None and time.monotonic() - saved > CHECKPOINT_EVERY_S:
-            trainer.save(checkpoint)
+        if should_stop():
+            kept = _saved(trainer, checkpoint)
+            where = "not saved" if kept is None else f"saved in {kept}: the same command goes on from there"
+            raise Interrupted(f"interrupted at step {trainer.steps_done} of {config.steps}, {where}")
+        if time.monotonic() - saved > CHECKPOINT_EVERY_S:
+            _saved(trainer, checkpoint)
             saved = time.monotonic()
+    _saved(trainer, checkpoint)
     return trainer.result(reason)
+
+
+def _saved(trainer: "Trainer", checkpoint: Path | None) -> Path | None:
+    """Save a training and return where; None where it is not wanted, or where the disk does not take it."""
+    if checkpoint is None:
+        return None
+    try:
+        trainer.save(checkpoint)
+    except OSError as error:  # a full disk: the training is worth more than its checkpoint
+        log.warning("step %d: %s cannot be written: %s", trainer.steps_done, checkpoint, error)
+        return None
+    return checkpoint
 
 
 class Trainer:
@@ -129,11 +155,10 @@ class Trainer:
                 f"{len(self.frames)} rise above the noise, {FEWEST_FRAMES} are needed"
             )
         outlines = silhouettes(self.frames, sensor)
-        if config.pixels_per_gaussian:
-            lit_pixels = sum(int(outline.sure.sum()) for outline in outlines.values())
-            most = min(config.max_gaussians, max(1, lit_pixels // config.pixels_per_gaussian))
-            fewer = min(config.start_count, most)
-            self.config = config = dataclasses.replace(config, max_gaussians=most, start_count=fewer)
+        lit_pixels = sum(int(outline.sure.sum()) for outline in outlines.values())
+        self.config, self.budget = _paid_for(config, lit_pixels)
+        config = self.config
+        log.info("budget: %s", self.budget)
         self.gaussians, self.radius, self.start = first_gaussians(
             self.frames, list(outlines.values()), sensor, config, self.rng
         )
@@ -156,6 +181,7 @@ class Trainer:
         self.shadow_maps: dict[tuple[float, ...], ShadowMap] = {}  # by the Sun's direction
         self.chi2, self.psnr_db, self.steps_done = math.nan, math.nan, 0
         self.history: list[StepInfo] = []
+        self.removed_not_finite = 0
         self.seconds = time.monotonic() - began
 
     def step(self) -> StepInfo:
@@ -205,7 +231,8 @@ class Trainer:
         """Return why the training is over, or nothing."""
         config = self.config
         if self.seconds >= time_limit_s:
-            return f"time limit of {time_limit_s:g} s"
+            untrained = ", before the first step: the model is its untrained start"
+            return f"time limit of {time_limit_s:g} s" + (untrained if self.steps_done == 0 else "")
         if (
             config.chi2_end
             and self.chi2 <= config.chi2_end
@@ -217,7 +244,12 @@ class Trainer:
         return ""
 
     def result(self, stop_reason: str) -> TrainResult:
-        """Return the model as it stands, filtered and with its gauge fixed as the method asks."""
+        """Return the model as it stands, filtered and with its gauge fixed as the method asks.
+
+        Raises:
+            Diverged: no Gaussian is finite.
+        """
+        self._drop_not_finite()
         gaussians, removed = self.gaussians.detach(), 0
         if self.config.outlier_filter:
             stray = outliers(gaussians)
@@ -227,6 +259,7 @@ class Trainer:
             gaussians = self.poses.settle(gaussians, self.frames)
         return TrainResult(
             gaussians,
+            self.config,
             self.history,
             stop_reason,
             self.start,
@@ -239,6 +272,8 @@ class Trainer:
             self.poses_decided or "as tagged (training ended before this was decided)",
             self.exposures,
             self.seconds,
+            self.budget,
+            self.removed_not_finite,
         )
 
     @property
@@ -275,6 +310,7 @@ class Trainer:
             "decisions": (self.poses_decided, self.grow_until, self.growth_ended),
             "best": (self.best, self.intervals_since_best),
             "numbers": (self.chi2, self.psnr_db, self.steps_done, self.seconds),
+            "removed_not_finite": self.removed_not_finite,
             "history": [dataclasses.astuple(info) for info in self.history],
         }
         content = io.BytesIO()
@@ -306,6 +342,7 @@ class Trainer:
         self.poses_decided, self.grow_until, self.growth_ended = state["decisions"]
         self.best, self.intervals_since_best = state["best"]
         self.chi2, self.psnr_db, self.steps_done, self.seconds = state["numbers"]
+        self.removed_not_finite = state.get("removed_not_finite", 0)  # not in checkpoints of before
         self.history = [StepInfo(*info) for info in state["history"]]
         return True
 
@@ -439,11 +476,13 @@ class Trainer:
         config, now = self.config, self.steps_done + 1
         growing = config.grow_from <= share < self.grow_until
         if growing and now % config.grow_interval == 0:
+            self._drop_not_finite()
             self.gaussians = densify(
                 self.gaussians, self.adam, self.growth, self.unit_m, config, share, self.rng
             )
             self.growth, self.boxes = Growth(len(self.gaussians), config.pixel_weighted), []
         elif growing and self.boxes and now % config.obb_interval == 0:
+            self._drop_not_finite()
             self.gaussians, self.growth = densify_boxes(
                 self.gaussians, self.adam, self.growth, self.boxes, self.unit_m, config, self.rng
             )
@@ -460,8 +499,22 @@ class Trainer:
         elif sun_moves and now == round(config.sun_from * config.steps):
             self._raise_degree(scale, "sun")
 
+    def _drop_not_finite(self) -> None:
+        """Remove the Gaussians of which a parameter is no number any more, and count them."""
+        kept = finite(self.gaussians)
+        count = len(kept) - int(kept.sum())
+        if count == len(kept):
+            problem = f"none of {count} Gaussians has finite parameters any more,"
+            raise Diverged(self.steps_done, math.nan, problem)
+        if count:
+            self.gaussians = keep(self.gaussians, self.adam, kept)
+            self.growth.follow(kept)
+            self.removed_not_finite += count
+            log.warning("step %d: %d Gaussians were not finite and are removed", self.steps_done, count)
+
     def _weigh(self, scale: float) -> None:
         """Remove the Gaussians that do not earn their parameters."""
+        self._drop_not_finite()
         gains, values = likelihood_gains(self.gaussians, self.batches, self.sensor, scale, self.rng)
         earning = gains >= self.config.price_factor * price(self.gaussians, values)
         earning |= self.gaussians.opacities.detach() > self.config.keep_opacity
@@ -509,6 +562,19 @@ class Trainer:
         )
         if not math.isnan(chi2):
             self.chi2 = chi2 if math.isnan(self.chi2) else CHI2_MEMORY * self.chi2 + (1 - CHI2_MEMORY) * chi2
+
+
+def _paid_for(config: MethodConfig, lit_pixels: int) -> tuple[MethodConfig, str]:
+    """Return the method with no more Gaussians than the budget and the lit pixels allow, and the budget in words."""
+    most, budget = config.max_gaussians, f"at most {config.max_gaussians:,} Gaussians"
+    if config.pixels_per_gaussian and lit_pixels // config.pixels_per_gaussian < most:
+        most = max(1, lit_pixels // config.pixels_per_gaussian)
+        budget = (
+            f"at most {most:,} Gaussians instead of {config.max_gaussians:,}: one for each "
+            f"{config.pixels_per_gaussian} of the {lit_pixels:,} pixels that are lit in the long exposures"
+        )
+    fewer = min(config.start_count, most)
+    return dataclasses.replace(config, max_gaussians=most, start_count=fewer), budget
 
 
 def _decided_at_once(config: MethodConfig, frames: list[TrainingFrame], brackets: list[list[int]]) -> str:

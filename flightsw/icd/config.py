@@ -153,6 +153,9 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return build(typing.cast(type, hint), value, path)
     origin = typing.get_origin(hint)
+    if origin is dict:
+        require(isinstance(value, dict), path, f"expected a mapping of keys, got {_describe(value)}")
+        return value
     if origin is Literal:
         options = typing.get_args(hint)
         require(

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from flightsw.icd.config import ConfigError, build, in_file, parse_yaml
 from flightsw.icd.config import require as _require
@@ -332,9 +332,12 @@ class LinkSection:
 
 @dataclass(frozen=True)
 class ReconstructSection:
-    method: str = "obbgs"
+    """How the ground trains; `settings` change the method's own, and the ground knows their names."""
+
+    method: Literal["obbgs", "jiang2025", "3dgs", "pixel-gs", "mvgs"] = "obbgs"
     seed: int = 7
     steps: int = 0  # of training; 0: the method's own number
+    settings: dict[str, Any] = field(default_factory=dict, hash=False)  # such as sun_shading: linear
 
     def __post_init__(self):
         _require(

@@ -17,9 +17,10 @@ from typer.testing import CliRunner
 
 from ground import cli
 from ground.evaluate import bounding_box, evaluate
-from ground.reconstruct import changes_for, reconstruct, split
+from ground.reconstruct import reconstruct, split
 from ground.report import write_report
 from ground.session import MissingFrames, SessionError, open_session
+from ground.settings import changes_for
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.methods import PRESETS
 from obbgs_core.ply import load_ply

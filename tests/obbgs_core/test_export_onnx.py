@@ -11,7 +11,7 @@ import torch
 from flightsw import model_file
 from obbgs_core.cameras import Cameras
 from obbgs_core.errors import ExportError
-from obbgs_core.export_onnx import MAX_MODEL_BYTES, export_onnx
+from obbgs_core.export_onnx import export_onnx
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
@@ -89,11 +89,18 @@ def test_float64_agrees_with_the_exported_float32(tmp_path, gaussians, distance)
     )  # dB, 12 bits are 84
 
 
-def test_a_model_that_flight_would_refuse_is_not_written(tmp_path, monkeypatch):
-    assert MAX_MODEL_BYTES == model_file.MAX_MODEL_BYTES
-    monkeypatch.setattr("obbgs_core.export_onnx.MAX_MODEL_BYTES", 100_000)
-    with pytest.raises(ExportError, match="smaller budget"):
-        export_onnx(scene(5000, 1, 1), SENSOR, tmp_path / "m.onnx", 32, 32, [1e-4])
+def test_a_model_too_large_for_the_uplink_is_written_and_one_too_large_for_onnx_is_named(
+    tmp_path, monkeypatch
+):
+    path = tmp_path / "m.onnx"
+    exported = export_onnx(scene(300_000, 16, 3), SENSOR, path, 32, 32, [1e-4])
+    assert exported.size_bytes == path.stat().st_size > model_file.MAX_MODEL_BYTES
+    path.unlink()
+    monkeypatch.setattr("obbgs_core.export_onnx.MAX_PROTOBUF_BYTES", 100_000)
+    with pytest.raises(
+        ExportError, match=r"5,000 Gaussians make .* ends at 100,000: train with a smaller budget"
+    ):
+        export_onnx(scene(5000, 1, 1), SENSOR, path, 32, 32, [1e-4])
     assert not list(tmp_path.iterdir())
 
 

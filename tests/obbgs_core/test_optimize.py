@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from hil.sensor import converted
 from obbgs_core.cameras import Cameras
-from obbgs_core.errors import Diverged, ReconstructionError, TooFewFrames
+from obbgs_core.densify import finite
+from obbgs_core.errors import Diverged, Interrupted, ReconstructionError, TooFewFrames
 from obbgs_core.frames import Batches, TrainingFrame, _shrunk
-from obbgs_core.gaussians import Gaussians
+from obbgs_core.gaussians import TENSORS, Gaussians
 from obbgs_core.held_out import held_out_brackets
 from obbgs_core.methods import preset, with_quality
 from obbgs_core.optimize import Trainer, train
@@ -112,9 +113,87 @@ def test_a_checkpoint_of_another_training_is_not_used(frames, tmp_path):
 
 def test_the_time_limit_ends_the_training_and_says_so(frames):
     result = train(frames, SENSOR, preset("obbgs", **QUICK), time_limit_s=0.0)
-    assert (
-        result.stop_reason == "time limit of 0 s" and len(result.history) == 0 and len(result.gaussians) > 0
-    )
+    assert len(result.history) == 0 and len(result.gaussians) > 0
+    assert result.stop_reason == "time limit of 0 s, before the first step: the model is its untrained start"
+    trainer = Trainer(frames, SENSOR, preset("obbgs", **QUICK))
+    trainer.step()
+    assert trainer.stop_reason(0.0) == "time limit of 0 s"
+
+
+def test_an_interrupted_training_is_saved_at_once_and_goes_on_to_the_same_model(frames, tmp_path):
+    config, checkpoint, steps = preset("obbgs", **QUICK), tmp_path / "c", []
+    whole = train(frames, SENSOR, config, seed=3)
+    with pytest.raises(Interrupted, match=r"step 13 of 40, saved in .*: the same command goes on"):
+        train(
+            frames,
+            SENSOR,
+            config,
+            3,
+            lambda info: steps.append(info.step),
+            checkpoint=checkpoint,
+            should_stop=lambda: len(steps) == 13,
+        )
+    resumed = train(frames, SENSOR, config, 3, lambda info: steps.append(info.step), checkpoint=checkpoint)
+    assert steps == list(range(1, 41))
+    again = train(frames, SENSOR, config, 3, lambda info: steps.append(info.step), checkpoint=checkpoint)
+    assert len(steps) == 40 and again.stop_reason == whole.stop_reason  # a finished one is kept too
+    for name, tensor in whole.gaussians.tensors().items():
+        assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
+        assert torch.equal(tensor, getattr(again.gaussians, name)), name
+
+
+def test_a_checkpoint_that_the_disk_does_not_take_costs_no_training(frames, tmp_path, caplog):
+    (tmp_path / "file").write_text("")
+    checkpoint = tmp_path / "file" / "training.checkpoint"
+    result = train(frames, SENSOR, preset("obbgs", **QUICK | {"steps": 3}), checkpoint=checkpoint)
+    assert len(result.history) == 3 and f"{checkpoint} cannot be written" in caplog.text
+    with pytest.raises(Interrupted, match="step 1 of 3, not saved"):
+        train(
+            frames,
+            SENSOR,
+            preset("obbgs", **QUICK | {"steps": 3}),
+            checkpoint=checkpoint,
+            should_stop=lambda: True,
+        )
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("name", TENSORS)
+def test_gaussians_that_are_not_finite_are_removed_and_counted(frames, tmp_path, caplog, name, value):
+    config = preset("obbgs", **QUICK, grow_interval=10)
+    trainer = Trainer(frames, SENSOR, config, seed=3)
+    for _ in range(8):
+        trainer.step()
+    with torch.no_grad():
+        trainer.gaussians.opacity_logits[
+            :3
+        ] = -20.0  # none of the three is drawn, as most that are not finite
+        getattr(trainer.gaussians, name)[:3] = value
+    while trainer.steps_done < 12:  # densification is due at step 10
+        trainer.step()
+    assert trainer.removed_not_finite == 3 and "3 Gaussians were not finite" in caplog.text
+    assert all(tensor.isfinite().all() for tensor in trainer.gaussians.tensors().values())
+    trainer.save(tmp_path / "c")
+    with torch.no_grad():
+        getattr(trainer.gaussians, name)[5] = value  # too late for any densification
+    assert trainer.result("").removed_not_finite == 4
+    resumed = Trainer(frames, SENSOR, config, seed=3)
+    assert resumed.resume(tmp_path / "c")
+    assert resumed.result("").removed_not_finite == 3
+
+
+def test_a_size_beyond_all_numbers_counts_as_not_finite():
+    gaussians = target(5)
+    gaussians.log_scales[2] = 200.0
+    assert finite(gaussians).tolist() == [True, True, False, True, True]
+
+
+def test_a_model_of_which_nothing_is_finite_has_diverged(frames):
+    trainer = Trainer(frames, SENSOR, preset("obbgs", **QUICK))
+    with torch.no_grad():
+        trainer.gaussians.quats[:] = math.nan
+    with pytest.raises(Diverged, match=r"none of [0-9]+ Gaussians has finite parameters"):
+        trainer.result("")
 
 
 def test_a_model_has_no_more_gaussians_than_the_lit_pixels_of_the_long_exposures_pay_for(frames):
@@ -124,8 +203,31 @@ def test_a_model_has_no_more_gaussians_than_the_lit_pixels_of_the_long_exposures
     wanted = QUICK | {"start_count": 100_000, "max_gaussians": 100_000}
     few = Trainer(frames, SENSOR, preset("obbgs", **wanted | {"pixels_per_gaussian": 20}))
     assert len(few.gaussians) <= few.config.max_gaussians == pytest.approx(np.sum(lit) / 20, rel=0.15)
+    assert f"at most {few.config.max_gaussians:,} Gaussians instead of 100,000: one for each 20" in few.budget
+    result = few.result("")
+    assert result.config == few.config and result.budget == few.budget
     many = Trainer(frames, SENSOR, preset("obbgs", **wanted | {"pixels_per_gaussian": 0}))
-    assert many.config.max_gaussians == 100_000
+    assert many.config.max_gaussians == 100_000 and many.budget == "at most 100,000 Gaussians"
+    start = Trainer(frames, SENSOR, preset("3dgs", **QUICK | {"start_count": 500, "max_gaussians": 100}))
+    assert len(start.gaussians) == start.config.start_count == 100
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("pyramid", ((0.1, 1.0),), "pairs of a share of the steps, from 0"),
+        ("pyramid", ((0.0, 1.0, 2.0),), "pairs"),
+        ("pyramid", (), "pairs"),
+        ("lr_means", -1.0, "0 or more, got -1.0"),
+        ("lr_means", math.nan, "0 or more, got nan"),
+        ("grow_interval", 0, "at least 1, got 0"),
+        ("weigh_at", (0.5, 1.5), "from 0 to 1, got 1.5"),
+        ("sh_degree", 4, "from 0 to 3, got 4"),
+    ],
+)
+def test_settings_that_no_training_can_have_are_refused(name, value, message):
+    with pytest.raises(ValueError, match=f"{name} must be .*{message}"):
+        preset("obbgs", **{name: value})
 
 
 def test_the_chi2_of_a_good_model_is_near_one(frames):

@@ -1,0 +1,67 @@
+"""What a run's figures are, as rows of a table with units: for `ground` and for the demo."""
+
+from rich.table import Table
+from rich.text import Text
+
+PSNR_LABELS = {"psnr_clean_db": "against noiseless exposures", "psnr_noisy_db": "against the noisy frames"}
+REMOVED = {
+    "dark_frames": "black frames",
+    "removed_outliers": "stray Gaussians",
+    "removed_not_finite": "Gaussians that stopped being numbers",
+}
+
+
+def model_rows(metrics: dict) -> list[tuple[str, str]]:
+    """Return label and value with its unit for each figure of a model that was measured."""
+
+    def known(key: str) -> bool:
+        return metrics.get(key) is not None
+
+    rows = [("method", str(metrics["method"]))]
+    views = "held-out views" if metrics.get("frames_held_out") else "views it was trained on"
+    for key, label in PSNR_LABELS.items():
+        if known(key):
+            blind = metrics.get("psnr_clean_blind_db") if key == "psnr_clean_db" else None
+            more = "" if blind is None else f" ({blind:.2f} dB blind to exposure)"
+            rows.append((f"PSNR of {views}, {label}", f"{metrics[key]:.2f} dB{more}"))
+    if known("chi2"):
+        rows.append(("residual chi² where the model is", f"{metrics['chi2']:.2f} (1 is noise)"))
+    if known("chamfer"):
+        rows.append(("Chamfer distance of the centres", f"{metrics['chamfer']:.4f} (largest dimension = 2)"))
+    if known("completeness_surface"):
+        rows.append(("true surface within 0.01 of the model's", f"{metrics['completeness_surface']:.1f} %"))
+    rows.append(("Gaussians", f"{metrics['gaussians']:,}"))
+    if known("budget"):
+        rows.append(("budget", metrics["budget"]))
+    removed = [f"{metrics[key]:,} {label}" for key, label in REMOVED.items() if metrics.get(key)]
+    if removed:
+        rows.append(("left out", ", ".join(removed)))
+    rows.append(("training", f"{metrics['train_seconds']:.0f} s; {metrics['stop_reason']}"))
+    if known("blind_train_seconds"):
+        rows.append(("training blind to exposure", f"{metrics['blind_train_seconds']:.0f} s"))
+    if known("onnx_parity_db"):
+        rows.append(("ONNX renderer agrees to", f"{metrics['onnx_parity_db']:.1f} dB"))
+    for name in ("ply", "spz", "onnx"):
+        if known(f"{name}_bytes"):
+            heavy = name == "onnx" and metrics.get("onnx_fits_uplink") is False
+            more = ", too large for the uplink: train with a smaller --budget" if heavy else ""
+            rows.append((f"model.{name}", f"{metrics[f'{name}_bytes'] / 1e6:.2f} MB{more}"))
+    rows += [(f"not made: {name}", reason) for name, reason in metrics.get("missing_outputs", {}).items()]
+    return rows
+
+
+def frames_row(metrics: dict) -> tuple[str, str]:
+    """Return what the frames were used for, as a row."""
+    counts = ("received", metrics["frames_received"]), ("trained on", metrics["frames_trained"])
+    counts += (("held out", metrics["frames_held_out"]),)
+    return "frames", ", ".join(f"{count:,} {what}" for what, count in counts)
+
+
+def table(title: str, rows: list[tuple[str, str]]) -> Table:
+    """Return the rows as a table for a terminal."""
+    made = Table(title=title, show_header=False)
+    made.add_column(overflow="fold")
+    made.add_column(overflow="fold")
+    for label, value in rows:
+        made.add_row(Text(label), Text(value))  # brackets in a reason are no markup
+    return made

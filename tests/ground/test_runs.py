@@ -1,0 +1,411 @@
+"""A run and its folder: nothing trained is lost, nothing is overwritten, and what was asked for is what happens."""
+
+import io
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from rich.console import Console
+from typer.testing import CliRunner
+
+from flightsw import model_file
+from flightsw.icd.mission import ConfigError, ReconstructSection, load_mission
+from ground import cli, uplink
+from ground.evaluate import evaluate
+from ground.progress import Stop, steps_shown
+from ground.reconstruct import reconstruct
+from ground.report import write_report
+from ground.session import SessionError
+from ground.settings import all_changes, changes_for, mission_changes, set_changes
+from ground.summary import model_rows
+from obbgs_core.errors import Diverged, Interrupted
+from obbgs_core.methods import PRESETS
+from obbgs_core.optimize import StepInfo
+from obbgs_core.ply import load_ply
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+QUICK = {"steps": 8, "start_count": 600, "max_gaussians": 800, "sh_degree": 0}
+FILES = {"model.ply", "model.spz", "surface.ply", "model.onnx"}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_surface_points():
+    """A hundred thousand take seconds, and nothing here asks how good they are."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ground.reconstruct.SURFACE_POINTS", 1000)
+        yield
+
+
+@pytest.fixture
+def session(tmp_path) -> Path:
+    return Path(shutil.copytree(GOLDEN / "session", tmp_path / "session"))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """A session with a run; not to be written to."""
+    folder = tmp_path_factory.mktemp("finished") / "session"
+    shutil.copytree(GOLDEN / "session", folder)
+    reconstruct(folder, "run", "obbgs", QUICK)
+    return folder
+
+
+def fail(*arguments, **named):
+    raise RuntimeError("no such luck")
+
+
+@pytest.mark.parametrize(
+    ("part", "missing"),
+    [
+        ("save_spz", "model.spz"),
+        ("surface_points", "surface.ply"),
+        ("export_onnx", "model.onnx"),
+        ("onnx_parity_db", "onnx_parity_db"),
+    ],
+)
+def test_what_cannot_be_made_of_a_model_is_named_and_the_rest_is_there(session, monkeypatch, part, missing):
+    monkeypatch.setattr(f"ground.reconstruct.{part}", fail)
+    folder = reconstruct(session, "run", "obbgs", QUICK)
+    metrics = evaluate(session, "run")
+    assert metrics["missing_outputs"] == {missing: "RuntimeError: no such luck"}
+    assert {path.name for path in folder.iterdir()} >= FILES - {missing}
+    assert metrics["gaussians"] == len(load_ply(folder / "model.ply")) and metrics["psnr_clean_db"] > 0
+    line = f"{missing} is missing: RuntimeError: no such luck"
+    assert line in (folder / "model_card.md").read_text() and line in write_report(session, "run").read_text()
+    log = (folder / "log").read_text()
+    assert f"{missing} is not made: RuntimeError: no such luck" in log and "Traceback" in log
+    assert (f"not made: {missing}", "RuntimeError: no such luck") in model_rows(metrics)
+
+
+def test_the_command_trains_and_ends_well_where_the_model_is_too_large_for_onnx(session, monkeypatch):
+    monkeypatch.setattr("obbgs_core.export_onnx.MAX_PROTOBUF_BYTES", 1000)
+    arguments = ["reconstruct", "--session", str(session), "--steps", "5"]
+    done = CliRunner().invoke(cli.app, arguments, env={"COLUMNS": "200"})
+    assert done.exit_code == 0, done.output
+    assert "not made: model.onnx" in done.stdout and "train with a smaller budget" in done.stdout
+    metrics = json.loads((session / "runs" / "run" / "metrics.json").read_text())
+    assert metrics["onnx_bytes"] is None and metrics["onnx_parity_db"] is None and metrics["ply_bytes"] > 0
+
+
+def test_the_limit_of_the_uplink_stops_no_model_of_the_ground_but_the_uplink(session, tmp_path, monkeypatch):
+    assert uplink.MAX_MODEL_BYTES == model_file.MAX_MODEL_BYTES
+    monkeypatch.setattr("ground.reconstruct.MAX_MODEL_BYTES", 1000)
+    monkeypatch.setattr("ground.uplink.MAX_MODEL_BYTES", 1000)
+    folder = reconstruct(session, "run", "obbgs", QUICK)
+    metrics = evaluate(session, "run")
+    assert metrics["onnx_bytes"] > 1000 and metrics["onnx_fits_uplink"] is False
+    assert metrics["missing_outputs"] == {} and metrics["onnx_parity_db"] > 40
+    assert "too large for the uplink" in (folder / "model_card.md").read_text()
+    assert "too large for the uplink" in dict(model_rows(metrics))["model.onnx"]
+    with pytest.raises(ConfigError, match=r"accepts 1 to 1,000; .*smaller --budget"):
+        command, model = uplink.parse_command("model", [str(folder / "model.onnx")])
+        uplink.make_key(tmp_path / "mission.key", 1)
+        uplink.submit(session, tmp_path / "mission.key", command, model, 60.0)
+
+
+def test_a_model_that_the_disk_does_not_take_is_kept_and_written_later(session, monkeypatch):
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("ground.reconstruct.save_ply", full)
+        with pytest.raises(
+            SessionError, match="No space left on device; the same command goes on from the training"
+        ):
+            reconstruct(session, "run", "obbgs", QUICK)
+    assert [path.name for path in (session / "runs").iterdir()] == [".run.part"]
+    steps = []
+    reconstruct(session, "run", "obbgs", QUICK, on_progress=steps.append)
+    assert steps == [] and evaluate(session, "run")["train_steps"] == QUICK["steps"]
+
+
+def test_a_blind_training_that_fails_does_not_cost_the_one_that_did_not(session, monkeypatch):
+    from obbgs_core.optimize import train
+
+    def blindly_diverging(frames, sensor, config, *more):
+        if not config.exposure_aware:
+            raise Diverged(7, math.inf)
+        return train(frames, sensor, config, *more)
+
+    monkeypatch.setattr("ground.reconstruct.train", blindly_diverging)
+    reconstruct(session, "run", "obbgs", QUICK, blind_reference=True)
+    metrics = evaluate(session, "run")
+    assert "the loss became inf at step 7" in metrics["missing_outputs"]["blind.ply"]
+    assert metrics["psnr_clean_db"] > 0 and "psnr_clean_blind_db" not in metrics
+    assert write_report(session, "run").exists()
+
+
+def test_a_time_limit_before_the_first_step_gives_the_untrained_start_and_says_so(session, caplog):
+    folder = reconstruct(session, "run", "obbgs", QUICK, time_limit_s=1e-6)
+    metrics = evaluate(session, "run")
+    assert metrics["train_steps"] == 0 and metrics["chi2"] is None and metrics["gaussians"] > 0
+    assert metrics["stop_reason"].endswith("before the first step: the model is its untrained start")
+    assert metrics["stop_reason"] in (folder / "model_card.md").read_text()
+    assert "No step was done" in write_report(session, "run").read_text()
+    assert "NaN" not in (folder / "metrics.json").read_text() and "training" in dict(model_rows(metrics))
+
+
+@pytest.mark.parametrize("limit", ["0", "-3", "nan"])
+def test_a_time_limit_that_is_none_is_wrong_usage(session, monkeypatch, capsys, limit):
+    arguments = ["ground", "reconstruct", "--session", str(session), "--time-limit", limit]
+    monkeypatch.setattr("sys.argv", arguments)
+    with pytest.raises(SystemExit) as exit_info:
+        cli.main()
+    assert exit_info.value.code == 2 and "time limit must be longer than 0 s" in capsys.readouterr().err
+    assert not (session / "runs").exists()
+
+
+def test_a_run_holds_nothing_of_an_interrupted_one_before_it(session):
+    part = session / "runs" / ".run.part"
+    with pytest.raises(Interrupted, match=r"before model\.spz was made; the same command goes on"):
+        reconstruct(
+            session,
+            "run",
+            "obbgs",
+            QUICK,
+            blind_reference=True,
+            should_stop=lambda: (part / "blind.ply").exists(),
+        )
+    (part / "left.npz").write_text("by who knows whom")
+    folder = reconstruct(session, "run", "obbgs", QUICK)
+    written = {"config.yaml", "log", "metrics.json", "metrics.jsonl"}
+    assert {path.name for path in folder.iterdir()} == FILES | written
+    assert "psnr_clean_blind_db" not in evaluate(session, "run")
+
+
+def test_a_stray_blind_model_of_an_older_run_is_not_scored(finished, tmp_path):
+    session = Path(shutil.copytree(finished, tmp_path / "session"))
+    shutil.copy(session / "runs" / "run" / "model.ply", session / "runs" / "run" / "blind.ply")
+    assert "psnr_clean_blind_db" not in evaluate(session, "run")
+
+
+def test_a_finished_run_is_replaced_only_when_asked_for(finished, tmp_path):
+    session = Path(shutil.copytree(finished, tmp_path / "session"))
+    model = session / "runs" / "run" / "model.ply"
+    before = model.read_bytes()
+    with pytest.raises(SessionError, match="--overwrite replaces it, --name makes another"):
+        reconstruct(session, "run", "obbgs", QUICK, seed=1)
+    assert model.read_bytes() == before
+    reconstruct(session, "run", "obbgs", QUICK, seed=1, overwrite=True)
+    assert model.read_bytes() != before
+    assert [path.name for path in (session / "runs").iterdir()] == ["run"]
+    precious = session / "runs" / "mine" / "thesis.txt"
+    precious.parent.mkdir()
+    precious.write_text("years")
+    with pytest.raises(SessionError, match="is no finished run: it stays as it is"):
+        reconstruct(session, "mine", "obbgs", QUICK, overwrite=True)
+    assert precious.read_text() == "years"
+
+
+def test_runs_go_to_another_folder_and_are_scored_there(session, tmp_path):
+    out = tmp_path / "elsewhere" / "runs"
+    more = ["--session", str(session), "--out", str(out), "--name", "a", "--json"]
+    for command in (["reconstruct", "--steps", "5"], ["evaluate"], ["report"]):
+        done = CliRunner().invoke(cli.app, [*command, *more])
+        assert done.exit_code == 0, done.output
+        json.loads(done.stdout)
+    assert (out / "a" / "report.html").exists() and not (session / "runs").exists()
+    header = json.loads((session / "session.json").read_text())
+    (session / "session.json").write_text(json.dumps(header | {"created_utc": "2030-01-01T00:00:00Z"}))
+    with pytest.raises(SessionError, match=r"is a run of the session of .* that of 2030-01-01T00:00:00Z"):
+        evaluate(session, "a", out)
+
+
+def test_a_folder_that_cannot_be_written_to_is_named(finished, tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file" / "runs", Path("/proc/runs")):
+        arguments = ["ground", "reconstruct", "--session", str(finished), "--out", str(out)]
+        monkeypatch.setattr("sys.argv", arguments)
+        with pytest.raises(SystemExit) as exit_info:
+            cli.main()
+        assert exit_info.value.code == 1
+        assert f"cannot write to {out}: " in (said := capsys.readouterr().err) and "--out DIR" in said
+
+    def read_only(*arguments):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("ground.evaluate.write_whole", read_only)
+    monkeypatch.setattr("ground.report.write_whole", read_only)
+    for score in (evaluate, write_report):
+        with pytest.raises(SessionError, match=r"cannot write to .*: Read-only file system; --out DIR"):
+            score(finished, "run")
+
+
+def test_a_budget_in_numbers_is_what_happens_and_a_cap_is_recorded(session):
+    asked = changes_for("obbgs", budget="3000") | {"steps": 2, "weigh_at": ()}
+    folder = reconstruct(session, "asked", "obbgs", asked)
+    config = yaml.safe_load((folder / "config.yaml").read_text())["method"]
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert config["max_gaussians"] == metrics["max_gaussians"] == config["start_count"] == 3000
+    asked_for = metrics["gaussians"]
+    assert metrics["budget"] == "at most 3,000 Gaussians"
+    folder = reconstruct(session, "best", "obbgs", changes_for("obbgs", "best") | {"steps": 2})
+    config = yaml.safe_load((folder / "config.yaml").read_text())["method"]
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["gaussians"] <= config["max_gaussians"] == metrics["max_gaussians"] < asked_for
+    reason = f"at most {metrics['max_gaussians']:,} Gaussians instead of 30,000: one for each 7 of the "
+    assert metrics["budget"].startswith(reason) and f"budget: {reason}" in (folder / "log").read_text()
+    assert dict(model_rows(metrics))["budget"].startswith(reason)
+
+
+def test_a_mission_file_says_how_to_train_and_the_command_line_says_otherwise(session, tmp_path):
+    path = tmp_path / "mission.yaml"
+    text = (GOLDEN / "mission.yaml").read_text().replace("seed: 7", "seed: 11").replace("obbgs", "mvgs")
+    path.write_text(
+        text + "  steps: 6\n  settings: {start_count: 300, max_gaussians: 300, weigh_at: [0.5]}\n"
+    )
+
+    def resolved(name: str, *arguments: str) -> dict:
+        start = ["reconstruct", "--session", str(session), "--name", name, "--mission", str(path)]
+        done = CliRunner().invoke(cli.app, [*start, *arguments])
+        assert done.exit_code == 0, done.output
+        return yaml.safe_load((session / "runs" / name / "config.yaml").read_text())
+
+    told = resolved("told")
+    assert (told["method"]["name"], told["seed"], told["method"]["steps"]) == ("mvgs", 11, 6)
+    assert told["method"]["start_count"] == 300 and told["method"]["weigh_at"] == [0.5]
+    hash(load_mission(path))  # flight plans with it as a key
+    more = ["--set", "start_count=200", "--set", "sun_shading=linear", "--set", "lr_means=1e-3"]
+    other = resolved("other", "--method", "obbgs", "--seed", "3", "--steps", "4", *more)
+    assert (other["method"]["name"], other["seed"], other["method"]["steps"]) == ("obbgs", 3, 4)
+    assert other["method"]["start_count"] == 200 and other["method"]["sun_shading"] == "linear"
+    assert other["method"]["lr_means"] == 1e-3 and other["method"]["max_gaussians"] == 300
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("method: obgs", r"mission\.reconstruct\.method: expected one of obbgs, .*mvgs, got 'obgs'"),
+        ("settings: 3", r"mission\.reconstruct\.settings: expected a mapping of keys, got 3"),
+        ("settings: {stepz: 3}", r"mission\.reconstruct\.settings\.stepz: unknown key; .*steps"),
+        ("settings: {steps: many}", r"settings\.steps: expected a whole number, got 'many'"),
+        ("settings: {name: mine}", r"settings\.name: unknown key"),
+    ],
+)
+def test_a_mission_that_asks_for_what_is_not_there_is_refused_by_its_path(tmp_path, line, message):
+    path = tmp_path / "mission.yaml"
+    text = (GOLDEN / "mission.yaml").read_text()
+    path.write_text(text[: text.index("reconstruct:")] + f"reconstruct:\n  {line}\n")
+    with pytest.raises(ConfigError, match=message):
+        mission_changes(load_mission(path).reconstruct)
+
+
+def test_the_methods_of_a_mission_file_are_those_of_the_ground():
+    for name in PRESETS:
+        assert mission_changes(ReconstructSection(method=name, steps=3)) == {"steps": 3}  # type: ignore
+    shown = CliRunner().invoke(cli.app, ["reconstruct", "--help"], env={"COLUMNS": "200"}).stdout
+    assert all(name in shown for name in PRESETS)
+
+
+@pytest.mark.parametrize(
+    ("assignments", "message"),
+    [
+        (["stepz=3"], "stepz: unknown key; expected one of exposure_aware, .*steps"),
+        (["sun_shading"], "expected key=value, got 'sun_shading'"),
+        (["lr_means=fast"], "lr_means: expected a number, got 'fast'"),
+        (["start=nowhere"], "start must be random or hull, got 'nowhere'"),
+        (["sh_degree=9"], "sh_degree must be from 0 to 3, got 9"),
+        (["sh_degree=1", "sh_degree=2"], "--set sh_degree: is given twice"),
+        (["weigh_at=[0.5"], "--set weigh_at: is not valid YAML"),
+        (["steps=5"], "--set steps: is given by --steps too"),
+    ],
+)
+def test_a_setting_that_is_not_there_or_of_the_wrong_kind_is_named(assignments, message):
+    with pytest.raises(ConfigError, match=message):
+        all_changes(ReconstructSection(), "obbgs", None, "auto", 4, assignments)
+
+
+def test_settings_have_the_types_that_the_method_wants():
+    assert set_changes(["lr_means=2e-3", "weigh_at=[0.5, 1]", "pyramid=[[0, 0.5], [0.5, 1]]"]) == {
+        "lr_means": 0.002,
+        "weigh_at": (0.5, 1.0),
+        "pyramid": ((0.0, 0.5), (0.5, 1.0)),
+    }
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_the_training_and_the_same_command_goes_on(session, number):
+    command = [sys.executable, "-m", "ground.cli", "reconstruct", "--session", str(session)]
+    command += ["--steps", "100000", "--threads", "1"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    lines = []
+    while "step 1 of 100000" not in (lines or [""])[-1]:
+        lines.append(process.stderr.readline())
+        assert lines[-1], lines
+    os.kill(process.pid, number)
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 1 and "Traceback" not in said
+    assert "of 100000, saved in" in said and "the same command goes on from there" in said
+    checkpoint = session / "runs" / ".run.part" / "known-exposure.checkpoint"
+    done = torch.load(checkpoint, weights_only=True)["numbers"][2]
+    steps = []
+    with pytest.raises(Interrupted, match=f"step {done + 1} of"):
+        reconstruct(
+            session,
+            changes={"steps": 100_000},
+            on_progress=lambda progress: steps.append(progress.info.step),
+            should_stop=lambda: bool(steps),
+        )
+
+
+def test_a_second_signal_does_not_wait_and_none_does_where_there_is_nothing_to_save():
+    stop = Stop()
+    before = signal.getsignal(signal.SIGTERM)
+    with stop.on_signals():
+        stop.obey()
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
+        stop.ask()
+        assert not stop.asked
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.asked
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            stop.obey()
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_an_interruption_after_the_training_says_that_the_run_is_there(session, monkeypatch):
+    def interrupted(*arguments):
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("ground.evaluate.evaluate", interrupted)
+    done = CliRunner().invoke(cli.app, ["reconstruct", "--session", str(session), "--steps", "3"])
+    assert isinstance(done.exception, Interrupted)
+    assert "the run is finished in" in str(done.exception) and "`ground evaluate`" in str(done.exception)
+    assert (session / "runs" / "run" / "model.ply").exists()
+
+
+def test_a_training_without_a_terminal_says_every_so_often_how_far_it_is(monkeypatch):
+    now_s, text = 0.0, io.StringIO()
+    monkeypatch.setattr("ground.progress.time.monotonic", lambda: now_s)
+    with steps_shown(Console(file=text)) as show:
+        for step in range(1, 101):
+            now_s += 0.5
+            for label in ("known exposure", "blind to exposure"):
+                if (label == "known exposure") == (step <= 50):
+                    show(label, StepInfo(step, 100, 0.1, 30.0, 1.5, 1234, now_s, 50 - now_s))
+    lines = text.getvalue().splitlines()
+    assert [int(line.split()[3 if "known" in line else 4]) for line in lines] == [1, 21, 41, 51, 71, 91, 100]
+    assert lines[0] == ("known exposure: step 1 of 100 PSNR 30.0 dB chi² 1.5 1234 Gaussians 50 s left")
+
+
+def test_the_result_is_a_table_with_units_and_json_as_ever(finished):
+    session = ["--session", str(finished)]
+    shown = CliRunner().invoke(cli.app, ["evaluate", *session], env={"COLUMNS": "120"}).stdout
+    figures = json.loads(CliRunner().invoke(cli.app, ["evaluate", *session, "--json"]).stdout)
+    assert f"{figures['psnr_clean_db']:.2f} dB" in shown and "48 received, 42 trained on, 6 held out" in shown
+    assert f"{figures['train_seconds']:.0f} s; all 8 steps done" in shown and "MB" in shown
+    assert "psnr_clean_db" not in shown and "sun_span_deg" not in shown
+    for key in ("method", "gaussians", "chi2", "frames_received", "ply_bytes", "onnx_parity_db", "start"):
+        assert key in figures
