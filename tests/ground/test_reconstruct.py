@@ -16,9 +16,9 @@ import yaml
 from typer.testing import CliRunner
 
 from ground import cli
-from ground.evaluate import bounding_box, evaluate
+from ground.evaluate import evaluate
 from ground.reconstruct import changes_for, reconstruct, split
-from ground.report import write_report
+from ground.report import bounding_box, write_report
 from ground.session import MissingFrames, SessionError, open_session
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.methods import PRESETS
