@@ -117,8 +117,7 @@ def reconstruct(
             "dark_frames": result.dark_frames,
             "chi2": result.history[-1].chi2,
             "frames_received": len(session.frames),
-            # frames are numbered without gaps in flight, so a gap here is a frame that never came
-            "frames_captured": session.frames[-1].id - session.frames[0].id + 1,
+            "frames_captured": session.frames_captured,  # null: flight did not say
             "frames_trained": len(training),
             "frames_held_out": len(held_out),
             "exposures_s": exposures_s,

@@ -293,16 +293,30 @@ def _histogram(run: Run) -> str:
 
 
 def _link(run: Run) -> str:
-    captured, received = run.metrics["frames_captured"], run.metrics["frames_received"]
+    captured, received = run.metrics.get("frames_captured"), run.metrics["frames_received"]
+    flight = run.session.flight
+    if captured is None:  # frames are numbered from 0 without gaps, so a gap is a frame that never came
+        missing = f"at least {run.session.frames[-1].id + 1 - received:,}"
+    else:
+        missing = f"{captured - received:,}"
     rows = [
-        ("frames captured (by their numbers)", captured),
-        ("frames received", received),
-        ("frames missing", captured - received),
-        ("bytes received", run.session.bytes_received),
-        *((_spelled(key), value) for key, value in run.session.losses.items()),
+        ("frames captured", frames_captured(run.metrics)),
+        ("frames received", f"{received:,}"),
+        ("frames missing", missing),
     ]
-    note = "What the ground counted. Segments that were lost or damaged are asked for again, and counted as resent."
-    return _section("Losses on the link", note, _two_tables([(label, f"{count:,}") for label, count in rows]))
+    if flight is not None:
+        rows += [
+            ("… deleted on board undelivered, to make room", f"{flight.frames_dropped:,}"),
+            ("… refused on board: the store had no room", f"{flight.frames_refused:,}"),
+            ("exposures that failed on board", f"{flight.frames_failed:,}"),
+        ]
+    rows.append(("bytes received", f"{run.session.bytes_received:,}"))
+    rows += [(_spelled(key), f"{value:,}") for key, value in run.session.losses.items()]
+    note = (
+        "Captured: as flight's telemetry told when it was last heard, unknown where none was. The rest is what the "
+        "ground counted: segments that were lost or damaged are asked for again, and counted as resent."
+    )
+    return _section("Losses on the link", note, _two_tables(rows))
 
 
 def _simulation(truth: Truth | None) -> str:
