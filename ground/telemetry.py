@@ -102,9 +102,7 @@ class TelemetryLog:
         utc_ns: Callable[[], int] = time.time_ns,
         flight: FlightCounts | None = None,
     ):
-        self.flight = (
-            flight  # what it has told of its frames, earlier runs of the ground included; None: nothing
-        )
+        self.flight = flight  # what it told of its frames, to earlier runs of the ground too; None: nothing
         self.refused = 0  # whole packets that the dictionary does not know
         self.write_failures = 0
         self.housekeeping: dict[str, Any] = {}  # the newest, {} before the first
