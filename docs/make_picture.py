@@ -6,9 +6,9 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 
-from ground.evaluate import Truth, bounding_box, clean_image, open_run
+from ground.evaluate import Truth, clean_image, open_run
 from ground.reconstruct import predicted_image
-from ground.report import ERROR_FULL_SCALE, heat, tone
+from ground.report import ERROR_FULL_SCALE, bounding_box, heat, tone
 
 SIZE_PX = 200
 
@@ -16,12 +16,12 @@ SIZE_PX = 200
 def main(session: Path, name: str) -> None:
     run = open_run(session, name)
     truth = Truth(run.session)
-    rows, held_out = [], [truth.posed(r) for r in run.held_out]
-    brackets = sorted({r.bracket for r in held_out})
-    for exposure_s in sorted({r.exposure_time_s for r in held_out}):
+    rows, scored = [], [truth.posed(r) for r in run.scored]
+    brackets = sorted({r.bracket for r in scored})
+    for exposure_s in sorted({r.exposure_time_s for r in scored}):
         cells = []
         for bracket in (brackets[1], brackets[2]):
-            record = next(r for r in held_out if (r.bracket, r.exposure_time_s) == (bracket, exposure_s))
+            record = next(r for r in scored if (r.bracket, r.exposure_time_s) == (bracket, exposure_s))
             clean = clean_image(run, truth, record)
             render = predicted_image(run.gaussians, run.session, record, run.sensor, exposure_s)
             box = bounding_box(truth.radiance(record)[1] > 0, 4)

@@ -1,11 +1,36 @@
-"""The model card: what a model is, how good, and why it is no larger."""
+"""The model card: what a model is, how good, and why it is no larger; and words that the report shares with it."""
 
+import math
+
+NOISE_LIKE_CHI2 = 1.5  # up to here the model's own error is under 0.7 sigma of the noise
 SIZES = {"model.ply": "ply_bytes", "model.spz": "spz_bytes", "model.onnx": "onnx_bytes"}
 USES = {
     "model.ply": "every number, read back exactly",
     "model.spz": "quantised, for viewers and storage",
     "model.onnx": "the renderer for use on board",
 }
+
+
+def scored_frames(metrics: dict) -> str:
+    """Return which frames a run's figures of image quality are of, in words."""
+    if metrics.get("scored_frames") == "training":
+        return "training frames (nothing was held out)"
+    return "held-out frames"
+
+
+def frames_captured(metrics: dict) -> str:
+    """Return how many frames flight said it took, as text: "unknown" where it did not say."""
+    captured = metrics.get("frames_captured")
+    return "unknown" if captured is None else f"{captured:,}"
+
+
+def chi2_explained(chi2: float) -> str:
+    """Return what a residual chi² of this size means, in one sentence."""
+    meaning = "the mean squared residual over the variance of the noise, where the model is; 1 is noise alone"
+    if chi2 <= NOISE_LIKE_CHI2:
+        return meaning + "."
+    at, times = (f"{x:.1f}" if x < 10 else f"{x:,.0f}" for x in (chi2, math.sqrt(chi2 - 1)))
+    return f"{meaning}, and at {at} the model's own error is {times} times as large as the noise."
 
 
 def appearance(metrics: dict) -> list[str]:
@@ -30,7 +55,6 @@ def appearance(metrics: dict) -> list[str]:
 
 def model_card(session_created_utc: str, metrics: dict) -> str:
     """Return the card as Markdown: figures that were not measured are left out."""
-    measured = metrics["chi2"] is not None  # not where no step was done
     exposures_ms = [1e3 * exposure_s for exposure_s in metrics["exposures_s"]]
     lines = [
         "# Model card",
@@ -43,9 +67,11 @@ def model_card(session_created_utc: str, metrics: dict) -> str:
         *([f"- Budget: {metrics['budget']}."] if "budget" in metrics else []),  # older runs did not note it
         f"- Exposure times it was trained on: {exposures_ms[0]:g} to {exposures_ms[-1]:g} ms. Between them its images "
         "are as good as below; outside them it extrapolates linearly.",
-        *([f"- Residual chi² on the target: {metrics['chi2']:.2f} (1 is pure noise)."] if measured else []),
-        *appearance(metrics),
+        f"- Frames received / captured: {metrics['frames_received']:,} / {frames_captured(metrics)}.",
     ]
+    if isinstance(chi2 := metrics.get("chi2"), int | float) and math.isfinite(chi2):
+        lines.append(f"- Residual chi² {chi2:.2f}: {chi2_explained(chi2)}")
+    lines += appearance(metrics)
     for key, text in (
         ("growth", "Growth ran {}."),
         ("poses", "Poses {}."),
@@ -53,9 +79,11 @@ def model_card(session_created_utc: str, metrics: dict) -> str:
     ):
         if key in metrics:  # older runs did not note it
             lines.append("- " + text.format(metrics[key]))
+    scored = scored_frames(metrics)
     for key, text in (
-        ("psnr_noisy_db", "Held-out PSNR against the noisy frames: {:.2f} dB."),
-        ("psnr_clean_db", "Held-out PSNR against the noiseless exposures: {:.2f} dB."),
+        ("psnr_noisy_db", f"PSNR of {scored} against their noisy readings: {{:.2f}} dB."),
+        ("psnr_clean_db", f"PSNR of {scored} against their noiseless exposures: {{:.2f}} dB."),
+        ("psnr_clean_foreground_db", "The same on the pixels that the target covers: {:.2f} dB."),
         ("chamfer", "Chamfer distance of the centres (largest dimension = 2): {:.4f}."),
         ("completeness_surface", "Of the true surface, {:.1f} % lies within 0.01 of surface.ply."),
     ):
@@ -69,6 +97,9 @@ def model_card(session_created_utc: str, metrics: dict) -> str:
         f"- {name} is missing: {reason}." for name, reason in metrics.get("missing_outputs", {}).items()
     ]
     lines += ["", "| file | bytes | for |", "| --- | --- | --- |"]
-    there = {name: metrics[key] for name, key in SIZES.items() if metrics[key] is not None}
-    lines += [f"| {name} | {size_bytes:,} | {USES[name]} |" for name, size_bytes in there.items()]
+    lines += [
+        f"| {name} | {metrics[key]:,} | {USES[name]} |"
+        for name, key in SIZES.items()
+        if metrics.get(key) is not None
+    ]
     return "\n".join([*lines, ""])

@@ -71,7 +71,7 @@ class ConsoleView:
         speed = f"{rates[0] / 1e3:.1f} kB/s down, {rates[1] / 1e3:.1f} up, " if rates else ""
         s = status.summary
         return (
-            f"{link_state(status)[0]}, {s.frames_in_session} frames, {speed}"
+            f"{link_state(status)[0]}, frames {s.frames_in_session} received / {captured(status)} captured, {speed}"
             f"{s.crc_errors} CRC errors, {s.packets_missing} missing, {s.segments_resent} resent, "
             f"outbox {status.housekeeping.get('outbox_frames', '?')}"
         )
@@ -86,6 +86,12 @@ def link_state(status: Status) -> tuple[str, str]:
     return "up", "green"
 
 
+def captured(status: Status) -> str:
+    """Return how many frames flight said it took, as text: "unknown" before its telemetry was heard."""
+    count = status.summary.frames_captured
+    return "unknown" if count is None else f"{count:,}"
+
+
 def _link(status: Status, down: float, up: float) -> Table:
     state, colour = link_state(status)
     s = status.summary
@@ -93,7 +99,12 @@ def _link(status: Status, down: float, up: float) -> Table:
         ("state", Text(state, colour)),
         ("rate down / up", Text(f"{down / 1e3:.1f} / {up / 1e3:.1f} kB/s")),
         ("received", Text(f"{s.bytes_received:,} B, {s.packets_received:,} packets")),
-        ("frames", Text(f"{s.frames_in_session}, {s.frames_received} in this run")),
+        (
+            "frames",
+            Text(
+                f"{s.frames_in_session} received / {captured(status)} captured, {s.frames_received} in this run"
+            ),
+        ),
         ("headers / thumbnails", Text(f"{s.headers_received} / {s.thumbnails_received}")),
     ]
     for name in COUNTS.split():

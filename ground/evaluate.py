@@ -16,12 +16,25 @@ from ground.reconstruct import camera_of, exposed, predicted_image, run_folder, 
 from ground.session import FrameRecord, Session, SessionError, open_session, write_whole
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.lpips import WeightsMissing, lpips
-from obbgs_core.metrics import cloud_distances, psnr_db, ssim
+from obbgs_core.metrics import cloud_distances, foreground_psnr_db, psnr_db, ssim
 from obbgs_core.ply import load_ply
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 
-FOREGROUND_MARGIN_PX = 4
+# what every run's metrics.json says, whatever its age; the rest may be missing
+NEEDED_METRICS: dict[str, type] = {
+    "method": str,
+    "gaussians": int,
+    "sh_degree": int,
+    "train_seconds": float,
+    "stop_reason": str,
+    "start": str,
+    "frames_received": int,
+    "frames_trained": int,
+    "frames_held_out": int,
+    "exposures_s": list,
+}
+KINDS = {str: "a text", int: "a whole number", float: "a number", list: "a list"}
 log = logging.getLogger(__name__)
 
 
@@ -31,7 +44,7 @@ class Run:
 
     folder: Path
     session: Session
-    held_out: list[FrameRecord]
+    scored: list[FrameRecord]  # the held-out frames; those trained on where nothing was held out
     sensor: Sensor
     gaussians: Gaussians
     blind: Gaussians | None
@@ -42,7 +55,7 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
     """Return a finished run; `out` is the folder of runs, if not the session's own.
 
     Raises:
-        SessionError: no such session or run.
+        SessionError: no such session or run, or its metrics.json is damaged.
     """
     session = open_session(session_dir)
     folder = run_folder(session, name, out)
@@ -51,7 +64,8 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
             f"{folder} is not a finished run; make one with `ground reconstruct --name {name}`"
         )
     training, held_out = split(session)
-    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics = read_metrics(folder / "metrics.json")
+    metrics["scored_frames"] = "held_out" if held_out else "training"
     if metrics.get("session_created_utc", session.created_utc) != session.created_utc:
         raise SessionError(
             f"{folder} is a run of the session of {metrics['session_created_utc']}, and {session.path} is that of "
@@ -67,6 +81,27 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
         load_ply(folder / "blind.ply") if with_blind else None,
         metrics,
     )
+
+
+def read_metrics(path: Path) -> dict:
+    """Return a run's metrics.json.
+
+    Raises:
+        SessionError: it is not there, not JSON, or lacks what every run has; the message names the file.
+    """
+    try:
+        metrics = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:  # a UnicodeDecodeError is a ValueError too
+        raise SessionError(f"{path} cannot be read: {error}; make the run again") from error
+    if not isinstance(metrics, dict):
+        raise SessionError(f"{path} should hold an object; make the run again")
+    for key, kind in NEEDED_METRICS.items():
+        value = metrics.get(key)
+        if type(value) is not kind and not (kind is float and type(value) is int):
+            raise SessionError(
+                f"{path} is damaged: expected {key} as {KINDS[kind]}, got {value!r}; make the run again"
+            )
+    return metrics
 
 
 class Truth:
@@ -119,16 +154,17 @@ def read_points(path: Path) -> np.ndarray:
 def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     """Score a run, add the figures to its metrics.json and return them all.
 
-    Keys: psnr_noisy_db against the frames themselves; with truth also, from the true poses, so that an error of a
-    held-out frame's tag does not count as the model's: psnr_clean_db (expected image against the noiseless exposure,
-    full scale 1, mean over held-out frames), psnr_clean_<exposure>_db, psnr_clean_foreground_db
-    (the target's bounding box), ssim_clean, lpips_clean (AlexNet, where its weights were fetched), psnr_radiance_db
-    (scene-linear, its brightest pixel 1), the clean PSNR of the blind training (psnr_clean_blind_db), and chamfer,
-    hausdorff, accuracy, completeness of the Gaussians' centres and *_surface of the 100,000 points of surface.ply,
-    where the target's largest dimension is 2.
+    Keys: scored_frames, "held_out", or "training" where nothing was held out and the figures are of the frames that
+    the model was trained on; psnr_noisy_db against the frames themselves; with truth also, from the true poses, so
+    that an error of a scored frame's tag does not count as the model's: psnr_clean_db (expected image against the
+    noiseless exposure, full scale 1, mean over the scored frames), psnr_clean_<exposure>_db, psnr_clean_foreground_db
+    (of the pixels that the target covers; left out where it covers none), ssim_clean, lpips_clean (AlexNet, where its
+    weights were fetched), psnr_radiance_db (scene-linear, its brightest pixel 1), the clean PSNR of the blind training
+    (psnr_clean_blind_db), and chamfer, hausdorff, accuracy, completeness of the Gaussians' centres and *_surface of
+    the 100,000 points of surface.ply, where the target's largest dimension is 2.
 
     Raises:
-        SessionError: no such session or run, damaged truth, or a run that cannot be written to.
+        SessionError: no such session or run, damaged metrics or truth, or a run that cannot be written to.
     """
     run = open_run(session_dir, name, out)
     figures: dict[str, float] = {}
@@ -136,7 +172,7 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
         psnr_db(
             predicted_image(run.gaussians, run.session, r, run.sensor, _exposure_s(run, r)), _noisy(run, r)
         )
-        for r in run.held_out
+        for r in run.scored
     )
     if Truth.exists(run.session):
         truth = Truth(run.session)
@@ -160,18 +196,16 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
 
 def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:
     by_exposure: dict[float, list[float]] = {}
-    foreground, similarity, blind, linear = [], [], [], []
-    pairs: list[tuple[torch.Tensor, torch.Tensor]] = []
-    for record in map(truth.posed, run.held_out):
+    similarity, blind, linear = [], [], []
+    views: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []  # image, truth, coverage
+    for record in map(truth.posed, run.scored):
         true, coverage = truth.radiance(record)
         clean = exposed(true, run.sensor, record.exposure_time_s)
         with torch.no_grad():
             radiance = render(run.gaussians, camera_of(run.session, record)).radiance[0]
         predicted = exposed(radiance, run.sensor, _exposure_s(run, record))
-        pairs.append((predicted, clean))
+        views.append((predicted, clean, coverage))
         by_exposure.setdefault(record.exposure_time_s, []).append(psnr_db(predicted, clean))
-        box = bounding_box(coverage > 0, FOREGROUND_MARGIN_PX)
-        foreground.append(psnr_db(predicted[box], clean[box]))
         similarity.append(ssim(predicted, clean))
         brightest = true.max().clamp(min=1e-6)
         linear.append(psnr_db(radiance / brightest, true / brightest))
@@ -182,10 +216,11 @@ def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:
     figures = {"psnr_clean_db": _mean(value for values in by_exposure.values() for value in values)}
     for exposure_s, values in sorted(by_exposure.items()):
         figures[f"psnr_clean_{exposure_s * 1e3:g}ms_db"] = _mean(values)
-    figures["psnr_clean_foreground_db"] = _mean(foreground)
+    if not math.isnan(foreground_db := foreground_psnr_db(views)):
+        figures["psnr_clean_foreground_db"] = foreground_db
     figures["ssim_clean"] = _mean(similarity)
     try:
-        figures["lpips_clean"] = _mean(lpips(*pair, network="alex") for pair in pairs)
+        figures["lpips_clean"] = _mean(lpips(image, clean, network="alex") for image, clean, _ in views)
     except WeightsMissing as error:
         log.info("LPIPS is left out: %s", error)
     figures["psnr_radiance_db"] = _mean(linear)
@@ -197,15 +232,6 @@ def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:
 def clean_image(run: Run, truth: Truth, record: FrameRecord) -> torch.Tensor:
     """Return the noiseless exposure of a frame [H, W, C] over full scale, clipped as the sensor clips."""
     return exposed(truth.radiance(record)[0], run.sensor, record.exposure_time_s)
-
-
-def bounding_box(mask: torch.Tensor, margin_px: int) -> tuple[slice, slice]:
-    """Return the rows and columns around a mask [H, W] with a margin; the whole image when it is empty."""
-    rows, columns = torch.nonzero(mask.any(dim=1))[:, 0], torch.nonzero(mask.any(dim=0))[:, 0]
-    if len(rows) == 0:
-        return slice(None), slice(None)
-    top, left = max(0, int(rows[0]) - margin_px), max(0, int(columns[0]) - margin_px)
-    return slice(top, int(rows[-1]) + margin_px + 1), slice(left, int(columns[-1]) + margin_px + 1)
 
 
 def _exposure_s(run: Run, record: FrameRecord) -> float:

@@ -40,10 +40,13 @@ SETTLE_INTERVALS = 12  # after the last wanted frame, for a flight side that has
 
 @dataclass(frozen=True)
 class ListenSummary:
-    """What a pass brought. Counts are of this run, `frames_in_session` of all runs."""
+    """What a pass brought. Counts are of this run; of all runs `frames_in_session` and `frames_captured`."""
 
     frames_received: int = 0
     frames_in_session: int = 0
+    frames_captured: int | None = (
+        None  # as flight's telemetry told so far, in all runs; None: it told nothing yet
+    )
     thumbnails_received: int = 0
     headers_received: int = 0  # of frames, as telemetry
     bytes_received: int = 0  # from the port
@@ -166,6 +169,7 @@ class _Ingest:
             writer.folder,
             on_event,
             lambda report: self._uplinker.take_report(report, self.last_packet_s),
+            flight=writer.flight,
         )
         self._thumbnails = self._commands_ended = 0
         self._payload_bytes = self._rejected = self._duplicates = self._store_failures = 0
@@ -244,7 +248,7 @@ class _Ingest:
     def save(self) -> None:
         summary = self.summary()
         try:
-            self._writer.save(summary.losses, summary.bytes_received)
+            self._writer.save(summary.losses, summary.bytes_received, self._telemetry.flight)
         except OSError as error:
             log.error("session.json cannot be written: %s", error)
 
@@ -264,10 +268,11 @@ class _Ingest:
         )
 
     def summary(self) -> ListenSummary:
-        deframer = self._stream.deframer
+        deframer, flight = self._stream.deframer, self._telemetry.flight
         return ListenSummary(
             frames_received=self.frames_received,
             frames_in_session=self._writer.frame_count,
+            frames_captured=flight.captured(self._writer.last_frame_id) if flight else None,
             thumbnails_received=self._thumbnails,
             headers_received=self._telemetry.headers_received,
             bytes_received=self._link.bytes_read,

@@ -449,8 +449,7 @@ def _metrics(
         "dark_frames": result.dark_frames,
         "chi2": None if math.isnan(chi2) else chi2,
         "frames_received": len(session.frames),
-        # frames are numbered without gaps in flight, so a gap here is a frame that never came
-        "frames_captured": session.frames[-1].id - session.frames[0].id + 1,
+        "frames_captured": session.frames_captured,  # null: flight did not say
         "frames_trained": len(training),
         "frames_held_out": len(held_out),
         "exposures_s": _exposures_s(training),

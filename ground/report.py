@@ -3,6 +3,7 @@
 import base64
 import html
 import json
+import math
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -14,7 +15,8 @@ import torch
 import yaml
 from plotly.offline import get_plotlyjs
 
-from ground.evaluate import Run, Truth, bounding_box, clean_image, open_run
+from ground.card import chi2_explained, frames_captured, scored_frames
+from ground.evaluate import Run, Truth, clean_image, open_run
 from ground.plots import INK, histogram_figure, model_figure, training_figure
 from ground.reconstruct import predicted_image, written_to
 from ground.session import FrameRecord, SessionError, write_whole
@@ -22,7 +24,7 @@ from obbgs_core.metrics import COMPLETENESS_RADIUS, psnr_db
 from obbgs_core.sensor import Sensor
 
 COLUMNS = 6  # brackets shown for each exposure
-HELD_OUT_VIEWS = 3
+VIEWS_SHOWN = 3
 MARGIN_PX = 10
 ABOVE_BLACK = 0.01  # of full scale: brighter pixels are the target, as far as cropping goes
 ERROR_FULL_SCALE = 0.1  # of full scale: shown as white
@@ -68,7 +70,7 @@ def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
     sections = [
         _headline(run, truth),
         _frames(run),
-        _held_out(run, truth),
+        _scored_views(run, truth),
         _model(run),
         _training(run),
         _histogram(run),
@@ -98,15 +100,19 @@ def _section(title: str, note: str, body: str) -> str:
 
 def _headline(run: Run, truth: Truth | None) -> str:
     m = run.metrics
+    scored = scored_frames(m)
     cards: list[tuple[str, str]] = []
     if "psnr_clean_db" in m:
-        cards.append((f"{m['psnr_clean_db']:.2f} dB", "clean held-out PSNR, exposure known"))
+        cards.append((f"{m['psnr_clean_db']:.2f} dB", f"clean PSNR of {scored}, exposure known"))
     elif "psnr_noisy_db" in m:
-        cards.append((f"{m['psnr_noisy_db']:.2f} dB", "held-out PSNR against the noisy frames"))
+        cards.append((f"{m['psnr_noisy_db']:.2f} dB", f"PSNR of {scored} against their noisy readings"))
     if "psnr_clean_blind_db" in m:
         gain_db = m["psnr_clean_db"] - m["psnr_clean_blind_db"]
         label = f"the same training blind to exposure (knowing it is worth {gain_db:+.2f} dB)"
         cards.append((f"{m['psnr_clean_blind_db']:.2f} dB", label))
+    if "psnr_clean_foreground_db" in m:
+        label = "clean PSNR of the foreground: the pixels that the target covers, without the sky"
+        cards.append((f"{m['psnr_clean_foreground_db']:.2f} dB", label))
     if "chamfer" in m:
         cards.append((f"{m['chamfer']:.4f}", "Chamfer distance of the centres (largest dimension = 2)"))
     if "completeness_surface" in m:
@@ -114,32 +120,33 @@ def _headline(run: Run, truth: Truth | None) -> str:
         cards.append((f"{m['completeness_surface']:.1f} %", label))
     cards.append((f"{m['gaussians']:,}", "Gaussians"))
     cards.append((f"{m['train_seconds']:.0f} s", f"training; {html.escape(m['stop_reason'])}"))
-    cards.append((f"{m['frames_received']} / {m['frames_captured']}", "frames received / captured"))
+    cards.append((f"{m['frames_received']:,} / {frames_captured(m)}", "frames received / captured"))
     if m.get("onnx_bytes") is not None and m.get("onnx_parity_db") is not None:
-        size = f"{m['onnx_bytes'] / 1e6:.2f} MB"
-        cards.append(
-            (f"{m['onnx_parity_db']:.0f} dB", f"ONNX renderer against ours, worst of its views; {size}")
-        )
+        label = f"ONNX renderer against ours, worst of its views; {m['onnx_bytes'] / 1e6:.2f} MB"
+        cards.append((f"{m['onnx_parity_db']:.0f} dB", label))
+    if (chi2 := _finite(m.get("chi2"))) is not None:
+        cards.append((f"{chi2:,.1f}", f"residual chi²: {chi2_explained(chi2)}"))
     body = "".join(f'<div class="card"><b>{value}</b><span>{label}</span></div>' for value, label in cards)
+    seen = "of the very views it was trained on" if m["scored_frames"] == "training" else "never trained on"
     note = (
-        "Clean: against noiseless exposures of views that were never trained on, full scale = 1. Distances: in units "
-        "where the target's largest dimension is 2."
+        f"Clean: against noiseless exposures of views {seen}, full scale = 1. Distances: in units where the target's "
+        "largest dimension is 2."
         if truth
         else "No truth beside this session: figures are against the received frames themselves."
     )
     lines = [*m.get("notes", []), *(f"{k} is missing: {v}" for k, v in m.get("missing_outputs", {}).items())]
     notes = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
     callout = f'<ul class="notes">{notes}</ul>' if notes else ""
-    return _section("Result", note, f'{callout}<div class="cards">{body}</div>{_details(m)}')
+    return _section("Result", note, f'{callout}<div class="cards">{body}</div>{_details(m, scored)}')
 
 
-def _details(m: dict) -> str:
+def _details(m: dict, scored: str) -> str:
     names = {
         "psnr_clean_db": "clean PSNR, dB",
         **{key: f"… at {_exposure_ms(key)} ms, dB" for key in m if _exposure_ms(key)},
-        "psnr_clean_foreground_db": "… inside the target's bounding box, dB",
+        "psnr_clean_foreground_db": "… of the foreground, dB",
         "psnr_clean_blind_db": "… of the training blind to exposure, dB",
-        "psnr_noisy_db": "PSNR against the noisy held-out frames, dB",
+        "psnr_noisy_db": f"PSNR of {scored} against their noisy readings, dB",
         "psnr_radiance_db": "PSNR of scene-linear radiance (brightest = 1), dB",
         "ssim_clean": "SSIM, clean",
         "chamfer": "Chamfer distance of the centres",
@@ -148,10 +155,16 @@ def _details(m: dict) -> str:
         "accuracy": "mean distance of the centres to the true surface",
         "completeness": f"true points within {COMPLETENESS_RADIUS} of a centre, %",
         "completeness_surface": f"true points within {COMPLETENESS_RADIUS} of a surface point, %",
-        "chi2": "residual chi² where the model is (1 is noise)",
     }
-    rows = [(label, f"{m[key]:.4g}") for key, label in names.items() if m.get(key) is not None]
+    rows = [
+        (label, f"{value:.4g}") for key, label in names.items() if (value := _finite(m.get(key))) is not None
+    ]
     return f'<div style="margin-top:16px">{_two_tables(rows)}</div>'
+
+
+def _finite(value: float | None) -> float | None:
+    """Return a figure; None for one that was not measured or is not finite."""
+    return value if value is not None and math.isfinite(value) else None
 
 
 def _exposure_ms(key: str) -> str:
@@ -198,13 +211,13 @@ def _frames(run: Run) -> str:
     )
 
 
-def _held_out(run: Run, truth: Truth | None) -> str:
+def _scored_views(run: Run, truth: Truth | None) -> str:
     m = run.metrics
-    records = [truth.posed(r) for r in run.held_out] if truth else run.held_out
+    records = [truth.posed(r) for r in run.scored] if truth else run.scored
     by_key = {(r.bracket, r.exposure_time_s): r for r in records}
     reference = "truth" if truth else "frame"
     names = [reference, "render", "error"] + (["blind render", "blind error"] if run.blind else [])
-    views = _spread(sorted({r.bracket for r in run.held_out}), HELD_OUT_VIEWS)
+    views = _spread(sorted({r.bracket for r in run.scored}), VIEWS_SHOWN)
     body = []
     for bracket in views:
         of_view = [by_key[key] for key in sorted(by_key) if key[0] == bracket]
@@ -229,15 +242,17 @@ def _held_out(run: Run, truth: Truth | None) -> str:
                 cells.append(_picture(heat(error[box].numpy()), "error", "&nbsp;"))
         body.append(f"<h3>Bracket {bracket}, {_range_m(of_view[0]):.0f} m</h3>")
         body.append(_grid(f"60px repeat({len(names)}, 1fr)", cells))
-    seen = "never trained on" if m["frames_held_out"] else "trained on: the session has one bracket only"
+    training = m["scored_frames"] == "training"
+    seen = "trained on: the session has too few brackets to hold one out" if training else "never trained on"
     note = (
-        f"{len(views)} of {len({r.bracket for r in run.held_out})} brackets, {seen}; cropped to the target. Brightness "
+        f"{len(views)} of {len({r.bracket for r in run.scored})} brackets, {seen}; cropped to the target. Brightness "
         f"as above. Error: absolute difference, 0<span class='ramp'></span>{ERROR_FULL_SCALE:.0%} of full scale or "
         f"more. PSNR is of the whole frame against the {'noiseless exposure' if truth else 'noisy frame'}."
     )
     if run.blind:
         note += " Blind: the same training with every exposure taken for their mean."
-    return _section(f"Held-out views: {reference}, render, error", note, "".join(body))
+    title = "Training views (nothing was held out)" if training else "Held-out views"
+    return _section(f"{title}: {reference}, render, error", note, "".join(body))
 
 
 def _model(run: Run) -> str:
@@ -283,16 +298,30 @@ def _histogram(run: Run) -> str:
 
 
 def _link(run: Run) -> str:
-    captured, received = run.metrics["frames_captured"], run.metrics["frames_received"]
+    captured, received = run.metrics.get("frames_captured"), run.metrics["frames_received"]
+    flight = run.session.flight
+    if captured is None:  # frames are numbered from 0 without gaps, so a gap is a frame that never came
+        missing = f"at least {run.session.frames[-1].id + 1 - received:,}"
+    else:
+        missing = f"{captured - received:,}"
     rows = [
-        ("frames captured (by their numbers)", captured),
-        ("frames received", received),
-        ("frames missing", captured - received),
-        ("bytes received", run.session.bytes_received),
-        *((_spelled(key), value) for key, value in run.session.losses.items()),
+        ("frames captured", frames_captured(run.metrics)),
+        ("frames received", f"{received:,}"),
+        ("frames missing", missing),
     ]
-    note = "What the ground counted. Segments that were lost or damaged are asked for again, and counted as resent."
-    return _section("Losses on the link", note, _two_tables([(label, f"{count:,}") for label, count in rows]))
+    if flight is not None:
+        rows += [
+            ("… deleted on board undelivered, to make room", f"{flight.frames_dropped:,}"),
+            ("… refused on board: the store had no room", f"{flight.frames_refused:,}"),
+            ("exposures that failed on board", f"{flight.frames_failed:,}"),
+        ]
+    rows.append(("bytes received", f"{run.session.bytes_received:,}"))
+    rows += [(_spelled(key), f"{value:,}") for key, value in run.session.losses.items()]
+    note = (
+        "Captured: as flight's telemetry told when it was last heard, unknown where none was. The rest is what the "
+        "ground counted: segments that were lost or damaged are asked for again, and counted as resent."
+    )
+    return _section("Losses on the link", note, _two_tables(rows))
 
 
 def _simulation(truth: Truth | None) -> str:
@@ -376,6 +405,15 @@ def heat(error: np.ndarray) -> np.ndarray:
     """Return black-red-yellow-white for 0..1, as bytes [H, W, 3]."""
     shown = np.clip(3 * error - np.array([0.0, 1.0, 2.0]), 0, 1)
     return (255 * shown).round().astype(np.uint8)
+
+
+def bounding_box(mask: torch.Tensor, margin_px: int) -> tuple[slice, slice]:
+    """Return the rows and columns around a mask [H, W] with a margin; the whole image when it is empty."""
+    rows, columns = torch.nonzero(mask.any(dim=1))[:, 0], torch.nonzero(mask.any(dim=0))[:, 0]
+    if len(rows) == 0:
+        return slice(None), slice(None)
+    top, left = max(0, int(rows[0]) - margin_px), max(0, int(columns[0]) - margin_px)
+    return slice(top, int(rows[-1]) + margin_px + 1), slice(left, int(columns[-1]) + margin_px + 1)
 
 
 def _png(image: np.ndarray) -> str:

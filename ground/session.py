@@ -21,6 +21,7 @@ import numpy as np
 from flightsw.icd.config import ConfigError, build, keys_below, parse_json
 from flightsw.icd.frame import Frame
 from flightsw.icd.mission import CameraSection, Mission
+from ground.telemetry import FlightCounts
 
 SCHEMA_VERSION = 1
 FRAME_FILE = re.compile(
@@ -88,6 +89,18 @@ class Session:
     tles: Mapping[str, tuple[str, ...]]
     bytes_received: int
     created_utc: str
+    flight: FlightCounts | None  # what flight's telemetry told of its frames; None: none was heard
+    frames_imported: int | None  # pictures that were imported; None: the frames came over a link
+
+    @property
+    def frames_captured(self) -> int | None:
+        """How many frames were taken, as flight's telemetry told when it was last heard; None where it told nothing.
+
+        Of an import these are the pictures that were imported.
+        """
+        if self.flight is None:
+            return self.frames_imported
+        return self.flight.captured(self.frames[-1].id)
 
     def dn(self, record: FrameRecord) -> np.ndarray:
         """Return a frame's digital numbers, uint16 [H, W] or [H, W, 3].
@@ -131,6 +144,8 @@ def open_session(folder: str | Path) -> Session:
             tles,
             int(header["bytes_received"]),
             str(header["created_utc"]),
+            _flight_counts(header),
+            int(header["frames_received"]) if "imported_from" in header else None,
         )
     except (ConfigError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise SessionCorrupt(f"{folder / 'session.json'}: {error}") from error
@@ -160,6 +175,7 @@ class SessionWriter:
         self._frames_file = self.folder / "frames.jsonl"
         self._losses_before: dict[str, int] = {}
         self._bytes_before = 0
+        self.flight: FlightCounts | None = None  # as session.json has it
         self._created_utc = datetime.now(UTC).isoformat(timespec="seconds")
         try:
             (self.folder / "frames").mkdir(parents=True, exist_ok=True)
@@ -174,6 +190,11 @@ class SessionWriter:
     @property
     def frame_count(self) -> int:
         return len(self._sha256_of)
+
+    @property
+    def last_frame_id(self) -> int:
+        """The highest number of a frame; -1 for none."""
+        return max(self._sha256_of, default=-1)
 
     def add(self, frame: Frame, container: bytes) -> bool:
         """Write a frame's picture and line; False if the session holds exactly this frame already.
@@ -210,8 +231,15 @@ class SessionWriter:
         self._sha256_of[frame.frame_id] = sha256
         return True
 
-    def save(self, losses: Mapping[str, int], bytes_received: int) -> None:
-        """Write session.json; `losses` and `bytes_received` are of this run and added to those before."""
+    def save(
+        self, losses: Mapping[str, int], bytes_received: int, flight: FlightCounts | None = None
+    ) -> None:
+        """Write session.json.
+
+        `losses` and `bytes_received` are of this run and added to those before; `flight` replaces what was told before,
+        None leaves it.
+        """
+        self.flight = flight or self.flight
         total = dict(self._losses_before)
         for name, count in losses.items():
             total[name] = total.get(name, 0) + count
@@ -224,6 +252,7 @@ class SessionWriter:
                 "chaser": list(self._mission.orbit.chaser_tle),
             },
             "losses": total,
+            "flight": dataclasses.asdict(self.flight) if self.flight else None,
             "frames_received": self.frame_count,
             "bytes_received": self._bytes_before + bytes_received,
             "created_utc": self._created_utc,
@@ -240,6 +269,7 @@ class SessionWriter:
             self._losses_before = {str(name): int(count) for name, count in header["losses"].items()}
             self._bytes_before = int(header["bytes_received"])
             self._created_utc = str(header["created_utc"])
+            self.flight = _flight_counts(header)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise SessionCorrupt(f"{self.folder / 'session.json'}: {error}") from error
 
@@ -308,6 +338,12 @@ def _read_header(folder: Path) -> dict[str, Any]:
             f"this software reads {SCHEMA_VERSION}"
         )
     return header
+
+
+def _flight_counts(header: dict[str, Any]) -> FlightCounts | None:
+    """Return what flight told, from session.json; None for sessions that were written before it was kept."""
+    told = header.get("flight")
+    return None if told is None else FlightCounts(**told)
 
 
 def _read_records(folder: Path) -> list[FrameRecord]:

@@ -3,7 +3,13 @@
 from rich.table import Table
 from rich.text import Text
 
-PSNR_LABELS = {"psnr_clean_db": "against noiseless exposures", "psnr_noisy_db": "against the noisy frames"}
+from ground.card import chi2_explained, frames_captured, scored_frames
+
+PSNR_LABELS = {
+    "psnr_clean_db": "against noiseless exposures",
+    "psnr_clean_foreground_db": "the same, pixels that show the target",
+    "psnr_noisy_db": "against the noisy frames",
+}
 REMOVED = {
     "dark_frames": "black frames",
     "removed_outliers": "stray Gaussians",
@@ -18,14 +24,14 @@ def model_rows(metrics: dict) -> list[tuple[str, str]]:
         return metrics.get(key) is not None
 
     rows = [("method", str(metrics["method"]))]
-    views = "held-out views" if metrics.get("frames_held_out") else "views it was trained on"
     for key, label in PSNR_LABELS.items():
         if known(key):
             blind = metrics.get("psnr_clean_blind_db") if key == "psnr_clean_db" else None
             more = "" if blind is None else f" ({blind:.2f} dB blind to exposure)"
-            rows.append((f"PSNR of {views}, {label}", f"{metrics[key]:.2f} dB{more}"))
+            rows.append((f"PSNR of {scored_frames(metrics)}, {label}", f"{metrics[key]:.2f} dB{more}"))
     if known("chi2"):
-        rows.append(("residual chi² where the model is", f"{metrics['chi2']:.2f} (1 is noise)"))
+        chi2 = metrics["chi2"]
+        rows.append(("residual chi² where the model is", f"{chi2:.2f}: {chi2_explained(chi2)}"))
     if known("chamfer"):
         rows.append(("Chamfer distance of the centres", f"{metrics['chamfer']:.4f} (largest dimension = 2)"))
     if known("completeness_surface"):
@@ -52,9 +58,9 @@ def model_rows(metrics: dict) -> list[tuple[str, str]]:
 
 def frames_row(metrics: dict) -> tuple[str, str]:
     """Return what the frames were used for, as a row."""
-    counts = ("received", metrics["frames_received"]), ("trained on", metrics["frames_trained"])
-    counts += (("held out", metrics["frames_held_out"]),)
-    return "frames", ", ".join(f"{count:,} {what}" for what, count in counts)
+    counts = ("trained on", metrics["frames_trained"]), ("held out", metrics["frames_held_out"])
+    used = ", ".join(f"{count:,} {what}" for what, count in counts)
+    return "frames", f"{metrics['frames_received']:,} received / {frames_captured(metrics)} captured, {used}"
 
 
 def table(title: str, rows: list[tuple[str, str]]) -> Table:

@@ -1,9 +1,11 @@
 """Telemetry, events and command reports as they come: kept with the session, and the newest at hand."""
 
+import dataclasses
 import json
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,71 @@ from flightsw.icd.packet import (
 from flightsw.icd.telemetry import DICTIONARY
 
 EVENTS_KEPT = 200  # in memory; the file has all
+NS = 1_000_000_000
+SAME_START_NS = 2 * NS  # two starts of flight nearer than this are one: uptime comes in whole seconds
+
+
+@dataclass(frozen=True)
+class FlightCounts:
+    """What flight's telemetry has told of its frames, over all runs of flight and ground; counts never fall.
+
+    Telemetry comes down best-effort: more frames may have been taken since it was last heard.
+    """
+
+    frames_stored: int = 0  # ever, deleted ones too: their numbers start at 0, and none is used twice
+    frames_refused: int = 0  # taken, but the store had no room
+    frames_failed: int = 0  # exposures that gave no frame
+    frames_dropped: int = 0  # stored, then deleted undelivered to make room
+    # the newest housekeeping of flight's present run, in which refused and failed are counted from 0
+    run_utc_ns: int = 0
+    run_uptime_s: int = 0
+    run_refused: int = 0
+    run_failed: int = 0
+
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if type(value) is not int or (value < 0 and name != "run_utc_ns"):
+                raise ValueError(f"flight.{name} must be a count, got {value!r}")
+
+    def captured(self, last_frame_id: int = -1) -> int:
+        """Return how many frames were taken; `last_frame_id` is the highest number received, -1 for none."""
+        return max(self.frames_stored, last_frame_id + 1) + self.frames_refused
+
+    def after_header(self, frame_id: int) -> "FlightCounts":
+        """Return the counts after the header of a frame was heard."""
+        return dataclasses.replace(self, frames_stored=max(self.frames_stored, frame_id + 1))
+
+    def after_housekeeping(self, values: Mapping[str, Any]) -> "FlightCounts":
+        """Return the counts after a housekeeping packet.
+
+        Frames that were deleted because the ground has them are in none of its items: their numbers tell of them.
+        """
+        utc_ns, uptime_s = values["utc_ns"], values["uptime_s"]
+        refused, failed = values["frames_refused"], values["frames_failed"]
+        if same_run := self._is_of_this_run(utc_ns, uptime_s):  # packets may overtake one another
+            utc_ns, uptime_s = max(utc_ns, self.run_utc_ns), max(uptime_s, self.run_uptime_s)
+            refused, failed = max(refused, self.run_refused), max(failed, self.run_failed)
+        return FlightCounts(
+            frames_stored=max(self.frames_stored, values["frames_stored"] + values["frames_dropped"]),
+            frames_refused=self.frames_refused + refused - (self.run_refused if same_run else 0),
+            frames_failed=self.frames_failed + failed - (self.run_failed if same_run else 0),
+            frames_dropped=max(self.frames_dropped, values["frames_dropped"]),
+            run_utc_ns=utc_ns,
+            run_uptime_s=uptime_s,
+            run_refused=refused,
+            run_failed=failed,
+        )
+
+    def _is_of_this_run(self, utc_ns: int, uptime_s: int) -> bool:
+        """Tell whether flight has not been started anew since the newest housekeeping.
+
+        It has when it started after that packet was made, or when its uptime fell and that is no packet overtaken by
+        another. A step of the clock during a run is not taken for a start unless it exceeds the uptime before it.
+        """
+        started_since = utc_ns - (uptime_s + 1) * NS > self.run_utc_ns
+        start_moved_ns = (utc_ns - uptime_s * NS) - (self.run_utc_ns - self.run_uptime_s * NS)
+        uptime_fell = uptime_s < self.run_uptime_s and abs(start_moved_ns) > SAME_START_NS
+        return not started_since and not uptime_fell
 
 
 class TelemetryLog:
@@ -33,7 +100,9 @@ class TelemetryLog:
         on_event: Callable[[dict[str, Any]], None] = lambda event: None,
         on_report: Callable[[Report], None] = lambda report: None,
         utc_ns: Callable[[], int] = time.time_ns,
+        flight: FlightCounts | None = None,
     ):
+        self.flight = flight  # what it told of its frames, to earlier runs of the ground too; None: nothing
         self.refused = 0  # whole packets that the dictionary does not know
         self.write_failures = 0
         self.housekeeping: dict[str, Any] = {}  # the newest, {} before the first
@@ -50,10 +119,12 @@ class TelemetryLog:
             if apid == APID_HOUSEKEEPING:
                 layout, values = DICTIONARY.unpack("telemetry", data)
                 self.housekeeping, self.housekeeping_utc_ns = values, received["received_utc_ns"]
+                self.flight = (self.flight or FlightCounts()).after_housekeeping(values)
                 self._write("telemetry.jsonl", received | {"packet": layout.name} | values)
             elif apid == APID_FRAME_HEADERS:
                 self.frame_header = read_header(data)
                 self.headers_received += 1
+                self.flight = (self.flight or FlightCounts()).after_header(self.frame_header["frame_id"])
                 self._write("telemetry.jsonl", received | {"packet": "frame"} | self.frame_header)
             elif apid == APID_EVENTS:
                 layout, values = DICTIONARY.unpack("events", data)

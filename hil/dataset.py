@@ -16,6 +16,7 @@ from flightsw.icd.mission import Mission
 from flightsw.sequencer import Shot, plan
 from ground.formats.nerf import export_nerf
 from ground.session import SessionWriter, open_session, write_whole
+from ground.telemetry import FlightCounts
 from hil import blender, sensor, truth
 from hil.blender import RenderFarm, mesh_sha256
 from hil.motion import image_velocity, smear
@@ -155,7 +156,7 @@ def make_dataset(
         for index, frame in enumerate(_frames(mission, sky, shots, states, farm, model, config.seed)):
             writer.add(frame, encode_frame(frame))
             on_progress(Progress(mesh.stem, "expose", index + 1, len(shots)))
-        writer.save({}, 0)
+        writer.save({}, 0, FlightCounts(frames_stored=len(shots)))
         truth.write_truth(
             out / "session",
             mission,

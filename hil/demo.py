@@ -38,7 +38,9 @@ from hil.virtual_can import VirtualCan
 from hil.virtual_link import Faults, VirtualLink, VirtualSerial
 from hil.world import World, load_world, write_flight_inputs
 
-MARKER = "demo.json"  # says that a folder's flight/ and session/ are a demo's own and may be made anew
+MARKER = "demo.json"  # says that what a folder has of these is a demo's own
+MADE_ANEW = ("flight", "session", "scenario")
+LOGS = ("ground.log", "flight.log", "flight.json")
 PATIENCE_S = 60.0  # the pass has stalled when nothing was captured or received for this long
 FAULT_SEED = 1
 FAULT_WORDS = {"lost", "destroyed", "flipped", "duplicated", "reordered", "cut", "overrun"}
@@ -100,6 +102,8 @@ def simulate_pass(
 ) -> dict[str, dict]:
     """Render the sky, fly the pass and write its truth, all below `out`; return what was simulated, by part.
 
+    A pass that cannot start leaves nothing but rendered frames.
+
     Raises:
         DemoError: a process failed or stalled, or a frame was lost or altered on its way.
         ConfigError, MeshError, BlenderError: the mission, the scenario, the mesh or Blender is not usable.
@@ -111,10 +115,7 @@ def simulate_pass(
         world.mission, config.real_time
     )  # a factor that cannot be is known before anything is removed
     check_mesh(mesh)
-    _clear(out)
-    if config.scenario or config.navigation_noise is not None:
-        mission_path = write_flight_inputs(world, out / "scenario", config.navigation_noise)
-        world = replace(world, mission=load_mission(mission_path))
+    _require_own(out)
     mission = world.mission
     exposures = true_exposures(mission, world.pose_at)
     size = f"{mission.camera.width}x{mission.camera.height}"
@@ -122,34 +123,59 @@ def simulate_pass(
         f"[bold]1/4 Sky[/]   {len(exposures)} exposures of {mesh.name} at {size}, rendered by Blender"
         + (f", scenario {config.scenario}" if config.scenario else "")
     )
-    with RenderFarm(mission, mesh, out / "renders") as farm:
+    with _nothing_left_behind(out), RenderFarm(mission, mesh, out / "renders") as farm:
         with _bar(console) as progress:
             task = progress.add_task("render", total=len(exposures))
             farm.prerender([e.pose for e in exposures], lambda: progress.advance(task))
+        _clear(out)  # only now: a mesh that cannot be rendered costs no earlier pass
+        if config.scenario or config.navigation_noise is not None:
+            mission_path = write_flight_inputs(world, out / "scenario", config.navigation_noise)
+            world = replace(world, mission=load_mission(mission_path))
         console.print(
             f"[bold]2/4 Pass[/]  flight and ground, {config.camera} camera, {config.link} link between, "
             f"faults: {config.faults}"
         )
         simulation = fly(out, world, mission_path, farm.radiance, config, console)
         console.print("[bold]3/4 Truth[/] the simulator's own record, for the evaluation only")
-        write_truth(out / "session", mission, farm, pose_at=world.pose_at, simulation=simulation)
+        write_truth(out / "session", world.mission, farm, pose_at=world.pose_at, simulation=simulation)
     return simulation
 
 
-def _clear(out: Path) -> None:
-    """Make room for a new pass; only what an earlier demo made is removed, rendered frames stay.
+def _require_own(out: Path) -> None:
+    """Refuse a folder whose flight/ or session/ no demo made.
 
     Raises:
-        DemoError: the folder holds a session that no demo made.
+        DemoError: there is such a one.
     """
-    ours = (out / MARKER).exists()
-    for name in ("flight", "session", "scenario"):
-        if (out / name).exists():
-            if not ours:
+    if not (out / MARKER).exists():
+        for name in MADE_ANEW:
+            if (out / name).exists():
                 raise DemoError(f"{out / name} was not made by a demo; choose another folder with OUT=DIR")
+
+
+def _clear(out: Path) -> None:
+    """Make room for a new pass: what an earlier demo flew is removed, rendered frames stay."""
+    for name in MADE_ANEW:
+        if (out / name).exists():
             shutil.rmtree(out / name)
     out.mkdir(parents=True, exist_ok=True)
     (out / MARKER).write_text("{}\n")
+
+
+@contextlib.contextmanager
+def _nothing_left_behind(out: Path) -> Iterator[None]:
+    """Take back the files of a demo that ends before flight or ground made any; rendered frames stay."""
+    try:
+        yield
+    except BaseException:
+        if not (out / "flight").exists() and not (out / "session").exists():
+            shutil.rmtree(out / "scenario", ignore_errors=True)
+            for name in (MARKER, *LOGS):
+                (out / name).unlink(missing_ok=True)
+            for folder in (out / "renders", out):
+                with contextlib.suppress(OSError):  # missing, or not empty
+                    folder.rmdir()
+        raise
 
 
 def fly(

@@ -1,6 +1,7 @@
 """How good a model is: image and geometry measures. Clouds in units where the target's largest dimension is 2."""
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -14,6 +15,19 @@ COMPLETENESS_RADIUS = 0.01
 def psnr_db(a: Tensor, b: Tensor) -> float:
     """Return the peak signal-to-noise ratio of two images in 0..1; capped at 120 dB for identical ones."""
     return -10 * math.log10(max((a.double() - b.double()).square().mean().item(), 1e-12))
+
+
+def foreground_psnr_db(views: Iterable[tuple[Tensor, Tensor, Tensor]]) -> float:
+    """Return the mean PSNR of views over their foreground: the pixels of which the target covers any part.
+
+    Args:
+        views: image [H, W, C] and truth [H, W, C] in 0..1, and the target's coverage [H, W] of each pixel in 0..1.
+
+    Returns:
+        dB; views in which the target covers no pixel do not count, and NaN stands where none counts.
+    """
+    values = [psnr_db(image[on], truth[on]) for image, truth, coverage in views if (on := coverage > 0).any()]
+    return math.fsum(values) / len(values) if values else math.nan
 
 
 def ssim(a: Tensor, b: Tensor) -> float:

@@ -21,7 +21,7 @@ from ground.session import open_session
 from hil.sensor import converted
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.gaussians import Gaussians
-from obbgs_core.metrics import cloud_distances, psnr_db, ssim
+from obbgs_core.metrics import cloud_distances, foreground_psnr_db, psnr_db, ssim
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 from obbgs_core.surface import surface_points
@@ -149,16 +149,20 @@ def clean_psnr_db(gaussians: Gaussians, target: Target, reference_exposure_s: fl
 def image_figures(
     gaussians: Gaussians, target: Target, reference_exposure_s: float | None
 ) -> dict[str, float]:
-    """Return the mean clean and noisy PSNR, the clean PSNR of the target's own pixels, and the clean SSIM."""
-    sums = {"psnr_clean_db": 0.0, "psnr_noisy_db": 0.0, "psnr_foreground_db": 0.0, "ssim_clean": 0.0}
-    for frame, exact, alpha in zip(target.held_out, target.clean, target.alpha, strict=True):
-        image = predicted(gaussians, frame, target.sensor, reference_exposure_s or frame.exposure_time_s)
-        on_target = alpha > 0
+    """Return the mean clean and noisy PSNR, the clean PSNR of the foreground, and the clean SSIM."""
+    sums = {"psnr_clean_db": 0.0, "psnr_noisy_db": 0.0, "ssim_clean": 0.0}
+    images = [
+        predicted(gaussians, frame, target.sensor, reference_exposure_s or frame.exposure_time_s)
+        for frame in target.held_out
+    ]
+    for image, frame, exact in zip(images, target.held_out, target.clean, strict=True):
         sums["psnr_clean_db"] += psnr_db(image, exact)
         sums["psnr_noisy_db"] += psnr_db(image, frame.dn / target.sensor.white_dn)
-        sums["psnr_foreground_db"] += psnr_db(image[on_target], exact[on_target])
         sums["ssim_clean"] += ssim(image, exact)
-    return {key: value / len(target.held_out) for key, value in sums.items()}
+    figures = {key: value / len(target.held_out) for key, value in sums.items()}
+    return figures | {
+        "psnr_foreground_db": foreground_psnr_db(zip(images, target.clean, target.alpha, strict=True))
+    }
 
 
 def cloud_figures(gaussians: Gaussians, target: Target, seed: int = 0) -> dict[str, float]:

@@ -132,6 +132,12 @@ def test_the_rate_is_of_the_last_seconds_only():
     assert rates == (10_000.0, 0.0)  # since 10 s: the newest status that is at least 5 s old
 
 
+def test_frames_that_flight_took_are_counted_or_said_to_be_unknown():
+    for taken, text in ((None, "24 received / unknown captured"), (48, "24 received / 48 captured")):
+        now = status(summary=ListenSummary(frames_in_session=24, frames_captured=taken))
+        assert text in screen(ConsoleView(), now) and text in ConsoleView().line(now)
+
+
 def test_a_model_and_the_lack_of_one_are_shown():
     assert (shown("model", b"\1\2\3\4"), shown("model", bytes(4))) == ("01020304", "none")
 

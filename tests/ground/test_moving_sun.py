@@ -138,6 +138,23 @@ def clean_db(gaussians: Gaussians, seen: list[tuple[np.ndarray, np.ndarray]], bo
     return sum(values) / len(values)
 
 
+def baselines_db(
+    frames: list[TrainingFrame],
+    seen: list[tuple[np.ndarray, np.ndarray]],
+    changes: dict,
+    bodies=ALONE,
+) -> float:
+    """Return the best that black, the mean of the frames' radiance or the untrained start score, as `clean_db`."""
+    signal = [(f.dn - SENSOR.black_dn) / (f.exposure_time_s * SENSOR.dn_per_radiance_s) for f in frames]
+    mean = torch.stack(signal).mean(0)
+    scores = []
+    for image in (torch.zeros_like(mean), mean):
+        true = [torch.from_numpy(lambertian_ellipsoids(*view, bodies)).float()[..., None] for view in seen]
+        scores.append(float(np.mean([psnr_db(image, radiance) for radiance in true])))
+    start = Trainer(frames, SENSOR, preset("obbgs", **changes), seed=1).gaussians.detach()
+    return max(*scores, clean_db(start, seen, bodies))
+
+
 def lit_model(count: int, sh_count: int = 4, channels: int = 3, seed: int = 0) -> Gaussians:
     """Return a random model under the Sun: of harmonics, or matt where it has but one coefficient."""
     g = torch.Generator().manual_seed(seed)
@@ -171,8 +188,10 @@ def test_under_a_moving_sun_the_model_turns_with_it_and_beats_the_static_one_on_
     assert under_the_sun.appearance.startswith("follows Lambert's law with cast shadows, ambient 0.0")
     assert "(step 12, degree 1: with the sun it would" in under_the_sun.appearance
     assert under_the_sun.sun_span_deg > 150
-    gain_db = clean_db(under_the_sun.gaussians, unseen) - clean_db(static.gaussians, unseen)
-    assert gain_db > 3
+    with_sun_db = clean_db(under_the_sun.gaussians, unseen)
+    # seeds 1 and 2: 26.2 and 25.7 dB, static 20.6 and 20.3; black 17.7, mean image 20.2, untrained 18.9
+    assert with_sun_db > clean_db(static.gaussians, unseen) + 3
+    assert with_sun_db > baselines_db(moving, unseen, QUICK) + 3
 
 
 def test_parts_that_shade_one_another_are_understood_by_lamberts_law_and_not_by_the_linear_one():
@@ -182,6 +201,8 @@ def test_parts_that_shade_one_another_are_understood_by_lamberts_law_and_not_by_
     cast = train(frames, SENSOR, preset("obbgs", **longer), seed=1)
     assert linear.gaussians.shading == "sun" and linear.appearance.startswith("turns with the sun (step 48")
     assert clean_db(cast.gaussians, unseen, TOGETHER) > clean_db(linear.gaussians, unseen, TOGETHER) + 0.8
+    # seeds 1 and 2: 34.1 dB; black 17.2, mean image 19.1, untrained 18.2
+    assert clean_db(cast.gaussians, unseen, TOGETHER) > baselines_db(frames, unseen, longer, TOGETHER) + 6
     without = []
     for pose, sun in unseen:  # the same model with nothing in the Sun's way
         true = torch.from_numpy(lambertian_ellipsoids(pose, sun, TOGETHER)).float()[..., None]
@@ -313,6 +334,7 @@ def test_onnxruntime_agrees_with_our_renderer_under_many_suns(tmp_path, sh_count
         radiance = render(gaussians, camera_of(pose, sun)).radiance[0]
         ours = (SENSOR.expected_dn(radiance, 5e-5) / SENSOR.white_dn).clamp(0, 1)
         assert psnr_db(torch.tensor(images[-1]), ours) >= 50  # dB, the project's bar
+        assert psnr_db(torch.full_like(ours, SENSOR.black_dn / SENSOR.white_dn), ours) < 40
     feed["sun_dir"] = -feed["sun_dir"]
     assert np.abs(session.run(["image"], feed)[0] - images[-1]).max() > 0.05  # the input counts
     export_onnx(
@@ -323,13 +345,15 @@ def test_onnxruntime_agrees_with_our_renderer_under_many_suns(tmp_path, sh_count
 
 
 def test_baked_under_one_sun_a_matt_model_looks_much_the_same(under_the_sun):
-    alike_db = []
+    alike_db, black_db = [], []
     for pose, sun in views(6, seed=5):
         direction = torch.tensor(sun).float()
         lit = render(under_the_sun.gaussians, camera_of(pose, sun)).radiance[0]
         baked = render(lit_from(under_the_sun.gaussians, direction), camera_of(pose, sun)).radiance[0]
         alike_db.append(psnr_db(baked, lit))
-    assert np.mean(alike_db) > 26  # harmonics of degree 1 for two sides
+        black_db.append(psnr_db(torch.zeros_like(lit), lit))
+    # harmonics of degree 1 for two sides; seeds 1 and 2: 27.5 and 29.2 dB, where black has 18.5 and 19.9
+    assert np.mean(alike_db) > np.mean(black_db) + 5
 
 
 def test_the_surface_does_not_depend_on_which_picture_had_which_sun(under_the_sun):

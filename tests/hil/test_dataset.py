@@ -101,6 +101,7 @@ def test_frames_are_the_true_radiance_through_the_sensor(made):
     out, facts = made
     session = open_session(out / "session")
     assert session.camera.dn_per_radiance_s == facts["dn_per_radiance_s"]
+    assert session.frames_captured == facts["frames"] == len(session.frames)
     residuals = []
     for record in session.frames:
         with np.load(out / "session" / "truth" / "radiance" / f"{record.id:06d}.npz") as light:

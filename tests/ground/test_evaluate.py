@@ -1,0 +1,135 @@
+"""What a run is scored on and how that is told: which frames, which pixels, and files that are damaged."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from ground.card import chi2_explained, model_card
+from ground.evaluate import Truth, evaluate
+from ground.reconstruct import reconstruct
+from ground.report import write_report
+from ground.session import SessionError, open_session
+from obbgs_core.metrics import foreground_psnr_db, psnr_db
+from obbgs_core.ply import load_ply
+from tests.benchmarks import targets
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "session"
+QUICK = {"steps": 30, "start_count": 500, "max_gaussians": 600, "sh_degree": 0}
+
+
+def run_of(folder: Path, wanted=lambda frame: True) -> Path:
+    """Return a copy of the golden session, with only the wanted frames, and a short run on it."""
+    shutil.copytree(GOLDEN, folder / "session")
+    lines = (GOLDEN / "frames.jsonl").read_text().splitlines()
+    kept = [line for line in lines if wanted(json.loads(line))]
+    (folder / "session" / "frames.jsonl").write_text("".join(line + "\n" for line in kept))
+    reconstruct(folder / "session", "run", "obbgs", QUICK)
+    return folder / "session"
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory) -> Path:
+    return run_of(tmp_path_factory.mktemp("scored"))
+
+
+def test_figures_of_training_frames_are_never_called_held_out(tmp_path):
+    session = run_of(tmp_path, lambda frame: frame["bracket"] == 0)
+    assert evaluate(session, "run")["scored_frames"] == "training"
+    assert json.loads((session / "runs/run/metrics.json").read_text())["scored_frames"] == "training"
+    card = (session / "runs/run/model_card.md").read_text()
+    page = write_report(session, "run").read_text()
+    body = page[page.index("<body>") :]
+    for text in (card, body):
+        assert "PSNR of training frames (nothing was held out)" in text
+        assert "held-out" not in text.lower() and "never trained on" not in text
+
+
+def test_figures_of_held_out_frames_are_called_so(session):
+    assert evaluate(session, "run")["scored_frames"] == "held_out"
+    card = (session / "runs/run/model_card.md").read_text()
+    page = write_report(session, "run").read_text()
+    body = page[page.index("<body>") :]
+    for text in (card, body):
+        assert "PSNR of held-out frames" in text and "training frames (" not in text
+
+
+def test_the_foreground_is_the_pixels_that_the_target_covers():
+    """Three pixels of four are sky; the one that the target grazes counts as much as one that it fills."""
+    truth = torch.tensor([[[0.5], [0.2]], [[0.0], [0.0]]])
+    coverage = torch.tensor([[1.0, 0.004], [0.0, 0.0]])
+    image = truth + torch.tensor([[[0.1], [0.1]], [[0.7], [0.7]]])
+    unseen = (image, truth, torch.zeros(2, 2))
+    assert foreground_psnr_db([(image, truth, coverage), unseen]) == pytest.approx(20, abs=1e-4)
+    assert psnr_db(image, truth) < 7
+    assert math.isnan(foreground_psnr_db([unseen]))
+
+
+def test_a_run_and_a_benchmark_score_the_same_foreground(session):
+    metrics = evaluate(session, "run")
+    units_per_m = 2 / Truth(open_session(session)).largest_dimension_m
+    gaussians = load_ply(session / "runs/run/model.ply")
+    gaussians.means *= units_per_m
+    gaussians.log_scales += math.log(units_per_m)
+    figures = targets.image_figures(gaussians, targets.from_session(session), None)
+    half_a_hundredth_db = 0.005  # float32 in two units of length
+    assert metrics["psnr_clean_db"] == pytest.approx(figures["psnr_clean_db"], abs=half_a_hundredth_db)
+    assert metrics["psnr_clean_foreground_db"] == pytest.approx(
+        figures["psnr_foreground_db"], abs=half_a_hundredth_db
+    )
+
+
+def test_the_first_section_of_the_report_explains_chi2_and_shows_the_foreground(session):
+    metrics = evaluate(session, "run")
+    page = write_report(session, "run").read_text()
+    cards = page[page.index('<div class="cards">') : page.index("<table>")]
+    assert f"<b>{metrics['psnr_clean_foreground_db']:.2f} dB</b><span>clean PSNR of the foreground" in cards
+    explained = chi2_explained(metrics["chi2"])
+    assert explained in cards and explained in (session / "runs/run/model_card.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("chi2", "told"),
+    [(1.02, "1 is noise alone."), (28.0, "at 28 the model's own error is 5.2 times as large")],
+)
+def test_chi2_far_above_one_is_told_as_the_size_of_the_models_error(chi2, told):
+    assert told in chi2_explained(chi2)
+
+
+@pytest.mark.parametrize("chi2", [None, math.nan])
+def test_a_run_without_chi2_or_onnx_has_its_card_and_report(session, tmp_path, chi2):
+    shutil.copytree(session, tmp_path / "session")
+    path = tmp_path / "session" / "runs" / "run" / "metrics.json"
+    metrics = json.loads(path.read_text()) | {"chi2": chi2}
+    del metrics["onnx_bytes"], metrics["onnx_parity_db"]
+    path.write_text(json.dumps(metrics))
+    page = write_report(tmp_path / "session", "run").read_text()
+    card = model_card("2026-07-21T00:00:00+00:00", metrics)
+    assert "model.onnx |" not in card and "ONNX renderer" not in page
+    assert "mean squared residual" not in card + page
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"", "cannot be read"),
+        (b'{"method": "obbgs", "gauss', "cannot be read"),
+        (b"\xff\xfe", "cannot be read"),
+        (b"[]", "should hold an object"),
+        (b"{}", "expected method as a text, got None"),
+        ("half", "expected gaussians as a whole number, got '600'"),
+    ],
+)
+@pytest.mark.parametrize("read", [evaluate, write_report])
+def test_damaged_metrics_are_named_by_their_file(session, tmp_path, content, told, read):
+    shutil.copytree(session, tmp_path / "session")
+    path = tmp_path / "session" / "runs" / "run" / "metrics.json"
+    if content == "half":
+        content = json.dumps(json.loads(path.read_text()) | {"gaussians": "600"}).encode()
+    path.write_bytes(content)
+    with pytest.raises(SessionError) as caught:
+        read(tmp_path / "session", "run")
+    assert str(path) in str(caught.value) and told in str(caught.value)
