@@ -1,5 +1,7 @@
 // Loops over one row of an image (or one block of parameters) that the compiler vectorises: losses and their gradients.
 // Rows hold width * channels values, channels interleaved: a pixel's neighbour is `c` (channels) values away.
+// Compiled once for each instruction set, in rows.cpp; others call what RowLoops points to. No loop adds up across lanes and
+// a*b + c is never contracted, so every instruction set gives the same bits.
 // Compile with -fno-math-errno -fno-trapping-math: square roots and conditions are scalar without them.
 #pragma once
 #include <cmath>
@@ -7,15 +9,7 @@
 #include <cstdint>
 #include <cstring>
 
-// Each loop is compiled for three instruction sets; the loader picks one at run time.
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-#define OBBGS_VECTORISED __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
-#else
-#define OBBGS_VECTORISED
-#endif
-
 namespace obbgs {
-namespace {
 
 constexpr int kReach = 5, kTaps = 2 * kReach + 1;  // SSIM window of Wang et al. 2004: 11 pixels, sigma 1.5
 constexpr float kSsimC1 = 1e-4f, kSsimC2 = 9e-4f;  // (0.01)^2, (0.03)^2
@@ -27,6 +21,11 @@ struct SensorModel {
   float anscombe_floor;  // electrons^2
   float root_averaged;   // sqrt of the sensor pixels in one pixel: averaging shrinks the noise
 };
+
+struct Window { float taps[kTaps]; };
+
+namespace rows {
+namespace {
 
 // exp(x) for -41 <= x <= 0, relative error 2e-7.
 inline float exp_negative(float x) {
@@ -59,7 +58,6 @@ inline float scaled_erfc(float u) {
 }
 
 // Noise-normalised residual of one row, its robust penalty (added to `penalty`), and d penalty / d radiance.
-OBBGS_VECTORISED
 void likelihood_row(int n, const float* __restrict radiance, const float* __restrict dn, float gain,
                     const SensorModel s, float* __restrict residual, float* __restrict penalty,
                     float* __restrict slope) {
@@ -84,7 +82,6 @@ void likelihood_row(int n, const float* __restrict radiance, const float* __rest
 }
 
 // Prediction minus reading on the variance-stabilised scale, prediction clamped at white, and its slope by radiance.
-OBBGS_VECTORISED
 void stabilised_row(int n, const float* __restrict radiance, const float* __restrict dn, float gain,
                     const SensorModel s, float* __restrict difference, float* __restrict slope) {
   for (int x = 0; x < n; ++x) {
@@ -100,7 +97,6 @@ void stabilised_row(int n, const float* __restrict radiance, const float* __rest
   }
 }
 
-OBBGS_VECTORISED
 void difference_row(int n, const float* __restrict a, const float* __restrict b, float* __restrict difference) {
   for (int x = 0; x < n; ++x) difference[x] = a[x] - b[x];
 }
@@ -109,7 +105,6 @@ inline float sign(float x) { return x > 0 ? 1.0f : (x < 0 ? -1.0f : x); }  // ke
 
 // Signs of the Sobel derivatives at the pixels of one row that have both neighbours; |dx| + |dy| goes to `sums`.
 // up, mid, down: three rows of differences; n: width * channels; c: channels.
-OBBGS_VECTORISED
 void sobel_row(int n, int c, const float* __restrict up, const float* __restrict mid, const float* __restrict down,
                float* __restrict sign_x, float* __restrict sign_y, float* __restrict sums) {
   for (int x = c; x < n - c; ++x) {
@@ -122,7 +117,6 @@ void sobel_row(int n, int c, const float* __restrict up, const float* __restrict
 }
 
 // gradient += scale * slope * (Sobel transposed of the signs); rows of signs have a zero margin of c on both sides.
-OBBGS_VECTORISED
 void sobel_gradient_row(int n, int c, float scale, const float* __restrict x_up, const float* __restrict x_mid,
                         const float* __restrict x_down, const float* __restrict y_up, const float* __restrict y_down,
                         const float* __restrict slope, float* __restrict gradient) {
@@ -135,10 +129,7 @@ void sobel_gradient_row(int n, int c, float scale, const float* __restrict x_up,
   }
 }
 
-struct Window { float taps[kTaps]; };
-
 // Gaussian sums down the columns of 11 rows: of a, b, a^2 + b^2 and a b.
-OBBGS_VECTORISED
 void blur_down_products(int n, const Window w, const float* const* a, const float* const* b, float* __restrict out_a,
                         float* __restrict out_b, float* __restrict out_squares, float* __restrict out_product) {
   for (int x = 0; x < n; ++x) {
@@ -158,7 +149,6 @@ void blur_down_products(int n, const Window w, const float* const* a, const floa
   }
 }
 
-OBBGS_VECTORISED
 void blur_down(int n, const Window w, const float* const* rows, float* __restrict out) {
   for (int x = 0; x < n; ++x) {
     float sum = 0;
@@ -177,7 +167,6 @@ inline float blur_along(const float* row, int c, const Window& w) {
 }
 
 // From columns already summed: 1 - SSIM (added to `sums`) and the slopes of SSIM by the blurred a, a^2 + b^2 and a b.
-OBBGS_VECTORISED
 void ssim_row(int n, int c, const Window w, const float* __restrict column_a, const float* __restrict column_b,
               const float* __restrict column_squares, const float* __restrict column_product, float* __restrict sums,
               float* __restrict by_mean, float* __restrict by_squares, float* __restrict by_product) {
@@ -195,7 +184,6 @@ void ssim_row(int n, int c, const Window w, const float* __restrict column_a, co
 }
 
 // gradient += scale * d SSIM / d a, from the three slopes summed down the columns.
-OBBGS_VECTORISED
 void ssim_gradient_row(int n, int c, const Window w, float scale, const float* __restrict by_mean,
                        const float* __restrict by_squares, const float* __restrict by_product,
                        const float* __restrict a, const float* __restrict b, float* __restrict gradient) {
@@ -205,7 +193,6 @@ void ssim_gradient_row(int n, int c, const Window w, float scale, const float* _
 }
 
 // difference = a - b; its size goes to `sums`; gradient = scale * sign(difference).
-OBBGS_VECTORISED
 void absolute_row(int n, float scale, const float* __restrict a, const float* __restrict b,
                   float* __restrict difference, float* __restrict sums, float* __restrict gradient) {
   for (int x = 0; x < n; ++x) {
@@ -217,18 +204,15 @@ void absolute_row(int n, float scale, const float* __restrict a, const float* __
 }
 
 // scaled = (row - zero) * gain
-OBBGS_VECTORISED
 void scaled_row(int n, const float* __restrict row, float zero, float gain, float* __restrict scaled) {
   for (int x = 0; x < n; ++x) scaled[x] = (row[x] - zero) * gain;
 }
 
-OBBGS_VECTORISED
 void scale_row(int n, float scale, float* __restrict row) {
   for (int x = 0; x < n; ++x) row[x] *= scale;
 }
 
 // Squared differences of the reading and the prediction as the sensor would show it, for PSNR.
-OBBGS_VECTORISED
 void squared_error_row(int n, const float* __restrict radiance, const float* __restrict dn, float gain,
                        const SensorModel s, float* __restrict sums) {
   for (int x = 0; x < n; ++x) {
@@ -238,7 +222,6 @@ void squared_error_row(int n, const float* __restrict radiance, const float* __r
   }
 }
 
-OBBGS_VECTORISED
 void adam_block(size_t n, float* __restrict parameter, const float* __restrict gradient, float* __restrict first,
                 float* __restrict second, float rate, float one_minus_b1, float b2, float one_minus_b2, float eps) {
   for (size_t i = 0; i < n; ++i) {
@@ -250,4 +233,23 @@ void adam_block(size_t n, float* __restrict parameter, const float* __restrict g
 }
 
 }  // namespace
+}  // namespace rows
+
+// Every loop above that is called from elsewhere.
+#define OBBGS_ROW_LOOPS(each) \
+  each(likelihood_row) each(stabilised_row) each(difference_row) each(sobel_row) each(sobel_gradient_row) \
+  each(blur_down_products) each(blur_down) each(ssim_row) each(ssim_gradient_row) each(absolute_row) \
+  each(scaled_row) each(scale_row) each(squared_error_row) each(adam_block)
+
+struct RowLoops {  // the loops as one instruction set has them; rows.cpp fills it
+#define OBBGS_MEMBER(name) decltype(&rows::name) name;
+  OBBGS_ROW_LOOPS(OBBGS_MEMBER)
+#undef OBBGS_MEMBER
+};
+namespace portable { extern const RowLoops row_loops; }
+namespace avx2 { extern const RowLoops row_loops; }
+namespace avx512 { extern const RowLoops row_loops; }
+
+void use_row_loops(const RowLoops& loops);  // from now on; training.cpp
+
 }  // namespace obbgs

@@ -2,7 +2,8 @@
 // one sweep, figures of the fit, and Adam. The readable versions are in losses.py and densify.py; tests compare them.
 //
 // Images are [count, height, width, channels] float32. Work is cut into bands of rows (or blocks of parameters) of a
-// fixed size whose sums are added in order, so the result does not depend on the number of threads.
+// fixed size whose sums are added in order, so the result does not depend on the number of threads. The loops over each row
+// are in rows.h, once for each instruction set.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -24,6 +25,8 @@ using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 
 namespace obbgs {
 namespace {
+
+const RowLoops* loops = &portable::row_loops;  // of the instruction set in use
 
 constexpr int kBandRows = 40;
 constexpr int kBlockParameters = 1 << 15;
@@ -78,11 +81,11 @@ double edge_band(const Shape& shape, const Band& band, float scale, float* gradi
   std::vector<float> inside(n, 0.0f), halo(n);
   for (int y = std::max(band.begin - 1, 1); y < std::min(band.end + 1, shape.height - 1); ++y) {
     float* sums = y >= band.begin && y < band.end ? inside.data() : halo.data();  // a neighbour counts its own rows
-    sobel_row(n, c, difference[y - 1], difference[y], difference[y + 1], sign_x[y], sign_y[y], sums);
+    loops->sobel_row(n, c, difference[y - 1], difference[y], difference[y + 1], sign_x[y], sign_y[y], sums);
   }
   for (int y = band.begin; gradient && y < band.end; ++y)
-    sobel_gradient_row(n, c, scale, sign_x[y - 1], sign_x[y], sign_x[y + 1], sign_y[y - 1], sign_y[y + 1], slope[y],
-                       gradient + size_t(y) * n);
+    loops->sobel_gradient_row(n, c, scale, sign_x[y - 1], sign_x[y], sign_x[y + 1], sign_y[y - 1], sign_y[y + 1], slope[y],
+                              gradient + size_t(y) * n);
   return total(inside);
 }
 
@@ -111,9 +114,10 @@ double ssim_band(const Shape& shape, const Band& band, float scale, Rows& a, Row
       rows_a[k] = outside ? sky.data() : a[row];
       rows_b[k] = outside ? sky.data() : b[row];
     }
-    blur_down_products(n, w, rows_a, rows_b, columns[0], columns[1], columns[2], columns[3]);
+    loops->blur_down_products(n, w, rows_a, rows_b, columns[0], columns[1], columns[2], columns[3]);
     float* sums = y >= band.begin && y < band.end ? inside.data() : halo.data();
-    ssim_row(n, c, w, columns[0], columns[1], columns[2], columns[3], sums, by_mean[y], by_squares[y], by_product[y]);
+    loops->ssim_row(n, c, w, columns[0], columns[1], columns[2], columns[3], sums, by_mean[y], by_squares[y],
+                    by_product[y]);
   }
   for (int y = band.begin; gradient && y < band.end; ++y) {
     Rows* slopes[3] = {&by_mean, &by_squares, &by_product};
@@ -122,9 +126,9 @@ double ssim_band(const Shape& shape, const Band& band, float scale, Rows& a, Row
         const int row = y + k - kReach;
         rows_a[k] = row < first || row >= last ? sky.data() : (*slopes[s])[row];
       }
-      blur_down(n, w, rows_a, columns[s]);
+      loops->blur_down(n, w, rows_a, columns[s]);
     }
-    ssim_gradient_row(n, c, w, scale, columns[0], columns[1], columns[2], a[y], b[y], gradient + size_t(y) * n);
+    loops->ssim_gradient_row(n, c, w, scale, columns[0], columns[1], columns[2], a[y], b[y], gradient + size_t(y) * n);
   }
   return total(inside);
 }
@@ -163,15 +167,15 @@ double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, d
     for (int y = band.begin; y < band.end; ++y) {
       const size_t at = image + size_t(y) * n;
       float* slope = g ? g + at : unwanted.data();
-      likelihood_row(n, r + at, d + at, t, s, out + at, penalty.data(), slope);
-      scale_row(n, float(scale), slope);
+      loops->likelihood_row(n, r + at, d + at, t, s, out + at, penalty.data(), slope);
+      loops->scale_row(n, float(scale), slope);
     }
     double sum = scale * total(penalty);
     if (edge_weight != 0)
       sum += edge_scale * edge_band(shape, band, float(edge_scale), g ? g + image : nullptr,
                                     [&](int y, float* difference, float* slope) {
                                       const size_t at = image + size_t(y) * n;
-                                      stabilised_row(n, r + at, d + at, t, s, difference, slope);
+                                      loops->stabilised_row(n, r + at, d + at, t, s, difference, slope);
                                     });
     return sum;
   });
@@ -198,14 +202,14 @@ double published(Array radiance, Array dn, Array gains, const SensorModel& s, do
     const int first = std::max(band.begin - 2 * kReach, 0), last = std::min(band.end + 2 * kReach, shape.height);
     Rows a(first, last, n), b(first, last, n);
     for (int y = first; y < last; ++y) {
-      scaled_row(n, r + image + size_t(y) * n, 0, slope, a[y]);
-      scaled_row(n, d + image + size_t(y) * n, s.black, per_dn, b[y]);
+      loops->scaled_row(n, r + image + size_t(y) * n, 0, slope, a[y]);
+      loops->scaled_row(n, d + image + size_t(y) * n, s.black, per_dn, b[y]);
     }
     float* image_gradient = g ? g + image : nullptr;
     std::vector<float> sums(n, 0.0f), unwanted(n);
     for (int y = band.begin; y < band.end; ++y) {
       const size_t at = image + size_t(y) * n;
-      absolute_row(n, float(l1_scale * slope), a[y], b[y], out + at, sums.data(), g ? g + at : unwanted.data());
+      loops->absolute_row(n, float(l1_scale * slope), a[y], b[y], out + at, sums.data(), g ? g + at : unwanted.data());
     }
     double sum = l1_scale * total(sums);
     if (ssim_weight != 0)
@@ -213,7 +217,7 @@ double published(Array radiance, Array dn, Array gains, const SensorModel& s, do
     if (edge_weight != 0)
       sum += edge_scale * edge_band(shape, band, float(edge_scale * slope), image_gradient,
                                     [&](int y, float* difference, float* by_a) {
-                                      difference_row(n, a[y], b[y], difference);
+                                      loops->difference_row(n, a[y], b[y], difference);
                                       std::fill_n(by_a, n, 1.0f);
                                     });
     return sum;
@@ -243,13 +247,13 @@ std::pair<double, double> fit(Array radiance, Array alpha, Array dn, Array gains
     Fit part;
     for (int y = band.begin; y < band.end; ++y) {
       const size_t at = band.image * shape.image() + size_t(y) * n;
-      squared_error_row(n, r + at, d + at, gain[band.image], s, errors.data());
+      loops->squared_error_row(n, r + at, d + at, gain[band.image], s, errors.data());
       const float* row = opaque + at / c;
       int x0 = 0, x1 = shape.width;  // the part of the row that may hold target
       while (x0 < x1 && !(row[x0] > least_alpha)) ++x0;
       while (x0 < x1 && !(row[x1 - 1] > least_alpha)) --x1;
-      likelihood_row((x1 - x0) * c, r + at + x0 * c, d + at + x0 * c, gain[band.image], s, residual.data(),
-                     penalty.data(), slope.data());
+      loops->likelihood_row((x1 - x0) * c, r + at + x0 * c, d + at + x0 * c, gain[band.image], s, residual.data(),
+                            penalty.data(), slope.data());
       for (int x = x0; x < x1; ++x) {
         if (!(row[x] > least_alpha)) continue;
         part.values += c;
@@ -275,11 +279,15 @@ void adam_step(Array parameter, Array gradient, Array first, Array second, doubl
   const int blocks = int((n + kBlockParameters - 1) / kBlockParameters);
   parallel_for(blocks, threads, [&](int block) {
     const size_t at = size_t(block) * kBlockParameters, count = std::min(n - at, size_t(kBlockParameters));
-    adam_block(count, p + at, g + at, m + at, v + at, float(rate), float(1 - b1), float(b2), float(1 - b2), float(eps));
+    loops->adam_block(count, p + at, g + at, m + at, v + at, float(rate), float(1 - b1), float(b2), float(1 - b2),
+                      float(eps));
   });
 }
 
 }  // namespace
+
+void use_row_loops(const RowLoops& chosen) { loops = &chosen; }
+
 }  // namespace obbgs
 
 void bind_training(nb::module_& m) {
