@@ -180,9 +180,20 @@ def read_out(
         electrons = bloom(electrons, sensor.full_well_e)
     electrons = np.minimum(electrons, sensor.full_well_e)
     dn = sensor.black_dn + electrons / sensor.electrons_per_dn
-    dn = dn + rng.normal(0.0, sensor.read_noise_e / sensor.electrons_per_dn, light.shape)
-    dn = np.clip(np.rint(dn), 0, sensor.white_dn).astype(np.uint16)
+    dn = converted(dn, sensor.read_noise_e / sensor.electrons_per_dn, sensor.white_dn, rng)
     return demosaic(dn[..., 0]) if sensor.colour == "bayer" else dn
+
+
+def converted(
+    signal_dn: np.ndarray, sigma_dn: float | np.ndarray, white_dn: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Return what the converter reads, uint16, of an unclipped signal of the same shape, DN above zero.
+
+    In the order of a real one: Gaussian noise of deviation `sigma_dn` is added, the sum is rounded, then clipped to
+    0..white_dn. A saturated pixel therefore still reads below full scale where its noise is negative enough.
+    """
+    noisy = signal_dn + sigma_dn * rng.standard_normal(signal_dn.shape)
+    return np.clip(np.rint(noisy), 0, white_dn).astype(np.uint16)
 
 
 def bloom(electrons: np.ndarray, full_well_e: float) -> np.ndarray:

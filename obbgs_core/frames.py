@@ -100,6 +100,7 @@ def bracket_numbers(frames: list[TrainingFrame]) -> list[int]:
 class Batches:
     """Draws frames without replacement, one of each exposure in turn when the method asks for brackets.
 
+    white_dn: the sensor's full scale.
     sky: where some of the frames, by index, surely show nothing [H, W] bool.
     exposures: what the tags' exposure times are corrected by, where the method allows them an error.
     """
@@ -107,11 +108,12 @@ class Batches:
     def __init__(
         self,
         frames: list[TrainingFrame],
+        white_dn: float,
         config: MethodConfig,
         rng: torch.Generator,
         sky: dict[int, Tensor] | None = None,
     ):
-        self.frames, self.rng = frames, rng
+        self.frames, self.white_dn, self.rng = frames, white_dn, rng
         self.frames_per_step = min(config.frames_per_step, len(frames))
         self.by_exposure = config.bracket_steps
         self.turn = 0
@@ -161,7 +163,7 @@ class Batches:
         """Return given frames at a scale."""
         factor = round(1 / scale)
         if factor not in self.levels:
-            self.levels[factor] = [_shrunk(f.dn, factor) for f in self.frames]
+            self.levels[factor] = [_shrunk(f.dn, factor, self.white_dn) for f in self.frames]
             self.sky_levels[factor] = self._sky_shares(factor)
         frames = [self.frames[i] for i in indices]
         cameras = cameras_of(frames)
@@ -186,12 +188,11 @@ class Batches:
         return [shares.get(i, nobody_looked) for i in range(len(self.frames))]
 
 
-def _shrunk(dn: Tensor, factor: int) -> Tensor:
-    """Return dn averaged over factor x factor pixels; a block with a saturated pixel stays saturated."""
+def _shrunk(dn: Tensor, factor: int, white_dn: float) -> Tensor:
+    """Return dn averaged over factor x factor pixels; a block with a pixel at full scale is at full scale."""
     if factor == 1:
         return dn
     image = dn.movedim(-1, 0)[None]
     mean = F.avg_pool2d(image, factor, ceil_mode=True)
     largest = F.max_pool2d(image, factor, ceil_mode=True)
-    top = image.max()
-    return torch.where(largest >= top, largest, mean)[0].movedim(0, -1) if top > 0 else mean[0].movedim(0, -1)
+    return torch.where(largest >= white_dn, largest, mean)[0].movedim(0, -1)

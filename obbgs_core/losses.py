@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from obbgs_core import compiled
 from obbgs_core.cameras import Cameras
-from obbgs_core.sensor import Sensor
+from obbgs_core.sensor import Sensor, clipped_moments
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Wang et al. 2004
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
@@ -42,7 +42,7 @@ def likelihood_loss(
         averaged_pixels: sensor pixels averaged into each pixel of dn; the noise is smaller by its root.
 
     Returns:
-        loss: scalar; residual: [B, H, W, C] in sigma, without gradient.
+        loss: scalar; residual: [B, H, W, C], `Sensor.deviance_residual`, without gradient.
 
     Raises:
         ValueError: shapes disagree, or images are smaller than the 3x3 of an edge.
@@ -64,7 +64,7 @@ def likelihood_loss_reference(
     edge_weight: float = 0.0,
 ) -> tuple[Tensor, Tensor]:
     """Return what `likelihood_loss` does, in readable PyTorch."""
-    residual = sensor.normalised_residual(radiance, exposure_time_s, dn) * math.sqrt(averaged_pixels)
+    residual = sensor.deviance_residual(radiance, exposure_time_s, dn, averaged_pixels)
     loss = charbonnier(residual)
     if edge_weight:
         visible = sensor.expected_dn(radiance, exposure_time_s).clamp(max=sensor.white_dn)
@@ -83,7 +83,7 @@ def published_loss(
     """Return (1 - ssim_weight)·L1 + ssim_weight·(1 - SSIM) + edge_weight·Sobel and the residual, as in publications.
 
     The loss of 3DGS (Kerbl et al. 2023) with the edges of Jiang et al. 2025, each a mean over images of which 0 is
-    black and 1 full scale.
+    black and 1 full scale. The prediction is clamped at full scale, as the sensor clamps the readings.
 
     Args:
         radiance, exposure_time_s, dn: as for `likelihood_loss`.
@@ -113,6 +113,9 @@ def published_loss_reference(
     """Return what `published_loss` does, in readable PyTorch."""
     full_scale_dn = sensor.white_dn - sensor.black_dn
     predicted = (sensor.expected_dn(radiance, exposure_time_s) - sensor.black_dn) / full_scale_dn
+    predicted = torch.where(
+        predicted > 1, 1 + 0 * predicted, predicted
+    )  # clamped, but not finite stays not finite
     truth = (dn - sensor.black_dn) / full_scale_dn
     loss = (1 - ssim_weight) * (predicted - truth).abs().mean()
     if ssim_weight:
@@ -133,8 +136,10 @@ def fit_figures(
 ) -> tuple[float, float]:
     """Return how well a step's frames fit: chi² on the target, and PSNR in dB of the prediction clamped at full scale.
 
-    chi² is the mean squared noise-normalised residual (pure noise: 1) where alpha [B, H, W] exceeds 0.05, NaN where it
-    does nowhere. The others are as for `likelihood_loss`.
+    chi² is the squared difference of readings and their expectation over the variance that noise gives them, both
+    summed where alpha [B, H, W] exceeds 0.05: 1 when the model is true, above where it errs, NaN where nothing is seen.
+    Clipped readings vary less than others and count less; where a mean of pixels is saturated it counts as nothing,
+    since some of its pixels need not be. The other arguments are as for `likelihood_loss`.
     """
     native = compiled.module_for(radiance, alpha, exposure_time_s, dn)
     if native is not None:
@@ -142,9 +147,13 @@ def fit_figures(
         images = (image.detach().contiguous() for image in (radiance, alpha, dn))
         chi2, mse = native.fit(*images, gains, model, ON_TARGET_ALPHA, torch.get_num_threads())
     else:
-        residual = sensor.normalised_residual(radiance, exposure_time_s, dn)[alpha > ON_TARGET_ALPHA]
-        chi2 = averaged_pixels * residual.square().mean().item()
-        expected = sensor.expected_dn(radiance, exposure_time_s).clamp(max=sensor.white_dn)
+        expected = sensor.expected_dn(radiance, exposure_time_s)
+        noise = sensor.variance_dn2(expected)
+        mean, variance = clipped_moments(expected, noise.sqrt(), sensor.white_dn)
+        seen = (alpha > ON_TARGET_ALPHA)[..., None] & ((averaged_pixels == 1) | (dn < sensor.white_dn))
+        squares = averaged_pixels * ((mean - dn).square() / noise)[seen].sum()
+        chi2 = (squares / (variance / noise)[seen].sum()).item()
+        expected = expected.clamp(max=sensor.white_dn)
         mse = ((expected - dn) / sensor.white_dn).square().mean().item()
     return chi2, -10 * math.log10(max(mse, 1e-12))
 

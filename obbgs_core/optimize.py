@@ -134,7 +134,7 @@ class Trainer:
         self.adam = Adam(self.gaussians)
         self.growth = Growth(len(self.gaussians), config.pixel_weighted)
         sky = {i: outline.sky for i, outline in outlines.items()} if config.sky_weight else None
-        self.batches = Batches(self.frames, config, self.rng, sky)
+        self.batches = Batches(self.frames, sensor.white_dn, config, self.rng, sky)
         self.grow_until, self.growth_ended = config.grow_until, "as configured"
         self.best: tuple[float, Tensor] | None = None  # image scale and losses of the held-out brackets
         self.intervals_since_best = 0

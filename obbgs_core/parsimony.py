@@ -58,7 +58,7 @@ def next_degree_gain(
     slope, curvature, shared = (torch.zeros_like(model.sh) for _ in range(3))
     values, times = 0, 0.0
     for view in _views(model, batches, sensor, scale, rng):
-        residual = ((view.dn - view.predicted.detach()) * view.weight).clamp(-3, 3)  # robust, as the loss is
+        residual = view.residual.clamp(-3, 3)  # robust, as the loss is
         signal = view.predicted * view.weight
         (g,) = torch.autograd.grad((signal * residual).sum(), model.sh, retain_graph=True)
         (probe,) = torch.autograd.grad((signal * view.signs).sum(), model.sh)
@@ -80,7 +80,7 @@ class _View:
     """One training frame as the model predicts it [1, H, W, C], with random signs to probe the likelihood with."""
 
     predicted: Tensor  # DN, with its graph
-    dn: Tensor
+    residual: Tensor  # (read - expected) / deviation of the reading: mean 0 where the model is true
     weight: Tensor  # 1 / sigma, 0 where saturated: such pixels measure nothing
     signs: Tensor
     values: int  # sensor values that show the target above the noise
@@ -94,12 +94,15 @@ def _views(
     chosen = range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS))
     for index in chosen:
         batch = batches.batch([index], scale)
-        predicted = sensor.expected_dn(render(model, batch.cameras).radiance, batch.exposure_time_s)
+        radiance = render(model, batch.cameras).radiance
+        predicted = sensor.expected_dn(radiance, batch.exposure_time_s)
+        residual = -sensor.normalised_residual(radiance.detach(), batch.exposure_time_s, batch.dn)
+        residual *= math.sqrt(batch.averaged_pixels)
         sigma = (sensor.variance_dn2(predicted) / batch.averaged_pixels).sqrt()
         weight = torch.where(batch.dn < sensor.white_dn, 1 / sigma, 0.0)
         signs = torch.randint(0, 2, predicted.shape, generator=rng) * 2.0 - 1
         values = int((predicted.detach() - sensor.black_dn > sigma).sum()) * batch.averaged_pixels
-        yield _View(predicted, batch.dn, weight, signs, values, len(batches.frames) / len(chosen))
+        yield _View(predicted, residual, weight, signs, values, len(batches.frames) / len(chosen))
 
 
 def padded(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+HALF_DN = 0.5  # a reading of 0 is of a signal that rounds to 0 or less
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -33,16 +35,42 @@ class Sensor:
         return signal_dn / self.electrons_per_dn + self.read_noise_dn**2 + 1 / 12
 
     def normalised_residual(self, radiance: Tensor, exposure_time_s: float | Tensor, dn: Tensor) -> Tensor:
-        """Return (predicted - read) / sigma with the sensor's limits respected.
+        """Return (expected reading - reading) / deviation of the reading: mean 0 and variance 1 for a true radiance.
 
-        Where the reading is saturated it says only "at least this much": a brighter prediction has no residual. Near
-        zero the prediction is the mean of a reading clipped at zero (0.4 sigma for no light on a sensor without black
-        level).
+        Mean and deviation are those of the clipped reading. Far beyond a clip the reading is certain, and its deviation
+        is taken for a thousandth of the noise, so that the residual stays finite; `fit_figures` weighs such pixels by
+        what their readings can tell.
         """
         expected = self.expected_dn(radiance, exposure_time_s)
         sigma = self.variance_dn2(expected).sqrt()
-        residual = clipped_mean(expected, sigma) - dn
-        return torch.where(dn >= self.white_dn, residual.clamp(max=0), residual) / sigma
+        mean, variance = clipped_moments(expected, sigma, self.white_dn)
+        return (mean - dn) / (variance.sqrt() + 1e-3 * sigma * (variance < 1e-6 * sigma**2))
+
+    def deviance_residual(
+        self, radiance: Tensor, exposure_time_s: float | Tensor, dn: Tensor, averaged_pixels: int = 1
+    ) -> Tensor:
+        """Return the signed root of twice the negative log-likelihood of each reading; positive: predicted too bright.
+
+        A reading is a normal variable clipped at zero and at full scale (Tobin 1958). Between the clips the residual is
+        (predicted - read) / sigma. A reading at a clip says only "at most this much" or "at least this much": its
+        likelihood is the probability of lying beyond the clip, and a prediction far beyond has no residual.
+
+        A mean of several sensor pixels is no clipped normal variable: its expectation is that of readings clipped at
+        zero, its noise is smaller by the root of their number, and a saturated one is fitted by all that is brighter.
+
+        Source: Tobin, Estimation of relationships for limited dependent variables, 1958.
+        """
+        expected = self.expected_dn(radiance, exposure_time_s)
+        sigma = self.variance_dn2(expected).sqrt()
+        saturated = dn >= self.white_dn
+        if averaged_pixels > 1:
+            residual = (clipped_mean(expected, sigma) - dn) / sigma * math.sqrt(averaged_pixels)
+            return torch.where(saturated, residual.clamp(max=0), residual)
+        beyond = torch.where(saturated, expected - (self.white_dn - HALF_DN), HALF_DN - expected) / sigma
+        # the root has no slope at 0, where the likelihood is 1: one rounding keeps it away
+        deviance = (-2 * torch.special.log_ndtr(beyond) + 1e-15).sqrt()
+        at_a_clip = torch.where(saturated, -deviance, deviance)
+        return torch.where(saturated | (dn <= 0), at_a_clip, (expected - dn) / sigma)
 
     def stabilised(self, dn: Tensor) -> Tensor:
         """Return readings on a scale where noise has unit variance everywhere, 0 where no light is.
@@ -59,5 +87,25 @@ class Sensor:
 def clipped_mean(mean: Tensor, sigma: Tensor) -> Tensor:
     """Return the mean of max(x, 0) for x normal: mean·Phi(mean/sigma) + sigma·phi(mean/sigma)."""
     z = mean / sigma
-    density = torch.exp(-0.5 * z.clamp(-9, 9) ** 2) / math.sqrt(2 * math.pi)
-    return mean * torch.special.ndtr(z) + sigma * density
+    return mean * torch.special.ndtr(z) + sigma * _density(z)
+
+
+def clipped_moments(mean: Tensor, sigma: Tensor, most: float) -> tuple[Tensor, Tensor]:
+    """Return mean and variance of min(max(x, 0), most) for x normal with `mean` and deviation `sigma`."""
+    low, high = -mean / sigma, (most - mean) / sigma  # the clips, in deviations from the mean
+    below, above = torch.special.ndtr(low), torch.special.ndtr(-high)
+    lifted, lowered = (
+        low * below + _density(low),
+        _density(high) - high * above,
+    )  # means of what each clip cuts off
+    inside = (
+        1 - below - above + low * _density(low) - high * _density(high)
+    )  # second moment between the clips
+    shift = lifted - lowered
+    variance = (inside + low**2 * below + high**2 * above - shift**2).clamp(min=0)
+    return (mean + sigma * shift).clamp(0, most), sigma**2 * variance
+
+
+def _density(z: Tensor) -> Tensor:
+    """Return the density of the standard normal distribution."""
+    return torch.exp(-0.5 * z.clamp(-12, 12) ** 2) / math.sqrt(2 * math.pi)

@@ -14,6 +14,7 @@ namespace obbgs {
 constexpr int kReach = 5, kTaps = 2 * kReach + 1;  // SSIM window of Wang et al. 2004: 11 pixels, sigma 1.5
 constexpr float kSsimC1 = 1e-4f, kSsimC2 = 9e-4f;  // (0.01)^2, (0.03)^2
 constexpr float kKnee = 2;                         // of the Charbonnier penalty, sigma
+constexpr float kHalfDn = 0.5f;                    // a reading of 0 is of a signal that rounds to 0 or less
 
 struct SensorModel {
   float black, white, dn_per_electron, electrons_per_dn;
@@ -57,7 +58,39 @@ inline float scaled_erfc(float u) {
   return p * t + 1.70917133e-4f;
 }
 
-// Noise-normalised residual of one row, its robust penalty (added to `penalty`), and d penalty / d radiance.
+// log(x) for 0 < x < 1e30, of x and x - 1 (which may be known more exactly), relative error 2e-7: the series of atanh
+// of a mantissa in 0.7 .. 1.4.
+inline float log_positive(float x, float x_minus_1) {
+  int32_t bits;
+  std::memcpy(&bits, &x, sizeof bits);
+  const int32_t exponent = (bits - 0x3f3504f3) >> 23;  // of x over the root of one half
+  bits -= exponent << 23;
+  float m;
+  std::memcpy(&m, &bits, sizeof m);
+  const float s = (exponent == 0 ? x_minus_1 : m - 1.0f) / (m + 1.0f), w = s * s;
+  float p = w * 0.111111111f + 0.142857143f;
+  p = p * w + 0.2f;
+  p = p * w + 0.333333333f;
+  return 2.0f * s * (p * w + 1.0f) + float(exponent) * 0.693147181f;
+}
+
+// The normal distribution at z: its density, and Phi(-|z|) with 0 beyond 9.
+struct Normal { float density, tail; };
+inline Normal normal(float z) {
+  float u = std::fabs(z) * 0.707106781f;
+  u = u > 6.36396103f ? 6.36396103f : u;
+  const float bell = exp_negative(-u * u);
+  return {0.39894228f * bell, u < 6.36396103f ? 0.5f * bell * scaled_erfc(u) : 0.0f};
+}
+
+// Robust penalty of a squared residual: knee^2 (q - 1) without the cancellation, q = sqrt(1 + (r / knee)^2).
+inline float charbonnier(float squared, float& q) {
+  q = std::sqrt(1.0f + squared * (1.0f / (kKnee * kKnee)));
+  return squared / (q + 1.0f);
+}
+
+// Deviance residual of one row of sensor pixels, its robust penalty (added to `penalty`), and d penalty / d radiance.
+// A reading at a clip has the probability Phi(b) of lying beyond it, b: the prediction's distance from it in sigma.
 void likelihood_row(int n, const float* __restrict radiance, const float* __restrict dn, float gain,
                     const SensorModel s, float* __restrict residual, float* __restrict penalty,
                     float* __restrict slope) {
@@ -65,19 +98,72 @@ void likelihood_row(int n, const float* __restrict radiance, const float* __rest
     const float signal = gain * radiance[x], expected = s.black + signal;
     const float variance = (signal > 0 ? signal : 0) * s.dn_per_electron + s.read_variance;
     const float inverse_sigma = 1.0f / std::sqrt(variance);
-    float z = expected * inverse_sigma;
-    z = z < -9.0f ? -9.0f : z;
-    z = z > 9.0f ? 9.0f : z;
-    const float u = std::fabs(z) * 0.707106781f;
-    const float bell = exp_negative(-u * u), tail = 0.5f * bell * scaled_erfc(u);
-    const float below = z < 0 ? tail : 1.0f - tail;  // Phi(z): also d clipped mean / d expected
-    float r = (expected * below - dn[x]) * inverse_sigma + 0.39894228f * bell;
-    const bool censored = dn[x] >= s.white && r > 0;  // "at least this much": a brighter prediction is no error
+    const bool saturated = dn[x] >= s.white, clipped = saturated || dn[x] <= 0;
+    const float b = (saturated ? expected - (s.white - kHalfDn) : kHalfDn - expected) * inverse_sigma;
+    // -2 log Phi(b) and phi(b) / Phi(b), by the tail over its bell where Phi is small; past 9 sigma the tail's asymptote
+    float u = std::fabs(b) * 0.707106781f;
+    u = u > 6.36396103f ? 6.36396103f : u;
+    const float bell = exp_negative(-u * u), i = 1.0f / (b * b + 1e-6f);
+    const float asymptote = 0.39894228f * std::sqrt(i) * (1.0f - i * (1.0f - 3.0f * i * (1.0f - 5.0f * i)));
+    const float scaled = b < -9.0f ? asymptote : 0.5f * scaled_erfc(u);
+    const float phi = b < 0 ? scaled : 1.0f - bell * scaled;  // over the bell below zero
+    const float phi_minus_1 = b < 0 ? scaled - 1.0f : -bell * scaled;
+    const float deviance = (b < 0 ? b * b : 0.0f) - 2.0f * log_positive(phi, phi_minus_1);
+    const float hazard = 0.39894228f * (b < 0 ? 1.0f : bell) / phi;
+    const float z = (expected - dn[x]) * inverse_sigma;
+    const float squared = clipped ? (deviance > 0 ? deviance : 0.0f) + 0 * z : z * z;  // NaN stays NaN
+    float q;
+    penalty[x] += charbonnier(squared, q);
+    const float root = std::sqrt(squared);
+    residual[x] = clipped ? (saturated ? -root : root) : z;
+    slope[x] = (clipped ? (saturated ? -hazard : hazard) : z) / q * inverse_sigma * gain;
+  }
+}
+
+// The same for means of several sensor pixels: expectation of readings clipped at zero, normal noise, saturated means
+// fitted by any brighter prediction.
+void averaged_likelihood_row(int n, const float* __restrict radiance, const float* __restrict dn, float gain,
+                             const SensorModel s, float* __restrict residual, float* __restrict penalty,
+                             float* __restrict slope) {
+  for (int x = 0; x < n; ++x) {
+    const float signal = gain * radiance[x], expected = s.black + signal;
+    const float variance = (signal > 0 ? signal : 0) * s.dn_per_electron + s.read_variance;
+    const float inverse_sigma = 1.0f / std::sqrt(variance);
+    const float z = expected * inverse_sigma;
+    const Normal at_zero = normal(z);
+    const float below = z < 0 ? at_zero.tail : 1.0f - at_zero.tail;  // also d clipped mean / d expected
+    float r = (expected * below - dn[x]) * inverse_sigma + at_zero.density;
+    const bool censored = dn[x] >= s.white && r > 0;
     r = censored ? 0.0f : r * s.root_averaged;
-    const float q = std::sqrt(1.0f + r * r * (1.0f / (kKnee * kKnee)));
+    float q;
+    penalty[x] += charbonnier(r * r, q);
     residual[x] = r;
-    penalty[x] += r * r / (q + 1.0f);  // knee^2 (q - 1) without the cancellation
     slope[x] = censored ? 0.0f : r / q * below * inverse_sigma * gain * s.root_averaged;
+  }
+}
+
+// Squared differences of readings and their expectation, and the variance of the readings, both over that of the
+// noise, times `seen` (0 or 1). A mean of several pixels that is saturated counts as nothing.
+void chi2_row(int n, const float* __restrict radiance, const float* __restrict dn, const float* __restrict seen,
+              float gain, const SensorModel s, float* __restrict squares, float* __restrict variances) {
+  for (int x = 0; x < n; ++x) {
+    const float signal = gain * radiance[x], expected = s.black + signal;
+    const float variance = (signal > 0 ? signal : 0) * s.dn_per_electron + s.read_variance;
+    const float inverse_sigma = 1.0f / std::sqrt(variance);
+    const float low = -expected * inverse_sigma, high = (s.white - expected) * inverse_sigma;
+    const Normal at_low = normal(low), at_high = normal(high);
+    const float below = low < 0 ? at_low.tail : 1.0f - at_low.tail;
+    const float above = high > 0 ? at_high.tail : 1.0f - at_high.tail;
+    const float lifted = low * below + at_low.density, lowered = at_high.density - high * above;
+    const float shift = lifted - lowered;
+    const float inside = 1.0f - below - above + low * at_low.density - high * at_high.density;
+    float spread = inside + low * low * below + high * high * above - shift * shift;
+    spread = (below >= 1.0f || above >= 1.0f || spread < 0) ? 0.0f : spread;  // certain: beyond a clip
+    float r = (expected - dn[x]) * inverse_sigma + shift;
+    r = above >= 1.0f ? (s.white - dn[x]) * inverse_sigma : (below >= 1.0f ? -dn[x] * inverse_sigma : r);
+    const float counts = s.root_averaged == 1.0f || dn[x] < s.white ? seen[x] : 0.0f;
+    squares[x] += counts * r * r;
+    variances[x] += counts * spread;
   }
 }
 
@@ -183,23 +269,33 @@ void ssim_row(int n, int c, const Window w, const float* __restrict column_a, co
   }
 }
 
-// gradient += scale * d SSIM / d a, from the three slopes summed down the columns.
-void ssim_gradient_row(int n, int c, const Window w, float scale, const float* __restrict by_mean,
-                       const float* __restrict by_squares, const float* __restrict by_product,
-                       const float* __restrict a, const float* __restrict b, float* __restrict gradient) {
+// gradient += scale * slope * d SSIM / d a, from the three slopes of SSIM summed down the columns.
+void ssim_gradient_row(int n, int c, const Window w, float scale, const float* __restrict slope,
+                       const float* __restrict by_mean, const float* __restrict by_squares,
+                       const float* __restrict by_product, const float* __restrict a, const float* __restrict b,
+                       float* __restrict gradient) {
   for (int x = 0; x < n; ++x)
-    gradient[x] += scale * (blur_along(by_mean + x, c, w) + 2 * a[x] * blur_along(by_squares + x, c, w) +
-                            b[x] * blur_along(by_product + x, c, w));
+    gradient[x] += scale * slope[x] * (blur_along(by_mean + x, c, w) + 2 * a[x] * blur_along(by_squares + x, c, w) +
+                                       b[x] * blur_along(by_product + x, c, w));
 }
 
-// difference = a - b; its size goes to `sums`; gradient = scale * sign(difference).
-void absolute_row(int n, float scale, const float* __restrict a, const float* __restrict b,
+// difference = a - b; its size goes to `sums`; gradient = sign(difference) * slope.
+void absolute_row(int n, const float* __restrict slope, const float* __restrict a, const float* __restrict b,
                   float* __restrict difference, float* __restrict sums, float* __restrict gradient) {
   for (int x = 0; x < n; ++x) {
     const float d = a[x] - b[x];
     difference[x] = d;
     sums[x] += std::fabs(d);
-    gradient[x] = scale * sign(d);
+    gradient[x] = sign(d) * slope[x];
+  }
+}
+
+// A prediction row * gain clamped at 1, and `slope`: its derivative by the row. What is not finite becomes NaN.
+void clamped_row(int n, const float* __restrict row, float gain, float* __restrict clamped, float* __restrict slope) {
+  for (int x = 0; x < n; ++x) {
+    const float value = row[x] * gain;
+    clamped[x] = value > 1.0f ? 1.0f + 0 * value : value;
+    slope[x] = value > 1.0f ? 0.0f : gain;
   }
 }
 
@@ -237,9 +333,10 @@ void adam_block(size_t n, float* __restrict parameter, const float* __restrict g
 
 // Every loop above that is called from elsewhere.
 #define OBBGS_ROW_LOOPS(each) \
-  each(likelihood_row) each(stabilised_row) each(difference_row) each(sobel_row) each(sobel_gradient_row) \
-  each(blur_down_products) each(blur_down) each(ssim_row) each(ssim_gradient_row) each(absolute_row) \
-  each(scaled_row) each(scale_row) each(squared_error_row) each(adam_block)
+  each(likelihood_row) each(averaged_likelihood_row) each(chi2_row) each(stabilised_row) \
+  each(difference_row) each(sobel_row) each(sobel_gradient_row) each(blur_down_products) each(blur_down) \
+  each(ssim_row) each(ssim_gradient_row) each(absolute_row) each(clamped_row) each(scaled_row) \
+  each(scale_row) each(squared_error_row) each(adam_block)
 
 struct RowLoops {  // the loops as one instruction set has them; rows.cpp fills it
 #define OBBGS_MEMBER(name) decltype(&rows::name) name;

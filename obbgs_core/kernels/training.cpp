@@ -97,9 +97,9 @@ Window gaussian_window() {
   return w;
 }
 
-// Adds scale * d SSIM / d a to the band's rows of `gradient` (when there is one); returns the sum of 1 - SSIM.
-// a and b hold the image's rows as far as the band's windows reach.
-double ssim_band(const Shape& shape, const Band& band, float scale, Rows& a, Rows& b, float* gradient) {
+// Adds scale * slope * d SSIM / d a to the band's rows of `gradient` (when there is one); returns the sum of 1 - SSIM.
+// a and b hold the image's rows as far as the band's windows reach; slope: of a by radiance.
+double ssim_band(const Shape& shape, const Band& band, float scale, Rows& a, Rows& slope, Rows& b, float* gradient) {
   static const Window w = gaussian_window();
   const int n = shape.row(), c = shape.channels, reach = gradient ? kReach : 0;
   const int first = std::max(band.begin - reach, 0), last = std::min(band.end + reach, shape.height);
@@ -128,7 +128,8 @@ double ssim_band(const Shape& shape, const Band& band, float scale, Rows& a, Row
       }
       loops->blur_down(n, w, rows_a, columns[s]);
     }
-    loops->ssim_gradient_row(n, c, w, scale, columns[0], columns[1], columns[2], a[y], b[y], gradient + size_t(y) * n);
+    loops->ssim_gradient_row(n, c, w, scale, slope[y], columns[0], columns[1], columns[2], a[y], b[y],
+                             gradient + size_t(y) * n);
   }
   return total(inside);
 }
@@ -147,7 +148,7 @@ void expect(const Array& array, const char* name, size_t count) {
                                 std::to_string(array.size()));
 }
 
-// Mean Charbonnier penalty of the noise-normalised residual + edge_weight * mean Sobel difference, stabilised scale.
+// Mean Charbonnier penalty of the deviance residual + edge_weight * mean Sobel difference, stabilised scale.
 double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, double edge_weight, Array residual,
                   std::optional<Array> gradient, int threads) {
   const Shape shape = shape_of(radiance, "radiance");
@@ -158,6 +159,7 @@ double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, d
   const float *r = radiance.data(), *d = dn.data(), *gain = gains.data();
   float *out = residual.data(), *g = gradient ? gradient->data() : nullptr;
   const double scale = 1 / shape.values(), edge_scale = edge_weight / shape.edges();
+  const auto row = s.root_averaged > 1 ? loops->averaged_likelihood_row : loops->likelihood_row;
   nb::gil_scoped_release release;
   return sum_over_bands(shape, threads, [&](const Band& band) {
     const int n = shape.row();
@@ -167,7 +169,7 @@ double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, d
     for (int y = band.begin; y < band.end; ++y) {
       const size_t at = image + size_t(y) * n;
       float* slope = g ? g + at : unwanted.data();
-      loops->likelihood_row(n, r + at, d + at, t, s, out + at, penalty.data(), slope);
+      row(n, r + at, d + at, t, s, out + at, penalty.data(), slope);
       loops->scale_row(n, float(scale), slope);
     }
     double sum = scale * total(penalty);
@@ -182,7 +184,7 @@ double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, d
 }
 
 // (1 - ssim_weight) * mean |a - b| + ssim_weight * (1 - mean SSIM) + edge_weight * mean Sobel difference, where a is
-// the prediction and b the reading, in full scales above black; the residual is a - b.
+// the prediction clamped at 1 and b the reading, in full scales above black; the residual is a - b.
 double published(Array radiance, Array dn, Array gains, const SensorModel& s, double ssim_weight, double edge_weight,
                  Array residual, std::optional<Array> gradient, int threads) {
   const Shape shape = shape_of(radiance, "radiance");
@@ -198,41 +200,43 @@ double published(Array radiance, Array dn, Array gains, const SensorModel& s, do
   return sum_over_bands(shape, threads, [&](const Band& band) {
     const int n = shape.row();
     const size_t image = band.image * shape.image();
-    const float per_dn = 1 / (s.white - s.black), slope = gain[band.image] * per_dn;  // of a by radiance
+    const float per_dn = 1 / (s.white - s.black);
     const int first = std::max(band.begin - 2 * kReach, 0), last = std::min(band.end + 2 * kReach, shape.height);
-    Rows a(first, last, n), b(first, last, n);
+    Rows a(first, last, n), slope(first, last, n), b(first, last, n);  // slope: of a by radiance
     for (int y = first; y < last; ++y) {
-      loops->scaled_row(n, r + image + size_t(y) * n, 0, slope, a[y]);
+      loops->clamped_row(n, r + image + size_t(y) * n, gain[band.image] * per_dn, a[y], slope[y]);
       loops->scaled_row(n, d + image + size_t(y) * n, s.black, per_dn, b[y]);
     }
     float* image_gradient = g ? g + image : nullptr;
     std::vector<float> sums(n, 0.0f), unwanted(n);
     for (int y = band.begin; y < band.end; ++y) {
       const size_t at = image + size_t(y) * n;
-      loops->absolute_row(n, float(l1_scale * slope), a[y], b[y], out + at, sums.data(), g ? g + at : unwanted.data());
+      float* by_radiance = g ? g + at : unwanted.data();
+      loops->absolute_row(n, slope[y], a[y], b[y], out + at, sums.data(), by_radiance);
+      loops->scale_row(n, float(l1_scale), by_radiance);
     }
     double sum = l1_scale * total(sums);
     if (ssim_weight != 0)
-      sum += ssim_scale * ssim_band(shape, band, float(-ssim_scale * slope), a, b, image_gradient);
+      sum += ssim_scale * ssim_band(shape, band, float(-ssim_scale), a, slope, b, image_gradient);
     if (edge_weight != 0)
-      sum += edge_scale * edge_band(shape, band, float(edge_scale * slope), image_gradient,
-                                    [&](int y, float* difference, float* by_a) {
+      sum += edge_scale * edge_band(shape, band, float(edge_scale), image_gradient,
+                                    [&](int y, float* difference, float* by_radiance) {
                                       loops->difference_row(n, a[y], b[y], difference);
-                                      std::fill_n(by_a, n, 1.0f);
+                                      std::copy_n(slope[y], n, by_radiance);
                                     });
     return sum;
   });
 }
 
 struct Fit {
-  double squares = 0, values = 0, error = 0;  // of residuals on the target, their number, squared error everywhere
+  double squares = 0, variances = 0, error = 0;  // see chi2_row; squared error everywhere
   Fit operator+(const Fit& other) const {
-    return {squares + other.squares, values + other.values, error + other.error};
+    return {squares + other.squares, variances + other.variances, error + other.error};
   }
 };
 
-// Mean squared noise-normalised residual where alpha > least_alpha (NaN where that is nowhere), and mean squared error
-// everywhere, full scale 1.
+// chi^2 where alpha > least_alpha (see chi2_row; NaN where that is nowhere), and mean squared error everywhere, full
+// scale 1.
 std::pair<double, double> fit(Array radiance, Array alpha, Array dn, Array gains, const SensorModel& s,
                               float least_alpha, int threads) {
   const Shape shape = shape_of(radiance, "radiance");
@@ -243,8 +247,7 @@ std::pair<double, double> fit(Array radiance, Array alpha, Array dn, Array gains
   nb::gil_scoped_release release;
   const Fit sum = sum_over_bands<Fit>(shape, threads, [&](const Band& band) {
     const int n = shape.row(), c = shape.channels;
-    std::vector<float> errors(n, 0.0f), residual(n), penalty(n, 0.0f), slope(n);
-    Fit part;
+    std::vector<float> errors(n, 0.0f), squares(n, 0.0f), variances(n, 0.0f), seen(n);
     for (int y = band.begin; y < band.end; ++y) {
       const size_t at = band.image * shape.image() + size_t(y) * n;
       loops->squared_error_row(n, r + at, d + at, gain[band.image], s, errors.data());
@@ -252,18 +255,14 @@ std::pair<double, double> fit(Array radiance, Array alpha, Array dn, Array gains
       int x0 = 0, x1 = shape.width;  // the part of the row that may hold target
       while (x0 < x1 && !(row[x0] > least_alpha)) ++x0;
       while (x0 < x1 && !(row[x1 - 1] > least_alpha)) --x1;
-      loops->likelihood_row((x1 - x0) * c, r + at + x0 * c, d + at + x0 * c, gain[band.image], s, residual.data(),
-                            penalty.data(), slope.data());
-      for (int x = x0; x < x1; ++x) {
-        if (!(row[x] > least_alpha)) continue;
-        part.values += c;
-        for (int k = (x - x0) * c; k < (x - x0 + 1) * c; ++k) part.squares += double(residual[k]) * residual[k];
-      }
+      for (int x = x0; x < x1; ++x) std::fill_n(seen.begin() + x * c, c, row[x] > least_alpha ? 1.0f : 0.0f);
+      loops->chi2_row((x1 - x0) * c, r + at + x0 * c, d + at + x0 * c, seen.data() + x0 * c, gain[band.image], s,
+                      squares.data(), variances.data());
     }
-    part.error = total(errors);
-    return part;
+    return Fit{total(squares), total(variances), total(errors)};
   });
-  return {sum.squares / sum.values, sum.error / shape.values()};
+  const double averaged = double(s.root_averaged) * s.root_averaged;
+  return {averaged * sum.squares / sum.variances, sum.error / shape.values()};
 }
 
 // One Adam step of one parameter, in place; rate already holds the bias correction.

@@ -1,12 +1,12 @@
 """What each ingredient is worth, one taken away (or added) at a time: python -m tests.benchmarks.ablation"""
 
 import argparse
-import json
 
 import torch
 
 from tests.benchmarks import targets
 from tests.benchmarks.methods import configure, measure
+from tests.benchmarks.rows import shown
 
 OURS: dict[str, dict] = {
     "as it is": {},
@@ -59,10 +59,7 @@ def main() -> None:
                 continue
             config = configure(arguments.method, arguments.steps_share, **changes)
             row = {"method": arguments.method, "ablation": name} | measure(config, target, 0)
-            print(
-                json.dumps(row) if arguments.json else "  ".join(f"{k} {v}" for k, v in row.items()),
-                flush=True,
-            )
+            print(shown(row, "ablation", arguments.json), flush=True)
 
 
 if __name__ == "__main__":

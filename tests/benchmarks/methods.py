@@ -15,6 +15,7 @@ import torch
 from obbgs_core.methods import PRESETS, preset
 from obbgs_core.optimize import Trainer
 from tests.benchmarks import targets
+from tests.benchmarks.rows import shown
 
 CURVE_STEPS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)  # shares of the steps
 
@@ -127,12 +128,11 @@ def main() -> None:
             if not name.startswith("obbgs") and arguments.published_share is not None:
                 share = arguments.published_share
             for seed in range(arguments.seeds):
-                row = {"method": name} | measure(
-                    configure(name, share), target, seed, arguments.curve or arguments.chart is not None
-                )
+                curve = arguments.curve or arguments.chart is not None
+                figures = measure(configure(name, share), target, seed, curve)
+                row = {"method": name, "size": arguments.size, "steps_share": share} | figures
                 rows.append(row)
-                text = "  ".join(f"{k} {v}" for k, v in row.items() if k != "curve")
-                print(json.dumps(row) if arguments.json else text, flush=True)
+                print(shown(row, "methods", arguments.json), flush=True)
     if arguments.chart is not None:
         draw(rows, arguments.chart)
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from ground.session import SessionError
+from hil.sensor import converted
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.metrics import psnr_db
@@ -66,8 +67,9 @@ def in_eclipse(target: targets.Target, first: float, last: float) -> targets.Tar
     rng, count = np.random.default_rng(0), len(target.training)
 
     def dark(frame: TrainingFrame) -> TrainingFrame:
-        noise = rng.normal(0, target.sensor.read_noise_dn, tuple(frame.dn.shape))
-        return dataclasses.replace(frame, dn=torch.from_numpy(np.clip(np.round(noise), 0, 255)).float())
+        unlit = np.full(tuple(frame.dn.shape), target.sensor.black_dn)
+        dn = converted(unlit, target.sensor.read_noise_dn, target.sensor.white_dn, rng)
+        return dataclasses.replace(frame, dn=torch.from_numpy(dn.astype(np.float32)))
 
     frames = [dark(f) if first <= i / count < last else f for i, f in enumerate(target.training)]
     return dataclasses.replace(target, training=frames)

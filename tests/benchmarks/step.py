@@ -12,9 +12,11 @@ from contextlib import ExitStack
 from dataclasses import replace
 from unittest.mock import patch
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from hil.sensor import converted
 from obbgs_core import optimize
 from obbgs_core.cameras import Cameras
 from obbgs_core.densify import Adam, trainable
@@ -105,7 +107,7 @@ class StepClock:
 
 def frames(distance: float) -> list[TrainingFrame]:
     """Return twelve noisy frames of the rasterizer benchmark's scene, seen along +z and turned about y."""
-    g = torch.Generator().manual_seed(0)
+    rng = np.random.default_rng(0)
     truth, front = scene(GAUSSIANS), camera(WIDTH_PX, distance)
     out = []
     for index in range(12):
@@ -117,8 +119,8 @@ def frames(distance: float) -> list[TrainingFrame]:
         with torch.no_grad():
             seen = render(truth, Cameras(pose[None], front.K, WIDTH_PX, WIDTH_PX)).radiance[0]
             expected = SENSOR.expected_dn(seen, exposure_s)
-            noise = torch.randn(expected.shape, generator=g) * SENSOR.variance_dn2(expected).sqrt()
-        dn = (expected + noise).round().clamp(0, SENSOR.white_dn)
+        sigma_dn = SENSOR.variance_dn2(expected).sqrt().numpy()
+        dn = torch.from_numpy(converted(expected.numpy(), sigma_dn, SENSOR.white_dn, rng).astype(np.float32))
         out.append(TrainingFrame(dn, exposure_s, pose, front.K[0], index))
     return out
 

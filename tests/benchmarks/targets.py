@@ -18,6 +18,7 @@ from torch import Tensor
 from ground.evaluate import Truth
 from ground.reconstruct import exposed, sensor_of, split, training_frame
 from ground.session import open_session
+from hil.sensor import converted
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.metrics import cloud_distances, psnr_db, ssim
@@ -60,7 +61,7 @@ def load(
     seed: int = 0,
     exposure_error: float = 0.0,
 ) -> Target:
-    """Return a target seen by an 8-bit camera of the paper: Gaussian noise of `sigma` (full scale 1), clipped.
+    """Return a target seen by an 8-bit camera of the paper: Gaussian noise of `sigma` (full scale 1), then clipped.
 
     Args:
         size: pixels along a side; 400, or 200 and 100 by averaging.
@@ -93,14 +94,12 @@ def load(
         exposure_s = bracket_s[i % len(bracket_s)]
         kept = i % HELD_OUT == HELD_OUT - 1
         longer = 1.0 if kept else float(np.exp(shutter.normal(0, exposure_error)))
-        exact = (radiance[i] * gain * exposure_s * longer).clamp(0, 1)
-        shape = tuple(exact.shape)
-        noisy = exact.numpy() + noise.normal(0, sigma, shape)
-        dn = torch.from_numpy(np.clip(np.round(noisy * 255), 0, 255).astype(np.float32))
-        frame = TrainingFrame(dn, exposure_s, poses[i], K, i)
+        signal = radiance[i] * gain * exposure_s * longer  # full scale = 1, not clipped yet
+        dn = converted(255 * signal.double().numpy(), 255 * sigma, 255, noise)
+        frame = TrainingFrame(torch.from_numpy(dn.astype(np.float32)), exposure_s, poses[i], K, i)
         if kept:
             held_out.append(frame)
-            clean.append(exact)
+            clean.append(signal.clamp(0, 1))
             covers.append(alpha[i])
         else:
             training.append(frame)

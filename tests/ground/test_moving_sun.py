@@ -244,7 +244,9 @@ def test_light_that_follows_the_sun_asks_for_its_harmonics_and_constant_light_do
     lit.sh[:, 0] = 2.0
     plain = dataclasses.replace(lit, sh=lit.sh[:, :1])
     for truth, spread_deg, pays in ((lit, 60, True), (plain, 60, False), (plain, 8, False)):
-        batches = Batches(shown(truth, spread_deg), preset("obbgs"), torch.Generator().manual_seed(0))
+        batches = Batches(
+            shown(truth, spread_deg), SENSOR.white_dn, preset("obbgs"), torch.Generator().manual_seed(0)
+        )
         gain, cost = next_degree_gain(plain, batches, SENSOR, 1.0, torch.Generator().manual_seed(0))
         assert (gain > cost) == pays, (gain, cost)
 

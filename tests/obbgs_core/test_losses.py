@@ -3,9 +3,11 @@
 import cv2
 import numpy as np
 import pytest
+import scipy.stats
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from hil.sensor import converted
 from obbgs_core import compiled
 from obbgs_core.losses import (
     charbonnier,
@@ -91,15 +93,21 @@ def test_charbonnier_is_half_the_square_for_noise_and_linear_for_outliers():
     ).item() == pytest.approx(2, rel=1e-2)
 
 
+def read_out(radiance: torch.Tensor, exposures_s: torch.Tensor, sensor: Sensor, seed: int) -> torch.Tensor:
+    """Return what the sensor reads of a radiance: the noise of our own model through the simulator's converter."""
+    expected = sensor.expected_dn(radiance.double(), exposures_s)
+    sigma_dn = (sensor.variance_dn2(expected) - 1 / 12).sqrt().numpy()  # rounding adds its own twelfth
+    dn = converted(expected.numpy(), sigma_dn, sensor.white_dn, np.random.default_rng(seed))
+    return torch.from_numpy(dn.astype(np.float32))
+
+
 def bracket(sensor: Sensor, height: int = 47, width: int = 53, channels: int = 3, seed: int = 0):
     """Return radiance, exposures and noisy readings of three frames: a third sky, some saturated, some far off."""
     g = torch.Generator().manual_seed(seed)
     exposures_s = torch.tensor([0.5e-4, 1e-4, 2e-4]).view(-1, 1, 1, 1)
     radiance = 2.2 * torch.rand(3, height, width, channels, generator=g)
     radiance[:, : height // 3] = 0
-    expected = sensor.expected_dn(radiance, exposures_s)
-    noise = torch.randn(expected.shape, generator=g) * sensor.variance_dn2(expected).sqrt()
-    dn = (expected + noise).round().clamp(0, sensor.white_dn)
+    dn = read_out(radiance, exposures_s, sensor, seed)
     error = torch.where(torch.rand(radiance.shape, generator=g) > 0.05, 0.02, 1.0)
     return radiance * (1 + error * torch.randn(radiance.shape, generator=g)), exposures_s, dn
 
@@ -144,6 +152,7 @@ def test_the_compiled_likelihood_is_the_readable_one(sensor, channels, averaged_
 def test_the_compiled_losses_have_the_readable_ones_gradient_by_exposure_time(channels):
     sensor = SENSORS["black level"]
     radiance, exposures_s, dn = bracket(sensor, channels=channels)
+    exposures_s = 1.1 * exposures_s  # as tagged: of a true one the gradient is 0 but for noise
     for ours, truth, settings in (
         (likelihood_loss, likelihood_loss_reference, (sensor, 4, 0.05)),
         (published_loss, published_loss_reference, (sensor, 0.2, 0.2)),
@@ -273,7 +282,7 @@ def test_the_figures_of_a_fit_are_chi2_on_the_target_and_psnr(module, monkeypatc
     elif compiled._rasterizer is None:
         pytest.skip("the compiled module is not installed")
     sensor = SENSORS["black level"]
-    radiance, exposures_s, dn = bracket(sensor)
+    radiance, exposures_s, dn = bracket(sensor, height=24, width=30)
     alpha = torch.rand(radiance.shape[:3], generator=torch.Generator().manual_seed(1)) * 0.1
     alpha[:, :10] = 0
     chi2, fit_psnr_db = fit_figures(radiance, alpha, exposures_s, dn, sensor, averaged_pixels=4)
@@ -281,7 +290,64 @@ def test_the_figures_of_a_fit_are_chi2_on_the_target_and_psnr(module, monkeypatc
     assert fit_psnr_db == pytest.approx(
         peak_signal_noise_ratio(dn.numpy() / 4095, seen.astype(np.float32), data_range=1.0), abs=1e-4
     )
-    residual = 2 * sensor.normalised_residual(radiance.double(), exposures_s.double(), dn.double()).numpy()
-    assert chi2 == pytest.approx((residual[alpha.numpy() > 0.05] ** 2).mean(), rel=1e-5)
+    expected = 64 + 2e7 * (exposures_s * radiance).double().numpy()
+    noise = np.maximum(expected - 64, 0) / 4 + 64 + 1 / 12
+    z, step = np.linspace(-8, 8, 1601, retstep=True)
+    readings = np.clip(expected[..., None] + np.sqrt(noise)[..., None] * z, 0, 4095)
+    weights = step * scipy.stats.norm.pdf(z)
+    mean = readings @ weights
+    variance = (readings - mean[..., None]) ** 2 @ weights
+    on_target = (alpha.numpy() > 0.05)[..., None] & (
+        dn.numpy() < 4095
+    )  # of four pixels some may be saturated
+    squares = 4 * (dn.numpy() - mean) ** 2 / noise
+    assert chi2 == pytest.approx(squares[on_target].sum() / (variance / noise)[on_target].sum(), rel=1e-4)
     no_target = fit_figures(radiance, torch.zeros_like(alpha), exposures_s, dn, sensor)
     assert np.isnan(no_target[0]) and no_target[1] == fit_psnr_db
+
+
+@pytest.mark.parametrize("module", ["compiled", "missing"])
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+def test_chi2_of_the_true_radiance_is_1_at_every_exposure(sensor, module, monkeypatch):
+    if module == "missing":
+        monkeypatch.setattr(compiled, "_rasterizer", None)
+    elif compiled._rasterizer is None:
+        pytest.skip("the compiled module is not installed")
+    alpha = torch.ones(1, 300, 200)
+    for exposure_s in (1e-5, 5e-5, 1e-4, 2e-4, 1e-3):
+        exposures_s = torch.full((1, 1, 1, 1), exposure_s)
+        brightest = min(2.5, 1.5 * sensor.white_dn / (sensor.dn_per_radiance_s * exposure_s))
+        radiance = torch.linspace(0, brightest, 200).view(1, 1, 200, 1).repeat(1, 300, 1, 1)
+        dn = read_out(radiance, exposures_s, sensor, seed=round(1e6 * exposure_s))
+        chi2, _ = fit_figures(radiance, alpha, exposures_s, dn, sensor)
+        assert chi2 == pytest.approx(1, abs=0.03), exposure_s  # of 40,000 readings it deviates by 0.007
+
+
+def test_a_reading_at_a_clip_has_the_probability_of_lying_beyond_it():
+    sensor, time_s = SENSORS["clipped at zero"], 1e-4
+    expected = np.linspace(-40, 1100, 115)
+    sigma = np.sqrt(np.maximum(expected, 0) / 2.5 + 144 + 1 / 12)
+    radiance = torch.tensor(expected / (5e6 * time_s))
+    for dn, log_likelihood in (
+        (0.0, scipy.stats.norm.logcdf((0.5 - expected) / sigma)),
+        (1023.0, scipy.stats.norm.logsf((1022.5 - expected) / sigma)),
+        (300.0, scipy.stats.norm.logpdf((300 - expected) / sigma) + 0.5 * np.log(2 * np.pi)),
+    ):
+        residual = sensor.deviance_residual(radiance, time_s, torch.full_like(radiance, dn)).numpy()
+        np.testing.assert_allclose(-0.5 * residual**2, log_likelihood, rtol=1e-9, atol=1e-14)
+        assert (np.sign(residual) == {0.0: 1, 1023.0: -1, 300.0: np.sign(expected - 300)}[dn]).all()
+
+
+@pytest.mark.parametrize("module", ["compiled", "missing"])
+def test_a_saturated_reading_does_not_pull_a_brighter_prediction_down(module, monkeypatch):
+    if module == "missing":
+        monkeypatch.setattr(compiled, "_rasterizer", None)
+    elif compiled._rasterizer is None:
+        pytest.skip("the compiled module is not installed")
+    sensor, exposures_s = SENSORS["black level"], torch.full((1, 1, 1, 1), 1e-4)
+    radiance = torch.full((1, 12, 12, 1), 9.0)  # 18,064 DN
+    for loss in (likelihood_loss, published_loss):
+        value, gradient = value_and_gradient(
+            lambda r, f=loss: f(r, exposures_s, torch.full_like(radiance, 4095.0), sensor)[0], radiance
+        )
+        assert value.abs() < 1e-6 and gradient.abs().max() < 1e-6

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from scipy.ndimage import uniform_filter
 from scipy.spatial.transform import Rotation
 
+from hil.sensor import converted
 from obbgs_core.cameras import Cameras
 from obbgs_core.errors import Diverged, ReconstructionError, TooFewFrames
-from obbgs_core.frames import Batches, TrainingFrame
+from obbgs_core.frames import Batches, TrainingFrame, _shrunk
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.held_out import held_out_brackets
 from obbgs_core.methods import preset, with_quality
@@ -56,17 +57,24 @@ def photographed(gaussians: Gaussians, count: int = 18, seed: int = 0) -> list[T
         exposure_s = (5e-5, 1e-4, 2e-4)[i % 3]
         cameras = Cameras(pose(rotation)[None], K[None], SIZE, SIZE)
         expected = SENSOR.expected_dn(render(gaussians, cameras).radiance[0], exposure_s)
-        noise = rng.normal(size=tuple(expected.shape)) * SENSOR.variance_dn2(expected).sqrt().numpy()
-        dn = np.clip(np.round(expected.numpy() + noise), 0, 4095)
-        frames.append(
-            TrainingFrame(torch.from_numpy(dn).float(), exposure_s, cameras.world_to_camera[0], K, i)
-        )
+        sigma_dn = SENSOR.variance_dn2(expected).sqrt().numpy()
+        dn = torch.from_numpy(converted(expected.numpy(), sigma_dn, SENSOR.white_dn, rng).astype(np.float32))
+        frames.append(TrainingFrame(dn, exposure_s, cameras.world_to_camera[0], K, i))
     return frames
 
 
 @pytest.fixture(scope="module")
 def frames() -> list[TrainingFrame]:
     return photographed(target())
+
+
+def test_only_full_scale_is_saturated_in_a_smaller_picture():
+    rng = np.random.default_rng(5)
+    dn = torch.from_numpy(rng.normal(2000, 100, (64, 64, 1)).round().astype(np.float32))
+    blocks = dn.reshape(16, 4, 16, 4)
+    torch.testing.assert_close(_shrunk(dn, 4, 4095.0)[..., 0], blocks.mean(dim=(1, 3)))
+    dn[8, 8] = 4095
+    torch.testing.assert_close(_shrunk(dn, 4, 4095.0)[2, 2, 0], torch.tensor(4095.0))
 
 
 def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path):
@@ -131,7 +139,7 @@ def test_the_chi2_of_a_good_model_is_near_one(frames):
 def test_what_removing_a_gaussian_costs_matches_removing_it():
     model = target(8, seed=2)
     frames = photographed(model, count=12)
-    batches = Batches(frames, preset("obbgs"), torch.Generator().manual_seed(0))
+    batches = Batches(frames, SENSOR.white_dn, preset("obbgs"), torch.Generator().manual_seed(0))
     rng = torch.Generator().manual_seed(1)
     estimates = torch.stack([likelihood_gains(model, batches, SENSOR, 1.0, rng)[0] for _ in range(60)])
     exact = torch.zeros(len(model))
@@ -155,7 +163,9 @@ def test_colour_that_turns_with_the_view_asks_for_harmonics_and_plain_colour_doe
     )
     gains = []
     for seen in (plain, turning):
-        batches = Batches(photographed(seen, 24), preset("obbgs"), torch.Generator().manual_seed(0))
+        batches = Batches(
+            photographed(seen, 24), SENSOR.white_dn, preset("obbgs"), torch.Generator().manual_seed(0)
+        )
         gains.append(next_degree_gain(plain, batches, SENSOR, 1.0, torch.Generator().manual_seed(0)))
     assert gains[0][0] < gains[0][1]
     assert gains[1][0] > gains[1][1]
@@ -271,7 +281,7 @@ def test_brackets_are_held_out_whole():
     frames = [dataclasses.replace(f, bracket=i // 3) for i, f in enumerate(exact)]
     brackets = held_out_brackets(frames)
     assert brackets == [[9, 10, 11], [30, 31, 32], [51, 52, 53]]
-    batches = Batches(frames, preset("obbgs"), torch.Generator().manual_seed(0))
+    batches = Batches(frames, SENSOR.white_dn, preset("obbgs"), torch.Generator().manual_seed(0))
     batches.hold_out(brackets)
     drawn = [i for _ in range(42) for i in batches.take(1.0).indices]
     assert (

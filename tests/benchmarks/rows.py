@@ -1,0 +1,132 @@
+"""Rows of benchmarks: where a figure comes from, and the page that is made of committed rows.
+
+Every row that a benchmark prints with --json says the commit, machine, load, date and command that it came from. Rows
+worth keeping are appended to `results/NAME.jsonl` and committed; `python -m tests.benchmarks.rows` writes
+`results/RESULTS.md` from them: a section a file, a line a method (or condition) and target, means over seeds.
+"""
+
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import torch
+
+from obbgs_core.render import native_kernels
+
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "results"
+NAMES = (
+    "method",
+    "ablation",
+    "condition",
+    "target",
+)  # what a line of a table is called by, where a row has it
+FIGURES = {  # key of a row: column title and format
+    "psnr_clean_db": ("clean PSNR", "{:.2f} dB"),
+    "psnr_foreground_db": ("foreground", "{:.2f} dB"),
+    "chamfer": ("Chamfer", "{:.4f}"),
+    "hausdorff": ("Hausdorff", "{:.3f}"),
+    "completeness_surface": ("surface complete", "{:.1f} %"),
+    "accuracy_surface": ("accuracy", "{:.4f}"),
+    "gaussians": ("Gaussians", "{:,.0f}"),
+    "seconds": ("seconds", "{:.0f}"),
+}
+
+
+def with_origin(row: dict, bench: str) -> dict:
+    """Return a row with the benchmark, commit, machine, load, date and command that it comes from."""
+    return {"bench": bench} | row | _origin(bench)
+
+
+def shown(row: dict, bench: str, as_json: bool) -> str:
+    """Return the line that a benchmark prints for a row: JSON with its origin, or the row as text."""
+    if as_json:
+        return json.dumps(with_origin(row, bench))
+    return "  ".join(f"{key} {value}" for key, value in row.items() if key != "curve")
+
+
+def _origin(bench: str) -> dict:
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(ROOT), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+    commit = git("rev-parse", "--short", "HEAD") or "unknown"
+    if git("status", "--porcelain", "--untracked-files=no", "--", ":!results"):
+        commit += "+changes"
+    kernels = native_kernels()
+    return {
+        "commit": commit,
+        "machine": f"{_processor()}, {os.cpu_count()} cores, kernel {kernels[0] if kernels else 'reference'}",
+        "threads": torch.get_num_threads(),
+        "load": round(os.getloadavg()[0], 1),
+        "utc": datetime.now(UTC).strftime("%Y-%m-%dT%H:%MZ"),
+        "command": " ".join(["python -m", f"tests.benchmarks.{bench}", *sys.argv[1:]]),
+    }
+
+
+def _processor() -> str:
+    """Return the processor's name as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def page(files: Iterable[Path]) -> str:
+    """Return the page of some files of rows as Markdown."""
+    parts = [
+        "# Results\n",
+        "Made from `results/*.jsonl` by `python -m tests.benchmarks.rows`; do not edit.\n",
+    ]
+    for file in files:
+        rows = [json.loads(line) for line in file.read_text().splitlines() if line]
+        parts.append(f"## {file.stem.replace('-', ' ')}\n")
+        for key, title in (("commit", "Commit"), ("machine", "Machine"), ("command", "Command")):
+            values = sorted({str(row[key]) for row in rows if key in row})
+            parts += [f"- {title}: " + "; ".join(f"`{v}`" if key == "command" else v for v in values)]
+        loads = [row["load"] for row in rows if "load" in row]
+        if loads:
+            parts.append(f"- Load while they ran: {min(loads):g} to {max(loads):g}")
+        parts += ["", *_table(rows), ""]
+    return "\n".join(parts)
+
+
+def _table(rows: list[dict]) -> list[str]:
+    names = [key for key in NAMES if any(key in row for row in rows)]
+    figures = [key for key in FIGURES if any(key in row for row in rows)]
+    groups: dict[tuple, list[dict]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row.get(key, "") for key in names), []).append(row)
+    titles = [*names, "seeds", *(FIGURES[key][0] for key in figures)]
+    lines = ["| " + " | ".join(titles) + " |", "| " + " | ".join(["---"] * len(titles)) + " |"]
+    for name, members in groups.items():
+        cells = [*map(str, name), str(len(members))]
+        cells += [_cell([m[key] for m in members if key in m], FIGURES[key][1]) for key in figures]
+        lines.append("| " + " | ".join(cells) + " |")
+    return lines
+
+
+def _cell(values: list[float], form: str) -> str:
+    """Return the mean of some values, with their deviation where there are several."""
+    if not values:
+        return ""
+    mean = form.format(statistics.fmean(values))
+    return mean if len(values) < 2 else f"{mean} ± {form.split(' ')[0].format(statistics.stdev(values))}"
+
+
+def main() -> None:
+    target = FOLDER / "RESULTS.md"
+    target.write_text(page(sorted(FOLDER.glob("*.jsonl"))))
+    print(target.relative_to(ROOT))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,32 @@
+"""Rows of benchmarks carry where they come from, and the page made of them shows every one."""
+
+import json
+import statistics
+
+from tests.benchmarks import rows
+
+
+def test_a_row_says_commit_machine_load_and_command():
+    row = json.loads(rows.shown({"method": "obbgs", "psnr_clean_db": 40.0}, "methods", as_json=True))
+    assert row["bench"] == "methods" and row["psnr_clean_db"] == 40.0
+    assert {"commit", "machine", "threads", "load", "utc", "command"} <= set(row)
+    assert row["command"].startswith("python -m tests.benchmarks.methods")
+
+
+def test_the_page_has_a_line_a_method_and_target_with_the_mean_over_seeds(tmp_path):
+    made = [
+        {"method": method, "target": "TDRS", "seed": seed, "psnr_clean_db": psnr, "commit": "abc1234"}
+        for method, values in {"ours": (40.0, 41.0, 42.5), "theirs": (30.0,)}.items()
+        for seed, psnr in enumerate(values)
+    ]
+    (tmp_path / "some-targets.jsonl").write_text("".join(json.dumps(row) + "\n" for row in made))
+    page = rows.page([tmp_path / "some-targets.jsonl"])
+    assert "## some targets" in page and "abc1234" in page
+    deviation = statistics.stdev([40.0, 41.0, 42.5])
+    assert f"| ours | TDRS | 3 | 41.17 dB ± {deviation:.2f} |" in page
+    assert "| theirs | TDRS | 1 | 30.00 dB |" in page
+
+
+def test_the_committed_page_is_made_of_the_committed_rows():
+    page = rows.FOLDER / "RESULTS.md"
+    assert page.read_text() == rows.page(sorted(rows.FOLDER.glob("*.jsonl")))
