@@ -1,5 +1,5 @@
 # Two commands: `make demo` runs the whole loop and ends in a report; `make test` checks everything. Both set up from nothing.
-# `make test-portable` repeats the numerical tests as processors with fewer instructions would run them.
+# `make test-portable` repeats the numerical tests as processors with fewer instructions would run them: tests/other_processors.py.
 OUT ?= demo
 export OMP_WAIT_POLICY ?= passive
 
