@@ -130,7 +130,7 @@ def test_a_model_has_no_more_gaussians_than_the_lit_pixels_of_the_long_exposures
 
 def test_the_chi2_of_a_good_model_is_near_one(frames):
     result = train(
-        frames, SENSOR, preset("obbgs", **QUICK | {"steps": 1000, "start_count": 2000, "max_gaussians": 3000})
+        frames, SENSOR, preset("obbgs", **QUICK | {"steps": 700, "start_count": 1000, "max_gaussians": 1500})
     )
     assert result.history[-1].chi2 < 3
     assert result.history[-1].seconds_left == pytest.approx(0, abs=1e-6)
