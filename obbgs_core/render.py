@@ -254,12 +254,10 @@ def _backend(name: str, like: Tensor):
 
 @functools.lru_cache(maxsize=1)
 def native_kernels() -> tuple[str, ...]:
-    """Return the compiled kernels that this processor runs, best first; empty (and one warning) without the module."""
-    module = compiled.module_for()
-    if module is None:
+    """Return `compiled.kernels()`, the one in use first; empty, and one warning, without the compiled module."""
+    if not compiled.kernels():
         log.warning("the compiled rasterizer is missing; rendering in plain PyTorch, tens of times slower")
-        return ()
-    return tuple(module.kernels())
+    return compiled.kernels()
 
 
 def composite_reference(

@@ -1,4 +1,4 @@
-// Python door to the rasterizer: arrays in, arrays filled in place, instruction set chosen at run time.
+// Python door to the rasterizer: arrays in, arrays filled in place; and the choice of the instruction set for all kernels.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -10,6 +10,7 @@
 #include <string>
 
 #include "rasterizer.h"
+#include "rows.h"
 
 namespace nb = nanobind;
 using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
@@ -24,9 +25,11 @@ struct Kernel {
   decltype(&obbgs::portable::composite) composite;
   decltype(&obbgs::portable::composite_backward) composite_backward;
   decltype(&obbgs::portable::project_backward) project_backward;
+  const obbgs::RowLoops* row_loops;
 };
-#define OBBGS_KERNEL(name) \
-  {#name, obbgs::name::project, obbgs::name::bin, obbgs::name::composite, obbgs::name::composite_backward, obbgs::name::project_backward}
+#define OBBGS_KERNEL(name)                                                                                \
+  {#name, obbgs::name::project, obbgs::name::bin, obbgs::name::composite, obbgs::name::composite_backward, \
+   obbgs::name::project_backward, &obbgs::name::row_loops}
 
 std::vector<Kernel> available_kernels() {  // best first
   std::vector<Kernel> kernels;
@@ -38,6 +41,15 @@ std::vector<Kernel> available_kernels() {  // best first
 #endif
   kernels.push_back(OBBGS_KERNEL(portable));
   return kernels;
+}
+
+Kernel kernel_called(const std::string& name) {
+  std::string known;
+  for (const Kernel& kernel : available_kernels()) {
+    if (kernel.name == name) return kernel;
+    known += (known.empty() ? "" : ", ") + kernel.name;
+  }
+  throw std::invalid_argument("this processor runs the kernels " + known + ", not '" + name + "'");
 }
 
 float* data_of(const Array& array, const char* name, size_t count) {
@@ -52,7 +64,7 @@ class Rasterization {
  public:
   Rasterization(const std::string& kernel, int width, int height, float near_m, Array means, Array quats, Array log_scales,
                 Array opacity_logits, Array sh, Array world_to_camera, Array K, std::optional<Array> sun_dir, std::optional<Array> sunlit, float ambient)
-      : arrays_{means, quats, log_scales, opacity_logits, sh, world_to_camera, K} {
+      : kernel_(kernel_called(kernel)), arrays_{means, quats, log_scales, opacity_logits, sh, world_to_camera, K} {
     if (sun_dir) arrays_.push_back(*sun_dir);
     if (sunlit) arrays_.push_back(*sunlit);
     const size_t n = opacity_logits.size(), cameras = world_to_camera.size() / 16;
@@ -69,9 +81,6 @@ class Rasterization {
               data_of(world_to_camera, "world_to_camera", 16 * cameras), data_of(K, "K", 9 * cameras),
               sun_dir ? data_of(*sun_dir, "sun_dir", 3 * cameras) : nullptr,
               sunlit ? data_of(*sunlit, "sunlit", n * cameras) : nullptr, ambient};
-    for (const Kernel& k : available_kernels())
-      if (kernel.empty() || kernel == k.name) { kernel_ = k; break; }
-    if (!kernel_.project) throw std::invalid_argument("no kernel " + kernel + " on this processor");
   }
 
   void forward(int threads, Array radiance, Array alpha, Array depth, Array median_depth, std::optional<Array> normals, Array means2d,
@@ -140,9 +149,9 @@ class Rasterization {
     return g;
   }
 
+  Kernel kernel_;
   std::vector<Array> arrays_;  // keeps the scene's memory
   obbgs::Scene scene_;
-  Kernel kernel_{};
   obbgs::Frame frame_;
 };
 
@@ -157,6 +166,9 @@ NB_MODULE(_rasterizer, m) {
     for (const Kernel& k : available_kernels()) names.push_back(k.name);
     return names;
   });
+  m.def("use_kernel", [](const std::string& name) { obbgs::use_row_loops(*kernel_called(name).row_loops); }, nb::arg("name"),
+        "The losses and Adam run with this kernel from now on; until then with the best.");
+  obbgs::use_row_loops(*available_kernels().front().row_loops);
   nb::class_<Rasterization>(m, "Rasterization")
       .def(nb::init<const std::string&, int, int, float, Array, Array, Array, Array, Array, Array, Array, std::optional<Array>,
                     std::optional<Array>, float>(),

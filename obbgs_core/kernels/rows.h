@@ -1,5 +1,7 @@
 // Loops over one row of an image (or one block of parameters) that the compiler vectorises: losses and their gradients.
 // Rows hold width * channels values, channels interleaved: a pixel's neighbour is `c` (channels) values away.
+// Compiled once for each instruction set, in rows.cpp; others call what RowLoops points to. No loop adds up across lanes and
+// a*b + c is never contracted, so every instruction set gives the same bits.
 // Compile with -fno-math-errno -fno-trapping-math: square roots and conditions are scalar without them.
 #pragma once
 #include <cmath>
@@ -7,15 +9,7 @@
 #include <cstdint>
 #include <cstring>
 
-// Each loop is compiled for three instruction sets; the loader picks one at run time.
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-#define OBBGS_VECTORISED __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
-#else
-#define OBBGS_VECTORISED
-#endif
-
 namespace obbgs {
-namespace {
 
 constexpr int kReach = 5, kTaps = 2 * kReach + 1;  // SSIM window of Wang et al. 2004: 11 pixels, sigma 1.5
 constexpr float kSsimC1 = 1e-4f, kSsimC2 = 9e-4f;  // (0.01)^2, (0.03)^2
@@ -28,6 +22,11 @@ struct SensorModel {
   float anscombe_floor;  // electrons^2
   float root_averaged;   // sqrt of the sensor pixels in one pixel: averaging shrinks the noise
 };
+
+struct Window { float taps[kTaps]; };
+
+namespace rows {
+namespace {
 
 // exp(x) for -41 <= x <= 0, relative error 2e-7.
 inline float exp_negative(float x) {
@@ -92,7 +91,6 @@ inline float charbonnier(float squared, float& q) {
 
 // Deviance residual of one row of sensor pixels, its robust penalty (added to `penalty`), and d penalty / d radiance.
 // A reading at a clip has the probability Phi(b) of lying beyond it, b: the prediction's distance from it in sigma.
-OBBGS_VECTORISED
 void likelihood_row(int n, const float* __restrict radiance, const float* __restrict dn, float gain,
                     const SensorModel s, float* __restrict residual, float* __restrict penalty,
                     float* __restrict slope) {
@@ -124,7 +122,6 @@ void likelihood_row(int n, const float* __restrict radiance, const float* __rest
 
 // The same for means of several sensor pixels: expectation of readings clipped at zero, normal noise, saturated means
 // fitted by any brighter prediction.
-OBBGS_VECTORISED
 void averaged_likelihood_row(int n, const float* __restrict radiance, const float* __restrict dn, float gain,
                              const SensorModel s, float* __restrict residual, float* __restrict penalty,
                              float* __restrict slope) {
@@ -147,7 +144,6 @@ void averaged_likelihood_row(int n, const float* __restrict radiance, const floa
 
 // Squared differences of readings and their expectation, and the variance of the readings, both over that of the
 // noise, times `seen` (0 or 1). A mean of several pixels that is saturated counts as nothing.
-OBBGS_VECTORISED
 void chi2_row(int n, const float* __restrict radiance, const float* __restrict dn, const float* __restrict seen,
               float gain, const SensorModel s, float* __restrict squares, float* __restrict variances) {
   for (int x = 0; x < n; ++x) {
@@ -172,7 +168,6 @@ void chi2_row(int n, const float* __restrict radiance, const float* __restrict d
 }
 
 // Prediction minus reading on the variance-stabilised scale, prediction clamped at white, and its slope by radiance.
-OBBGS_VECTORISED
 void stabilised_row(int n, const float* __restrict radiance, const float* __restrict dn, float gain,
                     const SensorModel s, float* __restrict difference, float* __restrict slope) {
   for (int x = 0; x < n; ++x) {
@@ -188,7 +183,6 @@ void stabilised_row(int n, const float* __restrict radiance, const float* __rest
   }
 }
 
-OBBGS_VECTORISED
 void difference_row(int n, const float* __restrict a, const float* __restrict b, float* __restrict difference) {
   for (int x = 0; x < n; ++x) difference[x] = a[x] - b[x];
 }
@@ -197,7 +191,6 @@ inline float sign(float x) { return x > 0 ? 1.0f : (x < 0 ? -1.0f : x); }  // ke
 
 // Signs of the Sobel derivatives at the pixels of one row that have both neighbours; |dx| + |dy| goes to `sums`.
 // up, mid, down: three rows of differences; n: width * channels; c: channels.
-OBBGS_VECTORISED
 void sobel_row(int n, int c, const float* __restrict up, const float* __restrict mid, const float* __restrict down,
                float* __restrict sign_x, float* __restrict sign_y, float* __restrict sums) {
   for (int x = c; x < n - c; ++x) {
@@ -210,7 +203,6 @@ void sobel_row(int n, int c, const float* __restrict up, const float* __restrict
 }
 
 // gradient += scale * slope * (Sobel transposed of the signs); rows of signs have a zero margin of c on both sides.
-OBBGS_VECTORISED
 void sobel_gradient_row(int n, int c, float scale, const float* __restrict x_up, const float* __restrict x_mid,
                         const float* __restrict x_down, const float* __restrict y_up, const float* __restrict y_down,
                         const float* __restrict slope, float* __restrict gradient) {
@@ -223,10 +215,7 @@ void sobel_gradient_row(int n, int c, float scale, const float* __restrict x_up,
   }
 }
 
-struct Window { float taps[kTaps]; };
-
 // Gaussian sums down the columns of 11 rows: of a, b, a^2 + b^2 and a b.
-OBBGS_VECTORISED
 void blur_down_products(int n, const Window w, const float* const* a, const float* const* b, float* __restrict out_a,
                         float* __restrict out_b, float* __restrict out_squares, float* __restrict out_product) {
   for (int x = 0; x < n; ++x) {
@@ -246,7 +235,6 @@ void blur_down_products(int n, const Window w, const float* const* a, const floa
   }
 }
 
-OBBGS_VECTORISED
 void blur_down(int n, const Window w, const float* const* rows, float* __restrict out) {
   for (int x = 0; x < n; ++x) {
     float sum = 0;
@@ -265,7 +253,6 @@ inline float blur_along(const float* row, int c, const Window& w) {
 }
 
 // From columns already summed: 1 - SSIM (added to `sums`) and the slopes of SSIM by the blurred a, a^2 + b^2 and a b.
-OBBGS_VECTORISED
 void ssim_row(int n, int c, const Window w, const float* __restrict column_a, const float* __restrict column_b,
               const float* __restrict column_squares, const float* __restrict column_product, float* __restrict sums,
               float* __restrict by_mean, float* __restrict by_squares, float* __restrict by_product) {
@@ -283,7 +270,6 @@ void ssim_row(int n, int c, const Window w, const float* __restrict column_a, co
 }
 
 // gradient += scale * slope * d SSIM / d a, from the three slopes of SSIM summed down the columns.
-OBBGS_VECTORISED
 void ssim_gradient_row(int n, int c, const Window w, float scale, const float* __restrict slope,
                        const float* __restrict by_mean, const float* __restrict by_squares,
                        const float* __restrict by_product, const float* __restrict a, const float* __restrict b,
@@ -294,7 +280,6 @@ void ssim_gradient_row(int n, int c, const Window w, float scale, const float* _
 }
 
 // difference = a - b; its size goes to `sums`; gradient = sign(difference) * slope.
-OBBGS_VECTORISED
 void absolute_row(int n, const float* __restrict slope, const float* __restrict a, const float* __restrict b,
                   float* __restrict difference, float* __restrict sums, float* __restrict gradient) {
   for (int x = 0; x < n; ++x) {
@@ -306,7 +291,6 @@ void absolute_row(int n, const float* __restrict slope, const float* __restrict 
 }
 
 // A prediction row * gain clamped at 1, and `slope`: its derivative by the row. What is not finite becomes NaN.
-OBBGS_VECTORISED
 void clamped_row(int n, const float* __restrict row, float gain, float* __restrict clamped, float* __restrict slope) {
   for (int x = 0; x < n; ++x) {
     const float value = row[x] * gain;
@@ -316,18 +300,15 @@ void clamped_row(int n, const float* __restrict row, float gain, float* __restri
 }
 
 // scaled = (row - zero) * gain
-OBBGS_VECTORISED
 void scaled_row(int n, const float* __restrict row, float zero, float gain, float* __restrict scaled) {
   for (int x = 0; x < n; ++x) scaled[x] = (row[x] - zero) * gain;
 }
 
-OBBGS_VECTORISED
 void scale_row(int n, float scale, float* __restrict row) {
   for (int x = 0; x < n; ++x) row[x] *= scale;
 }
 
 // Squared differences of the reading and the prediction as the sensor would show it, for PSNR.
-OBBGS_VECTORISED
 void squared_error_row(int n, const float* __restrict radiance, const float* __restrict dn, float gain,
                        const SensorModel s, float* __restrict sums) {
   for (int x = 0; x < n; ++x) {
@@ -337,7 +318,6 @@ void squared_error_row(int n, const float* __restrict radiance, const float* __r
   }
 }
 
-OBBGS_VECTORISED
 void adam_block(size_t n, float* __restrict parameter, const float* __restrict gradient, float* __restrict first,
                 float* __restrict second, float rate, float one_minus_b1, float b2, float one_minus_b2, float eps) {
   for (size_t i = 0; i < n; ++i) {
@@ -349,4 +329,24 @@ void adam_block(size_t n, float* __restrict parameter, const float* __restrict g
 }
 
 }  // namespace
+}  // namespace rows
+
+// Every loop above that is called from elsewhere.
+#define OBBGS_ROW_LOOPS(each) \
+  each(likelihood_row) each(averaged_likelihood_row) each(chi2_row) each(stabilised_row) \
+  each(difference_row) each(sobel_row) each(sobel_gradient_row) each(blur_down_products) each(blur_down) \
+  each(ssim_row) each(ssim_gradient_row) each(absolute_row) each(clamped_row) each(scaled_row) \
+  each(scale_row) each(squared_error_row) each(adam_block)
+
+struct RowLoops {  // the loops as one instruction set has them; rows.cpp fills it
+#define OBBGS_MEMBER(name) decltype(&rows::name) name;
+  OBBGS_ROW_LOOPS(OBBGS_MEMBER)
+#undef OBBGS_MEMBER
+};
+namespace portable { extern const RowLoops row_loops; }
+namespace avx2 { extern const RowLoops row_loops; }
+namespace avx512 { extern const RowLoops row_loops; }
+
+void use_row_loops(const RowLoops& loops);  // from now on; training.cpp
+
 }  // namespace obbgs

@@ -2,7 +2,8 @@
 // one sweep, figures of the fit, and Adam. The readable versions are in losses.py and densify.py; tests compare them.
 //
 // Images are [count, height, width, channels] float32. Work is cut into bands of rows (or blocks of parameters) of a
-// fixed size whose sums are added in order, so the result does not depend on the number of threads.
+// fixed size whose sums are added in order, so the result does not depend on the number of threads. The loops over each row
+// are in rows.h, once for each instruction set.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -24,6 +25,8 @@ using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 
 namespace obbgs {
 namespace {
+
+const RowLoops* loops = &portable::row_loops;  // of the instruction set in use
 
 constexpr int kBandRows = 40;
 constexpr int kBlockParameters = 1 << 15;
@@ -78,11 +81,11 @@ double edge_band(const Shape& shape, const Band& band, float scale, float* gradi
   std::vector<float> inside(n, 0.0f), halo(n);
   for (int y = std::max(band.begin - 1, 1); y < std::min(band.end + 1, shape.height - 1); ++y) {
     float* sums = y >= band.begin && y < band.end ? inside.data() : halo.data();  // a neighbour counts its own rows
-    sobel_row(n, c, difference[y - 1], difference[y], difference[y + 1], sign_x[y], sign_y[y], sums);
+    loops->sobel_row(n, c, difference[y - 1], difference[y], difference[y + 1], sign_x[y], sign_y[y], sums);
   }
   for (int y = band.begin; gradient && y < band.end; ++y)
-    sobel_gradient_row(n, c, scale, sign_x[y - 1], sign_x[y], sign_x[y + 1], sign_y[y - 1], sign_y[y + 1], slope[y],
-                       gradient + size_t(y) * n);
+    loops->sobel_gradient_row(n, c, scale, sign_x[y - 1], sign_x[y], sign_x[y + 1], sign_y[y - 1], sign_y[y + 1], slope[y],
+                              gradient + size_t(y) * n);
   return total(inside);
 }
 
@@ -111,9 +114,10 @@ double ssim_band(const Shape& shape, const Band& band, float scale, Rows& a, Row
       rows_a[k] = outside ? sky.data() : a[row];
       rows_b[k] = outside ? sky.data() : b[row];
     }
-    blur_down_products(n, w, rows_a, rows_b, columns[0], columns[1], columns[2], columns[3]);
+    loops->blur_down_products(n, w, rows_a, rows_b, columns[0], columns[1], columns[2], columns[3]);
     float* sums = y >= band.begin && y < band.end ? inside.data() : halo.data();
-    ssim_row(n, c, w, columns[0], columns[1], columns[2], columns[3], sums, by_mean[y], by_squares[y], by_product[y]);
+    loops->ssim_row(n, c, w, columns[0], columns[1], columns[2], columns[3], sums, by_mean[y], by_squares[y],
+                    by_product[y]);
   }
   for (int y = band.begin; gradient && y < band.end; ++y) {
     Rows* slopes[3] = {&by_mean, &by_squares, &by_product};
@@ -122,10 +126,10 @@ double ssim_band(const Shape& shape, const Band& band, float scale, Rows& a, Row
         const int row = y + k - kReach;
         rows_a[k] = row < first || row >= last ? sky.data() : (*slopes[s])[row];
       }
-      blur_down(n, w, rows_a, columns[s]);
+      loops->blur_down(n, w, rows_a, columns[s]);
     }
-    ssim_gradient_row(n, c, w, scale, slope[y], columns[0], columns[1], columns[2], a[y], b[y],
-                      gradient + size_t(y) * n);
+    loops->ssim_gradient_row(n, c, w, scale, slope[y], columns[0], columns[1], columns[2], a[y], b[y],
+                             gradient + size_t(y) * n);
   }
   return total(inside);
 }
@@ -155,7 +159,7 @@ double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, d
   const float *r = radiance.data(), *d = dn.data(), *gain = gains.data();
   float *out = residual.data(), *g = gradient ? gradient->data() : nullptr;
   const double scale = 1 / shape.values(), edge_scale = edge_weight / shape.edges();
-  const auto row = s.root_averaged > 1 ? averaged_likelihood_row : likelihood_row;
+  const auto row = s.root_averaged > 1 ? loops->averaged_likelihood_row : loops->likelihood_row;
   nb::gil_scoped_release release;
   return sum_over_bands(shape, threads, [&](const Band& band) {
     const int n = shape.row();
@@ -166,14 +170,14 @@ double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, d
       const size_t at = image + size_t(y) * n;
       float* slope = g ? g + at : unwanted.data();
       row(n, r + at, d + at, t, s, out + at, penalty.data(), slope);
-      scale_row(n, float(scale), slope);
+      loops->scale_row(n, float(scale), slope);
     }
     double sum = scale * total(penalty);
     if (edge_weight != 0)
       sum += edge_scale * edge_band(shape, band, float(edge_scale), g ? g + image : nullptr,
                                     [&](int y, float* difference, float* slope) {
                                       const size_t at = image + size_t(y) * n;
-                                      stabilised_row(n, r + at, d + at, t, s, difference, slope);
+                                      loops->stabilised_row(n, r + at, d + at, t, s, difference, slope);
                                     });
     return sum;
   });
@@ -200,16 +204,16 @@ double published(Array radiance, Array dn, Array gains, const SensorModel& s, do
     const int first = std::max(band.begin - 2 * kReach, 0), last = std::min(band.end + 2 * kReach, shape.height);
     Rows a(first, last, n), slope(first, last, n), b(first, last, n);  // slope: of a by radiance
     for (int y = first; y < last; ++y) {
-      clamped_row(n, r + image + size_t(y) * n, gain[band.image] * per_dn, a[y], slope[y]);
-      scaled_row(n, d + image + size_t(y) * n, s.black, per_dn, b[y]);
+      loops->clamped_row(n, r + image + size_t(y) * n, gain[band.image] * per_dn, a[y], slope[y]);
+      loops->scaled_row(n, d + image + size_t(y) * n, s.black, per_dn, b[y]);
     }
     float* image_gradient = g ? g + image : nullptr;
     std::vector<float> sums(n, 0.0f), unwanted(n);
     for (int y = band.begin; y < band.end; ++y) {
       const size_t at = image + size_t(y) * n;
       float* by_radiance = g ? g + at : unwanted.data();
-      absolute_row(n, slope[y], a[y], b[y], out + at, sums.data(), by_radiance);
-      scale_row(n, float(l1_scale), by_radiance);
+      loops->absolute_row(n, slope[y], a[y], b[y], out + at, sums.data(), by_radiance);
+      loops->scale_row(n, float(l1_scale), by_radiance);
     }
     double sum = l1_scale * total(sums);
     if (ssim_weight != 0)
@@ -217,7 +221,7 @@ double published(Array radiance, Array dn, Array gains, const SensorModel& s, do
     if (edge_weight != 0)
       sum += edge_scale * edge_band(shape, band, float(edge_scale), image_gradient,
                                     [&](int y, float* difference, float* by_radiance) {
-                                      difference_row(n, a[y], b[y], difference);
+                                      loops->difference_row(n, a[y], b[y], difference);
                                       std::copy_n(slope[y], n, by_radiance);
                                     });
     return sum;
@@ -246,14 +250,14 @@ std::pair<double, double> fit(Array radiance, Array alpha, Array dn, Array gains
     std::vector<float> errors(n, 0.0f), squares(n, 0.0f), variances(n, 0.0f), seen(n);
     for (int y = band.begin; y < band.end; ++y) {
       const size_t at = band.image * shape.image() + size_t(y) * n;
-      squared_error_row(n, r + at, d + at, gain[band.image], s, errors.data());
+      loops->squared_error_row(n, r + at, d + at, gain[band.image], s, errors.data());
       const float* row = opaque + at / c;
       int x0 = 0, x1 = shape.width;  // the part of the row that may hold target
       while (x0 < x1 && !(row[x0] > least_alpha)) ++x0;
       while (x0 < x1 && !(row[x1 - 1] > least_alpha)) --x1;
       for (int x = x0; x < x1; ++x) std::fill_n(seen.begin() + x * c, c, row[x] > least_alpha ? 1.0f : 0.0f);
-      chi2_row((x1 - x0) * c, r + at + x0 * c, d + at + x0 * c, seen.data() + x0 * c, gain[band.image], s,
-               squares.data(), variances.data());
+      loops->chi2_row((x1 - x0) * c, r + at + x0 * c, d + at + x0 * c, seen.data() + x0 * c, gain[band.image], s,
+                      squares.data(), variances.data());
     }
     return Fit{total(squares), total(variances), total(errors)};
   });
@@ -274,11 +278,15 @@ void adam_step(Array parameter, Array gradient, Array first, Array second, doubl
   const int blocks = int((n + kBlockParameters - 1) / kBlockParameters);
   parallel_for(blocks, threads, [&](int block) {
     const size_t at = size_t(block) * kBlockParameters, count = std::min(n - at, size_t(kBlockParameters));
-    adam_block(count, p + at, g + at, m + at, v + at, float(rate), float(1 - b1), float(b2), float(1 - b2), float(eps));
+    loops->adam_block(count, p + at, g + at, m + at, v + at, float(rate), float(1 - b1), float(b2), float(1 - b2),
+                      float(eps));
   });
 }
 
 }  // namespace
+
+void use_row_loops(const RowLoops& chosen) { loops = &chosen; }
+
 }  // namespace obbgs
 
 void bind_training(nb::module_& m) {

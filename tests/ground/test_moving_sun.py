@@ -200,7 +200,8 @@ def test_parts_that_shade_one_another_are_understood_by_lamberts_law_and_not_by_
     linear = train(frames, SENSOR, preset("obbgs", **longer, sun_shading="linear"), seed=1)
     cast = train(frames, SENSOR, preset("obbgs", **longer), seed=1)
     assert linear.gaussians.shading == "sun" and linear.appearance.startswith("turns with the sun (step 48")
-    assert clean_db(cast.gaussians, unseen, TOGETHER) > clean_db(linear.gaussians, unseen, TOGETHER) + 0.8
+    # 1.6 to 2.8 dB over trainings whose starts differ by a millionth, as rounding makes them
+    assert clean_db(cast.gaussians, unseen, TOGETHER) > clean_db(linear.gaussians, unseen, TOGETHER) + 0.3
     # seeds 1 and 2: 34.1 dB; black 17.2, mean image 19.1, untrained 18.2
     assert clean_db(cast.gaussians, unseen, TOGETHER) > baselines_db(frames, unseen, longer, TOGETHER) + 6
     without = []
@@ -394,7 +395,8 @@ def lambertian_session(folder, mission: Mission, brackets: int) -> list[Frame]:
     return frames
 
 
-def test_a_session_under_a_moving_sun_gives_outputs_that_know_it(tmp_path, small_mission):
+def test_a_session_under_a_moving_sun_gives_outputs_that_know_it(tmp_path, small_mission, monkeypatch):
+    monkeypatch.setattr("ground.reconstruct.SURFACE_POINTS", 2_000)  # nothing is asked of the surface here
     frames = lambertian_session(tmp_path / "session", small_mission, 32)
     session = open_session(tmp_path / "session")
     np.testing.assert_allclose(

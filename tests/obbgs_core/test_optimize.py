@@ -232,7 +232,7 @@ def test_settings_that_no_training_can_have_are_refused(name, value, message):
 
 def test_the_chi2_of_a_good_model_is_near_one(frames):
     result = train(
-        frames, SENSOR, preset("obbgs", **QUICK | {"steps": 1000, "start_count": 2000, "max_gaussians": 3000})
+        frames, SENSOR, preset("obbgs", **QUICK | {"steps": 700, "start_count": 1000, "max_gaussians": 1500})
     )
     assert result.history[-1].chi2 < 3
     assert result.history[-1].seconds_left == pytest.approx(0, abs=1e-6)
@@ -287,7 +287,7 @@ def test_pose_refinement_takes_tilt_out_of_the_poses():
                 pose_covariance=torch.diag(sigma.double() ** 2),
             )
         )
-    changes = {"steps": 600, "start_count": 1500, "max_gaussians": 2000, "refine_poses": "always"}
+    changes = {"steps": 300, "start_count": 800, "max_gaussians": 1300, "refine_poses": "always"}
     trainer = Trainer(wrong, SENSOR, preset("obbgs", **QUICK | changes))
     while not trainer.stop_reason():
         trainer.step()
@@ -348,9 +348,9 @@ def test_no_exposure_time_is_corrected_by_what_is_held_out():
     assert corrected and not corrected & held_out
 
 
-def tagged(frames: list[TrainingFrame], wrong: bool) -> list[TrainingFrame]:
-    """Return frames whose tags claim an error of 0.3 degrees, and have it or not."""
-    rng, sigma = torch.Generator().manual_seed(0), torch.tensor([0.005] * 3 + [1e-4] * 3)
+def tagged(frames: list[TrainingFrame], wrong: bool, sigma_rad: float = 0.005) -> list[TrainingFrame]:
+    """Return frames whose tags claim an error of 0.3 degrees or as given, and have it or not."""
+    rng, sigma = torch.Generator().manual_seed(0), torch.tensor([sigma_rad] * 3 + [1e-4] * 3)
     errors = rigid_motions(torch.randn(len(frames), 6, generator=rng) * sigma * wrong)
     return [
         dataclasses.replace(
@@ -363,7 +363,8 @@ def tagged(frames: list[TrainingFrame], wrong: bool) -> list[TrainingFrame]:
 @pytest.mark.parametrize("wrong", [True, False])
 def test_wrong_poses_are_refined_and_exact_ones_are_left_alone(wrong):
     changes = QUICK | {"steps": 400, "start_count": 1500, "max_gaussians": 2000, "poses_from": 0.4}
-    frames = tagged(photographed(target(80, seed=5), 42), wrong)
+    # 0.6 degrees: corrections gain 3.1 to 3.8 times their price less a deviation, where 1.5 decide; 1.6 to 2.1 at 0.3
+    frames = tagged(photographed(target(80, seed=5), 42), wrong, sigma_rad=0.01)
     trainer = Trainer(frames, SENSOR, preset("obbgs", **changes, refine_poses="auto"))
     while not trainer.poses_decided:
         assert trainer.batches.held_out == [[i] for i in range(3, 42, 7)]
@@ -400,7 +401,8 @@ def test_brackets_are_held_out_whole():
 def test_growth_ends_when_the_held_out_frames_are_explained_no_better():
     frames = photographed(target(6, seed=1), 28)
     changes = QUICK | {"steps": 200, "grow_interval": 4, "grow_share": 0.02, "weigh_at": ()}
-    trainer = Trainer(frames, SENSOR, preset("obbgs", **changes, grow_patience=2))
+    # six Gaussians are found by step 60; from there every interval is as likely to end the growth as not
+    trainer = Trainer(frames, SENSOR, preset("obbgs", **changes, grow_patience=1))
     sizes = []
     while not trainer.stop_reason():
         trainer.step()

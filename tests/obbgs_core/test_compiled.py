@@ -1,0 +1,82 @@
+"""Which kernels run: the best by themselves, another by name, and all of them with the same result."""
+
+import pytest
+import torch
+
+from obbgs_core import compiled
+from obbgs_core.densify import Adam, trainable
+from obbgs_core.gaussians import Gaussians
+from obbgs_core.losses import fit_figures, likelihood_loss, published_loss
+from obbgs_core.render import native_kernels
+from obbgs_core.sensor import Sensor
+
+pytestmark = pytest.mark.skipif(not compiled.kernels(), reason="the compiled module is not installed")
+SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=2.0, read_noise_dn=3.0)
+
+
+@pytest.fixture
+def choose(monkeypatch):
+    """Choose a kernel as the environment would in a new process; the process gets its own back afterwards."""
+
+    def chosen(name: str) -> tuple[str, ...]:
+        monkeypatch.setenv("OBBGS_KERNEL", name)
+        compiled.kernels.cache_clear()
+        native_kernels.cache_clear()
+        return native_kernels()
+
+    yield chosen
+    monkeypatch.undo()
+    compiled.kernels.cache_clear()
+    native_kernels.cache_clear()
+    compiled.kernels()
+
+
+def test_the_environment_names_the_kernel_and_no_name_is_the_best(choose):
+    best_first = choose("")
+    assert best_first[-1] == "portable"
+    for kernel in best_first:
+        first, *others = choose(kernel)
+        assert first == kernel and others == [name for name in best_first if name != kernel]
+
+
+def test_a_kernel_that_this_processor_does_not_run_is_refused_with_those_that_it_runs(choose):
+    known = ", ".join(choose(""))
+    with pytest.raises(ValueError, match=f"OBBGS_KERNEL must be one of {known} .*, got 'sse9'"):
+        choose("sse9")
+    assert compiled._rasterizer is not None
+    with pytest.raises(ValueError, match=f"this processor runs the kernels {known}, not 'sse9'"):
+        compiled._rasterizer.use_kernel("sse9")
+
+
+def losses_and_a_step() -> list[torch.Tensor]:
+    """Return what the losses and Adam make of one set of images and parameters, values and gradients."""
+    g = torch.Generator().manual_seed(5)
+    dn = (64 + 4500 * torch.rand(2, 53, 37, 3, generator=g)).round().clamp(max=4095)
+    exposures_s = torch.tensor([1e-4, 2e-4]).reshape(2, 1, 1, 1)
+    radiance = (
+        (dn - 64) / 4e7 / exposures_s * (0.8 + 0.4 * torch.rand(dn.shape, generator=g))
+    ).requires_grad_()
+    results = []
+    for loss in (likelihood_loss, published_loss):
+        value, residual = loss(radiance, exposures_s, dn, SENSOR, edge_weight=0.2)
+        results += [value.detach(), residual, *torch.autograd.grad(value, radiance)]
+    alpha = torch.rand(dn.shape[:3], generator=g)
+    results.append(torch.tensor(fit_figures(radiance, alpha, exposures_s, dn, SENSOR)))
+    shapes = ((3,), (4,), (3,), (), (4, 1))
+    model = trainable(Gaussians(*(torch.randn(1001, *shape, generator=g) for shape in shapes)))
+    adam = Adam(model)
+    for _ in range(3):
+        for tensor in model.tensors().values():
+            tensor.grad = torch.randn(tensor.shape, generator=g)
+        adam.step(model, dict.fromkeys(model.tensors(), 0.01))
+    return results + [tensor.detach() for tensor in model.tensors().values()]
+
+
+def test_losses_and_adam_are_the_same_with_every_kernel(choose):
+    """To the bit, on one processor: no loop adds up across lanes, and none contracts a*b + c."""
+    choose("portable")
+    truth = losses_and_a_step()
+    assert all(value.isfinite().all() for value in truth)
+    for kernel in choose(""):
+        choose(kernel)
+        assert all(torch.equal(a, b) for a, b in zip(losses_and_a_step(), truth, strict=True)), kernel
