@@ -74,14 +74,18 @@ class Worker:
     def _start(self) -> None:
         self.restarts += 1
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed with the process)
-        self._process = subprocess.Popen(
-            blender_command(),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._log,
-            text=True,
-            start_new_session=True,  # Ctrl-C is for us; the frame under way is finished and kept
-        )
+        try:
+            self._process = subprocess.Popen(
+                blender_command(),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._log,
+                text=True,
+                start_new_session=True,  # Ctrl-C is for us; the frame under way is finished and kept
+            )
+        except BaseException:
+            self._log.close()
+            raise
         greeting = self._reply()
         if greeting is None:
             reason = self._last_words()

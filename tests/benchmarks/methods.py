@@ -2,7 +2,8 @@
 
 Each row is one training: clean held-out PSNR, geometry, size and seconds of training alone (measuring stops the clock).
 `--curve` adds the clean PSNR and Chamfer distance on the way, `--chart FILE` draws them against seconds. Published
-methods are blind to exposure, as published; `NAME+exposure` gives them the exposure and the sensor's gain.
+methods are blind to exposure, as published; `NAME+exposure` gives them the exposure and the sensor's gain. `black` and
+`mean` are images that nothing was trained for, `untrained` are the Gaussians that `obbgs` starts from.
 """
 
 import argparse
@@ -14,9 +15,11 @@ import torch
 
 from obbgs_core.methods import PRESETS, preset
 from obbgs_core.optimize import Trainer
+from tests import baselines
 from tests.benchmarks import targets
 from tests.benchmarks.rows import shown
 
+WITHOUT_TRAINING = {"black": baselines.black, "mean": baselines.mean_image}
 CURVE_STEPS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)  # shares of the steps
 
 
@@ -59,6 +62,17 @@ def measure(
     if curve:
         row["curve"] = [*way, (row["seconds"], row["psnr_clean_db"], row["chamfer"])]
     return row
+
+
+def measure_named(name: str, target: targets.Target, share: float, seed: int, curve: bool) -> dict:
+    """Return the row of `METHOD`, `METHOD+exposure` or of what is not trained: `black`, `mean`, `untrained`."""
+    if name in WITHOUT_TRAINING:
+        score = WITHOUT_TRAINING[name](target)
+        figures = {"psnr_clean_db": score.clean_db, "psnr_foreground_db": score.foreground_db}
+        return {"target": target.name} | {key: round(value, 5) for key, value in figures.items()}
+    if name == "untrained":
+        return measure(configure("obbgs", share), target, seed, time_limit_s=0.0)
+    return measure(configure(name, share), target, seed, curve)
 
 
 def draw(rows: list[dict], path: Path) -> None:
@@ -129,12 +143,12 @@ def main() -> None:
                 share = arguments.published_share
             for seed in range(arguments.seeds):
                 curve = arguments.curve or arguments.chart is not None
-                figures = measure(configure(name, share), target, seed, curve)
+                figures = measure_named(name, target, share, seed, curve)
                 row = {"method": name, "size": arguments.size, "steps_share": share} | figures
                 rows.append(row)
                 print(shown(row, "methods", arguments.json), flush=True)
     if arguments.chart is not None:
-        draw(rows, arguments.chart)
+        draw([row for row in rows if "curve" in row], arguments.chart)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ ends with 1.
 
 import argparse
 import dataclasses
-import json
 import sys
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from obbgs_core.poses import rigid_motions
 from tests import baselines
 from tests.benchmarks import targets
 from tests.benchmarks.methods import configure, measure
+from tests.benchmarks.rows import shown
 
 BASE_S = 5e-5
 MARGIN_DB = 1.0  # above the best baseline; seeds of one condition scatter by 0.3 dB
@@ -168,9 +168,7 @@ def main() -> None:
         except ReconstructionError as error:
             row |= {"error": f"{type(error).__name__}: {error}", "ok": True}
         failures += not row["ok"]
-        print(
-            json.dumps(row) if arguments.json else "  ".join(f"{k} {v}" for k, v in row.items()), flush=True
-        )
+        print(shown(row, "stability", arguments.json), flush=True)
     sys.exit(1 if failures else 0)
 
 

@@ -338,7 +338,7 @@ def test_on_a_terminal_listen_is_a_console_that_shows_the_spacecraft(tmp_path, s
         try:
             read_until(b"no housekeeping yet")
             with Side(lambda stop: run_downlink(store, link, small_mission, should_stop=stop)):
-                for text in (b"outbox frames", b"flight software started", b"1, 1 in this run"):
+                for text in (b"outbox frames", b"flight software started", b"1 captured, 1 in this run"):
                     read_until(text)
             read_until(b"flight software stopped")
         finally:
