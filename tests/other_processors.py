@@ -48,7 +48,7 @@ def main() -> int:
         settings = environment(kernel)
         shown = " ".join(f'{name}="{value}"' for name, value in settings.items())
         print(f"the numerical tests as with {kernel}: {shown}", flush=True)
-        command = [sys.executable, "-m", "pytest", *tests, *sys.argv[1:]]
+        command = [sys.executable, "-m", "pytest", "-n", "2", "--dist", "loadfile", *tests, *sys.argv[1:]]
         code = subprocess.run(command, env=os.environ | settings).returncode
         if code:
             return code

@@ -324,7 +324,7 @@ def test_on_a_terminal_listen_is_a_console_that_shows_the_spacecraft(tmp_path, s
             tmp_path / "small.yaml",
         )
         command = [str(Path(sys.executable).with_name("ground")), "listen", *map(str, options)]
-        environment = os.environ | {"TERM": "xterm-256color"}
+        environment = os.environ | {"TERM": "xterm-256color", "LINES": "50", "COLUMNS": "140"}
         ground = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=slave, env=environment, text=True)
         os.close(slave)
 
