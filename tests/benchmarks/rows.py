@@ -52,6 +52,19 @@ def shown(row: dict, bench: str, as_json: bool) -> str:
 
 
 def _origin(bench: str) -> dict:
+    return {
+        "commit": COMMIT,
+        "machine": _machine(),
+        "threads": torch.get_num_threads(),
+        "load": round(os.getloadavg()[0], 1),
+        "utc": datetime.now(UTC).strftime("%Y-%m-%dT%H:%MZ"),
+        "command": " ".join(["python -m", f"tests.benchmarks.{bench}", *sys.argv[1:]]),
+    }
+
+
+def _commit() -> str:
+    """Return the commit that is checked out, `+changes` where files differ from it."""
+
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(ROOT), *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
@@ -59,15 +72,15 @@ def _origin(bench: str) -> dict:
     commit = git("rev-parse", "--short", "HEAD") or "unknown"
     if git("status", "--porcelain", "--untracked-files=no", "--", ":!results"):
         commit += "+changes"
+    return commit
+
+
+COMMIT = _commit()  # when the benchmark began: files may change while it runs
+
+
+def _machine() -> str:
     kernels = native_kernels()
-    return {
-        "commit": commit,
-        "machine": f"{_processor()}, {os.cpu_count()} cores, kernel {kernels[0] if kernels else 'reference'}",
-        "threads": torch.get_num_threads(),
-        "load": round(os.getloadavg()[0], 1),
-        "utc": datetime.now(UTC).strftime("%Y-%m-%dT%H:%MZ"),
-        "command": " ".join(["python -m", f"tests.benchmarks.{bench}", *sys.argv[1:]]),
-    }
+    return f"{_processor()}, {os.cpu_count()} cores, kernel {kernels[0] if kernels else 'reference'}"
 
 
 def _processor() -> str:
