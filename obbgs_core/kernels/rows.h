@@ -83,6 +83,12 @@ inline Normal normal(float z) {
   return {0.39894228f * bell, u < 6.36396103f ? 0.5f * bell * scaled_erfc(u) : 0.0f};
 }
 
+// The unclipped expected reading of a signal, DN, and one over the deviation of its noise.
+inline float expected_dn(float signal, const SensorModel& s, float& inverse_sigma) {
+  inverse_sigma = 1.0f / std::sqrt((signal > 0 ? signal : 0) * s.dn_per_electron + s.read_variance);
+  return s.black + signal;
+}
+
 // Robust penalty of a squared residual: knee^2 (q - 1) without the cancellation, q = sqrt(1 + (r / knee)^2).
 inline float charbonnier(float squared, float& q) {
   q = std::sqrt(1.0f + squared * (1.0f / (kKnee * kKnee)));
@@ -95,9 +101,8 @@ void likelihood_row(int n, const float* __restrict radiance, const float* __rest
                     const SensorModel s, float* __restrict residual, float* __restrict penalty,
                     float* __restrict slope) {
   for (int x = 0; x < n; ++x) {
-    const float signal = gain * radiance[x], expected = s.black + signal;
-    const float variance = (signal > 0 ? signal : 0) * s.dn_per_electron + s.read_variance;
-    const float inverse_sigma = 1.0f / std::sqrt(variance);
+    float inverse_sigma;
+    const float expected = expected_dn(gain * radiance[x], s, inverse_sigma);
     const bool saturated = dn[x] >= s.white, clipped = saturated || dn[x] <= 0;
     const float b = (saturated ? expected - (s.white - kHalfDn) : kHalfDn - expected) * inverse_sigma;
     // -2 log Phi(b) and phi(b) / Phi(b), by the tail over its bell where Phi is small; past 9 sigma the tail's asymptote
@@ -126,9 +131,8 @@ void averaged_likelihood_row(int n, const float* __restrict radiance, const floa
                              const SensorModel s, float* __restrict residual, float* __restrict penalty,
                              float* __restrict slope) {
   for (int x = 0; x < n; ++x) {
-    const float signal = gain * radiance[x], expected = s.black + signal;
-    const float variance = (signal > 0 ? signal : 0) * s.dn_per_electron + s.read_variance;
-    const float inverse_sigma = 1.0f / std::sqrt(variance);
+    float inverse_sigma;
+    const float expected = expected_dn(gain * radiance[x], s, inverse_sigma);
     const float z = expected * inverse_sigma;
     const Normal at_zero = normal(z);
     const float below = z < 0 ? at_zero.tail : 1.0f - at_zero.tail;  // also d clipped mean / d expected
@@ -147,9 +151,8 @@ void averaged_likelihood_row(int n, const float* __restrict radiance, const floa
 void chi2_row(int n, const float* __restrict radiance, const float* __restrict dn, const float* __restrict seen,
               float gain, const SensorModel s, float* __restrict squares, float* __restrict variances) {
   for (int x = 0; x < n; ++x) {
-    const float signal = gain * radiance[x], expected = s.black + signal;
-    const float variance = (signal > 0 ? signal : 0) * s.dn_per_electron + s.read_variance;
-    const float inverse_sigma = 1.0f / std::sqrt(variance);
+    float inverse_sigma;
+    const float expected = expected_dn(gain * radiance[x], s, inverse_sigma);
     const float low = -expected * inverse_sigma, high = (s.white - expected) * inverse_sigma;
     const Normal at_low = normal(low), at_high = normal(high);
     const float below = low < 0 ? at_low.tail : 1.0f - at_low.tail;

@@ -37,6 +37,15 @@ SENSORS = {
 }
 
 
+@pytest.fixture(params=["compiled", "missing"])
+def either_module(request, monkeypatch) -> None:
+    """Run a test with the compiled module and with the readable PyTorch that stands in for it."""
+    if request.param == "missing":
+        monkeypatch.setattr(compiled, "_rasterizer", None)
+    elif compiled._rasterizer is None:
+        pytest.skip("the compiled module is not installed")
+
+
 def images(seed: int, channels: int = 3, dtype=torch.float64) -> tuple[torch.Tensor, torch.Tensor]:
     rng = np.random.default_rng(seed)
     a = cv2.GaussianBlur(rng.random((48, 64, channels)), (7, 7), 2).reshape(48, 64, channels)
@@ -275,12 +284,7 @@ def test_images_that_do_not_match_are_refused():
             loss(radiance[:, :2], exposures_s, dn[:, :2], sensor)
 
 
-@pytest.mark.parametrize("module", ["compiled", "missing"])
-def test_the_figures_of_a_fit_are_chi2_on_the_target_and_psnr(module, monkeypatch):
-    if module == "missing":
-        monkeypatch.setattr(compiled, "_rasterizer", None)
-    elif compiled._rasterizer is None:
-        pytest.skip("the compiled module is not installed")
+def test_the_figures_of_a_fit_are_chi2_on_the_target_and_psnr(either_module):
     sensor = SENSORS["black level"]
     radiance, exposures_s, dn = bracket(sensor, height=24, width=30)
     alpha = torch.rand(radiance.shape[:3], generator=torch.Generator().manual_seed(1)) * 0.1
@@ -306,13 +310,8 @@ def test_the_figures_of_a_fit_are_chi2_on_the_target_and_psnr(module, monkeypatc
     assert np.isnan(no_target[0]) and no_target[1] == fit_psnr_db
 
 
-@pytest.mark.parametrize("module", ["compiled", "missing"])
 @pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
-def test_chi2_of_the_true_radiance_is_1_at_every_exposure(sensor, module, monkeypatch):
-    if module == "missing":
-        monkeypatch.setattr(compiled, "_rasterizer", None)
-    elif compiled._rasterizer is None:
-        pytest.skip("the compiled module is not installed")
+def test_chi2_of_the_true_radiance_is_1_at_every_exposure(sensor, either_module):
     alpha = torch.ones(1, 300, 200)
     for exposure_s in (1e-5, 5e-5, 1e-4, 2e-4, 1e-3):
         exposures_s = torch.full((1, 1, 1, 1), exposure_s)
@@ -338,12 +337,7 @@ def test_a_reading_at_a_clip_has_the_probability_of_lying_beyond_it():
         assert (np.sign(residual) == {0.0: 1, 1023.0: -1, 300.0: np.sign(expected - 300)}[dn]).all()
 
 
-@pytest.mark.parametrize("module", ["compiled", "missing"])
-def test_a_saturated_reading_does_not_pull_a_brighter_prediction_down(module, monkeypatch):
-    if module == "missing":
-        monkeypatch.setattr(compiled, "_rasterizer", None)
-    elif compiled._rasterizer is None:
-        pytest.skip("the compiled module is not installed")
+def test_a_saturated_reading_does_not_pull_a_brighter_prediction_down(either_module):
     sensor, exposures_s = SENSORS["black level"], torch.full((1, 1, 1, 1), 1e-4)
     radiance = torch.full((1, 12, 12, 1), 9.0)  # 18,064 DN
     for loss in (likelihood_loss, published_loss):
