@@ -125,6 +125,19 @@ void likelihood_row(int n, const float* __restrict radiance, const float* __rest
   }
 }
 
+// The same, bit for bit, where no reading of the row lies at a clip.
+void unclipped_likelihood_row(int n, const float* __restrict radiance, const float* __restrict dn, float gain,
+                              const SensorModel s, float* __restrict residual, float* __restrict penalty,
+                              float* __restrict slope) {
+  for (int x = 0; x < n; ++x) {
+    float inverse_sigma, q;
+    const float z = (expected_dn(gain * radiance[x], s, inverse_sigma) - dn[x]) * inverse_sigma;
+    penalty[x] += charbonnier(z * z, q);
+    residual[x] = z;
+    slope[x] = z / q * inverse_sigma * gain;
+  }
+}
+
 // The same for means of several sensor pixels: expectation of readings clipped at zero, normal noise, saturated means
 // fitted by any brighter prediction.
 void averaged_likelihood_row(int n, const float* __restrict radiance, const float* __restrict dn, float gain,
@@ -336,7 +349,8 @@ void adam_block(size_t n, float* __restrict parameter, const float* __restrict g
 
 // Every loop above that is called from elsewhere.
 #define OBBGS_ROW_LOOPS(each) \
-  each(likelihood_row) each(averaged_likelihood_row) each(chi2_row) each(stabilised_row) \
+  each(likelihood_row) each(unclipped_likelihood_row) each(averaged_likelihood_row) each(chi2_row) \
+  each(stabilised_row) \
   each(difference_row) each(sobel_row) each(sobel_gradient_row) each(blur_down_products) each(blur_down) \
   each(ssim_row) each(ssim_gradient_row) each(absolute_row) each(clamped_row) each(scaled_row) \
   each(scale_row) each(squared_error_row) each(adam_block)

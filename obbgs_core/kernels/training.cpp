@@ -159,7 +159,7 @@ double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, d
   const float *r = radiance.data(), *d = dn.data(), *gain = gains.data();
   float *out = residual.data(), *g = gradient ? gradient->data() : nullptr;
   const double scale = 1 / shape.values(), edge_scale = edge_weight / shape.edges();
-  const auto row = s.root_averaged > 1 ? loops->averaged_likelihood_row : loops->likelihood_row;
+  const auto at_a_clip = [&](float reading) { return reading <= 0 || reading >= s.white; };
   nb::gil_scoped_release release;
   return sum_over_bands(shape, threads, [&](const Band& band) {
     const int n = shape.row();
@@ -169,6 +169,10 @@ double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, d
     for (int y = band.begin; y < band.end; ++y) {
       const size_t at = image + size_t(y) * n;
       float* slope = g ? g + at : unwanted.data();
+      const bool clipped = std::any_of(d + at, d + at + n, at_a_clip);
+      const auto row = s.root_averaged > 1 ? loops->averaged_likelihood_row
+                       : clipped           ? loops->likelihood_row
+                                           : loops->unclipped_likelihood_row;
       row(n, r + at, d + at, t, s, out + at, penalty.data(), slope);
       loops->scale_row(n, float(scale), slope);
     }

@@ -345,3 +345,21 @@ def test_a_saturated_reading_does_not_pull_a_brighter_prediction_down(either_mod
             lambda r, f=loss: f(r, exposures_s, torch.full_like(radiance, 4095.0), sensor)[0], radiance
         )
         assert value.abs() < 1e-6 and gradient.abs().max() < 1e-6
+
+
+@needs_native
+def test_a_row_without_clipped_readings_gives_what_it_gives_among_others():
+    sensor, exposures_s = SENSORS["black level"], torch.full((1, 1, 1, 1), 1e-4)
+    radiance = torch.rand(1, 6, 53, 3, generator=torch.Generator().manual_seed(3))
+    dn = read_out(radiance, exposures_s, sensor, seed=3)
+    assert dn.min() > 0 and dn.max() < sensor.white_dn
+    clipped = dn.clone()
+    clipped[0, :, 0, 0] = sensor.white_dn  # one reading of every row: the loop for clipped rows takes them
+    plain, residual = likelihood_loss(radiance, exposures_s, dn, sensor)
+    among, residual_among = likelihood_loss(radiance, exposures_s, clipped, sensor)
+    assert torch.equal(residual[:, :, 1:], residual_among[:, :, 1:]) and plain != among
+    _, gradient = value_and_gradient(lambda r: likelihood_loss(r, exposures_s, dn, sensor)[0], radiance)
+    _, gradient_among = value_and_gradient(
+        lambda r: likelihood_loss(r, exposures_s, clipped, sensor)[0], radiance
+    )
+    assert torch.equal(gradient[:, :, 1:], gradient_among[:, :, 1:])
