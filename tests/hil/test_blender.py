@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.ndimage import map_coordinates
+from typer.testing import CliRunner
 
 from flightsw.icd.frame import PoseTag, matrix_to_quat
 from flightsw.icd.mission import Mission, load_mission
 from flightsw.pose import look_along
-from hil import spacecraft
+from hil import cli, spacecraft
 from hil.blender import MeshError, RenderFarm, Worker
 from hil.motion import image_velocity
 
@@ -239,6 +240,13 @@ def test_real_meshes_with_their_traps_are_not_black(tmp_path, name):
         with np.load(farm.path(pose)) as arrays:
             covered = arrays["alpha"] > 230
     assert covered.sum() > 30 and np.median(radiance[covered]) > 0.02 and radiance[covered].max() > 0.2
+
+
+def test_the_target_that_a_user_asks_for_is_the_shipped_one_byte_for_byte(tmp_path):
+    """A mesh is known as ours, of true size, by its digest: another's rounding would make it a stranger's."""
+    asked = CliRunner().invoke(cli.app, ["target", "--out", str(tmp_path / "mine.glb")])
+    assert asked.exit_code == 0
+    assert (tmp_path / "mine.glb").read_bytes() == spacecraft.SHIPPED.read_bytes()
 
 
 def test_the_shipped_target_is_what_the_code_builds(tmp_path):
