@@ -14,6 +14,7 @@ from obbgs_core.obb import Obb
 from obbgs_core.render import Rendered
 from obbgs_core.rotations import quats_to_matrices
 
+RECORDS = ("gradient", "weight", "radius_px")  # of each Gaussian in Growth
 SPLIT_SHRINK = 1.6  # a split's halves are this much smaller (Kerbl et al. 2023)
 
 
@@ -55,7 +56,8 @@ class Growth:
 
     def follow(self, kept: Tensor) -> None:
         """Keep the records of the Gaussians `kept` (index or mask)."""
-        self.gradient, self.weight = self.gradient[kept], self.weight[kept]
+        for name in RECORDS:
+            setattr(self, name, getattr(self, name)[kept])
         self.count = len(self.gradient)
 
 
@@ -208,7 +210,7 @@ def densify_boxes(
     growing = chosen(growth.mean(), gaussians, config) & inside
     gaussians, kept = grow(gaussians, adam, growing, config.split_over * unit_m, rng)
     anew = Growth(len(gaussians), config.pixel_weighted)
-    for name in ("gradient", "weight", "radius_px"):
+    for name in RECORDS:
         getattr(anew, name)[: len(kept)] = getattr(growth, name)[kept]
     return gaussians, anew
 

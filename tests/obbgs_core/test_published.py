@@ -108,6 +108,20 @@ def test_what_is_large_in_space_or_in_a_picture_is_pruned_after_the_first_reset_
         assert len(kept) == left
 
 
+def test_the_records_of_growth_follow_the_gaussians_that_are_kept(frames):
+    trainer = Trainer(frames, SENSOR, quick("jiang2025", grow_from=0.0, grow_interval=7, obb_interval=3))
+    for _ in range(2):
+        trainer.step()
+    longest_px = trainer.growth.radius_px.clone()
+    with torch.no_grad():
+        trainer.gaussians.log_scales[:5] = math.nan
+    trainer._drop_not_finite()
+    assert trainer.removed_not_finite == 5 and torch.equal(trainer.growth.radius_px, longest_px[5:])
+    for _ in range(8):  # past growth in the boxes and everywhere
+        trainer.step()
+    assert len(trainer.growth.radius_px) == len(trainer.gaussians)
+
+
 def test_a_reset_of_the_opacities_forgets_their_moments(frames):
     trainer = Trainer(frames, SENSOR, quick("3dgs", opacity_reset_interval=5, grow_from=0.0))
     for _ in range(4):
