@@ -57,6 +57,11 @@ def sun_span_deg(frames: list[TrainingFrame]) -> float:
     return math.degrees(torch.cdist(directions, directions).max().div(2).clamp(max=1).asin().mul(2).item())
 
 
+def mean_exposure_s(frames: list[TrainingFrame]) -> float:
+    """Return the geometric mean of the frames' exposure times, s."""
+    return math.exp(sum(math.log(f.exposure_time_s) for f in frames) / len(frames))
+
+
 def camera_extent_m(frames: list[TrainingFrame]) -> float:
     """Return 1.1 times the largest distance of a camera from the mean of all: the length unit of 3DGS (Kerbl 2023)."""
     poses = torch.stack([f.world_to_camera for f in frames]).double()
@@ -76,7 +81,7 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
 
     Raises:
         TooFewFrames: fewer than three.
-        ReconstructionError: sizes differ, a value is not finite, or a pose covariance is none.
+        ReconstructionError: sizes differ, a value is not finite, or a pose covariance is not a covariance.
     """
     if len(frames) < FEWEST_FRAMES:
         raise TooFewFrames(f"a reconstruction needs at least {FEWEST_FRAMES} frames, got {len(frames)}")
@@ -100,7 +105,7 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
             )
     if exposure_aware:
         return frames, None
-    reference_s = math.exp(sum(math.log(f.exposure_time_s) for f in frames) / len(frames))
+    reference_s = mean_exposure_s(frames)
     return [dataclasses.replace(f, exposure_time_s=reference_s) for f in frames], reference_s
 
 

@@ -113,9 +113,8 @@ def published_loss_reference(
     """Return what `published_loss` does, in readable PyTorch."""
     full_scale_dn = sensor.white_dn - sensor.black_dn
     predicted = (sensor.expected_dn(radiance, exposure_time_s) - sensor.black_dn) / full_scale_dn
-    predicted = torch.where(
-        predicted > 1, 1 + 0 * predicted, predicted
-    )  # clamped, but not finite stays not finite
+    # clamped at full scale; what is not finite stays so
+    predicted = torch.where(predicted > 1, 1 + 0 * predicted, predicted)
     truth = (dn - sensor.black_dn) / full_scale_dn
     loss = (1 - ssim_weight) * (predicted - truth).abs().mean()
     if ssim_weight:

@@ -94,13 +94,9 @@ def clipped_moments(mean: Tensor, sigma: Tensor, most: float) -> tuple[Tensor, T
     """Return mean and variance of min(max(x, 0), most) for x normal with `mean` and deviation `sigma`."""
     low, high = -mean / sigma, (most - mean) / sigma  # the clips, in deviations from the mean
     below, above = torch.special.ndtr(low), torch.special.ndtr(-high)
-    lifted, lowered = (
-        low * below + _density(low),
-        _density(high) - high * above,
-    )  # means of what each clip cuts off
-    inside = (
-        1 - below - above + low * _density(low) - high * _density(high)
-    )  # second moment between the clips
+    # the means of what each clip cuts off, and the second moment between the clips
+    lifted, lowered = low * below + _density(low), _density(high) - high * above
+    inside = 1 - below - above + low * _density(low) - high * _density(high)
     shift = lifted - lowered
     variance = (inside + low**2 * below + high**2 * above - shift**2).clamp(min=0)
     return (mean + sigma * shift).clamp(0, most), sigma**2 * variance

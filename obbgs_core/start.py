@@ -10,7 +10,7 @@ from torch import Tensor
 from obbgs_core import hull, sh
 from obbgs_core.densify import trainable
 from obbgs_core.errors import ReconstructionError
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import TrainingFrame, mean_exposure_s
 from obbgs_core.gaussians import Gaussians
 from obbgs_core.methods import MethodConfig
 from obbgs_core.sensor import Sensor
@@ -94,8 +94,8 @@ def _at(
     count, channels = len(points), frames[0].dn.shape[2]
     coefficients = torch.zeros(count, (config.sh_degree + 1) ** 2, channels)
     if config.start_colour == "grey":
-        exposure_s = math.exp(sum(math.log(f.exposure_time_s) for f in frames) / len(frames))
-        half = 0.5 * (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * exposure_s)
+        gain = sensor.dn_per_radiance_s * mean_exposure_s(frames)
+        half = 0.5 * (sensor.white_dn - sensor.black_dn) / gain
         coefficients[:, 0] = sh.from_radiance(torch.tensor(half))
     else:
         coefficients[:, 0] = sh.from_radiance(_seen_radiance(points, frames, sensor))
