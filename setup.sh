@@ -48,7 +48,7 @@ environment() { # directory, files that shape it, command that fills it
 }
 
 pip_args="-q --disable-pip-version-check ${PIP_ARGS:-}"
-environment .venv "pyproject.toml constraints.txt CMakeLists.txt $(find obbgs_core/kernels -type f -not -name '*.pyc' | sort | tr '\n' ' ')" \
+environment .venv "pyproject.toml constraints.txt CMakeLists.txt $(find obbgs_core/render/kernels -type f -not -name '*.pyc' | sort | tr '\n' ' ')" \
   ".venv/bin/pip install $pip_args -c constraints.txt -e '.[dev]'"
 environment .venv-blender "hil/blender-requirements.txt" \
   ".venv-blender/bin/pip install $pip_args -r hil/blender-requirements.txt"

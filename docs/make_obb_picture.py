@@ -16,9 +16,9 @@ from ground.report import tone
 from ground.session import open_session
 from obbgs_core import obb
 from obbgs_core.losses import likelihood_loss
-from obbgs_core.methods import preset
-from obbgs_core.optimize import Trainer
 from obbgs_core.render import render
+from obbgs_core.train.presets import preset
+from obbgs_core.train.trainer import Trainer
 
 ZOOM, STEPS = 4, 250
 RED, YELLOW, BLUE = (230, 60, 40), (250, 210, 60), (60, 140, 255)

@@ -6,7 +6,6 @@ import json
 import logging
 import math
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -23,16 +22,17 @@ from flightsw.cameras import open_camera
 from flightsw.cameras.reconnecting import RETRY_S, ReconnectingCamera
 from flightsw.commands import ReplayCounter
 from flightsw.downlink import DownlinkProgress, run_downlink
-from flightsw.errors import CaptureError, FlightError
+from flightsw.errors import CaptureError
 from flightsw.fsck import fsck
 from flightsw.icd.mission import BracketSection, ConfigError, Mission, load_mission
 from flightsw.link import Link, open_link
 from flightsw.sequencer import CaptureCounts, capture, plan
 from flightsw.settings import load_settings
 from flightsw.store import FrameStore, open_store
+from obbgs_base.command_line import new_app, run
 
 log = logging.getLogger(__name__)
-app = typer.Typer(add_completion=False, no_args_is_help=True, help="The flight side: what flies.")
+app = new_app("The flight side: what flies.")
 stderr = Console(stderr=True)
 LINGER_S = 0.5  # after the last delivery
 START_NOW_S = 2.0  # from the command to the first trigger of --start now: a camera takes a second to open
@@ -464,28 +464,15 @@ def _progress() -> Progress:
 
 
 def main() -> None:
-    """Run the command line; one clear line for what went wrong, exit code 2 for usage and configuration, 1 for work."""
-    logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", stream=sys.stderr)
+    """Run the command line."""
     threading.excepthook = log_dead_thread
-    try:
-        app()
-    except ConfigError as error:
-        sys.exit(_fail(error, 2))
-    except FlightError as error:
-        sys.exit(_fail(error, 1))
-    except ValueError as error:
-        sys.exit(_fail(error, 2))
+    run(app, "flightsw")
 
 
 def log_dead_thread(end: threading.ExceptHookArgs) -> None:
     """Log what ended a thread as an error; while there is a link, the ground gets it as an event."""
     name = end.thread.name if end.thread else "unknown"
     log.error("the thread %s has ended: %r", name, end.exc_value, exc_info=end.exc_value)
-
-
-def _fail(error: Exception, code: int) -> int:
-    print(f"flightsw: {error}", file=sys.stderr)
-    return code
 
 
 if __name__ == "__main__":

@@ -22,7 +22,8 @@ from flightsw.icd.mission import ConfigError, Mission
 from flightsw.icd.packet import PacketError
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.settings import Settings, load_settings, save_settings
-from flightsw.store import FrameStore, write_whole
+from flightsw.store import FrameStore
+from obbgs_base.files import write_whole
 
 log = logging.getLogger(__name__)
 REMEMBERED = 64  # commands whose reports are sent again when the ground asks again

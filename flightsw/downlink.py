@@ -33,8 +33,9 @@ from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import UPLINK, Receiver, Sender, timer_s
 from flightsw.link import Link
 from flightsw.settings import Settings
-from flightsw.store import FrameStore, sync_folder
+from flightsw.store import FrameStore
 from flightsw.triage import ModelVerified, Ranked, TriageWorker, sending_order, sent_view
+from obbgs_base.files import sync_folder
 
 log = logging.getLogger(__name__)
 

@@ -1,7 +1,9 @@
 """What can go wrong in flight. The sequencer catches FlightError, counts it and goes on."""
 
+from obbgs_base.errors import ObbgsError
 
-class FlightError(Exception):
+
+class FlightError(ObbgsError):
     """The world misbehaved: a camera, an orbit, a disk or a link."""
 
 

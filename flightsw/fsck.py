@@ -7,15 +7,8 @@ from pathlib import Path
 
 from flightsw.errors import StoreError
 from flightsw.icd.packet import PacketError
-from flightsw.store import (
-    StoredFrame,
-    index_entry,
-    lock_store,
-    parse_index_line,
-    quarantine,
-    sync_folder,
-    write_whole,
-)
+from flightsw.store import StoredFrame, index_entry, lock_store, parse_index_line, quarantine
+from obbgs_base.files import sync_folder, write_whole
 
 
 @dataclass

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from flightsw.errors import StoreError
 from flightsw.icd.mission import BracketSection, ConfigError, Mission
-from flightsw.store import write_whole
+from obbgs_base.files import write_whole
 
 log = logging.getLogger(__name__)
 ORDERS = ("oldest", "triage", "thumbnail-first")

@@ -18,6 +18,7 @@ from flightsw.errors import StoreError, StoreFull
 from flightsw.icd.frame import Frame, decode_frame, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.icd.packet import PacketError
+from obbgs_base.files import sync_folder, write_whole
 
 log = logging.getLogger(__name__)
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -377,29 +378,6 @@ def lock_store(folder: Path) -> Iterator[None]:
     with open(folder / "lock", "wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all, power cuts included: temporary name, sync, rename, sync folder."""
-    part = path.with_name(path.name + ".part")
-    try:
-        with open(part, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
-
-
-def sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 @contextlib.contextmanager

@@ -3,11 +3,9 @@
 import contextlib
 import dataclasses
 import json
-import logging
 import math
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -19,14 +17,12 @@ from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from flightsw.icd.mission import ConfigError, ReconstructSection, load_mission
-from ground.extras import how_to_install
+from flightsw.icd.mission import ReconstructSection, load_mission
 from ground.progress import Stop, say, steps_shown
 from ground.summary import frames_row, model_rows, table
+from obbgs_base.command_line import new_app, run
 
-app = typer.Typer(
-    add_completion=False, no_args_is_help=True, help="The ground station: frames in, a 3D model out."
-)
+app = new_app("The ground station: frames in, a 3D model out.")
 stderr = Console(stderr=True)
 
 SessionDir = Annotated[Path, typer.Option("--session", help="The session folder.")]
@@ -237,7 +233,7 @@ def reconstruct_command(
     os.environ.setdefault(
         "OMP_WAIT_POLICY", "passive"
     )  # spinning threads cost more than they give; before torch
-    from obbgs_core.errors import Interrupted
+    from obbgs_base.errors import Interrupted
 
     stop, folder = Stop(), None
     try:
@@ -382,34 +378,8 @@ def _print_metrics(metrics: dict, as_json: bool) -> None:
 
 
 def main() -> None:
-    """Run the command line; one clear line for what went wrong, exit code 2 for usage and configuration, 1 for work."""
-    logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", stream=sys.stderr)
-    logging.getLogger().setLevel(logging.INFO)
-    logging.getLogger().handlers[0].setLevel(logging.WARNING)
-    try:
-        app()
-    except KeyboardInterrupt:
-        sys.exit(
-            _fail("interrupted; nothing half-written was left, the same command goes on where it can", 1)
-        )
-    except ModuleNotFoundError as error:
-        message = how_to_install(error, "ground")
-        if message is None:
-            raise
-        sys.exit(_fail(message, 2))
-    except ConfigError as error:
-        sys.exit(_fail(str(error), 2))
-    except ValueError as error:
-        sys.exit(_fail(str(error), 2))
-    except Exception as error:
-        if type(error).__module__.partition(".")[0] not in ("ground", "obbgs_core"):
-            raise
-        sys.exit(_fail(str(error), 1))
-
-
-def _fail(message: str, code: int) -> int:
-    print(f"ground: {message}", file=sys.stderr)
-    return code
+    """Run the command line."""
+    run(app, "ground")
 
 
 if __name__ == "__main__":

@@ -13,12 +13,13 @@ from plyfile import PlyData, PlyParseError
 
 from ground.card import model_card
 from ground.reconstruct import camera_of, exposed, predicted_image, run_folder, sensor_of, split, written_to
-from ground.session import FrameRecord, Session, SessionError, open_session, write_whole
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.lpips import WeightsMissing, lpips
-from obbgs_core.metrics import cloud_distances, foreground_psnr_db, psnr_db, ssim
-from obbgs_core.ply import load_ply
+from ground.session import FrameRecord, Session, SessionError, open_session
+from obbgs_base.files import write_whole
+from obbgs_core.io.ply import load_ply
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
+from obbgs_core.score.lpips import WeightsMissing, lpips
+from obbgs_core.score.metrics import cloud_distances, foreground_psnr_db, psnr_db, ssim
 from obbgs_core.sensor import Sensor
 
 # what every run's metrics.json says, whatever its age; the rest may be missing

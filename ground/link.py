@@ -28,9 +28,10 @@ from flightsw.icd.can import (
     open_slcan,
 )
 from flightsw.icd.link_url import parse_link_url
+from obbgs_base.errors import ObbgsError
 
 
-class LinkError(RuntimeError):
+class LinkError(ObbgsError, RuntimeError):
     """The link's port cannot be opened."""
 
 

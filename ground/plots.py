@@ -10,9 +10,9 @@ from plotly.subplots import make_subplots
 
 from ground.reconstruct import cameras_of, sun_direction
 from ground.session import Session
-from obbgs_core.gaussians import Gaussians
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.render.lighting import mean_radiance
 from obbgs_core.sensor import Sensor
-from obbgs_core.shading import mean_radiance
 
 POINTS_SHOWN = 15_000  # more make the page heavy and the view no clearer
 LEAST_OPACITY = 0.2  # fainter Gaussians would only fog the view

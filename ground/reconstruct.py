@@ -23,18 +23,19 @@ from torch import Tensor
 from flightsw.icd.mission import CameraSection
 from ground.session import FrameRecord, Session, SessionError, open_session
 from ground.uplink import MAX_MODEL_BYTES
-from obbgs_core.cameras import Cameras, stacked_suns
-from obbgs_core.errors import Interrupted, ReconstructionError
-from obbgs_core.export_onnx import export_onnx
+from obbgs_base.errors import Interrupted
+from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.methods import MethodConfig, preset
-from obbgs_core.optimize import StepInfo, TrainResult, train
-from obbgs_core.ply import save_ply, save_surface_ply
+from obbgs_core.io.onnx import export_onnx
+from obbgs_core.io.ply import save_ply, save_surface_ply
+from obbgs_core.io.spz import save_spz
+from obbgs_core.model.cameras import Cameras, stacked_suns
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import native_kernels, render
+from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
-from obbgs_core.spz import save_spz
-from obbgs_core.surface import surface_points
+from obbgs_core.train.presets import MethodConfig, preset
+from obbgs_core.train.trainer import StepInfo, TrainResult, train
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")

@@ -22,6 +22,8 @@ from flightsw.icd.config import ConfigError, build, keys_below, parse_json
 from flightsw.icd.frame import Frame
 from flightsw.icd.mission import CameraSection, Mission
 from ground.telemetry import FlightCounts
+from obbgs_base.errors import ObbgsError
+from obbgs_base.files import write_whole
 
 SCHEMA_VERSION = 1
 FRAME_FILE = re.compile(
@@ -29,7 +31,7 @@ FRAME_FILE = re.compile(
 )  # nothing else is opened: a session may come from afar
 
 
-class SessionError(Exception):
+class SessionError(ObbgsError):
     """A session cannot be used; the message says why."""
 
 
@@ -303,21 +305,6 @@ def frame_line(frame: Frame, file: str, sha256: str) -> dict[str, Any]:
         "bit_depth": frame.bit_depth,
         "black_dn": frame.black_dn,
     }
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all, power cuts included."""
-    part = path.with_name(path.name + ".part")
-    with open(part, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, path)
-    descriptor = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _read_header(folder: Path) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 
 from flightsw.icd.mission import ConfigError, ReconstructSection, build, parse_yaml
-from obbgs_core.methods import MethodConfig, preset, with_quality
+from obbgs_core.train.presets import MethodConfig, preset, with_quality
 
 
 def all_changes(

@@ -23,7 +23,8 @@ from flightsw.icd.auth import Key, seal, seal_file
 from flightsw.icd.command import ENDED, Command, Report, model_file_name
 from flightsw.icd.mission import ConfigError
 from flightsw.icd.transfer import UPLINK, Sender
-from ground.session import SessionError, write_whole
+from ground.session import SessionError
+from obbgs_base.files import write_whole
 
 log = logging.getLogger(__name__)
 JOB_NAME = re.compile(r"(\d{20})\.json", re.ASCII)

@@ -3,7 +3,6 @@
 import dataclasses
 import io
 import json
-import logging
 import signal
 import sys
 import threading
@@ -15,14 +14,11 @@ import typer
 from rich.console import Console
 from rich.progress import TaskID
 
-from flightsw.errors import FlightError
-from flightsw.icd.mission import ConfigError, load_mission
-from ground.extras import how_to_install
+from flightsw.icd.mission import load_mission
 from hil import SHIPPED
+from obbgs_base.command_line import new_app, run
 
-app = typer.Typer(
-    add_completion=False, no_args_is_help=True, help="The simulated world around flight and ground."
-)
+app = new_app("The simulated world around flight and ground.")
 MissionFile = Annotated[Path, typer.Option("--mission", help="The mission file.")]
 Mesh = Annotated[Path, typer.Option("--mesh", help="GLB, OBJ or STL; default the shipped spacecraft.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
@@ -98,10 +94,10 @@ def camera(
 
     Example: hil camera --listen hil:///tmp/camera.sock --scenario v-bar --mesh target.glb
     """
-    from hil.blender import RenderFarm
-    from hil.gige_camera import GigeCameraServer
-    from hil.virtual_camera import CameraServer
-    from hil.world import load_world, write_flight_inputs
+    from hil.cameras.gige import GigeCameraServer
+    from hil.cameras.virtual import CameraServer
+    from hil.sky.blender import RenderFarm
+    from hil.world.states import load_world, write_flight_inputs
 
     world = load_world(load_mission(mission), scenario)
     if scenario:
@@ -151,8 +147,8 @@ def link(
 
     Example: hil link --baud 921600 --loss 0.02 --flip 0.01 --seed 3
     """
-    from hil.virtual_can import VirtualCan
-    from hil.virtual_link import Faults, VirtualLink, VirtualSerial, control, run_link
+    from hil.links.virtual_can import VirtualCan
+    from hil.links.virtual_link import Faults, VirtualLink, VirtualSerial, control, run_link
 
     faults = Faults(loss, flip, duplicate, reorder)
     line: VirtualLink
@@ -199,8 +195,8 @@ def scenario(
 
     Example: hil scenario tumbling --json; hil scenario --fly-around --radial 150 --out chaser.tle
     """
-    from hil.fly_around import FlyAround, design
-    from hil.scenario import describe, load_scenario
+    from hil.world.fly_around import FlyAround, design
+    from hil.world.scenario import describe, load_scenario
 
     if not fly_around:
         facts = describe(load_scenario(name))
@@ -323,30 +319,8 @@ def _stop_event() -> threading.Event:
 
 
 def main() -> None:
-    """Run the command line; one clear line for what went wrong, exit code 2 for usage and configuration, 1 for work."""
-    logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", stream=sys.stderr)
-    try:
-        app()
-    except KeyboardInterrupt:
-        sys.exit(_fail("interrupted; run it again, finished rendering is kept", 1))
-    except ModuleNotFoundError as error:
-        message = how_to_install(error, "hil")
-        if message is None:
-            raise
-        sys.exit(_fail(message, 2))
-    except (ConfigError, ValueError) as error:
-        sys.exit(_fail(str(error), 2))
-    except (FlightError, OSError) as error:
-        sys.exit(_fail(str(error), 1))
-    except RuntimeError as error:
-        if type(error).__module__.partition(".")[0] != "hil":
-            raise
-        sys.exit(_fail(str(error), 1))
-
-
-def _fail(message: str, code: int) -> int:
-    print(f"hil: {message}", file=sys.stderr)
-    return code
+    """Run the command line."""
+    run(app, "hil")
 
 
 if __name__ == "__main__":

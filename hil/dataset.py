@@ -15,14 +15,17 @@ from flightsw.icd.frame import Frame, PoseTag, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.sequencer import Shot, plan
 from ground.formats.nerf import export_nerf
-from ground.session import SessionWriter, open_session, write_whole
+from ground.session import SessionWriter, open_session
 from ground.telemetry import FlightCounts
-from hil import blender, sensor, truth
-from hil.blender import RenderFarm, mesh_sha256
-from hil.motion import image_velocity, smear
-from hil.scenario import SceneState, Sky, load_scenario
-from hil.sensor import PRESETS, SensorModel, read_out
-from hil.stars import star_radiance
+from hil.sky import blender, sensor
+from hil.sky.blender import RenderFarm, mesh_sha256
+from hil.sky.motion import image_velocity, smear
+from hil.sky.sensor import PRESETS, SensorModel, read_out
+from hil.sky.stars import star_radiance
+from hil.world import truth
+from hil.world.scenario import SceneState, Sky, load_scenario
+from obbgs_base.errors import ObbgsError
+from obbgs_base.files import write_whole
 
 DATASETS = Path(__file__).parent / "datasets"
 MARKER = "dataset.json"
@@ -32,7 +35,7 @@ BRIGHT_PERCENTILE, BRIGHT_SIGNAL, COVERED_ALPHA = 97, 0.7, 230
 MOTION_S = 0.1  # poses so far apart give the image's velocity
 
 
-class DatasetError(RuntimeError):
+class DatasetError(ObbgsError, RuntimeError):
     """A data set cannot be made where or as it was asked for."""
 
 

@@ -26,17 +26,18 @@ from rich.table import Table
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, load_mission
 from ground.summary import model_rows, table
-from hil.blender import RenderFarm, check_mesh
-from hil.clock import SimulatedClock
-from hil.gige_camera import GigeCameraServer
+from hil.cameras.gige import GigeCameraServer
+from hil.cameras.virtual import CameraServer
 from hil.link_trial import STANDARD_CUT_S, STANDARD_FAULTS
+from hil.links.virtual_can import VirtualCan
+from hil.links.virtual_link import Faults, VirtualLink, VirtualSerial
 from hil.processes import end, tied
-from hil.scenario import true_exposures
-from hil.truth import write_truth
-from hil.virtual_camera import CameraServer
-from hil.virtual_can import VirtualCan
-from hil.virtual_link import Faults, VirtualLink, VirtualSerial
-from hil.world import World, load_world, write_flight_inputs
+from hil.sky.blender import RenderFarm, check_mesh
+from hil.world.clock import SimulatedClock
+from hil.world.scenario import true_exposures
+from hil.world.states import World, load_world, write_flight_inputs
+from hil.world.truth import write_truth
+from obbgs_base.errors import ObbgsError
 
 MARKER = "demo.json"  # says that what a folder has of these is a demo's own
 MADE_ANEW = ("flight", "session", "scenario")
@@ -46,7 +47,7 @@ FAULT_SEED = 1
 FAULT_WORDS = {"lost", "destroyed", "flipped", "duplicated", "reordered", "cut", "overrun"}
 
 
-class DemoError(RuntimeError):
+class DemoError(ObbgsError, RuntimeError):
     """A step of the loop failed; the message says which, and where its log is."""
 
 

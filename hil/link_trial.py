@@ -25,9 +25,10 @@ import numpy as np
 from flightsw.icd.frame import Frame, PoseTag, decode_frame, encode_frame
 from flightsw.store import FrameStore
 from ground.session import open_session
+from hil.links.virtual_can import VirtualCan
+from hil.links.virtual_link import Faults, VirtualLink, VirtualSerial
 from hil.processes import tied
-from hil.virtual_can import VirtualCan
-from hil.virtual_link import Faults, VirtualLink, VirtualSerial
+from obbgs_base.errors import ObbgsError
 
 POLL_S = 0.01
 FULL_S = 3.0  # a disk stays full
@@ -84,7 +85,7 @@ STANDARD_FAULTS = Faults(loss=0.02, bit_flip=0.02, duplicate=0.02, reorder=0.02)
 STANDARD_CUT_S = 5.0  # one cut, when half of the frames are there
 
 
-class TrialError(RuntimeError):
+class TrialError(ObbgsError, RuntimeError):
     """A process of the trial failed, or the frames did not arrive as they were."""
 
 

@@ -4,10 +4,12 @@ import logging
 import threading
 from collections.abc import Callable
 
+from obbgs_base.errors import ObbgsError
+
 log = logging.getLogger(__name__)
 
 
-class ServerError(RuntimeError):
+class ServerError(ObbgsError, RuntimeError):
     """A part of the simulator has ended while others needed it."""
 
 

@@ -1,7 +1,9 @@
 """What can go wrong in a reconstruction."""
 
+from obbgs_base.errors import ObbgsError
 
-class ReconstructionError(Exception):
+
+class ReconstructionError(ObbgsError):
     """The frames do not allow a model."""
 
 
@@ -16,10 +18,6 @@ class Diverged(ReconstructionError):
         problem = problem or f"the loss became {loss}"
         super().__init__(f"{problem} at step {step}; try smaller learning rates or check the poses")
         self.step, self.loss = step, loss
-
-
-class Interrupted(Exception):
-    """Work was asked to stop before its end; the message says what is kept."""
 
 
 class ExportError(ReconstructionError):

@@ -8,11 +8,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_core.cameras import Cameras, stacked_suns
-from obbgs_core.corrections import ExposureCorrections
 from obbgs_core.errors import ReconstructionError, TooFewFrames
-from obbgs_core.methods import MethodConfig
-from obbgs_core.pose_covariance import flaw
+from obbgs_core.model.cameras import Cameras, stacked_suns
+from obbgs_core.model.pose_covariance import flaw
+from obbgs_core.train.corrections import ExposureCorrections
+from obbgs_core.train.presets import MethodConfig
 
 FEWEST_FRAMES = 3
 

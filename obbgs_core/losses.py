@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from obbgs_core import compiled
-from obbgs_core.cameras import Cameras
+from obbgs_core.model.cameras import Cameras
 from obbgs_core.sensor import Sensor, clipped_moments
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Wang et al. 2004

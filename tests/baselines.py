@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from obbgs_core.methods import MethodConfig
-from obbgs_core.metrics import foreground_psnr_db, psnr_db
-from obbgs_core.optimize import Trainer
+from obbgs_core.score.metrics import foreground_psnr_db, psnr_db
+from obbgs_core.train.presets import MethodConfig
+from obbgs_core.train.trainer import Trainer
 from tests.benchmarks.targets import Target, predicted
 
 

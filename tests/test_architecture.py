@@ -15,7 +15,7 @@ FORBIDDEN = {
     "ground": {"hil", "cv2", "trimesh"},
     "hil": {"obbgs_core", "bpy"},
 }
-BLENDER_ONLY = {"hil.blender_worker"}  # runs in Blender's own Python
+BLENDER_ONLY = {"hil.sky.blender_worker"}  # runs in Blender's own Python
 
 
 def modules_of(part: str) -> list[str]:

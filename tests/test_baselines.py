@@ -9,8 +9,8 @@ import torch
 
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.methods import preset
 from obbgs_core.sensor import Sensor
+from obbgs_core.train.presets import preset
 from tests import baselines
 from tests.benchmarks import stability, targets
 

@@ -12,12 +12,16 @@ from typing import Any, Literal
 
 import yaml
 
+from obbgs_base.errors import ObbgsError
 
-class ConfigError(ValueError):
+
+class ConfigError(ObbgsError, ValueError):
     """A key of a file or an option is missing, unknown, repeated or wrong.
 
     `path` names the key, `problem` says what is wrong with it, `file` is where it stands, empty if not in a file.
     """
+
+    exit_code = 2
 
     def __init__(self, path: str, problem: str, file: str = ""):
         super().__init__(f"{file}: {path}: {problem}" if file else f"{path}: {problem}")

@@ -4,6 +4,8 @@ import struct
 from dataclasses import dataclass
 from typing import Self
 
+from obbgs_base.errors import ObbgsError
+
 HEADER = struct.Struct(">HHH")
 TELEMETRY, TELECOMMAND = 0, 1
 UNSEGMENTED = 3
@@ -17,7 +19,7 @@ APID_UPLINK_FILES = 0x0C6  # CFDP PDUs of files to the spacecraft, both directio
 APIDS = range(APID_FILES, APID_UPLINK_FILES + 1)
 
 
-class PacketError(ValueError):
+class PacketError(ObbgsError, ValueError):
     """Bytes from the link are not what they claim to be."""
 
 

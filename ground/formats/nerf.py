@@ -23,7 +23,8 @@ from ground.formats.views import (
     opengl_to_world_to_camera,
     world_to_camera_to_opengl,
 )
-from ground.session import FrameRecord, Session, write_whole
+from ground.session import FrameRecord, Session
+from obbgs_base.files import write_whole
 
 SPLITS = ("train", "val", "test")
 # Of eleven brackets six train, two validate, three test: 363 frames in threes give 198, 66 and 99, as published

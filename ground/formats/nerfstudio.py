@@ -19,7 +19,8 @@ from ground.formats.nerf import (
     split_brackets,
 )
 from ground.formats.views import FormatError, Intrinsics, View
-from ground.session import Session, write_whole
+from ground.session import Session
+from obbgs_base.files import write_whole
 
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")

@@ -17,7 +17,7 @@ from flightsw.icd.link_url import parse_link_url
 from flightsw.icd.packet import APID_FILES, TELECOMMAND, TELEMETRY
 from flightsw.icd.transfer import Receiver, Sender, timer_s
 from hil.link_trial import noise_containers
-from hil.virtual_can import QUEUE_FRAMES, frame_s
+from hil.links.virtual_can import QUEUE_FRAMES, frame_s
 
 BITRATE = 1_000_000
 TICK_S = 0.0002

@@ -20,8 +20,8 @@ from hil.link_trial import (
     noise_containers,
     run_trial,
 )
+from hil.links.virtual_link import Faults
 from hil.processes import unwind_on_sigterm
-from hil.virtual_link import Faults
 
 TWO_PERCENT = Faults(bit_flip=0.02, duplicate=0.02, reorder=0.02)
 CASES = {

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import torch
 
-from obbgs_core.methods import PRESETS, preset
-from obbgs_core.optimize import Trainer
+from obbgs_core.train.presets import PRESETS, preset
+from obbgs_core.train.trainer import Trainer
 from tests import baselines
 from tests.benchmarks import targets
 from tests.benchmarks.rows import shown

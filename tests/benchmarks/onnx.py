@@ -91,10 +91,10 @@ def measure(gaussians, distance: float) -> dict:
     """
     import torch
 
-    from obbgs_core.cameras import Cameras
-    from obbgs_core.export_onnx import export_onnx
-    from obbgs_core.metrics import psnr_db
+    from obbgs_core.io.onnx import export_onnx
+    from obbgs_core.model.cameras import Cameras
     from obbgs_core.render import render
+    from obbgs_core.score.metrics import psnr_db
     from obbgs_core.sensor import Sensor
 
     poses, suns = random_poses(distance), random_poses(0.0, seed=1)[:, 2, :3].copy()
@@ -149,7 +149,7 @@ def main() -> None:
     import torch
 
     from obbgs_core.errors import ReconstructionError
-    from obbgs_core.ply import load_ply
+    from obbgs_core.io.ply import load_ply
     from tests.benchmarks.rasterizer import scene
 
     if arguments.model:

@@ -14,8 +14,8 @@ import time
 
 import torch
 
-from obbgs_core.cameras import Cameras
-from obbgs_core.gaussians import Gaussians
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import native_kernels, render
 
 REPEATS = 25

@@ -15,11 +15,11 @@ import numpy as np
 import torch
 
 from ground.session import SessionError
-from hil.sensor import converted
+from hil.sky.sensor import converted
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.methods import MethodConfig
-from obbgs_core.poses import rigid_motions
+from obbgs_core.train.poses import rigid_motions
+from obbgs_core.train.presets import MethodConfig
 from tests import baselines
 from tests.benchmarks import targets
 from tests.benchmarks.methods import configure, measure

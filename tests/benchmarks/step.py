@@ -16,16 +16,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hil.sensor import converted
-from obbgs_core import optimize
-from obbgs_core.cameras import Cameras
-from obbgs_core.densify import Adam, trainable
+from hil.sky.sensor import converted
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.methods import MethodConfig, preset
-from obbgs_core.optimize import Trainer
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
+from obbgs_core.train import trainer as optimize
+from obbgs_core.train.growth import Adam, trainable
+from obbgs_core.train.presets import MethodConfig, preset
+from obbgs_core.train.trainer import Trainer
 from tests.benchmarks.rasterizer import camera, scene
 
 GAUSSIANS, WIDTH_PX = 20_000, 400

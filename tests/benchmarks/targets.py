@@ -18,13 +18,13 @@ from torch import Tensor
 from ground.evaluate import Truth
 from ground.reconstruct import exposed, sensor_of, split, training_frame
 from ground.session import open_session
-from hil.sensor import converted
+from hil.sky.sensor import converted
 from obbgs_core.frames import TrainingFrame, cameras_of
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.metrics import cloud_distances, foreground_psnr_db, psnr_db, ssim
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
+from obbgs_core.score.metrics import cloud_distances, foreground_psnr_db, psnr_db, ssim
+from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
-from obbgs_core.surface import surface_points
 
 FOLDER = Path(os.environ.get("OBBGS_TARGETS", Path(__file__).parents[3] / "shared" / "data"))
 BRACKET_S = (5e-5, 1e-4, 2e-4)

@@ -30,16 +30,16 @@ from flightsw.triage import ModelVerified, Ranked, TriageWorker, sending_order, 
 from ground.evaluate import Truth
 from ground.reconstruct import SURFACE_POINTS, camera_of, exposed, sensor_of, split, training_frame
 from ground.session import FrameRecord, Session, open_session
-from hil import spacecraft
 from hil.dataset import DatasetConfig, make_dataset
-from obbgs_core.export_onnx import export_onnx
+from hil.sky import spacecraft
 from obbgs_core.frames import TrainingFrame, cameras_of
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.metrics import cloud_distances, psnr_db
-from obbgs_core.optimize import train
+from obbgs_core.io.onnx import export_onnx
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
+from obbgs_core.score.metrics import cloud_distances, psnr_db
+from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
-from obbgs_core.surface import surface_points
+from obbgs_core.train.trainer import train
 from tests.benchmarks.methods import configure
 
 FIRST, BUDGET = 8, 4  # an eighth comes down before there is a model, a quarter in all

@@ -24,7 +24,7 @@ from flightsw.bracket import (
 from flightsw.icd.mission import BracketSection, CameraSection, load_mission
 from flightsw.pose import pose_tag
 from flightsw.region import target_pixels
-from hil.sensor import expose
+from hil.sky.sensor import expose
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 MISSION = load_mission(GOLDEN / "mission.yaml")

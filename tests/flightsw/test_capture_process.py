@@ -18,7 +18,7 @@ from flightsw.fsck import fsck
 from flightsw.icd.frame import decode_frame
 from flightsw.icd.mission import load_mission
 from flightsw.store import FrameStore
-from hil.virtual_camera import CameraServer
+from hil.cameras.virtual import CameraServer
 
 COUNT = 40
 

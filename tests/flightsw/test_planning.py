@@ -13,7 +13,7 @@ from flightsw.icd.mission import load_mission
 from flightsw.orbit import shadow_crossings
 from flightsw.planning import pass_plan
 from flightsw.pose import pose_tag
-from hil.sensor import clean_dn
+from hil.sky.sensor import clean_dn
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")
 ISS = (  # crosses the shadow each revolution; published elements of 2008-09-20

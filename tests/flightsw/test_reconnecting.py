@@ -171,7 +171,7 @@ def camera_process(tmp_path: Path, limit: int = 10**6) -> Iterator[subprocess.Po
 import itertools, os, sys, threading
 import numpy as np
 from flightsw.icd.mission import load_mission
-from hil.virtual_camera import CameraServer
+from hil.cameras.virtual import CameraServer
 mission, count = load_mission(sys.argv[1]), itertools.count(1)
 def sky(pose):
     if next(count) == {limit}:
@@ -233,7 +233,7 @@ def test_the_ground_is_told_that_the_camera_is_lost(tmp_path, small_mission):
     from flightsw.icd.packet import APID_EVENTS, APID_HOUSEKEEPING, TELECOMMAND
     from flightsw.icd.telemetry import DICTIONARY
     from flightsw.link import open_link
-    from hil.virtual_link import VirtualSerial
+    from hil.links.virtual_link import VirtualSerial
 
     path = tmp_path / "small.yaml"
     path.write_text(path.read_text().replace("link:", "link:\n  housekeeping_s: 0.1"))

@@ -13,7 +13,8 @@ import pytest
 from flightsw.errors import StoreError, StoreFull
 from flightsw.fsck import fsck
 from flightsw.icd.frame import decode_frame, encode_frame
-from flightsw.store import FrameStore, write_whole
+from flightsw.store import FrameStore
+from obbgs_base.files import write_whole
 
 
 def fill(store: FrameStore, make_frame, count: int) -> None:

@@ -38,9 +38,9 @@ from flightsw.triage import (
     tile_means,
 )
 from ground.ingest import listen
-from hil.virtual_link import VirtualSerial
-from obbgs_core.export_onnx import export_onnx
-from obbgs_core.gaussians import Gaussians
+from hil.links.virtual_link import VirtualSerial
+from obbgs_core.io.onnx import export_onnx
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
 
 GOLDEN = Path(__file__).parents[1] / "golden"

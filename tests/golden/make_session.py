@@ -13,11 +13,11 @@ from flightsw.icd.mission import load_mission
 from flightsw.sequencer import capture
 from flightsw.store import FrameStore
 from ground.session import SessionWriter
-from hil import spacecraft
-from hil.blender import RenderFarm
-from hil.scenario import true_exposures
-from hil.truth import write_truth
-from hil.virtual_camera import CameraServer
+from hil.cameras.virtual import CameraServer
+from hil.sky import spacecraft
+from hil.sky.blender import RenderFarm
+from hil.world.scenario import true_exposures
+from hil.world.truth import write_truth
 
 HERE = Path(__file__).parent
 

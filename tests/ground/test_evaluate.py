@@ -13,8 +13,8 @@ from ground.evaluate import Truth, evaluate
 from ground.reconstruct import reconstruct
 from ground.report import write_report
 from ground.session import SessionError, open_session
-from obbgs_core.metrics import foreground_psnr_db, psnr_db
-from obbgs_core.ply import load_ply
+from obbgs_core.io.ply import load_ply
+from obbgs_core.score.metrics import foreground_psnr_db, psnr_db
 from tests.benchmarks import targets
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"

@@ -20,20 +20,20 @@ from ground.evaluate import evaluate
 from ground.reconstruct import reconstruct, sensor_of, sun_direction, training_frame
 from ground.report import write_report
 from ground.session import SessionWriter, open_session
-from obbgs_core.cameras import Cameras
 from obbgs_core.errors import ReconstructionError
-from obbgs_core.export_onnx import export_onnx
 from obbgs_core.frames import Batches, TrainingFrame, sun_span_deg
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.methods import preset
-from obbgs_core.metrics import psnr_db
-from obbgs_core.optimize import Trainer, train
-from obbgs_core.parsimony import next_degree_gain
-from obbgs_core.ply import display_sh, load_ply, save_ply
+from obbgs_core.io.onnx import export_onnx
+from obbgs_core.io.ply import display_sh, load_ply, save_ply
+from obbgs_core.io.spz import load_spz, save_spz
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import lit_from, render
+from obbgs_core.score.metrics import psnr_db
+from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
-from obbgs_core.spz import load_spz, save_spz
-from obbgs_core.surface import surface_points
+from obbgs_core.train.parsimony import next_degree_gain
+from obbgs_core.train.presets import preset
+from obbgs_core.train.trainer import Trainer, train
 
 SIZE_PX, RANGE_M = 48, 60.0
 SEMI_AXES_M = np.array([1.5, 1.0, 0.7])

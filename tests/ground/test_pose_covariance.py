@@ -18,8 +18,8 @@ from flightsw.navigation import RelativePose, SatelliteStates, interpolate, pars
 from flightsw.pose import navigation_tag
 from ground.reconstruct import motion_covariance, training_frame
 from ground.session import open_session
-from obbgs_core.pose_covariance import flaw
-from obbgs_core.poses import PoseCorrections
+from obbgs_core.model.pose_covariance import flaw
+from obbgs_core.train.poses import PoseCorrections
 
 ROOT = Path(__file__).parents[2]
 GOLDEN = ROOT / "tests" / "golden" / "session"

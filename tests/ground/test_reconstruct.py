@@ -22,8 +22,8 @@ from ground.report import bounding_box, write_report
 from ground.session import MissingFrames, SessionError, open_session
 from ground.settings import changes_for
 from obbgs_core.errors import ReconstructionError, TooFewFrames
-from obbgs_core.methods import PRESETS, preset
-from obbgs_core.ply import load_ply
+from obbgs_core.io.ply import load_ply
+from obbgs_core.train.presets import PRESETS, preset
 from tests import baselines
 from tests.benchmarks import targets
 
@@ -139,7 +139,7 @@ def test_a_killed_run_goes_on_to_the_same_model(tmp_path):
     code = f"""
 import os, signal
 from pathlib import Path
-import obbgs_core.optimize as optimize
+import obbgs_core.train.trainer as optimize
 from ground.reconstruct import reconstruct
 optimize.CHECKPOINT_EVERY_S = 0.0
 def die(progress):

@@ -26,10 +26,11 @@ from ground.report import write_report
 from ground.session import SessionError
 from ground.settings import all_changes, changes_for, mission_changes, set_changes
 from ground.summary import model_rows
-from obbgs_core.errors import Diverged, Interrupted
-from obbgs_core.methods import PRESETS
-from obbgs_core.optimize import StepInfo
-from obbgs_core.ply import load_ply
+from obbgs_base.errors import Interrupted
+from obbgs_core.errors import Diverged
+from obbgs_core.io.ply import load_ply
+from obbgs_core.train.presets import PRESETS
+from obbgs_core.train.trainer import StepInfo
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 QUICK = {"steps": 8, "start_count": 600, "max_gaussians": 800, "sh_degree": 0}
@@ -86,7 +87,7 @@ def test_what_cannot_be_made_of_a_model_is_named_and_the_rest_is_there(session, 
 
 
 def test_the_command_trains_and_ends_well_where_the_model_is_too_large_for_onnx(session, monkeypatch):
-    monkeypatch.setattr("obbgs_core.export_onnx.MAX_PROTOBUF_BYTES", 1000)
+    monkeypatch.setattr("obbgs_core.io.onnx.MAX_PROTOBUF_BYTES", 1000)
     arguments = ["reconstruct", "--session", str(session), "--steps", "5"]
     done = CliRunner().invoke(cli.app, arguments, env={"COLUMNS": "200"})
     assert done.exit_code == 0, done.output
@@ -128,7 +129,7 @@ def test_a_model_that_the_disk_does_not_take_is_kept_and_written_later(session, 
 
 
 def test_a_blind_training_that_fails_does_not_cost_the_one_that_did_not(session, monkeypatch):
-    from obbgs_core.optimize import train
+    from obbgs_core.train.trainer import train
 
     def blindly_diverging(frames, sensor, config, *more):
         if not config.exposure_aware:

@@ -12,7 +12,7 @@ from flightsw.icd.frame import quat_to_matrix
 from flightsw.icd.mission import ConfigError, TargetAttitudeSection, load_mission
 from flightsw.orbit import propagate
 from flightsw.pose import target_attitude
-from hil.attitude import AttitudeSection, attitude, tumble
+from hil.world.attitude import AttitudeSection, attitude, tumble
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")
 START_NS = MISSION.orbit.start_utc_ns

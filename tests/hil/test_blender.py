@@ -14,9 +14,10 @@ from typer.testing import CliRunner
 from flightsw.icd.frame import PoseTag, matrix_to_quat
 from flightsw.icd.mission import Mission, load_mission
 from flightsw.pose import look_along
-from hil import cli, spacecraft
-from hil.blender import MeshError, RenderFarm, Worker
-from hil.motion import image_velocity
+from hil import cli
+from hil.sky import spacecraft
+from hil.sky.blender import MeshError, RenderFarm, Worker
+from hil.sky.motion import image_velocity
 
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT.parent / "shared" / "models"

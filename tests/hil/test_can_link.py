@@ -10,7 +10,7 @@ import pytest
 import flightsw.link
 import ground.link
 from flightsw.icd.framing import frame_packet
-from hil.virtual_can import VirtualCan
+from hil.links.virtual_can import VirtualCan
 
 BOTH = pytest.mark.parametrize("fd", [False, True], ids=["classic", "fd"])
 

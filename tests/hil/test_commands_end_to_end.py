@@ -29,10 +29,10 @@ from flightsw.triage import Renderer
 from ground.ingest import ListenSummary, listen
 from ground.session import open_session
 from ground.uplink import make_key, outcome, submit
-from hil.virtual_camera import CameraServer
-from hil.virtual_link import Faults, VirtualSerial
-from obbgs_core.export_onnx import export_onnx
-from obbgs_core.gaussians import Gaussians
+from hil.cameras.virtual import CameraServer
+from hil.links.virtual_link import Faults, VirtualSerial
+from obbgs_core.io.onnx import export_onnx
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
 
 GOLDEN = Path(__file__).parents[1] / "golden"

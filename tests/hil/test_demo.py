@@ -12,11 +12,12 @@ import pytest
 from rich.console import Console
 
 from flightsw.icd.mission import load_mission
-from hil import cli, spacecraft
+from hil import cli
+from hil.cameras.gige import GVCP_PORT, LOOPBACK
 from hil.demo import DemoConfig, DemoError, fly, simulate_pass
-from hil.gige_camera import GVCP_PORT, LOOPBACK
-from hil.scenario import Sky, load_scenario
-from hil.world import load_world
+from hil.sky import spacecraft
+from hil.world.scenario import Sky, load_scenario
+from hil.world.states import load_world
 from tests import baselines
 from tests.benchmarks import targets
 

@@ -18,7 +18,7 @@ from flightsw.link import SerialLink
 from flightsw.store import FrameStore
 from ground.ingest import ListenSummary, listen
 from ground.session import open_session
-from hil.virtual_link import Faults, VirtualSerial
+from hil.links.virtual_link import Faults, VirtualSerial
 
 BAUD_RATE = 3_000_000
 

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from flightsw.icd.mission import ConfigError, OrbitSection, load_mission
 from flightsw.orbit import propagate
-from hil.fly_around import FlyAround, RelativeElements, design, linear_motion
+from hil.world.fly_around import FlyAround, RelativeElements, design, linear_motion
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")
 TARGET, START_NS = MISSION.orbit.target_tle, MISSION.orbit.start_utc_ns

@@ -23,8 +23,8 @@ from flightsw.icd.frame import decode_frame
 from flightsw.icd.mission import CameraSection, Mission, load_mission
 from flightsw.sequencer import capture
 from flightsw.store import FrameStore
-from hil.gige_camera import GigeCameraServer
-from hil.sensor import demosaic as simulator_demosaic
+from hil.cameras.gige import GigeCameraServer
+from hil.sky.sensor import demosaic as simulator_demosaic
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")
 SIZE_PX = 96

@@ -8,7 +8,7 @@ from skyfield.api import EarthSatellite
 
 from flightsw.icd.mission import ConfigError, Mission, TargetAttitudeSection
 from flightsw.pose import pose_tag
-from hil.scenario import SCENARIOS, Scenario, Sky, describe, load_scenario
+from hil.world.scenario import SCENARIOS, Scenario, Sky, describe, load_scenario
 
 NAMES = ["approach", "eclipse", "fly-around", "sparse", "tumbling", "v-bar"]
 
@@ -86,7 +86,7 @@ def test_a_spinning_scenario_has_the_poses_that_flight_computes():
 
 
 def _camera():
-    from hil.sensor import PRESETS
+    from hil.sky.sensor import PRESETS
 
     return PRESETS["spacecam"].camera_section(64, 64, 1000.0)
 

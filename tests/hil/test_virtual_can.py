@@ -14,8 +14,8 @@ from isotp import CanMessage
 
 from flightsw.icd.can import FD_SIZES, SlcanText, format_slcan, open_slcan
 from flightsw.icd.link_url import parse_link_url
-from hil.virtual_can import VirtualCan, frame_bits, frame_s
-from hil.virtual_link import Faults
+from hil.links.virtual_can import VirtualCan, frame_bits, frame_s
+from hil.links.virtual_link import Faults
 
 FRAMES = [CanMessage(0x100 + number % 50, 8, number.to_bytes(8, "big")) for number in range(400)]
 

@@ -13,7 +13,7 @@ import pytest
 import serial
 
 from flightsw.icd.framing import Deframer, frame_packet
-from hil.virtual_link import Faults, VirtualLink, VirtualSerial, control, run_link
+from hil.links.virtual_link import Faults, VirtualLink, VirtualSerial, control, run_link
 
 PACKETS = [bytes([number % 256]) * (20 + number % 50) for number in range(300)]
 STREAM = b"".join(map(frame_packet, PACKETS))

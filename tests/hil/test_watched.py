@@ -8,9 +8,9 @@ import pytest
 
 from flightsw.cameras import open_camera
 from flightsw.errors import CaptureError
-from hil.virtual_camera import CameraServer
-from hil.virtual_can import VirtualCan
-from hil.virtual_link import VirtualLink, VirtualSerial, run_link
+from hil.cameras.virtual import CameraServer
+from hil.links.virtual_can import VirtualCan
+from hil.links.virtual_link import VirtualLink, VirtualSerial, run_link
 from hil.watched import ServerError, WatchedThread
 
 

@@ -18,10 +18,10 @@ from flightsw.icd.frame import quat_to_matrix
 from flightsw.icd.mission import ConfigError, Mission, load_mission
 from flightsw.pose import PoseTagger
 from flightsw.sequencer import plan
-from hil.clock import LONGEST_WAIT_S, SimulatedClock
-from hil.scenario import SCENARIOS, load_scenario
-from hil.virtual_camera import CameraServer
-from hil.world import World, load_world, write_flight_inputs
+from hil.cameras.virtual import CameraServer
+from hil.world.clock import LONGEST_WAIT_S, SimulatedClock
+from hil.world.scenario import SCENARIOS, load_scenario
+from hil.world.states import World, load_world, write_flight_inputs
 
 NS = 1_000_000_000
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from obbgs_core import compiled
-from obbgs_core.densify import Adam, trainable
-from obbgs_core.gaussians import Gaussians
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.train.growth import Adam, trainable
 
 needs_native = pytest.mark.skipif(compiled._rasterizer is None, reason="the compiled module is not installed")
 RATES = {"means": 1e-3, "quats": 2e-3, "log_scales": 5e-3, "opacity_logits": 0.05, "sh": 0.01}

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from obbgs_core import compiled
-from obbgs_core.densify import Adam, trainable
-from obbgs_core.gaussians import Gaussians
 from obbgs_core.losses import fit_figures, likelihood_loss, published_loss
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import native_kernels
 from obbgs_core.sensor import Sensor
+from obbgs_core.train.growth import Adam, trainable
 
 pytestmark = pytest.mark.skipif(not compiled.kernels(), reason="the compiled module is not installed")
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=2.0, read_noise_dn=3.0)

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from flightsw import model_file
-from obbgs_core.cameras import Cameras
 from obbgs_core.errors import ExportError
-from obbgs_core.export_onnx import export_onnx
-from obbgs_core.gaussians import Gaussians
+from obbgs_core.io.onnx import export_onnx
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 
@@ -96,7 +96,7 @@ def test_a_model_too_large_for_the_uplink_is_written_and_one_too_large_for_onnx_
     exported = export_onnx(scene(300_000, 16, 3), SENSOR, path, 32, 32, [1e-4])
     assert exported.size_bytes == path.stat().st_size > model_file.MAX_MODEL_BYTES
     path.unlink()
-    monkeypatch.setattr("obbgs_core.export_onnx.MAX_PROTOBUF_BYTES", 100_000)
+    monkeypatch.setattr("obbgs_core.io.onnx.MAX_PROTOBUF_BYTES", 100_000)
     with pytest.raises(
         ExportError, match=r"5,000 Gaussians make .* ends at 100,000: train with a smaller budget"
     ):

@@ -10,13 +10,15 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from obbgs_core import hull, obb, sh
-from obbgs_core.densify import Adam, grow, keep, outliers, trainable
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.methods import PRESETS, preset
-from obbgs_core.metrics import cloud_distances
-from obbgs_core.rotations import multiply, quats_to_matrices
+from obbgs_core import obb
+from obbgs_core.model import sh
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.rotations import multiply, quats_to_matrices
+from obbgs_core.score.metrics import cloud_distances
 from obbgs_core.sensor import Sensor
+from obbgs_core.start import hull
+from obbgs_core.train.growth import Adam, grow, keep, outliers, trainable
+from obbgs_core.train.presets import PRESETS, preset
 
 
 def model(count: int, sh_count: int = 1, channels: int = 1, seed: int = 0) -> Gaussians:

@@ -7,7 +7,7 @@ import scipy.stats
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from hil.sensor import converted
+from hil.sky.sensor import converted
 from obbgs_core import compiled
 from obbgs_core.losses import (
     charbonnier,
@@ -20,7 +20,7 @@ from obbgs_core.losses import (
     sobel_edge_loss,
     ssim_map,
 )
-from obbgs_core.metrics import psnr_db, ssim
+from obbgs_core.score.metrics import psnr_db, ssim
 from obbgs_core.sensor import Sensor
 
 needs_native = pytest.mark.skipif(compiled._rasterizer is None, reason="the compiled module is not installed")

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from obbgs_core import lpips as module
 from obbgs_core.errors import ReconstructionError
-from obbgs_core.lpips import NETWORKS, WeightsMissing, lpips, store_weights, weights_folder
+from obbgs_core.score import lpips as module
+from obbgs_core.score.lpips import NETWORKS, WeightsMissing, lpips, store_weights, weights_folder
 
 PAIRS = ("noise", "blur", "mirror", "grey")
 # By the authors' package, lpips 0.1.4, fed the same weights: see `print_distances` at the end of this file.
@@ -150,7 +150,7 @@ def test_a_grey_image_is_seen_as_three_equal_channels(random_weights):
 def test_missing_weights_name_the_file_and_the_command(tmp_path, monkeypatch):
     monkeypatch.delenv("OBBGS_LPIPS", raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
-    with pytest.raises(WeightsMissing, match=r"python -m obbgs_core\.lpips --fetch") as raised:
+    with pytest.raises(WeightsMissing, match=r"python -m obbgs_core\.score\.lpips --fetch") as raised:
         lpips(*pair("noise"))
     assert raised.value.file == tmp_path / ".cache/obbgs/lpips/vgg.npz"
     assert str(raised.value.file) in str(raised.value)

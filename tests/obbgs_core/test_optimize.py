@@ -11,20 +11,21 @@ from hypothesis import strategies as st
 from scipy.ndimage import uniform_filter
 from scipy.spatial.transform import Rotation
 
-from hil.sensor import converted
-from obbgs_core.cameras import Cameras
-from obbgs_core.densify import finite
-from obbgs_core.errors import Diverged, Interrupted, ReconstructionError, TooFewFrames
+from hil.sky.sensor import converted
+from obbgs_base.errors import Interrupted
+from obbgs_core.errors import Diverged, ReconstructionError, TooFewFrames
 from obbgs_core.frames import Batches, TrainingFrame, _shrunk
-from obbgs_core.gaussians import TENSORS, Gaussians
-from obbgs_core.held_out import held_out_brackets
-from obbgs_core.methods import preset, with_quality
-from obbgs_core.optimize import Trainer, train
-from obbgs_core.parsimony import likelihood_gains, next_degree_gain
-from obbgs_core.poses import PoseCorrections, rigid_motions
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import TENSORS, Gaussians
+from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
-from obbgs_core.sh import from_radiance
+from obbgs_core.train.growth import finite
+from obbgs_core.train.parsimony import likelihood_gains, next_degree_gain
+from obbgs_core.train.poses import PoseCorrections, rigid_motions
+from obbgs_core.train.presets import preset, with_quality
+from obbgs_core.train.trainer import Trainer, train
+from obbgs_core.train.validation import held_out_brackets
 
 SIZE, RANGE_M = 64, 8.0
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=2.0, read_noise_dn=3.0)

@@ -7,10 +7,10 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.special import expit, sph_harm_y
 
-from obbgs_core import sh
 from obbgs_core.errors import ReconstructionError
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.ply import display_sh, load_ply, radiance_sh, save_ply, save_surface_ply
+from obbgs_core.io.ply import display_sh, load_ply, radiance_sh, save_ply, save_surface_ply
+from obbgs_core.model import sh
+from obbgs_core.model.gaussians import Gaussians
 
 WHITE = 2.0
 

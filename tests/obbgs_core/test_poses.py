@@ -10,20 +10,20 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from obbgs_core.cameras import Cameras
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import Batches, TrainingFrame, usable
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.held_out import worth_of_corrections
 from obbgs_core.losses import likelihood_loss
-from obbgs_core.methods import preset
-from obbgs_core.optimize import Trainer, train
-from obbgs_core.pose_covariance import flaw, whitening
-from obbgs_core.poses import PoseCorrections, rigid_motions
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.pose_covariance import flaw, whitening
+from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
-from obbgs_core.sh import from_radiance
-from obbgs_core.start import MOST_DILATION_PX, _pose_error_px
+from obbgs_core.start.initial import MOST_DILATION_PX, _pose_error_px
+from obbgs_core.train.poses import PoseCorrections, rigid_motions
+from obbgs_core.train.presets import preset
+from obbgs_core.train.trainer import Trainer, train
+from obbgs_core.train.validation import worth_of_corrections
 
 SIZE, RANGE_M, FOCAL_PX = 48, 8.0, 100.0
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=2.0, read_noise_dn=3.0)

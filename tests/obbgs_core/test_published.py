@@ -8,15 +8,15 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from obbgs_core.cameras import Cameras
-from obbgs_core.densify import Adam, Growth, densify, trainable
 from obbgs_core.frames import TrainingFrame, camera_extent_m
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.methods import preset
-from obbgs_core.optimize import Trainer, _rates
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
-from obbgs_core.sh import from_radiance
+from obbgs_core.train.growth import Adam, Growth, densify, trainable
+from obbgs_core.train.presets import preset
+from obbgs_core.train.trainer import Trainer, _rates
 
 SENSOR = Sensor(black_dn=0, white_dn=255, dn_per_radiance_s=2.55e6, electrons_per_dn=1e9, read_noise_dn=2)
 SIZE_PX, RANGE_M = 40, 5.0

@@ -8,11 +8,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obbgs_core.cameras import Cameras
-from obbgs_core.gaussians import Gaussians
 from obbgs_core.losses import normal_disagreement
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.rotations import multiply, quats_to_matrices
 from obbgs_core.render import lit_from, native_kernels, project, render, sunlit_shares
-from obbgs_core.rotations import multiply, quats_to_matrices
 
 needs_native = pytest.mark.skipif(not native_kernels(), reason="the compiled rasterizer is not installed")
 

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
-from obbgs_core import sh
-from obbgs_core.cameras import Cameras
 from obbgs_core.errors import ExportError, ReconstructionError
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.metrics import psnr_db
-from obbgs_core.ply import display_sh, save_ply
+from obbgs_core.io.ply import display_sh, save_ply
+from obbgs_core.io.spz import load_spz, save_spz
+from obbgs_core.model import sh
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
-from obbgs_core.spz import load_spz, save_spz
+from obbgs_core.score.metrics import psnr_db
 
 WHITE = 4.0
 HALF_TURN = np.diag([1.0, -1.0, -1.0])  # our axes, taken as those of 3DGS PLYs, to SPZ's

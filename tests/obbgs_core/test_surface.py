@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.spatial import KDTree
 
-from obbgs_core.cameras import Cameras
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.surface import depth_map, surface_points
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.score.surface import depth_map, surface_points
 
 SIZE = 96
 DISTANCE = 4.0

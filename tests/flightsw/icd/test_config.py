@@ -15,7 +15,7 @@ from ground.formats.nerf import load_transforms
 from ground.formats.views import FormatError
 from ground.session import SessionCorrupt, open_session
 from hil.dataset import DATASETS, load_dataset_config
-from hil.scenario import SCENARIOS, load_scenario
+from hil.world.scenario import SCENARIOS, load_scenario
 
 ROOT = Path(__file__).parents[3]
 LEAVES = st.none() | st.booleans() | st.integers(-9, 9) | st.text("ab: {}[]#", max_size=4)

@@ -5,12 +5,12 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from obbgs_core.cameras import Cameras
-from obbgs_core.corrections import Corrections
 from obbgs_core.frames import Batch, TrainingFrame, bracket_numbers
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.pose_covariance import whitening
-from obbgs_core.rotations import from_rotation_vectors, multiply
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.pose_covariance import whitening
+from obbgs_core.model.rotations import from_rotation_vectors, multiply
+from obbgs_core.train.corrections import Corrections
 
 NULL = 1e-9  # a singular value of rows of unit length that is zero up to rounding
 

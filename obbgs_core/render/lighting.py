@@ -9,10 +9,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_core.cameras import Cameras
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.rotations import quats_to_matrices
-from obbgs_core.sh import C0, fit, from_radiance, radiance, sh_basis, softplus
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.rotations import quats_to_matrices
+from obbgs_core.model.sh import C0, fit, from_radiance, radiance, sh_basis, softplus
 
 HALF_LIT = 2.0  # albedo of a Gaussian, over its mean radiance as the Sun goes round
 FIRST_AMBIENT = 0.02

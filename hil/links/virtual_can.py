@@ -25,7 +25,7 @@ from isotp import CanMessage
 
 from flightsw.icd.can import SlcanText, format_slcan, parse_slcan
 from flightsw.icd.link_url import SLCAN_BITRATES
-from hil.virtual_link import Faults, VirtualLink, flip_a_bit
+from hil.links.virtual_link import Faults, VirtualLink, flip_a_bit
 
 DATA_BITRATE = 5_000_000  # of CAN FD's data phase
 QUEUE_FRAMES = 128  # an adapter takes no more text until the bus has taken some

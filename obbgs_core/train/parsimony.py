@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from obbgs_core.frames import Batches
-from obbgs_core.gaussians import Gaussians
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 

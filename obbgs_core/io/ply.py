@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from obbgs_core import sh
+from obbgs_base.files import write_whole
 from obbgs_core.errors import ReconstructionError
-from obbgs_core.files import write_whole
-from obbgs_core.gaussians import Gaussians, Shading
+from obbgs_core.model import sh
+from obbgs_core.model.gaussians import Gaussians, Shading
 from obbgs_core.render import lit_from
 
 DISPLAY_GAMMA = 2.2

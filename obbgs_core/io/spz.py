@@ -18,11 +18,11 @@ from pathlib import Path
 import gsply
 import torch
 
-from obbgs_core import sh
+from obbgs_base.files import write_whole
 from obbgs_core.errors import ExportError, ReconstructionError
-from obbgs_core.files import write_whole
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.ply import display_sh, radiance_sh
+from obbgs_core.io.ply import display_sh, radiance_sh
+from obbgs_core.model import sh
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import lit_from
 
 FLIP = torch.tensor([1.0, -1.0, -1.0])  # half a turn about x, its own inverse

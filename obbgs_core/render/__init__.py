@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from obbgs_core import compiled
-from obbgs_core.cameras import Cameras
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.shading import (
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.render.lighting import (
     ShadowMap,
     bare,
     lit_shares,

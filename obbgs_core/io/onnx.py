@@ -15,13 +15,20 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor
 
+from obbgs_base.files import write_whole
 from obbgs_core.errors import ExportError
-from obbgs_core.files import write_whole
-from obbgs_core.gaussians import Gaussians
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.sh import C0, SOFTNESS
 from obbgs_core.render import DILATION_PX2, FOV_MARGIN, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from obbgs_core.render.lighting import (
+    DARK_FROM,
+    LIT_UNTIL,
+    SHADOW_MAP_PX,
+    SUN_DISTANCE,
+    shortest_axes,
+    solid_ball,
+)
 from obbgs_core.sensor import Sensor
-from obbgs_core.sh import C0, SOFTNESS
-from obbgs_core.shading import DARK_FROM, LIT_UNTIL, SHADOW_MAP_PX, SUN_DISTANCE, shortest_axes, solid_ball
 
 OPSET = 18
 TILE = 16  # px: 8 costs more calls, 32 more pixels that a Gaussian does not reach

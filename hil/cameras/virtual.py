@@ -20,10 +20,10 @@ from flightsw.errors import FlightError
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission
 from flightsw.pose import pose_tag
-from hil.blender import BlenderError
-from hil.clock import SimulatedClock
-from hil.sensor import expose
+from hil.sky.blender import BlenderError
+from hil.sky.sensor import expose
 from hil.watched import WatchedThread
+from hil.world.clock import SimulatedClock
 
 log = logging.getLogger(__name__)
 MAX_SOCKET_PATH_BYTES = 107  # sun_path of Linux

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from obbgs_core.rotations import quats_to_matrices
+from obbgs_core.model.rotations import quats_to_matrices
 
 Shading = Literal["view", "sun", "lambert"]
 TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh")

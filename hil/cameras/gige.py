@@ -1,7 +1,7 @@
 """The simulated sky as a GigE Vision camera on loopback: Aravis' fake camera speaks the protocol, this fills frames.
 
 A picture may take seconds to render, but the fake camera answers its client's heartbeat only between pictures. So the
-client's trigger goes to registers of our own (gige_camera.xml); when the picture is ready, the fake camera's own
+client's trigger goes to registers of our own (gige.xml); when the picture is ready, the fake camera's own
 trigger is pulled.
 """
 
@@ -21,18 +21,18 @@ from flightsw.cameras.aravis import PIXEL_FORMATS, aravis
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import CameraSection, Mission
 from flightsw.pose import pose_tag
-from hil.clock import SimulatedClock
-from hil.sensor import expose
+from hil.sky.sensor import expose
 from hil.watched import WatchedThread
+from hil.world.clock import SimulatedClock
 
 log = logging.getLogger(__name__)
-DESCRIPTION = Path(__file__).with_name("gige_camera.xml")
+DESCRIPTION = Path(__file__).with_name("gige.xml")
 LOOPBACK, GVCP_PORT = "127.0.0.1", 3956
 POLL_S = 1e-3
 SEND_S = 1.0  # longest wait for the fake camera to take a picture
 NS = 1_000_000_000
 
-# Registers of Aravis' fake camera (arvfakecamera.h), and ours (gige_camera.xml).
+# Registers of Aravis' fake camera (arvfakecamera.h), and ours (gige.xml).
 WIDTH, HEIGHT, GAIN_TENTH_DB, SENSOR_HEIGHT, SENSOR_WIDTH = 0x100, 0x104, 0x110, 0x118, 0x11C
 EXPOSURE_US, ACQUISITION, PIXEL_FORMAT, OFFSET_X, OFFSET_Y = 0x120, 0x124, 0x128, 0x130, 0x134
 FAKE_TRIGGER_MODE, FAKE_TRIGGER_SOURCE, FAKE_TRIGGER = 0x300, 0x304, 0x30C

@@ -11,7 +11,7 @@ import trimesh
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission
 from flightsw.pose import pose_tag
-from hil.blender import RenderFarm
+from hil.sky.blender import RenderFarm
 
 CLOUD_POINTS = 100_000
 LARGEST_SAMPLE = 10  # times the points wanted: a target whose inside is a tenth outside is given up on

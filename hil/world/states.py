@@ -15,7 +15,7 @@ from flightsw.icd.frame import PoseTag, matrix_to_quat, quat_to_matrix
 from flightsw.icd.mission import Mission, NavigationSection, PoseSection, TargetAttitudeSection
 from flightsw.orbit import propagate
 from flightsw.pose import look_along, pose_tag, target_attitude
-from hil.scenario import Scenario, Sky, load_scenario
+from hil.world.scenario import Scenario, Sky, load_scenario
 
 NS = 1_000_000_000
 MARGIN_S = 10.0  # navigation goes on so long after the last exposure

@@ -8,11 +8,11 @@ import torch.nn.functional as F
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from obbgs_core.cameras import Cameras
-from obbgs_core.gaussians import Gaussians
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.rotations import quats_to_matrices
 from obbgs_core.render import project, render
-from obbgs_core.rotations import quats_to_matrices
-from obbgs_core.shading import bare, mean_radiance
+from obbgs_core.render.lighting import bare, mean_radiance
 
 BLACKEST = 3e-4  # of the bright surface's radiance; fainter Gaussians show no light, so no surface was measured there
 BRIGHT_QUANTILE = 0.97

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from obbgs_core import compiled
-from obbgs_core.gaussians import TENSORS, Gaussians
-from obbgs_core.methods import MethodConfig
+from obbgs_core.model.gaussians import TENSORS, Gaussians
+from obbgs_core.model.rotations import quats_to_matrices
 from obbgs_core.obb import Obb
 from obbgs_core.render import Rendered
-from obbgs_core.rotations import quats_to_matrices
+from obbgs_core.train.presets import MethodConfig
 
 RECORDS = ("gradient", "weight", "radius_px")  # of each Gaussian in Growth
 SPLIT_SHRINK = 1.6  # a split's halves are this much smaller (Kerbl et al. 2023)

@@ -16,11 +16,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from obbgs_core import held_out, obb
-from obbgs_core.cameras import Cameras
-from obbgs_core.densify import Adam, Growth, densify, densify_boxes, finite, keep, outliers, trainable
-from obbgs_core.errors import Diverged, Interrupted, ReconstructionError
-from obbgs_core.files import write_whole
+from obbgs_base.errors import Interrupted
+from obbgs_base.files import write_whole
+from obbgs_core import obb
+from obbgs_core.errors import Diverged, ReconstructionError
 from obbgs_core.frames import (
     FEWEST_FRAMES,
     Batch,
@@ -30,16 +29,19 @@ from obbgs_core.frames import (
     sun_span_deg,
     usable,
 )
-from obbgs_core.gaussians import Gaussians
-from obbgs_core.hull import shows_light
 from obbgs_core.losses import fit_figures, likelihood_loss, normal_disagreement, published_loss
-from obbgs_core.methods import MethodConfig
-from obbgs_core.parsimony import likelihood_gains, next_degree_gain, padded, price
-from obbgs_core.poses import PoseCorrections
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import Rendered, render, shadow_map
+from obbgs_core.render.lighting import SHADOW_MAP_PX, ShadowMap, lambertian, lit_shares
 from obbgs_core.sensor import Sensor
-from obbgs_core.shading import SHADOW_MAP_PX, ShadowMap, lambertian, lit_shares
-from obbgs_core.start import first_gaussians, silhouettes
+from obbgs_core.start.hull import shows_light
+from obbgs_core.start.initial import first_gaussians, silhouettes
+from obbgs_core.train import validation as held_out
+from obbgs_core.train.growth import Adam, Growth, densify, densify_boxes, finite, keep, outliers, trainable
+from obbgs_core.train.parsimony import likelihood_gains, next_degree_gain, padded, price
+from obbgs_core.train.poses import PoseCorrections
+from obbgs_core.train.presets import MethodConfig
 
 log = logging.getLogger(__name__)
 CHI2_MEMORY = 0.98  # of the running chi² a step

@@ -15,8 +15,8 @@ from flightsw.icd.mission import BracketSection, Mission, OrbitSection, PoseSect
 from flightsw.orbit import OrbitState, propagate, sun_direction_gcrs, sunlit_fraction
 from flightsw.pose import look_along, pose_tag
 from flightsw.sequencer import plan
-from hil.attitude import AttitudeSection, attitude
-from hil.fly_around import Design, FlyAround, RelativeElements, design
+from hil.world.attitude import AttitudeSection, attitude
+from hil.world.fly_around import Design, FlyAround, RelativeElements, design
 
 SCENARIOS = Path(__file__).parent / "scenarios"
 HORIZON_MARGIN_S = 3600.0  # a tumble is integrated so much longer than the scenario

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from obbgs_core.frames import Batch, TrainingFrame, bracket_numbers
-from obbgs_core.gaussians import Gaussians
 from obbgs_core.losses import ON_TARGET_ALPHA, fit_figures, likelihood_loss
-from obbgs_core.poses import PoseCorrections
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
+from obbgs_core.train.poses import PoseCorrections
 
 INTERVAL, FEWEST = 7, 3  # brackets; a prime keeps step with no cycle of exposures
 FEWEST_IN_ALL = 24  # frames: of fewer, each is needed

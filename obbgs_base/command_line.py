@@ -1,0 +1,75 @@
+"""What the command lines of flight, ground and simulator share: how they start, and how they end."""
+
+import logging
+import sys
+from importlib.metadata import version
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from obbgs_base.errors import Interrupted, ObbgsError
+from obbgs_base.extras import how_to_install
+
+
+class _Group(TyperGroup):
+    """A group of commands whose Ctrl-C is an error with a message, like any other; click would end in silence."""
+
+    def invoke(self, ctx: typer.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as error:
+            raise Interrupted(
+                "interrupted; nothing is half written, the same command goes on where it can"
+            ) from error
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"obbgs {version('obbgs')}")
+        raise typer.Exit
+
+
+def new_app(summary: str) -> typer.Typer:
+    """Return the command line of a tool, without commands yet; it knows --version and shell completion."""
+    app = typer.Typer(cls=_Group, no_args_is_help=True, help=summary)
+
+    @app.callback(help=summary)
+    def options(
+        version: Annotated[
+            bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
+        ] = False,
+    ) -> None:
+        pass
+
+    return app
+
+
+def run(app: typer.Typer, tool: str) -> None:
+    """Run a command line: one clear line for what went wrong, exit code 2 for usage and configuration, 1 for work.
+
+    Args:
+        tool: its name, also that of the package's extra which installs what it needs.
+    """
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(name)s: %(message)s"))
+    handler.setLevel(logging.WARNING)
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
+    try:
+        app()
+    except ModuleNotFoundError as error:
+        message = how_to_install(error, tool)
+        if message is None:
+            raise
+        _end(tool, message, 2)
+    except ObbgsError as error:
+        _end(tool, str(error), error.exit_code)
+    except ValueError as error:
+        _end(tool, str(error), 2)
+    except OSError as error:
+        _end(tool, str(error), 1)
+
+
+def _end(tool: str, message: str, exit_code: int) -> None:
+    print(f"{tool}: {message}", file=sys.stderr)
+    sys.exit(exit_code)
