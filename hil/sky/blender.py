@@ -47,7 +47,7 @@ def blender_command() -> list[str]:
     Raises:
         BlenderError: none of them is there.
     """
-    own = os.environ.get("OBBGS_BLENDER_PYTHON") or str(WORKER.parents[1] / ".venv-blender/bin/python")
+    own = os.environ.get("OBBGS_BLENDER_PYTHON") or str(WORKER.parents[2] / ".venv-blender/bin/python")
     if Path(own).exists():
         return [own, str(WORKER)]
     if installed := shutil.which("blender"):
