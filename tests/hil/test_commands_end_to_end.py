@@ -135,7 +135,9 @@ def wait_for(condition: Callable[[], bool], limit_s: float = 60) -> None:
 
 
 def lines(path: Path) -> list[dict]:
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    """Return the whole lines of a file that another process is writing."""
+    content = path.read_text() if path.exists() else ""
+    return [json.loads(line) for line in content.splitlines(keepends=True) if line.endswith("\n")]
 
 
 def test_the_ground_changes_the_bracket_and_uplinks_a_model_and_the_downlink_follows_it(
