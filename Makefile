@@ -1,9 +1,11 @@
-# Two commands: `make demo` runs the whole loop and ends in a report; `make test` checks everything. Both set up from nothing.
+# `make demo` runs the whole loop and ends in a report; `make test` checks everything. Both set up from nothing, as all below do.
 # `make test-portable` repeats the numerical tests as processors with fewer instructions would run them: tests/other_processors.py.
+# `make sanitize` runs the kernels under the address, undefined-behaviour and thread sanitizers: tests/sanitize.py.
+# `make coverage` says which lines the tests reach; `make docs` builds the documentation into build/docs.
 OUT ?= demo
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo test test-portable setup clean
+.PHONY: demo test test-portable sanitize coverage docs setup clean
 
 demo: setup
 	.venv/bin/hil demo --out "$(OUT)" $(ARGS)
@@ -17,8 +19,22 @@ test: setup
 test-portable: setup
 	.venv/bin/python -m tests.other_processors $(ARGS)
 
+sanitize: setup
+	.venv/bin/python -m tests.sanitize $(ARGS)
+
+coverage: setup
+	.venv/bin/pytest -n 2 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:build/coverage $(ARGS)
+
+docs: .venv-docs/.ready
+	.venv-docs/bin/mkdocs build --strict --site-dir build/docs
+
+.venv-docs/.ready: docs/requirements.txt
+	$(or $(PYTHON),python3) -m venv .venv-docs
+	.venv-docs/bin/pip install -q --disable-pip-version-check $(PIP_ARGS) -r docs/requirements.txt
+	touch $@
+
 setup:
 	@./setup.sh
 
 clean:
-	rm -rf .venv .venv-blender build
+	rm -rf .venv .venv-blender .venv-docs build

@@ -15,7 +15,7 @@ from obbgs_base.extras import how_to_install
 class _Group(TyperGroup):
     """A group of commands whose Ctrl-C is an error with a message, like any other; click would end in silence."""
 
-    def invoke(self, ctx: typer.Context) -> Any:
+    def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt as error:

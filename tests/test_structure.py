@@ -1,0 +1,92 @@
+"""The house rules: which room may import which, no cycles, no long file, no long function. Read from the source text."""
+
+import ast
+import graphlib
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PARTS = ("obbgs_base", "obbgs_core", "flightsw", "ground", "hil")
+LONGEST_FILE, LONGEST_FUNCTION = 400, 80  # lines
+CORE = {"obbgs_base", "obbgs_core.model", "obbgs_core"}  # what every room of the library may use
+ARROWS = {  # room: the rooms that its modules may import besides their own; a room holds what no deeper room holds
+    "obbgs_base": set(),
+    "obbgs_core.model": {"obbgs_base"},
+    "obbgs_core": {"obbgs_base", "obbgs_core.model"},  # the flat modules: errors, sensor, losses, obb, frames, compiled
+    "obbgs_core.render": CORE,
+    "obbgs_core.start": CORE | {"obbgs_core.render"},
+    "obbgs_core.train": CORE | {"obbgs_core.render", "obbgs_core.start"},
+    "obbgs_core.io": CORE | {"obbgs_core.render"},
+    "obbgs_core.score": CORE | {"obbgs_core.render"},
+}
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Return the product's modules by their dotted names."""
+    found = {}
+    for part in PARTS:
+        for path in sorted((ROOT / part).rglob("*.py")):
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+            found[name.removesuffix(".__init__")] = path
+    return found
+
+
+@cache
+def imports(module: str) -> frozenset[str]:
+    """Return which of the product's modules a module imports, anywhere in its text."""
+    names = set()
+    for node in ast.walk(ast.parse(modules()[module].read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: imports are absolute here"
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}"
+                names.add(whole if whole in modules() else str(node.module))
+    return frozenset(name for name in names if name in modules() and name != module)
+
+
+def room(module: str) -> str:
+    """Return the innermost room that a module stands in."""
+    return max((r for r in ARROWS if f"{module}.".startswith(f"{r}.")), key=len)
+
+
+@pytest.mark.parametrize("module", modules())
+def test_a_room_imports_only_the_rooms_it_may(module):
+    allowed = ARROWS[room(module)] | {room(module)}
+    wrong = {name for name in imports(module) if room(name) not in allowed}
+    assert not wrong, f"{module} (room {room(module)}) imports {', '.join(sorted(wrong))}"
+
+
+def test_every_arrow_between_rooms_is_used():
+    used = {(room(module), room(name)) for module in modules() for name in imports(module)}
+    idle = {(a, b) for a, targets in ARROWS.items() for b in targets if (a, b) not in used}
+    assert idle <= {(a, b) for a in ARROWS for b in CORE}  # every room of the library may use its foundations
+
+
+def test_no_module_is_part_of_a_cycle():
+    tuple(graphlib.TopologicalSorter({m: imports(m) for m in modules()}).static_order())  # raises CycleError
+
+
+def sources() -> list[Path]:
+    kernels = (p for p in (ROOT / "obbgs_core").rglob("*") if p.suffix in (".cpp", ".h"))
+    return [*modules().values(), *sorted(kernels)]
+
+
+def test_no_file_is_longer_than_a_reader_can_hold():
+    lengths = {str(p.relative_to(ROOT)): len(p.read_text().splitlines()) for p in sources()}
+    assert {name: n for name, n in lengths.items() if n > LONGEST_FILE} == {}
+
+
+def test_no_function_is_longer_than_a_screen_and_a_half():
+    long = {}
+    for name, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = (node.end_lineno or node.lineno) - node.lineno + 1
+                if lines > LONGEST_FUNCTION:
+                    long[f"{name}.{node.name}"] = lines
+    assert long == {}
