@@ -14,7 +14,10 @@ CORE = {"obbgs_base", "obbgs_core.model", "obbgs_core"}  # what every room of th
 ARROWS = {  # room: the rooms that its modules may import besides their own; a room holds what no deeper room holds
     "obbgs_base": set(),
     "obbgs_core.model": {"obbgs_base"},
-    "obbgs_core": {"obbgs_base", "obbgs_core.model"},  # the flat modules: errors, sensor, losses, obb, frames, compiled
+    "obbgs_core": {
+        "obbgs_base",
+        "obbgs_core.model",
+    },  # the flat modules: errors, sensor, losses, obb, frames, compiled
     "obbgs_core.render": CORE,
     "obbgs_core.start": CORE | {"obbgs_core.render"},
     "obbgs_core.train": CORE | {"obbgs_core.render", "obbgs_core.start"},

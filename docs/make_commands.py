@@ -1,0 +1,66 @@
+"""Write docs/commands.md from the command lines themselves: python docs/make_commands.py"""
+
+import enum
+import importlib
+import inspect
+import typing
+from pathlib import Path
+from typing import Any
+
+import typer.main
+from typer.core import TyperArgument
+
+TOOLS = {
+    "flightsw": "in flight",
+    "ground": "on the ground",
+    "hil": "the simulated world",
+}
+HEAD = """# Commands
+
+Made from the command lines by `docs/make_commands.py`; do not edit. Every command has `--help`,
+and prints JSON with `--json` where it prints a result. Exit codes: 0, 1 (the work failed, or was
+interrupted), 2 (wrong usage or configuration). Shell completion: `ground --install-completion`.
+
+Links are `serial:///dev/ttyUSB0?baud=921600`, `slcan:///dev/ttyACM0?bitrate=1000000` or
+`can://can0`; cameras are `hil://HOST:PORT`, `hil:///path/to/socket` or `gige://ID`.
+"""
+
+
+def page() -> str:
+    """Return the page: a section a tool, a subsection a command, a table of its options."""
+    parts = [HEAD]
+    for tool, where in TOOLS.items():
+        group = typer.main.get_command(importlib.import_module(f"{tool}.cli").app)
+        parts.append(f"## {tool}: {where}\n")
+        for name, command in group.commands.items():  # pyright: ignore[reportAttributeAccessIssue]
+            text = inspect.cleandoc(command.help or "")
+            text, _, example = text.partition("Example: ")
+            parts.append(f"### {tool} {name}\n\n{text.strip()}\n")
+            if example:
+                parts.append(f"```sh\n{' '.join(example.split())}\n```\n")
+            hints = typing.get_type_hints(inspect.unwrap(command.callback))
+            rows = [
+                _row(option, hints.get(option.name)) for option in command.params if option.name != "help"
+            ]
+            if rows:
+                parts.append("\n".join(["| option | default | |", "| --- | --- | --- |", *rows]) + "\n")
+    return "\n".join(parts)
+
+
+def _row(option: Any, hint: Any) -> str:
+    """Return the row of an option or argument: its names with their choices, its default, its help."""
+    positional = isinstance(option, TyperArgument)
+    names = option.name.upper() if positional else ", ".join(f"`{name}`" for name in option.opts)
+    for choice in (hint, *typing.get_args(hint)):
+        if isinstance(choice, type) and issubclass(choice, enum.Enum):
+            names += ": " + ", ".join(str(member.value) for member in choice)
+    default = getattr(option.default, "value", option.default)
+    empty = default in (None, False, (), []) or callable(default)
+    shown = "required" if option.required else "" if empty else f"`{default}`"
+    return f"| {names} | {shown} | {option.help or ''} |"
+
+
+if __name__ == "__main__":
+    target = Path(__file__).with_name("commands.md")
+    target.write_text(page())
+    print(target)

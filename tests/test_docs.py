@@ -1,0 +1,42 @@
+"""The documents are true: their links lead somewhere, the page of commands is that of today's command lines."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "CHANGELOG.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
+LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
+WIDEST_README = 100  # columns
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_of_a_page_leads_to_a_file(page):
+    targets = [link for link in LINK.findall(page.read_text()) if "://" not in link]
+    assert [link for link in targets if not (page.parent / link).exists()] == []
+
+
+def test_the_readme_fits_a_terminal():
+    wide = [line for line in (ROOT / "README.md").read_text().splitlines() if len(line) > WIDEST_README]
+    assert wide == []
+
+
+def test_the_page_of_commands_is_that_of_the_command_lines():
+    spec = importlib.util.spec_from_file_location("make_commands", ROOT / "docs" / "make_commands.py")
+    assert spec and spec.loader
+    maker = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(maker)
+    assert (ROOT / "docs" / "commands.md").read_text() == maker.page(), "run: python docs/make_commands.py"
+
+
+def test_every_page_is_in_the_site():
+    navigation = (ROOT / "mkdocs.yml").read_text()
+    pages = [p.relative_to(ROOT / "docs") for p in PAGES if p.parent == ROOT / "docs"]
+    assert [str(page) for page in pages if f"{page}" not in navigation] == []
