@@ -61,7 +61,7 @@ def test_the_model_exceeds_every_baseline_and_knowing_the_exposure_is_worth_deci
     black image has 33.8, the mean image 27.7 and the untrained start 28.7; 1.9 to 3.1 dB above blind; Chamfer .048.
 
     The target covers 72 px at best and every other held-out view is a few pixels wide: black alone is hard to beat, and
-    blindness costs less than in the 256 px demo (see RESULTS.md).
+    blindness costs less than in the 256 px demo (docs/experiments/021-the-whole-loop.md).
     """
     session, metrics = trained
     target, config = targets.from_session(session), preset("obbgs", **TRAINED)
