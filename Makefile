@@ -26,7 +26,7 @@ coverage: setup
 	.venv/bin/pytest -n 2 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:build/coverage $(ARGS)
 
 docs: .venv-docs/.ready
-	.venv-docs/bin/mkdocs build --strict --site-dir build/docs
+	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --strict --site-dir build/docs
 
 .venv-docs/.ready: docs/requirements.txt
 	$(or $(PYTHON),python3) -m venv .venv-docs
