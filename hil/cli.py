@@ -147,8 +147,10 @@ def link(
 
     Example: hil link --baud 921600 --loss 0.02 --flip 0.01 --seed 3
     """
+    from hil.links.faults import Faults
     from hil.links.virtual_can import VirtualCan
-    from hil.links.virtual_link import Faults, VirtualLink, VirtualSerial, control, run_link
+    from hil.links.virtual_link import VirtualLink, control, run_link
+    from hil.links.virtual_serial import VirtualSerial
 
     faults = Faults(loss, flip, duplicate, reorder)
     line: VirtualLink

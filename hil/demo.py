@@ -28,9 +28,10 @@ from flightsw.icd.mission import Mission, load_mission
 from ground.summary import model_rows, table
 from hil.cameras.gige import GigeCameraServer
 from hil.cameras.virtual import CameraServer
-from hil.link_trial import STANDARD_CUT_S, STANDARD_FAULTS
+from hil.links.faults import STANDARD_CUT_S, STANDARD_FAULTS, Faults
 from hil.links.virtual_can import VirtualCan
-from hil.links.virtual_link import Faults, VirtualLink, VirtualSerial
+from hil.links.virtual_link import VirtualLink
+from hil.links.virtual_serial import VirtualSerial
 from hil.processes import end, tied
 from hil.sky.blender import RenderFarm, check_mesh
 from hil.world.clock import SimulatedClock

@@ -30,7 +30,8 @@ from ground.ingest import ListenSummary, listen
 from ground.session import open_session
 from ground.uplink import make_key, outcome, submit
 from hil.cameras.virtual import CameraServer
-from hil.links.virtual_link import Faults, VirtualSerial
+from hil.links.faults import Faults
+from hil.links.virtual_serial import VirtualSerial
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor

@@ -18,7 +18,8 @@ from flightsw.link import SerialLink
 from flightsw.store import FrameStore
 from ground.ingest import ListenSummary, listen
 from ground.session import open_session
-from hil.links.virtual_link import Faults, VirtualSerial
+from hil.links.faults import Faults
+from hil.links.virtual_serial import VirtualSerial
 
 BAUD_RATE = 3_000_000
 

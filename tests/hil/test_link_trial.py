@@ -6,8 +6,8 @@ frames is `python -m tests.benchmarks.link`.
 
 import pytest
 
-from hil.link_trial import Trial, TrialError, TrialResult, noise_containers, run_trial
-from hil.links.virtual_link import Faults
+from hil.links.faults import Faults
+from tests.link_trial import Trial, TrialError, TrialResult, noise_containers, run_trial
 
 FAULTS = Faults(loss=0.1, bit_flip=0.02, duplicate=0.02, reorder=0.02)
 ALL = {"cut_s": 2.0, "kills": 3, "full_disks": True, "seed": 5}

@@ -14,8 +14,9 @@ from isotp import CanMessage
 
 from flightsw.icd.can import FD_SIZES, SlcanText, format_slcan, open_slcan
 from flightsw.icd.link_url import parse_link_url
-from hil.links.virtual_can import VirtualCan, frame_bits, frame_s
-from hil.links.virtual_link import Faults
+from hil.links.can_timing import frame_bits, frame_s
+from hil.links.faults import Faults
+from hil.links.virtual_can import VirtualCan
 
 FRAMES = [CanMessage(0x100 + number % 50, 8, number.to_bytes(8, "big")) for number in range(400)]
 

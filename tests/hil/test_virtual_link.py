@@ -13,7 +13,9 @@ import pytest
 import serial
 
 from flightsw.icd.framing import Deframer, frame_packet
-from hil.links.virtual_link import Faults, VirtualLink, VirtualSerial, control, run_link
+from hil.links.faults import Faults
+from hil.links.virtual_link import VirtualLink, control, run_link
+from hil.links.virtual_serial import VirtualSerial
 
 PACKETS = [bytes([number % 256]) * (20 + number % 50) for number in range(300)]
 STREAM = b"".join(map(frame_packet, PACKETS))

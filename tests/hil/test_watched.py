@@ -10,7 +10,8 @@ from flightsw.cameras import open_camera
 from flightsw.errors import CaptureError
 from hil.cameras.virtual import CameraServer
 from hil.links.virtual_can import VirtualCan
-from hil.links.virtual_link import VirtualLink, VirtualSerial, run_link
+from hil.links.virtual_link import VirtualLink, run_link
+from hil.links.virtual_serial import VirtualSerial
 from hil.watched import ServerError, WatchedThread
 
 
