@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import inspect
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -10,19 +11,20 @@ from typing import Literal
 
 import numpy as np
 
+import ground.truth
 from flightsw.icd.config import ConfigError, build, in_file, parse_yaml
-from flightsw.icd.frame import Frame, PoseTag, encode_frame
+from flightsw.icd.frame import Frame, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.sequencer import Shot, plan
 from ground.formats.nerf import export_nerf
 from ground.session import SessionWriter, open_session
 from ground.telemetry import FlightCounts
-from hil.sky import blender, sensor
+from hil import truth
+from hil.sky import blender, motion, sensor, stars
 from hil.sky.blender import RenderFarm, mesh_sha256
 from hil.sky.motion import image_velocity, smear
 from hil.sky.sensor import PRESETS, SensorModel, read_out
 from hil.sky.stars import star_radiance
-from hil.world import truth
 from hil.world.scenario import SceneState, Sky, load_scenario
 from obbgs_base.errors import ObbgsError
 from obbgs_base.files import write_whole
@@ -35,7 +37,7 @@ BRIGHT_PERCENTILE, BRIGHT_SIGNAL, COVERED_ALPHA = 97, 0.7, 230
 MOTION_S = 0.1  # poses so far apart give the image's velocity
 
 
-class DatasetError(ObbgsError, RuntimeError):
+class DatasetError(ObbgsError):
     """A data set cannot be made where or as it was asked for."""
 
 
@@ -227,7 +229,7 @@ def _light(
     camera = mission.camera
     light = farm.radiance(state.pose).astype(np.float64)
     if model.stars:
-        alpha = _alpha(farm, state.pose)
+        alpha = farm.alpha(state.pose) / 255
         sky_light = star_radiance(state.gcrs_to_camera, np.array(camera.K), camera.width, camera.height)
         light += (sky_light * (1 - alpha))[..., None]
     if model.line_time_s or exposure_time_s > MOTION_S / 100:
@@ -246,18 +248,13 @@ def _light(
     return light
 
 
-def _alpha(farm: RenderFarm, pose: PoseTag) -> np.ndarray:
-    with np.load(farm.path(pose)) as arrays:
-        return arrays["alpha"] / 255.0
-
-
 def _gain(farm: RenderFarm, states: list[SceneState], model: SensorModel, exposure_time_s: float) -> float:
     """Return the digital numbers per radiance and second that put the target's bright parts at 0.7 of full scale."""
     covered = []
     for state in states:
         if not state.pose.in_eclipse:
             radiance = farm.radiance(state.pose).astype(np.float32).mean(axis=2)
-            covered.append(radiance[_alpha(farm, state.pose) * 255 >= COVERED_ALPHA])
+            covered.append(radiance[farm.alpha(state.pose) >= COVERED_ALPHA])
     values = np.concatenate(covered) if covered else np.empty(0)
     bright = float(np.percentile(values, BRIGHT_PERCENTILE)) if len(values) else 0.0
     if not bright > 0:
@@ -271,8 +268,10 @@ def _digest(config: DatasetConfig, scenario_sha256: str, mesh: Path) -> str:
     blender.check_mesh(mesh)
     settings = {**dataclasses.asdict(config), "targets": None, "scenario": scenario_sha256}
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode() + mesh_sha256(mesh).encode())
-    for source in (blender.WORKER, Path(sensor.__file__), Path(truth.__file__), Path(__file__)):
+    for source in (blender.WORKER, Path(__file__)):
         digest.update(source.read_bytes())
+    for module in (sensor, motion, stars, truth, ground.truth):
+        digest.update(inspect.getsource(module).encode())
     return digest.hexdigest()
 
 

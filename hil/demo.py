@@ -34,10 +34,10 @@ from hil.links.virtual_link import VirtualLink
 from hil.links.virtual_serial import VirtualSerial
 from hil.processes import end, tied
 from hil.sky.blender import RenderFarm, check_mesh
+from hil.truth import write_truth
 from hil.world.clock import SimulatedClock
 from hil.world.scenario import true_exposures
 from hil.world.states import World, load_world, write_flight_inputs
-from hil.world.truth import write_truth
 from obbgs_base.errors import ObbgsError
 
 MARKER = "demo.json"  # says that what a folder has of these is a demo's own

@@ -55,14 +55,14 @@ class SlcanAdapter:
     def __init__(self, link: VirtualLink, bitrate: int, master: int, seed: int):
         self.master = master
         self.statistics = BusLaneStatistics()  # of the direction that it sends
-        self.queue: deque[tuple[float, CanMessage]] = deque()  # frames for the bus, each with its time of arrival
+        self.queue: deque[tuple[float, CanMessage]] = deque()  # for the bus, with times of arrival
         self.is_open = False
         self._link, self._bus_bitrate = link, bitrate
         self._random = random.Random(seed)
         self._bitrate, self._fd = 0, False  # as the computer has set them
         self._line = bytearray()  # of text from the computer, until it ends
         self._travelling: deque[tuple[float, CanMessage]] = deque()  # when each frame reaches the computer
-        self._held_back: tuple[bytes, int] | None = None  # text and data bytes of a frame that the next overtakes
+        self._held_back: tuple[bytes, int] | None = None  # a frame that the next overtakes
         self._out = bytearray()
         # For each line in `_out`: the bytes of text that are left, and the data bytes of its frame (-1: an answer).
         self._out_frames: deque[list[int]] = deque()

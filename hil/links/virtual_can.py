@@ -46,7 +46,8 @@ class VirtualCan(VirtualLink):
         self._random = random.Random(3 * seed)
         self._free_s = 0.0  # when the frame on the bus ends
         self._flight, self._ground = (
-            SlcanAdapter(self, bitrate, master, 3 * seed + number + 1) for number, master in enumerate(self._masters)
+            SlcanAdapter(self, bitrate, master, 3 * seed + number + 1)
+            for number, master in enumerate(self._masters)
         )
         self._flight.partner, self._ground.partner = self._ground, self._flight
 

@@ -34,7 +34,7 @@ class VirtualLink:
             tty.setraw(slave)  # at once: a terminal by default echoes and translates
             os.set_blocking(master, False)
             self._masters.append(master)
-            self._slaves.append(slave)  # kept open: else reading the master fails while no program has this end open
+            self._slaves.append(slave)  # kept open, or reading the master fails until a program opens it
         self._thread = WatchedThread(f"simulated link ({type(self).__name__})", self._run)
 
     @property
@@ -79,7 +79,7 @@ class VirtualLink:
 
 
 def control(line: VirtualLink, command: str) -> str:
-    """Execute `cut`, `mend`, `latency SECONDS` or a fault's name with its probability, and return the new state as text.
+    """Execute `cut`, `mend`, `latency SECONDS` or a fault's name with its probability, and return the new state.
 
     Raises:
         ValueError: another command, or a value out of range; the message says what was expected.

@@ -41,7 +41,7 @@ class LaneStatistics:
 
 
 class _Lane:
-    """One direction. It reads no faster than the line's rate, so that the kernel's buffer fills and the writer waits."""
+    """One direction. Reads no faster than the line's rate, so that the kernel's buffer fills and the writer waits."""
 
     def __init__(self, line: "VirtualSerial", source: int, sink: int, seed: int):
         self.source, self.sink = source, sink

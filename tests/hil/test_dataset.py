@@ -14,11 +14,10 @@ from typer.testing import CliRunner
 from flightsw.icd.mission import ConfigError
 from ground.formats.nerf import SPLIT_PATTERN
 from ground.session import open_session
-from hil import cli, dataset
+from hil import cli, dataset, truth
 from hil.dataset import DatasetConfig, DatasetError, load_dataset_config, make_dataset, target_meshes
 from hil.sky import spacecraft
 from hil.sky.sensor import PRESETS
-from hil.world import truth
 
 POINTS = 5000
 SMALL = DatasetConfig(frames=33, size_px=40, bracket_ms=(0.05, 0.1, 0.2), sensor="paper")
