@@ -20,12 +20,13 @@ from ground.formats.nerf import export_nerf
 from ground.session import SessionWriter, open_session
 from ground.telemetry import FlightCounts
 from hil import truth
+from hil.choices import SensorKind
 from hil.sky import blender, motion, sensor, stars
 from hil.sky.blender import RenderFarm, mesh_sha256
 from hil.sky.motion import image_velocity, smear
 from hil.sky.sensor import PRESETS, SensorModel, read_out
 from hil.sky.stars import star_radiance
-from hil.world.scenario import SceneState, Sky, load_scenario
+from hil.world.scenario import Scene, SceneState, load_scenario
 from obbgs_base.errors import ObbgsError
 from obbgs_base.files import write_whole
 
@@ -49,7 +50,7 @@ class DatasetConfig:
     frames: int = 363
     size_px: int = 800
     bracket_ms: tuple[float, ...] = (0.05, 0.1, 0.2)
-    sensor: Literal["paper", "spacecam"] = "paper"
+    sensor: SensorKind = "paper"
     seed: int = 1
     targets: tuple[str, ...] = ()
 
@@ -141,9 +142,9 @@ def make_dataset(
     model = PRESETS[config.sensor]
     camera = model.camera_section(config.size_px, config.size_px, focal_px)
     mission = Mission(orbit=scenario.orbit, camera=camera, bracket=brackets, sha256=digest)
-    sky = Sky(scenario)
+    scene = Scene(scenario)
     shots = list(plan(mission))
-    states = [sky.state(shot.mid_exposure_utc_ns) for shot in shots]
+    states = [scene.state(shot.mid_exposure_utc_ns) for shot in shots]
     with RenderFarm(mission, mesh, cache, workers) as farm:
         rendered = iter(range(1, len(states) + 1))  # a worker's thread takes the next number: a count
         farm.prerender(
@@ -158,7 +159,7 @@ def make_dataset(
             mission, camera=model.camera_section(config.size_px, config.size_px, focal_px)
         )
         writer = SessionWriter(out / "session", mission)
-        for index, frame in enumerate(_frames(mission, sky, shots, states, farm, model, config.seed)):
+        for index, frame in enumerate(_frames(mission, scene, shots, states, farm, model, config.seed)):
             writer.add(frame, encode_frame(frame))
             on_progress(Progress(mesh.stem, "expose", index + 1, len(shots)))
         writer.save({}, 0, FlightCounts(frames_stored=len(shots)))
@@ -167,7 +168,7 @@ def make_dataset(
             mission,
             farm,
             truth.CLOUD_POINTS,
-            pose_at=lambda utc_ns: sky.state(utc_ns).pose,
+            pose_at=lambda utc_ns: scene.state(utc_ns).pose,
             geometry=True,
         )
         mesh_facts = farm.facts
@@ -192,7 +193,7 @@ def make_dataset(
 
 def _frames(
     mission: Mission,
-    sky: Sky,
+    scene: Scene,
     shots: list[Shot],
     states: list[SceneState],
     farm: RenderFarm,
@@ -200,7 +201,7 @@ def _frames(
     seed: int,
 ) -> Iterator[Frame]:
     for number, (shot, state) in enumerate(zip(shots, states, strict=True)):
-        light = _light(mission, sky, state, farm, model, shot.exposure_time_s)
+        light = _light(mission, scene, state, farm, model, shot.exposure_time_s)
         dn = read_out(model, light, shot.exposure_time_s, np.random.default_rng((seed, number)))
         yield Frame(
             frame_id=number,
@@ -219,7 +220,7 @@ def _frames(
 
 def _light(
     mission: Mission,
-    sky: Sky,
+    scene: Scene,
     state: SceneState,
     farm: RenderFarm,
     model: SensorModel,
@@ -234,14 +235,14 @@ def _light(
         light += (sky_light * (1 - alpha))[..., None]
     if model.line_time_s or exposure_time_s > MOTION_S / 100:
         depth, _ = farm.geometry(state.pose)
-        start_ns = sky.orbit.start_utc_ns
+        start_ns = scene.orbit.start_utc_ns
         before_ns = max(start_ns, state.utc_ns - round(MOTION_S * 5e8))
         after_ns = state.utc_ns + round(MOTION_S * 5e8)
         velocity = image_velocity(
             depth,
             np.array(camera.K),
-            sky.state(before_ns).pose.world_to_camera,
-            sky.state(after_ns).pose.world_to_camera,
+            scene.state(before_ns).pose.world_to_camera,
+            scene.state(after_ns).pose.world_to_camera,
             (after_ns - before_ns) * 1e-9,
         )
         light = smear(light, velocity, exposure_time_s, model.line_time_s)

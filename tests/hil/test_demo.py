@@ -14,10 +14,11 @@ from rich.console import Console
 from flightsw.icd.mission import load_mission
 from hil import cli
 from hil.cameras.gige import GVCP_PORT, LOOPBACK
-from hil.demo import DemoConfig, DemoError, fly, simulate_pass
+from hil.demo import simulate_pass
+from hil.simulated_pass import PassConfig, PassError, fly
 from hil.sky import spacecraft
-from hil.world.scenario import Sky, load_scenario
-from hil.world.states import load_world
+from hil.world.scenario import Scene, load_scenario
+from hil.world.world import load_world
 from tests import baselines
 from tests.benchmarks import targets
 
@@ -101,7 +102,7 @@ def plate(pose) -> np.ndarray:
 def test_every_frame_crosses_a_faulty_can_bus_from_a_gige_camera(
     quick, tmp_path, the_only_camera_on_loopback
 ):
-    config = DemoConfig(camera="gige", link="slcan", faults="standard")
+    config = PassConfig(camera="gige", link="slcan", faults="standard")
     world = load_world(load_mission(quick))
     figures = fly(tmp_path, world, quick, plate, config, Console(stderr=True))
     assert figures["frames"] == {"captured": 4, "received": 4, "without_valid_pose": 0}
@@ -115,16 +116,16 @@ def test_every_frame_crosses_a_faulty_can_bus_from_a_gige_camera(
 
 
 def test_a_pass_that_does_not_move_is_an_error(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr("hil.demo.PATIENCE_S", 2.0)
-    monkeypatch.setattr("hil.demo._Cut.update", lambda cut, received: cut._line.cut())
+    monkeypatch.setattr("hil.simulated_pass.STALL_S", 2.0)
+    monkeypatch.setattr("hil.simulated_pass._Cut.update", lambda cut, received: cut._line.cut())
     world = load_world(load_mission(quick))
-    with pytest.raises(DemoError, match="0 received of 4"):
-        fly(tmp_path, world, quick, plate, DemoConfig(), Console(stderr=True))
+    with pytest.raises(PassError, match="0 received of 4"):
+        fly(tmp_path, world, quick, plate, PassConfig(), Console(stderr=True))
 
 
 def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_path):
     out = tmp_path / "demo"
-    config = DemoConfig(link="slcan-fd", scenario="tumbling", real_time=3000.0, navigation_noise=3)
+    config = PassConfig(link="slcan-fd", scenario="tumbling", real_time=3000.0, navigation_noise=3)
     simulation = simulate_pass(out, quick, spacecraft.SHIPPED, config, Console(stderr=True))
     assert simulation["frames"] == {"captured": 4, "received": 4, "without_valid_pose": 0}
     link = simulation["link"]  # without faults, a CAN bus
@@ -132,7 +133,7 @@ def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_pat
     # a sixth of a millisecond from frame to frame of a bracket: nobody stores a frame so fast
     assert 2 <= simulation["camera"]["late_frames"] <= 3
     assert 0.005 < simulation["navigation"]["position_error_m"] < 0.1
-    sky = Sky(load_scenario("tumbling"))
+    scene = Scene(load_scenario("tumbling"))
     truth = json.loads((out / "session" / "truth" / "truth.json").read_text())
     assert truth["simulation"] == simulation
     lines = (out / "session" / "frames.jsonl").read_text().splitlines()
@@ -140,15 +141,16 @@ def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_pat
     assert len(truth["frames"]) == 4
     for entry in truth["frames"]:
         tag = tags[entry["id"]]
-        true = sky.state(tag["mid_exposure_utc_ns"]).pose.world_to_camera
+        true = scene.state(tag["mid_exposure_utc_ns"]).pose.world_to_camera
         np.testing.assert_allclose(entry["world_to_camera"], true, atol=1e-9)
         assert 1e-4 < np.abs(np.array(tag["world_to_camera"]) - true).max() < 0.5  # m: navigation errs
 
 
 def test_what_cannot_be_flown_is_refused_before_anything_is_written(mission, tmp_path, monkeypatch, capsys):
     for chosen, reason in (
-        (("--link", "radio"), "demo.link: expected one of serial, slcan, slcan-fd"),
-        (("--camera", "usb"), "demo.camera: expected one of hil, gige"),
+        (("--link", "radio"), "'radio' is not one of 'serial', 'slcan', 'slcan-fd'"),
+        (("--camera", "usb"), "'usb' is not one of 'hil', 'gige'"),
+        (("--faults", "all"), "'all' is not one of 'none', 'standard'"),
         (("--scenario", "fly_around"), "expected a YAML file or one of approach"),
         (("--real-time", "-1"), "0 (lock step) or positive"),
     ):
@@ -156,7 +158,8 @@ def test_what_cannot_be_flown_is_refused_before_anything_is_written(mission, tmp
         monkeypatch.setattr(sys, "argv", command)
         with pytest.raises(SystemExit) as ended:
             cli.main()
-        assert ended.value.code == 2 and reason in capsys.readouterr().err
+        told = " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().err).split())  # without the box around it
+        assert ended.value.code == 2 and reason in told
     assert not (tmp_path / "d").exists()
 
 
@@ -190,7 +193,7 @@ def test_a_pass_that_cannot_start_leaves_only_rendered_frames(quick, tmp_path, t
     out = tmp_path / "demo"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind((LOOPBACK, GVCP_PORT))
-        config = DemoConfig(camera="gige", scenario="tumbling")
+        config = PassConfig(camera="gige", scenario="tumbling")
         with pytest.raises(OSError, match="is in use"):
             simulate_pass(out, quick, spacecraft.SHIPPED, config, Console(stderr=True))
     assert [path.name for path in out.iterdir()] == ["renders"]

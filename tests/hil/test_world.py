@@ -20,8 +20,9 @@ from flightsw.pose import PoseTagger
 from flightsw.sequencer import plan
 from hil.cameras.virtual import CameraServer
 from hil.world.clock import LONGEST_WAIT_S, SimulatedClock
+from hil.world.navigation import write_flight_inputs
 from hil.world.scenario import SCENARIOS, load_scenario
-from hil.world.states import World, load_world, write_flight_inputs
+from hil.world.world import World, load_world
 
 NS = 1_000_000_000
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")
