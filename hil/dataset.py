@@ -1,4 +1,4 @@
-"""Data sets like the source paper's: a scenario rendered, exposed and written as a session and as NeRF pictures."""
+"""Data sets like that of Jiang et al. 2025: a scenario rendered, exposed, and written as a session and for NeRF."""
 
 import dataclasses
 import hashlib
@@ -33,18 +33,18 @@ from obbgs_base.files import write_whole
 DATASETS = Path(__file__).parent / "datasets"
 MARKER = "dataset.json"
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".stl")
-# The lens is chosen so that a bright part of the target reads 0.7 of full scale at the middle exposure
+# The gain is chosen so that bright parts of the target read 0.7 of full scale at the middle exposure.
 BRIGHT_PERCENTILE, BRIGHT_SIGNAL, COVERED_ALPHA = 97, 0.7, 230
-MOTION_S = 0.1  # poses so far apart give the image's velocity
+MOTION_S = 0.1  # interval over which the image velocity is measured
 
 
 class DatasetError(ObbgsError):
-    """A data set cannot be made where or as it was asked for."""
+    """The data set's folder or its scenario cannot be used."""
 
 
 @dataclass(frozen=True)
 class DatasetConfig:
-    """What makes one data set, apart from the mesh; `targets` are mesh names for a set of several."""
+    """The settings of a data set; the mesh is given apart, or `targets` names the meshes of several."""
 
     scenario: str = "fly-around"
     frames: int = 363
@@ -68,7 +68,7 @@ class DatasetConfig:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far one step of one target's data set is."""
+    """The state of one step of a target's data set, in frames."""
 
     target: str
     step: Literal["render", "expose"]
@@ -80,7 +80,7 @@ def load_dataset_config(name: str | Path) -> DatasetConfig:
     """Return a ready-made data set's configuration by its name, or the one in a YAML file.
 
     Raises:
-        ConfigError: there is none, or it is wrong; the message names the file and the key's path.
+        ConfigError: it does not exist or is wrong; the message names the file and the key's path.
     """
     path = DATASETS / f"{name}.yaml"
     if not path.is_file():
@@ -119,7 +119,7 @@ def make_dataset(
     workers: int = 2,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> dict:
-    """Make one target's data set in `out` and return its facts; what is there already is kept and continued.
+    """Make one target's data set in `out` and return its facts; one that was interrupted is continued.
 
     `out` holds session/ (frames, and truth/ with radiance and masks, depth and normals, mesh, cloud), the NeRF layout
     (transforms_{train,val,test}.json with their pictures), and dataset.json. Frames are tagged with their true poses.
@@ -146,7 +146,7 @@ def make_dataset(
     shots = list(plan(mission))
     states = [scene.state(shot.mid_exposure_utc_ns) for shot in shots]
     with RenderFarm(mission, mesh, cache, workers) as farm:
-        rendered = iter(range(1, len(states) + 1))  # a worker's thread takes the next number: a count
+        rendered = iter(range(1, len(states) + 1))  # a counter that the workers' threads share
         farm.prerender(
             [state.pose for state in states],
             lambda: on_progress(Progress(mesh.stem, "render", next(rendered), len(states))),
@@ -226,7 +226,7 @@ def _light(
     model: SensorModel,
     exposure_time_s: float,
 ) -> np.ndarray:
-    """Return the mean radiance [H, W, C] in front of the lens during an exposure: the target, moving, and the stars."""
+    """Return the mean radiance [H, W, C] over an exposure, before the lens: the moving target and the stars."""
     camera = mission.camera
     light = farm.radiance(state.pose).astype(np.float64)
     if model.stars:
@@ -250,7 +250,7 @@ def _light(
 
 
 def _gain(farm: RenderFarm, states: list[SceneState], model: SensorModel, exposure_time_s: float) -> float:
-    """Return the digital numbers per radiance and second that put the target's bright parts at 0.7 of full scale."""
+    """Return the gain, DN per radiance and s, at which bright parts of the target read 0.7 of full scale."""
     covered = []
     for state in states:
         if not state.pose.in_eclipse:
@@ -259,13 +259,13 @@ def _gain(farm: RenderFarm, states: list[SceneState], model: SensorModel, exposu
     values = np.concatenate(covered) if covered else np.empty(0)
     bright = float(np.percentile(values, BRIGHT_PERCENTILE)) if len(values) else 0.0
     if not bright > 0:
-        raise DatasetError("no frame of this scenario shows a lit target: nothing to set the exposure by")
+        raise DatasetError("no frame of this scenario shows a lit target: the gain cannot be set")
     gain = BRIGHT_SIGNAL * (model.white_dn - model.black_dn) / (bright * exposure_time_s)
     return float(f"{gain:.6g}")
 
 
 def _digest(config: DatasetConfig, scenario_sha256: str, mesh: Path) -> str:
-    """Return the digest of all that shapes a data set: settings, scenario, mesh, and the code that makes pixels."""
+    """Return the SHA-256 of what a data set depends on: settings, scenario, mesh, and the code that computes pixels."""
     blender.check_mesh(mesh)
     settings = {**dataclasses.asdict(config), "targets": None, "scenario": scenario_sha256}
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode() + mesh_sha256(mesh).encode())
@@ -277,7 +277,7 @@ def _digest(config: DatasetConfig, scenario_sha256: str, mesh: Path) -> str:
 
 
 def _already_made(out: Path, digest: str) -> dict | None:
-    """Return the facts of a finished data set, None where there is nothing or one to continue."""
+    """Return the facts of a finished data set; None if there is none yet or it is to be continued."""
     marker = out / MARKER
     if not marker.exists():
         if (out / "session").exists():

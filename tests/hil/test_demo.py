@@ -1,4 +1,4 @@
-"""The whole loop, small: Blender, camera, flight, link, ground, model, report; each a process of its own."""
+"""The whole demo at small size: Blender, camera, flight, link, ground, model and report, each a separate process."""
 
 import json
 import re
@@ -79,7 +79,7 @@ def test_demo_ends_in_a_report_with_every_frame_across(mission, tmp_path):
         json.loads(line)["sha256"] for line in (out / "session" / "frames.jsonl").read_text().splitlines()
     ]
     assert sorted(stored) == sorted(arrived)
-    kept = [np.load(path).files for path in (out / "renders").iterdir()]  # for the next run
+    kept = [np.load(path).files for path in (out / "renders").iterdir()]  # cached for the next run
     assert sum("radiance" in names for names in kept) == 15
 
 
@@ -93,7 +93,7 @@ def quick(mission, tmp_path) -> Path:
 
 
 def plate(pose) -> np.ndarray:
-    """A sky that is a bright plate in the middle, wherever the camera is."""
+    """A bright square in the middle of the picture, wherever the camera is."""
     picture = np.zeros((48, 48, 1))
     picture[18:30, 18:30] = 0.4
     return picture
@@ -115,7 +115,7 @@ def test_every_frame_crosses_a_faulty_can_bus_from_a_gige_camera(
     assert link["segments_resent"] > 0
 
 
-def test_a_pass_that_does_not_move_is_an_error(quick, tmp_path, monkeypatch):
+def test_a_pass_that_stalls_is_an_error(quick, tmp_path, monkeypatch):
     monkeypatch.setattr("hil.simulated_pass.STALL_S", 2.0)
     monkeypatch.setattr("hil.simulated_pass._Cut.update", lambda cut, received: cut._line.cut())
     world = load_world(load_mission(quick))
@@ -130,7 +130,7 @@ def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_pat
     assert simulation["frames"] == {"captured": 4, "received": 4, "without_valid_pose": 0}
     link = simulation["link"]  # without faults, a CAN bus
     assert link["can_frames_lost"] == link["can_frames_overrun"] == link["segments_resent"] == 0
-    # a sixth of a millisecond from frame to frame of a bracket: nobody stores a frame so fast
+    # frames of a bracket are a sixth of a millisecond apart, less than storing one takes
     assert 2 <= simulation["camera"]["late_frames"] <= 3
     assert 0.005 < simulation["navigation"]["position_error_m"] < 0.1
     scene = Scene(load_scenario("tumbling"))
@@ -146,7 +146,7 @@ def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_pat
         assert 1e-4 < np.abs(np.array(tag["world_to_camera"]) - true).max() < 0.5  # m: navigation errs
 
 
-def test_what_cannot_be_flown_is_refused_before_anything_is_written(mission, tmp_path, monkeypatch, capsys):
+def test_impossible_options_are_refused_before_anything_is_written(mission, tmp_path, monkeypatch, capsys):
     for chosen, reason in (
         (("--link", "radio"), "'radio' is not one of 'serial', 'slcan', 'slcan-fd'"),
         (("--camera", "usb"), "'usb' is not one of 'hil', 'gige'"),
@@ -163,7 +163,7 @@ def test_what_cannot_be_flown_is_refused_before_anything_is_written(mission, tmp
     assert not (tmp_path / "d").exists()
 
 
-def test_a_session_that_is_no_demos_is_never_overwritten(mission, tmp_path):
+def test_a_session_that_no_demo_made_is_never_overwritten(mission, tmp_path):
     (tmp_path / "session").mkdir()
     done = hil("demo", "--out", str(tmp_path), "--mission", str(mission))
     assert done.returncode == 1 and "was not made by a demo" in done.stderr
@@ -199,7 +199,7 @@ def test_a_pass_that_cannot_start_leaves_only_rendered_frames(quick, tmp_path, t
     assert [path.name for path in out.iterdir()] == ["renders"]
 
 
-def test_a_mesh_that_is_none_and_a_broken_mission_are_one_clear_line(mission, tmp_path):
+def test_a_file_that_is_no_mesh_and_a_missing_mission_are_refused_in_one_line(mission, tmp_path):
     (tmp_path / "bad.glb").write_bytes(b"not a mesh")
     done = hil(
         "demo", "--out", str(tmp_path / "d"), "--mission", str(mission), "--mesh", str(tmp_path / "bad.glb")

@@ -31,9 +31,8 @@ def test_range_phase_angle_sun_and_eclipse_match_skyfield(skyfield_oracle, name)
         time = timescale.from_datetime(datetime.fromtimestamp(utc_ns / 1e9, UTC))
         relative_m = chaser.at(time).xyz.m - target.at(time).xyz.m
         assert state.range_m == pytest.approx(np.linalg.norm(relative_m), abs=0.01)
-        np.testing.assert_allclose(
-            state.chaser.position_m - state.target.position_m, relative_m, atol=0.01
-        )  # 0.15 arcsec of frame over 400 m is a millimetre
+        # 0.15 arcsec of frame over 400 m is a millimetre
+        np.testing.assert_allclose(state.chaser.position_m - state.target.position_m, relative_m, atol=0.01)
         sun_m = (ephemeris["sun"] - ephemeris["earth"]).at(time).xyz.m - target.at(time).xyz.m
         cosine = sun_m @ relative_m / np.linalg.norm(sun_m) / np.linalg.norm(relative_m)
         # the Sun as seen from the Earth's centre: parallax of the orbit 0.003 degrees
@@ -57,7 +56,7 @@ def test_the_eclipse_scenario_enters_and_leaves_the_shadow_when_skyfield_says(sk
     ).is_sunlit(ephemeris)
     assert 60 < ours.sum() < 200
     assert (ours != theirs).sum() <= 4  # skyfield's Sun is a point: some seconds at each of two edges
-    assert not ours[0] and not ours[-1]  # the shadow takes the middle
+    assert not ours[0] and not ours[-1]  # the shadow is in the middle
 
 
 def test_the_camera_looks_at_the_target_and_is_where_the_orbits_are():
