@@ -5,10 +5,12 @@ from pathlib import Path
 
 import imagecodecs
 import numpy as np
+import torch
 
-from ground.evaluate import Truth, clean_image, open_run
+from ground.evaluate import clean_image, open_run
 from ground.reconstruct import predicted_image
 from ground.report import ERROR_FULL_SCALE, bounding_box, heat, tone
+from ground.truth import Truth
 
 SIZE_PX = 200
 
@@ -24,7 +26,7 @@ def main(session: Path, name: str) -> None:
             record = next(r for r in scored if (r.bracket, r.exposure_time_s) == (bracket, exposure_s))
             clean = clean_image(run, truth, record)
             render = predicted_image(run.gaussians, run.session, record, run.sensor, exposure_s)
-            box = bounding_box(truth.radiance(record)[1] > 0, 4)
+            box = bounding_box(torch.from_numpy(truth.radiance(record)[1] > 0), 4)
             error = ((render - clean).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
             cells += [_fitted(tone(image[box].numpy(), run.sensor)) for image in (clean, render)]
             cells.append(_fitted(heat(error[box].numpy())))

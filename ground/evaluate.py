@@ -1,6 +1,5 @@
 """A finished run against the held-out frames and, where a simulator left it, the truth."""
 
-import dataclasses
 import json
 import logging
 import math
@@ -9,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyParseError
 
 from ground.card import model_card
 from ground.reconstruct import camera_of, exposed, predicted_image, run_folder, sensor_of, split, written_to
 from ground.session import FrameRecord, Session, SessionError, open_session
+from ground.truth import Truth, read_points
 from obbgs_base.files import write_whole
 from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
@@ -105,53 +104,6 @@ def read_metrics(path: Path) -> dict:
     return metrics
 
 
-class Truth:
-    """A simulator's truth folder: clean radiance and pose by frame, and the visible surface.
-
-    Raises:
-        SessionError: it is there but damaged.
-    """
-
-    def __init__(self, session: Session):
-        self.folder = session.path / "truth"
-        try:
-            facts = json.loads((self.folder / "truth.json").read_text())
-            self._radiance = {entry["id"]: entry["radiance"] for entry in facts["frames"]}
-            self._poses = {entry["id"]: np.array(entry["world_to_camera"]) for entry in facts["frames"]}
-            self.largest_dimension_m = float(facts["largest_dimension_m"])
-            self.simulation: dict[str, dict] = facts.get("simulation", {})  # what was simulated, by part
-            self.cloud_m = read_points(self.folder / facts["cloud"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise SessionError(f"{self.folder} is damaged: {error}") from error
-
-    @staticmethod
-    def exists(session: Session) -> bool:
-        return (session.path / "truth" / "truth.json").is_file()
-
-    def posed(self, record: FrameRecord) -> FrameRecord:
-        """Return a frame's record with its true pose in place of the tag's."""
-        return dataclasses.replace(record, world_to_camera=self._poses[record.id])
-
-    def radiance(self, record: FrameRecord) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return scene-linear radiance [H, W, C] and coverage [H, W] in 0..1 of a frame."""
-        with np.load(self.folder / self._radiance[record.id]) as arrays:
-            radiance = torch.from_numpy(arrays["radiance"].astype(np.float32))
-            return radiance, torch.from_numpy(arrays["alpha"].astype(np.float32) / 255)
-
-
-def read_points(path: Path) -> np.ndarray:
-    """Return the vertices [N, 3] of a PLY file.
-
-    Raises:
-        SessionError: the file is missing or damaged.
-    """
-    try:
-        vertices = PlyData.read(str(path))["vertex"]
-        return np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-    except (OSError, ValueError, KeyError, PlyParseError) as error:
-        raise SessionError(f"{path} is damaged: {error}") from error
-
-
 def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     """Score a run, add the figures to its metrics.json and return them all.
 
@@ -200,7 +152,7 @@ def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:
     similarity, blind, linear = [], [], []
     views: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []  # image, truth, coverage
     for record in map(truth.posed, run.scored):
-        true, coverage = truth.radiance(record)
+        true, coverage = map(torch.from_numpy, truth.radiance(record))
         clean = exposed(true, run.sensor, record.exposure_time_s)
         with torch.no_grad():
             radiance = render(run.gaussians, camera_of(run.session, record)).radiance[0]
@@ -232,7 +184,7 @@ def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:
 
 def clean_image(run: Run, truth: Truth, record: FrameRecord) -> torch.Tensor:
     """Return the noiseless exposure of a frame [H, W, C] over full scale, clipped as the sensor clips."""
-    return exposed(truth.radiance(record)[0], run.sensor, record.exposure_time_s)
+    return exposed(torch.from_numpy(truth.radiance(record)[0]), run.sensor, record.exposure_time_s)
 
 
 def _exposure_s(run: Run, record: FrameRecord) -> float:

@@ -16,10 +16,11 @@ import yaml
 from plotly.offline import get_plotlyjs
 
 from ground.card import chi2_explained, frames_captured, scored_frames
-from ground.evaluate import Run, Truth, clean_image, open_run
+from ground.evaluate import Run, clean_image, open_run
 from ground.plots import INK, histogram_figure, model_figure, training_figure
 from ground.reconstruct import predicted_image, written_to
 from ground.session import FrameRecord, SessionError
+from ground.truth import Truth
 from obbgs_base.files import write_whole
 from obbgs_core.score.metrics import COMPLETENESS_RADIUS, psnr_db
 from obbgs_core.sensor import Sensor

@@ -1,4 +1,4 @@
-"""hil: demo, camera, link, scenario, dataset, target."""
+"""The command line `hil`: demo, camera, link, scenario, dataset, target."""
 
 import dataclasses
 import io
@@ -16,11 +16,17 @@ from rich.progress import TaskID
 
 from flightsw.icd.mission import load_mission
 from hil import SHIPPED
+from hil.choices import CameraKind, FaultKind, LinkKind, SensorKind
 from obbgs_base.command_line import new_app, run
 
 app = new_app("The simulated world around flight and ground.")
 MissionFile = Annotated[Path, typer.Option("--mission", help="The mission file.")]
-Mesh = Annotated[Path, typer.Option("--mesh", help="GLB, OBJ or STL; default the shipped spacecraft.")]
+Mesh = Annotated[
+    Path,
+    typer.Option(
+        "--mesh", help="The target: GLB, OBJ or STL; default the shipped spacecraft.", show_default=False
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 ScenarioName = Annotated[
     str,
@@ -31,7 +37,7 @@ ScenarioName = Annotated[
 RealTime = Annotated[
     float,
     typer.Option(
-        "--real-time", help="How many times as fast as ours simulated time runs; 0: as fast as it goes."
+        "--real-time", help="Speed of simulated time as a multiple of real time; 0: as fast as possible."
     ),
 ]
 
@@ -41,32 +47,36 @@ def demo(
     out: Annotated[Path, typer.Option(help="Everything is written below this folder.")] = Path("demo"),
     mission: MissionFile = Path("mission.yaml"),
     mesh: Mesh = SHIPPED,
-    camera: Annotated[str, typer.Option(help="hil (a socket) or gige (GigE Vision on 127.0.0.1).")] = "hil",
-    link: Annotated[str, typer.Option(help="serial, slcan or slcan-fd (CAN at 1 Mbit/s).")] = "serial",
+    camera: Annotated[
+        CameraKind, typer.Option(help="A socket of our own, or GigE Vision on 127.0.0.1.")
+    ] = "hil",
+    link: Annotated[
+        LinkKind, typer.Option(help="A serial line, a CAN or a CAN FD bus (at 1 Mbit/s).")
+    ] = "serial",
     faults: Annotated[
-        str,
-        typer.Option(help="none, or standard: 2 % lost, flipped, doubled, swapped each, and a cut of 5 s."),
+        FaultKind,
+        typer.Option(
+            help="standard: 2 % of the packets lost, damaged, doubled and reordered each, and a cut of 5 s."
+        ),
     ] = "none",
     scenario: ScenarioName = "",
     real_time: RealTime = 0.0,
     navigation_noise: Annotated[
         int | None,
-        typer.Option(help="Seed of navigation errors with the mission's sigmas; default no errors."),
+        typer.Option(help="Seed of random navigation errors with the mission's sigmas; default none."),
     ] = None,
     json_: AsJson = False,
 ) -> None:
-    """Run the whole loop: sky, camera, flight, link, ground, model, report.
+    """Simulate a whole pass, from rendered frames over flight, link and ground to a model and its report.
 
     Example: hil demo --camera gige --link slcan --faults standard --scenario tumbling --out demo
     """
-    from flightsw.icd.mission import build
-    from hil.demo import DemoConfig, run_demo
+    from hil.demo import run_demo
     from hil.processes import unwind_on_sigterm
+    from hil.simulated_pass import PassConfig
 
     unwind_on_sigterm()
-    chosen = {"camera": camera, "link": link, "faults": faults}
-    more = {"scenario": scenario, "navigation_noise": navigation_noise, "real_time": real_time}
-    config = build(DemoConfig, chosen, "demo", **more)
+    config = PassConfig(camera, link, faults, scenario, navigation_noise, real_time)
     figures = run_demo(out, mission, mesh, config, Console(stderr=json_))
     if json_:
         print(json.dumps(figures))
@@ -75,33 +85,34 @@ def demo(
 @app.command()
 def camera(
     listen: Annotated[
-        str, typer.Option(help="hil:///path/to/socket, or hil://host:port; port 0 takes a free one.")
+        str, typer.Option(help="hil:///path/to/socket, or hil://host:port; port 0 chooses a free one.")
     ] = "hil://127.0.0.1:0",
     mission: MissionFile = Path("mission.yaml"),
     mesh: Mesh = SHIPPED,
-    cache: Annotated[Path, typer.Option(help="Rendered frames are kept here.")] = Path("renders"),
+    cache: Annotated[Path, typer.Option(help="Folder in which rendered frames are kept.")] = Path("renders"),
     gige: Annotated[bool, typer.Option("--gige", help="Serve GigE Vision on 127.0.0.1 instead.")] = False,
     scenario: ScenarioName = "",
     inputs: Annotated[
         Path,
-        typer.Option(help="With --scenario: flight's mission.yaml and navigation states are written here."),
+        typer.Option(help="With --scenario: folder for flight's mission.yaml and navigation states."),
     ] = Path("scenario"),
     real_time: RealTime = 0.0,
 ) -> None:
-    """Serve the simulated camera until stopped; prints its URL. Frames are rendered when they are asked for.
+    """Serve the simulated camera until stopped; prints its URL. Frames are rendered when a client requests them.
 
-    With --gige any GenICam client sees the sky: `arv-viewer-0.8`, `arv-camera-test-0.8 -n 127.0.0.1`, `flightsw`.
+    With --gige any GenICam client can use it: `arv-viewer-0.8`, `arv-camera-test-0.8 -n 127.0.0.1`, `flightsw`.
 
     Example: hil camera --listen hil:///tmp/camera.sock --scenario v-bar --mesh target.glb
     """
     from hil.cameras.gige import GigeCameraServer
     from hil.cameras.virtual import CameraServer
     from hil.sky.blender import RenderFarm
-    from hil.world.states import load_world, write_flight_inputs
+    from hil.world.navigation import write_flight_inputs
+    from hil.world.world import load_world
 
     world = load_world(load_mission(mission), scenario)
     if scenario:
-        print(f"flight takes --mission {write_flight_inputs(world, inputs)}", file=sys.stderr)
+        print(f"start flight with --mission {write_flight_inputs(world, inputs)}", file=sys.stderr)
     stop = _stop_event()
     with RenderFarm(world.mission, mesh, cache, workers=1) as farm:
         more = {"pose_at": world.pose_at, "real_time": real_time}
@@ -125,30 +136,34 @@ def link(
     fd: Annotated[
         bool, typer.Option(help="The bus is CAN FD, data phase at 5 Mbit/s; implies --can.")
     ] = False,
-    baud: Annotated[int, typer.Option(help="Serial: bits per second; a byte takes ten.")] = 921_600,
+    baud: Annotated[int, typer.Option(help="Serial: bits per second; a byte takes 10.")] = 921_600,
     bitrate: Annotated[int, typer.Option(help="CAN: bits per second.")] = 1_000_000,
-    latency: Annotated[float, typer.Option(help="Seconds from one end to the other, beside the rate.")] = 0.0,
-    loss: Annotated[float, typer.Option(help="Share of packets (CAN: frames) lost.")] = 0.0,
-    flip: Annotated[float, typer.Option(help="Share with a flipped bit.")] = 0.0,
-    duplicate: Annotated[float, typer.Option(help="Share sent twice.")] = 0.0,
-    reorder: Annotated[float, typer.Option(help="Share that change places.")] = 0.0,
+    latency: Annotated[
+        float, typer.Option(help="Delay from one end to the other, s, in addition to the transmission time.")
+    ] = 0.0,
+    loss: Annotated[float, typer.Option(help="Fraction of packets (CAN: frames) lost.")] = 0.0,
+    flip: Annotated[float, typer.Option(help="Fraction with a flipped bit.")] = 0.0,
+    duplicate: Annotated[float, typer.Option(help="Fraction sent twice.")] = 0.0,
+    reorder: Annotated[float, typer.Option(help="Fraction that changes places with the next.")] = 0.0,
     overrun: Annotated[
-        bool, typer.Option(help="Serial: no flow control, what nobody reads in time is lost.")
+        bool, typer.Option(help="Serial: no flow control; bytes that are not read in time are lost.")
     ] = False,
     one_shot: Annotated[
-        bool, typer.Option(help="CAN: a frame lost on the bus is not sent again by the controller.")
+        bool, typer.Option(help="CAN: the controller does not repeat a frame that is destroyed on the bus.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Same seed, same faults.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the faults.")] = 0,
 ) -> None:
     """Run a virtual serial line or CAN bus with seeded faults until stopped; prints both ends, then the counts.
 
-    While it runs it obeys lines on its standard input: cut, mend, latency 0.2, loss 0.1, bit_flip, duplicate, reorder.
-    SIGUSR1 cuts and SIGUSR2 mends too.
+    While it runs it reads commands from standard input, one a line: cut, mend, latency 0.2, loss 0.1, and bit_flip,
+    duplicate or reorder with a fraction. SIGUSR1 and SIGUSR2 also cut and mend.
 
     Example: hil link --baud 921600 --loss 0.02 --flip 0.01 --seed 3
     """
+    from hil.links.faults import Faults
     from hil.links.virtual_can import VirtualCan
-    from hil.links.virtual_link import Faults, VirtualLink, VirtualSerial, control, run_link
+    from hil.links.virtual_link import VirtualLink, control, run_link
+    from hil.links.virtual_serial import VirtualSerial
 
     faults = Faults(loss, flip, duplicate, reorder)
     line: VirtualLink
@@ -157,9 +172,9 @@ def link(
     else:
         line = VirtualSerial(baud, faults, seed, latency, flow_control=not overrun)
 
-    def obey_standard_input() -> None:
+    def read_commands() -> None:
         if isinstance(sys.stdin, io.TextIOWrapper):
-            sys.stdin.reconfigure(errors="replace")  # bytes that are no text are answered like any nonsense
+            sys.stdin.reconfigure(errors="replace")  # bytes that are not UTF-8 are an unknown command
         for command in sys.stdin:
             try:
                 print(control(line, command), file=sys.stderr)
@@ -170,7 +185,7 @@ def link(
         signal.signal(signal.SIGUSR1, lambda *_: line.cut())
         signal.signal(signal.SIGUSR2, lambda *_: line.mend())
         print(f"flight {line.flight_url}\nground {line.ground_url}", flush=True)
-        threading.Thread(target=obey_standard_input, daemon=True).start()
+        threading.Thread(target=read_commands, daemon=True).start()
 
     stop = _stop_event()
     counts = run_link(line, ready, stop.is_set)
@@ -184,14 +199,15 @@ def scenario(
         bool, typer.Option("--fly-around", help="Design a fly-around about the mission's target instead.")
     ] = False,
     mission: MissionFile = Path("mission.yaml"),
-    radial: Annotated[float, typer.Option(help="Half height of the ellipse, m.")] = 200.0,
+    radial: Annotated[float, typer.Option(help="Half of the ellipse's height, m.")] = 200.0,
     out_of_plane: Annotated[
-        float | None, typer.Option(help="Half width across the orbit, m; default a constant range.")
+        float | None,
+        typer.Option(help="Half of its width across the orbit, m; default: that of a constant range."),
     ] = None,
     out: Annotated[Path, typer.Option(help="The chaser's TLE is written here.")] = Path("chaser.tle"),
     json_: AsJson = False,
 ) -> None:
-    """Describe a scenario: range, phase angle, eclipse; or design a fly-around and write the chaser's TLE.
+    """Print a scenario's range, phase angle and eclipses; or design a fly-around and write the chaser's TLE.
 
     Example: hil scenario tumbling --json; hil scenario --fly-around --radial 150 --out chaser.tle
     """
@@ -211,39 +227,38 @@ def scenario(
 
 @app.command()
 def dataset(
-    out: Annotated[Path, typer.Option(help="The data set's folder; a set of several has one below it each.")],
+    out: Annotated[
+        Path, typer.Option(help="The data set's folder; with --set it holds one folder a target.")
+    ],
     mesh: Annotated[
         Path | None, typer.Option(help="GLB, OBJ or STL; default the shipped spacecraft.")
     ] = None,
     set_: Annotated[
-        str | None, typer.Option("--set", help="Several targets: obr-st, obr-st-small or a YAML file.")
+        str | None,
+        typer.Option("--set", help="A data set of several targets: obr-st, obr-st-small or a YAML file."),
     ] = None,
-    meshes: Annotated[Path, typer.Option(help="Where the set's meshes are.")] = Path(),
+    meshes: Annotated[Path, typer.Option(help="Folder of the set's meshes.")] = Path(),
     scenario: Annotated[str, typer.Option(help="A ready-made scenario or a YAML file.")] = "fly-around",
-    frames: Annotated[int, typer.Option(help="A multiple of the bracket's exposures.")] = 363,
-    size: Annotated[int, typer.Option(help="Width and height, px.")] = 800,
+    frames: Annotated[
+        int, typer.Option(help="Number of frames, a multiple of the bracket's exposures.")
+    ] = 363,
+    size: Annotated[int, typer.Option(help="Width and height of a frame, px.")] = 800,
     bracket: Annotated[str, typer.Option(help="Exposure times, ms.")] = "0.05,0.1,0.2",
-    sensor: Annotated[str, typer.Option(help="paper or spacecam.")] = "paper",
-    seed: Annotated[int, typer.Option(help="Same seed, same noise.")] = 1,
-    cache: Annotated[Path, typer.Option(help="Rendered pictures are kept here.")] = Path("renders"),
+    sensor: Annotated[
+        SensorKind, typer.Option(help="8 bits with the paper's noise, or a scientific CMOS.")
+    ] = "paper",
+    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 1,
+    cache: Annotated[Path, typer.Option(help="Folder in which rendered frames are kept.")] = Path("renders"),
     workers: Annotated[int, typer.Option(min=1, help="Blender processes.")] = 2,
     json_: AsJson = False,
 ) -> None:
-    """Make a data set: frames as a session and in NeRF-synthetic layout, with their truth. An interrupted one goes on.
+    """Make a data set with its truth, as a session and in NeRF-synthetic layout; an interrupted one is continued.
 
     Example: hil dataset --mesh TDRS.glb --scenario fly-around --frames 363 --size 800 --bracket 0.05,0.1,0.2 --out tdrs
     """
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-    from rich.progress import Progress as Bar
-
     from flightsw.icd.mission import build
     from hil.dataset import DatasetConfig, Progress, load_dataset_config, make_dataset, target_meshes
+    from hil.progress import progress_bar
 
     if set_ is not None:
         if mesh is not None:
@@ -255,8 +270,7 @@ def dataset(
         settings = {"scenario": scenario, "frames": frames, "size_px": size, "bracket_ms": times_ms}
         config = build(DatasetConfig, {**settings, "sensor": sensor, "seed": seed}, "dataset")
         jobs = [(mesh or SHIPPED, out)]
-    columns = (TextColumn("{task.description:>20}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Bar(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as bars:
+    with progress_bar(Console(stderr=True), label_width=20) as bars:
         tasks: dict[str, TaskID] = {}
 
         def show(step: Progress) -> None:
@@ -275,17 +289,15 @@ def dataset(
 
 @app.command()
 def target(out: Annotated[Path, typer.Option(help="The GLB to write.")] = Path("spacecraft.glb")) -> None:
-    """Write the shipped target, a parametric spacecraft, as binary glTF: the same bytes on every machine.
+    """Write the shipped target, a parametric spacecraft, as binary glTF; the bytes are the same on every machine.
 
     Example: hil target --out spacecraft.glb
     """
-    from hil import SHIPPED
-
-    out.write_bytes(SHIPPED.read_bytes())  # built anew it would round as this processor does
+    out.write_bytes(SHIPPED.read_bytes())  # not built again: rounding differs between processors
     print(out)
 
 
-UNITS = {"_m_per_orbit": " m per orbit", "_m": " m", "_s": " s", "_deg": " deg"}  # by the ends of names
+UNITS = {"_m_per_orbit": " m per orbit", "_m": " m", "_s": " s", "_deg": " deg"}  # by the suffix of a name
 
 
 def _lines(facts: dict[str, Any]) -> Iterator[str]:
@@ -312,6 +324,7 @@ def _number(value: float) -> str:
 
 
 def _stop_event() -> threading.Event:
+    """Return an event that SIGTERM and SIGINT set."""
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())

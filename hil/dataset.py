@@ -1,7 +1,8 @@
-"""Data sets like the source paper's: a scenario rendered, exposed and written as a session and as NeRF pictures."""
+"""Data sets like that of Jiang et al. 2025: a scenario rendered, exposed, and written as a session and for NeRF."""
 
 import dataclasses
 import hashlib
+import inspect
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -10,44 +11,46 @@ from typing import Literal
 
 import numpy as np
 
+import ground.truth
 from flightsw.icd.config import ConfigError, build, in_file, parse_yaml
-from flightsw.icd.frame import Frame, PoseTag, encode_frame
+from flightsw.icd.frame import Frame, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.sequencer import Shot, plan
 from ground.formats.nerf import export_nerf
 from ground.session import SessionWriter, open_session
 from ground.telemetry import FlightCounts
-from hil.sky import blender, sensor
+from hil import truth
+from hil.choices import SensorKind
+from hil.sky import blender, motion, sensor, stars
 from hil.sky.blender import RenderFarm, mesh_sha256
 from hil.sky.motion import image_velocity, smear
 from hil.sky.sensor import PRESETS, SensorModel, read_out
 from hil.sky.stars import star_radiance
-from hil.world import truth
-from hil.world.scenario import SceneState, Sky, load_scenario
+from hil.world.scenario import Scene, SceneState, load_scenario
 from obbgs_base.errors import ObbgsError
 from obbgs_base.files import write_whole
 
 DATASETS = Path(__file__).parent / "datasets"
 MARKER = "dataset.json"
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".stl")
-# The lens is chosen so that a bright part of the target reads 0.7 of full scale at the middle exposure
+# The gain is chosen so that bright parts of the target read 0.7 of full scale at the middle exposure.
 BRIGHT_PERCENTILE, BRIGHT_SIGNAL, COVERED_ALPHA = 97, 0.7, 230
-MOTION_S = 0.1  # poses so far apart give the image's velocity
+MOTION_S = 0.1  # interval over which the image velocity is measured
 
 
-class DatasetError(ObbgsError, RuntimeError):
-    """A data set cannot be made where or as it was asked for."""
+class DatasetError(ObbgsError):
+    """The data set's folder or its scenario cannot be used."""
 
 
 @dataclass(frozen=True)
 class DatasetConfig:
-    """What makes one data set, apart from the mesh; `targets` are mesh names for a set of several."""
+    """The settings of a data set; the mesh is given apart, or `targets` names the meshes of several."""
 
     scenario: str = "fly-around"
     frames: int = 363
     size_px: int = 800
     bracket_ms: tuple[float, ...] = (0.05, 0.1, 0.2)
-    sensor: Literal["paper", "spacecam"] = "paper"
+    sensor: SensorKind = "paper"
     seed: int = 1
     targets: tuple[str, ...] = ()
 
@@ -65,7 +68,7 @@ class DatasetConfig:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far one step of one target's data set is."""
+    """The state of one step of a target's data set, in frames."""
 
     target: str
     step: Literal["render", "expose"]
@@ -77,7 +80,7 @@ def load_dataset_config(name: str | Path) -> DatasetConfig:
     """Return a ready-made data set's configuration by its name, or the one in a YAML file.
 
     Raises:
-        ConfigError: there is none, or it is wrong; the message names the file and the key's path.
+        ConfigError: it does not exist or is wrong; the message names the file and the key's path.
     """
     path = DATASETS / f"{name}.yaml"
     if not path.is_file():
@@ -116,7 +119,7 @@ def make_dataset(
     workers: int = 2,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> dict:
-    """Make one target's data set in `out` and return its facts; what is there already is kept and continued.
+    """Make one target's data set in `out` and return its facts; one that was interrupted is continued.
 
     `out` holds session/ (frames, and truth/ with radiance and masks, depth and normals, mesh, cloud), the NeRF layout
     (transforms_{train,val,test}.json with their pictures), and dataset.json. Frames are tagged with their true poses.
@@ -139,11 +142,11 @@ def make_dataset(
     model = PRESETS[config.sensor]
     camera = model.camera_section(config.size_px, config.size_px, focal_px)
     mission = Mission(orbit=scenario.orbit, camera=camera, bracket=brackets, sha256=digest)
-    sky = Sky(scenario)
+    scene = Scene(scenario)
     shots = list(plan(mission))
-    states = [sky.state(shot.mid_exposure_utc_ns) for shot in shots]
+    states = [scene.state(shot.mid_exposure_utc_ns) for shot in shots]
     with RenderFarm(mission, mesh, cache, workers) as farm:
-        rendered = iter(range(1, len(states) + 1))  # a worker's thread takes the next number: a count
+        rendered = iter(range(1, len(states) + 1))  # a counter that the workers' threads share
         farm.prerender(
             [state.pose for state in states],
             lambda: on_progress(Progress(mesh.stem, "render", next(rendered), len(states))),
@@ -156,7 +159,7 @@ def make_dataset(
             mission, camera=model.camera_section(config.size_px, config.size_px, focal_px)
         )
         writer = SessionWriter(out / "session", mission)
-        for index, frame in enumerate(_frames(mission, sky, shots, states, farm, model, config.seed)):
+        for index, frame in enumerate(_frames(mission, scene, shots, states, farm, model, config.seed)):
             writer.add(frame, encode_frame(frame))
             on_progress(Progress(mesh.stem, "expose", index + 1, len(shots)))
         writer.save({}, 0, FlightCounts(frames_stored=len(shots)))
@@ -165,7 +168,7 @@ def make_dataset(
             mission,
             farm,
             truth.CLOUD_POINTS,
-            pose_at=lambda utc_ns: sky.state(utc_ns).pose,
+            pose_at=lambda utc_ns: scene.state(utc_ns).pose,
             geometry=True,
         )
         mesh_facts = farm.facts
@@ -190,7 +193,7 @@ def make_dataset(
 
 def _frames(
     mission: Mission,
-    sky: Sky,
+    scene: Scene,
     shots: list[Shot],
     states: list[SceneState],
     farm: RenderFarm,
@@ -198,7 +201,7 @@ def _frames(
     seed: int,
 ) -> Iterator[Frame]:
     for number, (shot, state) in enumerate(zip(shots, states, strict=True)):
-        light = _light(mission, sky, state, farm, model, shot.exposure_time_s)
+        light = _light(mission, scene, state, farm, model, shot.exposure_time_s)
         dn = read_out(model, light, shot.exposure_time_s, np.random.default_rng((seed, number)))
         yield Frame(
             frame_id=number,
@@ -217,67 +220,64 @@ def _frames(
 
 def _light(
     mission: Mission,
-    sky: Sky,
+    scene: Scene,
     state: SceneState,
     farm: RenderFarm,
     model: SensorModel,
     exposure_time_s: float,
 ) -> np.ndarray:
-    """Return the mean radiance [H, W, C] in front of the lens during an exposure: the target, moving, and the stars."""
+    """Return the mean radiance [H, W, C] over an exposure, before the lens: the moving target and the stars."""
     camera = mission.camera
     light = farm.radiance(state.pose).astype(np.float64)
     if model.stars:
-        alpha = _alpha(farm, state.pose)
+        alpha = farm.alpha(state.pose) / 255
         sky_light = star_radiance(state.gcrs_to_camera, np.array(camera.K), camera.width, camera.height)
         light += (sky_light * (1 - alpha))[..., None]
     if model.line_time_s or exposure_time_s > MOTION_S / 100:
         depth, _ = farm.geometry(state.pose)
-        start_ns = sky.orbit.start_utc_ns
+        start_ns = scene.orbit.start_utc_ns
         before_ns = max(start_ns, state.utc_ns - round(MOTION_S * 5e8))
         after_ns = state.utc_ns + round(MOTION_S * 5e8)
         velocity = image_velocity(
             depth,
             np.array(camera.K),
-            sky.state(before_ns).pose.world_to_camera,
-            sky.state(after_ns).pose.world_to_camera,
+            scene.state(before_ns).pose.world_to_camera,
+            scene.state(after_ns).pose.world_to_camera,
             (after_ns - before_ns) * 1e-9,
         )
         light = smear(light, velocity, exposure_time_s, model.line_time_s)
     return light
 
 
-def _alpha(farm: RenderFarm, pose: PoseTag) -> np.ndarray:
-    with np.load(farm.path(pose)) as arrays:
-        return arrays["alpha"] / 255.0
-
-
 def _gain(farm: RenderFarm, states: list[SceneState], model: SensorModel, exposure_time_s: float) -> float:
-    """Return the digital numbers per radiance and second that put the target's bright parts at 0.7 of full scale."""
+    """Return the gain, DN per radiance and s, at which bright parts of the target read 0.7 of full scale."""
     covered = []
     for state in states:
         if not state.pose.in_eclipse:
             radiance = farm.radiance(state.pose).astype(np.float32).mean(axis=2)
-            covered.append(radiance[_alpha(farm, state.pose) * 255 >= COVERED_ALPHA])
+            covered.append(radiance[farm.alpha(state.pose) >= COVERED_ALPHA])
     values = np.concatenate(covered) if covered else np.empty(0)
     bright = float(np.percentile(values, BRIGHT_PERCENTILE)) if len(values) else 0.0
     if not bright > 0:
-        raise DatasetError("no frame of this scenario shows a lit target: nothing to set the exposure by")
+        raise DatasetError("no frame of this scenario shows a lit target: the gain cannot be set")
     gain = BRIGHT_SIGNAL * (model.white_dn - model.black_dn) / (bright * exposure_time_s)
     return float(f"{gain:.6g}")
 
 
 def _digest(config: DatasetConfig, scenario_sha256: str, mesh: Path) -> str:
-    """Return the digest of all that shapes a data set: settings, scenario, mesh, and the code that makes pixels."""
+    """Return the SHA-256 of what a data set depends on: settings, scenario, mesh, and the code that computes pixels."""
     blender.check_mesh(mesh)
     settings = {**dataclasses.asdict(config), "targets": None, "scenario": scenario_sha256}
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode() + mesh_sha256(mesh).encode())
-    for source in (blender.WORKER, Path(sensor.__file__), Path(truth.__file__), Path(__file__)):
+    for source in (blender.WORKER, Path(__file__)):
         digest.update(source.read_bytes())
+    for module in (sensor, motion, stars, truth, ground.truth):
+        digest.update(inspect.getsource(module).encode())
     return digest.hexdigest()
 
 
 def _already_made(out: Path, digest: str) -> dict | None:
-    """Return the facts of a finished data set, None where there is nothing or one to continue."""
+    """Return the facts of a finished data set; None if there is none yet or it is to be continued."""
     marker = out / MARKER
     if not marker.exists():
         if (out / "session").exists():

@@ -1,14 +1,15 @@
-"""Processes that end with the one that started them, whether it returns, is told to end, or is killed."""
+"""Child processes that end with their parent, whether it returns, is terminated, or is killed."""
 
 import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 from types import FrameType
 
-# Linux: the kernel kills the process when its parent ends (prctl 1 is PR_SET_PDEATHSIG), also after exec. A parent
-# that had ended before is noticed by another parent's number. Elsewhere there is no such thing and the command is
-# only executed. A launcher and not `preexec_fn`, which may hang where other threads run.
+# On Linux the kernel kills the process when its parent ends (prctl 1 is PR_SET_PDEATHSIG), also after exec. If the
+# parent has already ended, the process has another parent by now and ends itself. Elsewhere the command is only run.
+# This is a launcher and not a `preexec_fn`, which may deadlock in a program with several threads.
 LAUNCHER = """
 import os, signal, sys
 if sys.platform == "linux":
@@ -21,17 +22,18 @@ os.execvp(sys.argv[2], sys.argv[2:])
 
 
 def tied(command: list[str]) -> list[str]:
-    """Return what runs `command` as a process that is killed when the thread that starts it has ended.
+    """Return a command for `subprocess` that runs `command` as a process which is killed when its parent ends.
 
-    Give it to `subprocess`. The process keeps its number: it becomes `command`. On Linux; elsewhere nothing ties it.
+    The parent is the thread that starts it. The process becomes `command` and keeps its number. Only on Linux is it
+    killed; elsewhere `command` just runs.
     """
     return [sys.executable, "-I", "-S", "-c", LAUNCHER, str(os.getpid()), *command]
 
 
 def unwind_on_sigterm() -> None:
-    """Leave by SystemExit on the next SIGTERM, so that every `with` and `finally` ends what it began.
+    """Raise SystemExit on the next SIGTERM, so that every `with` and `finally` block is left in order.
 
-    A second SIGTERM ends the process at once. To be called by a program's main thread.
+    A second SIGTERM ends the process at once. Must be called by a program's main thread.
     """
 
     def leave(number: int, _: FrameType | None) -> None:
@@ -41,11 +43,16 @@ def unwind_on_sigterm() -> None:
     signal.signal(signal.SIGTERM, leave)
 
 
-def end(process: subprocess.Popen, patience_s: float = 10.0) -> None:
-    """Tell a process to end and wait for it; kill it when that takes longer than `patience_s`."""
+def installed(tool: str) -> str:
+    """Return the path of one of our command lines (flightsw, ground, hil) in this Python environment."""
+    return str(Path(sys.executable).with_name(tool))
+
+
+def end(process: subprocess.Popen, timeout_s: float = 10.0) -> None:
+    """Terminate a process and wait for it; kill it when that takes longer than `timeout_s`."""
     process.terminate()
     try:
-        process.wait(patience_s)
+        process.wait(timeout_s)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()

@@ -1,4 +1,4 @@
-"""Threads of the simulator whose end is never silent."""
+"""Threads of the simulator whose failures are logged and reported to those that depend on them."""
 
 import logging
 import threading
@@ -9,12 +9,12 @@ from obbgs_base.errors import ObbgsError
 log = logging.getLogger(__name__)
 
 
-class ServerError(ObbgsError, RuntimeError):
-    """A part of the simulator has ended while others needed it."""
+class ServerError(ObbgsError):
+    """A thread of the simulator has failed while others still depend on it."""
 
 
 class WatchedThread(threading.Thread):
-    """Runs `work` until it returns; if it raises instead, that is logged at once, and `check` raises it again."""
+    """Runs `work` until it returns. If it raises, that is logged at once, and `check` raises it as a ServerError."""
 
     def __init__(self, name: str, work: Callable[[], object]):
         super().__init__(name=name, daemon=True)

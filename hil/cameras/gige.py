@@ -1,8 +1,8 @@
-"""The simulated sky as a GigE Vision camera on loopback: Aravis' fake camera speaks the protocol, this fills frames.
+"""The simulated camera as a GigE Vision camera on 127.0.0.1, by the fake camera of Aravis, which speaks the protocol.
 
-A picture may take seconds to render, but the fake camera answers its client's heartbeat only between pictures. So the
-client's trigger goes to registers of our own (gige.xml); when the picture is ready, the fake camera's own
-trigger is pulled.
+A picture may take seconds to render, but the fake camera answers its client's heartbeat only between pictures. The
+client therefore writes to trigger registers of our own (see gige.xml), and the fake camera is triggered when the
+picture is ready.
 """
 
 import ctypes
@@ -45,20 +45,20 @@ FillPattern = ctypes.CFUNCTYPE(
 class GigeCameraServer:
     """A GigE Vision camera at 127.0.0.1 until closed; `url` is what `flightsw --camera` takes.
 
-    A software trigger exposes at the time in the feature SimulatedStartUtcNs, or at the simulated time of now, which
-    runs from the mission's start in real time or `real_time` times as fast. Without a trigger the camera runs free at
-    its frame rate. LateFrameCount counts what was not ready in time: free running, such a frame is left out; with a
-    real-time factor a triggered one comes late. Pictures carry the simulated time of the shutter.
+    A software trigger exposes at the time in the feature SimulatedStartUtcNs or, if that is 0, at the present simulated
+    time, which runs from the mission's start in real time or `real_time` times as fast. Without a trigger the camera
+    runs freely at its frame rate. LateFrameCount counts frames that were not ready in time: in free running they are
+    left out, triggered ones are sent late. A picture's time stamp is the simulated time at which the shutter opened.
 
     Args:
-        radiance: gives the sky [H, W, C] for a true pose.
+        radiance: gives the scene-linear radiance [H, W, C] for a true pose.
         pose_at: UTC ns to the true pose; by default the mission's own orbits and attitude.
-        real_time: with a factor a picture that was asked for by its time leaves no earlier than its exposure has
+        real_time: with a factor a picture that was requested with its time is sent no earlier than its exposure has
             ended on the simulated clock; 0 is lock step.
 
     Raises:
         CaptureError: Aravis is not installed.
-        ValueError: the factor is none that flight can follow.
+        ValueError: flight cannot follow the real-time factor.
         OSError: another GigE Vision camera or client holds the port.
     """
 
@@ -98,7 +98,7 @@ class GigeCameraServer:
         return self
 
     def check(self) -> None:
-        """Raise ServerError if nobody serves any more."""
+        """Raise ServerError if the server's thread has failed."""
         self._thread.check()
 
     def __exit__(self, kind: object, *_: object) -> None:
@@ -126,7 +126,8 @@ class GigeCameraServer:
         ):
             self._write(address, value)
         call = self._aravis.call
-        call("arv_fake_camera_set_trigger_frequency", self._camera, 1 / POLL_S)  # how often it looks for one
+        # How often the fake camera polls its trigger.
+        call("arv_fake_camera_set_trigger_frequency", self._camera, 1 / POLL_S)
         fill = ctypes.cast(self._fill_callback, ctypes.c_void_p)
         call("arv_fake_camera_set_fill_pattern", self._camera, fill, None)
 
@@ -139,8 +140,8 @@ class GigeCameraServer:
             elif self._read(TRIGGER_MODE):
                 if self._read(TRIGGER):
                     self._write(TRIGGER, 0)
-                    asked_utc_ns = self._read(START_UTC_NS, 8)
-                    self._take(asked_utc_ns or self._simulated_utc_ns(), timed=bool(asked_utc_ns))
+                    requested_utc_ns = self._read(START_UTC_NS, 8)
+                    self._take(requested_utc_ns or self._simulated_utc_ns(), timed=bool(requested_utc_ns))
             elif now_s >= due_s:
                 self._take(self._simulated_utc_ns(), timed=False)
                 period_s = max(self._read(FRAME_PERIOD_US), 1000) / 1e6
@@ -154,9 +155,9 @@ class GigeCameraServer:
         return self.mission.orbit.start_utc_ns + round(elapsed_s * NS)
 
     def _take(self, start_utc_ns: int, timed: bool) -> None:
-        """Expose, and hand the picture to the fake camera, not before its time if that was given.
+        """Expose and let the fake camera send the picture; if its time was given (`timed`), not before that.
 
-        A sky that fails leaves the client without a picture.
+        If rendering fails, the client receives no picture.
         """
         exposure_s = self._read(EXPOSURE_US) / 1e6
         mid_ns = start_utc_ns + round(exposure_s * NS / 2)
@@ -172,7 +173,7 @@ class GigeCameraServer:
             rng = np.random.default_rng((self.seed, mid_ns))
             dn = expose(radiance, exposure_s, amplified, rng)
             self._picture = self._encode(dn, camera)
-        except Exception as error:  # a sky fails in its own ways; later triggers must be served all the same
+        except Exception as error:  # whatever fails in rendering, later triggers must be served
             self.failures += 1
             log.warning("no picture: %r", error)
             return
@@ -185,10 +186,10 @@ class GigeCameraServer:
         if self._sent.wait(SEND_S):
             self.exposures += 1
         else:
-            self._write(FAKE_TRIGGER, 0)  # the client stopped in the meantime
+            self._write(FAKE_TRIGGER, 0)  # the client has stopped meanwhile
 
     def _encode(self, dn: np.ndarray, camera: CameraSection) -> bytes:
-        """Return the region and pixel format that the client asked for, from the sensor's numbers."""
+        """Return the region that the client has set, in its pixel format, from the sensor's digital numbers."""
         number = self._read(PIXEL_FORMAT)
         names = [name for name, (known, *_) in PIXEL_FORMATS.items() if known == number]
         if not names:
@@ -231,5 +232,5 @@ def _require_free_port() -> None:
         except OSError as error:
             raise OSError(
                 f"UDP port {GVCP_PORT} of {LOOPBACK} is in use: a machine has one simulated GigE camera, and another "
-                "camera or client runs; stop it, or take the hil camera"
+                "camera or client runs; stop it, or use the hil camera"
             ) from error

@@ -1,8 +1,9 @@
-"""The camera that flight sees: a socket server that renders and exposes the simulated sky at the asked time.
+"""The simulated camera as a socket server: it renders and exposes the target at the requested time.
 
-Protocol hil://: one JSON line a request, one JSON line a reply, then `nbytes` of little-endian uint16 pixels.
-The request says when the shutter opens. In lock step the reply comes when the picture is done; with a real-time factor
-no earlier than the exposure has ended on the simulated clock, and `late_frames` counts those that were not ready then.
+Protocol hil://: each request is one JSON line, each reply one JSON line and `nbytes` of little-endian uint16 pixels.
+The request says when the shutter opens. In lock step the reply is sent when the picture is ready; with a real-time
+factor not before the exposure has ended on the simulated clock, and `late_frames` counts the pictures that were not
+ready by then.
 """
 
 import json
@@ -33,14 +34,14 @@ class CameraServer:
     """Serves the mission's camera until closed; `url` is what `flightsw --camera` takes.
 
     Args:
-        radiance: gives the sky [H, W, C] for a true pose.
-        listen: path of a Unix socket, or hil:///path/to/socket, or hil://host:port (port 0 takes a free one).
+        radiance: gives the scene-linear radiance [H, W, C] for a true pose.
+        listen: path of a Unix socket, or hil:///path/to/socket, or hil://host:port (port 0 chooses a free one).
         pose_at: UTC ns to the true pose; by default the mission's own orbits and attitude.
-        real_time: how many times as fast as ours the simulated clock runs; 0 is lock step.
+        real_time: how many times as fast as real time the simulated clock runs; 0 is lock step.
 
     Raises:
-        ValueError: `listen` is none of these, its path is too long or holds a file that is not a socket; or the
-            factor is none that flight can follow.
+        ValueError: `listen` is none of these, its path is too long or holds a file that is not a socket; or flight
+            cannot follow the real-time factor.
         OSError: the address is taken or not this machine's.
     """
 
@@ -67,7 +68,7 @@ class CameraServer:
                         header, pixels = camera.answer(line)
                         self.wfile.write(json.dumps(header).encode() + b"\n" + pixels)
                 except OSError as error:
-                    log.warning("a client left in the middle: %s", error)
+                    log.warning("a client disconnected during a request: %s", error)
 
         address = _address(listen)
         if isinstance(address, str):
@@ -89,7 +90,7 @@ class CameraServer:
         return self.clock.late_frames
 
     def check(self) -> None:
-        """Raise ServerError if nobody serves any more."""
+        """Raise ServerError if the server's thread has failed."""
         self._thread.check()
 
     def __exit__(self, kind: object, *_: object) -> None:
@@ -104,7 +105,7 @@ class CameraServer:
             self.check()
 
     def answer(self, line: bytes) -> tuple[dict, bytes]:
-        """Return the reply to one request line: header and pixel bytes. A bad request gets ok=False, never a crash."""
+        """Return the reply to one request line: header and pixel bytes; ok=False and the reason if it failed."""
         try:
             request = json.loads(line)
             if request["op"] == "info":
@@ -117,7 +118,7 @@ class CameraServer:
         except (FlightError, BlenderError) as error:
             self.failures += 1
             return {"ok": False, "error": str(error)}, b""
-        except Exception as error:  # of a sky that fails in its own way; the client must hear of it
+        except Exception as error:  # whatever fails in rendering, the client must be told
             self.failures += 1
             log.error("no picture: %r", error, exc_info=error)
             return {"ok": False, "error": f"the simulated sky failed: {error!r}"}, b""

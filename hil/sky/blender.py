@@ -1,4 +1,4 @@
-"""Drives Blender workers: starts and restarts them, spreads the frames, and keeps every picture by its content."""
+"""Renders with Blender: worker processes that are restarted when they crash, and a cache of every picture."""
 
 import contextlib
 import hashlib
@@ -23,11 +23,12 @@ from hil.sky import spacecraft
 from obbgs_base.errors import ObbgsError
 
 log = logging.getLogger(__name__)
+Op = Literal["render", "geometry"]  # light and coverage, or depth and normals
 WORKER = Path(__file__).with_name("blender_worker.py")
-SAMPLES = 16  # with OIDN; more changes little and costs in proportion
+SAMPLES = 16  # a pixel, before denoising (OIDN); rendering time grows in proportion, quality hardly
 BPY_VERSION = "4.5.15"
-RETRIES = 2  # a crash of Blender costs one frame's time, a second crash on the same frame is a defect
-SIDE_FILES = (".mtl", ".bin", ".png", ".jpg", ".jpeg")  # what an OBJ or glTF keeps beside it
+RETRIES = 2  # of a request on which Blender crashed
+SIDE_FILES = (".mtl", ".bin", ".png", ".jpg", ".jpeg")  # files that an OBJ or glTF may refer to
 LIBRARIES = "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
 
 
@@ -37,15 +38,17 @@ class MeshError(ObbgsError, ValueError):
     exit_code = 2
 
 
-class BlenderError(ObbgsError, RuntimeError):
-    """Blender cannot be started, or failed on a frame more than once."""
+class BlenderError(ObbgsError):
+    """Blender cannot be started, refused a request, or crashed on it every time."""
 
 
 def blender_command() -> list[str]:
-    """Return the command that runs the worker: OBBGS_BLENDER_PYTHON, .venv-blender beside the project, or `blender`.
+    """Return the command that runs the worker, by the first of these that exists.
+
+    The Python that the environment variable OBBGS_BLENDER_PYTHON names, .venv-blender in the project's root, `blender`.
 
     Raises:
-        BlenderError: none of them is there.
+        BlenderError: none of them exists.
     """
     own = os.environ.get("OBBGS_BLENDER_PYTHON") or str(WORKER.parents[2] / ".venv-blender/bin/python")
     if Path(own).exists():
@@ -66,7 +69,16 @@ def _remedy(reason: str) -> str:
 
 
 class Worker:
-    """One Blender process with one mesh loaded; it is started again when it dies."""
+    """A Blender process with one mesh loaded; it is started again when it crashes.
+
+    Args:
+        samples: light paths a pixel.
+        ambient: radiance of the uniform light from all around; default the worker's own (blender_worker.py).
+
+    Raises:
+        MeshError: the mesh cannot be loaded.
+        BlenderError: Blender cannot be started.
+    """
 
     def __init__(self, mesh: Path, samples: int = SAMPLES, ambient: float | None = None):
         self.mesh, self.samples, self.ambient = mesh, samples, ambient
@@ -84,14 +96,14 @@ class Worker:
                 stdout=subprocess.PIPE,
                 stderr=self._log,
                 text=True,
-                start_new_session=True,  # Ctrl-C is for us; the frame under way is finished and kept
+                start_new_session=True,  # Ctrl-C goes to us alone: the frame being rendered is finished and kept
             )
         except BaseException:
             self._log.close()
             raise
         greeting = self._reply()
         if greeting is None:
-            reason = self._last_words()
+            reason = self._end_of_log()
             self.close()
             raise BlenderError(f"Blender did not start: {reason}; {_remedy(reason)}")
         self.version = greeting["ready"]
@@ -101,28 +113,28 @@ class Worker:
             load["ambient"] = self.ambient
         reply = self._exchange(load)
         if reply is None or not reply["ok"]:
-            reason = reply["error"] if reply else self._last_words()
+            reason = reply["error"] if reply else self._end_of_log()
             self.close()
             raise MeshError(f"{self.mesh}: not a mesh that Blender can load: {reason}")
         self.facts = {key: value for key, value in reply.items() if key != "ok"}
 
     def ask(self, **request) -> dict:
-        """Return the worker's reply; a crash restarts Blender and asks again.
+        """Return the worker's reply to a request; after a crash Blender is restarted and asked again.
 
         Raises:
-            BlenderError: Blender refused the request, or died on it every time.
+            BlenderError: Blender refused the request, or crashed on it every time.
         """
         for _ in range(1 + RETRIES):
             reply = self._exchange(request)
             if reply is None:
-                log.warning("Blender died (%s); starting it again", self._last_words())
+                log.warning("Blender crashed (%s); starting it again", self._end_of_log())
                 self.close()
                 self._start()
                 continue
             if not reply["ok"]:
                 raise BlenderError(f"Blender refused {request['op']}: {reply['error']}")
             return reply
-        raise BlenderError(f"Blender died {1 + RETRIES} times on the same request")
+        raise BlenderError(f"Blender crashed {1 + RETRIES} times on the same request")
 
     def _exchange(self, request: dict) -> dict | None:
         assert self._process.stdin
@@ -136,16 +148,19 @@ class Worker:
     def _reply(self) -> dict | None:
         assert self._process.stdout
         for line in self._process.stdout:
-            if line.startswith("{"):  # an installed Blender greets on stdout before the worker takes it over
+            if line.startswith(
+                "{"
+            ):  # an installed Blender prints its version before the worker redirects stdout
                 return json.loads(line)
         return None
 
-    def _last_words(self) -> str:
+    def _end_of_log(self) -> str:
         self._log.seek(0)
         lines = [line.strip() for line in self._log.read().splitlines() if line.strip()]
         return " ".join(lines[-2:])[-300:] or "no message"
 
     def close(self) -> None:
+        """End the process; the frame that it is rendering is given 5 s."""
         assert self._process.stdin and self._process.stdout
         with contextlib.suppress(OSError):
             self._process.stdin.close()
@@ -159,7 +174,7 @@ class Worker:
 
 
 class RenderFarm:
-    """True radiance of the mission's target at any pose, rendered once and then read from the cache.
+    """Renders the mission's target at any pose, once; afterwards the picture is read from the cache.
 
     Raises:
         MeshError: `mesh` cannot be loaded.
@@ -173,7 +188,7 @@ class RenderFarm:
         self._count = workers
         self._workers: list[Worker] = []
         self._lock = threading.Lock()
-        self._first = self._worker(0)  # a bad mesh is known at once
+        self._first = self._worker(0)  # at once, so that a bad mesh is reported here
         settings = f"{mesh_sha256(mesh)} {SAMPLES} {self._first.version} ".encode()
         self._identity = hashlib.sha256(settings + WORKER.read_bytes()).hexdigest()
 
@@ -189,32 +204,37 @@ class RenderFarm:
         """What the worker found in the mesh: largest_dimension_m, triangles, normals_recomputed."""
         return self._first.facts
 
-    def path(self, pose: PoseTag, op: Literal["render", "geometry"] = "render") -> Path:
-        """Return where the picture of this pose, or its depth and normals, is kept."""
+    def path(self, pose: PoseTag, op: Op = "render") -> Path:
+        """Return the cache's file for the picture of this pose, or for its depth and normals."""
         content = json.dumps(self._request(pose, op), sort_keys=True)
         return self.cache / (hashlib.sha256((self._identity + content).encode()).hexdigest()[:32] + ".npz")
 
     def radiance(self, pose: PoseTag) -> np.ndarray:
         """Return the scene-linear radiance [H, W, C] float16, premultiplied by coverage."""
-        with self._lock:
-            path = self._rendered(self._first, pose)
-        with np.load(path) as arrays:
-            return arrays["radiance"]
+        return self._array(pose, "render", "radiance")
+
+    def alpha(self, pose: PoseTag) -> np.ndarray:
+        """Return how much of each pixel the target covers, [H, W] uint8, 255 for all of it."""
+        return self._array(pose, "render", "alpha")
 
     def geometry(self, pose: PoseTag) -> tuple[np.ndarray, np.ndarray]:
-        """Return what pixel centres see: planar depth [H, W] float32, m, inf for nothing; normals [H, W, 3] float16."""
-        with self._lock:
-            path = self._rendered(self._first, pose, "geometry")
-        with np.load(path) as arrays:
-            return arrays["depth"], arrays["normals"]
+        """Return depth and normal of what each pixel's centre sees.
+
+        Returns:
+            depth [H, W] float32, planar, m, inf where nothing is seen; normals [H, W, 3] float16, unit, body axes.
+        """
+        return self._array(pose, "geometry", "depth"), self._array(pose, "geometry", "normals")
 
     def prerender(
         self,
         poses: Sequence[PoseTag],
         on_rendered: Callable[[], None] = lambda: None,
-        ops: Sequence[Literal["render", "geometry"]] = ("render",),
+        ops: Sequence[Op] = ("render",),
     ) -> int:
-        """Render what is not in the cache yet on all workers; return how many poses were not."""
+        """Render, on all workers, the poses that are not in the cache yet; return how many those were.
+
+        `on_rendered` is called once for each pose, from the workers' threads.
+        """
         waiting: queue.SimpleQueue[PoseTag] = queue.SimpleQueue()
         missing = 0
         for pose in poses:
@@ -234,7 +254,7 @@ class RenderFarm:
                     on_rendered()
             except queue.Empty:
                 pass
-            finally:  # all is done, or one worker failed
+            finally:  # every pose is rendered, or one worker failed
                 stop.set()
 
         with ThreadPoolExecutor(self._count) as pool:
@@ -242,7 +262,7 @@ class RenderFarm:
                 count = min(self._count, missing)
                 for running in [pool.submit(work, self._worker(index)) for index in range(count)]:
                     running.result()
-            finally:  # interrupted: the frames under way are finished and kept
+            finally:  # when interrupted, the frames being rendered are finished and kept
                 stop.set()
         return missing
 
@@ -271,7 +291,7 @@ class RenderFarm:
             self._workers.append(Worker(self.mesh))
         return self._workers[index]
 
-    def _request(self, pose: PoseTag, op: str) -> dict:
+    def _request(self, pose: PoseTag, op: Op) -> dict:
         camera = self.mission.camera
         return {
             "op": op,
@@ -284,7 +304,13 @@ class RenderFarm:
             "in_eclipse": pose.in_eclipse,
         }
 
-    def _rendered(self, worker: Worker, pose: PoseTag, op: Literal["render", "geometry"] = "render") -> Path:
+    def _array(self, pose: PoseTag, op: Op, name: str) -> np.ndarray:
+        with self._lock:
+            path = self._rendered(self._first, pose, op)
+        with np.load(path) as arrays:
+            return arrays[name]
+
+    def _rendered(self, worker: Worker, pose: PoseTag, op: Op) -> Path:
         path = self.path(pose, op)
         if not path.exists():
             worker.ask(**self._request(pose, op), out=str(path))
@@ -292,13 +318,13 @@ class RenderFarm:
 
 
 def check_mesh(mesh: Path) -> None:
-    """Raise MeshError when there is no such file; whether Blender can load it, Blender says."""
+    """Raise MeshError if the file does not exist; whether Blender can load it is found when it does."""
     if not mesh.is_file():
         raise MeshError(f"{mesh}: no such file")
 
 
 def mesh_sha256(mesh: Path) -> str:
-    """Return the digest of a mesh file and, for the formats that refer to others, of the materials beside it."""
+    """Return the SHA-256 of a mesh file and, for formats that refer to other files, of the materials beside it."""
     files = [mesh]
     if mesh.suffix.lower() in (".obj", ".gltf"):
         files += sorted(path for path in mesh.parent.iterdir() if path.suffix.lower() in SIDE_FILES)

@@ -1,8 +1,9 @@
-"""Runs inside Blender's own Python: renders scene-linear radiance of one mesh, one JSON request a line.
+"""Renders one mesh with Blender, in whose own Python it runs: only bpy, NumPy and the standard library are imported.
 
-Only bpy, numpy and the standard library here. Settings and traps were measured with bpy 4.5.15 (Cycles, CPU). Requests
-on stdin, replies on stdout, both one JSON object a line; pixels go to the .npz that the request names.
-Light is `render`, shape is `geometry`: with many samples, depth would be that of a random point of the pixel.
+Requests come on stdin and replies go to stdout, each one JSON object in a line; arrays go to the .npz file that the
+request names. `render` gives scene-linear radiance, and `geometry` depth and normals: these need a render of their own
+with one ray through each pixel's centre, since with many samples the depth is that of a random point of the pixel.
+The settings were chosen by measurement with bpy 4.5.15 (Cycles, CPU).
 """
 
 import json
@@ -17,43 +18,31 @@ from mathutils.bvhtree import BVHTree
 
 FOREIGN_SIZE_M = 6.0  # a mesh of unknown units is scaled to this largest dimension
 SUN_IRRADIANCE = np.pi  # a white Lambert plate facing the Sun has radiance 1
-SUN_ANGLE_RAD = 0.00925  # the Sun's diameter at 1 au
-EARTHSHINE_RADIANCE = 0.06  # uniform light from all around, share of that plate's radiance
-MAX_METALLIC = 0.3  # a metal under one Sun and a black sky renders black
-MIN_ROUGHNESS = 0.15
+SUN_ANGLE_RAD = 0.00925  # angular diameter of the Sun at 1 au
+EARTHSHINE_RADIANCE = 0.06  # uniform light from all directions, relative to that plate's radiance
+MAX_METALLIC = 0.3  # a metal reflects its surroundings, which are black here except for the Sun
+MIN_ROUGHNESS = 0.15  # a smoother surface shows nothing but a point-like reflection of the Sun
 LARGEST_FLOAT16 = 65504.0
-NOTHING_M = 1e9  # Cycles' depth of the background is 1e10
+BACKGROUND_DEPTH_M = 1e9  # larger depths are background: Cycles writes 1e10 there
 
 
 def load(path, keep_scale):
-    """Load a mesh file into an empty scene and return its facts; the body frame is the file's own (glTF: y-up kept).
+    """Load a mesh file into an empty scene and return its facts.
 
-    Blender turns glTF's y-up into its z-up on import; the file's coordinates are restored, so that the body frame
-    is what the file says.
+    Without `keep_scale` the mesh is centred and scaled to 6 m.
     """
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    suffix = Path(path).suffix.lower()
-    if suffix in (".glb", ".gltf"):
-        bpy.ops.import_scene.gltf(filepath=path)
-        undo = Matrix.Rotation(-np.pi / 2, 4, "X")
-    elif suffix == ".obj":
-        bpy.ops.wm.obj_import(filepath=path, forward_axis="Y", up_axis="Z")
-        undo = Matrix.Identity(4)
-    elif suffix == ".stl":
-        bpy.ops.wm.stl_import(filepath=path)
-        undo = Matrix.Identity(4)
-    else:
-        raise ValueError(f"expected a .glb, .gltf, .obj or .stl file, got {suffix or 'no suffix'}")
-    meshes = mesh_objects()  # what the importer adds to show bones is outside the view layer
+    to_file_axes = import_mesh(path)
+    meshes = mesh_objects()  # what the importer adds to show bones is not in the view layer
     for o in list(bpy.context.scene.objects):
         if o not in meshes and o.type in ("MESH", "CAMERA", "LIGHT"):
             bpy.data.objects.remove(o)
     if not meshes:
         raise ValueError("the file holds no triangles")
     bpy.context.view_layer.update()
-    for o in meshes:  # bake every transform, so that world coordinates are the mesh's own
+    for o in meshes:  # apply every object's transform to its vertices
         o.data = o.data.copy()
-        o.data.transform(undo @ o.matrix_world)
+        o.data.transform(to_file_axes @ o.matrix_world)
         o.parent = None
         o.matrix_world = Matrix.Identity(4)
     low, high = bounds(meshes)
@@ -68,32 +57,55 @@ def load(path, keep_scale):
         extent = FOREIGN_SIZE_M
     recomputed = sum(recompute_normals(o) for o in meshes)
     for material in bpy.data.materials:
-        tame(material)
+        limit_material(material)
     bpy.context.view_layer.update()
     triangles = sum(len(p.vertices) - 2 for o in meshes for p in o.data.polygons)
     return {"largest_dimension_m": extent, "triangles": triangles, "normals_recomputed": recomputed}
 
 
+def import_mesh(path):
+    """Import a file's objects and return the rotation from Blender's axes to the file's.
+
+    Blender turns the y-up of glTF into its own z-up; the body frame keeps the file's axes.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix in (".glb", ".gltf"):
+        bpy.ops.import_scene.gltf(filepath=path)
+        to_file_axes = Matrix.Rotation(-np.pi / 2, 4, "X")
+    elif suffix == ".obj":
+        bpy.ops.wm.obj_import(filepath=path, forward_axis="Y", up_axis="Z")
+        to_file_axes = Matrix.Identity(4)
+    elif suffix == ".stl":
+        bpy.ops.wm.stl_import(filepath=path)
+        to_file_axes = Matrix.Identity(4)
+    else:
+        raise ValueError(f"expected a .glb, .gltf, .obj or .stl file, got {suffix or 'no suffix'}")
+    return to_file_axes
+
+
 def mesh_objects():
+    """Return the objects of the view layer that have faces."""
     return [o for o in bpy.context.view_layer.objects if o.type == "MESH" and len(o.data.polygons)]
 
 
 def bounds(meshes):
+    """Return the smallest and the largest coordinates [3] of all vertices."""
     points = np.concatenate([vertices(o) for o in meshes])
     return points.min(0), points.max(0)
 
 
 def vertices(o):
+    """Return an object's vertices [V, 3]."""
     flat = np.empty(3 * len(o.data.vertices), dtype=np.float64)
     o.data.vertices.foreach_get("co", flat)
     return flat.reshape(-1, 3)
 
 
 def recompute_normals(o):
-    """Drop stored normals and crease edges sharper than 30 degrees instead; return whether any were stored.
+    """Replace stored normals by smooth shading with edges sharper than 30 degrees; return whether there were any.
 
-    Stored normals cannot be trusted: SOHO's point inwards together with its faces, and it renders black with them.
-    Without them Cycles turns a face towards the light by itself.
+    Stored normals are not reliable: NASA's SOHO has normals and faces that point inwards, and it renders black.
+    Without stored normals Cycles shades both sides of a face alike.
     """
     mesh = o.data
     attribute = mesh.attributes.get("custom_normal")
@@ -104,38 +116,43 @@ def recompute_normals(o):
     return True
 
 
-def tame(material):
-    """Keep a material visible under one Sun: clamp metallic and roughness, remove emission."""
+def limit_material(material):
+    """Keep a material visible under one Sun: limit how metallic and how smooth it is, and remove emission."""
     if not material.use_nodes:
         return
     nodes = list(material.node_tree.nodes)
-    if not any(node.type == "BSDF_PRINCIPLED" for node in nodes):
+    shaders = [node for node in nodes if node.type == "BSDF_PRINCIPLED"]
+    if not shaders:
         for node in nodes:
             if node.type == "EMISSION":
-                light_up(material, node)
-    for node in nodes:
-        if node.type != "BSDF_PRINCIPLED":
-            continue
-        links = material.node_tree.links
-        for name, limit in (("Metallic", min), ("Roughness", max)):
-            socket = node.inputs[name]
-            bound = MAX_METALLIC if name == "Metallic" else MIN_ROUGHNESS
-            for link in list(socket.links):
-                clamp = material.node_tree.nodes.new("ShaderNodeMath")
-                clamp.operation = "MINIMUM" if limit is min else "MAXIMUM"
-                clamp.inputs[1].default_value = bound
-                source = link.from_socket
-                links.remove(link)
-                links.new(source, clamp.inputs[0])
-                links.new(clamp.outputs[0], socket)
-            socket.default_value = limit(socket.default_value, bound)
-        for link in list(node.inputs["Emission Strength"].links) + list(node.inputs["Emission Color"].links):
+                replace_emission(material, node)
+    links = material.node_tree.links
+    for shader in shaders:
+        limit_input(material, shader.inputs["Metallic"], "MINIMUM", MAX_METALLIC)
+        limit_input(material, shader.inputs["Roughness"], "MAXIMUM", MIN_ROUGHNESS)
+        emission = [shader.inputs["Emission Strength"], shader.inputs["Emission Color"]]
+        for link in [link for socket in emission for link in socket.links]:
             links.remove(link)
-        node.inputs["Emission Strength"].default_value = 0.0
+        shader.inputs["Emission Strength"].default_value = 0.0
 
 
-def light_up(material, emission):
-    """Let the Sun light an unlit material (KHR_materials_unlit glows and casts no shadow): matt, same colour."""
+def limit_input(material, socket, operation, bound):
+    """Replace a shader's input, a value or a texture, by its minimum or maximum with a bound."""
+    links = material.node_tree.links
+    for link in list(socket.links):
+        clamp = material.node_tree.nodes.new("ShaderNodeMath")
+        clamp.operation = operation
+        clamp.inputs[1].default_value = bound
+        source = link.from_socket
+        links.remove(link)
+        links.new(source, clamp.inputs[0])
+        links.new(clamp.outputs[0], socket)
+    limit = min if operation == "MINIMUM" else max
+    socket.default_value = limit(socket.default_value, bound)
+
+
+def replace_emission(material, emission):
+    """Make an unlit material (KHR_materials_unlit, imported as emission) a matt one of the same colour."""
     links = material.node_tree.links
     matt = material.node_tree.nodes.new("ShaderNodeBsdfDiffuse")
     matt.inputs["Color"].default_value = emission.inputs["Color"].default_value
@@ -147,7 +164,7 @@ def light_up(material, emission):
 
 
 def set_up(samples, ambient):
-    """Prepare Cycles, the Sun, Earth-shine and the camera of an opened scene."""
+    """Set up Cycles, the Sun, Earthshine and the camera of the scene."""
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.render.threads_mode, scene.render.threads = "FIXED", 1
@@ -173,7 +190,7 @@ def set_up(samples, ambient):
 
 
 def place(request):
-    """Put camera and Sun where the request says; OpenCV axes and pixel centres become Blender's."""
+    """Place camera and Sun as requested; OpenCV's axes and pixel coordinates become Blender's."""
     scene = bpy.context.scene
     world_to_camera, K = np.array(request["world_to_camera"]), np.array(request["K"])
     width, height = request["width"], request["height"]
@@ -198,7 +215,7 @@ def place(request):
     direction = Vector(request["sun_dir_body"])
     sun.rotation_mode = "QUATERNION"
     sun.rotation_quaternion = direction.to_track_quat("Z", "Y")
-    in_eclipse = request.get("in_eclipse", False)  # the Earth's night side sends no light either
+    in_eclipse = request.get("in_eclipse", False)  # then the Earth below is dark, too: no Earthshine
     sun.data.energy = 0.0 if in_eclipse else SUN_IRRADIANCE
     world = scene.world.node_tree.nodes["Background"].inputs["Strength"]
     world.default_value = 0.0 if in_eclipse else scene["ambient"]
@@ -208,7 +225,7 @@ PASSES = {}
 
 
 def keep_passes():
-    """Read the passes straight from Cycles' result: float32, no file, no view transform."""
+    """Let Cycles leave its render passes in PASSES: float32, without a file and without a view transform."""
     from cycles import CyclesRender
 
     original = CyclesRender.render
@@ -226,14 +243,14 @@ def keep_passes():
 
 
 def render(request):
-    """Render one view: premultiplied radiance and alpha, float32 radiance where the request says so."""
+    """Write one view: radiance, premultiplied by coverage, in float16 (float32 if requested), and coverage (alpha)."""
     place(request)
     PASSES.clear()
     bpy.ops.render.render(write_still=False)
     combined = PASSES["Combined"]
     alpha = np.clip(combined[..., 3], 0, 1)
     radiance = np.clip(np.nan_to_num(combined[..., :3]), 0, LARGEST_FLOAT16)
-    radiance[alpha == 0] = 0  # OIDN leaks outside the alpha
+    radiance[alpha == 0] = 0  # the denoiser spreads light beyond the target's outline
     if request["channels"] == 1:
         radiance = radiance @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # Rec. 709 luminance
         radiance = radiance[..., None]
@@ -243,7 +260,7 @@ def render(request):
 
 
 def geometry(request):
-    """Write what the middle of each pixel sees: planar depth, m (inf: nothing), and the unit normal, body axes."""
+    """Write planar depth, m (inf: background), and unit normal, body axes, at each pixel's centre."""
     cycles = bpy.context.scene.cycles
     usual = {
         "samples": cycles.samples,
@@ -263,12 +280,12 @@ def geometry(request):
         for name, value in usual.items():
             setattr(cycles, name, value)
     depth, normals = PASSES["Depth"][..., 0].astype(np.float32), PASSES["Normal"].astype(np.float16)
-    depth[depth > NOTHING_M] = np.inf
+    depth[depth > BACKGROUND_DEPTH_M] = np.inf
     write_whole(request["out"], depth=depth, normals=normals)
 
 
 def write_whole(out, **arrays):
-    """Write an .npz whole or not at all."""
+    """Write an .npz file under a temporary name and rename it, so that it is complete or missing."""
     part = out + f".{os.getpid()}.part"
     with open(part, "wb") as f:
         np.savez_compressed(f, **arrays)
@@ -289,7 +306,7 @@ def surface():
 
 
 def visible(request):
-    """Mark the points that at least one camera centre sees, by casting rays from the point towards each camera."""
+    """Write which points at least one camera centre sees, by casting a ray from the point towards each camera."""
     v, f = surface()
     tree = BVHTree.FromPolygons(v.tolist(), f.tolist())
     with np.load(request["points"]) as given:
@@ -307,6 +324,7 @@ def visible(request):
 
 
 def answer(request):
+    """Carry out a request and return the facts for its reply."""
     op = request["op"]
     if op == "load":
         facts = load(request["mesh"], request["keep_scale"])
@@ -331,7 +349,7 @@ def answer(request):
 
 def main():
     replies = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # Blender's own chatter goes to stderr, replies keep the real stdout
+    os.dup2(2, 1)  # what Blender itself prints goes to stderr, so that stdout holds replies only
     keep_passes()
     print(json.dumps({"ready": bpy.app.version_string}), file=replies, flush=True)
     for line in sys.stdin:

@@ -1,22 +1,22 @@
-"""Motion during an exposure: how each pixel's point moves in the image, and the picture smeared along it.
+"""Motion blur and rolling shutter: the image velocity of each pixel, and the picture averaged along it.
 
-The blur is an image-plane warp of one rendered view, not an average of many: exact for a surface that stays in view
-while the shutter is open, without what appears or disappears behind an edge in that time.
+One rendered view is warped in the image plane. That is exact for a surface that stays in view while the shutter is
+open; what is uncovered or hidden behind an edge in that time is not modelled.
 """
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 NEGLIGIBLE_PX = 0.02  # smaller movements are left out
-STEP_PX = 0.5  # between the copies that make up a smear
+STEP_PX = 0.5  # between the shifted copies that are averaged
 
 
 def image_velocity(
     depth: np.ndarray, K: np.ndarray, before: np.ndarray, after: np.ndarray, interval_s: float
 ) -> np.ndarray:
-    """Return how fast the point behind each pixel moves in the image, [H, W, 2] px/s (x, y).
+    """Return how fast the point seen by each pixel moves in the image, [H, W, 2] px/s (x, y).
 
-    Pixels that see nothing take the velocity of the nearest one that does: light is smeared out over them.
+    Background pixels take the velocity of the nearest pixel of the target, whose light may be blurred into them.
 
     Args:
         depth: [H, W] planar, m, at the middle of the interval; inf where nothing is seen.
@@ -47,7 +47,7 @@ def smear(
     Args:
         radiance: [H, W, C] at mid-exposure of the middle row.
         velocity_px_s: [H, W, 2].
-        line_time_s: of a rolling shutter: row r opens (r - H/2) line times after the middle row.
+        line_time_s: of a rolling shutter, whose row r opens (r - H/2) line times after the middle row; 0 for none.
     """
     height, width = radiance.shape[:2]
     fastest_px_s = float(np.abs(velocity_px_s).max())
@@ -65,7 +65,7 @@ def smear(
             total[..., channel] += map_coordinates(
                 radiance[..., channel].astype(np.float64), source, order=3, mode="constant"
             )
-    return np.maximum(total / copies, 0)  # splines swing below zero beside bright edges
+    return np.maximum(total / copies, 0)  # cubic splines undershoot beside bright edges
 
 
 def _project(K: np.ndarray, world_to_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -74,7 +74,7 @@ def _project(K: np.ndarray, world_to_camera: np.ndarray, points: np.ndarray) -> 
 
 
 def _half_way(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the pose in the middle of two that differ little: their mean, with the rotation made a rotation again."""
+    """Return the pose halfway between two similar ones: their mean, its rotation made orthonormal again."""
     middle = (before + after) / 2
     u, _, vt = np.linalg.svd(middle[:3, :3])
     middle[:3, :3] = u @ vt

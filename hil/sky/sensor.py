@@ -1,4 +1,7 @@
-"""The simulated sensor: radiance and exposure to digital numbers. Independent of `obbgs_core.sensor` on purpose."""
+"""The simulated sensor: from radiance to digital numbers (DN). Written independently of `obbgs_core.sensor` on purpose.
+
+Terms and units follow EMVA Standard 1288 and Janesick, Photon Transfer, 2007.
+"""
 
 import functools
 import math
@@ -10,45 +13,43 @@ from scipy.ndimage import convolve, gaussian_filter
 
 from flightsw.icd.mission import CameraSection
 
-HOT_RATE_E_S = 2e5  # mean dark current of a hot pixel, electrons a second
+HOT_RATE_E_S = 2e5  # mean dark current of a hot pixel, electrons per second
 LARGEST_POISSON_E = 1e15  # far above any pixel; NumPy's Poisson refuses about 9e18
 
 
 @dataclass(frozen=True)
 class SensorModel:
-    """A camera's sensor and optics, in the terms of a datasheet; the defaults are a perfect one.
+    """A camera's sensor and optics, in the terms of a datasheet; the defaults are free of faults.
 
     Light: electrons = radiance * photons_per_radiance_s * exposure_time_s * quantum_efficiency.
     """
 
-    photons_per_radiance_s: float = (
-        1.0e8  # at one pixel for unit radiance: aperture, transmission, pixel area
-    )
-    quantum_efficiency: float = 1.0  # electrons a photon
-    electrons_per_dn: float = 4.0  # the gain; shot noise fades as it grows
+    photons_per_radiance_s: float = 1.0e8  # at a pixel: aperture, transmission and pixel area
+    quantum_efficiency: float = 1.0  # electrons per photon
+    electrons_per_dn: float = 4.0  # at a given DN the shot noise is the smaller, the larger this is
     bit_depth: int = 12
     black_dn: float = 64.0
-    read_noise_e: float = 0.0  # 1 sigma a pixel and frame
-    dark_e_s: float = 0.0  # dark current a pixel
-    prnu: float = 0.0  # 1 sigma of the pixels' sensitivity, share of it (fixed pattern)
-    dsnu_e: float = 0.0  # 1 sigma of the pixels' offset (fixed pattern)
-    hot_pixels: float = 0.0  # share of the pixels
+    read_noise_e: float = 0.0  # standard deviation of a pixel
+    dark_e_s: float = 0.0  # dark current of a pixel
+    prnu: float = 0.0  # photo response non-uniformity: relative standard deviation of the pixels
+    dsnu_e: float = 0.0  # dark signal non-uniformity: standard deviation of the pixels
+    hot_pixels: float = 0.0  # fraction of the pixels
     full_well_e: float = math.inf
     blooming: bool = False  # charge above the full well runs along its column instead of being lost
-    vignetting: float = 0.0  # light lost in the corners, share; grows with the square of the distance
-    psf_sigma_px: float = 0.0  # of the Gaussian that the optics make of a point
-    exposure_error: float = 0.0  # 1 sigma of the true exposure time, share of the commanded one
-    line_time_s: float = 0.0  # from one row's exposure to the next: rolling shutter; 0 is a global one
+    vignetting: float = 0.0  # fraction of the light lost in the corners; grows with the distance squared
+    psf_sigma_px: float = 0.0  # of the Gaussian point spread function
+    exposure_error: float = 0.0  # relative standard deviation of the true exposure time
+    line_time_s: float = 0.0  # of a rolling shutter, from one row to the next; 0: a global shutter
     stars: bool = False
-    colour: Literal["mono", "rgb", "bayer"] = "mono"  # bayer: RGGB, read as a mosaic, interpolated after
-    seed: int = 0  # of the fixed pattern and the hot pixels: which specimen of the sensor
+    colour: Literal["mono", "rgb", "bayer"] = "mono"  # bayer: an RGGB mosaic, interpolated
+    seed: int = 0  # of the fixed pattern and the hot pixels: the individual sensor
 
     def __post_init__(self):
         for name in ("photons_per_radiance_s", "quantum_efficiency", "electrons_per_dn", "full_well_e"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if not (0 <= self.vignetting <= 1 and 0 <= self.hot_pixels <= 1):
-            raise ValueError(f"expected shares of 0 to 1, got {self.vignetting} and {self.hot_pixels}")
+            raise ValueError(f"expected fractions of 0 to 1, got {self.vignetting} and {self.hot_pixels}")
 
     @property
     def channels(self) -> int:
@@ -63,12 +64,12 @@ class SensorModel:
         return (1 << self.bit_depth) - 1
 
     def with_gain(self, dn_per_radiance_s: float) -> "SensorModel":
-        """Return the sensor behind a lens that gives this signal."""
+        """Return the sensor with as much light as gives this signal."""
         photons = dn_per_radiance_s * self.electrons_per_dn / self.quantum_efficiency
         return replace(self, photons_per_radiance_s=photons)
 
     def camera_section(self, width: int, height: int, focal_px: float) -> CameraSection:
-        """Return what a calibration of this camera tells flight and ground: the linear part only."""
+        """Return what a calibration of this camera tells flight and ground: its linear response and noise only."""
         return CameraSection(
             width=width,
             height=height,
@@ -86,11 +87,11 @@ class SensorModel:
 
 
 PRESETS = {
-    # Jiang et al. 2025: Gaussian noise on 8-bit pictures; 0.025 of full scale explains their PSNR
+    # Jiang et al. 2025: Gaussian noise on 8-bit pictures; 0.025 of full scale is consistent with their PSNR
     "paper": SensorModel(
         electrons_per_dn=1e6, bit_depth=8, black_dn=0.0, read_noise_e=0.025 * 255 * 1e6, colour="rgb"
     ),
-    # a scientific CMOS of the kind that flies: 16,000 electrons over 12 bits
+    # a typical scientific CMOS sensor for space: 16,000 electrons at 12 bits
     "spacecam": SensorModel(
         quantum_efficiency=0.6,
         electrons_per_dn=4.0,
@@ -112,7 +113,7 @@ PRESETS = {
 
 
 def ideal(camera: CameraSection) -> SensorModel:
-    """Return the sensor that a camera's calibration describes, without any of the faults it leaves out."""
+    """Return the sensor that a camera's calibration describes, free of the faults that a calibration leaves out."""
     return SensorModel(
         photons_per_radiance_s=camera.dn_per_radiance_s * camera.electrons_per_dn,
         electrons_per_dn=camera.electrons_per_dn,
@@ -124,7 +125,7 @@ def ideal(camera: CameraSection) -> SensorModel:
 
 
 def clean_dn(radiance: np.ndarray, exposure_time_s: float, camera: CameraSection) -> np.ndarray:
-    """Return what a noiseless sensor would read, float64, clipped at full scale but not rounded."""
+    """Return the reading of a noiseless sensor, DN as float64, clipped at full scale but not rounded."""
     signal_dn = camera.dn_per_radiance_s * exposure_time_s * radiance.astype(np.float64)
     return np.minimum(camera.black_dn + signal_dn, camera.white_dn)
 
@@ -145,8 +146,8 @@ def read_out(
 ) -> np.ndarray:
     """Return one noisy exposure, uint16, of the radiance's shape.
 
-    In the order of the light: lens (fall-off, blur), shutter, colour filter, pixels (fixed pattern, dark current, shot
-    noise, full well), converter (read noise, black level, clipping), and for a Bayer sensor the interpolation.
+    In the order of the signal chain: lens (vignetting, blur), shutter, colour filter, pixels (fixed pattern, dark
+    current, shot noise, full well), converter (read noise, black level, clipping); for a Bayer sensor interpolation.
 
     Args:
         radiance: [H, W, C], scene-linear; C is 1 for a mono sensor and 3 for the others.
@@ -187,10 +188,10 @@ def read_out(
 def converted(
     signal_dn: np.ndarray, sigma_dn: float | np.ndarray, white_dn: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return what the converter reads, uint16, of an unclipped signal of the same shape, DN above zero.
+    """Return the analogue-to-digital converter's output, uint16, for an unclipped signal in DN of the same shape.
 
-    In the order of a real one: Gaussian noise of deviation `sigma_dn` is added, the sum is rounded, then clipped to
-    0..white_dn. A saturated pixel therefore still reads below full scale where its noise is negative enough.
+    As in a real converter Gaussian noise of standard deviation `sigma_dn` is added, the sum is rounded, then clipped to
+    0..white_dn. A signal above full scale can therefore still read below it.
     """
     noisy = signal_dn + sigma_dn * rng.standard_normal(signal_dn.shape)
     return np.clip(np.rint(noisy), 0, white_dn).astype(np.uint16)
@@ -199,7 +200,7 @@ def converted(
 def bloom(electrons: np.ndarray, full_well_e: float) -> np.ndarray:
     """Return the charge [H, W, C] after the excess over the full well has run along its columns, half each way.
 
-    No charge is lost but over the upper and lower edge.
+    Charge is lost only over the upper and the lower edge.
     """
     well = np.minimum(electrons, full_well_e)
     half_excess = (electrons - well) / 2
@@ -213,7 +214,7 @@ def bloom(electrons: np.ndarray, full_well_e: float) -> np.ndarray:
 
 
 def demosaic(dn: np.ndarray) -> np.ndarray:
-    """Return an RGGB mosaic [H, W] as colours [H, W, 3]: each from the mean of its nearest pixels (bilinear)."""
+    """Return an RGGB mosaic [H, W] as colours [H, W, 3] by bilinear interpolation."""
     mask = _bayer_mask(*dn.shape)
     kernel = np.array([[0.25, 0.5, 0.25], [0.5, 1.0, 0.5], [0.25, 0.5, 0.25]])
     colours = []
@@ -225,7 +226,7 @@ def demosaic(dn: np.ndarray) -> np.ndarray:
 
 
 def _bayer_mask(height: int, width: int) -> np.ndarray:
-    """Return [H, W, 3], 1 where a pixel of an RGGB sensor sees the colour."""
+    """Return [H, W, 3], 1 where a pixel of an RGGB sensor is sensitive to the colour, else 0."""
     mask = np.zeros((height, width, 3))
     mask[0::2, 0::2, 0] = 1
     mask[0::2, 1::2, 1] = mask[1::2, 0::2, 1] = 1
@@ -242,7 +243,7 @@ def _squared_distance(height: int, width: int) -> np.ndarray:
 
 @functools.lru_cache(maxsize=4)
 def _fixed_pattern(sensor: SensorModel, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a specimen's sensitivity (mean 1), offset (electrons), hot pixels' dark current (electrons a second)."""
+    """Return the pixels' relative sensitivity, offset (electrons) and additional dark current (electrons/s)."""
     rng = np.random.default_rng((sensor.seed, *shape))
     sensitivity = np.maximum(0.0, 1 + sensor.prnu * rng.standard_normal(shape))
     offset_e = sensor.dsnu_e * rng.standard_normal(shape)

@@ -1,4 +1,4 @@
-"""The target that ships with the project: a parametric spacecraft built from simple solids.
+"""The target that comes with the project: a parametric spacecraft made of simple solids.
 
 Body axes: +z faces the Sun (as the solar panels do), +y along the panels, +x towards the dish; metres.
 """
@@ -14,7 +14,7 @@ from trimesh.visual.material import PBRMaterial
 
 from hil import SHIPPED as SHIPPED
 
-# name: base colour (linear), metallic, roughness
+# base colour (linear), metallic, roughness
 MATERIALS = {
     "gold_foil": ((0.75, 0.48, 0.12), 0.3, 0.35),
     "white_paint": ((0.80, 0.80, 0.78), 0.0, 0.6),
@@ -26,7 +26,7 @@ MATERIALS = {
 
 
 def build() -> trimesh.Scene:
-    """Return the spacecraft as a scene of one mesh a material; the largest dimension is 6.0 m (panel tip to tip)."""
+    """Return the spacecraft as a scene with one mesh for each material; it is 6.0 m from panel tip to panel tip."""
     parts: dict[str, list[trimesh.Trimesh]] = {name: [] for name in MATERIALS}
     _bus(parts)
     for side in (-1, 1):
@@ -52,7 +52,7 @@ def write(path: Path) -> None:
 
 
 def _box(size: tuple[float, float, float], centre: tuple[float, float, float]) -> trimesh.Trimesh:
-    # unshared vertices keep the edges sharp when a viewer smooths normals
+    # Vertices that faces do not share keep the edges sharp where a viewer smooths normals.
     mesh = trimesh.creation.box(extents=size, transform=translation_matrix(centre))
     mesh.unmerge_vertices()
     return mesh
@@ -85,7 +85,7 @@ def _bus(parts: dict[str, list[trimesh.Trimesh]]) -> None:
 
 
 def _solar_panel(parts: dict[str, list[trimesh.Trimesh]], side: int) -> None:
-    """Three hinged segments a side: frames with a grid of cells on the Sun face and white paint behind."""
+    """Add one side's three hinged segments: frames with a grid of cells on the Sun side and white paint behind."""
     parts["aluminium"].append(_rod((0, side * 0.55, 0.1), (0, side * 0.9, 0.1), 0.035))
     length_m, width_m = 0.68, 1.3
     for segment in range(3):
@@ -104,7 +104,7 @@ def _solar_panel(parts: dict[str, list[trimesh.Trimesh]], side: int) -> None:
 
 
 def _dish(parts: dict[str, list[trimesh.Trimesh]]) -> None:
-    """A parabolic reflector with a feed on three struts, looking along +x and a little up."""
+    """Add a parabolic reflector with a feed on three struts, which points along +x and slightly upwards."""
     radius_m, depth_m = 0.55, 0.18
     r = np.linspace(0.0, radius_m, 12)
     outline = np.stack([r, depth_m * (r / radius_m) ** 2], axis=1)
@@ -125,7 +125,7 @@ def _dish(parts: dict[str, list[trimesh.Trimesh]]) -> None:
 
 
 def _boom_and_antennas(parts: dict[str, list[trimesh.Trimesh]]) -> None:
-    """A thin magnetometer boom along -x and two whip antennas below: the parts that methods lose first."""
+    """Add a magnetometer boom along -x and two whip antennas: thin parts, which are hard to reconstruct."""
     parts["panel_frame"].append(_rod((-0.6, 0.0, -0.5), (-2.6, 0.0, -0.8), 0.022))
     parts["aluminium"].append(_box((0.14, 0.1, 0.1), (-2.65, 0.0, -0.81)))
     for y in (-0.45, 0.45):

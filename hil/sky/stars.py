@@ -1,4 +1,4 @@
-"""Stars behind the target: invented places, the real sky's brightness and number."""
+"""Stars behind the target: random positions, with the number and brightness of the real sky's."""
 
 import functools
 
@@ -13,8 +13,8 @@ SUN_IRRADIANCE = np.pi  # in the renderer's unit: a white Lambert plate facing t
 def catalogue() -> tuple[np.ndarray, np.ndarray]:
     """Return stars brighter than magnitude 9: directions [N, 3] in GCRS and irradiances [N] in the renderer's unit.
 
-    Numbers grow as 10^(0.51 m), 5,000 brighter than magnitude 6, as on the real sky (Allen's Astrophysical Quantities);
-    places are random and always the same.
+    As on the real sky 5,000 are brighter than magnitude 6, and their number grows as 10^(0.51 m) with the magnitude m
+    (Allen's Astrophysical Quantities). Positions are random, with a fixed seed.
     """
     rng = np.random.default_rng(20260721)
     count = round(5000 * 10 ** (0.51 * (FAINTEST_MAGNITUDE - 6)))
@@ -25,7 +25,7 @@ def catalogue() -> tuple[np.ndarray, np.ndarray]:
 
 
 def star_radiance(gcrs_to_camera: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Return the stars' radiance [H, W], each star's light in one pixel (a lens with a PSF spreads it)."""
+    """Return the stars' radiance [H, W], the light of each star in one pixel; the sensor's PSF spreads it later."""
     directions, irradiances = catalogue()
     in_camera = directions @ gcrs_to_camera.T
     ahead = in_camera[:, 2] > 1e-6

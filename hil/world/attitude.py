@@ -1,4 +1,4 @@
-"""How the target turns: the rotation from GCRS to its body frame over time."""
+"""The target's attitude: the rotation from GCRS to its body frame as a function of time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,8 +19,11 @@ Attitude = Callable[[int], np.ndarray]  # UTC ns to gcrs_to_body [3, 3]
 class AttitudeSection:
     """The attitude of a scenario's target.
 
-    inertial: body +z stays on `axis`. spin: the same, turning about +z once every `period_s`. lvlh: body x forward, y
-    against the orbit normal, z to the Earth. tumble: free rotation that starts as inertial with `rates_deg_s`.
+    Modes:
+        inertial: body +z points along `axis`, and the target does not rotate.
+        spin: body +z points along `axis`, and the target rotates about it once in `period_s`.
+        lvlh: body x points forward, y against the orbit normal, z to the Earth's centre.
+        tumble: torque-free rotation that starts in the inertial attitude with the angular velocity `rates_deg_s`.
     """
 
     mode: Literal["inertial", "lvlh", "spin", "tumble"] = "inertial"
@@ -50,9 +53,10 @@ class AttitudeSection:
 def attitude(
     section: AttitudeSection, target_tle: tuple[str, ...], start_utc_ns: int, horizon_s: float
 ) -> Attitude:
-    """Return the target's attitude as a function of time, from its start to `horizon_s` later.
+    """Return the target's attitude as a function of time.
 
-    The function raises ValueError for a tumbling target outside that time; the other modes have no end.
+    A tumble is integrated from the start to `horizon_s` later; outside, the function raises ValueError. The other modes
+    are known at any time.
     """
     if section.mode == "lvlh":
         return lambda utc_ns: _gcrs_to_lvlh(target_tle, utc_ns)
@@ -86,13 +90,15 @@ def attitude(
 def tumble(
     inertia: np.ndarray, rates_rad_s: np.ndarray, quat_body_to_gcrs: np.ndarray, horizon_s: float
 ) -> OdeSolution:
-    """Return the torque-free rotation of a rigid body: a function of seconds to quat_body_to_gcrs [4], rates [3] rad/s.
+    """Return a rigid body's torque-free rotation: a function of s to quat_body_to_gcrs [4] and rates [3] rad/s, joined.
 
     Args:
         inertia: [3] principal moments about the body axes.
-        rates_rad_s: [3] at the start, body axes.
+        rates_rad_s: [3] angular velocity at the start, body axes.
+        quat_body_to_gcrs: [4] at the start.
 
-    Source: Euler's equations, I dω/dt = Iω x ω; dq/dt = q (0, ω) / 2.
+    Source: Euler's equations, I dω/dt = Iω x ω, and dq/dt = q (0, ω) / 2 with quaternion multiplication (Markley and
+    Crassidis, Fundamentals of Spacecraft Attitude Determination and Control, 2014).
     """
 
     def derivative(_: float, state: np.ndarray) -> np.ndarray:
@@ -103,7 +109,7 @@ def tumble(
         return np.concatenate([turn, np.cross(inertia * state[4:], state[4:]) / inertia])
 
     start = np.concatenate([quat_body_to_gcrs, rates_rad_s])
-    # the dense output is one order below the steps: short steps keep it at 1e-8 of a radian
+    # The dense output is of lower order than the steps; with steps this short its error stays below 1e-8 rad.
     rate = max(float(np.linalg.norm(rates_rad_s)), 1e-9)
     solved = solve_ivp(
         derivative,
@@ -115,7 +121,7 @@ def tumble(
         max_step=0.25 / rate,
         dense_output=True,
     )
-    assert solved.success and solved.sol is not None  # smooth and bounded: nothing a user gives can stop it
+    assert solved.success and solved.sol is not None  # smooth equations with a bounded solution
     return solved.sol
 
 

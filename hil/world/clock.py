@@ -1,4 +1,4 @@
-"""The simulated clock: when a picture may leave the camera, and whether it is late."""
+"""The simulated clock: it holds a camera's pictures back until their exposures have ended, and counts late ones."""
 
 import math
 import threading
@@ -9,18 +9,19 @@ from flightsw.cameras import gige, hil
 from flightsw.icd.mission import Mission
 
 NS = 1_000_000_000
-MARGIN_S = 20.0  # of a driver's patience, for rendering
+MARGIN_S = 20.0  # of a camera driver's timeout, left for rendering
 LONGEST_WAIT_S = min(gige.RENDER_S, hil.TIMEOUT_S) - MARGIN_S
 
 
 class SimulatedClock:
-    """The mission's time, `factor` times as fast as ours; with 0 the camera is in lock step with its client.
+    """Mission time that runs `factor` times as fast as real time; with 0 the camera is in lock step with its client.
 
-    It starts with the first picture that is ready. From then on a picture leaves no earlier than its exposure has
-    ended, and one that was not ready by then (rendered too slowly, or asked for too late) is late: it leaves at once.
+    It starts when the first picture is ready. From then on no picture leaves before its exposure has ended on this
+    clock. One that was not ready by then (rendered too slowly, or requested too late) leaves at once and is late.
 
     Raises:
-        ValueError: the factor is negative or not finite, or flight would not wait so long from bracket to bracket.
+        ValueError: the factor is negative or not finite, or brackets would come so slowly that flight's camera driver
+            times out.
     """
 
     def __init__(self, mission: Mission, factor: float = 0.0, clock_s: Callable[[], float] = time.monotonic):
@@ -36,11 +37,11 @@ class SimulatedClock:
         self.factor = factor
         self.late_frames = 0
         self._clock_s = clock_s
-        self._start: tuple[float, int] | None = None  # our seconds, UTC ns
+        self._start: tuple[float, int] | None = None  # real time s, and mission time UTC ns
         self._lock = threading.Lock()
 
     def release(self, end_utc_ns: int, wait: Callable[[float], object]) -> None:
-        """Return when an exposure whose picture is ready has ended; `wait` takes the seconds until then."""
+        """Wait until an exposure, whose picture is ready, has ended; `wait` is called with the seconds until then."""
         if not self.factor:
             return
         ready_s = self._clock_s()

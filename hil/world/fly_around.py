@@ -1,6 +1,6 @@
-"""Relative orbits about a target: designed with the linear solution, flown by a chaser's TLE.
+"""Relative orbits about a target: designed by the linear solution, and turned into a TLE for the chaser.
 
-Beside SGP4 as flightsw/orbit.py is: TEME, kilometres and mean elements stay in this file.
+TEME, kilometres and SGP4's mean elements occur in this file and in flightsw/orbit.py only.
 """
 
 import math
@@ -11,21 +11,22 @@ from sgp4.api import WGS72, Satrec
 
 from flightsw.icd.mission import ConfigError, tle_checksum
 
-CATALOGUE_NUMBER = 90001  # of the designed chaser; no catalogued object has it
+CATALOGUE_NUMBER = 90001  # of the designed chaser; not assigned to any object
 UNIX_EPOCH_JD = 2_440_587.5
 SGP4_EPOCH_JD = 2_433_281.5  # 1949-12-31 00:00 UT
 SAMPLES_PER_ORBIT = 72
-EPOCH_TICK_DAYS = 1e-8  # the last digit of a TLE's epoch, 0.9 ms or 6.5 m of orbit
-ANGLE_TICK_DEG = 1e-4  # the last digit of a TLE's angles, 12 m of orbit
-EPOCH_TICKS = 400  # among so many epochs one has a mean anomaly within centimetres of a whole tick
+EPOCH_TICK_DAYS = 1e-8  # last digit of a TLE's epoch: 0.9 ms, or 6.5 m along the orbit
+ANGLE_TICK_DEG = 1e-4  # last digit of a TLE's angles: 12 m along the orbit
+EPOCH_TICKS = 400  # enough epochs for one whose mean anomaly is within centimetres of a multiple of the tick
 
 
 @dataclass(frozen=True)
 class RelativeElements:
     """Relative orbital elements times the target's semi-major axis, m, at the scenario's start.
 
-    Source: D'Amico, Autonomous Formation Flying in Low Earth Orbit, 2010: the differences of semi-major axis, mean
-    argument of latitude (plus node), eccentricity vector and inclination vector.
+    Differences of semi-major axis, relative mean longitude, eccentricity vector (x, y) and inclination vector (x, y).
+
+    Source: D'Amico, Autonomous Formation Flying in Low Earth Orbit, PhD thesis, TU Delft, 2010.
     """
 
     da_m: float = 0.0
@@ -40,11 +41,12 @@ class RelativeElements:
 class FlyAround:
     """A natural fly-around: a closed ellipse about the target, twice as long along the track as it is high.
 
-    With the default out-of-plane part (sqrt(3) of the radial one, in step with it) the range stays constant.
+    With the default out-of-plane amplitude (sqrt(3) times the radial one, in phase with it) the range is constant.
+    Without drift the linear solution has no other closed orbits (Clohessy and Wiltshire, 1960).
     """
 
-    radial_m: float  # half height; half length is twice that
-    out_of_plane_m: float = -1.0  # half width; negative: sqrt(3) of radial_m
+    radial_m: float  # half of the height; half of the length is twice as much
+    out_of_plane_m: float = -1.0  # half of the width; negative: sqrt(3) times radial_m
     phase_deg: float = 0.0  # at the start; 0 is the highest point
     out_of_plane_phase_deg: float = 0.0  # how far the out-of-plane oscillation leads the radial one
 
@@ -57,7 +59,7 @@ class FlyAround:
         return self.out_of_plane_m if self.out_of_plane_m >= 0 else math.sqrt(3) * self.radial_m
 
     def elements(self, latitude_rad: float) -> RelativeElements:
-        """Return the relative elements of this ellipse for a target at this argument of latitude."""
+        """Return the relative elements of this ellipse if the target starts at this argument of latitude."""
         phi = latitude_rad - math.radians(self.phase_deg) + math.pi
         theta = phi + math.pi / 2 - math.radians(self.out_of_plane_phase_deg)
         return RelativeElements(
@@ -77,19 +79,23 @@ class Design:
     period_s: float
     error_rms_m: float  # of the TLE's motion against the linear solution, over the whole span
     error_max_m: float
-    unrounded_error_max_m: float  # what is left without the TLE's rounding: orbits are not linear
-    drift_m_per_orbit: float  # of the mean along-track offset; 0 is bounded
+    unrounded_error_max_m: float  # without the rounding to a TLE's digits: the error of the linear solution
+    drift_m_per_orbit: float  # of the mean along-track offset; 0 for a bounded orbit
 
 
 def linear_motion(
     elements: RelativeElements, latitude_rad: np.ndarray, elapsed_s: np.ndarray, rate_rad_s: float
 ) -> np.ndarray:
-    """Return the chaser's place [N, 3], m, RTN of the target, by the Clohessy-Wiltshire solution.
+    """Return the chaser's position [N, 3], m, in the target's RTN frame, by the linear (Clohessy-Wiltshire) solution.
 
     Args:
         latitude_rad: [N] the target's argument of latitude.
         elapsed_s: [N] since the elements' time.
         rate_rad_s: the target's mean motion.
+
+    Source: Clohessy and Wiltshire, Terminal Guidance System for Satellite Rendezvous, 1960; in relative orbital
+    elements D'Amico and Montenbruck, Proximity Operations of Formation-Flying Spacecraft Using an
+    Eccentricity/Inclination Vector Separation, 2006.
     """
     e, c, s = elements, np.cos(latitude_rad), np.sin(latitude_rad)
     radial = e.da_m - e.dex_m * c - e.dey_m * s
@@ -102,8 +108,9 @@ def design(
 ) -> Design:
     """Return the chaser whose SGP4 motion follows a relative orbit from the start over a span (at least one orbit).
 
-    The chaser's mean elements are fitted to the linear solution by least squares, then rounded to a TLE's digits.
-    Angles have steps of 12 m; along the track the epoch's digits make up for it, across it up to 6 m remain.
+    The chaser's mean elements are fitted to the linear solution by least squares, then rounded to a TLE's digits. Its
+    angles have steps of 12 m. Along the track the choice of the epoch compensates for that; in the node and in the
+    inclination rounding errors of up to 6 m each remain.
 
     Raises:
         ConfigError: SGP4 cannot propagate the target.
@@ -114,7 +121,7 @@ def design(
     goal = linear_motion(wanted, target.latitude_rad, target.elapsed_s, target.rate_rad_s)
     start = np.array(list(vars(wanted).values()))
     values = start.copy()
-    for _ in range(3):  # nearly linear: the second step is below a millimetre
+    for _ in range(3):  # Gauss-Newton; nearly linear, so that the second step is below a millimetre
         here = target.relative_motion(target.chaser(values))
         columns = [
             (target.relative_motion(target.chaser(values + step)) - here).ravel() for step in np.eye(6)
@@ -125,7 +132,7 @@ def design(
     flown = target.relative_motion(Satrec.twoline2rv(*tle))
     error = np.linalg.norm(flown - goal, axis=1)
     period_s = 2 * np.pi / target.rate_rad_s
-    # the mean along-track offset over sliding whole orbits, as a line
+    # A line through the moving average, over one orbit, of the along-track offset.
     offset = np.convolve(flown[:, 1] - goal[:, 1], np.ones(SAMPLES_PER_ORBIT) / SAMPLES_PER_ORBIT, "valid")
     drift = np.polyfit(np.arange(len(offset)), offset, 1)[0] * SAMPLES_PER_ORBIT if len(offset) > 1 else 0.0
     return Design(
@@ -175,7 +182,7 @@ class _Target:
         return np.einsum("nij,nj->ni", self.rtn, self._propagate(chaser)[0] - self.position_m)
 
     def chaser(self, values: np.ndarray) -> Satrec:
-        """Return the chaser with these relative elements [6], m, not rounded, at the target's epoch."""
+        """Return the chaser with these relative elements [6], m, at the target's epoch, without rounding."""
         n, e, i, raan, argp, anomaly = self._mean_elements(values)
         s, satellite = self.satellite, Satrec()
         epoch_days = s.jdsatepoch - SGP4_EPOCH_JD + s.jdsatepochF
@@ -188,7 +195,7 @@ class _Target:
         """Return mean motion rad/min, eccentricity, inclination, node, perigee and mean anomaly, rad."""
         s = self.satellite
         da, dlambda, dex, dey, dix, diy = values / self.semi_major_m
-        dlambda += 1.5 * self.rate_rad_s * self.start_after_epoch_s * da  # from the start back to the epoch
+        dlambda += 1.5 * self.rate_rad_s * self.start_after_epoch_s * da  # back to the epoch
         ex, ey = s.ecco * np.cos(s.argpo) + dex, s.ecco * np.sin(s.argpo) + dey
         raan = s.nodeo + diy / np.sin(s.inclo)
         argp = np.arctan2(ey, ex)
@@ -197,14 +204,14 @@ class _Target:
         return n, float(np.hypot(ex, ey)), s.inclo + dix, raan, float(argp), latitude - float(argp)
 
     def rounded_tle(self, values: np.ndarray) -> tuple[str, str]:
-        """Return these relative elements as a TLE, its epoch milliseconds later, where the anomaly rounds well."""
+        """Return these elements as a TLE whose epoch is up to 0.4 s later, where the anomaly is rounded least."""
         n, e, i, raan, argp, anomaly = self._mean_elements(values)
         degrees = np.degrees([i, raan, argp])
         i_deg, raan_deg, argp_deg = np.round(degrees / ANGLE_TICK_DEG) * ANGLE_TICK_DEG
-        # the node's and perigee's rounding moves the chaser along its track: the anomaly takes it back
+        # Rounding the node and the perigee moves the chaser along its track: the anomaly compensates for it.
         anomaly_deg = np.degrees(anomaly) + (degrees[2] - argp_deg) + (degrees[1] - raan_deg) * np.cos(i)
         ticks = np.arange(EPOCH_TICKS)
-        # by the rate of latitude, J2 included: perigee and node hardly move in milliseconds
+        # The rate of the argument of latitude, J2 included; perigee and node hardly change in milliseconds.
         rate_deg_day = np.degrees(self.satellite.mdot + self.satellite.argpdot) * 1440
         at_epochs = anomaly_deg + rate_deg_day * EPOCH_TICK_DAYS * ticks
         steps = at_epochs / ANGLE_TICK_DEG

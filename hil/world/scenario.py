@@ -1,4 +1,4 @@
-"""What happens in the sky: orbits, attitude and light of a scenario, and every exposure's time and true pose."""
+"""Scenarios: the orbits, the target's attitude and the light at any time, and the true pose of each exposure."""
 
 import functools
 import hashlib
@@ -19,18 +19,20 @@ from hil.world.attitude import AttitudeSection, attitude
 from hil.world.fly_around import Design, FlyAround, RelativeElements, design
 
 SCENARIOS = Path(__file__).parent / "scenarios"
-HORIZON_MARGIN_S = 3600.0  # a tumble is integrated so much longer than the scenario
+HORIZON_MARGIN_S = 3600.0  # a tumble is integrated so much further than the scenario lasts
 
 
 @dataclass(frozen=True)
 class TrueExposure:
+    """An exposure's times and the true pose at its middle."""
+
     exposure_time_s: float
     mid_exposure_utc_ns: int
     pose: PoseTag
 
 
 def true_exposures(mission: Mission, pose_at: Callable[[int], PoseTag] | None = None) -> list[TrueExposure]:
-    """Return the exposures that the mission's bracket section asks for, with the true pose at each mid-exposure.
+    """Return the exposures that the mission's bracket section plans, with the true pose at each mid-exposure.
 
     Args:
         pose_at: UTC ns to the true pose; by default the mission's own orbits and attitude.
@@ -44,15 +46,15 @@ def true_exposures(mission: Mission, pose_at: Callable[[int], PoseTag] | None = 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Who flies where, how the target turns, and when pictures are taken.
+    """Orbits of target and chaser, the target's attitude, and the times of the brackets.
 
-    The chaser is given in one of three ways: a TLE, relative elements at the start, or a fly-around.
+    The chaser's orbit is given in one of three ways: a TLE, relative elements at the start, or a fly-around.
     """
 
     description: str
     start_utc: str
     duration_s: float  # from the first bracket to the last
-    brackets: int  # evenly spread over the duration, unless the caller wants another number
+    brackets: int  # evenly spread over the duration; a caller may choose another number
     target_tle: tuple[str, ...]
     fov_deg: float  # of the image's width
     chaser_tle: tuple[str, ...] = ()
@@ -69,7 +71,7 @@ class Scenario:
                 "expected exactly one of chaser_tle, relative_elements and fly_around, "
                 f"got {sum(given)} of them",
             )
-        with keys_below("scenario", "mission.orbit"):  # raises what is wrong
+        with keys_below("scenario", "mission.orbit"):  # to validate them
             OrbitSection(self.target_tle, self.chaser_tle or self.target_tle, self.start_utc)
         for name, low, high in (
             ("duration_s", 1.0, 30 * 86_400.0),
@@ -83,7 +85,7 @@ class Scenario:
 
     @functools.cached_property
     def design(self) -> Design | None:
-        """The chaser's TLE made from relative elements or a fly-around; None where a TLE is given."""
+        """The chaser's TLE made from relative elements or a fly-around; None if a TLE is given."""
         wanted = self.relative_elements or self.fly_around
         if wanted is None:
             return None
@@ -92,7 +94,7 @@ class Scenario:
 
     @functools.cached_property
     def orbit(self) -> OrbitSection:
-        """Both TLEs and the start, as a mission has them."""
+        """Both TLEs and the start, as a section of a mission."""
         chaser_tle = self.design.chaser_tle if self.design else self.chaser_tle
         return OrbitSection(self.target_tle, chaser_tle, self.start_utc)
 
@@ -102,7 +104,7 @@ class Scenario:
         """Return `count` brackets (default: the scenario's) spread evenly over the duration.
 
         Raises:
-            ConfigError: they do not fit into it.
+            ConfigError: they do not fit into the duration.
         """
         count = count or self.brackets
         spacing_s = min(0.5, self.duration_s / (count * len(exposure_times_ms)))
@@ -116,22 +118,22 @@ class Scenario:
 
 @dataclass(frozen=True)
 class SceneState:
-    """Everything that light and geometry need at one time; directions are unit vectors in the target's body frame."""
+    """The geometry and the light at one time; directions are unit vectors in the target's body frame."""
 
     utc_ns: int
     target: OrbitState
     chaser: OrbitState
     pose: PoseTag  # the true camera: looks at the target, image y against the chaser's orbit normal
     gcrs_to_camera: np.ndarray  # [3, 3]
-    earth_dir_body: np.ndarray  # [3] to the Earth's centre: where Earth-shine comes from
-    relative_rtn_m: np.ndarray  # [3] chaser from target: radial, along the track, along the orbit normal
+    earth_dir_body: np.ndarray  # [3] to the Earth's centre
+    relative_rtn_m: np.ndarray  # [3] chaser minus target in the target's RTN frame
     range_m: float
-    phase_angle_rad: float  # between the Sun and the chaser, seen from the target
-    sunlit: float  # part of the Sun's disc that the target sees
+    phase_angle_rad: float  # at the target, between the Sun and the chaser
+    sunlit: float  # visible fraction of the Sun's disc, at the target
 
 
-class Sky:
-    """A scenario at any time from its start on."""
+class Scene:
+    """A scenario's state at any time from its start on."""
 
     def __init__(self, scenario: Scenario):
         self.scenario = scenario
@@ -142,12 +144,12 @@ class Sky:
             self.orbit.start_utc_ns,
             scenario.duration_s + HORIZON_MARGIN_S,
         )
-        sigma = PoseSection()  # what the tag claims; the pose itself is exact
+        sigma = PoseSection()  # the tag's stated uncertainty; the pose itself is exact
         variances = [sigma.sigma_position_m**2, np.radians(sigma.sigma_attitude_deg) ** 2]
         self._covariance = np.diag(np.repeat(variances, 3))
 
     def state(self, utc_ns: int) -> SceneState:
-        """Return the scene at a time.
+        """Return the geometry and the light at a time.
 
         Raises:
             OrbitError: an orbit cannot be propagated so far, or the time is outside the ephemeris.
@@ -188,13 +190,13 @@ class Sky:
 
 
 def describe(scenario: Scenario) -> dict:
-    """Return a scenario's facts over its brackets: range, phase angle, eclipse, how far the body sees the Sun move.
+    """Return a scenario's range, phase angle, eclipses and motion of the Sun in body axes over its brackets.
 
-    For a designed chaser also how well it follows the orbit that it was designed with.
+    For a designed chaser also how closely its TLE follows the linear solution that it was designed with.
     """
-    sky, start_ns = Sky(scenario), scenario.orbit.start_utc_ns
+    scene, start_ns = Scene(scenario), scenario.orbit.start_utc_ns
     times_s = np.linspace(0.0, scenario.duration_s, scenario.brackets)
-    states = [sky.state(start_ns + round(t * 1e9)) for t in times_s]
+    states = [scene.state(start_ns + round(t * 1e9)) for t in times_s]
     ranges = [state.range_m for state in states]
     phases = [math.degrees(state.phase_angle_rad) for state in states]
     suns = np.array([state.pose.sun_dir_body for state in states])
@@ -206,7 +208,7 @@ def describe(scenario: Scenario) -> dict:
         "phase_angle_deg": [round(min(phases), 1), round(max(phases), 1)],
         "in_eclipse": sum(state.pose.in_eclipse for state in states),
         "sun_moves_deg": round(float(np.degrees(np.arccos(np.clip(suns @ suns[0], -1, 1)).max())), 2),
-        "chaser_tle": list(sky.orbit.chaser_tle),
+        "chaser_tle": list(scene.orbit.chaser_tle),
     }
     made = scenario.design
     if made is not None:

@@ -16,8 +16,9 @@ from flightsw.icd.framing import PacketStream
 from flightsw.icd.link_url import parse_link_url
 from flightsw.icd.packet import APID_FILES, TELECOMMAND, TELEMETRY
 from flightsw.icd.transfer import Receiver, Sender, timer_s
-from hil.link_trial import noise_containers
-from hil.links.virtual_can import QUEUE_FRAMES, frame_s
+from hil.links.can_timing import frame_s
+from hil.links.slcan_adapter import QUEUE_FRAMES
+from tests.link_trial import noise_containers
 
 BITRATE = 1_000_000
 TICK_S = 0.0002

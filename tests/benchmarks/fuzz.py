@@ -78,7 +78,7 @@ if hook is not None:
     hook.__exit__(None, None, None)
     sys.meta_path[:] = finders
 
-from hil.link_trial import noise_containers
+from tests.link_trial import noise_containers
 
 MAX_INPUT_BYTES = 4096
 MAX_PACKET_BYTES = 300

@@ -12,16 +12,14 @@ import os
 import tempfile
 from pathlib import Path
 
-from hil.link_trial import (
-    STANDARD_CUT_S,
-    STANDARD_FAULTS,
+from hil.links.faults import STANDARD_CUT_S, STANDARD_FAULTS, Faults
+from hil.processes import unwind_on_sigterm
+from tests.link_trial import (
     Trial,
     TrialResult,
     noise_containers,
     run_trial,
 )
-from hil.links.virtual_link import Faults
-from hil.processes import unwind_on_sigterm
 
 TWO_PERCENT = Faults(bit_flip=0.02, duplicate=0.02, reorder=0.02)
 CASES = {

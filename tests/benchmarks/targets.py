@@ -15,9 +15,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ground.evaluate import Truth
 from ground.reconstruct import exposed, sensor_of, split, training_frame
 from ground.session import open_session
+from ground.truth import Truth
 from hil.sky.sensor import converted
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.model.gaussians import Gaussians
@@ -124,7 +124,7 @@ def from_session(folder: Path) -> Target:
             pose = frame.world_to_camera.clone()
             pose[:3, 3] *= units_per_m
             sides[-1].append(dataclasses.replace(frame, world_to_camera=pose, pose_covariance=None))
-    true = [truth.radiance(record) for record in held_out]
+    true = [tuple(map(torch.from_numpy, truth.radiance(record))) for record in held_out]
     clean = [exposed(light, sensor, r.exposure_time_s) for (light, _), r in zip(true, held_out, strict=True)]
     alpha, cloud = [alpha for _, alpha in true], truth.cloud_m * units_per_m
     return Target(session.path.parent.name, sensor, sides[0], sides[1], clean, alpha, cloud)

@@ -27,9 +27,9 @@ import torch
 from flightsw.icd.frame import HEADER, Frame, PoseTag
 from flightsw.store import FrameStore
 from flightsw.triage import ModelVerified, Ranked, TriageWorker, sending_order, sent_view
-from ground.evaluate import Truth
 from ground.reconstruct import SURFACE_POINTS, camera_of, exposed, sensor_of, split, training_frame
 from ground.session import FrameRecord, Session, open_session
+from ground.truth import Truth
 from hil.dataset import DatasetConfig, make_dataset
 from hil.sky import spacecraft
 from obbgs_core.frames import TrainingFrame, cameras_of
@@ -187,7 +187,9 @@ def figures(the_pass: Pass, gaussians: Gaussians) -> dict[str, float]:
     """Return clean PSNR over the held-out views and of the worst of them, and the geometry."""
     psnrs_db = []
     for record in map(the_pass.truth.posed, the_pass.held_out):
-        exact = exposed(the_pass.truth.radiance(record)[0], the_pass.sensor, record.exposure_time_s)
+        exact = exposed(
+            torch.from_numpy(the_pass.truth.radiance(record)[0]), the_pass.sensor, record.exposure_time_s
+        )
         radiance = render(gaussians, camera_of(the_pass.session, record)).radiance[0]
         psnrs_db.append(psnr_db(exposed(radiance, the_pass.sensor, record.exposure_time_s), exact))
     scale = 2 / the_pass.truth.largest_dimension_m

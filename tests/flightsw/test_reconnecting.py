@@ -233,7 +233,7 @@ def test_the_ground_is_told_that_the_camera_is_lost(tmp_path, small_mission):
     from flightsw.icd.packet import APID_EVENTS, APID_HOUSEKEEPING, TELECOMMAND
     from flightsw.icd.telemetry import DICTIONARY
     from flightsw.link import open_link
-    from hil.links.virtual_link import VirtualSerial
+    from hil.links.virtual_serial import VirtualSerial
 
     path = tmp_path / "small.yaml"
     path.write_text(path.read_text().replace("link:", "link:\n  housekeeping_s: 0.1"))

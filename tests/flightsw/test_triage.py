@@ -38,7 +38,7 @@ from flightsw.triage import (
     tile_means,
 )
 from ground.ingest import listen
-from hil.links.virtual_link import VirtualSerial
+from hil.links.virtual_serial import VirtualSerial
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor

@@ -16,8 +16,8 @@ from ground.session import SessionWriter
 from hil.cameras.virtual import CameraServer
 from hil.sky import spacecraft
 from hil.sky.blender import RenderFarm
+from hil.truth import write_truth
 from hil.world.scenario import true_exposures
-from hil.world.truth import write_truth
 
 HERE = Path(__file__).parent
 

@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from ground.card import chi2_explained, model_card
-from ground.evaluate import Truth, evaluate
+from ground.evaluate import evaluate
 from ground.reconstruct import reconstruct
 from ground.report import write_report
 from ground.session import SessionError, open_session
+from ground.truth import Truth
 from obbgs_core.io.ply import load_ply
 from obbgs_core.score.metrics import foreground_psnr_db, psnr_db
 from tests.benchmarks import targets

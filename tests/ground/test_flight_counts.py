@@ -25,7 +25,7 @@ from ground.reconstruct import reconstruct
 from ground.report import write_report
 from ground.session import SessionCorrupt, SessionWriter, open_session
 from ground.telemetry import FlightCounts, TelemetryLog
-from hil.links.virtual_link import VirtualSerial
+from hil.links.virtual_serial import VirtualSerial
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
 QUICK = {"steps": 10, "start_count": 300, "max_gaussians": 300, "sh_degree": 0}

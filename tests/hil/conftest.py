@@ -1,4 +1,4 @@
-"""What several tests of the simulated world need."""
+"""Fixtures that several tests of the simulator share."""
 
 import fcntl
 import tempfile

@@ -51,7 +51,7 @@ def test_a_symmetric_top_precesses_as_the_closed_form_says():
         state = motion(t)
         expected = [0.02 * np.cos(body_rate * t), 0.02 * np.sin(body_rate * t), 0.05]
         np.testing.assert_allclose(state[4:], expected, atol=1e-9)
-        # the figure axis walks round the momentum vector (Rodrigues' formula)
+        # the figure axis precesses about the momentum vector (Rodrigues' formula)
         z, angle = np.array([0.0, 0.0, 1.0]), precession * t
         turned = (
             z * np.cos(angle) + np.cross(axis, z) * np.sin(angle) + axis * (axis @ z) * (1 - np.cos(angle))
@@ -69,7 +69,7 @@ def test_rotation_about_the_intermediate_axis_turns_over_and_about_the_largest_d
 
 @pytest.mark.parametrize("mode", ["inertial", "spin"])
 @pytest.mark.parametrize("axis", ["sun", (0.6, 0.0, 0.8)])
-def test_inertial_and_spin_are_what_flight_takes_them_for(mode, axis):
+def test_inertial_and_spin_agree_with_flight(mode, axis):
     mission = dataclasses.replace(MISSION, target_attitude=TargetAttitudeSection(mode, axis, 233.0))
     ours = attitude(AttitudeSection(mode, axis, 233.0), mission.orbit.target_tle, START_NS, 1000.0)
     for seconds in (0, 100, 5000):
@@ -89,7 +89,7 @@ def test_lvlh_faces_the_earth_and_flies_forward():
         assert forward[0] > 0.99999 and abs(forward[1]) < 1e-12
 
 
-def test_a_tumble_is_not_invented_outside_its_time():
+def test_a_tumble_is_refused_outside_its_time():
     section = AttitudeSection("tumble", rates_deg_s=(0.1, 1.0, 0.0), inertia=(1.0, 2.0, 2.5))
     at = attitude(section, MISSION.orbit.target_tle, START_NS, 60.0)
     np.testing.assert_allclose(at(START_NS + 60 * 10**9) @ at(START_NS + 60 * 10**9).T, np.eye(3), atol=1e-12)

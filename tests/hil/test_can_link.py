@@ -1,4 +1,4 @@
-"""The links of both sides over the virtual CAN bus: at the start, at the end, and while one side does not look."""
+"""Flight's and ground's links over the virtual CAN bus: at the start, at the end, and while one side does not read."""
 
 import os
 import threading
@@ -68,7 +68,7 @@ def assert_nothing_is_lost(line: VirtualCan, *links: flightsw.link.Link) -> None
 
 
 @BOTH
-def test_what_is_said_last_before_a_link_is_closed_arrives(fd):
+def test_what_is_sent_just_before_a_link_is_closed_arrives(fd):
     packets = [frame_packet(os.urandom(size)) for size in (1000, 30, 400)]
     with VirtualCan(fd=fd) as line, Reader(line) as reader:
         with flightsw.link.open_link(line.flight_url) as flight:
@@ -80,7 +80,7 @@ def test_what_is_said_last_before_a_link_is_closed_arrives(fd):
 
 
 @BOTH
-def test_what_is_said_before_the_other_side_is_there_arrives(fd):
+def test_what_is_sent_before_the_other_side_opens_arrives(fd):
     packets = [frame_packet(os.urandom(size)) for size in (100, 400, 1000)]
     with VirtualCan(fd=fd) as line, flightsw.link.open_link(line.flight_url) as flight:
         for packet in packets:
@@ -96,7 +96,7 @@ def test_what_is_said_before_the_other_side_is_there_arrives(fd):
             assert_nothing_is_lost(line, flight, reader.link)
 
 
-def test_a_link_that_is_closed_though_nobody_listens_says_what_was_not_taken():
+def test_a_link_that_is_closed_while_nobody_listens_counts_what_was_not_sent():
     with VirtualCan() as line:
         with flightsw.link.open_link(line.flight_url) as flight:
             flight.write(frame_packet(bytes(100)))
@@ -106,7 +106,7 @@ def test_a_link_that_is_closed_though_nobody_listens_says_what_was_not_taken():
 @BOTH
 @pytest.mark.parametrize("packet_bytes", [1100, 4096])
 @pytest.mark.parametrize("stall_s", [0.3, 1.0])
-def test_a_ground_that_does_not_look_for_a_while_loses_nothing(fd, packet_bytes, stall_s):
+def test_a_ground_that_does_not_read_for_a_while_loses_nothing(fd, packet_bytes, stall_s):
     packets = [frame_packet(os.urandom(packet_bytes)) for _ in range(160 if packet_bytes == 1100 else 48)]
     with (
         VirtualCan(fd=fd) as line,
@@ -127,7 +127,7 @@ def test_a_ground_that_does_not_look_for_a_while_loses_nothing(fd, packet_bytes,
 
 
 @BOTH
-def test_a_spacecraft_that_does_not_look_for_a_while_loses_nothing(fd):
+def test_a_spacecraft_that_does_not_read_for_a_while_loses_nothing(fd):
     packets = [frame_packet(os.urandom(1100)) for _ in range(60)]
     with (
         VirtualCan(fd=fd) as line,

@@ -30,7 +30,8 @@ from ground.ingest import ListenSummary, listen
 from ground.session import open_session
 from ground.uplink import make_key, outcome, submit
 from hil.cameras.virtual import CameraServer
-from hil.links.virtual_link import Faults, VirtualSerial
+from hil.links.faults import Faults
+from hil.links.virtual_serial import VirtualSerial
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
@@ -76,7 +77,7 @@ def model(tmp_path_factory, mission_file) -> Path:
 
 
 class Sky:
-    """The light of the ball, and from a given bracket on of something beside it. Waits until `shutter` is set."""
+    """The ball's radiance, with something beside it from a given bracket on. Waits until `shutter` is set."""
 
     def __init__(self, mission: Mission, model: Path):
         self.shutter = threading.Event()
@@ -97,7 +98,7 @@ class Sky:
 
 
 class Tools:
-    """Our command lines as processes, ended with the `with` whatever happens."""
+    """Our command lines as processes; leaving the `with` block ends them."""
 
     def __init__(self, folder: Path):
         self._folder, self._running = folder, []
@@ -211,7 +212,7 @@ def test_the_ground_changes_the_bracket_and_uplinks_a_model_and_the_downlink_fol
 
 
 class Side:
-    """One side of the link in a thread, stopped and joined at the end of the `with`."""
+    """One side of the link in a thread, stopped and joined at the end of the `with` block."""
 
     def __init__(self, work: Callable[[Callable[[], bool]], object]):
         self._stop, self.result = False, None
@@ -231,7 +232,7 @@ class Side:
         assert not self._thread.is_alive()
 
 
-def test_commands_get_through_a_line_that_loses_and_damages_and_each_is_executed_once(
+def test_commands_cross_a_line_that_loses_and_damages_packets_and_each_is_executed_once(
     tmp_path, small_mission, make_frame
 ):
     key, session, store = tmp_path / "k", tmp_path / "session", FrameStore(tmp_path / "store")
@@ -264,7 +265,7 @@ def test_commands_get_through_a_line_that_loses_and_damages_and_each_is_executed
                     )
                 ]
                 wait_for(lambda: all(outcome(session, number) for number in counters))
-                # a picture of 200 px is none of this mission's, but its thumbnail is kept
+                # a frame of 200 px does not fit this mission, but its thumbnail is kept
                 wait_for(lambda: len(list((session / "thumbnails").glob("*.png"))) >= 2)
         counter.close()
     ends = [outcome(session, number) for number in counters]
@@ -284,7 +285,7 @@ def test_commands_get_through_a_line_that_loses_and_damages_and_each_is_executed
         open_session(session)
 
 
-def test_without_a_listener_the_command_opens_the_link_itself_and_without_a_link_it_says_what_to_do(
+def test_without_a_listener_the_command_opens_the_link_itself_and_without_a_link_it_is_an_error(
     tmp_path, small_mission
 ):
     key, session, mission = tmp_path / "k", tmp_path / "session", tmp_path / "small.yaml"

@@ -1,4 +1,4 @@
-"""A data set of a few tiny frames: its layout read by plain JSON, its truth against its pictures, resuming."""
+"""A data set of a few tiny frames: its layout read as plain JSON, its truth against its frames, resuming."""
 
 import dataclasses
 import json
@@ -14,11 +14,10 @@ from typer.testing import CliRunner
 from flightsw.icd.mission import ConfigError
 from ground.formats.nerf import SPLIT_PATTERN
 from ground.session import open_session
-from hil import cli, dataset
+from hil import cli, dataset, truth
 from hil.dataset import DatasetConfig, DatasetError, load_dataset_config, make_dataset, target_meshes
 from hil.sky import spacecraft
 from hil.sky.sensor import PRESETS
-from hil.world import truth
 
 POINTS = 5000
 SMALL = DatasetConfig(frames=33, size_px=40, bracket_ms=(0.05, 0.1, 0.2), sensor="paper")
@@ -39,12 +38,12 @@ def made(tmp_path_factory, cache) -> tuple[Path, dict]:
 
 @pytest.fixture(autouse=True)
 def few_points(monkeypatch):
-    """A cloud of 100,000 points takes seconds of rays."""
+    """Casting rays for 100,000 points takes seconds."""
     monkeypatch.setattr(truth, "CLOUD_POINTS", POINTS)
 
 
 def opengl_projection(frame: dict, tree: dict, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel places [N, 2] and depths [N] by the NeRF convention, written out again: x right, y up, looking along -z."""
+    """Return pixel coordinates [N, 2] and depths [N] by the NeRF convention: x right, y up, looking along -z."""
     c2w = np.array(frame["transform_matrix"])
     p = (points - c2w[:3, 3]) @ c2w[:3, :3]
     focal_px = tree["w"] / 2 / np.tan(tree["camera_angle_x"] / 2)
@@ -92,7 +91,7 @@ def test_the_cloud_projects_onto_the_mask_and_nowhere_in_front_of_the_depth(made
         inside = (columns >= 0) & (columns < 40) & (rows >= 0) & (rows < 40)
         assert inside.mean() > 0.99
         assert (alpha[rows[inside], columns[inside]] > 0).mean() > 0.995  # 16 samples may miss a thin edge
-        # no true point lies in front of what the pixel's middle sees, but by the slope within a pixel of 23 cm
+        # no true point lies in front of what the pixel's centre sees, except by the slope within a pixel of 23 cm
         in_front = depth[rows[inside], columns[inside]] - depths[inside]
         assert (in_front[np.isfinite(in_front)] > 1.0).mean() < 0.02
         seen = np.isfinite(depth)
@@ -142,12 +141,12 @@ def test_an_interrupted_run_goes_on_to_the_same_frames(made, cache, tmp_path):
         assert (tmp_path / "cut" / name).read_bytes() == (out / name).read_bytes()
 
 
-def test_another_sensor_needs_no_new_picture(made, cache, tmp_path):
+def test_another_sensor_or_seed_needs_no_new_rendering_of_the_same_channels(made, cache, tmp_path):
     pictures = set(cache.iterdir())
     config = dataclasses.replace(SMALL, sensor="spacecam")
     make_dataset(config, spacecraft.SHIPPED, tmp_path / "spacecam", cache, 1)
     new = set(cache.iterdir()) - pictures
-    # one channel instead of three is another request; the same sensor again is none
+    # one channel instead of three is rendered anew; the same sensor again is not
     assert len(new) == 2 * 33 and open_session(tmp_path / "spacecam" / "session").camera.channels == 1
     pictures = set(cache.iterdir())
     make_dataset(dataclasses.replace(config, seed=2), spacecraft.SHIPPED, tmp_path / "noise", cache, 1)
@@ -161,7 +160,7 @@ def test_other_settings_do_not_overwrite_a_data_set(made, cache):
         make_dataset(dataclasses.replace(SMALL, seed=5), spacecraft.SHIPPED, out, cache)
 
 
-def test_a_set_of_targets_is_found_and_a_missing_one_named(tmp_path):
+def test_the_meshes_of_a_set_are_found_and_a_missing_one_is_named(tmp_path):
     config = load_dataset_config("obr-st-small")
     assert config.frames == 120 and config.size_px == 200
     for name in config.targets[:-1]:

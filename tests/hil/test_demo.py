@@ -1,4 +1,4 @@
-"""The whole loop, small: Blender, camera, flight, link, ground, model, report; each a process of its own."""
+"""The whole demo at small size: Blender, camera, flight, link, ground, model and report, each a separate process."""
 
 import json
 import re
@@ -14,10 +14,11 @@ from rich.console import Console
 from flightsw.icd.mission import load_mission
 from hil import cli
 from hil.cameras.gige import GVCP_PORT, LOOPBACK
-from hil.demo import DemoConfig, DemoError, fly, simulate_pass
+from hil.demo import simulate_pass
+from hil.simulated_pass import PassConfig, PassError, fly
 from hil.sky import spacecraft
-from hil.world.scenario import Sky, load_scenario
-from hil.world.states import load_world
+from hil.world.scenario import Scene, load_scenario
+from hil.world.world import load_world
 from tests import baselines
 from tests.benchmarks import targets
 
@@ -78,7 +79,7 @@ def test_demo_ends_in_a_report_with_every_frame_across(mission, tmp_path):
         json.loads(line)["sha256"] for line in (out / "session" / "frames.jsonl").read_text().splitlines()
     ]
     assert sorted(stored) == sorted(arrived)
-    kept = [np.load(path).files for path in (out / "renders").iterdir()]  # for the next run
+    kept = [np.load(path).files for path in (out / "renders").iterdir()]  # cached for the next run
     assert sum("radiance" in names for names in kept) == 15
 
 
@@ -92,7 +93,7 @@ def quick(mission, tmp_path) -> Path:
 
 
 def plate(pose) -> np.ndarray:
-    """A sky that is a bright plate in the middle, wherever the camera is."""
+    """A bright square in the middle of the picture, wherever the camera is."""
     picture = np.zeros((48, 48, 1))
     picture[18:30, 18:30] = 0.4
     return picture
@@ -101,7 +102,7 @@ def plate(pose) -> np.ndarray:
 def test_every_frame_crosses_a_faulty_can_bus_from_a_gige_camera(
     quick, tmp_path, the_only_camera_on_loopback
 ):
-    config = DemoConfig(camera="gige", link="slcan", faults="standard")
+    config = PassConfig(camera="gige", link="slcan", faults="standard")
     world = load_world(load_mission(quick))
     figures = fly(tmp_path, world, quick, plate, config, Console(stderr=True))
     assert figures["frames"] == {"captured": 4, "received": 4, "without_valid_pose": 0}
@@ -114,25 +115,25 @@ def test_every_frame_crosses_a_faulty_can_bus_from_a_gige_camera(
     assert link["segments_resent"] > 0
 
 
-def test_a_pass_that_does_not_move_is_an_error(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr("hil.demo.PATIENCE_S", 2.0)
-    monkeypatch.setattr("hil.demo._Cut.update", lambda cut, received: cut._line.cut())
+def test_a_pass_that_stalls_is_an_error(quick, tmp_path, monkeypatch):
+    monkeypatch.setattr("hil.simulated_pass.STALL_S", 2.0)
+    monkeypatch.setattr("hil.simulated_pass._Cut.update", lambda cut, received: cut._line.cut())
     world = load_world(load_mission(quick))
-    with pytest.raises(DemoError, match="0 received of 4"):
-        fly(tmp_path, world, quick, plate, DemoConfig(), Console(stderr=True))
+    with pytest.raises(PassError, match="0 received of 4"):
+        fly(tmp_path, world, quick, plate, PassConfig(), Console(stderr=True))
 
 
 def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_path):
     out = tmp_path / "demo"
-    config = DemoConfig(link="slcan-fd", scenario="tumbling", real_time=3000.0, navigation_noise=3)
+    config = PassConfig(link="slcan-fd", scenario="tumbling", real_time=3000.0, navigation_noise=3)
     simulation = simulate_pass(out, quick, spacecraft.SHIPPED, config, Console(stderr=True))
     assert simulation["frames"] == {"captured": 4, "received": 4, "without_valid_pose": 0}
     link = simulation["link"]  # without faults, a CAN bus
     assert link["can_frames_lost"] == link["can_frames_overrun"] == link["segments_resent"] == 0
-    # a sixth of a millisecond from frame to frame of a bracket: nobody stores a frame so fast
+    # frames of a bracket are a sixth of a millisecond apart, less than storing one takes
     assert 2 <= simulation["camera"]["late_frames"] <= 3
     assert 0.005 < simulation["navigation"]["position_error_m"] < 0.1
-    sky = Sky(load_scenario("tumbling"))
+    scene = Scene(load_scenario("tumbling"))
     truth = json.loads((out / "session" / "truth" / "truth.json").read_text())
     assert truth["simulation"] == simulation
     lines = (out / "session" / "frames.jsonl").read_text().splitlines()
@@ -140,15 +141,16 @@ def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_pat
     assert len(truth["frames"]) == 4
     for entry in truth["frames"]:
         tag = tags[entry["id"]]
-        true = sky.state(tag["mid_exposure_utc_ns"]).pose.world_to_camera
+        true = scene.state(tag["mid_exposure_utc_ns"]).pose.world_to_camera
         np.testing.assert_allclose(entry["world_to_camera"], true, atol=1e-9)
         assert 1e-4 < np.abs(np.array(tag["world_to_camera"]) - true).max() < 0.5  # m: navigation errs
 
 
-def test_what_cannot_be_flown_is_refused_before_anything_is_written(mission, tmp_path, monkeypatch, capsys):
+def test_impossible_options_are_refused_before_anything_is_written(mission, tmp_path, monkeypatch, capsys):
     for chosen, reason in (
-        (("--link", "radio"), "demo.link: expected one of serial, slcan, slcan-fd"),
-        (("--camera", "usb"), "demo.camera: expected one of hil, gige"),
+        (("--link", "radio"), "'radio' is not one of 'serial', 'slcan', 'slcan-fd'"),
+        (("--camera", "usb"), "'usb' is not one of 'hil', 'gige'"),
+        (("--faults", "all"), "'all' is not one of 'none', 'standard'"),
         (("--scenario", "fly_around"), "expected a YAML file or one of approach"),
         (("--real-time", "-1"), "0 (lock step) or positive"),
     ):
@@ -156,11 +158,12 @@ def test_what_cannot_be_flown_is_refused_before_anything_is_written(mission, tmp
         monkeypatch.setattr(sys, "argv", command)
         with pytest.raises(SystemExit) as ended:
             cli.main()
-        assert ended.value.code == 2 and reason in capsys.readouterr().err
+        told = " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().err).split())  # without the box around it
+        assert ended.value.code == 2 and reason in told
     assert not (tmp_path / "d").exists()
 
 
-def test_a_session_that_is_no_demos_is_never_overwritten(mission, tmp_path):
+def test_a_session_that_no_demo_made_is_never_overwritten(mission, tmp_path):
     (tmp_path / "session").mkdir()
     done = hil("demo", "--out", str(tmp_path), "--mission", str(mission))
     assert done.returncode == 1 and "was not made by a demo" in done.stderr
@@ -190,13 +193,13 @@ def test_a_pass_that_cannot_start_leaves_only_rendered_frames(quick, tmp_path, t
     out = tmp_path / "demo"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind((LOOPBACK, GVCP_PORT))
-        config = DemoConfig(camera="gige", scenario="tumbling")
+        config = PassConfig(camera="gige", scenario="tumbling")
         with pytest.raises(OSError, match="is in use"):
             simulate_pass(out, quick, spacecraft.SHIPPED, config, Console(stderr=True))
     assert [path.name for path in out.iterdir()] == ["renders"]
 
 
-def test_a_mesh_that_is_none_and_a_broken_mission_are_one_clear_line(mission, tmp_path):
+def test_a_file_that_is_no_mesh_and_a_missing_mission_are_refused_in_one_line(mission, tmp_path):
     (tmp_path / "bad.glb").write_bytes(b"not a mesh")
     done = hil(
         "demo", "--out", str(tmp_path / "d"), "--mission", str(mission), "--mesh", str(tmp_path / "bad.glb")

@@ -18,13 +18,14 @@ from flightsw.link import SerialLink
 from flightsw.store import FrameStore
 from ground.ingest import ListenSummary, listen
 from ground.session import open_session
-from hil.links.virtual_link import Faults, VirtualSerial
+from hil.links.faults import Faults
+from hil.links.virtual_serial import VirtualSerial
 
 BAUD_RATE = 3_000_000
 
 
 class Listening:
-    """`ground listen` in a thread, stopped and joined at the end of the `with`."""
+    """`ground listen` in a thread, stopped and joined at the end of the `with` block."""
 
     def __init__(self, line: VirtualSerial, folder: Path, mission: Mission, exit_after: int | None = None):
         self._stop = False
@@ -117,7 +118,7 @@ def test_every_frame_arrives_bit_identical_and_the_counts_add_up(tmp_path, small
         assert flight.segments_resent > 0
         assert heard.crc_errors > 0
         assert heard.skipped_bytes > 0
-        assert 0 < heard.packets_missing <= 2 * damaged  # a flipped delimiter takes the next packet along
+        assert 0 < heard.packets_missing <= 2 * damaged  # a damaged delimiter also spoils the next packet
     else:
         assert damaged == 0
         assert set(heard.losses.values()) == {0}
@@ -168,7 +169,7 @@ listen(sys.argv[1], sys.argv[2], load_mission(sys.argv[3]), exit_after=int(sys.a
 
 
 class Processes:
-    """Flight and ground as processes of their own, ended with the `with` whatever happens."""
+    """Flight and ground as separate processes; leaving the `with` block ends them."""
 
     def __init__(self):
         self._running: dict[str, subprocess.Popen] = {}
@@ -272,7 +273,7 @@ def test_a_ground_disk_that_refuses_leaves_the_frame_on_board_until_it_takes_it(
         while not (session / "session.json").exists():
             time.sleep(0.01)
         os.rmdir(session / "frames")
-        (session / "frames").write_text("in the way")  # as root nothing less makes the disk refuse
+        (session / "frames").write_text("in the way")  # permissions would not stop root
 
         def make_way() -> None:
             (session / "frames").unlink()

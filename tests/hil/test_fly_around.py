@@ -17,13 +17,13 @@ from hil.world.fly_around import FlyAround, RelativeElements, design, linear_mot
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")
 TARGET, START_NS = MISSION.orbit.target_tle, MISSION.orbit.start_utc_ns
-# Half a tick of inclination and of node is 6.1 m each at this orbit's radius: what no TLE can do better than
+# Half a tick of inclination and of node is 6.1 m each at this orbit's radius: the precision of a TLE
 ROUNDING_M = np.hypot(6.1, 6.1)
 metres = st.floats(-300, 300)
 
 
 def flown_rtn_m(chaser: tuple[str, ...], times_s: np.ndarray) -> np.ndarray:
-    """The chaser in the target's radial, along-track, normal axes, by flight's own propagation."""
+    """Return the chaser's position [N, 3] in the target's RTN frame, by flight's own propagation."""
     places = []
     for t in times_s:
         utc_ns = START_NS + round(t * 1e9)
@@ -83,19 +83,18 @@ def test_the_default_width_keeps_the_range_constant():
     phase=st.floats(0, 360),
     lead=st.floats(0, 360),
 )
-def test_the_reported_error_is_true_and_rounding_is_all_of_it(radial, width, phase, lead):
+def test_the_reported_error_is_correct_and_comes_from_rounding(radial, width, phase, lead):
     made = design(TARGET, FlyAround(radial, width, phase, lead), START_NS, 5700.0)
     assert made.error_max_m <= made.unrounded_error_max_m + ROUNDING_M + 1
-    assert made.unrounded_error_max_m < 0.03 * max(
-        radial, width
-    )  # eccentricity 2e-4, J2 1e-3, span of 1.25 orbits
+    # eccentricity 2e-4, J2 1e-3, span of 1.25 orbits
+    assert made.unrounded_error_max_m < 0.03 * max(radial, width)
     start = flown_rtn_m(made.chaser_tle, np.array([0.0]))[0]
     asked = [radial * np.cos(np.radians(phase)), width * np.cos(np.radians(phase + lead))]
     assert abs(start[0] - asked[0]) <= made.error_max_m + 0.05
     assert abs(start[2] - asked[1]) <= made.error_max_m + 0.05
 
 
-def test_standing_on_the_track_and_drifting_along_it_are_flown_to_decimetres():
+def test_holding_a_position_on_the_track_and_drifting_along_it_are_accurate_to_decimetres():
     hold = design(TARGET, RelativeElements(dlambda_m=-60), START_NS, 5692.0)
     assert hold.error_max_m < 1.0  # half a tick of eccentricity is 0.3 m, along the track 0.7 m
     drift = design(TARGET, RelativeElements(da_m=-10, dlambda_m=-120), START_NS, 5692.0)

@@ -1,4 +1,4 @@
-"""GigE Vision on loopback: our driver on Aravis' fake camera, Aravis' client on our camera, and both of ours."""
+"""GigE Vision on loopback: our driver with Aravis' fake camera, Aravis' client with our camera, and ours with ours."""
 
 import contextlib
 import ctypes
@@ -44,7 +44,7 @@ def aravis_tools() -> None:
 
 @contextlib.contextmanager
 def fake_camera(*arguments: str) -> Iterator[None]:
-    """Aravis' own fake camera, which knows nothing of us."""
+    """Run Aravis' own fake camera, independent of our code."""
     process = subprocess.Popen(
         [FAKE_CAMERA, "-i", "127.0.0.1", *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
@@ -60,7 +60,7 @@ def fake_camera(*arguments: str) -> Iterator[None]:
 
 
 def section(bit_depth: int, channels: int = 1, size_px: int = SIZE_PX) -> CameraSection:
-    """A camera of 12 bits by the mission, scaled to another depth."""
+    """Return the mission's 12-bit camera scaled to another bit depth."""
     scale = 2.0 ** (bit_depth - 12)
     return dataclasses.replace(
         MISSION.camera,
@@ -75,9 +75,9 @@ def section(bit_depth: int, channels: int = 1, size_px: int = SIZE_PX) -> Camera
 
 
 def is_ramp(dn: np.ndarray, exposure_us: float, scale: int) -> bool:
-    """Tell whether this is what Aravis' fake camera shows (arvfakecamera.c): a ramp that moves by one a frame.
+    """Return whether this is the pattern of Aravis' fake camera (arvfakecamera.c): a ramp that moves by one a frame.
 
-    Its frames are counted from 65401 on.
+    Its frame numbers begin at 65401.
     """
     y, x = np.mgrid[: dn.shape[0], : dn.shape[1]]
     white = 255 if scale == 1 else 65535
@@ -104,7 +104,7 @@ def test_pictures_of_aravis_fake_camera_arrive_bit_for_bit(name, bit_depth, scal
         camera.close()
 
 
-def test_a_bayer_mosaic_comes_as_it_is_or_as_colours():
+def test_a_bayer_mosaic_is_received_raw_or_interpolated():
     with fake_camera():
         raw = open_camera("gige://127.0.0.1?pixel_format=BayerRG8", section(8))
         mosaic = raw.expose(0.01, time.time_ns()).dn
@@ -137,7 +137,7 @@ def test_interpolated_colours_match_an_independent_demosaic(pattern):
         assert np.abs(demosaic(mosaic, pattern).astype(int) - theirs)[inside].max() <= 1
 
 
-def test_lost_packets_are_counted_and_the_frame_is_not_taken_for_whole():
+def test_lost_packets_are_counted_and_the_frame_is_rejected():
     with fake_camera("-r", "20"):  # 2 % of the packets; the fake camera resends none
         camera = open_camera("gige://127.0.0.1?pixel_format=Mono8", section(8, size_px=256))
         whole = failed = 0
@@ -165,7 +165,7 @@ def test_a_camera_that_comes_back_is_opened_again():
         camera.close()
 
 
-def test_what_cannot_be_is_refused_with_its_reason():
+def test_impossible_requests_are_refused_with_the_reason():
     with pytest.raises(ValueError, match="Mono13"):
         open_camera("gige://127.0.0.1?pixel_format=Mono13", section(12))
     with pytest.raises(ValueError, match="Mono8 has 8 bits, the mission's camera 12"):
@@ -251,11 +251,8 @@ def test_the_command_line_captures_from_the_fake_camera_now(tmp_path):
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     counts = json.loads(done.stdout)["capture"]
-    assert (counts["stored"], counts["failed"], counts["packets_lost"]) == (
-        6,
-        0,
-        0,
-    )  # triggers at 0, 0.5 and 1 s
+    # triggers at 0, 0.5 and 1 s
+    assert (counts["stored"], counts["failed"], counts["packets_lost"]) == (6, 0, 0)
     store = FrameStore(tmp_path / "store")
     times_ns = [decode_frame(store.read(f.frame_id)).mid_exposure_utc_ns for f in store.frames]
     assert abs(times_ns[4] - times_ns[0] - 1_000_000_000) < 400_000_000  # they waited for their time
@@ -263,7 +260,7 @@ def test_the_command_line_captures_from_the_fake_camera_now(tmp_path):
 
 
 def plate(radiance: float, size_px: int = SIZE_PX, channels: int = 1):
-    """A sky that is a plate of even radiance, wherever the camera is."""
+    """Return a scene of uniform radiance, wherever the camera is."""
     return lambda pose: np.full((size_px, size_px, channels), radiance)
 
 
@@ -340,7 +337,7 @@ def test_gain_amplifies_signal_and_noise_but_not_the_black_level():
     assert amplified.std() > 1.5 * plain.std()
 
 
-def test_a_colour_sensor_shows_its_mosaic():
+def test_a_colour_sensor_sends_its_mosaic():
     mission = simulated(12, channels=3)
     sky = np.broadcast_to([0.1, 0.2, 0.4], (SIZE_PX, SIZE_PX, 3))
     with GigeCameraServer(mission, lambda pose: sky) as server:
@@ -350,7 +347,7 @@ def test_a_colour_sensor_shows_its_mosaic():
     np.testing.assert_allclose(dn.mean(axis=(0, 1)) - 64, [400, 800, 1600], rtol=0.01)
 
 
-def test_a_slow_sky_does_not_lose_the_client():
+def test_slow_rendering_does_not_lose_the_client():
     """Rendering takes longer than the client's heartbeat allows a silent camera (3 s)."""
     mission = simulated()
 
@@ -365,7 +362,7 @@ def test_a_slow_sky_does_not_lose_the_client():
         camera.close()
 
 
-def test_the_simulated_pass_is_the_same_through_gige_as_in_the_missions_time(tmp_path):
+def test_frames_captured_through_gige_have_the_poses_of_the_mission_s_times(tmp_path):
     mission = dataclasses.replace(simulated(), bracket=dataclasses.replace(MISSION.bracket, count=3))
     poses = []
 
@@ -385,7 +382,7 @@ def test_the_simulated_pass_is_the_same_through_gige_as_in_the_missions_time(tmp
         np.testing.assert_allclose(frame.pose.position_body_m, pose, atol=1e-9)
 
 
-def test_a_sky_that_fails_in_its_own_way_costs_one_picture_and_not_the_camera(monkeypatch):
+def test_a_failure_in_rendering_loses_one_picture_and_not_the_camera(monkeypatch):
     monkeypatch.setattr("flightsw.cameras.gige.RENDER_S", 1.0)
     failures = [ZeroDivisionError("a defect")]
     plain = plate(0.4)

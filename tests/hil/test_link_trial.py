@@ -1,13 +1,13 @@
-"""The fault bars at reduced size: flight and ground as processes, every frame once and bit-identical.
+"""Passes under faults at reduced size: flight and ground as processes, every frame once and bit-identical.
 
-`run_trial` itself compares sha256 and pixels and looks for doubles and leftovers; the whole matrix with 64
-frames is `python -m tests.benchmarks.link`.
+`run_trial` itself compares SHA-256 and pixels and looks for duplicates and frames that were not delivered; the whole
+matrix with 64 frames is `python -m tests.benchmarks.link`.
 """
 
 import pytest
 
-from hil.link_trial import Trial, TrialError, TrialResult, noise_containers, run_trial
-from hil.links.virtual_link import Faults
+from hil.links.faults import Faults
+from tests.link_trial import Trial, TrialError, TrialResult, noise_containers, run_trial
 
 FAULTS = Faults(loss=0.1, bit_flip=0.02, duplicate=0.02, reorder=0.02)
 ALL = {"cut_s": 2.0, "kills": 3, "full_disks": True, "seed": 5}
@@ -30,7 +30,7 @@ def trial(tmp_path, small_mission):
 def test_every_packet_lost_on_a_serial_line_is_counted_as_missing(trial):
     result = trial(Trial("serial", Faults(loss=0.1), seed=3), 40)
     lost = result.lanes["down"]["packets_lost"]
-    # the ground cannot know of the first zero byte, nor of what is lost before or after all it hears of an APID
+    # the ground cannot know of the first zero byte, nor of losses before the first or after the last packet of an APID
     apids = 5
     assert lost - apids <= result.ground["packets_missing"] <= lost
     assert result.ground["crc_errors"] == result.ground["skipped_bytes"] == 0
@@ -74,18 +74,17 @@ def test_every_frame_arrives_once_and_unchanged(trial, case, frames):
     ids=lambda value: f"{value.link}-{value.stall_s:g}" if isinstance(value, Trial) else "",
 )
 def test_a_can_bus_without_faults_carries_a_pass_without_a_loss_or_a_repetition(trial, case, frames):
-    """Nor does it matter that a side is stopped for a while, as one that waits for its disk is."""
+    """Nor when one side is stopped for a while, as when it waits for its disk."""
     result = trial(case, frames)
     downlink = result.flight["downlink"]
     assert downlink["segments_resent"] == downlink["transfers_failed"] == 0
     assert result.ground["packets_missing"] == result.ground["crc_errors"] == 0
-    assert result.ground["packets_received"] == downlink["packets_sent"]  # flight's last words too
+    assert result.ground["packets_received"] == downlink["packets_sent"]  # flight's last packets too
     assert set(result.ground["link_losses"].values()) == {0}
     for lane in result.lanes.values():
         assert lane["frames_lost"] == lane["frames_overrun"] == 0
-    down = result.lanes[
-        "down"
-    ]  # up, a second answer to an offer that was repeated may come when flight has gone
+    # up, a second answer to an offer that was repeated may come when flight has gone
+    down = result.lanes["down"]
     assert down["frames_in"] == down["frames_out"]
 
 

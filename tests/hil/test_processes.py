@@ -1,4 +1,4 @@
-"""Nothing that a benchmark or a demo started outlives it, however it ends: with real processes."""
+"""No process that a benchmark or a demo starts outlives it, however it ends; tested with real processes."""
 
 import os
 import signal
@@ -44,14 +44,14 @@ def descendants(pid: int) -> dict[int, str]:
 def wait_for(condition, limit_s: float = 60.0) -> None:
     end_s = time.monotonic() + limit_s
     while not condition():
-        assert time.monotonic() < end_s, "it did not come to it in time"
+        assert time.monotonic() < end_s, "the condition was not met in time"
         time.sleep(0.02)
 
 
 def end_in_the_middle(command: list[str], number: int, tmp_path: Path) -> int:
     """Send a signal to a command while its flight and ground processes run; return how it ended.
 
-    Fails if any process below it lives on.
+    Fails if any of its descendants survives.
     """
     with open(tmp_path / "log", "wb") as log:
         process = subprocess.Popen(
@@ -82,7 +82,7 @@ BENCHMARK = [sys.executable, "-m", "tests.benchmarks.link", "--quick", "--clean"
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_link_benchmark_that_is_told_to_end_ends_its_processes_and_removes_its_files(number, tmp_path):
+def test_a_link_benchmark_that_is_terminated_ends_its_processes_and_removes_its_files(number, tmp_path):
     assert end_in_the_middle(BENCHMARK, number, tmp_path) != 0
     assert [path.name for path in tmp_path.iterdir()] == ["log"]
 
@@ -91,7 +91,7 @@ def test_a_link_benchmark_that_is_killed_takes_its_processes_with_it(tmp_path):
     assert end_in_the_middle(BENCHMARK, signal.SIGKILL, tmp_path) == -signal.SIGKILL
 
 
-def test_a_demo_that_is_told_to_end_ends_blender_flight_and_ground(small_mission, tmp_path):
+def test_a_demo_that_is_terminated_ends_blender_flight_and_ground(small_mission, tmp_path):
     text = (tmp_path / "small.yaml").read_text().replace("count: 40", "count: 2")
     (tmp_path / "small.yaml").write_text(text)
     # two brackets with 54 s between them: the pass is still under way when the signal comes

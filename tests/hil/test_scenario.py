@@ -8,7 +8,7 @@ from skyfield.api import EarthSatellite
 
 from flightsw.icd.mission import ConfigError, Mission, TargetAttitudeSection
 from flightsw.pose import pose_tag
-from hil.world.scenario import SCENARIOS, Scenario, Sky, describe, load_scenario
+from hil.world.scenario import SCENARIOS, Scenario, Scene, describe, load_scenario
 
 NAMES = ["approach", "eclipse", "fly-around", "sparse", "tumbling", "v-bar"]
 
@@ -21,19 +21,18 @@ def test_the_ready_made_scenarios_are_these():
 def test_range_phase_angle_sun_and_eclipse_match_skyfield(skyfield_oracle, name):
     timescale, ephemeris = skyfield_oracle
     scenario = load_scenario(name)
-    sky = Sky(scenario)
+    scene = Scene(scenario)
     target, chaser = (
-        EarthSatellite(*tle, ts=timescale) for tle in (sky.orbit.target_tle, sky.orbit.chaser_tle)
+        EarthSatellite(*tle, ts=timescale) for tle in (scene.orbit.target_tle, scene.orbit.chaser_tle)
     )
     for elapsed_s in (0, 1700, 3900):
-        utc_ns = sky.orbit.start_utc_ns + elapsed_s * 10**9
-        state = sky.state(utc_ns)
+        utc_ns = scene.orbit.start_utc_ns + elapsed_s * 10**9
+        state = scene.state(utc_ns)
         time = timescale.from_datetime(datetime.fromtimestamp(utc_ns / 1e9, UTC))
         relative_m = chaser.at(time).xyz.m - target.at(time).xyz.m
         assert state.range_m == pytest.approx(np.linalg.norm(relative_m), abs=0.01)
-        np.testing.assert_allclose(
-            state.chaser.position_m - state.target.position_m, relative_m, atol=0.01
-        )  # 0.15 arcsec of frame over 400 m is a millimetre
+        # 0.15 arcsec of frame over 400 m is a millimetre
+        np.testing.assert_allclose(state.chaser.position_m - state.target.position_m, relative_m, atol=0.01)
         sun_m = (ephemeris["sun"] - ephemeris["earth"]).at(time).xyz.m - target.at(time).xyz.m
         cosine = sun_m @ relative_m / np.linalg.norm(sun_m) / np.linalg.norm(relative_m)
         # the Sun as seen from the Earth's centre: parallax of the orbit 0.003 degrees
@@ -47,23 +46,23 @@ def test_range_phase_angle_sun_and_eclipse_match_skyfield(skyfield_oracle, name)
 
 def test_the_eclipse_scenario_enters_and_leaves_the_shadow_when_skyfield_says(skyfield_oracle):
     timescale, ephemeris = skyfield_oracle
-    sky = Sky(load_scenario("eclipse"))
-    target = EarthSatellite(*sky.orbit.target_tle, ts=timescale)
+    scene = Scene(load_scenario("eclipse"))
+    target = EarthSatellite(*scene.orbit.target_tle, ts=timescale)
     times_s = np.arange(0, 5690, 10)
-    ours = np.array([sky.state(sky.orbit.start_utc_ns + int(t) * 10**9).sunlit < 0.5 for t in times_s])
-    start = datetime.fromtimestamp(sky.orbit.start_utc_ns / 1e9, UTC)
+    ours = np.array([scene.state(scene.orbit.start_utc_ns + int(t) * 10**9).sunlit < 0.5 for t in times_s])
+    start = datetime.fromtimestamp(scene.orbit.start_utc_ns / 1e9, UTC)
     theirs = ~target.at(
         timescale.utc(start.year, start.month, start.day, start.hour, start.minute, start.second + times_s)
     ).is_sunlit(ephemeris)
     assert 60 < ours.sum() < 200
     assert (ours != theirs).sum() <= 4  # skyfield's Sun is a point: some seconds at each of two edges
-    assert not ours[0] and not ours[-1]  # the shadow takes the middle
+    assert not ours[0] and not ours[-1]  # the shadow is in the middle
 
 
 def test_the_camera_looks_at_the_target_and_is_where_the_orbits_are():
-    sky = Sky(load_scenario("tumbling"))
+    scene = Scene(load_scenario("tumbling"))
     for elapsed_s in (0, 500, 3000):
-        state = sky.state(sky.orbit.start_utc_ns + elapsed_s * 10**9)
+        state = scene.state(scene.orbit.start_utc_ns + elapsed_s * 10**9)
         origin = state.pose.world_to_camera @ [0, 0, 0, 1]
         np.testing.assert_allclose(origin[:3], [0, 0, state.range_m], atol=1e-6)
         assert np.linalg.norm(state.relative_rtn_m) == pytest.approx(state.range_m)
@@ -74,12 +73,12 @@ def test_the_camera_looks_at_the_target_and_is_where_the_orbits_are():
 
 def test_a_spinning_scenario_has_the_poses_that_flight_computes():
     scenario = load_scenario("fly-around")
-    sky = Sky(scenario)
+    scene = Scene(scenario)
     camera = _camera()
-    mission = Mission(sky.orbit, camera, TargetAttitudeSection("spin", "sun", scenario.attitude.period_s))
+    mission = Mission(scene.orbit, camera, TargetAttitudeSection("spin", "sun", scenario.attitude.period_s))
     for elapsed_s in (0, 1234):
-        utc_ns = sky.orbit.start_utc_ns + elapsed_s * 10**9
-        theirs, ours = pose_tag(mission, utc_ns), sky.state(utc_ns).pose
+        utc_ns = scene.orbit.start_utc_ns + elapsed_s * 10**9
+        theirs, ours = pose_tag(mission, utc_ns), scene.state(utc_ns).pose
         np.testing.assert_allclose(ours.world_to_camera, theirs.world_to_camera, atol=1e-6)
         np.testing.assert_allclose(ours.sun_dir_body, theirs.sun_dir_body, atol=1e-12)
         assert ours.in_eclipse == theirs.in_eclipse

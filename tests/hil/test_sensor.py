@@ -1,4 +1,4 @@
-"""The sensor as its datasheet: what was put in comes out again by the methods that measure real cameras."""
+"""The simulated sensor: the methods that characterise real cameras recover the parameters that were put in."""
 
 import dataclasses
 import math
@@ -31,7 +31,7 @@ def flat(sensor: SensorModel, level: float, exposure_time_s: float, seed: int, s
     ],
 )
 def test_photon_transfer_recovers_gain_read_noise_and_sensitivity_within_3_percent(sensor):
-    """Janesick's method: the difference of two equal flats has no fixed pattern, and twice their variance."""
+    """Janesick's method: the difference of two equal flat fields has no fixed pattern and twice their variance."""
     time_s = 1e-4
     full_e = min(sensor.full_well_e, (sensor.white_dn - sensor.black_dn) * sensor.electrons_per_dn)
     brightest = 0.8 * full_e / (sensor.photons_per_radiance_s * sensor.quantum_efficiency * time_s)
@@ -184,7 +184,7 @@ def test_the_image_velocity_of_a_plane_is_focal_length_times_speed_over_depth():
     assert not image_velocity(np.full((4, 4), np.inf), K, moved(0), moved(1), 1.0).any()
 
 
-def test_a_smear_spreads_a_point_over_the_way_it_went_and_keeps_its_light():
+def test_motion_blur_spreads_a_point_along_its_path_and_keeps_its_light():
     picture = np.zeros((21, 41, 1))
     picture[10, 20] = 1.0
     velocity = np.broadcast_to([80.0, 0.0], (21, 41, 2))
@@ -194,7 +194,7 @@ def test_a_smear_spreads_a_point_over_the_way_it_went_and_keeps_its_light():
     assert smear(picture, velocity, 1e-6) is picture  # nothing to see
 
 
-def test_a_rolling_shutter_leans_a_moving_column():
+def test_a_rolling_shutter_slants_a_moving_column():
     picture = np.zeros((40, 60, 1))
     picture[:, 30] = 1.0
     velocity = np.broadcast_to([100.0, 0.0], (40, 60, 2))

@@ -14,14 +14,15 @@ from isotp import CanMessage
 
 from flightsw.icd.can import FD_SIZES, SlcanText, format_slcan, open_slcan
 from flightsw.icd.link_url import parse_link_url
-from hil.links.virtual_can import VirtualCan, frame_bits, frame_s
-from hil.links.virtual_link import Faults
+from hil.links.can_timing import frame_bits, frame_s
+from hil.links.faults import Faults
+from hil.links.virtual_can import VirtualCan
 
 FRAMES = [CanMessage(0x100 + number % 50, 8, number.to_bytes(8, "big")) for number in range(400)]
 
 
 def classic_bits_by_hand(frame: CanMessage) -> int:
-    """Return a classic frame's bits as ISO 11898-1 puts it, one bit after the other."""
+    """Return a classic frame's number of bits by ISO 11898-1, built bit by bit."""
     number = frame.arbitration_id
     head = f"0{number >> 18:011b}11{number & 0x3FFFF:018b}0" if frame.is_extended_id else f"0{number:011b}0"
     head += "00" + f"{len(frame.data):04b}" + "".join(f"{byte:08b}" for byte in frame.data)
@@ -182,7 +183,7 @@ def test_the_lower_identifier_wins_the_bus():
         assert order.count("up") == 3
 
 
-def test_a_frame_destroyed_on_the_bus_is_sent_again_and_costs_time():
+def test_a_frame_destroyed_on_the_bus_is_repeated_and_takes_more_time():
     with VirtualCan(faults=Faults(loss=0.3), seed=4) as line:
         opened(line)
         assert contents(send(line, FRAMES)) == contents(FRAMES)

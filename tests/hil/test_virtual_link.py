@@ -13,7 +13,9 @@ import pytest
 import serial
 
 from flightsw.icd.framing import Deframer, frame_packet
-from hil.links.virtual_link import Faults, VirtualLink, VirtualSerial, control, run_link
+from hil.links.faults import Faults
+from hil.links.virtual_link import VirtualLink, control, run_link
+from hil.links.virtual_serial import VirtualSerial
 
 PACKETS = [bytes([number % 256]) * (20 + number % 50) for number in range(300)]
 STREAM = b"".join(map(frame_packet, PACKETS))
@@ -50,12 +52,12 @@ def test_without_faults_every_byte_passes_at_the_line_s_rate():
         assert send(line, STREAM, quiet_s=0.1) == STREAM
         seconds = time.monotonic() - began_s - 0.1
         ideal_s = len(STREAM) * 10 / baud_rate
-        assert seconds > 0.95 * ideal_s  # the burst of 10 ms is all that it may gain
+        assert seconds > 0.95 * ideal_s  # it may be faster by the burst of 10 ms only
         assert_counts_add_up(line)
         assert line.statistics()["down"].packets == len(PACKETS)
 
 
-def test_nobody_reading_holds_the_writer_back_and_loses_nothing():
+def test_without_a_reader_the_writer_is_held_back_and_nothing_is_lost():
     with (
         VirtualSerial(3_000_000) as line,
         serial.Serial(line.flight_device, timeout=0, write_timeout=0) as near,
@@ -85,7 +87,7 @@ def test_each_fault_happens_about_as_often_as_asked_and_is_counted():
     packets = deframer.feed(received)
     assert set(packets) <= set(PACKETS)
     assert deframer.crc_errors > 0
-    # a flipped delimiter joins two packets, a new one splits a packet: either spoils at most two
+    # a damaged delimiter joins two packets, a new one splits one: either damages at most two
     expected = len(PACKETS) - lane.packets_lost + lane.packets_duplicated
     assert expected - 3 * lane.packets_flipped <= len(packets) <= expected
 
@@ -147,7 +149,7 @@ def test_without_flow_control_what_nobody_reads_in_time_is_lost_and_counted():
         assert_counts_add_up(line)
 
 
-def test_a_running_line_obeys_commands():
+def test_a_running_line_executes_commands():
     with VirtualSerial(3_000_000) as line:
         assert control(line, "cut").startswith("cut")
         assert send(line, STREAM[:1000]) == b""
@@ -161,7 +163,7 @@ def test_a_running_line_obeys_commands():
 
 
 @pytest.mark.parametrize("command", ["", "loss", "loss 2", "loss much", "latency -1", "cut 3", "explode"])
-def test_a_command_that_makes_no_sense_changes_nothing_and_says_why(command):
+def test_an_invalid_command_changes_nothing_and_is_explained(command):
     line = VirtualSerial(9600)
     with pytest.raises(ValueError, match=r"expected cut, mend|must be 0 to 1|could not convert"):
         control(line, command)
@@ -190,7 +192,7 @@ def test_run_link_names_its_ends_and_returns_its_counts():
 @pytest.mark.parametrize(
     ("arguments", "scheme"), [(["--baud", "115200"], "serial"), (["--fd", "--one-shot"], "slcan")]
 )
-def test_the_link_command_prints_its_ends_obeys_its_input_and_prints_its_counts(arguments, scheme):
+def test_the_link_command_prints_its_ends_executes_its_input_and_prints_its_counts(arguments, scheme):
     command = [sys.executable, "-m", "hil.cli", "link", "--seed", "3", *arguments]
     with subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True) as process:
         assert process.stdout and process.stdin and process.stderr
@@ -200,13 +202,12 @@ def test_the_link_command_prints_its_ends_obeys_its_input_and_prints_its_counts(
             assert all(end[1].startswith(f"{scheme}:///dev/") for end in ends)
             assert "'loss': 0.5" in answer(process, "loss 0.5")
             assert "expected cut, mend" in answer(process, "nonsense")
-            process.stdin.buffer.write(b"\xff is no UTF-8\n")  # an answer too, and not the last one
+            process.stdin.buffer.write(b"\xff is no UTF-8\n")  # answered too, and the command goes on
             assert "expected cut, mend" in answer(process, "loss 0.5")
             assert "'loss': 0.5" in process.stderr.readline()
             process.send_signal(signal.SIGUSR1)
-            answers = (
-                answer(process, "latency 0.1") for _ in range(100)
-            )  # the signal may come after the line
+            # the signal may come after the line
+            answers = (answer(process, "latency 0.1") for _ in range(100))
             assert any(text.startswith("cut, latency 0.1 s") for text in answers)
         finally:
             process.terminate()

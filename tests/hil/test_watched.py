@@ -1,4 +1,4 @@
-"""Servers of the simulator whose threads or skies fail: the client is answered, and nobody waits for a dead one."""
+"""Servers of the simulator whose thread or rendering fails: clients are answered, and a dead server is reported."""
 
 import os
 import threading
@@ -10,12 +10,13 @@ from flightsw.cameras import open_camera
 from flightsw.errors import CaptureError
 from hil.cameras.virtual import CameraServer
 from hil.links.virtual_can import VirtualCan
-from hil.links.virtual_link import VirtualLink, VirtualSerial, run_link
+from hil.links.virtual_link import VirtualLink, run_link
+from hil.links.virtual_serial import VirtualSerial
 from hil.watched import ServerError, WatchedThread
 
 
 def failing_once():
-    """A sky whose first picture does not fit the memory."""
+    """Return a scene whose first rendering runs out of memory."""
     failures = [MemoryError("one picture too many")]
 
     def sky(pose) -> np.ndarray:
@@ -26,7 +27,7 @@ def failing_once():
     return sky
 
 
-def test_a_sky_that_fails_in_its_own_way_is_an_answer_and_a_count(small_mission):
+def test_a_failure_in_rendering_is_answered_and_counted(small_mission):
     with CameraServer(small_mission, failing_once(), "hil://127.0.0.1:0") as server:
         camera = open_camera(server.url, small_mission.camera)
         with pytest.raises(CaptureError, match=r"the camera refused: the simulated sky failed: MemoryError"):
@@ -36,7 +37,7 @@ def test_a_sky_that_fails_in_its_own_way_is_an_answer_and_a_count(small_mission)
         assert (server.failures, server.exposures) == (1, 1)
 
 
-def test_a_camera_server_that_ended_is_an_error_for_whoever_waits(small_mission):
+def test_a_camera_server_whose_thread_failed_is_an_error_for_its_user(small_mission):
     def fail() -> None:
         raise OSError("no more descriptors")
 
@@ -44,14 +45,14 @@ def test_a_camera_server_that_ended_is_an_error_for_whoever_waits(small_mission)
         pytest.raises(ServerError, match="the camera server has ended: OSError"),
         CameraServer(small_mission, failing_once(), "hil://127.0.0.1:0") as server,
     ):
-        server._server.service_actions = fail  # called between two looks at the socket
+        server._server.service_actions = fail  # called between two polls of the socket
         server._thread.join(30)
         with pytest.raises(ServerError):
             server.check()
 
 
 @pytest.mark.parametrize("make", [lambda: VirtualSerial(921_600), VirtualCan], ids=["serial", "CAN"])
-def test_a_link_that_ended_is_an_error_and_not_a_silent_line(make):
+def test_a_link_whose_thread_failed_is_an_error(make):
     def pull_the_plug(line: VirtualLink) -> None:
         os.close(line._masters[0])
 

@@ -1,4 +1,4 @@
-"""What flight is told of a simulated pass: against the truth, and by statistics. When its pictures come."""
+"""Navigation states of a simulated pass, against the truth and by statistics; the simulated clock of the camera."""
 
 import dataclasses
 import json
@@ -20,8 +20,9 @@ from flightsw.pose import PoseTagger
 from flightsw.sequencer import plan
 from hil.cameras.virtual import CameraServer
 from hil.world.clock import LONGEST_WAIT_S, SimulatedClock
+from hil.world.navigation import write_flight_inputs
 from hil.world.scenario import SCENARIOS, load_scenario
-from hil.world.states import World, load_world, write_flight_inputs
+from hil.world.world import World, load_world
 
 NS = 1_000_000_000
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")
@@ -34,7 +35,7 @@ def few_brackets(world: World, count: int, interval_s: float) -> World:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_missions_of_scenarios_are_theirs_and_survive_the_file(tmp_path, name):
+def test_a_scenario_s_mission_has_its_orbits_and_brackets_and_survives_the_file(tmp_path, name):
     scenario = load_scenario(name)
     world = load_world(MISSION, name)
     mission = world.mission
@@ -70,7 +71,7 @@ def test_flight_tags_frames_of_any_target_with_the_truth(tmp_path, name):
         # the tumble accelerates by its rate squared, 5e-4 rad/s², for half of a second between states: 6e-5 rad
         assert Rotation.from_matrix(turn).magnitude() < 6e-5
         in_camera = [t.world_to_camera[:3, 3] for t in (tag, true)]
-        np.testing.assert_allclose(*in_camera, atol=1e-3)  # the target where it is in the picture
+        np.testing.assert_allclose(*in_camera, atol=1e-3)  # the target's position in the picture
         np.testing.assert_allclose(tag.sun_dir_body, true.sun_dir_body, atol=6e-5)
         assert tag.in_eclipse == true.in_eclipse
     tagger.close()
@@ -96,9 +97,8 @@ def test_navigation_errors_are_as_large_as_the_tags_say(tmp_path):
 
 
 def test_the_same_seed_gives_the_same_errors_and_no_seed_none(tmp_path):
-    world = few_brackets(
-        load_world(MISSION), 2, 5.0
-    )  # the mission's own orbits: navigation is what SGP4 says
+    # the mission's own orbits: navigation is what SGP4 says
+    world = few_brackets(load_world(MISSION), 2, 5.0)
 
     def states(seed: int | None) -> bytes:
         return (write_flight_inputs(world, tmp_path, seed).parent / "navigation.jsonl").read_bytes()
@@ -130,7 +130,7 @@ def at_pace(interval_s: float) -> Mission:
     st.lists(st.tuples(st.floats(0.01, 50), st.floats(0.001, 5)), min_size=1, max_size=20),
 )
 def test_a_picture_leaves_at_its_time_or_late_and_is_then_counted(factor, frames):
-    """Frames as (simulated seconds since the last one, our seconds until it is ready after the last one left)."""
+    """Frames are pairs: simulated s since the last exposure, and real s from the last release until it is ready."""
     now_s, waited_s = 0.0, []
     clock = SimulatedClock(at_pace(max(1.5, factor)), factor, clock_s=lambda: now_s)
     elapsed_s, started_s, late = 0.0, None, 0
@@ -156,12 +156,12 @@ def test_in_lock_step_nothing_waits_and_nothing_is_late():
 
 
 @pytest.mark.parametrize("factor", [-1.0, math.nan, math.inf])
-def test_a_factor_that_is_none_is_refused(factor):
+def test_an_invalid_factor_is_refused(factor):
     with pytest.raises(ValueError, match="lock step"):
         SimulatedClock(MISSION, factor)
 
 
-def test_a_pace_that_flight_would_not_wait_for_is_refused_with_one_that_it_would():
+def test_a_factor_at_which_flight_would_time_out_is_refused_and_the_smallest_possible_is_named():
     slow = at_pace(10 * LONGEST_WAIT_S)
     with pytest.raises(ValueError, match="at least 10"):
         SimulatedClock(slow, 1.0)

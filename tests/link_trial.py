@@ -1,6 +1,6 @@
-"""A pass under faults: flight and ground as processes of their own over a virtual link, and what arrived.
+"""Trials of the link: flight and ground as separate processes over a virtual link with faults, every frame compared.
 
-Cuts, kills and full disks come at seeded moments of the pass, told by how many frames the ground holds.
+Cuts, kills and full disks happen at seeded moments of the pass, counted in frames that the ground has received.
 """
 
 import contextlib
@@ -25,13 +25,14 @@ import numpy as np
 from flightsw.icd.frame import Frame, PoseTag, decode_frame, encode_frame
 from flightsw.store import FrameStore
 from ground.session import open_session
+from hil.links.faults import Faults
 from hil.links.virtual_can import VirtualCan
-from hil.links.virtual_link import Faults, VirtualLink, VirtualSerial
+from hil.links.virtual_link import VirtualLink
+from hil.links.virtual_serial import VirtualSerial
 from hil.processes import tied
-from obbgs_base.errors import ObbgsError
 
 POLL_S = 0.01
-FULL_S = 3.0  # a disk stays full
+FULL_S = 3.0  # how long a disk stays full
 CAPTURE = """
 import sys, time
 from pathlib import Path
@@ -81,17 +82,13 @@ def noise_containers(count: int, size_px: int) -> list[bytes]:
     return containers
 
 
-STANDARD_FAULTS = Faults(loss=0.02, bit_flip=0.02, duplicate=0.02, reorder=0.02)
-STANDARD_CUT_S = 5.0  # one cut, when half of the frames are there
-
-
-class TrialError(ObbgsError, RuntimeError):
+class TrialError(Exception):
     """A process of the trial failed, or the frames did not arrive as they were."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What happens in a pass."""
+    """The link of a pass and the faults that happen in it."""
 
     link: str = "serial"  # serial (3 Mbaud), can (slcan at 1 Mbit/s) or canfd
     faults: Faults = field(default_factory=Faults)
@@ -114,7 +111,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class TrialResult:
-    """What a pass brought. Every frame arrived once and bit-identical, or there is no result."""
+    """What a pass measured. It exists only if every frame arrived once and bit-identical."""
 
     frames: int
     payload_bytes: int  # of the containers
@@ -154,8 +151,8 @@ def run_trial(
 class _Disk:
     """A folder; on a small file system of its own if it is to become full.
 
-    Where mounting is not permitted, `fill` takes the right to write from the process that uses it: the kernel
-    then refuses with EFBIG where a full disk does with ENOSPC.
+    Where mounting is not permitted, `fill` limits the file size of the processes that use it to zero: the kernel then
+    refuses writing with EFBIG instead of the ENOSPC of a full disk.
     """
 
     def __init__(self, folder: Path, size_bytes: int):
@@ -195,7 +192,7 @@ class _Disk:
 
 
 class _Pass:
-    """The processes of a trial, ended with the `with` whatever happens."""
+    """The processes of a trial; leaving the `with` block ends them."""
 
     def __init__(
         self,
@@ -248,7 +245,7 @@ class _Pass:
 
     def run(self, limit_s: float) -> TrialResult:
         end_s = time.monotonic() + limit_s
-        if not self._trial.full_disks:  # else a process of its own stores them, also while the disks are full
+        if not self._trial.full_disks:  # else a separate process stores them, also while the disks are full
             store = FrameStore(self._store)
             for path in sorted((self._folder / "captured").iterdir()):
                 store.put(decode_frame(path.read_bytes()))
@@ -287,7 +284,7 @@ class _Pass:
         )
 
     def _plan(self) -> list[tuple[float, Iterator[float]]]:
-        """Return what happens at how many received frames, in order."""
+        """Return the actions and the numbers of received frames at which they start, in order."""
         source = random.Random(self._trial.seed)
         moments: list[tuple[float, Iterator[float]]] = []
         if self._trial.cut_s:
@@ -303,7 +300,7 @@ class _Pass:
                 moments.append((source.uniform(0, self._count - 1), self._stall(side)))
         return sorted(moments, key=lambda moment: moment[0])
 
-    # Each action is a generator that yields the seconds until it goes on.
+    # Each action is a generator that yields the seconds until its next step.
 
     def _cut(self) -> Iterator[float]:
         self._line.cut()
@@ -340,24 +337,24 @@ class _Pass:
         process.send_signal(signal.SIGTERM)
         process.wait(30)
         if process.returncode == -signal.SIGTERM:
-            return {}  # started anew a moment ago, nothing counted yet
+            return {}  # it was restarted a moment ago and has not counted anything yet
         try:
             return json.loads((self._folder / f"{name}.json").read_text().splitlines()[-1])
         except (IndexError, ValueError) as error:
-            raise TrialError(f"{name} printed no result: {self._last_words(name)}") from error
+            raise TrialError(f"{name} printed no result: {self._end_of_log(name)}") from error
 
     def _check(self, end_s: float, received: int) -> None:
         for name, process in list(self._running.items()):
             if process.poll() is None or (name == "capture" and not process.returncode):
                 continue
             if self._trial.kills and self._is_full[name] and process.returncode == 1:
-                self._start(name)  # killed, and started while its disk was full: it said so and left
+                self._start(name)  # killed and restarted while its disk was full: it reported that and ended
             else:
-                raise TrialError(f"{name} ended with {process.returncode}: {self._last_words(name)}")
+                raise TrialError(f"{name} ended with {process.returncode}: {self._end_of_log(name)}")
         if time.monotonic() > end_s:
-            raise TrialError(f"{received} of {self._count} frames had come when the time was up")
+            raise TrialError(f"{received} of {self._count} frames had arrived when the time was up")
 
-    def _last_words(self, name: str) -> str:
+    def _end_of_log(self, name: str) -> str:
         return (self._folder / f"{name}.log").read_text()[-2000:]
 
     def _wait(self, condition: Callable[[], bool], end_s: float) -> None:
