@@ -6,9 +6,10 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 
-from ground.evaluate import Truth, clean_image, open_run
-from ground.reconstruct import predicted_image
-from ground.report import ERROR_FULL_SCALE, bounding_box, heat, tone
+from ground.cameras import predicted_image
+from ground.evaluate import Truth, clean_image
+from ground.pictures import ERROR_FULL_SCALE, bounding_box, heat, tone
+from ground.runs import open_run
 
 SIZE_PX = 200
 

@@ -15,11 +15,13 @@ from flightsw.errors import TriageError
 from flightsw.icd.frame import Frame, PoseTag, encode_frame, matrix_to_quat
 from flightsw.icd.mission import Mission
 from flightsw.triage import Renderer, rank_frames
+from ground.cameras import sensor_of, sun_direction
 from ground.card import model_card
 from ground.evaluate import evaluate
-from ground.reconstruct import reconstruct, sensor_of, sun_direction, training_frame
+from ground.reconstruct import reconstruct
 from ground.report import write_report
 from ground.session import SessionWriter, open_session
+from ground.training_frames import training_frame
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import Batches, TrainingFrame, sun_span_deg
 from obbgs_core.io.onnx import export_onnx

@@ -17,10 +17,12 @@ from typer.testing import CliRunner
 
 from ground import cli
 from ground.evaluate import evaluate
-from ground.reconstruct import reconstruct, split
-from ground.report import bounding_box, write_report
+from ground.pictures import bounding_box
+from ground.reconstruct import reconstruct
+from ground.report import write_report
 from ground.session import MissingFrames, SessionError, open_session
 from ground.settings import changes_for
+from ground.training_frames import split
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.io.ply import load_ply
 from obbgs_core.train.presets import PRESETS, preset
@@ -53,7 +55,7 @@ def trained(tmp_path_factory) -> tuple[Path, dict]:
 @pytest.fixture(autouse=True)
 def few_surface_points(monkeypatch) -> None:
     """The surface's 100,000 points cost half of a short run: only `trained`, made before this, has them all."""
-    monkeypatch.setattr("ground.reconstruct.SURFACE_POINTS", 2_000)
+    monkeypatch.setattr("ground.model_files.SURFACE_POINTS", 2_000)
 
 
 def test_the_model_exceeds_every_baseline_and_knowing_the_exposure_is_worth_decibels(trained):

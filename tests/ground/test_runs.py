@@ -41,7 +41,7 @@ FILES = {"model.ply", "model.spz", "surface.ply", "model.onnx"}
 def few_surface_points():
     """A hundred thousand take seconds, and nothing here asks how good they are."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ground.reconstruct.SURFACE_POINTS", 1000)
+        patch.setattr("ground.model_files.SURFACE_POINTS", 1000)
         yield
 
 
@@ -73,7 +73,7 @@ def fail(*arguments, **named):
     ],
 )
 def test_what_cannot_be_made_of_a_model_is_named_and_the_rest_is_there(session, monkeypatch, part, missing):
-    monkeypatch.setattr(f"ground.reconstruct.{part}", fail)
+    monkeypatch.setattr(f"ground.model_files.{part}", fail)
     folder = reconstruct(session, "run", "obbgs", QUICK)
     metrics = evaluate(session, "run")
     assert metrics["missing_outputs"] == {missing: "RuntimeError: no such luck"}
@@ -98,7 +98,7 @@ def test_the_command_trains_and_ends_well_where_the_model_is_too_large_for_onnx(
 
 def test_the_limit_of_the_uplink_stops_no_model_of_the_ground_but_the_uplink(session, tmp_path, monkeypatch):
     assert uplink.MAX_MODEL_BYTES == model_file.MAX_MODEL_BYTES
-    monkeypatch.setattr("ground.reconstruct.MAX_MODEL_BYTES", 1000)
+    monkeypatch.setattr("ground.model_files.MAX_MODEL_BYTES", 1000)
     monkeypatch.setattr("ground.uplink.MAX_MODEL_BYTES", 1000)
     folder = reconstruct(session, "run", "obbgs", QUICK)
     metrics = evaluate(session, "run")
@@ -117,9 +117,9 @@ def test_a_model_that_the_disk_does_not_take_is_kept_and_written_later(session, 
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("ground.reconstruct.save_ply", full)
+        patched.setattr("ground.model_files.save_ply", full)
         with pytest.raises(
-            SessionError, match="No space left on device; the same command goes on from the training"
+            SessionError, match="No space left on device; the same command resumes from the training"
         ):
             reconstruct(session, "run", "obbgs", QUICK)
     assert [path.name for path in (session / "runs").iterdir()] == [".run.part"]
@@ -166,7 +166,7 @@ def test_a_time_limit_that_is_none_is_wrong_usage(session, monkeypatch, capsys, 
 
 def test_a_run_holds_nothing_of_an_interrupted_one_before_it(session):
     part = session / "runs" / ".run.part"
-    with pytest.raises(Interrupted, match=r"before model\.spz was made; the same command goes on"):
+    with pytest.raises(Interrupted, match=r"before model\.spz was made; the same command resumes"):
         reconstruct(
             session,
             "run",
@@ -201,7 +201,7 @@ def test_a_finished_run_is_replaced_only_when_asked_for(finished, tmp_path):
     precious = session / "runs" / "mine" / "thesis.txt"
     precious.parent.mkdir()
     precious.write_text("years")
-    with pytest.raises(SessionError, match="is no finished run: it stays as it is"):
+    with pytest.raises(SessionError, match="is not a finished run, so it is not replaced"):
         reconstruct(session, "mine", "obbgs", QUICK, overwrite=True)
     assert precious.read_text() == "years"
 
@@ -220,6 +220,55 @@ def test_runs_go_to_another_folder_and_are_scored_there(session, tmp_path):
         evaluate(session, "a", out)
 
 
+TRAINS_UNTIL_TOLD = """
+import sys
+from pathlib import Path
+from ground.reconstruct import reconstruct
+def told(progress):
+    if progress.info.step == 3:
+        print("training", flush=True)
+        sys.stdin.readline()
+reconstruct(Path(sys.argv[1]), "run", "obbgs", {quick!r}, on_progress=told)
+"""
+
+
+def test_two_processes_do_not_make_one_run_at_once(session):
+    """The second one is refused and names the first, which ends as if alone; a killed one leaves no lock behind."""
+    command = [sys.executable, "-c", TRAINS_UNTIL_TOLD.format(quick=QUICK), str(session)]
+    first = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert first.stdout is not None and first.stdout.readline() == "training\n"
+    second = subprocess.run(
+        [sys.executable, "-m", "ground.cli", "reconstruct", "--session", str(session), "--overwrite"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert second.returncode == 1 and "Traceback" not in second.stderr
+    assert f"process {first.pid} on " in second.stderr and "give another --name" in second.stderr
+    first.communicate("go on\n", timeout=120)
+    assert first.returncode == 0
+    assert {path.name for path in (session / "runs").iterdir()} == {"run"}
+    assert not (session / "runs" / "run" / "lock").exists()
+
+    shutil.rmtree(session / "runs" / "run")
+    killed = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert killed.stdout is not None and killed.stdout.readline() == "training\n"
+    killed.kill()
+    killed.communicate(timeout=60)
+    assert reconstruct(session, "run", "obbgs", QUICK).is_dir()
+
+
+def test_a_run_that_another_process_has_just_finished_is_not_replaced(session, monkeypatch):
+    """It appears between the first look at the folder and the lock: the second look sees it."""
+    reconstruct(session, "run", "obbgs", QUICK)
+    model = (session / "runs" / "run" / "model.ply").read_bytes()
+    monkeypatch.setattr("ground.reconstruct.check_replaceable", lambda *arguments: None)
+    with pytest.raises(SessionError, match="is a finished run"):
+        reconstruct(session, "run", "obbgs", QUICK, seed=1)
+    assert (session / "runs" / "run" / "model.ply").read_bytes() == model
+    assert [path.name for path in (session / "runs").iterdir()] == ["run"]
+
+
 def test_a_folder_that_cannot_be_written_to_is_named(finished, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file" / "runs", Path("/proc/runs")):
@@ -236,7 +285,7 @@ def test_a_folder_that_cannot_be_written_to_is_named(finished, tmp_path, monkeyp
     monkeypatch.setattr("ground.evaluate.write_whole", read_only)
     monkeypatch.setattr("ground.report.write_whole", read_only)
     for score in (evaluate, write_report):
-        with pytest.raises(SessionError, match=r"cannot write to .*: Read-only file system; --out DIR"):
+        with pytest.raises(SessionError, match=r"cannot write to .*: Read-only file system; use --out DIR"):
             score(finished, "run")
 
 
