@@ -230,7 +230,7 @@ def _model(run: Run) -> str:
     ranges_m = [_range_m(record) for record in run.session.frames]
     note = (
         f"Centres of {shown:,} of the {len(run.gaussians):,} Gaussians without the faint ones, coloured by brightness, "
-        "in the target's body frame. The camera track has true directions but is drawn at one distance; flown ranges were "
+        "in the target's body frame. The camera track has true directions but is drawn at one distance; ranges were "
         f"{min(ranges_m):.0f} to {max(ranges_m):.0f} m. Drag to turn, scroll to zoom."
     )
     if "appearance" in run.metrics:

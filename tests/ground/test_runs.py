@@ -18,7 +18,9 @@ from typer.testing import CliRunner
 
 from flightsw import model_file
 from flightsw.icd.mission import ConfigError, ReconstructSection, load_mission
+from flightsw.icd.telemetry import DICTIONARY
 from ground import cli, uplink
+from ground.cli_options import ExportFormat, ImportFormat, Method, Quality, UplinkCommand
 from ground.evaluate import evaluate
 from ground.progress import Stop, steps_shown
 from ground.reconstruct import reconstruct
@@ -29,7 +31,7 @@ from ground.summary import model_rows
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged
 from obbgs_core.io.ply import load_ply
-from obbgs_core.train.presets import PRESETS
+from obbgs_core.train.presets import PRESETS, QUALITIES
 from obbgs_core.train.trainer import StepInfo
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -348,6 +350,40 @@ def test_a_mission_that_asks_for_what_is_not_there_is_refused_by_its_path(tmp_pa
         mission_changes(load_mission(path).reconstruct)
 
 
+def test_the_choices_of_the_commands_are_those_of_the_library_and_the_dictionary():
+    assert set(Method) == set(PRESETS) and set(Quality) == set(QUALITIES)
+    assert set(UplinkCommand) == set(DICTIONARY.commands)
+    for command, choices in (
+        ("reconstruct", (*Method, *Quality)),
+        ("import", ImportFormat),
+        ("export", ExportFormat),
+        ("uplink", UplinkCommand),
+    ):
+        shown = CliRunner().invoke(cli.app, [command, "--help"], env={"COLUMNS": "300"}).stdout
+        assert all(choice in shown for choice in choices)
+
+
+@pytest.mark.parametrize(
+    ("command", "work"),
+    [
+        (["evaluate", "--session", "s"], "ground.evaluate.evaluate"),
+        (["report", "--session", "s"], "ground.report.write_report"),
+        (["import", "--format", "nerf", "--from", "d", "--session", "s"], "ground.formats.nerf.read_nerf"),
+        (["export", "--session", "s", "--out", "d"], "ground.session.open_session"),
+    ],
+)
+def test_an_interrupted_command_ends_with_one_line_and_exit_code_1(monkeypatch, capsys, command, work):
+    def interrupted(*arguments):
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(work, interrupted)
+    monkeypatch.setattr("sys.argv", ["ground", *command])
+    with pytest.raises(SystemExit) as exit_info:
+        cli.main()
+    assert exit_info.value.code == 1
+    assert capsys.readouterr().err.startswith("ground: interrupted; ")
+
+
 def test_the_methods_of_a_mission_file_are_those_of_the_ground():
     for name in PRESETS:
         assert mission_changes(ReconstructSection(method=name, steps=3)) == {"steps": 3}  # type: ignore
@@ -411,17 +447,17 @@ def test_a_second_signal_does_not_wait_and_none_does_where_there_is_nothing_to_s
     stop = Stop()
     before = signal.getsignal(signal.SIGTERM)
     with stop.on_signals():
-        stop.obey()
+        stop.raise_at_once()
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGTERM)
-        stop.ask()
-        assert not stop.asked
+        stop.defer()
+        assert not stop.requested
         os.kill(os.getpid(), signal.SIGTERM)
-        assert stop.asked
+        assert stop.requested
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGTERM)
         with pytest.raises(KeyboardInterrupt):
-            stop.obey()
+            stop.raise_at_once()
     assert signal.getsignal(signal.SIGTERM) == before
 
 
