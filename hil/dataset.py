@@ -15,7 +15,8 @@ from flightsw.icd.frame import Frame, PoseTag, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.sequencer import Shot, plan
 from ground.formats.nerf import export_nerf
-from ground.session import SessionWriter, open_session
+from ground.session import open_session
+from ground.session_writer import SessionWriter
 from ground.telemetry import FlightCounts
 from hil.sky import blender, sensor
 from hil.sky.blender import RenderFarm, mesh_sha256

@@ -27,7 +27,8 @@ from ground.formats.views import (
     world_to_camera_to_opengl,
     write_session,
 )
-from ground.session import SessionError, SessionWriter, open_session
+from ground.session import SessionError, open_session
+from ground.session_writer import SessionWriter
 
 RNG = np.random.default_rng(3)
 unit_quats = st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1)

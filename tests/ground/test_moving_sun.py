@@ -20,7 +20,8 @@ from ground.card import model_card
 from ground.evaluate import evaluate
 from ground.reconstruct import reconstruct
 from ground.report import write_report
-from ground.session import SessionWriter, open_session
+from ground.session import open_session
+from ground.session_writer import SessionWriter
 from ground.training_frames import training_frame
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import Batches, TrainingFrame, sun_span_deg
