@@ -7,9 +7,10 @@ import imagecodecs
 import numpy as np
 import torch
 
-from ground.evaluate import clean_image, open_run
-from ground.reconstruct import predicted_image
-from ground.report import ERROR_FULL_SCALE, bounding_box, heat, tone
+from ground.cameras import predicted_image
+from ground.evaluate import clean_image
+from ground.pictures import ERROR_FULL_SCALE, bounding_box, heat, tone
+from ground.runs import open_run
 from ground.truth import Truth
 
 SIZE_PX = 200

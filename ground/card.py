@@ -1,105 +1,121 @@
-"""The model card: what a model is, how good, and why it is no larger; and words that the report shares with it."""
+"""The model card: what a model is, how good it is, and what limited its size; and phrases the report shares with it."""
 
 import math
 
 NOISE_LIKE_CHI2 = 1.5  # up to here the model's own error is under 0.7 sigma of the noise
 SIZES = {"model.ply": "ply_bytes", "model.spz": "spz_bytes", "model.onnx": "onnx_bytes"}
 USES = {
-    "model.ply": "every number, read back exactly",
+    "model.ply": "the model without loss",
     "model.spz": "quantised, for viewers and storage",
     "model.onnx": "the renderer for use on board",
 }
 
 
 def scored_frames(metrics: dict) -> str:
-    """Return which frames a run's figures of image quality are of, in words."""
+    """Return in words which frames a run's image quality was measured on."""
     if metrics.get("scored_frames") == "training":
         return "training frames (nothing was held out)"
     return "held-out frames"
 
 
 def frames_captured(metrics: dict) -> str:
-    """Return how many frames flight said it took, as text: "unknown" where it did not say."""
+    """Return how many frames the spacecraft reported to have taken; "unknown" without its telemetry."""
     captured = metrics.get("frames_captured")
     return "unknown" if captured is None else f"{captured:,}"
 
 
 def chi2_explained(chi2: float) -> str:
-    """Return what a residual chi² of this size means, in one sentence."""
-    meaning = "the mean squared residual over the variance of the noise, where the model is; 1 is noise alone"
+    """Return in one sentence what a residual chi² of this size means."""
+    meaning = "mean squared residual divided by the noise variance, over pixels that show the model; 1 is noise alone"
     if chi2 <= NOISE_LIKE_CHI2:
         return meaning + "."
     at, times = (f"{x:.1f}" if x < 10 else f"{x:,.0f}" for x in (chi2, math.sqrt(chi2 - 1)))
     return f"{meaning}, and at {at} the model's own error is {times} times as large as the noise."
 
 
-def appearance(metrics: dict) -> list[str]:
-    """Return what the radiance turns with and why, as a point of a list; nothing for runs that did not note it."""
-    if "appearance" not in metrics:
-        return []
-    lines = [
-        f"- Radiance {metrics['appearance']}. The Sun's direction spans {metrics['sun_span_deg']:.1f} degrees in the "
-        "target's frame."
-    ]
-    shading = metrics.get("shading", metrics.get("sh_direction"))  # as older runs called it
-    if shading != "view":
-        x, y, z = metrics["shown_under_sun_dir_body"]
-        shadows = "cast" if shading == "lambert" else "not modelled"
-        lines.append(
-            f"- Shadows of parts on one another are {shadows}. model.ply and model.onnx hold every Sun; "
-            f"model.spz, and what viewers show of model.ply, are lit from ({x:.3f}, {y:.3f}, {z:.3f}), target body "
-            "frame."
-        )
-    return lines
-
-
 def model_card(session_created_utc: str, metrics: dict) -> str:
-    """Return the card as Markdown: figures that were not measured are left out."""
-    exposures_ms = [1e3 * exposure_s for exposure_s in metrics["exposures_s"]]
+    """Return the card as Markdown; figures that were not measured are left out."""
     lines = [
         "# Model card",
         "",
-        f"{metrics['gaussians']:,} Gaussians with radiance of degree {metrics['sh_degree']}, by method "
+        f"{metrics['gaussians']:,} Gaussians, radiance of spherical-harmonic degree {metrics['sh_degree']}, made by "
         f"{metrics['method']} from {metrics['frames_trained']} frames of the session of {session_created_utc}.",
         "",
-        f"- Started from: {metrics['start']}. Stopped because: {metrics['stop_reason']}, after "
-        f"{metrics['train_seconds']:.0f} s.",
-        *([f"- Budget: {metrics['budget']}."] if "budget" in metrics else []),  # older runs did not note it
-        f"- Exposure times it was trained on: {exposures_ms[0]:g} to {exposures_ms[-1]:g} ms. Between them its images "
-        "are as good as below; outside them it extrapolates linearly.",
-        f"- Frames received / captured: {metrics['frames_received']:,} / {frames_captured(metrics)}.",
+        *_training(metrics),
+        *_appearance(metrics),
+        *_quality(metrics),
     ]
-    if isinstance(chi2 := metrics.get("chi2"), int | float) and math.isfinite(chi2):
-        lines.append(f"- Residual chi² {chi2:.2f}: {chi2_explained(chi2)}")
-    lines += appearance(metrics)
-    for key, text in (
-        ("growth", "Growth ran {}."),
-        ("poses", "Poses {}."),
-        ("exposures", "Exposure times {}."),
-    ):
-        if key in metrics:  # older runs did not note it
-            lines.append("- " + text.format(metrics[key]))
-    scored = scored_frames(metrics)
-    for key, text in (
-        ("psnr_noisy_db", f"PSNR of {scored} against their noisy readings: {{:.2f}} dB."),
-        ("psnr_clean_db", f"PSNR of {scored} against their noiseless exposures: {{:.2f}} dB."),
-        ("psnr_clean_foreground_db", "The same on the pixels that the target covers: {:.2f} dB."),
-        ("chamfer", "Chamfer distance of the centres (largest dimension = 2): {:.4f}."),
-        ("completeness_surface", "Of the true surface, {:.1f} % lies within 0.01 of surface.ply."),
-    ):
-        if key in metrics:
-            lines.append("- " + text.format(metrics[key]))
-    if metrics.get("removed_not_finite"):
-        lines.append(f"- {metrics['removed_not_finite']:,} Gaussians stopped being numbers and were removed.")
-    if metrics.get("onnx_fits_uplink") is False:
-        lines.append("- model.onnx is too large for the uplink: a smaller budget makes a smaller one.")
     lines += [
         f"- {name} is missing: {reason}." for name, reason in metrics.get("missing_outputs", {}).items()
     ]
-    lines += ["", "| file | bytes | for |", "| --- | --- | --- |"]
+    lines += ["", "| file | bytes | use |", "| --- | --- | --- |"]
     lines += [
         f"| {name} | {metrics[key]:,} | {USES[name]} |"
         for name, key in SIZES.items()
         if metrics.get(key) is not None
     ]
     return "\n".join([*lines, ""])
+
+
+def _training(metrics: dict) -> list[str]:
+    """Return how the model came about; runs made by older versions did not record all of it."""
+    exposures_ms = [1e3 * exposure_s for exposure_s in metrics["exposures_s"]]
+    lines = [
+        f"- Start: {metrics['start']}. Training ended after {metrics['train_seconds']:.0f} s: "
+        f"{metrics['stop_reason']}.",
+        f"- Exposure times of the training frames: {exposures_ms[0]:g} to {exposures_ms[-1]:g} ms. Between them images "
+        "are as good as stated below; outside them the model extrapolates linearly.",
+        f"- Frames received / captured: {metrics['frames_received']:,} / {frames_captured(metrics)}.",
+    ]
+    for key, name in (
+        ("budget", "Budget"),
+        ("growth", "Growth"),
+        ("poses", "Poses"),
+        ("exposures", "Exposures"),
+    ):
+        if key in metrics:
+            lines.append(f"- {name}: {metrics[key]}.")
+    if metrics.get("removed_not_finite"):
+        lines.append(
+            f"- {metrics['removed_not_finite']:,} Gaussians were removed: a parameter became NaN or infinite."
+        )
+    return lines
+
+
+def _appearance(metrics: dict) -> list[str]:
+    """Return what the radiance depends on; nothing for runs that did not record it."""
+    if "appearance" not in metrics:
+        return []
+    lines = [
+        f"- Radiance: {metrics['appearance']}. The Sun's direction spans {metrics['sun_span_deg']:.1f} degrees in the "
+        "target's frame."
+    ]
+    shading = metrics.get("shading", metrics.get("sh_direction"))  # its name in older runs
+    if shading != "view":
+        x, y, z = metrics["shown_under_sun_dir_body"]
+        shadows = "cast" if shading == "lambert" else "not modelled"
+        lines.append(
+            f"- Shadows of parts on one another are {shadows}. model.ply and model.onnx hold the model for every Sun "
+            "direction; model.spz, and what other viewers show of model.ply, are lit from "
+            f"({x:.3f}, {y:.3f}, {z:.3f}), target body frame."
+        )
+    return lines
+
+
+def _quality(metrics: dict) -> list[str]:
+    lines = []
+    if isinstance(chi2 := metrics.get("chi2"), int | float) and math.isfinite(chi2):
+        lines.append(f"- Residual chi² {chi2:.2f}: {chi2_explained(chi2)}")
+    scored = scored_frames(metrics)
+    for key, text in (
+        ("psnr_noisy_db", f"PSNR of {scored} against their noisy readings: {{:.2f}} dB."),
+        ("psnr_clean_db", f"PSNR of {scored} against their noiseless exposures: {{:.2f}} dB."),
+        ("psnr_clean_foreground_db", "The same on the pixels that the target covers: {:.2f} dB."),
+        ("chamfer", "Chamfer distance of the centres (the target's largest dimension = 2): {:.4f}."),
+        ("completeness_surface", "Of the true surface, {:.1f} % lies within 0.01 of surface.ply."),
+    ):
+        if key in metrics:
+            lines.append("- " + text.format(metrics[key]))
+    if metrics.get("onnx_fits_uplink") is False:
+        lines.append("- model.onnx is too large for the uplink: train with a smaller --budget.")
+    return lines

@@ -1,63 +1,53 @@
-"""ground: listen, uplink, key, reconstruct, evaluate, report, import, export."""
+"""ground: listen, key, uplink, reconstruct, evaluate, report, import, export."""
 
-import contextlib
 import dataclasses
 import json
-import math
-import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from flightsw.icd.mission import ReconstructSection, load_mission
-from ground.progress import Stop, say, steps_shown
-from ground.summary import frames_row, model_rows, table
+from flightsw.icd.mission import load_mission
+from ground.cli_options import AsJson, ExportFormat, ImportFormat, SessionDir, UplinkCommand
+from ground.cli_runs import evaluate_command, reconstruct_command, report_command
 from obbgs_base.command_line import new_app, run
 
 app = new_app("The ground station: frames in, a 3D model out.")
 stderr = Console(stderr=True)
 
-SessionDir = Annotated[Path, typer.Option("--session", help="The session folder.")]
-RunName = Annotated[str, typer.Option("--name", help="The run's name.")]
-RunsDir = Annotated[
-    Path | None, typer.Option("--out", help="The folder of runs; default: runs/ in the session.")
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-PLAIN_S = 10.0  # between lines about the link where there is no terminal
-
 
 @app.command("listen")
 def listen_command(
-    link: Annotated[str, typer.Option(help="serial:///dev/ttyUSB0?baud=921600")],
+    link: Annotated[str, typer.Option(help="The link's URL, such as serial:///dev/ttyUSB0?baud=921600.")],
     session: SessionDir,
     mission: Annotated[Path, typer.Option(help="The mission file.")] = Path("mission.yaml"),
     exit_after: Annotated[
-        int | None, typer.Option(help="Stop when the session holds so many frames.")
+        int | None, typer.Option(help="Stop when the session holds this many frames.")
     ] = None,
-    idle_timeout: Annotated[float | None, typer.Option(help="Stop after so many seconds of silence.")] = None,
+    idle_timeout: Annotated[
+        float | None, typer.Option(help="Stop after this many seconds without a packet.")
+    ] = None,
     json_: AsJson = False,
 ) -> None:
     """Receive frames and telemetry into a session folder until stopped, send commands, show the link.
 
-    On a terminal a console; elsewhere a line every ten seconds and each event. --json prints a line a second and each
-    event; the last line is the summary.
+    On a terminal it shows a screen; elsewhere it prints a line every ten seconds and each event. --json prints a line a
+    second and each event; its last line is the summary.
 
     Example: ground listen --link serial:///dev/ttyUSB0?baud=921600 --session pass-12
     """
+    from ground.console import statuses_shown
     from ground.ingest import listen
 
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    with _shown(json_) as (on_status, on_event):
+    with statuses_shown(stderr, json_) as (on_status, on_event):
         summary = listen(
             link,
             session,
@@ -76,49 +66,15 @@ def listen_command(
         raise typer.Exit(1)
 
 
-@contextlib.contextmanager
-def _shown(as_json: bool) -> Iterator[tuple[Any, Any]]:
-    """Give what shows statuses and events: a screen, lines where there is no terminal, or JSON lines on stdout."""
-    from ground.console import ConsoleView
-    from ground.ingest import Status
-    from ground.telemetry import plain
-
-    view, next_line_s = ConsoleView(), float("-inf")
-    live = stderr.is_terminal and not as_json
-
-    def on_status(status: Status) -> None:
-        nonlocal next_line_s
-        if live:
-            screen.update(view.draw(status), refresh=True)
-        elif status.now_s >= next_line_s:
-            next_line_s = status.now_s + (1.0 if as_json else PLAIN_S)
-            if as_json:
-                facts = dataclasses.asdict(status)
-                facts["housekeeping"] = plain(facts["housekeeping"])
-                del facts["events"]  # printed when they came
-                print(json.dumps({"type": "status"} | facts), flush=True)
-            else:
-                stderr.print(view.line(status), markup=False, highlight=False, soft_wrap=True)
-
-    def on_event(event: dict[str, Any]) -> None:
-        if as_json:
-            print(json.dumps({"type": "event"} | event), flush=True)
-        elif not live:
-            text = f"{event['severity']}: {event['text']}"
-            stderr.print(text, markup=False, highlight=False, soft_wrap=True)
-
-    screen = Live(console=stderr, auto_refresh=False, transient=True)  # drawn here: no thread that could die
-    with screen if live else contextlib.nullcontext():
-        yield on_status, on_event
-
-
 @app.command()
 def key(
     file: Annotated[Path, typer.Argument(help="Where to write the key.")],
     spi: Annotated[int, typer.Option(min=1, max=65534, help="The key's number.")] = 1,
     json_: AsJson = False,
 ) -> None:
-    """Make the key of a mission's commands. FILE and FILE.received go to the spacecraft, FILE and FILE.sent stay.
+    """Make the key that authenticates a mission's commands, and a counter for each side.
+
+    Copy FILE and FILE.received to the spacecraft; FILE and FILE.sent stay on the ground.
 
     Example: ground key mission.key
     """
@@ -133,32 +89,32 @@ def key(
 
 @app.command()
 def uplink(
-    command: Annotated[
-        str, typer.Argument(help="ping, bracket, near, priority, model, arm, delete, safe or resume.")
-    ],
-    arguments: Annotated[list[str] | None, typer.Argument(help="What the command needs.")] = None,
+    command: Annotated[UplinkCommand, typer.Argument(help="The command.")],
+    arguments: Annotated[list[str] | None, typer.Argument(help="The arguments of the command.")] = None,
     session: Annotated[Path, typer.Option("--session", help="The session folder.")] = Path("session"),
     key_file: Annotated[Path, typer.Option("--key", help="The mission's key.")] = Path("mission.key"),
-    link: Annotated[str | None, typer.Option(help="The link, if no `ground listen` has it.")] = None,
+    link: Annotated[
+        str | None, typer.Option(help="The link's URL, if no `ground listen` has it open.")
+    ] = None,
     mission: Annotated[Path, typer.Option(help="The mission file, with --link.")] = Path("mission.yaml"),
-    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the end.")] = 120.0,
+    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the result.")] = 120.0,
     json_: AsJson = False,
 ) -> None:
-    """Send a command through the `ground listen` of the session, or through --link, and wait for its end.
+    """Send a command through the session's `ground listen`, or over --link, and wait for its result.
 
     bracket 0.05,0.1,0.2 (ms) · near 2 (DN) · priority oldest|triage|thumbnail-first · model FILE · safe · ping;
-    delete FIRST LAST and resume want `arm delete` or `arm resume` just before.
+    delete FIRST LAST and resume need `arm delete` or `arm resume` just before.
 
     Example: ground uplink bracket 0.02,0.05,0.1 --session pass-12 --key mission.key
     """
     from ground import uplink as uplinking
     from ground.session import SessionError
 
-    made, model = uplinking.parse_command(command, arguments or [])
+    made, model = uplinking.parse_command(command.value, arguments or [])
     if link is None and not uplinking.is_listening(session):
-        raise SessionError(f"no `ground listen` has the link of {session}: start one, or give --link URL")
+        raise SessionError(f"no `ground listen` receives into {session}: start one, or give --link URL")
     counter = uplinking.submit(session, key_file, made, model, timeout)
-    end_s = time.monotonic() + timeout + 1.0  # the listener writes the end when the command expires
+    end_s = time.monotonic() + timeout + 1.0  # the listener writes a result when the command expires
 
     def ended() -> bool:
         return uplinking.outcome(session, counter) is not None or time.monotonic() > end_s
@@ -179,7 +135,7 @@ def uplink(
             "counter": counter,
             "command": made.name,
             "stage": "failed",
-            "text": "nobody sent it",
+            "text": "no process sent it",
             "reports": [],
         }
     if json_:
@@ -193,129 +149,18 @@ def uplink(
         raise typer.Exit(1)
 
 
-@app.command("reconstruct")
-def reconstruct_command(
-    session: SessionDir,
-    name: RunName = "run",
-    out: RunsDir = None,
-    method: Annotated[
-        str | None, typer.Option(help="obbgs (default), jiang2025, 3dgs, pixel-gs or mvgs.")
-    ] = None,
-    quality: Annotated[str | None, typer.Option(help="draft, standard (default) or best.")] = None,
-    budget: Annotated[
-        str, typer.Option(help="Most Gaussians, a number; auto: as many as the frames pay for.")
-    ] = "auto",
-    steps: Annotated[int | None, typer.Option(min=1, help="Training steps.")] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="A setting of the method, key=value (YAML); may be given again."),
-    ] = None,
-    mission: Annotated[
-        Path | None,
-        typer.Option(help="A mission file: its reconstruct section, where no option says otherwise."),
-    ] = None,
-    time_limit: Annotated[float, typer.Option(help="Seconds for each training.")] = math.inf,
-    seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same model; default 7.")] = None,
-    blind_reference: Annotated[
-        bool, typer.Option(help="Train once more blind to exposure, to compare.")
-    ] = False,
-    overwrite: Annotated[bool, typer.Option(help="Replace a finished run of the same name.")] = False,
-    threads: Annotated[int | None, typer.Option(min=1, help="Cores; default all.")] = None,
-    json_: AsJson = False,
-) -> None:
-    """Train a model on a session, export it, score it and write its report.
-
-    Ctrl-C and SIGTERM save the training and end with exit code 1; the same command goes on from there, and so it does
-    after a kill.
-
-    Example: ground reconstruct --session pass-12 --name first --time-limit 120 --set sun_shading=linear
-    """
-    os.environ.setdefault(
-        "OMP_WAIT_POLICY", "passive"
-    )  # spinning threads cost more than they give; before torch
-    from obbgs_base.errors import Interrupted
-
-    stop, folder = Stop(), None
-    try:
-        with stop.on_signals(), steps_shown(stderr) as show:
-            import torch
-
-            from ground.evaluate import evaluate
-            from ground.reconstruct import Progress, reconstruct
-            from ground.report import write_report
-            from ground.settings import all_changes
-
-            section = load_mission(mission).reconstruct if mission else ReconstructSection()
-            wanted = method or section.method
-            changes = all_changes(section, wanted, quality, budget, steps, settings or [])
-            torch.set_num_threads(threads or os.cpu_count() or 1)
-            stop.obey()
-
-            def on_progress(progress: Progress) -> None:
-                stop.ask()
-                show(progress.label, progress.info)
-
-            say(stderr, f"reading the frames of {session}")
-            folder = reconstruct(
-                session,
-                name,
-                wanted,
-                changes,
-                section.seed if seed is None else seed,
-                time_limit,
-                blind_reference,
-                on_progress,
-                out,
-                overwrite,
-                lambda: stop.asked,
-            )
-            stop.obey()
-            say(stderr, "scoring the model and writing its report")
-            metrics = evaluate(session, name, out)
-            report = write_report(session, name, out)
-    except KeyboardInterrupt as error:
-        done = f"the run is finished in {folder}: `ground evaluate` and `ground report` score it"
-        kept = done if folder else "the same command goes on from the last checkpoint, if there is one"
-        raise Interrupted(f"interrupted; {kept}") from error
-    _print_metrics(metrics, json_)
-    if not json_:
-        print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}\nreport: {report}")
-
-
-@app.command("evaluate")
-def evaluate_command(
-    session: SessionDir, name: RunName = "run", out: RunsDir = None, json_: AsJson = False
-) -> None:
-    """Score a finished run against held-out frames, and against the truth if a simulator left it.
-
-    Example: ground evaluate --session demo/session --name demo --json
-    """
-    from ground.evaluate import evaluate
-
-    _print_metrics(evaluate(session, name, out), json_)
-
-
-@app.command("report")
-def report_command(
-    session: SessionDir, name: RunName = "run", out: RunsDir = None, json_: AsJson = False
-) -> None:
-    """Write a run's report.html again.
-
-    Example: ground report --session demo/session --name demo
-    """
-    from ground.report import write_report
-
-    path = write_report(session, name, out)
-    print(json.dumps({"report": str(path)}) if json_ else path)
+app.command("reconstruct")(reconstruct_command)
+app.command("evaluate")(evaluate_command)
+app.command("report")(report_command)
 
 
 @app.command("import")
 def import_command(
     folder: Annotated[Path, typer.Option("--from", help="The data set's folder.")],
     session: Annotated[Path, typer.Option(help="The session folder to make.")],
-    format_: Annotated[str, typer.Option("--format", help="nerf, nerfstudio, colmap or shirt.")],
+    format_: Annotated[ImportFormat, typer.Option("--format", help="The data set's format.")],
     srgb: Annotated[bool, typer.Option(help="Undo the sRGB curve of the pictures.")] = False,
-    frames: Annotated[int | None, typer.Option(min=1, help="Only so many, the first ones.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Import only the first so many pictures.")] = None,
     json_: AsJson = False,
 ) -> None:
     """Make a session of pictures with known cameras: NeRF-synthetic, nerfstudio, COLMAP or SHIRT.
@@ -329,20 +174,19 @@ def import_command(
     from ground.formats.views import write_session
 
     camera = None
-    if format_ == "nerf":
-        views, camera = read_nerf(folder)
-    elif format_ == "nerfstudio":
-        views, camera = read_nerfstudio(folder)
-    elif format_ == "colmap":
-        views = read_colmap(folder)
-    elif format_ == "shirt":
-        views = read_shirt(folder)
-    else:
-        raise ValueError(f"--format must be nerf, nerfstudio, colmap or shirt, got {format_!r}")
+    match format_:
+        case ImportFormat.NERF:
+            views, camera = read_nerf(folder)
+        case ImportFormat.NERFSTUDIO:
+            views, camera = read_nerfstudio(folder)
+        case ImportFormat.COLMAP:
+            views = read_colmap(folder)
+        case ImportFormat.SHIRT:
+            views = read_shirt(folder)
     views = views[:frames]
     with Progress(TextColumn("importing"), BarColumn(), TimeRemainingColumn(), console=stderr) as progress:
         task = progress.add_task("import", total=len(views))
-        source = f"{format_}: {folder}"
+        source = f"{format_.value}: {folder}"
         count = write_session(views, session, source, srgb, camera, lambda: progress.advance(task))
     print(json.dumps({"frames": count, "session": str(session)}) if json_ else f"{count} frames in {session}")
 
@@ -351,7 +195,9 @@ def import_command(
 def export_command(
     session: SessionDir,
     out: Annotated[Path, typer.Option(help="The folder to write.")],
-    format_: Annotated[str, typer.Option("--format", help="nerf or nerfstudio.")] = "nerf",
+    format_: Annotated[
+        ExportFormat, typer.Option("--format", help="The format to write.")
+    ] = ExportFormat.NERF,
     json_: AsJson = False,
 ) -> None:
     """Write a session's frames for other tools, split by brackets into train, val and test (6:2:3).
@@ -362,19 +208,10 @@ def export_command(
     from ground.formats.nerfstudio import export_nerfstudio
     from ground.session import open_session
 
-    exporters = {"nerf": export_nerf, "nerfstudio": export_nerfstudio}
-    if format_ not in exporters:
-        raise ValueError(f"--format must be nerf or nerfstudio, got {format_!r}")
+    exporters = {ExportFormat.NERF: export_nerf, ExportFormat.NERFSTUDIO: export_nerfstudio}
     counts = exporters[format_](open_session(session), out)
     text = ", ".join(f"{count} {split}" for split, count in counts.items())
     print(json.dumps(counts) if json_ else f"{text} in {out}")
-
-
-def _print_metrics(metrics: dict, as_json: bool) -> None:
-    if as_json:
-        print(json.dumps(metrics))
-        return
-    Console().print(table("The model", [frames_row(metrics), *model_rows(metrics)]))
 
 
 def main() -> None:

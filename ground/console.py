@@ -1,11 +1,16 @@
-"""The operator's console: what `ground listen` knows, on one screen; lines of text where there is no terminal."""
+"""The operator's console: the state of link, spacecraft, files and commands, on one screen or in lines of text."""
 
+import contextlib
+import dataclasses
+import json
 import math
 from collections import deque
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any
 
-from rich.console import Group, RenderableType
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
 from rich.panel import Panel
 from rich.progress_bar import ProgressBar
 from rich.table import Table
@@ -13,15 +18,17 @@ from rich.text import Text
 
 from flightsw.icd.telemetry import DICTIONARY, printable
 from ground.ingest import Status
+from ground.telemetry import plain
 
+PLAIN_S, JSON_S = 10.0, 1.0  # between lines where there is no screen
 RATE_WINDOW_S = 5.0
-SILENT_S = 3.0  # without a packet the link counts as down: housekeeping comes every second
+SILENT_S = 3.0  # without a packet the link counts as silent; housekeeping comes every second
 EVENTS_SHOWN = 10
 FILES_SHOWN = 8
 HOUSEKEEPING = DICTIONARY.telemetry["housekeeping"]
 COLOURS = {"green": "green", "yellow": "yellow", "red": "bold red"}
 SEVERITIES = {"info": "", "warning": "yellow", "error": "bold red"}
-# the items of the housekeeping panel; the rest is in telemetry.jsonl
+# Items of the spacecraft panel; telemetry.jsonl holds all of them.
 SHOWN = """
 mode camera exposure_times_ms near priority model frames_stored frames_failed outbox_frames frames_ranked
 transfers_failed segments_resent crc_errors hang_ups disk_free_bytes cpu_percent rss_bytes commands_accepted
@@ -33,16 +40,53 @@ hang_ups
 """
 
 
+@contextlib.contextmanager
+def statuses_shown(console: Console, as_json: bool) -> Iterator[tuple[Any, Any]]:
+    """Give two functions for `listen`, which show a status and an event.
+
+    On a terminal they draw a screen; elsewhere they print a line every ten seconds and each event; with `as_json` a
+    line of JSON on stdout every second and for each event.
+    """
+    view, next_line_s = ConsoleView(), float("-inf")
+    live = console.is_terminal and not as_json
+
+    def on_status(status: Status) -> None:
+        nonlocal next_line_s
+        if live:
+            screen.update(view.draw(status), refresh=True)
+        elif status.now_s >= next_line_s:
+            next_line_s = status.now_s + (JSON_S if as_json else PLAIN_S)
+            if as_json:
+                facts = dataclasses.asdict(status)
+                facts["housekeeping"] = plain(facts["housekeeping"])
+                del facts["events"]  # each was printed when it came
+                print(json.dumps({"type": "status"} | facts), flush=True)
+            else:
+                console.print(view.line(status), markup=False, highlight=False, soft_wrap=True)
+
+    def on_event(event: dict[str, Any]) -> None:
+        if as_json:
+            print(json.dumps({"type": "event"} | event), flush=True)
+        elif not live:
+            text = f"{event['severity']}: {event['text']}"
+            console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    # Refreshed by on_status, so that no thread of rich's can fail unseen.
+    screen = Live(console=console, auto_refresh=False, transient=True)
+    with screen if live else contextlib.nullcontext():
+        yield on_status, on_event
+
+
 class ConsoleView:
-    """Draws statuses; keeps those of the last seconds, and one before them, to tell rates."""
+    """Draws statuses, and keeps those of the last seconds to compute data rates."""
 
     def __init__(self) -> None:
         self._history: deque[tuple[float, int, int]] = deque()
 
     def rates(self, status: Status) -> tuple[float, float] | None:
-        """Return bytes a second down and up, since the last status that is five seconds old or older.
+        """Return bytes per second down and up since the latest status at least five seconds old; None at first.
 
-        Statuses may come rarely, as where there is no terminal: then since the one before. None for the first one.
+        Where statuses come less often than that, as without a terminal, this is the status before.
         """
         now = (status.now_s, status.summary.bytes_received, status.summary.bytes_sent)
         self._history.append(now)
@@ -87,7 +131,7 @@ def link_state(status: Status) -> tuple[str, str]:
 
 
 def captured(status: Status) -> str:
-    """Return how many frames flight said it took, as text: "unknown" before its telemetry was heard."""
+    """Return how many frames the spacecraft reported to have taken; "unknown" before its first telemetry."""
     count = status.summary.frames_captured
     return "unknown" if count is None else f"{count:,}"
 
@@ -183,7 +227,7 @@ def _rows(rows: list[tuple[str, Text]]) -> Table:
 
 
 def utc(seconds: int) -> str:
-    """Return a Unix time as a time of day; anything that is none as it is."""
+    """Return a Unix time as a time of day; a number that is not a valid time in seconds."""
     try:
         return datetime.fromtimestamp(seconds, UTC).strftime("%H:%M:%SZ")
     except (ValueError, OverflowError, OSError):

@@ -23,7 +23,8 @@ from flightsw.icd.packet import (
 )
 from flightsw.icd.transfer import Incoming, Receiver, timer_s
 from ground.link import Link, open_link
-from ground.session import SessionError, SessionWriter
+from ground.session import SessionError
+from ground.session_writer import SessionWriter
 from ground.telemetry import TelemetryLog
 from ground.uplink import Uplinker, listening
 from obbgs_base.files import write_whole

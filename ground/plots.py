@@ -8,7 +8,7 @@ import plotly.graph_objects as go
 import torch
 from plotly.subplots import make_subplots
 
-from ground.reconstruct import cameras_of, sun_direction
+from ground.cameras import cameras_of, sun_direction
 from ground.session import Session
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.lighting import mean_radiance

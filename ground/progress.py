@@ -1,4 +1,4 @@
-"""A training on the screen, or in lines where there is no terminal, and how it is stopped."""
+"""Shows the progress of trainings, as bars or as lines of text, and stops them on Ctrl-C or SIGTERM."""
 
 import contextlib
 import logging
@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-if TYPE_CHECKING:  # torch takes seconds to import, and signals are obeyed before
+if TYPE_CHECKING:  # torch takes seconds to import, and signals must be handled before that
     from obbgs_core.train.trainer import StepInfo
 
-EVENTS = ("ground.reconstruct", "obbgs_core.train.trainer")  # loggers whose events are shown
+EVENTS = ("ground.reconstruct", "ground.model_files", "obbgs_core.train.trainer")  # loggers that are shown
 PLAIN_S = 10.0  # between lines where there is no terminal
 REDRAWN = 5  # steps
 
 
 @contextlib.contextmanager
 def steps_shown(console: Console) -> Iterator[Callable[[str, "StepInfo"], None]]:
-    """Give what shows the steps of trainings by their label: a bar each, or a line every ten seconds and at the end.
+    """Give a function that shows a step of a training by its label; messages of the training's log stand between.
 
-    Between them stand the events that the training tells its log.
+    On a terminal each training has a bar; elsewhere a line for its first and last step and every ten seconds.
     """
     events = _Events(console)
     for name in EVENTS:
@@ -69,7 +69,7 @@ class _Lines:
 
 
 class _Events(logging.Handler):
-    """Prints what is told at the level of information; warnings have their own way to the screen."""
+    """Prints log messages of level INFO; warnings reach the screen through the program's own handler."""
 
     def __init__(self, console: Console):
         super().__init__(logging.INFO)
@@ -81,7 +81,7 @@ class _Events(logging.Handler):
 
 
 def say(console: Console, text: str) -> None:
-    """Print a line as it is."""
+    """Print a line of plain text, without markup."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
@@ -93,28 +93,28 @@ def _state(info: "StepInfo") -> str:
 
 
 class Stop:
-    """Ctrl-C and SIGTERM as a question, `asked`, which a training answers by saving itself; a second one ends at once.
+    """Turns Ctrl-C and SIGTERM into a request to save and stop; a second signal raises KeyboardInterrupt at once.
 
-    Where nothing asks the question, before the first step and after the run, they raise KeyboardInterrupt. Imports are
-    waited for: a library that is cut off in its own comes up broken.
+    During a training a signal sets `requested`, which the training looks at after each step. Where there is nothing to
+    save it raises KeyboardInterrupt instead, but not during imports: a half-imported library would fail later.
     """
 
     def __init__(self) -> None:
-        self.asked, self._patient = False, True
+        self.requested, self._deferred = False, True
 
-    def ask(self) -> None:
-        """From here on a signal is a question."""
-        self._patient = True
+    def defer(self) -> None:
+        """From here on a signal only sets `requested`."""
+        self._deferred = True
 
-    def obey(self) -> None:
-        """From here on a signal ends the work at once, and so does one that has come already."""
-        self._patient = False
-        if self.asked:
+    def raise_at_once(self) -> None:
+        """From here on a signal raises KeyboardInterrupt, and so does one that has come already."""
+        self._deferred = False
+        if self.requested:
             raise KeyboardInterrupt
 
     @contextlib.contextmanager
     def on_signals(self) -> Iterator["Stop"]:
-        """Obey both signals until the end of the block."""
+        """Handle both signals until the end of the block."""
         before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
         for number in before:
             signal.signal(number, self._received)
@@ -125,6 +125,6 @@ class Stop:
                 signal.signal(number, handler)
 
     def _received(self, *_: object) -> None:
-        if self.asked or not self._patient:
+        if self.requested or not self._deferred:
             raise KeyboardInterrupt
-        self.asked = True
+        self.requested = True

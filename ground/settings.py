@@ -1,4 +1,4 @@
-"""What a user wishes of a training: options, `--set` and the mission file, as changes to a method's preset."""
+"""Options, `--set` and the mission file as changes to the preset of a training method."""
 
 import re
 from collections.abc import Sequence
@@ -15,10 +15,10 @@ def all_changes(
     steps: int | None,
     assignments: Sequence[str],
 ) -> dict:
-    """Return the changes to a method's preset: of the mission file, over those the options, over those `--set`.
+    """Return all changes to a method's preset; `--set` overrides the options, and both override the mission file.
 
     Raises:
-        ValueError: as in the functions below, or an option and `--set` say the same thing twice.
+        ValueError: as in the functions below, or an option and `--set` give the same setting.
     """
     by_set = set_changes(assignments)
     for name, option, given in (
@@ -33,22 +33,22 @@ def all_changes(
 def changes_for(
     method: str, quality: str | None = None, budget: str = "auto", steps: int | None = None
 ) -> dict:
-    """Return the changes to a method's preset that a user's wishes come to.
+    """Return the changes to a method's preset that the options ask for.
 
-    A budget in numbers is what happens: no number of pixels for each Gaussian takes from it.
+    A budget given as a number is used as it is: the limit by the number of lit pixels is turned off.
 
     Raises:
         ValueError: no such method or quality, or a budget that is neither `auto` nor a number.
     """
-    wished, changes = preset(method), {}
+    config, changes = preset(method), {}
     if quality is not None:
-        wished = with_quality(wished, quality)
-        changes = {name: getattr(wished, name) for name in ("steps", "max_gaussians", "start_count")}
+        config = with_quality(config, quality)
+        changes = {name: getattr(config, name) for name in ("steps", "max_gaussians", "start_count")}
     if budget != "auto":
         if not (budget.isascii() and budget.isdigit()) or int(budget) == 0:
             raise ValueError(f"--budget must be auto or a number of Gaussians, got {budget!r}")
         changes["max_gaussians"] = int(budget)
-        changes["start_count"] = min(wished.start_count, int(budget))
+        changes["start_count"] = min(config.start_count, int(budget))
         changes["pixels_per_gaussian"] = 0
     if steps is not None:
         changes["steps"] = steps
@@ -66,10 +66,10 @@ def mission_changes(section: ReconstructSection) -> dict:
 
 
 def set_changes(assignments: Sequence[str]) -> dict:
-    """Return the settings in texts such as `sun_shading=linear`; the values are YAML.
+    """Return the settings given as texts such as `sun_shading=linear`; values are YAML.
 
     Raises:
-        ConfigError: not such a text, no such setting, one given twice, or a value of the wrong type.
+        ConfigError: a text is not key=value, a setting is unknown or given twice, or a value has the wrong type.
     """
     tree: dict[str, object] = {}
     for text in assignments:
@@ -81,12 +81,12 @@ def set_changes(assignments: Sequence[str]) -> dict:
             raise ConfigError(f"--set {key}", "is given twice")
         tree[key] = parse_yaml(value.encode(), f"--set {key}")
         if isinstance(tree[key], str) and re.fullmatch(r"\s*[+-]?\d+[eE][+-]?\d+\s*", value):
-            tree[key] = float(value)  # YAML takes 2e-3, without a point, for text
+            tree[key] = float(value)  # YAML reads 2e-3, without a point, as text
     return checked_settings(tree, "--set")
 
 
 def checked_settings(tree: dict, path: str) -> dict:
-    """Return settings of a method by name, with the types that it wants.
+    """Return settings by name, converted to the types that MethodConfig declares.
 
     Raises:
         ConfigError: no such setting, or a value of the wrong type or out of its range; names its path.

@@ -1,4 +1,4 @@
-"""What a run's figures are, as rows of a table with units: for `ground` and for the demo."""
+"""A run's figures as rows of a table with units, for the command line and the demo."""
 
 from rich.table import Table
 from rich.text import Text
@@ -13,12 +13,12 @@ PSNR_LABELS = {
 REMOVED = {
     "dark_frames": "black frames",
     "removed_outliers": "stray Gaussians",
-    "removed_not_finite": "Gaussians that stopped being numbers",
+    "removed_not_finite": "Gaussians with NaN or infinite parameters",
 }
 
 
 def model_rows(metrics: dict) -> list[tuple[str, str]]:
-    """Return label and value with its unit for each figure of a model that was measured."""
+    """Return label and value with unit for each of a model's figures that was measured."""
 
     def known(key: str) -> bool:
         return metrics.get(key) is not None
@@ -31,7 +31,7 @@ def model_rows(metrics: dict) -> list[tuple[str, str]]:
             rows.append((f"PSNR of {scored_frames(metrics)}, {label}", f"{metrics[key]:.2f} dB{more}"))
     if known("chi2"):
         chi2 = metrics["chi2"]
-        rows.append(("residual chi² where the model is", f"{chi2:.2f}: {chi2_explained(chi2)}"))
+        rows.append(("residual chi²", f"{chi2:.2f}: {chi2_explained(chi2)}"))
     if known("chamfer"):
         rows.append(("Chamfer distance of the centres", f"{metrics['chamfer']:.4f} (largest dimension = 2)"))
     if known("completeness_surface"):
@@ -57,17 +57,17 @@ def model_rows(metrics: dict) -> list[tuple[str, str]]:
 
 
 def frames_row(metrics: dict) -> tuple[str, str]:
-    """Return what the frames were used for, as a row."""
+    """Return as a row how many frames came down and what they were used for."""
     counts = ("trained on", metrics["frames_trained"]), ("held out", metrics["frames_held_out"])
     used = ", ".join(f"{count:,} {what}" for what, count in counts)
     return "frames", f"{metrics['frames_received']:,} received / {frames_captured(metrics)} captured, {used}"
 
 
 def table(title: str, rows: list[tuple[str, str]]) -> Table:
-    """Return the rows as a table for a terminal."""
+    """Return rows as a table for a terminal."""
     made = Table(title=title, show_header=False)
     made.add_column(overflow="fold")
     made.add_column(overflow="fold")
     for label, value in rows:
-        made.add_row(Text(label), Text(value))  # brackets in a reason are no markup
+        made.add_row(Text(label), Text(value))  # Text: brackets in a reason are not rich's markup
     return made

@@ -17,7 +17,8 @@ from flightsw.icd.frame import Frame, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.sequencer import Shot, plan
 from ground.formats.nerf import export_nerf
-from ground.session import SessionWriter, open_session
+from ground.session import open_session
+from ground.session_writer import SessionWriter
 from ground.telemetry import FlightCounts
 from hil import truth
 from hil.choices import SensorKind

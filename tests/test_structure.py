@@ -1,4 +1,4 @@
-"""The house rules: which room may import which, no cycles, no long file, no long function. Read from the source text."""
+"""The house rules: which room may import which, no cycles, no long files, no long functions; read from the source."""
 
 import ast
 import graphlib

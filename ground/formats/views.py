@@ -14,7 +14,8 @@ from scipy.ndimage import map_coordinates
 
 from flightsw.icd.frame import Frame, PoseTag, matrix_to_quat
 from flightsw.icd.mission import CameraSection
-from ground.session import SCHEMA_VERSION, SessionError, frame_line
+from ground.session import SCHEMA_VERSION, SessionError
+from ground.session_writer import frame_line
 from obbgs_base.files import write_whole
 
 # What nobody says about a foreign picture's noise: a little of it, the same everywhere

@@ -15,8 +15,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ground.reconstruct import exposed, sensor_of, split, training_frame
+from ground.cameras import exposed, sensor_of
 from ground.session import open_session
+from ground.training_frames import split, training_frame
 from ground.truth import Truth
 from hil.sky.sensor import converted
 from obbgs_core.frames import TrainingFrame, cameras_of

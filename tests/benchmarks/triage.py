@@ -27,8 +27,10 @@ import torch
 from flightsw.icd.frame import HEADER, Frame, PoseTag
 from flightsw.store import FrameStore
 from flightsw.triage import ModelVerified, Ranked, TriageWorker, sending_order, sent_view
-from ground.reconstruct import SURFACE_POINTS, camera_of, exposed, sensor_of, split, training_frame
+from ground.cameras import camera_of, exposed, sensor_of
+from ground.model_files import SURFACE_POINTS
 from ground.session import FrameRecord, Session, open_session
+from ground.training_frames import split, training_frame
 from ground.truth import Truth
 from hil.dataset import DatasetConfig, make_dataset
 from hil.sky import spacecraft

@@ -12,7 +12,7 @@ from flightsw.icd.frame import decode_frame
 from flightsw.icd.mission import load_mission
 from flightsw.sequencer import capture
 from flightsw.store import FrameStore
-from ground.session import SessionWriter
+from ground.session_writer import SessionWriter
 from hil.cameras.virtual import CameraServer
 from hil.sky import spacecraft
 from hil.sky.blender import RenderFarm

@@ -11,8 +11,7 @@ from flightsw.icd.frame import HEADER, encode_frame
 from flightsw.icd.packet import APID_EVENTS, APID_FRAME_HEADERS, APID_HOUSEKEEPING, APID_REPORTS
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import Incoming
-from ground.cli import PLAIN_S
-from ground.console import ConsoleView, link_state, shown
+from ground.console import PLAIN_S, ConsoleView, link_state, shown
 from ground.ingest import ListenSummary, Status
 from ground.telemetry import TelemetryLog
 

@@ -23,7 +23,8 @@ from ground.formats.views import Intrinsics, View, write_session
 from ground.ingest import listen
 from ground.reconstruct import reconstruct
 from ground.report import write_report
-from ground.session import SessionCorrupt, SessionWriter, open_session
+from ground.session import SessionCorrupt, open_session
+from ground.session_writer import SessionWriter
 from ground.telemetry import FlightCounts, TelemetryLog
 from hil.links.virtual_serial import VirtualSerial
 

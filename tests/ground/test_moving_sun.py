@@ -15,11 +15,14 @@ from flightsw.errors import TriageError
 from flightsw.icd.frame import Frame, PoseTag, encode_frame, matrix_to_quat
 from flightsw.icd.mission import Mission
 from flightsw.triage import Renderer, rank_frames
+from ground.cameras import sensor_of, sun_direction
 from ground.card import model_card
 from ground.evaluate import evaluate
-from ground.reconstruct import reconstruct, sensor_of, sun_direction, training_frame
+from ground.reconstruct import reconstruct
 from ground.report import write_report
-from ground.session import SessionWriter, open_session
+from ground.session import open_session
+from ground.session_writer import SessionWriter
+from ground.training_frames import training_frame
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import Batches, TrainingFrame, sun_span_deg
 from obbgs_core.io.onnx import export_onnx
@@ -396,7 +399,7 @@ def lambertian_session(folder, mission: Mission, brackets: int) -> list[Frame]:
 
 
 def test_a_session_under_a_moving_sun_gives_outputs_that_know_it(tmp_path, small_mission, monkeypatch):
-    monkeypatch.setattr("ground.reconstruct.SURFACE_POINTS", 2_000)  # nothing is asked of the surface here
+    monkeypatch.setattr("ground.model_files.SURFACE_POINTS", 2_000)  # nothing is asked of the surface here
     frames = lambertian_session(tmp_path / "session", small_mission, 32)
     session = open_session(tmp_path / "session")
     np.testing.assert_allclose(
@@ -418,7 +421,8 @@ def test_a_session_under_a_moving_sun_gives_outputs_that_know_it(tmp_path, small
     (tmp_path / "session" / "frames.jsonl").write_text("".join(json.dumps(e) + "\n" for e in wrong))
     assert evaluate(tmp_path / "session", "run")["psnr_noisy_db"] < known - 3
     card = model_card("2026-07-21T00:00:00+00:00", metrics)
-    assert "Radiance follows Lambert's law with cast shadows, ambient 0." in card and "hold every Sun" in card
+    assert "Radiance: follows Lambert's law with cast shadows, ambient 0." in card
+    assert "hold the model for every Sun direction" in card
     older = {key: value for key, value in metrics.items() if key != "shading"} | {"sh_direction": "sun"}
     assert "on one another are not modelled" in model_card("2026-07-21T00:00:00+00:00", older)
     assert "with the sun it would gain" in write_report(tmp_path / "session", "run").read_text()

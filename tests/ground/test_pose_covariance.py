@@ -16,8 +16,8 @@ from flightsw.icd.frame import PoseTag, matrix_to_quat, quat_to_matrix
 from flightsw.icd.mission import load_mission
 from flightsw.navigation import RelativePose, SatelliteStates, interpolate, parse_state
 from flightsw.pose import navigation_tag
-from ground.reconstruct import motion_covariance, training_frame
 from ground.session import open_session
+from ground.training_frames import motion_covariance, training_frame
 from obbgs_core.model.pose_covariance import flaw
 from obbgs_core.train.poses import PoseCorrections
 

@@ -18,7 +18,9 @@ from typer.testing import CliRunner
 
 from flightsw import model_file
 from flightsw.icd.mission import ConfigError, ReconstructSection, load_mission
+from flightsw.icd.telemetry import DICTIONARY
 from ground import cli, uplink
+from ground.cli_options import ExportFormat, ImportFormat, Method, Quality, UplinkCommand
 from ground.evaluate import evaluate
 from ground.progress import Stop, steps_shown
 from ground.reconstruct import reconstruct
@@ -29,7 +31,7 @@ from ground.summary import model_rows
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged
 from obbgs_core.io.ply import load_ply
-from obbgs_core.train.presets import PRESETS
+from obbgs_core.train.presets import PRESETS, QUALITIES
 from obbgs_core.train.trainer import StepInfo
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -41,7 +43,7 @@ FILES = {"model.ply", "model.spz", "surface.ply", "model.onnx"}
 def few_surface_points():
     """A hundred thousand take seconds, and nothing here asks how good they are."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ground.reconstruct.SURFACE_POINTS", 1000)
+        patch.setattr("ground.model_files.SURFACE_POINTS", 1000)
         yield
 
 
@@ -73,7 +75,7 @@ def fail(*arguments, **named):
     ],
 )
 def test_what_cannot_be_made_of_a_model_is_named_and_the_rest_is_there(session, monkeypatch, part, missing):
-    monkeypatch.setattr(f"ground.reconstruct.{part}", fail)
+    monkeypatch.setattr(f"ground.model_files.{part}", fail)
     folder = reconstruct(session, "run", "obbgs", QUICK)
     metrics = evaluate(session, "run")
     assert metrics["missing_outputs"] == {missing: "RuntimeError: no such luck"}
@@ -98,7 +100,7 @@ def test_the_command_trains_and_ends_well_where_the_model_is_too_large_for_onnx(
 
 def test_the_limit_of_the_uplink_stops_no_model_of_the_ground_but_the_uplink(session, tmp_path, monkeypatch):
     assert uplink.MAX_MODEL_BYTES == model_file.MAX_MODEL_BYTES
-    monkeypatch.setattr("ground.reconstruct.MAX_MODEL_BYTES", 1000)
+    monkeypatch.setattr("ground.model_files.MAX_MODEL_BYTES", 1000)
     monkeypatch.setattr("ground.uplink.MAX_MODEL_BYTES", 1000)
     folder = reconstruct(session, "run", "obbgs", QUICK)
     metrics = evaluate(session, "run")
@@ -117,9 +119,9 @@ def test_a_model_that_the_disk_does_not_take_is_kept_and_written_later(session, 
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("ground.reconstruct.save_ply", full)
+        patched.setattr("ground.model_files.save_ply", full)
         with pytest.raises(
-            SessionError, match="No space left on device; the same command goes on from the training"
+            SessionError, match="No space left on device; the same command resumes from the training"
         ):
             reconstruct(session, "run", "obbgs", QUICK)
     assert [path.name for path in (session / "runs").iterdir()] == [".run.part"]
@@ -166,7 +168,7 @@ def test_a_time_limit_that_is_none_is_wrong_usage(session, monkeypatch, capsys, 
 
 def test_a_run_holds_nothing_of_an_interrupted_one_before_it(session):
     part = session / "runs" / ".run.part"
-    with pytest.raises(Interrupted, match=r"before model\.spz was made; the same command goes on"):
+    with pytest.raises(Interrupted, match=r"before model\.spz was made; the same command resumes"):
         reconstruct(
             session,
             "run",
@@ -201,7 +203,7 @@ def test_a_finished_run_is_replaced_only_when_asked_for(finished, tmp_path):
     precious = session / "runs" / "mine" / "thesis.txt"
     precious.parent.mkdir()
     precious.write_text("years")
-    with pytest.raises(SessionError, match="is no finished run: it stays as it is"):
+    with pytest.raises(SessionError, match="is not a finished run, so it is not replaced"):
         reconstruct(session, "mine", "obbgs", QUICK, overwrite=True)
     assert precious.read_text() == "years"
 
@@ -220,6 +222,55 @@ def test_runs_go_to_another_folder_and_are_scored_there(session, tmp_path):
         evaluate(session, "a", out)
 
 
+TRAINS_UNTIL_TOLD = """
+import sys
+from pathlib import Path
+from ground.reconstruct import reconstruct
+def told(progress):
+    if progress.info.step == 3:
+        print("training", flush=True)
+        sys.stdin.readline()
+reconstruct(Path(sys.argv[1]), "run", "obbgs", {quick!r}, on_progress=told)
+"""
+
+
+def test_two_processes_do_not_make_one_run_at_once(session):
+    """The second one is refused and names the first, which ends as if alone; a killed one leaves no lock behind."""
+    command = [sys.executable, "-c", TRAINS_UNTIL_TOLD.format(quick=QUICK), str(session)]
+    first = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert first.stdout is not None and first.stdout.readline() == "training\n"
+    second = subprocess.run(
+        [sys.executable, "-m", "ground.cli", "reconstruct", "--session", str(session), "--overwrite"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert second.returncode == 1 and "Traceback" not in second.stderr
+    assert f"process {first.pid} on " in second.stderr and "give another --name" in second.stderr
+    first.communicate("go on\n", timeout=120)
+    assert first.returncode == 0
+    assert {path.name for path in (session / "runs").iterdir()} == {"run"}
+    assert not (session / "runs" / "run" / "lock").exists()
+
+    shutil.rmtree(session / "runs" / "run")
+    killed = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert killed.stdout is not None and killed.stdout.readline() == "training\n"
+    killed.kill()
+    killed.communicate(timeout=60)
+    assert reconstruct(session, "run", "obbgs", QUICK).is_dir()
+
+
+def test_a_run_that_another_process_has_just_finished_is_not_replaced(session, monkeypatch):
+    """It appears between the first look at the folder and the lock: the second look sees it."""
+    reconstruct(session, "run", "obbgs", QUICK)
+    model = (session / "runs" / "run" / "model.ply").read_bytes()
+    monkeypatch.setattr("ground.reconstruct.check_replaceable", lambda *arguments: None)
+    with pytest.raises(SessionError, match="is a finished run"):
+        reconstruct(session, "run", "obbgs", QUICK, seed=1)
+    assert (session / "runs" / "run" / "model.ply").read_bytes() == model
+    assert [path.name for path in (session / "runs").iterdir()] == ["run"]
+
+
 def test_a_folder_that_cannot_be_written_to_is_named(finished, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file" / "runs", Path("/proc/runs")):
@@ -236,7 +287,7 @@ def test_a_folder_that_cannot_be_written_to_is_named(finished, tmp_path, monkeyp
     monkeypatch.setattr("ground.evaluate.write_whole", read_only)
     monkeypatch.setattr("ground.report.write_whole", read_only)
     for score in (evaluate, write_report):
-        with pytest.raises(SessionError, match=r"cannot write to .*: Read-only file system; --out DIR"):
+        with pytest.raises(SessionError, match=r"cannot write to .*: Read-only file system; use --out DIR"):
             score(finished, "run")
 
 
@@ -297,6 +348,40 @@ def test_a_mission_that_asks_for_what_is_not_there_is_refused_by_its_path(tmp_pa
     path.write_text(text[: text.index("reconstruct:")] + f"reconstruct:\n  {line}\n")
     with pytest.raises(ConfigError, match=message):
         mission_changes(load_mission(path).reconstruct)
+
+
+def test_the_choices_of_the_commands_are_those_of_the_library_and_the_dictionary():
+    assert set(Method) == set(PRESETS) and set(Quality) == set(QUALITIES)
+    assert set(UplinkCommand) == set(DICTIONARY.commands)
+    for command, choices in (
+        ("reconstruct", (*Method, *Quality)),
+        ("import", ImportFormat),
+        ("export", ExportFormat),
+        ("uplink", UplinkCommand),
+    ):
+        shown = CliRunner().invoke(cli.app, [command, "--help"], env={"COLUMNS": "300"}).stdout
+        assert all(choice in shown for choice in choices)
+
+
+@pytest.mark.parametrize(
+    ("command", "work"),
+    [
+        (["evaluate", "--session", "s"], "ground.evaluate.evaluate"),
+        (["report", "--session", "s"], "ground.report.write_report"),
+        (["import", "--format", "nerf", "--from", "d", "--session", "s"], "ground.formats.nerf.read_nerf"),
+        (["export", "--session", "s", "--out", "d"], "ground.session.open_session"),
+    ],
+)
+def test_an_interrupted_command_ends_with_one_line_and_exit_code_1(monkeypatch, capsys, command, work):
+    def interrupted(*arguments):
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(work, interrupted)
+    monkeypatch.setattr("sys.argv", ["ground", *command])
+    with pytest.raises(SystemExit) as exit_info:
+        cli.main()
+    assert exit_info.value.code == 1
+    assert capsys.readouterr().err.startswith("ground: interrupted; ")
 
 
 def test_the_methods_of_a_mission_file_are_those_of_the_ground():
@@ -362,17 +447,17 @@ def test_a_second_signal_does_not_wait_and_none_does_where_there_is_nothing_to_s
     stop = Stop()
     before = signal.getsignal(signal.SIGTERM)
     with stop.on_signals():
-        stop.obey()
+        stop.raise_at_once()
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGTERM)
-        stop.ask()
-        assert not stop.asked
+        stop.defer()
+        assert not stop.requested
         os.kill(os.getpid(), signal.SIGTERM)
-        assert stop.asked
+        assert stop.requested
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGTERM)
         with pytest.raises(KeyboardInterrupt):
-            stop.obey()
+            stop.raise_at_once()
     assert signal.getsignal(signal.SIGTERM) == before
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from flightsw.icd.frame import encode_frame
-from ground.session import MissingFrames, SessionCorrupt, SessionError, SessionWriter, open_session
+from ground.session import MissingFrames, SessionCorrupt, SessionError, open_session
+from ground.session_writer import SessionWriter
 
 
 @pytest.fixture

@@ -1,0 +1,139 @@
+"""The commands of `ground` that make, score and show a model: reconstruct, evaluate, report."""
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from flightsw.icd.mission import ReconstructSection, load_mission
+from ground.cli_options import AsJson, Method, Quality, RunName, RunsDir, SessionDir
+from ground.progress import Stop, say, steps_shown
+from ground.summary import frames_row, model_rows, table
+from obbgs_base.errors import Interrupted
+
+stderr = Console(stderr=True)
+
+
+def reconstruct_command(
+    session: SessionDir,
+    name: RunName = "run",
+    out: RunsDir = None,
+    method: Annotated[Method | None, typer.Option(help="The training method; default: obbgs.")] = None,
+    quality: Annotated[
+        Quality | None,
+        typer.Option(help="A third, all or three times the method's steps and Gaussians; default: standard."),
+    ] = None,
+    budget: Annotated[
+        str, typer.Option(help="Most Gaussians, a number; auto: limited by the number of lit pixels.")
+    ] = "auto",
+    steps: Annotated[int | None, typer.Option(min=1, help="Training steps.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="A setting of the method, key=value (YAML); can be repeated."),
+    ] = None,
+    mission: Annotated[
+        Path | None,
+        typer.Option(help="A mission file; its reconstruct section applies where no option is given."),
+    ] = None,
+    time_limit: Annotated[float, typer.Option(help="Seconds for each training.")] = math.inf,
+    seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same model; default: 7.")] = None,
+    blind_reference: Annotated[
+        bool, typer.Option(help="Train a second time without exposure times, for comparison.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option(help="Replace a finished run of the same name.")] = False,
+    threads: Annotated[int | None, typer.Option(min=1, help="Processor cores; default: all.")] = None,
+    json_: AsJson = False,
+) -> None:
+    """Train a model on a session, export it, score it and write its report.
+
+    Ctrl-C and SIGTERM save the training and end with exit code 1; the same command resumes it, also after a kill.
+
+    Example: ground reconstruct --session pass-12 --name first --time-limit 120 --set sun_shading=linear
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning threads slow each other down
+    stop, folder = Stop(), None
+    try:
+        with stop.on_signals(), steps_shown(stderr) as show:
+            import torch
+
+            from ground.evaluate import evaluate
+            from ground.reconstruct import Progress, reconstruct
+            from ground.report import write_report
+            from ground.settings import all_changes
+
+            section = load_mission(mission).reconstruct if mission else ReconstructSection()
+            chosen = method.value if method else section.method
+            changes = all_changes(section, chosen, quality, budget, steps, settings or [])
+            torch.set_num_threads(threads or os.cpu_count() or 1)
+            stop.raise_at_once()
+
+            def on_progress(progress: Progress) -> None:
+                stop.defer()
+                show(progress.label, progress.info)
+
+            say(stderr, f"reading the frames of {session}")
+            folder = reconstruct(
+                session,
+                name,
+                chosen,
+                changes,
+                section.seed if seed is None else seed,
+                time_limit,
+                blind_reference,
+                on_progress,
+                out,
+                overwrite,
+                lambda: stop.requested,
+            )
+            stop.raise_at_once()
+            say(stderr, "scoring the model and writing its report")
+            metrics = evaluate(session, name, out)
+            report = write_report(session, name, out)
+    except KeyboardInterrupt as error:
+        raise Interrupted(_interrupted(folder)) from error
+    _print_metrics(metrics, json_)
+    if not json_:
+        print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}\nreport: {report}")
+
+
+def evaluate_command(
+    session: SessionDir, name: RunName = "run", out: RunsDir = None, json_: AsJson = False
+) -> None:
+    """Score a finished run against its held-out frames, and against the truth if a simulator left one.
+
+    Example: ground evaluate --session demo/session --name demo --json
+    """
+    from ground.evaluate import evaluate
+
+    _print_metrics(evaluate(session, name, out), json_)
+
+
+def report_command(
+    session: SessionDir, name: RunName = "run", out: RunsDir = None, json_: AsJson = False
+) -> None:
+    """Write the report of a finished run again, report.html in its folder.
+
+    Example: ground report --session demo/session --name demo
+    """
+    from ground.report import write_report
+
+    path = write_report(session, name, out)
+    print(json.dumps({"report": str(path)}) if json_ else path)
+
+
+def _interrupted(folder: Path | None) -> str:
+    """Return what an interruption left; `folder` is that of the run if it was finished."""
+    if folder is None:
+        return "interrupted; the same command resumes from the last checkpoint, if there is one"
+    return f"interrupted; the run is finished in {folder}: `ground evaluate` and `ground report` score it"
+
+
+def _print_metrics(metrics: dict, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(metrics))
+        return
+    Console().print(table("The model", [frames_row(metrics), *model_rows(metrics)]))

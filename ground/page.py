@@ -1,0 +1,114 @@
+"""Building blocks of a report's page: its style, sections, tables, and figures embedded in the one file."""
+
+import base64
+import html
+from collections.abc import Iterable
+
+import imagecodecs
+import numpy as np
+import plotly.graph_objects as go
+import plotly.io
+import yaml
+from plotly.offline import get_plotlyjs
+
+from ground.plots import INK
+
+STYLE = """
+:root { --ink: #1c2733; --soft: #5b6b7b; --line: #dde3ea; --card: #ffffff; }
+* { box-sizing: border-box; }
+body { margin: 0; background: #f3f5f8; color: var(--ink); font: 15px/1.55 system-ui, "Segoe UI", Roboto, sans-serif; }
+main { max-width: 1120px; margin: 0 auto; padding: 28px 24px 60px; }
+h1 { font-size: 26px; margin: 0 0 4px; } h2 { font-size: 19px; margin: 0 0 10px; }
+section { background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 20px 22px;
+  margin-top: 20px; }
+p.note { color: var(--soft); margin: 4px 0 14px; font-size: 13.5px; }
+.cards { display: grid; grid-template-columns: repeat(4, 1fr); gap: 12px; }
+.card { border: 1px solid var(--line); border-radius: 8px; padding: 12px 14px; }
+.card b { display: block; font-size: 23px; font-variant-numeric: tabular-nums; }
+.card span { color: var(--soft); font-size: 13px; }
+table { border-collapse: collapse; width: 100%; font-size: 14px; }
+td, th { text-align: left; padding: 5px 10px; border-bottom: 1px solid var(--line); vertical-align: top; }
+td.n { text-align: right; font-variant-numeric: tabular-nums; }
+.grid { display: grid; gap: 6px; }
+.grid img { width: 100%; display: block; background: #000; border-radius: 3px; image-rendering: pixelated; }
+.grid .label { color: var(--soft); font-size: 13px; align-self: center; }
+.grid figure { margin: 0; } .grid figcaption { color: var(--soft); font-size: 12px; text-align: center; }
+h3 { font-size: 15px; margin: 18px 0 8px; }
+.two { display: grid; grid-template-columns: 1fr 1fr; gap: 8px 32px; align-items: start; }
+.ramp { display: inline-block; width: 90px; height: 10px; border-radius: 3px; margin: 0 6px;
+  border: 1px solid var(--line); background: linear-gradient(90deg, #000, #f00, #ff0, #fff); }
+ul.notes { background: #fff7e6; border: 1px solid #f0d9a8; border-radius: 8px; margin: 0 0 14px;
+  padding: 10px 14px 10px 30px; }
+pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px; overflow-x: auto; margin: 0 0 12px; }
+"""
+
+
+def page(title: str, subtitle: str, sections: Iterable[str]) -> str:
+    """Return the whole page; title and subtitle are plain text, sections HTML."""
+    title = html.escape(title)
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style>'
+        f"<script>{get_plotlyjs()}</script></head><body><main><h1>{title}</h1>"
+        f'<p class="note">{html.escape(subtitle)}</p>{"".join(sections)}</main></body></html>'
+    )
+
+
+def section(title: str, note: str, body: str) -> str:
+    """Return a section with a note under its title that says how to read it."""
+    return f'<section><h2>{title}</h2><p class="note">{note}</p>{body}</section>'
+
+
+def cards(entries: Iterable[tuple[str, str]]) -> str:
+    """Return figures in large type, each with a sentence of what it means."""
+    body = "".join(f'<div class="card"><b>{value}</b><span>{label}</span></div>' for value, label in entries)
+    return f'<div class="cards">{body}</div>'
+
+
+def two_tables(rows: list[tuple[str, str]]) -> str:
+    """Return rows of label and value as two tables side by side, read down the left one first."""
+    half = (len(rows) + 1) // 2
+    return f'<div class="two">{_table(rows[:half])}{_table(rows[half:])}</div>'
+
+
+def _table(rows: Iterable[tuple[str, str]]) -> str:
+    cells = "".join(
+        f'<tr><td>{html.escape(label)}</td><td class="n">{value}</td></tr>' for label, value in rows
+    )
+    return f"<table>{cells}</table>"
+
+
+def grid(columns: str, cells: list[str]) -> str:
+    """Return cells in rows; `columns` are the widths as CSS has them."""
+    return f'<div class="grid" style="grid-template-columns: {columns}">{"".join(cells)}</div>'
+
+
+def label(text: str) -> str:
+    """Return a cell of a grid with text."""
+    return f'<div class="label">{text}</div>'
+
+
+def picture(image: np.ndarray, alt: str, caption: str) -> str:
+    """Return an image of bytes [H, W, 3] with a caption, embedded as PNG."""
+    png = imagecodecs.png_encode(np.ascontiguousarray(image), level=9)
+    source = "data:image/png;base64," + base64.b64encode(bytes(png)).decode()
+    return f'<figure><img alt="{alt}" src="{source}"><figcaption>{caption}</figcaption></figure>'
+
+
+def plot(figure: go.Figure) -> str:
+    """Return an interactive figure; the page holds Plotly itself."""
+    figure.update_layout(template="plotly_white", font={"family": "system-ui, sans-serif", "color": INK})
+    return plotly.io.to_html(
+        figure,
+        full_html=False,
+        include_plotlyjs=False,
+        config={"displaylogo": False, "displayModeBar": False},
+    )
+
+
+def as_yaml(tree: dict) -> str:
+    """Return settings as a block of YAML."""
+    text = yaml.safe_dump(
+        tree, sort_keys=False, default_flow_style=None if "method" in tree else False, width=80
+    )
+    return f"<pre>{html.escape(text)}</pre>"

@@ -1,0 +1,109 @@
+"""What a run records of itself: figures in metrics.json, steps in metrics.jsonl, and config.yaml to repeat it."""
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import math
+import platform
+from pathlib import Path
+
+import torch
+import yaml
+
+from ground.cameras import median_sun_direction
+from ground.model_files import exposure_times_s
+from ground.session import FrameRecord, Session
+from obbgs_core.render import native_kernels
+from obbgs_core.train.presets import MethodConfig
+from obbgs_core.train.trainer import TrainResult
+
+LOG_EVERY = 10  # steps
+PACKAGES = ("obbgs", "torch", "numpy", "onnxruntime", "plotly")
+
+
+def training_metrics(
+    result: TrainResult,
+    blind: TrainResult | None,
+    session: Session,
+    training: list[FrameRecord],
+    held_out: list[FrameRecord],
+) -> dict:
+    """Return how a run's trainings went, for metrics.json; `blind` is the training that ignored exposure times."""
+    sun_dir = median_sun_direction(training)
+    chi2 = result.history[-1].chi2 if result.history else math.nan
+    metrics = {
+        "method": result.config.name,
+        "gaussians": len(result.gaussians),
+        "max_gaussians": result.config.max_gaussians,
+        "budget": result.budget,
+        "sh_degree": math.isqrt(result.gaussians.sh.shape[1]) - 1,
+        "shading": result.gaussians.shading,
+        "appearance": result.appearance,
+        "growth": result.growth,
+        "poses": result.poses,
+        "exposures": result.exposures,
+        "sun_span_deg": round(result.sun_span_deg, 2),
+        "shown_under_sun_dir_body": None if sun_dir is None else [round(x, 6) for x in sun_dir.tolist()],
+        "train_seconds": round(result.seconds, 3),
+        "train_steps": len(result.history),
+        "stop_reason": result.stop_reason,
+        "start": result.start,
+        "removed_outliers": result.removed_outliers,
+        "removed_not_finite": result.removed_not_finite,
+        "dark_frames": result.dark_frames,
+        "chi2": None if math.isnan(chi2) else chi2,
+        "frames_received": len(session.frames),
+        "frames_captured": session.frames_captured,  # null: flight did not say
+        "frames_trained": len(training),
+        "frames_held_out": len(held_out),
+        "exposures_s": exposure_times_s(training),
+        "bytes_received": session.bytes_received,
+        "session_created_utc": session.created_utc,
+        "reference_exposure_s": result.reference_exposure_s,
+    }
+    if blind is not None:
+        metrics |= {
+            "blind_gaussians": len(blind.gaussians),
+            "blind_budget": blind.budget,
+            "blind_removed_not_finite": blind.removed_not_finite,
+            "blind_train_seconds": round(blind.seconds, 3),
+            "blind_reference_exposure_s": blind.reference_exposure_s,
+        }
+    return metrics
+
+
+def write_history(results: dict[str, TrainResult | None], path: Path) -> None:
+    """Write every tenth step of each training, and its last, as a line of JSON."""
+    with open(path, "w") as lines:
+        for label, result in results.items():
+            for info in result.history if result is not None else []:
+                if info.step % LOG_EVERY == 0 or info.step == info.steps:
+                    line = {"training": label, **dataclasses.asdict(info)}
+                    lines.write(json.dumps({k: None if v != v else v for k, v in line.items()}) + "\n")
+
+
+def write_config(session: Session, config: MethodConfig, seed: int, path: Path) -> None:
+    """Write everything needed to repeat a run: settings, seed, digests of its input, versions, machine."""
+    frames = (session.path / "frames.jsonl").read_bytes()
+    versions = {name: importlib.metadata.version(name) for name in PACKAGES}
+    kernels = native_kernels()
+    tree = {
+        "method": {k: _plain(v) for k, v in dataclasses.asdict(config).items()},
+        "seed": seed,
+        "threads": torch.get_num_threads(),
+        "rasterizer": f"native {kernels[0]}" if kernels else "reference",
+        "session": {
+            "mission_sha256": session.mission_sha256,
+            "frames_jsonl_sha256": hashlib.sha256(frames).hexdigest(),
+            "created_utc": session.created_utc,
+        },
+        "versions": {"python": platform.python_version(), **versions},
+        "machine": platform.machine(),
+    }
+    path.write_text(yaml.safe_dump(tree, sort_keys=False))
+
+
+def _plain(value):
+    """Return tuples as lists, which YAML can write."""
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value

@@ -1,0 +1,172 @@
+"""Writes a session frame by frame, so that a power cut at any moment leaves a session that opens again."""
+
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import imagecodecs
+
+from flightsw.icd.frame import Frame
+from flightsw.icd.mission import Mission
+from ground.session import (
+    SCHEMA_VERSION,
+    SessionCorrupt,
+    SessionError,
+    flight_counts,
+    read_header,
+    read_records,
+)
+from ground.telemetry import FlightCounts
+from obbgs_base.files import write_whole
+
+
+class SessionWriter:
+    """Adds frames to a session folder: a new one, or one that an earlier run began.
+
+    Raises:
+        SessionError: the folder holds a session of another mission or schema version, or cannot be written.
+        SessionCorrupt: its files are damaged in another way than an unfinished last line.
+    """
+
+    def __init__(self, folder: str | Path, mission: Mission):
+        self.folder = Path(folder)
+        self._mission = mission
+        self._frames_file = self.folder / "frames.jsonl"
+        self._losses_before: dict[str, int] = {}
+        self._bytes_before = 0
+        self.flight: FlightCounts | None = None  # as in session.json
+        self._created_utc = datetime.now(UTC).isoformat(timespec="seconds")
+        try:
+            (self.folder / "frames").mkdir(parents=True, exist_ok=True)
+            if (self.folder / "session.json").exists():
+                self._continue()
+            self._sha256_of = {record.id: record.sha256 for record in read_records(self.folder)}
+            self._cut_unfinished_line()
+            self.save({}, 0)
+        except OSError as error:
+            raise SessionError(f"cannot write the session {self.folder}: {error}") from error
+
+    @property
+    def frame_count(self) -> int:
+        return len(self._sha256_of)
+
+    @property
+    def last_frame_id(self) -> int:
+        """The highest frame number; -1 without frames."""
+        return max(self._sha256_of, default=-1)
+
+    def add(self, frame: Frame, container: bytes) -> bool:
+        """Write a frame's picture and line, and return True; return False if the session already holds this very frame.
+
+        Args:
+            container: the frame as received; its SHA-256 tells whether two frames are the same.
+
+        Raises:
+            SessionError: the session holds another frame of this number, or the picture is not of the camera's size.
+            OSError: writing failed; the frame is not in the session.
+        """
+        sha256 = hashlib.sha256(container).hexdigest()
+        known = self._sha256_of.get(frame.frame_id)
+        if known is not None:
+            if known != sha256:
+                raise SessionError(f"another frame {frame.frame_id} is in the session already")
+            return False
+        camera = self._mission.camera
+        shape = (camera.height, camera.width) + ((3,) if camera.channels == 3 else ())
+        if frame.dn.shape != shape:
+            raise SessionError(
+                f"frame {frame.frame_id} has shape {frame.dn.shape}, the mission's camera {shape}"
+            )
+        name = f"frames/{frame.frame_id:06d}.png"
+        write_whole(self.folder / name, bytes(imagecodecs.png_encode(frame.dn, level=1)))
+        line = json.dumps(frame_line(frame, name, sha256), allow_nan=False).encode() + b"\n"
+        before_bytes = self._frames_file.stat().st_size if self._frames_file.exists() else 0
+        try:
+            with open(self._frames_file, "ab") as file:
+                file.write(line)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError:
+            if self._frames_file.exists():  # after half a line, the next one would be damaged too
+                os.truncate(self._frames_file, before_bytes)
+            raise
+        self._sha256_of[frame.frame_id] = sha256
+        return True
+
+    def save(
+        self, losses: Mapping[str, int], bytes_received: int, flight: FlightCounts | None = None
+    ) -> None:
+        """Write session.json.
+
+        `losses` and `bytes_received` are counts of this run and added to those of earlier runs; `flight` replaces the
+        earlier value, unless it is None.
+        """
+        self.flight = flight or self.flight
+        total = dict(self._losses_before)
+        for name, count in losses.items():
+            total[name] = total.get(name, 0) + count
+        header = {
+            "schema_version": SCHEMA_VERSION,
+            "mission_sha256": self._mission.sha256,
+            "camera": dataclasses.asdict(self._mission.camera),
+            "tles": {
+                "target": list(self._mission.orbit.target_tle),
+                "chaser": list(self._mission.orbit.chaser_tle),
+            },
+            "losses": total,
+            "flight": dataclasses.asdict(self.flight) if self.flight else None,
+            "frames_received": self.frame_count,
+            "bytes_received": self._bytes_before + bytes_received,
+            "created_utc": self._created_utc,
+        }
+        write_whole(self.folder / "session.json", json.dumps(header, indent=2).encode() + b"\n")
+
+    def _continue(self) -> None:
+        header = read_header(self.folder)
+        if header.get("mission_sha256") != self._mission.sha256:
+            raise SessionError(
+                f"{self.folder} belongs to another mission file; choose another session folder"
+            )
+        try:
+            self._losses_before = {str(name): int(count) for name, count in header["losses"].items()}
+            self._bytes_before = int(header["bytes_received"])
+            self._created_utc = str(header["created_utc"])
+            self.flight = flight_counts(header)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise SessionCorrupt(f"{self.folder / 'session.json'}: {error}") from error
+
+    def _cut_unfinished_line(self) -> None:
+        if self._frames_file.exists():
+            content = self._frames_file.read_bytes()
+            whole_bytes = content.rfind(b"\n") + 1
+            if whole_bytes < len(content):
+                os.truncate(self._frames_file, whole_bytes)
+
+
+def frame_line(frame: Frame, file: str, sha256: str) -> dict[str, Any]:
+    """Return a frame's line of frames.jsonl."""
+    pose = frame.pose
+    return {
+        "id": frame.frame_id,
+        "bracket": frame.bracket_id,
+        "bracket_index": frame.bracket_index,
+        "exposure_time_s": frame.exposure_time_s,
+        "mid_exposure_utc_ns": frame.mid_exposure_utc_ns,
+        "world_to_camera": pose.world_to_camera.tolist(),
+        "quat_body_to_camera": pose.quat_body_to_camera.tolist(),
+        "position_body_m": pose.position_body_m.tolist(),
+        "covariance": pose.covariance.tolist(),
+        "sun_dir_body": pose.sun_dir_body.tolist(),
+        "in_eclipse": pose.in_eclipse,
+        "pose_valid": pose.valid,
+        "saturated": frame.saturated_count,
+        "file": file,
+        "sha256": sha256,
+        "bit_depth": frame.bit_depth,
+        "black_dn": frame.black_dn,
+    }

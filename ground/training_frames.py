@@ -1,0 +1,81 @@
+"""From a session's frames to those of a training: which are used, which are held out for testing, in what form."""
+
+import logging
+
+import numpy as np
+import torch
+
+from ground.cameras import sun_direction
+from ground.session import FrameRecord, Session, SessionError
+from obbgs_core.frames import TrainingFrame
+
+log = logging.getLogger(__name__)
+TEST_INTERVAL = 8  # every eighth bracket is held out
+
+
+def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
+    """Return the training frames and the held-out test frames of a session.
+
+    Every eighth bracket is held out as a whole; of 2 to 7 brackets the last one; a single bracket is all for training.
+    Frames in eclipse and frames whose pose is not valid are in neither list.
+
+    Raises:
+        SessionError: no frame is left.
+    """
+    usable = [r for r in session.frames if r.pose_valid and not r.in_eclipse]
+    if not usable:
+        eclipsed = sum(r.in_eclipse for r in session.frames)
+        raise SessionError(
+            f"none of the {len(session.frames)} frames can be used: {eclipsed} in eclipse, the others without a valid "
+            "pose"
+        )
+    if len(usable) < len(session.frames):
+        log.warning(
+            "%d frames are left out: in eclipse, or without a valid pose", len(session.frames) - len(usable)
+        )
+    brackets = sorted({r.bracket for r in usable})
+    chosen = set(brackets[TEST_INTERVAL - 1 :: TEST_INTERVAL])
+    if not chosen and len(brackets) > 1:
+        chosen = {brackets[-1]}
+    return [r for r in usable if r.bracket not in chosen], [r for r in usable if r.bracket in chosen]
+
+
+def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
+    """Return a frame with its picture, pose and calibration in the library's form.
+
+    Raises:
+        MissingFrames, SessionCorrupt: its picture cannot be read.
+    """
+    dn = session.dn(record).astype(np.float32)
+    return TrainingFrame(
+        dn=torch.from_numpy(dn.reshape(*dn.shape[:2], session.camera.channels)),
+        exposure_time_s=record.exposure_time_s,
+        world_to_camera=torch.tensor(record.world_to_camera, dtype=torch.float32),
+        K=torch.tensor(session.camera.K),
+        id=record.id,
+        bracket=record.bracket,
+        pose_covariance=torch.from_numpy(
+            motion_covariance(record.covariance, record.world_to_camera[:3, :3])
+        ),
+        sun_dir=sun_direction(record),
+    )
+
+
+def motion_covariance(tag_covariance: np.ndarray, body_to_camera: np.ndarray) -> np.ndarray:
+    """Return the covariance [6, 6] of the correcting motion that turns a tagged pose into the true one.
+
+    The motion multiplies world_to_camera from the left: a rotation vector (rad), then a shift (m), both along the
+    camera's axes. `tag_covariance` is of the tag's errors: tagged minus true position dp (m, body), and the rotation
+    vector a (rad, camera) in R_tag = exp(a) R_true. As t = -R p, the motion is the rotation -a and the shift
+    t_true - exp(-a) t_tag = R_true dp, to first order R_tag dp. The rotation is about the camera's centre and does not
+    move it, so no term that grows with the range couples rotation and shift. The two have opposite signs, which also
+    changes the sign of the correlation between position and rotation.
+
+    Args:
+        tag_covariance: [6, 6], position (m, body), then rotation vector (rad, camera).
+        body_to_camera: rotation matrix [3, 3] of the tagged pose.
+    """
+    motion_by_tag = np.zeros((6, 6))
+    motion_by_tag[:3, 3:] = -np.eye(3)
+    motion_by_tag[3:, :3] = body_to_camera
+    return motion_by_tag @ tag_covariance @ motion_by_tag.T
