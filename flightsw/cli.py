@@ -24,8 +24,9 @@ from flightsw.commands import ReplayCounter
 from flightsw.downlink import DownlinkProgress, run_downlink
 from flightsw.errors import CaptureError
 from flightsw.fsck import fsck
+from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.icd.mission import BracketSection, ConfigError, Mission, load_mission
-from flightsw.link import Link, open_link
+from flightsw.ports import Link, open_link
 from flightsw.sequencer import CaptureCounts, capture, plan
 from flightsw.settings import load_settings
 from flightsw.store import FrameStore, open_store
@@ -266,7 +267,7 @@ def _run(
             counter = ReplayCounter(key_file) if key_file is not None else None
             if counter is not None:
                 opened.callback(counter.close)
-            link = opened.enter_context(open_link(link_url))
+            link = opened.enter_context(open_link(link_url, FLIGHT_SIDE))
         if camera_url is not None:
             try:
                 camera = ReconnectingCamera(open_camera(camera_url, mission.camera), stop.wait)

@@ -31,7 +31,7 @@ from flightsw.icd.packet import (
 )
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import UPLINK, Receiver, Sender, timer_s
-from flightsw.link import Link
+from flightsw.ports import Link
 from flightsw.settings import Settings
 from flightsw.store import FrameStore
 from flightsw.triage import ModelVerified, Ranked, TriageWorker, sending_order, sent_view

@@ -289,9 +289,9 @@ def test_an_outbox_that_stays_unreadable_ends_with_the_stores_error(store, small
 def test_a_dead_downlink_is_no_success_of_the_program(tmp_path, small_mission):
     """`flightsw downlink` as a process whose port driver has a defect."""
     code = """
-import sys, flightsw.downlink, flightsw.link
+import sys, flightsw.downlink, flightsw.ports
 def exchange(self, timeout_s): raise ZeroDivisionError("a defect")
-flightsw.link.SerialLink.exchange = exchange
+flightsw.ports.SerialLink.exchange = exchange
 flightsw.downlink.RESTART_S = 0.0
 from flightsw.cli import main
 main()

@@ -229,10 +229,11 @@ def test_a_camera_that_never_comes_back_is_two_lines_a_summary_and_a_failure(tmp
 
 def test_the_ground_is_told_that_the_camera_is_lost(tmp_path, small_mission):
     """In the housekeeping packets of `flightsw capture --link`, while it is tried again and after it was given up."""
+    from flightsw.icd.can import GROUND_SIDE
     from flightsw.icd.framing import PacketStream
     from flightsw.icd.packet import APID_EVENTS, APID_HOUSEKEEPING, TELECOMMAND
     from flightsw.icd.telemetry import DICTIONARY
-    from flightsw.link import open_link
+    from flightsw.ports import open_link
     from hil.links.virtual_link import VirtualSerial
 
     path = tmp_path / "small.yaml"
@@ -241,7 +242,7 @@ def test_the_ground_is_told_that_the_camera_is_lost(tmp_path, small_mission):
     with (
         camera_process(tmp_path, limit=2),
         VirtualSerial(921_600) as line,
-        open_link(line.ground_url) as ground,
+        open_link(line.ground_url, GROUND_SIDE) as ground,
     ):
         process = start_capture(tmp_path, "--link", line.flight_url, patience_s=1.0)
         for _ in itertools.count():
