@@ -25,7 +25,8 @@ from flightsw.downlink import DownlinkProgress, run_downlink
 from flightsw.errors import CaptureError
 from flightsw.fsck import fsck
 from flightsw.icd.can import FLIGHT_SIDE
-from flightsw.icd.mission import BracketSection, ConfigError, Mission, load_mission
+from flightsw.icd.config import ConfigError
+from flightsw.icd.mission import BracketSection, Mission, load_mission
 from flightsw.ports import Link, open_link
 from flightsw.sequencer import CaptureCounts, capture, plan
 from flightsw.settings import load_settings

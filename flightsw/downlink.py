@@ -339,7 +339,7 @@ class _Downlink:
             "mode": "safe" if settings.safe_mode else "normal",
             "camera": "none",
             "exposure_times_ms": bracket.exposure_times_ms,
-            "near": settings.near,
+            "near": settings.max_error_dn,
             "priority": settings.priority,
             "model": (self._model_sha256 or bytes(4))[:4],
             "frames_stored": frames_stored,

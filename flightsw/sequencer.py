@@ -108,8 +108,9 @@ def capture(
                     break
                 try:
                     frame = expose(mission, camera, shot, store.next_frame_id, tagger)
-                    near = commanded.near if commanded else 0
-                    store.put(frame, near=near, roi_mask=region_of_interest(frame.dn, mission))
+                    max_error_dn = commanded.max_error_dn if commanded else 0
+                    roi_mask = region_of_interest(frame.dn, mission)
+                    store.put(frame, max_error_dn=max_error_dn, roi_mask=roi_mask)
                 except StoreFull as error:
                     counts.refused += 1
                     log.warning("%s", error)

@@ -11,8 +11,9 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from flightsw.icd.frame import PoseTag, matrix_to_quat, quat_to_matrix
+from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, NavigationSection, PoseSection, TargetAttitudeSection
+from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.orbit import propagate
 from flightsw.pose import look_along, pose_tag, target_attitude
 from hil.world.scenario import Scenario, Sky, load_scenario

@@ -12,9 +12,9 @@ import pytest
 from isotp import CanMessage
 
 from flightsw.icd.can import FLIGHT_SIDE, GROUND_SIDE, format_slcan
+from flightsw.icd.config import ConfigError
 from flightsw.icd.framing import frame_packet
 from flightsw.icd.link_url import LinkUrl, parse_link_url
-from flightsw.icd.mission import ConfigError
 from flightsw.ports import LinkError, SlcanLink, open_link
 from flightsw.ports.slcan import SILENT_S
 

@@ -19,8 +19,9 @@ from flightsw.cli import app
 from flightsw.downlink import run_downlink
 from flightsw.errors import TriageError
 from flightsw.icd.can import FLIGHT_SIDE
-from flightsw.icd.frame import HEADER, Frame, PoseTag, encode_frame, quat_to_matrix
+from flightsw.icd.frame import HEADER, Frame, PoseTag, encode_frame
 from flightsw.icd.mission import load_mission
+from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.model_file import MAX_MODEL_BYTES, verified_model
 from flightsw.ports import open_link
 from flightsw.settings import Settings, save_settings
