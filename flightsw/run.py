@@ -147,7 +147,9 @@ def _capture(
     on_counts: Callable[[CaptureCounts], None],
 ) -> CaptureCounts:
     def wait_until(utc_ns: int) -> None:
-        while camera.waits and not stop.is_set() and (left_s := (utc_ns - time.time_ns()) / 1e9) > 0:
+        while (
+            not camera.has_own_clock and not stop.is_set() and (left_s := (utc_ns - time.time_ns()) / 1e9) > 0
+        ):
             camera.reconnect()
             stop.wait(min(left_s, RETRY_S) if camera.lost else left_s)
 

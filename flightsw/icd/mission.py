@@ -1,4 +1,4 @@
-"""The mission file: one YAML read by flight, ground and simulator, checked key by key."""
+"""The mission file: one YAML read by every part, checked key by key."""
 
 import hashlib
 import math

@@ -45,7 +45,7 @@ FillPattern = ctypes.CFUNCTYPE(
 class GigeCameraServer:
     """A GigE Vision camera at 127.0.0.1 until closed; `url` is what `flightsw --camera` takes.
 
-    A software trigger exposes at the time in the feature SimulatedStartUtcNs, or at the simulated time of now, which
+    A software trigger exposes at the time in the feature ExposureStartUtcNs, or at the simulated time of now, which
     runs from the mission's start in real time or `real_time` times as fast. Without a trigger the camera runs free at
     its frame rate. LateFrameCount counts what was not ready in time: free running, such a frame is left out; with a
     real-time factor a triggered one comes late. Pictures carry the simulated time of the shutter.
