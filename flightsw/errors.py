@@ -32,7 +32,7 @@ class NavigationError(FlightError):
 
 
 class DownlinkError(FlightError):
-    """The downlink failed again and again, each time for a reason that nobody foresaw."""
+    """The downlink failed several times in a row with errors that are not ours."""
 
 
 class TriageError(FlightError):

@@ -1,4 +1,4 @@
-"""The crash-safe frame store: a frame is there whole or not at all, its number is never used twice."""
+"""The crash-safe frame store: a frame is stored whole or not at all, and its number is never used twice."""
 
 import contextlib
 import errno
