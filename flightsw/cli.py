@@ -1,14 +1,11 @@
 """flightsw: capture, downlink, serve, triage, plan, fsck."""
 
-import contextlib
 import dataclasses
 import json
 import logging
 import math
 import signal
 import threading
-import time
-from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,23 +15,17 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from flightsw.cameras import open_camera
-from flightsw.cameras.reconnecting import RETRY_S, ReconnectingCamera
-from flightsw.commands import ReplayCounter
-from flightsw.downlink import DownlinkProgress, run_downlink
-from flightsw.errors import CaptureError
+from flightsw.downlink import DownlinkProgress
 from flightsw.fsck import fsck
-from flightsw.icd.mission import BracketSection, ConfigError, Mission, load_mission
-from flightsw.link import Link, open_link
-from flightsw.sequencer import CaptureCounts, capture, plan
-from flightsw.settings import load_settings
-from flightsw.store import FrameStore, open_store
+from flightsw.icd.config import ConfigError
+from flightsw.icd.mission import BracketSection, Mission, load_mission
+from flightsw.run import RunResult, run_pass
+from flightsw.sequencer import plan
 from obbgs_base.command_line import new_app, run
 
 log = logging.getLogger(__name__)
 app = new_app("The flight side: what flies.")
 stderr = Console(stderr=True)
-LINGER_S = 0.5  # after the last delivery
 START_NOW_S = 2.0  # from the command to the first trigger of --start now: a camera takes a second to open
 
 MissionFile = Annotated[Path, typer.Option("--mission", help="The mission file.")]
@@ -73,7 +64,8 @@ def capture_command(
 ) -> None:
     """Take exposure brackets, tag and store them; started again, it takes what the store does not hold.
 
-    A simulated camera lives in the mission's time. A real one waits for each exposure's time: --start now on a bench.
+    A camera with a clock of its own takes each exposure at once. With any other one flightsw waits for the time of each
+    exposure: give --start now on a bench.
 
     Example: flightsw capture --bracket 0.05,0.1,0.2 --count 40 --camera hil:///tmp/camera.sock --store store
     """
@@ -251,205 +243,55 @@ def _run(
     as_json: bool,
     key_file: Path | None = None,
 ) -> None:
-    """Capture and downlink side by side, whichever are asked for; print what became of every frame.
-
-    Key, link and camera come before the store: wrong ones leave none behind.
-    """
+    """Capture and send, whichever are asked for, with a bar for each; print what became of every frame."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     signal.signal(signal.SIGINT, lambda *_: stop.set())
-    captured = CaptureCounts()
-    sent = DownlinkProgress()
-    with contextlib.ExitStack() as opened, _progress() as progress:
-        counter = link = camera = no_camera = None
-        if link_url is not None:
-            counter = ReplayCounter(key_file) if key_file is not None else None
-            if counter is not None:
-                opened.callback(counter.close)
-            link = opened.enter_context(open_link(link_url))
-        if camera_url is not None:
-            try:
-                camera = ReconnectingCamera(open_camera(camera_url, mission.camera), stop.wait)
-                opened.callback(camera.close)
-            except CaptureError as error:
-                if link is None:
-                    raise
-                no_camera = error  # what is stored goes down all the same
-        store = open_store(store_dir, mission)
-        capturing = threading.Event()
-        thread = None
-        if link is not None:
-            task = progress.add_task("sent", total=None)
+    shots = len(list(plan(mission))) if camera_url is not None else None
+    with _progress() as progress:
+        sent_bar = progress.add_task("sent", total=None, visible=link_url is not None)
+        captured_bar = progress.add_task("captured", total=shots, visible=False)
 
-            def report_sent(now: DownlinkProgress) -> None:
-                progress.update(task, completed=now.delivered, total=now.delivered + now.waiting)
+        def show_sent(now: DownlinkProgress) -> None:
+            progress.update(sent_bar, completed=now.delivered, total=now.delivered + now.waiting)
 
-            if camera_url is not None:
-                capturing.set()
-            thread = _Downlink(
-                FrameStore(store_dir),
-                link,
-                mission,
-                counter,
-                exit_when_empty,
-                capturing,
-                stop,
-                report_sent,
-                camera,
-            )
-            thread.start()
-        try:
-            if no_camera is not None:
-                raise no_camera
-            if camera is not None:
-                shots = len(list(plan(mission)))
-                note = thread.note_capture if thread is not None else lambda counts: None
-                captured = _capture(mission, camera, store, progress, shots, stop, note)
-        except Exception as error:
-            if thread is not None:  # it goes on until the outbox is empty or for ever: say now what is wrong
-                thread.camera_failed = True
-                log.error("no more exposures: %s", str(error) or repr(error))
-            raise
-        finally:
-            capturing.clear()
-            if thread is not None:
-                thread.join()
-        if thread is not None:
-            if thread.error:
-                raise thread.error
-            sent = thread.result
-    left = FrameStore(store_dir)  # opened again: the downlink has its own
-    result: dict[str, Any] = {"frames_stored": len(left.frames), "outbox": len(left.outbox())}
-    if camera_url is not None:
-        result["capture"] = vars(captured) | {"camera_losses": camera.losses if camera else 0}
-    if link_url is not None:
-        result["downlink"] = dataclasses.asdict(sent)
+        result = run_pass(
+            mission,
+            store_dir,
+            stop,
+            camera_url=camera_url,
+            link_url=link_url,
+            key_file=key_file,
+            exit_when_empty=exit_when_empty,
+            on_captured=lambda now: progress.update(captured_bar, completed=now.planned, visible=True),
+            on_sent=show_sent,
+        )
     if as_json:
-        print(json.dumps(result))
+        print(json.dumps(result.tree()))
     else:
-        if camera_url is not None:
-            print(
-                f"captured {captured.stored} frames, {captured.already_stored} were there, {captured.failed} failed, "
-                f"{captured.refused} refused, {captured.pose_invalid} without a valid pose"
-            )
-            if camera is not None and camera.losses:
-                times = "once" if camera.losses == 1 else f"{camera.losses} times"
-                print(
-                    f"the camera was lost {times}"
-                    f"{' and never came back' if camera.lost else ''}: {captured.lost_with_camera} exposures "
-                    f"of {captured.brackets_short} brackets were not taken"
-                )
-        if link_url is not None:
-            print(f"delivered {sent.delivered} frames, {sent.segments_resent} segments resent")
-        print(f"{result['frames_stored']} frames in {store_dir}, {result['outbox']} still to be delivered")
-    if captured.failed or captured.refused or (exit_when_empty and link_url is not None and result["outbox"]):
+        _print_result(result, store_dir)
+    captured = result.captured
+    not_all_stored = captured is not None and (captured.failed or captured.refused)
+    if not_all_stored or (exit_when_empty and link_url is not None and result.outbox):
         raise typer.Exit(1)
 
 
-def _capture(
-    mission: Mission,
-    camera: ReconnectingCamera,
-    store: FrameStore,
-    progress: Progress,
-    shots: int,
-    stop: threading.Event,
-    on_counts: Callable[[CaptureCounts], None],
-) -> CaptureCounts:
-    task = progress.add_task("captured", total=shots)
-
-    def wait_until(utc_ns: int) -> None:
-        while camera.waits and not stop.is_set() and (left_s := (utc_ns - time.time_ns()) / 1e9) > 0:
-            camera.reconnect()
-            stop.wait(min(left_s, RETRY_S) if camera.lost else left_s)
-
-    def on_frame(counts: CaptureCounts) -> None:
-        counts.packets_lost = camera.packets_lost
-        progress.update(task, completed=counts.planned)
-        on_counts(counts)
-
-    counts = capture(
-        mission,
-        camera,
-        store,
-        on_frame=on_frame,
-        should_stop=stop.is_set,
-        wait_until=wait_until,
-        settings=lambda: load_settings(store.folder, mission),
-    )
-    if camera.lost:
-        log.error("the camera did not come back: %d exposures were not taken", counts.lost_with_camera)
-    return counts
-
-
-class _Downlink(threading.Thread):
-    """Sends while frames are being taken; an error is kept for the main thread."""
-
-    def __init__(
-        self,
-        store: FrameStore,
-        link: Link,
-        mission: Mission,
-        counter: ReplayCounter | None,
-        exit_when_empty: bool,
-        capturing: threading.Event,
-        stop: threading.Event,
-        on_progress: Callable[[DownlinkProgress], None],
-        camera: ReconnectingCamera | None,
-    ):
-        super().__init__(name="downlink", daemon=True)
-        self.store, self.link, self.mission, self.counter = store, link, mission, counter
-        self.captured = CaptureCounts()
-        self.camera, self.camera_failed = camera, False
-        self.exit_when_empty, self.capturing, self.stop, self.on_progress = (
-            exit_when_empty,
-            capturing,
-            stop,
-            on_progress,
+def _print_result(result: RunResult, store_dir: Path) -> None:
+    if (captured := result.captured) is not None:
+        print(
+            f"captured {captured.stored} frames, {captured.already_stored} were there, {captured.failed} failed, "
+            f"{captured.refused} refused, {captured.pose_invalid} without a valid pose"
         )
-        self.empty_since_s: float | None = None
-        self.result = DownlinkProgress()
-        self.error: Exception | None = None
-
-    def run(self) -> None:
-        try:
-            self.result = run_downlink(
-                self.store,
-                self.link,
-                self.mission,
-                on_progress=self._keep,
-                should_stop=self._should_stop,
-                counter=self.counter,
-                capture_values=self._capture_values,
+        if result.camera_losses:
+            times = "once" if result.camera_losses == 1 else f"{result.camera_losses} times"
+            print(
+                f"the camera was lost {times}"
+                f"{' and never came back' if result.camera_is_lost else ''}: {captured.lost_with_camera} exposures "
+                f"of {captured.brackets_short} brackets were not taken"
             )
-        except Exception as error:  # of this thread nothing else would remain; the main thread raises it
-            self.error = error
-            if self.capturing.is_set():  # perhaps for hours
-                log.error("the downlink has ended, frames are only stored: %s", str(error) or repr(error))
-
-    def note_capture(self, counts: CaptureCounts) -> None:
-        self.captured = counts
-
-    def _capture_values(self) -> dict[str, Any]:
-        """Return what capture knows of the housekeeping packet."""
-        state = "capturing" if self.capturing.is_set() else "pass done" if self.captured.planned else "none"
-        is_lost = self.camera is not None and self.camera.lost
-        state = "failed" if self.camera_failed or is_lost else state
-        counts = {"frames_failed": self.captured.failed, "frames_refused": self.captured.refused}
-        return {"camera": state} | counts
-
-    def _keep(self, now: DownlinkProgress) -> None:
-        self.result = now
-        self.on_progress(now)
-
-    def _should_stop(self) -> bool:
-        """Tell whether all is delivered; lingers a little, as the ground may ask for its last answer once more."""
-        waiting = self.capturing.is_set() or self.result.waiting or not self.exit_when_empty
-        if waiting or self.store.outbox():
-            self.empty_since_s = None
-        elif self.empty_since_s is None:
-            self.empty_since_s = time.monotonic()
-        done = self.empty_since_s is not None and time.monotonic() - self.empty_since_s > LINGER_S
-        return self.stop.is_set() or done
+    if result.sent is not None:
+        print(f"delivered {result.sent.delivered} frames, {result.sent.segments_resent} segments resent")
+    print(f"{result.frames_stored} frames in {store_dir}, {result.outbox} still to be delivered")
 
 
 def _progress() -> Progress:

@@ -18,7 +18,8 @@ from pathlib import Path
 from flightsw.errors import FlightError, StoreError
 from flightsw.icd.auth import TAG_BYTES, AuthError, Key, unseal, unseal_file
 from flightsw.icd.command import ENDED, Command, Report, model_file_name
-from flightsw.icd.mission import ConfigError, Mission
+from flightsw.icd.config import ConfigError
+from flightsw.icd.mission import Mission
 from flightsw.icd.packet import PacketError
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.settings import Settings, load_settings, save_settings
@@ -219,7 +220,7 @@ class Commander:
                 self._change(exposure_times_ms=values["exposure_times_ms"])
                 return ", ".join(f"{time_ms:g}" for time_ms in values["exposure_times_ms"]) + " ms"
             case "near":
-                self._change(near=values["near"])
+                self._change(max_error_dn=values["near"])
                 return f"NEAR {values['near']}"
             case "priority":
                 self._change(priority=values["order"])

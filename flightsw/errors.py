@@ -31,12 +31,8 @@ class NavigationError(FlightError):
     """The navigation stream cannot be opened, or has no trustworthy state for the asked time."""
 
 
-class LinkError(FlightError):
-    """The link's port cannot be opened or was lost."""
-
-
 class DownlinkError(FlightError):
-    """The downlink failed again and again, each time for a reason that nobody foresaw."""
+    """The downlink failed several times in a row with errors that are not ours."""
 
 
 class TriageError(FlightError):

@@ -1,4 +1,4 @@
-"""Check and repair a frame store: what a crash, a bad sector or a careless hand may have left behind."""
+"""Check and repair a frame store after a crash, a bad sector or a change by hand."""
 
 import json
 import time
@@ -13,7 +13,7 @@ from obbgs_base.files import sync_folder, write_whole
 
 @dataclass
 class FsckReport:
-    """What was found. `problems` has a line for each; all are mended unless only a check was asked for."""
+    """What was found. `problems` has a line for each; all are repaired unless only a check was asked for."""
 
     frames: int = 0  # containers whose every checksum fits
     waiting: int = 0  # of them still to be delivered
@@ -23,11 +23,11 @@ class FsckReport:
 
 
 def fsck(folder: Path, repair: bool = True) -> FsckReport:
-    """Check every file of a frame store, and mend what is wrong.
+    """Check every file of a frame store, and repair what is wrong.
 
     Temporary files are deleted. A container is decoded whole (its own CRC-32, that of its pixels, the number in its
-    name); what fails goes to quarantine/ and out of the outbox. The index is written again if a line is unreadable,
-    twice there, or says other than the containers, which are believed; the numbers of deleted frames are kept. A
+    name); what fails goes to quarantine/ and out of the outbox. The index is written again if a line is unreadable
+    or repeated or contradicts the containers, which take precedence; the numbers of deleted frames are kept. A
     damaged transfer number is replaced by the time in seconds, which no counter has reached. Unknown files are left.
 
     Raises:

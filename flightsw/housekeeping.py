@@ -1,4 +1,4 @@
-"""What the flight software says of itself: housekeeping values of the process and the disk, and events."""
+"""What the flight software reports about itself: values of the process and the disk, and events."""
 
 import logging
 import os

@@ -24,7 +24,7 @@ NODE_DOMAIN, TENSOR_EXTERNAL_DATA, TENSOR_DATA_LOCATION = 7, 13, 14
 
 
 def verified_model(path: Path) -> bytes:
-    """Return the bytes of an ONNX file whose every node and tensor has been looked at.
+    """Return the bytes of an ONNX file after checking every node and tensor in it.
 
     Raises:
         TriageError: unreadable, too large, not ONNX, an operator that is not standard, or data outside the file.

@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 
 from flightsw.errors import NavigationError
-from flightsw.icd.frame import matrix_to_quat, quat_to_matrix
 from flightsw.icd.mission import NavigationSection
+from flightsw.icd.quaternion import quat_to_matrix, slerp
 
 MAX_LINE_BYTES = 16_384
 MAX_STATES = 4096  # kept behind the newest one
@@ -136,18 +136,19 @@ def interpolate(before: NavigationState, after: NavigationState, utc_ns: int) ->
 
     Positions follow the cubic through both positions and velocities, attitudes the shorter arc. A relative pose is
     interpolated as the target's position in the camera, which hardly moves while the camera tracks,
-    however fast the target spins. The covariance is the weighted mean of both: no smaller than the filter's own.
+    however fast the target spins. The covariance is the weighted mean of both, taken in GCRS or, for a relative pose,
+    in the camera's axes, in which its errors hardly turn: it is no smaller than the filter's own.
     """
     step_ns = after.utc_ns - before.utc_ns
     u = (utc_ns - before.utc_ns) / step_ns if step_ns else 0.0
     if isinstance(before, RelativePose) and isinstance(after, RelativePose):
-        quat = _slerp(before.quat_body_to_camera, after.quat_body_to_camera, u)
-        seen = [quat_to_matrix(s.quat_body_to_camera) @ s.position_body_m for s in (before, after)]
+        quat = slerp(before.quat_body_to_camera, after.quat_body_to_camera, u)
+        turns = [quat_to_matrix(s.quat_body_to_camera) for s in (before, after)]
+        position_camera_m = (1 - u) * turns[0] @ before.position_body_m + u * turns[1] @ after.position_body_m
+        covariance = (1 - u) * _turned(before.covariance, turns[0]) + u * _turned(after.covariance, turns[1])
+        camera_to_body = quat_to_matrix(quat).T
         return RelativePose(
-            utc_ns,
-            quat,
-            quat_to_matrix(quat).T @ ((1 - u) * seen[0] + u * seen[1]),
-            (1 - u) * before.covariance + u * after.covariance,
+            utc_ns, quat, camera_to_body @ position_camera_m, _turned(covariance, camera_to_body)
         )
     assert isinstance(before, SatelliteStates) and isinstance(after, SatelliteStates)
     step_s = step_ns / NS
@@ -173,10 +174,17 @@ def interpolate(before: NavigationState, after: NavigationState, utc_ns: int) ->
             step_s,
             u,
         ),
-        optional(before.quat_gcrs_to_body, after.quat_gcrs_to_body, _slerp),
-        optional(before.quat_gcrs_to_chaser, after.quat_gcrs_to_chaser, _slerp),
+        optional(before.quat_gcrs_to_body, after.quat_gcrs_to_body, slerp),
+        optional(before.quat_gcrs_to_chaser, after.quat_gcrs_to_chaser, slerp),
         optional(before.covariance, after.covariance, lambda a, b, u: (1 - u) * a + u * b),
     )
+
+
+def _turned(covariance: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Return a relative pose's covariance [6, 6] with the position in other axes; the rotation vector keeps its own."""
+    both = np.eye(6)
+    both[:3, :3] = rotation
+    return both @ covariance @ both.T
 
 
 def _hermite(
@@ -188,17 +196,6 @@ def _hermite(
     m0, m1, chord = v0 * step_s, v1 * step_s, p1 - p0
     a, b = m0 + m1 - 2 * chord, 3 * chord - 2 * m0 - m1
     return ((a * u + b) * u + m0) * u + p0, ((3 * a * u + 2 * b) * u + m0) / step_s
-
-
-def _slerp(a: np.ndarray, b: np.ndarray, u: float) -> np.ndarray:
-    """Return the unit quaternion a share `u` of the way from `a` to `b`."""
-    b = b if a @ b >= 0 else -b
-    angle = np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b)) * 2
-    if angle < 1e-9:
-        mixed = (1 - u) * a + u * b
-    else:
-        mixed = (np.sin((1 - u) * angle) * a + np.sin(u * angle) * b) / np.sin(angle)
-    return matrix_to_quat(quat_to_matrix(mixed))  # unit, w not negative
 
 
 class NavigationStream:

@@ -31,7 +31,7 @@ class PlannedBracket:
 
 @dataclass(frozen=True)
 class PlannedPass:
-    """Brackets in a row that the Sun lights."""
+    """Consecutive brackets in sunlight."""
 
     first_bracket: int
     last_bracket: int

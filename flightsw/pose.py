@@ -6,8 +6,9 @@ import logging
 import numpy as np
 
 from flightsw.errors import NavigationError, OrbitError
-from flightsw.icd.frame import PoseTag, matrix_to_quat, quat_to_matrix
+from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission
+from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.navigation import NavigationStream, RelativePose, SatelliteStates
 from flightsw.orbit import in_eclipse, propagate, sun_direction_gcrs
 

@@ -1,4 +1,4 @@
-"""Where in a frame the target is: what is worth sending, and what the exposure is measured on."""
+"""Where in a frame the target is: the pixels that are sent, and those that the exposure is measured on."""
 
 import numpy as np
 

@@ -58,7 +58,7 @@ def plan(
 ) -> Iterator[Shot]:
     """Yield the pass's exposures: brackets `interval_s` apart, their frames `frame_spacing_s` apart, shortest first.
 
-    `times_s` may give other exposure times than the mission's; it is asked when a bracket's first exposure is due.
+    `times_s` may give other exposure times than the mission's; it is called when a bracket's first exposure is due.
     """
     bracket = mission.bracket
     for bracket_id in range(bracket.count):
@@ -92,7 +92,9 @@ def capture(
     counts = CaptureCounts()
     tagger = PoseTagger(mission)
     times = _BracketTimes(mission, store, settings)
-    reasons, short = _Reasons(), set()
+    failures = _Repeats("%d more exposures lost for the same reason: %s")
+    refusals = _Repeats("%d more frames refused: %s")
+    short = set()
     try:
         for shot in plan(mission, times.at):
             if should_stop():
@@ -108,11 +110,12 @@ def capture(
                     break
                 try:
                     frame = expose(mission, camera, shot, store.next_frame_id, tagger)
-                    near = commanded.near if commanded else 0
-                    store.put(frame, near=near, roi_mask=region_of_interest(frame.dn, mission))
+                    max_error_dn = commanded.max_error_dn if commanded else 0
+                    roi_mask = region_of_interest(frame.dn, mission)
+                    store.put(frame, max_error_dn=max_error_dn, roi_mask=roi_mask)
                 except StoreFull as error:
                     counts.refused += 1
-                    log.warning("%s", error)
+                    refusals.log("the store is full", str(error))
                 except CameraLost:
                     counts.failed += 1
                     counts.lost_with_camera += 1
@@ -120,9 +123,11 @@ def capture(
                     counts.brackets_short = len(short)
                 except (CaptureError, ValueError) as error:
                     counts.failed += 1
-                    reasons.log(shot, error)
+                    place = f"bracket {shot.bracket_id} frame {shot.bracket_index}"
+                    failures.log(str(error), f"{place} lost: {error}")
                 else:
-                    reasons.end()
+                    failures.end()
+                    refusals.end()
                     times.observe(frame)
                     counts.stored += 1
                     counts.in_eclipse += frame.pose.in_eclipse
@@ -133,7 +138,8 @@ def capture(
             counts.navigation_gaps = tagger.navigation_gaps
             on_frame(counts)
     finally:
-        reasons.end()
+        failures.end()
+        refusals.end()
         tagger.close()
     return counts
 
@@ -166,23 +172,24 @@ def expose(
     )
 
 
-class _Reasons:
-    """Logs why exposures were lost: a reason that comes again and again has one line, and one with its count."""
+class _Repeats:
+    """Logs the first of several equal problems in a row, and when the row ends how many more there were."""
 
-    def __init__(self) -> None:
+    def __init__(self, summary: str):
+        self._summary = summary  # takes the count and the problem
         self._last, self._repeats = "", 0
 
-    def log(self, shot: Shot, error: Exception) -> None:
-        if str(error) == self._last:
+    def log(self, problem: str, line: str) -> None:
+        if problem == self._last:
             self._repeats += 1
             return
         self.end()
-        self._last = str(error)
-        log.warning("bracket %d frame %d lost: %s", shot.bracket_id, shot.bracket_index, error)
+        self._last = problem
+        log.warning("%s", line)
 
     def end(self) -> None:
         if self._repeats:
-            log.warning("%d more exposures lost for the same reason: %s", self._repeats, self._last)
+            log.warning(self._summary, self._repeats, self._last)
         self._last, self._repeats = "", 0
 
 
@@ -220,7 +227,7 @@ class _BracketTimes:
             self._auto.observe([(frame.dn, frame.exposure_time_s) for frame in self._taken], self._last_seen)
             self._taken = []
         if self._mission.navigation.source != "sgp4" and self._last_seen is not None:
-            return self._auto.times_s(self._last_seen)  # the stream does not know the future
+            return self._auto.times_s(self._last_seen)  # the stream has no states of the future
         try:
             return self._auto.times_s(Geometry.of(pose_tag(self._mission, trigger_utc_ns)))
         except OrbitError as error:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flightsw.errors import StoreError
-from flightsw.icd.mission import BracketSection, ConfigError, Mission
+from flightsw.icd.config import ConfigError
+from flightsw.icd.mission import BracketSection, Mission
 from obbgs_base.files import write_whole
 
 log = logging.getLogger(__name__)
@@ -20,14 +21,16 @@ class Settings:
 
     priority: str
     exposure_times_ms: tuple[float, ...] | None = None
-    near: int = 0  # largest coding error, DN
+    max_error_dn: int = 0  # of a coded pixel; `near` in settings.json and in the command
     safe_mode: bool = False  # no exposures
 
     def __post_init__(self):
         if self.priority not in ORDERS:
             raise ValueError(f"priority must be one of {', '.join(ORDERS)}, got {self.priority!r}")
-        if type(self.near) is not int or not 0 <= self.near <= 255 or type(self.safe_mode) is not bool:
-            raise ValueError(f"near={self.near!r}, safe_mode={self.safe_mode!r}: out of range")
+        if type(self.max_error_dn) is not int or not 0 <= self.max_error_dn <= 255:
+            raise ValueError(f"max_error_dn must be 0 to 255, got {self.max_error_dn!r}")
+        if type(self.safe_mode) is not bool:
+            raise ValueError(f"safe_mode must be true or false, got {self.safe_mode!r}")
 
     def bracket(self, mission: Mission) -> BracketSection:
         """Return the mission's bracket with the commanded exposures.
@@ -48,6 +51,7 @@ def load_settings(folder: Path, mission: Mission) -> Settings:
         tree = json.loads(path.read_bytes())
         if tree["exposure_times_ms"] is not None:
             tree["exposure_times_ms"] = tuple(map(float, tree["exposure_times_ms"]))
+        tree["max_error_dn"] = tree.pop("near")
         settings = Settings(**tree)
         settings.bracket(mission)
     except FileNotFoundError:
@@ -64,7 +68,9 @@ def save_settings(folder: Path, settings: Settings) -> None:
     Raises:
         StoreError: the disk refuses; what was there before is still there.
     """
+    tree = dataclasses.asdict(settings)
+    tree["near"] = tree.pop("max_error_dn")
     try:
-        write_whole(folder / "settings.json", json.dumps(vars(settings)).encode())
+        write_whole(folder / "settings.json", json.dumps(tree).encode())
     except OSError as error:
         raise StoreError(f"cannot keep the settings: {error}") from error

@@ -1,4 +1,4 @@
-"""The crash-safe frame store: a frame is there whole or not at all, its number is never used twice."""
+"""The crash-safe frame store: a frame is stored whole or not at all, and its number is never used twice."""
 
 import contextlib
 import errno
@@ -88,14 +88,14 @@ class FrameStore:
         """Tell whether this exposure of the pass was stored, even if it has been deleted since."""
         return (bracket_id, bracket_index) in self._exposures
 
-    def put(self, frame: Frame, *, near: int = 0, roi_mask: np.ndarray | None = None) -> StoredFrame:
+    def put(self, frame: Frame, *, max_error_dn: int = 0, roi_mask: np.ndarray | None = None) -> StoredFrame:
         """Store a frame and put it into the outbox; when this returns, a power cut cannot lose it.
 
         Raises:
             StoreFull: no room, and the policy lets nothing be deleted for it; the frame is counted as refused.
             StoreError: the disk refuses, or the frame's number is taken.
         """
-        container = encode_frame(frame, near=near, roi_mask=roi_mask)
+        container = encode_frame(frame, max_error_dn=max_error_dn, roi_mask=roi_mask)
         with _disk_errors(f"store frame {frame.frame_id}"), self.locked():
             self._read_index()
             if frame.frame_id <= self._last_id:

@@ -1,8 +1,8 @@
 """Which frames are worth sending first: those that the uplinked model predicts worst, and that show something new.
 
-The residual alone sends the best lit side again and again: it has the most light and so the largest chi², and the
-exposures of a bracket come one after the other. So a residual counts less the closer its view is to one that the ground
-has, or gets before. onnxruntime and numpy only.
+The residual alone would send the best lit side again and again: it has the most light and so the largest chi², and all
+exposures of a bracket show it. So a residual counts less the closer its view is to one that the ground has already, or
+will receive earlier. Needs onnxruntime and numpy only.
 """
 
 import hashlib
@@ -25,18 +25,20 @@ from flightsw.model_file import verified_model
 log = logging.getLogger(__name__)
 
 TILE_ROWS, TILE_COLUMNS = 20, 40  # px, as in the ground's densification
-FACTS = ("black_dn", "white_dn", "dn_per_radiance_s", "electrons_per_dn", "read_noise_dn")
-ALIKE_RAD = 0.7  # views so far apart share exp(-1/2) of what they show: about how far a face can be seen from
+SENSOR_METADATA = ("black_dn", "white_dn", "dn_per_radiance_s", "electrons_per_dn", "read_noise_dn")
+SIMILAR_RAD = (
+    0.7  # views so far apart share exp(-1/2) of what they show: about how far a face can be seen from
+)
 NOISE_CHI2 = 1.25  # below it is the worst tile of pure noise: 1 on average, a deviation of 0.05 for 800 px
-REPEAT = 0.05  # what a view that was sent already is still worth: its noise differs
-NICENESS = 10  # of the ranking thread: the link goes first
+REPEAT = 0.05  # novelty of a view that was sent already: its noise differs
+NICENESS = 10  # of the ranking thread: the link has priority
 INPUTS = {"world_to_camera": [4, 4], "K": [3, 3], "exposure_time_s": []}
 SUN_INPUT = {"sun_dir": [3]}  # of a model whose radiance turns with the Sun
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """What the model makes of one frame: the mean chi² of its worst tile (1 is noise), and where that tile is.
+    """How well the model predicts one frame: the mean chi² of its worst tile (1 is noise), and where that tile is.
 
     A frame taken in eclipse or with a pose that is not valid is not `comparable`: its chi² says nothing about
     the model. `view` is the direction from the target to the camera, then to the Sun: two unit vectors, body frame.
@@ -84,7 +86,7 @@ class Renderer:
         metadata = self._session.get_modelmeta().custom_metadata_map
         try:
             self.width, self.height = int(metadata["width"]), int(metadata["height"])
-            self.sensor = {name: float(metadata[name]) for name in FACTS}
+            self.sensor = {name: float(metadata[name]) for name in SENSOR_METADATA}
         except (KeyError, ValueError) as error:
             raise TriageError(f"{path} lacks metadata that triage needs: {error}") from error
         sensor = self.sensor
@@ -140,7 +142,7 @@ class Renderer:
 
 
 def rank_frames(model: Path, frames: Path, K: np.ndarray) -> tuple[list[Ranked], int]:
-    """Return the stored frames in the order in which they are worth sending, and how many could not be read.
+    """Return the stored frames, the most informative first, and how many could not be read.
 
     The order is that of the downlink if nothing was sent yet.
 
@@ -170,10 +172,10 @@ def rank_frames(model: Path, frames: Path, K: np.ndarray) -> tuple[list[Ranked],
 def sending_order(
     ranked: Sequence[Ranked], sent: Sequence[tuple[float, ...]], first: int | None = None
 ) -> list[Ranked]:
-    """Return frames in the order in which they are worth sending.
+    """Return frames in the order in which they should be sent.
 
     One by one, the frame comes next whose residual (sigmas, worst tile) times the novelty of its view is largest. The
-    novelty is 1 - exp(-d²/2 ALIKE_RAD²), at least REPEAT, with d the distance of camera and Sun direction from the
+    novelty is 1 - exp(-d²/2 SIMILAR_RAD²), at least REPEAT, with d the distance of camera and Sun direction from the
     nearest view sent or placed before. Exposures need no rule: of a bracket the one with most signal over noise has
     the largest residual, unless it is saturated, and the others are then repeats. Frames that are not comparable come
     last, oldest first.
@@ -195,7 +197,7 @@ def sending_order(
     waiting = np.ones(len(candidates), dtype=bool)
     placed: list[int] = []
     while waiting.any():
-        novelty = np.maximum(1 - np.exp(-nearest2 / (2 * ALIKE_RAD**2)), REPEAT)
+        novelty = np.maximum(1 - np.exp(-nearest2 / (2 * SIMILAR_RAD**2)), REPEAT)
         worth = np.where(waiting, residuals * novelty, -1)
         if first is not None and len(placed) >= first:
             placed += np.argsort(-worth, kind="stable")[: waiting.sum()].tolist()
@@ -271,7 +273,7 @@ class TriageWorker:
         self._thread = threading.Thread(target=self._run, name="triage", daemon=True)
 
     def verify(self, model: Path) -> None:
-        """Look at a model file; if it is good, later frames are ranked by it."""
+        """Check a model file; if it is usable, later frames are ranked by it."""
         self._put(model, True)
 
     def rank(self, container: Path) -> None:
@@ -304,7 +306,9 @@ class TriageWorker:
             path, is_model = task
             try:
                 result = self._verified(path) if is_model else (path, self._ranked(path))
-            except Exception as error:  # the outermost loop of this thread: frames would wait for it for ever
+            except (
+                Exception
+            ) as error:  # the outermost loop of this thread: without it frames would wait forever
                 log.error("triage failed at %s: %r", path.name, error, exc_info=error)
                 result = ModelVerified(path, b"", f"triage failed: {error!r}") if is_model else (path, None)
             self._results.put(result)

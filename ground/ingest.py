@@ -10,6 +10,7 @@ from typing import Any
 
 import imagecodecs
 
+from flightsw.icd.can import GROUND_SIDE
 from flightsw.icd.frame import Frame, decode_frame
 from flightsw.icd.framing import PacketStream
 from flightsw.icd.mission import Mission
@@ -22,7 +23,7 @@ from flightsw.icd.packet import (
     PacketError,
 )
 from flightsw.icd.transfer import Incoming, Receiver, timer_s
-from ground.link import Link, open_link
+from flightsw.ports import Link, open_link
 from ground.session import SessionError
 from ground.session_writer import SessionWriter
 from ground.telemetry import TelemetryLog
@@ -119,7 +120,7 @@ def listen(
         LinkError: the port cannot be opened.
         SessionError: the folder cannot be used as this mission's session, or another process listens into it.
     """
-    with open_link(link_url) as link:
+    with open_link(link_url, GROUND_SIDE) as link:
         writer = SessionWriter(session_dir, mission)
         with listening(writer.folder):
             ingest = _Ingest(link, writer, mission, on_event)

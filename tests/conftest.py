@@ -1,8 +1,10 @@
 """What several packages' tests need: a mission and frames for it."""
 
+import fcntl
 import importlib.util
 import os
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hypothesis
@@ -10,6 +12,8 @@ import numpy as np
 import pytest
 import skyfield.api
 
+from flightsw.cameras.aravis import aravis
+from flightsw.errors import CaptureError
 from flightsw.icd.frame import Frame, PoseTag
 from flightsw.icd.mission import Mission, load_mission
 
@@ -75,3 +79,15 @@ def skyfield_oracle():
     ephemeris = skyfield.api.Loader(str(Path(spec.origin).parent / "data"))("de421.bsp")
     yield skyfield.api.load.timescale(builtin=True), ephemeris
     ephemeris.close()
+
+
+@pytest.fixture
+def the_only_camera_on_loopback() -> Iterator[None]:
+    """GigE Vision has one port, 3956: two test runs on one machine take turns."""
+    try:
+        aravis()
+    except CaptureError as error:
+        pytest.skip(str(error))
+    with open(Path(tempfile.gettempdir()) / "obbgs-gige-test.lock", "wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield

@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 FORBIDDEN = {
     "flightsw": {"torch", "cv2", "obbgs_core", "ground", "hil", "scipy", "plotly", "trimesh"},
     "flightsw.icd": {"torch", "cv2", "obbgs_core", "ground", "hil", "serial"},
+    "flightsw.ports": {"torch", "cv2", "obbgs_core", "ground", "hil"},
     "obbgs_core": {"flightsw", "ground", "hil", "typer", "rich", "serial"},
     "ground": {"hil", "cv2", "trimesh"},
     "hil": {"obbgs_core", "bpy"},
@@ -37,10 +38,11 @@ def test_part_imports_only_what_it_may(part):
     assert not {name for name in loaded if name.partition(".")[0] in FORBIDDEN[part]}
 
 
-def test_ground_uses_only_the_icd_of_flight():
-    loaded = loaded_after_importing(modules_of("ground"))
+@pytest.mark.parametrize("part", ["ground", "flightsw.ports"])
+def test_ground_and_the_ports_use_only_the_icd_and_the_ports_of_flight(part):
+    loaded = loaded_after_importing(modules_of(part))
     flight = {name for name in loaded if name.startswith("flightsw.")}
-    assert flight and all(name.startswith("flightsw.icd") for name in flight)
+    assert flight and all(name.startswith(("flightsw.icd", "flightsw.ports")) for name in flight)
 
 
 def test_the_icd_needs_nothing_else_of_flight():

@@ -17,10 +17,18 @@ class Exposure:
     mid_exposure_utc_ns: int
 
 
+OWN_CLOCK_ANSWER_S = 120.0  # that a camera with a clock of its own may take for a picture
+
+
 class Camera(Protocol):
+    """What every camera promises."""
+
     @property
-    def waits(self) -> bool:
-        """Whether exposures must be asked for when their time has come, as of a camera in our own time."""
+    def has_own_clock(self) -> bool:
+        """Whether the camera sets its clock to the time of each exposure, which may then be requested at any moment.
+
+        Without one, the caller must request each exposure when its time has come.
+        """
         ...
 
     @property
@@ -29,7 +37,7 @@ class Camera(Protocol):
         ...
 
     def expose(self, exposure_time_s: float, start_utc_ns: int) -> Exposure:
-        """Open the shutter at a UTC time and return the exposure.
+        """Open the shutter at a UTC time, Unix nanoseconds, and return the exposure.
 
         A camera that was lost is opened again first.
 
@@ -40,10 +48,16 @@ class Camera(Protocol):
         ...
 
     def open(self) -> None:
-        """Open the camera unless it is open; CameraLost when it does not answer."""
+        """Open the camera unless it is open.
+
+        Raises:
+            CameraLost: it does not answer.
+        """
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Close the camera if it is open; `open` and `expose` open it again."""
+        ...
 
 
 def open_camera(url: str, section: CameraSection) -> Camera:
@@ -54,9 +68,9 @@ def open_camera(url: str, section: CameraSection) -> Camera:
         ValueError: no driver for this URL.
     """
     if url.startswith("hil://"):
-        from flightsw.cameras.hil import HilCamera
+        from flightsw.cameras.networked import NetworkedCamera
 
-        return HilCamera(url)
+        return NetworkedCamera(url)
     if url.startswith("gige://"):
         from flightsw.cameras.gige import GigeCamera
 

@@ -9,7 +9,7 @@ from urllib.parse import parse_qs
 
 import numpy as np
 
-from flightsw.cameras import Exposure
+from flightsw.cameras import OWN_CLOCK_ANSWER_S, Exposure
 from flightsw.cameras.aravis import BUFFER_STATUS, BUFFER_SUCCESS, PIXEL_FORMATS, AravisError, aravis
 from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.mission import CameraSection
@@ -18,10 +18,9 @@ log = logging.getLogger(__name__)
 NS = 1_000_000_000
 BUFFERS = 3
 ANSWER_S = 3.0  # from the end of an exposure to its last packet
-RENDER_S = 120.0  # the simulator may have to render the picture first
 LATE_S = 0.5  # an exposure that is asked for so long after its time is not taken
-CLOCK_S = 1.0  # a camera whose time stamps are as near to ours keeps UTC (PTP, IEEE 1588)
-SIMULATED_TIME = b"SimulatedStartUtcNs"  # a feature of `hil camera --gige` only
+CLOCK_S = 1.0  # a camera whose time stamps differ from our clock by less keeps UTC (PTP, IEEE 1588)
+START_TIME = b"ExposureStartUtcNs"  # feature of a camera whose clock can be set to the start of an exposure
 
 
 class GigeCamera:
@@ -53,12 +52,8 @@ class GigeCamera:
         self._aravis = aravis()
         self._camera = self._stream = None
         self._packets_before = (0, 0)
-        self.simulated = False
+        self.has_own_clock = False  # known once the camera is open
         self.open()
-
-    @property
-    def waits(self) -> bool:
-        return not self.simulated
 
     @property
     def packets_lost(self) -> int:
@@ -70,7 +65,7 @@ class GigeCamera:
         return self._packets_before[1] + self._packets()[1]
 
     def expose(self, exposure_time_s: float, start_utc_ns: int) -> Exposure:
-        """Return one exposure. The caller waits until its time has come; a simulated camera is told the time.
+        """Return one exposure. A camera with a clock of its own is told the time at which it begins.
 
         The exposure time is the one that the camera reports; its middle is counted from the camera's time stamp when
         the camera's clock keeps UTC, otherwise from the moment of the trigger.
@@ -81,18 +76,19 @@ class GigeCamera:
         """
         self.open()
         late_s = (time.time_ns() - start_utc_ns) / NS
-        if not self.simulated and late_s > LATE_S:
+        if not self.has_own_clock and late_s > LATE_S:
             raise CaptureError(f"the exposure was due {late_s:.1f} s ago")
         try:
             return self._expose(exposure_time_s, start_utc_ns)
         except CaptureError as error:
             if isinstance(error, AravisError) or not self._alive():
-                # ten seconds of farewells that nobody answers: not in the way of the next exposure
-                threading.Thread(target=self._release(), name="gige farewell", daemon=True).start()
+                # in a thread: closing a camera that does not answer takes Aravis ten seconds
+                threading.Thread(target=self._release(), name="gige close", daemon=True).start()
                 raise CameraLost(f"{self._url}: {error}") from error
             raise
 
     def close(self) -> None:
+        """Stop the acquisition and give the camera back, if it is open."""
         if self._camera is not None:
             try:
                 self._aravis.call("arv_camera_stop_acquisition", self._camera)
@@ -116,7 +112,7 @@ class GigeCamera:
             call("arv_camera_set_pixel_format_from_string", self._camera, self._format.encode())
             call("arv_camera_set_region", self._camera, 0, 0, section.width, section.height)
             call("arv_camera_set_trigger", self._camera, b"Software")
-            self.simulated = bool(call("arv_camera_is_feature_available", self._camera, SIMULATED_TIME))
+            self.has_own_clock = bool(call("arv_camera_is_feature_available", self._camera, START_TIME))
             self._stream = call("arv_camera_create_stream", self._camera, None, None)
             payload_bytes = call("arv_camera_get_payload", self._camera)
             for _ in range(BUFFERS):
@@ -159,11 +155,11 @@ class GigeCamera:
             call("arv_stream_push_buffer", self._stream, stale)
         call("arv_camera_set_exposure_time", self._camera, round(exposure_time_s * 1e6, 3))
         taken_s = call("arv_camera_get_exposure_time", self._camera) / 1e6
-        if self.simulated:
-            call("arv_camera_set_integer", self._camera, SIMULATED_TIME, start_utc_ns)
+        if self.has_own_clock:
+            call("arv_camera_set_integer", self._camera, START_TIME, start_utc_ns)
         triggered_utc_ns = time.time_ns()
         call("arv_camera_software_trigger", self._camera)
-        wait_s = exposure_time_s + (RENDER_S if self.simulated else ANSWER_S)
+        wait_s = exposure_time_s + (OWN_CLOCK_ANSWER_S if self.has_own_clock else ANSWER_S)
         buffer = call("arv_stream_timeout_pop_buffer", self._stream, round(wait_s * 1e6))
         if not buffer:
             raise CaptureError(f"no picture within {wait_s:.1f} s")
@@ -178,7 +174,7 @@ class GigeCamera:
             dn = self._pixels(buffer)
         finally:
             call("arv_stream_push_buffer", self._stream, buffer)
-        keeps_utc = self.simulated or abs(stamp_ns - triggered_utc_ns) < CLOCK_S * NS
+        keeps_utc = self.has_own_clock or abs(stamp_ns - triggered_utc_ns) < CLOCK_S * NS
         opened_utc_ns = stamp_ns if keeps_utc else triggered_utc_ns
         return Exposure(dn, taken_s, opened_utc_ns + round(taken_s * NS / 2))
 

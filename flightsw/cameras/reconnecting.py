@@ -1,4 +1,4 @@
-"""A camera that may be lost and come back: one line when it goes, one when it is back, and counts of what it cost."""
+"""A camera that may be lost and come back: one log line for each, and counts of the exposures that it missed."""
 
 import logging
 import time
@@ -9,15 +9,15 @@ from flightsw.errors import CameraLost, CaptureError
 
 log = logging.getLogger(__name__)
 RETRY_S = 1.0  # between attempts to reach a lost camera
-PATIENCE_S = 30.0  # for which a camera that waits for us is tried again before it counts as gone
+PATIENCE_S = 30.0  # for which a lost camera with a clock of its own is tried again before it counts as gone
 
 
 class ReconnectingCamera:
-    """Asks a lost camera again, and logs only when it goes and when it is back.
+    """Tries a lost camera again, and logs only when it is lost and when it is back.
 
-    A camera in our own time (`waits`) is tried at each exposure, and between them by `reconnect`: exposures go on at
-    their times. The simulator's time waits for us, so the same exposure is asked for again, and nothing is lost if the
-    camera comes back within `PATIENCE_S`; after that it counts as gone, and every further exposure fails at once.
+    A camera without a clock of its own is tried at each exposure, and between exposures by `reconnect`: exposures go on
+    at their times. One with its own clock is asked for the same exposure again, so that no exposure is lost if it comes
+    back within `PATIENCE_S`; after that it counts as gone, and every further exposure fails at once.
 
     Args:
         pause: waits some seconds; returns true when there is no point in going on.
@@ -40,8 +40,8 @@ class ReconnectingCamera:
         return self._lost_since_s is not None
 
     @property
-    def waits(self) -> bool:
-        return self._camera.waits
+    def has_own_clock(self) -> bool:
+        return self._camera.has_own_clock
 
     @property
     def packets_lost(self) -> int:
@@ -59,8 +59,8 @@ class ReconnectingCamera:
                 exposure = self._camera.expose(exposure_time_s, start_utc_ns)
             except CameraLost as error:
                 away_s = self._note_loss(error)
-                self._gone = not self.waits and away_s >= PATIENCE_S
-                if self.waits or self._gone or self._pause(RETRY_S):
+                self._gone = self.has_own_clock and away_s >= PATIENCE_S
+                if not self.has_own_clock or self._gone or self._pause(RETRY_S):
                     self._exposures_lost += 1
                     raise
             except CaptureError:
@@ -72,7 +72,7 @@ class ReconnectingCamera:
         raise CameraLost("the camera was lost and did not come back")
 
     def reconnect(self) -> None:
-        """Try once to reach a lost camera; whether it answers, `lost` says."""
+        """Try once to reach a lost camera; `lost` says whether it answered."""
         if not self.lost:
             return
         try:

@@ -11,6 +11,7 @@ import re
 from collections import deque
 from collections.abc import Callable, Iterable
 from itertools import groupby
+from typing import NamedTuple
 
 import isotp
 
@@ -19,6 +20,16 @@ from flightsw.icd.link_url import SLCAN_BITRATES, LinkUrl
 
 # The ground's identifiers are the lower ones and win the bus: flow control and commands pass first.
 GROUND_IDS, FLIGHT_IDS = tuple(range(0x0C0, 0x0D0)), tuple(range(0x0D0, 0x0E0))
+
+
+class CanSide(NamedTuple):
+    """One end of the bus: the identifiers of the frames that it sends, and of those that it receives."""
+
+    own_ids: tuple[int, ...]
+    other_ids: tuple[int, ...]
+
+
+FLIGHT_SIDE, GROUND_SIDE = CanSide(FLIGHT_IDS, GROUND_IDS), CanSide(GROUND_IDS, FLIGHT_IDS)
 # Some channels wait for their flow control while another's data are on the bus. So many must be under way that
 # the bus stays busy while the ground stores a frame (8 ms and more): 1100 bytes take 20 ms, on FD 2.5 ms. And no
 # more than adapter and terminal hold for a ground that does not read: 16 such messages are 39 kB of slcan text.

@@ -9,6 +9,7 @@ import imagecodecs
 import numpy as np
 
 from flightsw.icd.packet import CrcMismatch, PacketError, PacketTooShort
+from flightsw.icd.quaternion import quat_to_matrix
 
 MAGIC = b"OBGF"
 VERSION = 1
@@ -23,7 +24,7 @@ CODEC_JPEG_LS = 1
 END_OF_IMAGE = b"\xff\xd9"
 MAX_PIXELS = 8192 * 8192
 THUMBNAIL_PX = 64  # longest side of a thumbnail
-THUMBNAIL_NEAR = 2  # DN
+THUMBNAIL_MAX_ERROR = 2  # DN
 TRIANGLE = np.tril_indices(6)
 
 
@@ -110,23 +111,23 @@ class Frame:
         return self.pose.world_to_camera
 
 
-def encode_frame(frame: Frame, *, near: int = 0, roi_mask: np.ndarray | None = None) -> bytes:
+def encode_frame(frame: Frame, *, max_error_dn: int = 0, roi_mask: np.ndarray | None = None) -> bytes:
     """Return the frame as a container: header, JPEG-LS codestream, CRC-32 over both.
 
     Args:
-        near: largest error of a pixel, DN; 0 is lossless.
+        max_error_dn: the largest error of a pixel, which JPEG-LS calls NEAR; 0 is lossless.
         roi_mask: [H, W] bool; pixels outside are set to the black level before coding. None keeps all.
     """
-    if not 0 <= near <= 255:
-        raise ValueError(f"near must be 0 to 255, got {near}")
+    if not 0 <= max_error_dn <= 255:
+        raise ValueError(f"max_error_dn must be 0 to 255, got {max_error_dn}")
     dn, flags = frame.dn, FLAG_ECLIPSE * frame.pose.in_eclipse | FLAG_POSE_VALID * frame.pose.valid
     if roi_mask is not None:
         if roi_mask.shape != dn.shape[:2]:
             raise ValueError(f"roi_mask has shape {roi_mask.shape}, the frame {dn.shape[:2]}")
         dn = np.where(roi_mask.reshape(roi_mask.shape + (1,) * (dn.ndim - 2)), dn, np.uint16(frame.black_dn))
         flags |= FLAG_MASKED
-    codestream = bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(dn), level=near))
-    decoded = dn if near == 0 else imagecodecs.jpegls_decode(codestream)
+    codestream = bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(dn), level=max_error_dn))
+    decoded = dn if max_error_dn == 0 else imagecodecs.jpegls_decode(codestream)
     pose = frame.pose
     header = HEADER.pack(
         MAGIC,
@@ -144,7 +145,7 @@ def encode_frame(frame: Frame, *, near: int = 0, roi_mask: np.ndarray | None = N
         1 if dn.ndim == 2 else 3,
         frame.bit_depth,
         CODEC_JPEG_LS,
-        near,
+        max_error_dn,
         SOURCES.index(pose.source),
         frame.black_dn,
         frame.saturated_count,
@@ -188,7 +189,7 @@ def decode_frame(data: bytes) -> Frame:
 
 
 def read_header(data: bytes) -> dict[str, Any]:
-    """Return the values in a container's header alone, by their names in README.md; what a frame is before it is here.
+    """Return the values in a container's header, by their names in README.md: they arrive before the frame itself.
 
     Raises:
         PacketError: not one whole header of this version, or a value that is not finite.
@@ -225,7 +226,7 @@ def encode_thumbnail(frame: Frame) -> bytes | None:
     squares = frame.dn[: rows * size_px, : columns * size_px]
     squares = squares.reshape(rows, size_px, columns, size_px, *frame.dn.shape[2:])
     dn = squares.mean(axis=(1, 3)).round().astype(np.uint16)
-    return encode_frame(replace(frame, dn=dn), near=THUMBNAIL_NEAR)
+    return encode_frame(replace(frame, dn=dn), max_error_dn=THUMBNAIL_MAX_ERROR)
 
 
 def _frame_from(fields: tuple, codestream: bytes, pixel_crc: int) -> Frame:
@@ -290,32 +291,3 @@ def _codestream_size(codestream: bytes) -> tuple[int, int, int] | None:
 
 def _pixel_crc(dn: np.ndarray) -> int:
     return zlib.crc32(np.ascontiguousarray(dn, dtype=">u2").tobytes())
-
-
-def quat_to_matrix(quat: np.ndarray) -> np.ndarray:
-    """Return the rotation [3, 3] of a unit quaternion w, x, y, z."""
-    w, x, y, z = quat / np.linalg.norm(quat)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def matrix_to_quat(matrix: np.ndarray) -> np.ndarray:
-    """Return the unit quaternion [4] w, x, y, z (w not negative) of a rotation [3, 3], at any angle."""
-    m = matrix
-    K = np.array(
-        [
-            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [0, m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-            [0, 0, m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
-            [0, 0, 0, m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    # Bar-Itzhack: the eigenvector of the largest eigenvalue of this symmetric matrix
-    _, vectors = np.linalg.eigh(np.triu(K) + np.triu(K, 1).T)
-    quat = vectors[:, -1]
-    return quat if quat[0] >= 0 else -quat

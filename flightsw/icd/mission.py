@@ -1,4 +1,4 @@
-"""The mission file: one YAML read by flight, ground and simulator, checked key by key."""
+"""The mission file: one YAML read by every part, checked key by key."""
 
 import hashlib
 import math
@@ -8,55 +8,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from flightsw.icd.config import ConfigError, build, in_file, parse_yaml
-from flightsw.icd.config import require as _require
-
-# The fields of a two-line element set that SGP4 reads: line, first and last column (from 1), name, form.
-DECIMAL = r" *-?\d*\.\d+ *"
-TLE_FIELDS = (
-    (1, 19, 32, "epoch", r"\d\d[ \d]{2}\d\.\d+ *"),
-    (1, 34, 43, "first derivative of mean motion", r"[ +-]*\d?\.\d+ *"),
-    (1, 45, 52, "second derivative of mean motion", r"[ +-]*\d+[ +-]\d"),
-    (1, 54, 61, "drag term", r"[ +-]*\d+[ +-]\d"),
-    (2, 9, 16, "inclination", DECIMAL),
-    (2, 18, 25, "right ascension", DECIMAL),
-    (2, 27, 33, "eccentricity", r"\d{7}"),
-    (2, 35, 42, "argument of perigee", DECIMAL),
-    (2, 44, 51, "mean anomaly", DECIMAL),
-    (2, 53, 63, "mean motion", DECIMAL),
-)
-
-
-def tle_checksum(line: str) -> int:
-    """Return the modulo-10 checksum of a TLE line's first 68 columns (digits, and 1 for each minus)."""
-    return sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
-
-
-def _check_tle(lines: tuple[str, ...], path: str) -> None:
-    _require(len(lines) == 2, path, f"expected two lines, got {len(lines)}")
-    for number, line in enumerate(lines, start=1):
-        where = f"{path}[{number - 1}]"
-        _require(line.isascii(), where, "a TLE line is plain ASCII text")
-        _require(len(line) == 69, where, f"a TLE line has 69 columns, got {len(line)}")
-        _require(line.startswith(f"{number} "), where, f"expected line {number}, got {line[:2]!r}")
-        _require(line[68].isdigit(), where, f"column 69 must be the checksum digit, got {line[68]!r}")
-        expected = tle_checksum(line)
-        _require(
-            expected == int(line[68]),
-            where,
-            f"checksum is {line[68]}, but the line adds up to {expected}: copy the elements again",
-        )
-    _require(
-        lines[0][2:7] == lines[1][2:7],
-        path,
-        f"the lines belong to different objects: {lines[0][2:7]} and {lines[1][2:7]}",
-    )
-    for number, first, last, name, form in TLE_FIELDS:
-        text = lines[number - 1][first - 1 : last]
-        where = f"{path}[{number - 1}]"
-        _require(
-            re.fullmatch(form, text) is not None, where, f"columns {first}-{last} hold no {name}: {text!r}"
-        )
+from flightsw.icd.config import ConfigError, build, in_file, parse_yaml, require
+from flightsw.icd.tle import check_tle
 
 
 @dataclass(frozen=True)
@@ -67,9 +20,9 @@ class OrbitSection:
     max_element_age_days: float = 7.0
 
     def __post_init__(self):
-        _check_tle(self.target_tle, "mission.orbit.target_tle")
-        _check_tle(self.chaser_tle, "mission.orbit.chaser_tle")
-        _require(self.max_element_age_days > 0, "mission.orbit.max_element_age_days", "must be positive")
+        check_tle(self.target_tle, "mission.orbit.target_tle")
+        check_tle(self.chaser_tle, "mission.orbit.chaser_tle")
+        require(self.max_element_age_days > 0, "mission.orbit.max_element_age_days", "must be positive")
         _ = self.start_utc_ns
 
     @property
@@ -80,8 +33,8 @@ class OrbitSection:
             moment = datetime.fromisoformat(self.start_utc)
         except ValueError as error:
             raise ConfigError(path, f"expected ISO 8601, got {self.start_utc!r}") from error
-        _require(moment.tzinfo is not None, path, "say the time zone: end the time with Z")
-        _require(
+        require(moment.tzinfo is not None, path, "say the time zone: end the time with Z")
+        require(
             1970 <= moment.year <= 2052, path, f"expected 1970 to 2052, where DE421 ends, got {moment.year}"
         )
         whole = moment.astimezone(UTC).replace(microsecond=0)
@@ -99,13 +52,13 @@ class TargetAttitudeSection:
     def __post_init__(self):
         path = "mission.target_attitude"
         if not isinstance(self.axis, str):
-            _require(len(self.axis) == 3, f"{path}.axis", f"expected 3 numbers, got {len(self.axis)}")
-            _require(
+            require(len(self.axis) == 3, f"{path}.axis", f"expected 3 numbers, got {len(self.axis)}")
+            require(
                 abs(math.hypot(*self.axis) - 1) < 1e-3,
                 f"{path}.axis",
                 f"expected a unit vector, got length {math.hypot(*self.axis):.4f}",
             )
-        _require(
+        require(
             0.1 <= self.period_s <= 1e9, f"{path}.period_s", f"expected 0.1 to 1e9 s, got {self.period_s}"
         )
 
@@ -133,23 +86,21 @@ class CameraSection:
     def __post_init__(self):
         path = "mission.camera"
         for name in ("width", "height"):
-            _require(
+            require(
                 1 <= getattr(self, name) <= 8192,
                 f"{path}.{name}",
                 f"expected 1 to 8192, got {getattr(self, name)}",
             )
         for name in ("fx_px", "fy_px", "dn_per_radiance_s", "electrons_per_dn"):
-            _require(
-                getattr(self, name) > 0, f"{path}.{name}", f"must be positive, got {getattr(self, name)}"
-            )
-        _require(
+            require(getattr(self, name) > 0, f"{path}.{name}", f"must be positive, got {getattr(self, name)}")
+        require(
             self.read_noise_dn >= 0,
             f"{path}.read_noise_dn",
             f"must not be negative, got {self.read_noise_dn}",
         )
-        _require(self.channels in (1, 3), f"{path}.channels", f"expected 1 or 3, got {self.channels}")
-        _require(8 <= self.bit_depth <= 16, f"{path}.bit_depth", f"expected 8 to 16, got {self.bit_depth}")
-        _require(
+        require(self.channels in (1, 3), f"{path}.channels", f"expected 1 or 3, got {self.channels}")
+        require(8 <= self.bit_depth <= 16, f"{path}.bit_depth", f"expected 8 to 16, got {self.bit_depth}")
+        require(
             0 <= self.black_dn < self.white_dn / 2,
             f"{path}.black_dn",
             f"expected 0 to half of full scale, got {self.black_dn}",
@@ -179,46 +130,46 @@ class BracketSection:
 
     def __post_init__(self):
         path = "mission.bracket"
-        _require(
+        require(
             1 <= len(self.exposure_times_ms) <= 16,
             f"{path}.exposure_times_ms",
             f"expected 1 to 16 exposures, got {len(self.exposure_times_ms)}",
         )
         for index, time_ms in enumerate(self.exposure_times_ms):
-            _require(
+            require(
                 1e-3 <= time_ms <= 60_000,
                 f"{path}.exposure_times_ms[{index}]",
                 f"expected 0.001 to 60000 ms, got {time_ms}",
             )
-            _require(
+            require(
                 time_ms / 1e3 <= self.frame_spacing_s,
                 f"{path}.frame_spacing_s",
                 f"{self.frame_spacing_s} s is shorter than an exposure of {time_ms} ms",
             )
-        _require(
+        require(
             1e-3 <= self.exposure_min_ms < self.exposure_max_ms <= 60_000,
             f"{path}.exposure_max_ms",
             "expected 0.001 <= exposure_min_ms < exposure_max_ms <= 60000, got "
             f"{self.exposure_min_ms} and {self.exposure_max_ms} ms",
         )
-        _require(
+        require(
             not self.auto or self.exposure_max_ms / 1e3 <= self.frame_spacing_s,
             f"{path}.exposure_max_ms",
             f"{self.exposure_max_ms} ms is longer than frame_spacing_s, {self.frame_spacing_s} s",
         )
-        _require(
+        require(
             self.target_extent_m > 0,
             f"{path}.target_extent_m",
             f"must be positive, got {self.target_extent_m}",
         )
         shortest_s = self.frame_spacing_s * len(self.exposure_times_ms)
-        _require(
+        require(
             self.interval_s >= shortest_s,
             f"{path}.interval_s",
             f"{self.interval_s} s is shorter than the bracket itself ({shortest_s} s)",
         )
-        _require(self.interval_s <= 86_400, f"{path}.interval_s", f"{self.interval_s} s is more than a day")
-        _require(1 <= self.count <= 100_000, f"{path}.count", f"expected 1 to 100000, got {self.count}")
+        require(self.interval_s <= 86_400, f"{path}.interval_s", f"{self.interval_s} s is more than a day")
+        require(1 <= self.count <= 100_000, f"{path}.count", f"expected 1 to 100000, got {self.count}")
 
     @property
     def exposure_times_s(self) -> tuple[float, ...]:
@@ -238,15 +189,15 @@ class PoseSection:
         path = "mission.pose"
         for name, count in (("quat_chaser_to_camera", 4), ("camera_position_m", 3)):
             got = len(getattr(self, name))
-            _require(got == count, f"{path}.{name}", f"expected {count} numbers, got {got}")
+            require(got == count, f"{path}.{name}", f"expected {count} numbers, got {got}")
         length = math.hypot(*self.quat_chaser_to_camera)
-        _require(
+        require(
             abs(length - 1) < 1e-6,
             f"{path}.quat_chaser_to_camera",
             f"expected a unit quaternion, got length {length:.6f}",
         )
         for name in ("sigma_position_m", "sigma_attitude_deg"):
-            _require(
+            require(
                 getattr(self, name) >= 0,
                 f"mission.pose.{name}",
                 f"must not be negative, got {getattr(self, name)}",
@@ -263,16 +214,16 @@ class NavigationSection:
 
     def __post_init__(self):
         path = "mission.navigation"
-        _require(
+        require(
             self.source == "sgp4"
             or re.fullmatch(r"file:///.+|tcp://[^:/]+:\d{1,5}", self.source) is not None,
             f"{path}.source",
             f"expected sgp4, file:///path or tcp://host:port, got {self.source!r}",
         )
-        _require(
+        require(
             0 < self.max_gap_s <= 3600, f"{path}.max_gap_s", f"expected 0 to 3600 s, got {self.max_gap_s}"
         )
-        _require(0 <= self.wait_s <= 60, f"{path}.wait_s", f"expected 0 to 60 s, got {self.wait_s}")
+        require(0 <= self.wait_s <= 60, f"{path}.wait_s", f"expected 0 to 60 s, got {self.wait_s}")
 
 
 @dataclass(frozen=True)
@@ -287,7 +238,7 @@ class StoreSection:
     when_full: Literal["refuse", "drop-oldest"] = "refuse"
 
     def __post_init__(self):
-        _require(self.quota_mb >= 0, "mission.store.quota_mb", f"must not be negative, got {self.quota_mb}")
+        require(self.quota_mb >= 0, "mission.store.quota_mb", f"must not be negative, got {self.quota_mb}")
 
     @property
     def quota_bytes(self) -> int | None:
@@ -307,23 +258,23 @@ class LinkSection:
 
     def __post_init__(self):
         path = "mission.link"
-        _require(
+        require(
             0.1 <= self.housekeeping_s <= 3600,
             f"{path}.housekeeping_s",
             f"expected 0.1 to 3600 s, got {self.housekeeping_s}",
         )
-        _require(
+        require(
             1200 <= self.baud_rate <= 12_000_000,
             f"{path}.baud_rate",
             f"expected 1200 to 12000000, got {self.baud_rate}",
         )
-        _require(
+        require(
             512 <= self.max_packet_bytes <= 4096,  # the longest telemetry packets have some 400 bytes
             f"{path}.max_packet_bytes",
             f"expected 512 to 4096, got {self.max_packet_bytes}",
         )
-        _require(self.roi_sigma > 0, f"{path}.roi_sigma", f"must be positive, got {self.roi_sigma}")
-        _require(
+        require(self.roi_sigma > 0, f"{path}.roi_sigma", f"must be positive, got {self.roi_sigma}")
+        require(
             0 <= self.roi_margin_px <= 8192,
             f"{path}.roi_margin_px",
             f"expected 0 to 8192, got {self.roi_margin_px}",
@@ -340,10 +291,10 @@ class ReconstructSection:
     settings: dict[str, Any] = field(default_factory=dict, hash=False)  # such as sun_shading: linear
 
     def __post_init__(self):
-        _require(
+        require(
             0 <= self.seed < 1 << 32, "mission.reconstruct.seed", f"expected 0 to 2^32 - 1, got {self.seed}"
         )
-        _require(self.steps >= 0, "mission.reconstruct.steps", f"must not be negative, got {self.steps}")
+        require(self.steps >= 0, "mission.reconstruct.steps", f"must not be negative, got {self.steps}")
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flightsw.icd.frame import quat_to_matrix
+from flightsw.icd.quaternion import quat_to_matrix
 from ground.formats.views import FormatError, Intrinsics, View
 
 # model number in binary files: name, and where its parameters go (f is both focal lengths)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from flightsw.icd.config import ConfigError, parse_json
-from flightsw.icd.frame import quat_to_matrix
+from flightsw.icd.quaternion import quat_to_matrix
 from ground.formats.views import FormatError, Intrinsics, View
 
 

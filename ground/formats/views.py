@@ -12,8 +12,9 @@ import imagecodecs
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from flightsw.icd.frame import Frame, PoseTag, matrix_to_quat
+from flightsw.icd.frame import Frame, PoseTag
 from flightsw.icd.mission import CameraSection
+from flightsw.icd.quaternion import matrix_to_quat
 from ground.session import SCHEMA_VERSION, SessionError
 from ground.session_writer import frame_line
 from obbgs_base.files import write_whole

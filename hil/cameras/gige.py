@@ -45,7 +45,7 @@ FillPattern = ctypes.CFUNCTYPE(
 class GigeCameraServer:
     """A GigE Vision camera at 127.0.0.1 until closed; `url` is what `flightsw --camera` takes.
 
-    A software trigger exposes at the time in the feature SimulatedStartUtcNs or, if that is 0, at the present simulated
+    A software trigger exposes at the time in the feature ExposureStartUtcNs or, if that is 0, at the present simulated
     time, which runs from the mission's start in real time or `real_time` times as fast. Without a trigger the camera
     runs freely at its frame rate. LateFrameCount counts frames that were not ready in time: in free running they are
     left out, triggered ones are sent late. A picture's time stamp is the simulated time at which the shutter opened.

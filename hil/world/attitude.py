@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from scipy.integrate import OdeSolution, solve_ivp
 
-from flightsw.icd.frame import matrix_to_quat, quat_to_matrix
 from flightsw.icd.mission import ConfigError
+from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.orbit import propagate, sun_direction_gcrs
 from flightsw.pose import look_along
 

@@ -5,12 +5,12 @@ import threading
 import time
 from collections.abc import Callable
 
-from flightsw.cameras import gige, hil
+from flightsw.cameras import OWN_CLOCK_ANSWER_S
 from flightsw.icd.mission import Mission
 
 NS = 1_000_000_000
 MARGIN_S = 20.0  # of a camera driver's timeout, left for rendering
-LONGEST_WAIT_S = min(gige.RENDER_S, hil.TIMEOUT_S) - MARGIN_S
+LONGEST_WAIT_S = OWN_CLOCK_ANSWER_S - MARGIN_S
 
 
 class SimulatedClock:

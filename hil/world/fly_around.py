@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from sgp4.api import WGS72, Satrec
 
-from flightsw.icd.mission import ConfigError, tle_checksum
+from flightsw.icd.config import ConfigError
+from flightsw.icd.tle import tle_checksum
 
 CATALOGUE_NUMBER = 90001  # of the designed chaser; not assigned to any object
 UNIX_EPOCH_JD = 2_440_587.5

@@ -9,8 +9,8 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from flightsw.icd.frame import matrix_to_quat, quat_to_matrix
 from flightsw.icd.mission import NavigationSection
+from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.orbit import propagate
 from flightsw.pose import look_along
 from hil.world.world import World

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from flightsw.icd.config import ConfigError, build, in_file, keys_below, parse_yaml
-from flightsw.icd.frame import PoseTag, matrix_to_quat
+from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import BracketSection, Mission, OrbitSection, PoseSection
+from flightsw.icd.quaternion import matrix_to_quat
 from flightsw.orbit import OrbitState, propagate, sun_direction_gcrs, sunlit_fraction
 from flightsw.pose import look_along, pose_tag
 from flightsw.sequencer import plan

@@ -53,10 +53,11 @@ from flightsw.icd.can import (
     format_slcan,
 )
 from flightsw.icd.command import Command, Report
+from flightsw.icd.config import ConfigError
 from flightsw.icd.frame import CRC, HEADER, MAX_PIXELS, decode_frame
 from flightsw.icd.framing import Deframer, PacketStream, frame_packet, max_frame_bytes
 from flightsw.icd.link_url import parse_link_url
-from flightsw.icd.mission import ConfigError, load_mission
+from flightsw.icd.mission import load_mission
 from flightsw.icd.packet import (
     APID_EVENTS,
     APID_FILES,

@@ -25,7 +25,7 @@ COUNT = 40
 
 @contextlib.contextmanager
 def camera(mission, radiance: float = 0.4, delay_s: float = 0.0) -> Iterator[CameraServer]:
-    """The simulator's camera in front of an even plate that fills a quarter of the picture."""
+    """The simulated camera in front of an even plate that fills a quarter of the picture."""
 
     def sky(pose) -> np.ndarray:
         time.sleep(delay_s)
@@ -166,7 +166,7 @@ def test_frames_outside_the_ephemeris_are_kept_without_a_pose(tmp_path, small_mi
     from flightsw.sequencer import capture
 
     class Clock:
-        waits = False
+        has_own_clock = True
 
         def expose(self, exposure_time_s: float, start_utc_ns: int) -> Exposure:
             shape = (small_mission.camera.height, small_mission.camera.width)

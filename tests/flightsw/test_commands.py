@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from flightsw.commands import ANSWER_S, Commander, ReplayCounter
 from flightsw.icd.auth import Key, seal, seal_file
 from flightsw.icd.command import Command
-from flightsw.icd.mission import ConfigError
+from flightsw.icd.config import ConfigError
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.settings import Settings, load_settings, save_settings
 from flightsw.store import FrameStore
@@ -79,7 +79,7 @@ def test_a_command_is_accepted_started_and_completed(spacecraft):
     ("name", "arguments", "expected"),
     [
         ("bracket", {"exposure_times_ms": (0.02, 0.04)}, {"exposure_times_ms": (0.02, 0.04)}),
-        ("near", {"near": 2}, {"near": 2}),
+        ("near", {"near": 2}, {"max_error_dn": 2}),
         ("priority", {"order": "triage"}, {"priority": "triage"}),
         ("safe", {}, {"safe_mode": True}),
     ],
@@ -138,11 +138,11 @@ def test_a_command_has_no_effect_when_its_counter_cannot_be_kept(spacecraft):
     packet = spacecraft.seal("near", near=2)
     spacecraft.commander.receive(packet)
     assert [stage for stage, _ in spacecraft.reports()] == ["refused"]
-    assert spacecraft.commander.settings.near == 0
+    assert spacecraft.commander.settings.max_error_dn == 0
     block.rmdir()
     spacecraft.commander.receive(packet)  # it was told as refused: it stays so
     assert [stage for stage, _ in spacecraft.reports()] == ["refused"]
-    assert spacecraft.commander.settings.near == 0
+    assert spacecraft.commander.settings.max_error_dn == 0
 
 
 @pytest.mark.parametrize("forged", ["no key on board", "wrong key", "cut", "flipped", "noise"])
@@ -175,7 +175,7 @@ def test_an_authentic_packet_with_any_content_is_executed_in_range_or_refused(sp
         spacecraft.commander.receive(seal(spacecraft.key, spacecraft.counter, content))
         stages = [stage for stage, _ in spacecraft.reports()]
         assert stages in (["refused"], ["accepted", "started", "completed"], ["accepted", "started"])
-    assert 0 <= spacecraft.commander.settings.near <= 16
+    assert 0 <= spacecraft.commander.settings.max_error_dn <= 16
     assert len(spacecraft.store.frames) == 3  # nothing destructive without arming
 
 
@@ -292,8 +292,8 @@ def test_two_processes_cannot_share_a_counter(spacecraft):
 def test_damaged_settings_fall_back_to_the_mission(tmp_path, small_mission):
     default = Settings(small_mission.link.priority)
     assert load_settings(tmp_path, small_mission) == default
-    save_settings(tmp_path, replace(default, near=3))
-    assert load_settings(tmp_path, small_mission).near == 3
+    save_settings(tmp_path, replace(default, max_error_dn=3))
+    assert load_settings(tmp_path, small_mission).max_error_dn == 3
     for text in (
         "",
         "{",

@@ -11,7 +11,7 @@ import pytest
 from spacepackets.cfdp.pdu import FileDataPdu, MetadataPdu
 
 from flightsw.commands import ReplayCounter
-from flightsw.downlink import GOODBYE_S, RESTARTS, WAIT_S, run_downlink
+from flightsw.downlink import LAST_TELEMETRY_S, RESTARTS, WAIT_S, run_downlink
 from flightsw.errors import DownlinkError, StoreError
 from flightsw.housekeeping import MAX_EVENTS, EventLog, ProcessMeter
 from flightsw.icd.frame import HEADER, read_header
@@ -160,7 +160,7 @@ def test_a_port_that_takes_nothing_does_not_keep_the_software_from_ending(store,
     link.ready = False
     fly(link, store, small_mission, 1.0)
     assert link.written == []
-    assert link.now_s < 1.0 + GOODBYE_S + 3 * WAIT_S
+    assert link.now_s < 1.0 + LAST_TELEMETRY_S + 3 * WAIT_S
 
 
 def test_a_flood_of_forged_commands_is_counted_and_does_not_fill_the_downlink(store, small_mission, tmp_path):
@@ -289,9 +289,9 @@ def test_an_outbox_that_stays_unreadable_ends_with_the_stores_error(store, small
 def test_a_dead_downlink_is_no_success_of_the_program(tmp_path, small_mission):
     """`flightsw downlink` as a process whose port driver has a defect."""
     code = """
-import sys, flightsw.downlink, flightsw.link
+import sys, flightsw.downlink, flightsw.ports
 def exchange(self, timeout_s): raise ZeroDivisionError("a defect")
-flightsw.link.SerialLink.exchange = exchange
+flightsw.ports.SerialLink.exchange = exchange
 flightsw.downlink.RESTART_S = 0.0
 from flightsw.cli import main
 main()

@@ -8,7 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sgp4.io import compute_checksum
 
-from flightsw.icd.mission import ConfigError, Mission, build, load_mission, tle_checksum
+from flightsw.icd.config import ConfigError, build
+from flightsw.icd.mission import Mission, load_mission
+from flightsw.icd.tle import tle_checksum
 
 TEXT = (Path(__file__).parents[2] / "mission.yaml").read_text()
 TREE = yaml.safe_load(TEXT)

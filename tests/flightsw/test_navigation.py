@@ -14,8 +14,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from flightsw.errors import NavigationError
-from flightsw.icd.frame import quat_to_matrix
 from flightsw.icd.mission import Mission, NavigationSection, load_mission
+from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.navigation import NavigationStream, RelativePose, SatelliteStates, interpolate, parse_state
 from flightsw.orbit import propagate
 from flightsw.pose import PoseTagger, navigation_tag, pose_tag, target_attitude
@@ -105,6 +105,32 @@ def test_interpolation_matches_scipy(seed, u, step_s):
         np.testing.assert_allclose(quat_to_matrix(getattr(ours, name)), expected, atol=1e-6)
     assert ours.covariance is not None
     assert np.linalg.eigvalsh(ours.covariance)[0] > -1e-9  # a mean of covariances is one
+
+
+@pytest.mark.parametrize("u", [0.0, 0.3, 1.0])
+def test_an_error_along_the_line_of_sight_stays_along_it_while_the_target_spins(u):
+    """Range is far less certain than direction; the body axes turn by 80 degrees from one state to the next."""
+    sigmas_camera_m, sigma_rad = np.array([0.1, 0.1, 2.0]), 1e-3
+    ends = []
+    for share in (0, 1):
+        body_to_camera = Rotation.from_euler("y", 80.0 * share, degrees=True)
+        camera_to_body = body_to_camera.as_matrix().T
+        covariance = np.diag([*sigmas_camera_m, *np.full(3, sigma_rad)]) ** 2
+        covariance[0, 3] = covariance[3, 0] = 0.5 * sigmas_camera_m[0] * sigma_rad
+        covariance[:3] = camera_to_body @ covariance[:3]
+        covariance[:, :3] = covariance[:, :3] @ camera_to_body.T
+        position_body_m = camera_to_body @ [0.0, 0.0, -20.0]
+        quat = body_to_camera.as_quat(scalar_first=True)
+        ends.append(RelativePose(START_NS + share * NS, quat, position_body_m, covariance))
+    between = interpolate(ends[0], ends[1], START_NS + round(u * NS))
+    assert isinstance(between, RelativePose)
+    body_to_camera = quat_to_matrix(between.quat_body_to_camera)
+    seen = between.covariance.copy()
+    seen[:3] = body_to_camera @ seen[:3]
+    seen[:, :3] = seen[:, :3] @ body_to_camera.T
+    np.testing.assert_allclose(np.sqrt(np.diag(seen)[:3]), sigmas_camera_m, rtol=1e-9)
+    np.testing.assert_allclose(seen[0, 3], 0.5 * sigmas_camera_m[0] * sigma_rad, rtol=1e-9)
+    np.testing.assert_allclose(body_to_camera @ between.position_body_m, [0, 0, -20.0], atol=1e-9)
 
 
 def test_each_frame_of_a_bracket_has_its_own_pose_and_covariance(tmp_path):

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from flightsw.icd.frame import matrix_to_quat, quat_to_matrix
 from flightsw.icd.mission import load_mission
+from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.pose import look_along, pose_tag, target_attitude
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")

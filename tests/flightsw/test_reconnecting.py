@@ -1,4 +1,4 @@
-"""A lost camera is tried again: one line when it goes, one when it is back, and its cost is counted."""
+"""A lost camera is tried again: one log line when it is lost, one when it is back, and lost exposures are counted."""
 
 import contextlib
 import itertools
@@ -29,8 +29,8 @@ class Scripted:
 
     packets_lost = 0
 
-    def __init__(self, *script: Exception | None, waits: bool = False):
-        self.script, self.waits, self.calls = list(script), waits, 0
+    def __init__(self, *script: Exception | None, has_own_clock: bool = True):
+        self.script, self.has_own_clock, self.calls = list(script), has_own_clock, 0
 
     def _next(self) -> None:
         self.calls += 1
@@ -66,7 +66,7 @@ def keeper(camera: Scripted, clock: Clock | None = None) -> ReconnectingCamera:
     return ReconnectingCamera(camera, clock.pause, clock)
 
 
-def test_a_simulated_camera_that_comes_back_costs_no_exposure(tmp_path, caplog):
+def test_a_camera_with_its_own_clock_that_comes_back_costs_no_exposure(tmp_path, caplog):
     camera = Scripted(None, None, LOST, LOST, LOST)
     kept = keeper(camera)
     counts = capture(MISSION, kept, FrameStore(tmp_path))
@@ -78,7 +78,7 @@ def test_a_simulated_camera_that_comes_back_costs_no_exposure(tmp_path, caplog):
     ]
 
 
-def test_a_simulated_camera_that_never_comes_back_is_given_up_once_with_the_counts(tmp_path, caplog):
+def test_a_camera_with_its_own_clock_that_never_comes_back_is_given_up_once_with_the_counts(tmp_path, caplog):
     camera = Scripted(*[None] * 4, *[LOST] * 1000)
     clock = Clock()
     kept = keeper(camera, clock)
@@ -89,8 +89,10 @@ def test_a_simulated_camera_that_never_comes_back_is_given_up_once_with_the_coun
     assert kept.lost and len(caplog.records) == 1
 
 
-def test_a_camera_in_our_time_is_tried_at_each_exposure_and_the_lost_ones_are_counted(tmp_path, caplog):
-    camera = Scripted(None, LOST, LOST, None, LOST, waits=True)
+def test_a_camera_without_its_own_clock_is_tried_at_each_exposure_and_the_lost_ones_are_counted(
+    tmp_path, caplog
+):
+    camera = Scripted(None, LOST, LOST, None, LOST, has_own_clock=False)
     kept = keeper(camera)
     counts = capture(MISSION, kept, FrameStore(tmp_path))
     assert (counts.stored, counts.failed, counts.lost_with_camera, counts.brackets_short) == (45, 3, 3, 2)
@@ -102,7 +104,7 @@ def test_a_camera_in_our_time_is_tried_at_each_exposure_and_the_lost_ones_are_co
 
 
 def test_between_exposures_a_lost_camera_is_reached_without_losing_one():
-    camera = Scripted(LOST, LOST, None, waits=True)
+    camera = Scripted(LOST, LOST, None, has_own_clock=False)
     kept = keeper(camera)
     with pytest.raises(CameraLost):
         kept.expose(1e-4, 0)
@@ -134,7 +136,7 @@ def test_a_camera_that_answers_without_a_picture_is_not_lost_and_the_reason_come
 
 
 @pytest.mark.parametrize("answer", [b"", b"no JSON\n", b"[]\n", b'{"ok": true, "height": 2}\n', "short"])
-def test_a_hil_camera_that_breaks_off_is_lost_and_connects_anew(answer):
+def test_a_networked_camera_that_breaks_off_is_lost_and_connects_anew(answer):
     if answer == "short":
         header = {"ok": True, "height": 2, "width": 2, "channels": 1, "nbytes": 8}
         answer = json.dumps(header).encode() + b"\nabc"
@@ -166,7 +168,7 @@ def test_a_hil_camera_that_breaks_off_is_lost_and_connects_anew(answer):
 
 @contextlib.contextmanager
 def camera_process(tmp_path: Path, limit: int = 10**6) -> Iterator[subprocess.Popen]:
-    """The simulator's camera as a process of its own that dies with exposure number `limit`."""
+    """The simulated camera as a process of its own that dies with exposure number `limit`."""
     code = f"""
 import itertools, os, sys, threading
 import numpy as np
@@ -229,10 +231,11 @@ def test_a_camera_that_never_comes_back_is_two_lines_a_summary_and_a_failure(tmp
 
 def test_the_ground_is_told_that_the_camera_is_lost(tmp_path, small_mission):
     """In the housekeeping packets of `flightsw capture --link`, while it is tried again and after it was given up."""
+    from flightsw.icd.can import GROUND_SIDE
     from flightsw.icd.framing import PacketStream
     from flightsw.icd.packet import APID_EVENTS, APID_HOUSEKEEPING, TELECOMMAND
     from flightsw.icd.telemetry import DICTIONARY
-    from flightsw.link import open_link
+    from flightsw.ports import open_link
     from hil.links.virtual_serial import VirtualSerial
 
     path = tmp_path / "small.yaml"
@@ -241,7 +244,7 @@ def test_the_ground_is_told_that_the_camera_is_lost(tmp_path, small_mission):
     with (
         camera_process(tmp_path, limit=2),
         VirtualSerial(921_600) as line,
-        open_link(line.ground_url) as ground,
+        open_link(line.ground_url, GROUND_SIDE) as ground,
     ):
         process = start_capture(tmp_path, "--link", line.flight_url, patience_s=1.0)
         for _ in itertools.count():

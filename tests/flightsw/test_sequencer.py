@@ -52,6 +52,17 @@ def test_one_bad_frame_is_counted_and_never_ends_the_pass(tmp_path):
     assert [f.frame_id for f in store.frames] == list(range(46))  # no number is lost to a failed exposure
 
 
+def test_a_full_store_is_one_line_and_one_with_the_count(tmp_path, caplog):
+    room = FrameStore(tmp_path / "room")
+    capture(MISSION, Sky(), room)
+    quota_bytes = sum(stored.size_bytes for stored in room.frames[:5])
+    counts = capture(MISSION, Sky(), FrameStore(tmp_path / "small", quota_bytes))
+    assert counts.refused == 48 - counts.stored > 40
+    first, rest = (record.getMessage() for record in caplog.records)
+    assert first == f"frame {counts.stored} refused: the quota of {quota_bytes} bytes is full, policy refuse"
+    assert rest == f"{counts.refused - 1} more frames refused: the store is full"
+
+
 def test_a_restart_takes_only_what_is_missing(tmp_path):
     counts = capture(MISSION, Sky(failing=(4, 5)), FrameStore(tmp_path))
     again = capture(MISSION, Sky(), FrameStore(tmp_path))

@@ -18,10 +18,12 @@ from hypothesis import strategies as st
 from flightsw.cli import app
 from flightsw.downlink import run_downlink
 from flightsw.errors import TriageError
-from flightsw.icd.frame import HEADER, Frame, PoseTag, encode_frame, quat_to_matrix
+from flightsw.icd.can import FLIGHT_SIDE
+from flightsw.icd.frame import HEADER, Frame, PoseTag, encode_frame
 from flightsw.icd.mission import load_mission
-from flightsw.link import open_link
+from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.model_file import MAX_MODEL_BYTES, verified_model
+from flightsw.ports import open_link
 from flightsw.settings import Settings, save_settings
 from flightsw.store import FrameStore
 from flightsw.triage import (
@@ -358,7 +360,7 @@ def test_over_the_link_an_informative_view_comes_before_repeats_of_what_the_grou
     store.mark_delivered(0)
     (store.folder / "model.onnx").write_bytes(model.read_bytes())
     save_settings(store.folder, Settings(priority="triage"))
-    with VirtualSerial(3_000_000) as line, open_link(line.flight_url) as link:
+    with VirtualSerial(3_000_000) as line, open_link(line.flight_url, FLIGHT_SIDE) as link:
         ended = threading.Event()
         ground = threading.Thread(
             target=listen, args=(line.ground_url, session, MISSION), kwargs={"should_stop": ended.is_set}

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from flightsw.downlink import run_downlink
 from flightsw.icd.frame import HEADER, encode_frame
 from flightsw.icd.packet import APID_FRAME_HEADERS
-from flightsw.link import SerialLink
+from flightsw.ports import SerialLink
 from flightsw.store import FrameStore
 from ground.evaluate import evaluate
 from ground.formats.views import Intrinsics, View, write_session

@@ -14,7 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flightsw.icd.frame import encode_frame, quat_to_matrix
+from flightsw.icd.frame import encode_frame
+from flightsw.icd.quaternion import quat_to_matrix
 from ground.formats.colmap import read_colmap
 from ground.formats.nerf import export_nerf, read_nerf, split_brackets
 from ground.formats.nerfstudio import export_nerfstudio, read_nerfstudio

@@ -12,8 +12,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from flightsw.errors import TriageError
-from flightsw.icd.frame import Frame, PoseTag, encode_frame, matrix_to_quat
+from flightsw.icd.frame import Frame, PoseTag, encode_frame
 from flightsw.icd.mission import Mission
+from flightsw.icd.quaternion import matrix_to_quat
 from flightsw.triage import Renderer, rank_frames
 from ground.cameras import sensor_of, sun_direction
 from ground.card import model_card

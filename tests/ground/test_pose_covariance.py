@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from flightsw.errors import NavigationError
-from flightsw.icd.frame import PoseTag, matrix_to_quat, quat_to_matrix
+from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import load_mission
+from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.navigation import RelativePose, SatelliteStates, interpolate, parse_state
 from flightsw.pose import navigation_tag
 from ground.session import open_session

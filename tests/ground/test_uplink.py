@@ -141,7 +141,7 @@ def test_whatever_is_lost_each_command_is_executed_once_and_its_end_is_known(
     assert [end["stage"] for end in ends if end] == ["completed"] * 6
     assert (commander.accepted, commander.refused) == (6, 0)
     assert (commander.repeated > 0) == (loss > 0)
-    assert commander.settings.near == 5
+    assert commander.settings.max_error_dn == 5
     assert not uplinker.jobs and not list((session / "uplink").glob("*[0-9].json"))
 
 

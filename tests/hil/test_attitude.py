@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flightsw.icd.frame import quat_to_matrix
 from flightsw.icd.mission import ConfigError, TargetAttitudeSection, load_mission
+from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.orbit import propagate
 from flightsw.pose import target_attitude
 from hil.world.attitude import AttitudeSection, attitude, tumble

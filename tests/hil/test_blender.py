@@ -11,8 +11,9 @@ import trimesh
 from scipy.ndimage import map_coordinates
 from typer.testing import CliRunner
 
-from flightsw.icd.frame import PoseTag, matrix_to_quat
+from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, load_mission
+from flightsw.icd.quaternion import matrix_to_quat
 from flightsw.pose import look_along
 from hil import cli
 from hil.sky import spacecraft

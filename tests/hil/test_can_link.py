@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import pytest
 
-import flightsw.link
-import ground.link
+from flightsw.icd.can import FLIGHT_SIDE, GROUND_SIDE
 from flightsw.icd.framing import frame_packet
+from flightsw.ports import Link, open_link
 from hil.links.virtual_can import VirtualCan
 
 BOTH = pytest.mark.parametrize("fd", [False, True], ids=["classic", "fd"])
@@ -19,7 +19,7 @@ class Reader:
     """The ground's end of the link, read by a thread that can be stopped for a while."""
 
     def __init__(self, line: VirtualCan):
-        self.link = ground.link.open_link(line.ground_url)
+        self.link = open_link(line.ground_url, GROUND_SIDE)
         self.received = b""
         self._run, self._end = threading.Event(), False
         self._run.set()
@@ -51,7 +51,7 @@ def wait_for(condition: Callable[[], bool], limit_s: float = 30.0) -> None:
         time.sleep(0.01)
 
 
-def write_all(link: flightsw.link.Link, packets: list[bytes]) -> None:
+def write_all(link: Link, packets: list[bytes]) -> None:
     end_s, waiting = time.monotonic() + 60, list(packets)
     while waiting and time.monotonic() < end_s:
         if link.ready:
@@ -60,7 +60,7 @@ def write_all(link: flightsw.link.Link, packets: list[bytes]) -> None:
     assert not waiting
 
 
-def assert_nothing_is_lost(line: VirtualCan, *links: flightsw.link.Link) -> None:
+def assert_nothing_is_lost(line: VirtualCan, *links: Link) -> None:
     for link in links:
         assert set(link.losses.values()) == {0}, link.losses
     for lane in line.statistics().values():
@@ -71,7 +71,7 @@ def assert_nothing_is_lost(line: VirtualCan, *links: flightsw.link.Link) -> None
 def test_what_is_sent_just_before_a_link_is_closed_arrives(fd):
     packets = [frame_packet(os.urandom(size)) for size in (1000, 30, 400)]
     with VirtualCan(fd=fd) as line, Reader(line) as reader:
-        with flightsw.link.open_link(line.flight_url) as flight:
+        with open_link(line.flight_url, FLIGHT_SIDE) as flight:
             for packet in packets:
                 flight.write(packet)
         wait_for(lambda: len(reader.received) >= sum(map(len, packets)))
@@ -82,7 +82,7 @@ def test_what_is_sent_just_before_a_link_is_closed_arrives(fd):
 @BOTH
 def test_what_is_sent_before_the_other_side_opens_arrives(fd):
     packets = [frame_packet(os.urandom(size)) for size in (100, 400, 1000)]
-    with VirtualCan(fd=fd) as line, flightsw.link.open_link(line.flight_url) as flight:
+    with VirtualCan(fd=fd) as line, open_link(line.flight_url, FLIGHT_SIDE) as flight:
         for packet in packets:
             flight.write(packet)
         end_s = time.monotonic() + 1.0
@@ -98,7 +98,7 @@ def test_what_is_sent_before_the_other_side_opens_arrives(fd):
 
 def test_a_link_that_is_closed_while_nobody_listens_counts_what_was_not_sent():
     with VirtualCan() as line:
-        with flightsw.link.open_link(line.flight_url) as flight:
+        with open_link(line.flight_url, FLIGHT_SIDE) as flight:
             flight.write(frame_packet(bytes(100)))
         assert flight.losses["messages_failed"] == 1
 
@@ -111,7 +111,7 @@ def test_a_ground_that_does_not_read_for_a_while_loses_nothing(fd, packet_bytes,
     with (
         VirtualCan(fd=fd) as line,
         Reader(line) as reader,
-        flightsw.link.open_link(line.flight_url) as flight,
+        open_link(line.flight_url, FLIGHT_SIDE) as flight,
     ):
         half = len(packets) // 2
         writer = threading.Thread(target=write_all, args=(flight, packets))
@@ -132,7 +132,7 @@ def test_a_spacecraft_that_does_not_read_for_a_while_loses_nothing(fd):
     with (
         VirtualCan(fd=fd) as line,
         Reader(line) as reader,
-        flightsw.link.open_link(line.flight_url) as flight,
+        open_link(line.flight_url, FLIGHT_SIDE) as flight,
     ):
         write_all(flight, packets[:30])
         time.sleep(1.0)  # while answers wait in its port

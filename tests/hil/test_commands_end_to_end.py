@@ -20,10 +20,11 @@ import torch
 
 from flightsw.commands import ReplayCounter
 from flightsw.downlink import DownlinkProgress, run_downlink
+from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.icd.command import Command
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, load_mission
-from flightsw.link import open_link
+from flightsw.ports import open_link
 from flightsw.store import FrameStore
 from flightsw.triage import Renderer
 from ground.ingest import ListenSummary, listen
@@ -243,7 +244,7 @@ def test_commands_cross_a_line_that_loses_and_damages_packets_and_each_is_execut
     with VirtualSerial(
         3_000_000, Faults(loss=0.1, bit_flip=0.02, duplicate=0.1, reorder=0.02), seed=4
     ) as line:
-        with open_link(line.flight_url) as link:
+        with open_link(line.flight_url, FLIGHT_SIDE) as link:
             flight = Side(
                 lambda stop: run_downlink(store, link, small_mission, should_stop=stop, counter=counter)
             )
@@ -294,7 +295,7 @@ def test_without_a_listener_the_command_opens_the_link_itself_and_without_a_link
     store = FrameStore(tmp_path / "store")
     with (
         VirtualSerial(460_800) as line,
-        open_link(line.flight_url) as link,
+        open_link(line.flight_url, FLIGHT_SIDE) as link,
         Side(lambda stop: run_downlink(store, link, small_mission, should_stop=stop, counter=counter)),
         Tools(tmp_path) as tools,
     ):
@@ -317,7 +318,7 @@ def test_on_a_terminal_listen_is_a_console_that_shows_the_spacecraft(tmp_path, s
     master, slave = os.openpty()
     termios.tcsetwinsize(slave, (50, 140))
     seen = bytearray()
-    with VirtualSerial(460_800) as line, open_link(line.flight_url) as link:
+    with VirtualSerial(460_800) as line, open_link(line.flight_url, FLIGHT_SIDE) as link:
         options = (
             "--link",
             line.ground_url,

@@ -14,7 +14,7 @@ from flightsw.icd.framing import PacketStream
 from flightsw.icd.mission import Mission, load_mission
 from flightsw.icd.packet import APID_FILES, TELEMETRY
 from flightsw.icd.transfer import Sender
-from flightsw.link import SerialLink
+from flightsw.ports import SerialLink
 from flightsw.store import FrameStore
 from ground.ingest import ListenSummary, listen
 from ground.session import open_session
@@ -155,7 +155,7 @@ import sys
 from pathlib import Path
 from flightsw.downlink import run_downlink
 from flightsw.icd.mission import load_mission
-from flightsw.link import SerialLink
+from flightsw.ports import SerialLink
 from flightsw.store import FrameStore
 with SerialLink(sys.argv[1]) as link:
     run_downlink(FrameStore(Path(sys.argv[2])), link, load_mission(sys.argv[3]), exit_when_empty=True)

@@ -100,7 +100,7 @@ def test_pictures_of_aravis_fake_camera_arrive_bit_for_bit(name, bit_depth, scal
             opened_ns = exposure.mid_exposure_utc_ns - exposure_us * 500
             assert before_ns <= opened_ns <= time.time_ns()
             assert is_ramp(exposure.dn, exposure_us, scale)
-        assert camera.waits
+        assert not camera.has_own_clock
         camera.close()
 
 
@@ -203,7 +203,7 @@ def test_a_frame_of_the_gige_driver_goes_through_store_and_container_unchanged(t
         taken = []
 
         class Watched:
-            waits = True
+            has_own_clock = False
 
             def expose(self, exposure_time_s: float, start_utc_ns: int):
                 taken.append(camera.expose(exposure_time_s, start_utc_ns))
@@ -373,7 +373,7 @@ def test_frames_captured_through_gige_have_the_poses_of_the_mission_s_times(tmp_
     store = FrameStore(tmp_path)
     with GigeCameraServer(mission, sky) as server:
         camera = open_camera(server.url, mission.camera)
-        assert not camera.waits
+        assert camera.has_own_clock
         counts = capture(mission, camera, store)
         camera.close()
     assert counts.stored == 9
@@ -383,7 +383,7 @@ def test_frames_captured_through_gige_have_the_poses_of_the_mission_s_times(tmp_
 
 
 def test_a_failure_in_rendering_loses_one_picture_and_not_the_camera(monkeypatch):
-    monkeypatch.setattr("flightsw.cameras.gige.RENDER_S", 1.0)
+    monkeypatch.setattr("flightsw.cameras.gige.OWN_CLOCK_ANSWER_S", 1.0)
     failures = [ZeroDivisionError("a defect")]
     plain = plate(0.4)
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from flightsw.cameras import open_camera
-from flightsw.icd.frame import quat_to_matrix
 from flightsw.icd.mission import ConfigError, Mission, load_mission
+from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.pose import PoseTagger
 from flightsw.sequencer import plan
 from hil.cameras.virtual import CameraServer

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flightsw.icd.auth import SECURITY_HEADER, TAG_BYTES, AuthError, Key, seal, seal_file, unseal, unseal_file
-from flightsw.icd.mission import ConfigError
+from flightsw.icd.config import ConfigError
 
 KEY = Key(1, bytes(range(32)))
 contents = st.binary(max_size=300)

@@ -81,7 +81,7 @@ def test_region_of_interest_is_lossless_inside_and_black_outside(make_frame):
 @pytest.mark.parametrize("channels", [1, 3])
 def test_near_bounds_the_error_of_every_pixel(make_frame, channels):
     frame = make_frame(1, channels=channels)
-    error = decode_frame(encode_frame(frame, near=2)).dn.astype(int) - frame.dn
+    error = decode_frame(encode_frame(frame, max_error_dn=2)).dn.astype(int) - frame.dn
     assert 0 < np.abs(error).max() <= 2
 
 
@@ -177,7 +177,7 @@ def test_a_frame_cannot_hold_values_that_the_container_cannot(make_frame, wrong)
 
 def test_a_header_alone_says_what_the_frame_is(make_frame):
     frame = make_frame(7)
-    values = read_header(encode_frame(frame, near=2)[: HEADER.size])
+    values = read_header(encode_frame(frame, max_error_dn=2)[: HEADER.size])
     for name in (
         "frame_id",
         "bracket_id",

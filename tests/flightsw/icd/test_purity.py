@@ -15,7 +15,7 @@ CLOCKS = {"now", "today", "utcnow", "monotonic", "perf_counter", "time_ns"}
 
 def test_the_code_reads_two_files_and_names_no_clock_port_or_thread():
     imported, called = set(), set()
-    for path in sorted(ICD.glob("*.py")):
+    for path in sorted(ICD.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
                 imported |= {(path.name, alias.name.partition(".")[0]) for alias in node.names}
@@ -41,7 +41,8 @@ def test_the_code_reads_two_files_and_names_no_clock_port_or_thread():
 
 def test_importing_all_of_it_opens_only_the_dictionary():
     """Seen by Python's own audit; modules and what other packages bring along are left out."""
-    modules = [f"flightsw.icd.{path.stem}" for path in sorted(ICD.glob("[a-z]*.py"))]
+    paths = sorted(path.relative_to(ICD).with_suffix("") for path in ICD.rglob("[a-z]*.py"))
+    modules = [".".join(("flightsw.icd", *path.parts)) for path in paths]
     code = f"""
 import importlib, json, sys
 opened = []

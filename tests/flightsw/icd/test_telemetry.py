@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flightsw.icd.command import Command, Report
-from flightsw.icd.mission import ConfigError
+from flightsw.icd.config import ConfigError
 from flightsw.icd.packet import HEADER, PacketError
 from flightsw.icd.telemetry import DICTIONARY, Item, Layout, parse_dictionary, printable
 

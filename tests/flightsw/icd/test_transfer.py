@@ -1,4 +1,4 @@
-"""CFDP over a lossy wire in simulated time, and one test for each defect of cfdp-py 0.7.0 that we mend."""
+"""CFDP over a lossy wire in simulated time, and one test for each defect of cfdp-py 0.7.0 that we fix."""
 
 import contextlib
 import importlib.metadata
@@ -16,10 +16,11 @@ from spacepackets.cfdp import ConditionCode, DirectiveType, PduConfig, Transmiss
 from spacepackets.cfdp.pdu import AckPdu, EofPdu, FileDataPdu, FinishedPdu, NakPdu
 from spacepackets.util import ByteFieldU8, ByteFieldU32
 
-from flightsw.icd import transfer
-from flightsw.icd.cfdp_shim import Gaps, MendedDest, MendedSource
 from flightsw.icd.packet import PacketError
-from flightsw.icd.transfer import Receiver, Sender, parse_pdu, timer_s
+from flightsw.icd.transfer import UPLINK, Receiver, Sender, parse_pdu, timer_s
+from flightsw.icd.transfer.cfdp_fixes import FixedDestHandler, FixedSourceHandler, Gaps
+from flightsw.icd.transfer.receiver import MAX_NAK_BYTES
+from flightsw.icd.transfer.rounds import merged_ranges
 
 MAX_PDU_BYTES = 200
 INTERVAL_S = 0.5
@@ -92,12 +93,13 @@ def acknowledges(pdu: object, directive: DirectiveType) -> bool:
 
 
 @pytest.fixture
-def unmend(monkeypatch):
-    """Gives methods of the mended state machines back their original form."""
+def unfix(monkeypatch):
+    """Gives methods of the fixed state machines back their original form."""
 
-    def restore(*names: str, of: type = MendedDest, to: type = DestHandler) -> None:
-        changed = type("Unmended", (of,), {name: getattr(to, name) for name in names})
-        monkeypatch.setattr(transfer, of.__name__, changed)
+    def restore(*names: str, of: type = FixedDestHandler, to: type = DestHandler) -> None:
+        changed = type("Unfixed", (of,), {name: getattr(to, name) for name in names})
+        user = "sender" if of is FixedSourceHandler else "receiver"
+        monkeypatch.setattr(f"flightsw.icd.transfer.{user}.{of.__name__}", changed)
 
     yield restore
     stock_dest._AckedModeParams().lost_seg_tracker.reset()  # the original shares it with everyone
@@ -114,7 +116,7 @@ def test_a_receiver_that_is_silent_for_two_and_a_half_seconds_is_waited_for():
     assert wire.delivered == {"slow"} and wire.failed == []
 
 
-def test_the_version_that_the_mends_are_for_is_installed():
+def test_the_version_that_the_fixes_are_for_is_installed():
     assert importlib.metadata.version("cfdp-py") == "0.7.0"
 
 
@@ -200,7 +202,7 @@ def test_many_gaps_are_asked_for_in_several_short_packets_and_all_sent_in_one_ro
     wire.run(5.0)
     naks = [pdu for pdu in wire.sent_up if isinstance(pdu, NakPdu)]
     assert wire.stored["a"] == content(15_000)
-    assert len(naks) > 2 and all(pdu.packet_len <= transfer.MAX_NAK_BYTES for pdu in naks)
+    assert len(naks) > 2 and all(pdu.packet_len <= MAX_NAK_BYTES for pdu in naks)
     assert naks[0].start_of_scope == 0 and naks[-1].end_of_scope == 15_000
     assert wire.sender.segments_resent == sum(len(pdu.segment_requests) for pdu in naks)
 
@@ -298,10 +300,10 @@ def test_hostile_sizes_take_no_memory():
 
 def test_a_nak_for_everything_many_times_costs_the_file_once():
     ranges = [(0, 0), (0, 0), (0, 5000), (100, 2**32 - 1), (900, 50), (0, 1000)]
-    assert transfer._merged(ranges, 1000) == [(0, 0), (0, 1000)]
+    assert merged_ranges(ranges, 1000) == [(0, 0), (0, 1000)]
 
 
-# ---- the mended defects: each test also shows what happens without its mend ----
+# ---- the fixed defects: each test also shows what happens without its fix ----
 
 
 def four_files_with_gaps() -> Wire:
@@ -315,11 +317,11 @@ def four_files_with_gaps() -> Wire:
     return wire
 
 
-def test_each_transaction_has_its_own_gaps(unmend):
+def test_each_transaction_has_its_own_gaps(unfix):
     wire = four_files_with_gaps()
     assert wire.stored == {str(number): content(1500, number) for number in range(4)}
     assert wire.sender.segments_resent == 4
-    unmend("_common_first_packet_handler")
+    unfix("_common_first_packet_handler")
     assert four_files_with_gaps().stored != wire.stored
 
 
@@ -333,10 +335,10 @@ def one_flipped_byte() -> Wire:
     return wire
 
 
-def test_a_byte_flipped_before_framing_is_not_reported_as_good(unmend):
+def test_a_byte_flipped_before_framing_is_not_reported_as_good(unfix):
     wire = one_flipped_byte()
     assert wire.stored == {} and wire.failed == ["a"]
-    unmend("_handle_transfer_completion")
+    unfix("_handle_transfer_completion")
     assert "a" in one_flipped_byte().stored
 
 
@@ -354,7 +356,7 @@ def eof_acknowledgements() -> int:
 
 def test_a_repeated_eof_is_acknowledged_each_time(monkeypatch):
     assert eof_acknowledgements() == 3
-    monkeypatch.setattr(MendedDest, "acknowledge_again", lambda self: None)
+    monkeypatch.setattr(FixedDestHandler, "acknowledge_again", lambda self: None)
     assert eof_acknowledgements() == 1
 
 
@@ -365,22 +367,22 @@ def metadata_and_a_segment_lost() -> Wire:
     return wire
 
 
-def test_metadata_that_comes_after_the_eof_ends_in_a_good_file(unmend):
+def test_metadata_that_comes_after_the_eof_ends_in_a_good_file(unfix):
     wire = metadata_and_a_segment_lost()
     assert wire.stored == {"a": content(1500)}
-    unmend("_handle_metadata_packet")
+    unfix("_handle_metadata_packet")
     assert metadata_and_a_segment_lost().delivered == set()
 
 
-def test_data_that_comes_before_the_metadata_is_kept(unmend):
+def test_data_that_comes_before_the_metadata_is_kept(unfix):
     assert metadata_and_a_segment_lost().sender.segments_resent == 1
-    unmend("_handle_file_data_without_previous_metadata")
+    unfix("_handle_file_data_without_previous_metadata")
     assert metadata_and_a_segment_lost().sender.segments_resent > 1
 
 
-def test_the_checksum_of_an_eof_before_the_metadata_is_kept(unmend):
+def test_the_checksum_of_an_eof_before_the_metadata_is_kept(unfix):
     assert metadata_and_a_segment_lost().delivered == {"a"}
-    unmend("_handle_eof_without_previous_metadata", "_handle_file_data_without_previous_metadata")
+    unfix("_handle_eof_without_previous_metadata", "_handle_file_data_without_previous_metadata")
     assert metadata_and_a_segment_lost().delivered == set()
 
 
@@ -398,9 +400,9 @@ def finished_before_the_acknowledgement() -> Wire:
     return wire
 
 
-def test_finished_counts_as_the_acknowledgement_of_the_eof(unmend):
+def test_finished_counts_as_the_acknowledgement_of_the_eof(unfix):
     assert finished_before_the_acknowledgement().failed == []
-    unmend("_check_inserted_packet", of=MendedSource, to=SourceHandler)
+    unfix("_check_inserted_packet", of=FixedSourceHandler, to=SourceHandler)
     assert finished_before_the_acknowledgement().failed == ["a"]
 
 
@@ -428,9 +430,9 @@ def finished_never_acknowledged() -> set[ConditionCode]:
     return {pdu.condition_code for pdu in wire.sent_up if isinstance(pdu, FinishedPdu)}
 
 
-def test_a_stored_file_is_never_reported_as_cancelled(unmend):
+def test_a_stored_file_is_never_reported_as_cancelled(unfix):
     assert finished_never_acknowledged() == {ConditionCode.NO_ERROR}
-    unmend("_handle_positive_ack_procedures")
+    unfix("_handle_positive_ack_procedures")
     assert ConditionCode.POSITIVE_ACK_LIMIT_REACHED in finished_never_acknowledged()
 
 
@@ -486,9 +488,9 @@ def test_files_go_up_as_they_go_down_and_the_two_routes_do_not_mix():
         stored[name] = content
         return True
 
-    up = Sender(MAX_PDU_BYTES, INTERVAL_S, route=transfer.UPLINK)
+    up = Sender(MAX_PDU_BYTES, INTERVAL_S, route=UPLINK)
     up.put("model-1", b"weights" * 100, 1, 0.0)
-    outcomes = run_both_ways(up, Receiver(MAX_PDU_BYTES, INTERVAL_S, store, route=transfer.UPLINK), 3.0)
+    outcomes = run_both_ways(up, Receiver(MAX_PDU_BYTES, INTERVAL_S, store, route=UPLINK), 3.0)
     assert [(o.name, o.delivered) for o in outcomes] == [("model-1", True)]
     assert stored == {"model-1": b"weights" * 100}
     up.put("model-2", b"weights", 2, 3.0)

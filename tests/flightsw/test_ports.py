@@ -1,7 +1,6 @@
-"""The ports of either side: URLs, hang-up and return, back-pressure, CAN. Both sides' do the same."""
+"""The ports that flight and ground share: URLs, hang-up and return, back-pressure, CAN."""
 
 import contextlib
-import inspect
 import os
 import subprocess
 import time
@@ -10,16 +9,16 @@ from pathlib import Path
 
 import can
 import pytest
+from isotp import CanMessage
 
-import flightsw.link
-import ground.link
-from flightsw.errors import LinkError
-from flightsw.icd.can import format_slcan
+from flightsw.icd.can import FLIGHT_SIDE, GROUND_SIDE, format_slcan
+from flightsw.icd.config import ConfigError
 from flightsw.icd.framing import frame_packet
 from flightsw.icd.link_url import LinkUrl, parse_link_url
-from flightsw.icd.mission import ConfigError
+from flightsw.ports import LinkError, SlcanLink, open_link
+from flightsw.ports.slcan import SILENT_S
 
-BOTH_SIDES = pytest.mark.parametrize("side", [flightsw.link, ground.link])
+BOTH_SIDES = pytest.mark.parametrize("side", [FLIGHT_SIDE, GROUND_SIDE], ids=["flight", "ground"])
 
 
 @pytest.fixture
@@ -94,30 +93,24 @@ def test_an_unusable_url_says_what_is_wrong(url, problem):
         parse_link_url(url)
 
 
-def test_both_sides_have_the_same_ports():
-    """Neither side may import the other: the two files differ in their head alone."""
-    flight, own = (inspect.getsource(side) for side in (flightsw.link, ground.link))
-    start = "\nREOPEN_S"
-    assert flight[flight.index(start) :] == own[own.index(start) :]
-    assert flightsw.link.OWN_IDS == ground.link.OTHER_IDS and flightsw.link.OTHER_IDS == ground.link.OWN_IDS
+def test_the_identifiers_that_one_side_sends_with_are_those_that_the_other_receives():
+    assert FLIGHT_SIDE.own_ids == GROUND_SIDE.other_ids and FLIGHT_SIDE.other_ids == GROUND_SIDE.own_ids
+    assert not set(FLIGHT_SIDE.own_ids) & set(GROUND_SIDE.own_ids)
 
 
-@BOTH_SIDES
-def test_a_port_that_is_not_there_is_a_link_error(side, tmp_path):
-    with pytest.raises(side.LinkError, match=f"cannot open {tmp_path}/none"):
-        side.open_link(f"serial://{tmp_path}/none")
-    with pytest.raises(side.LinkError, match=f"cannot open {tmp_path}/none"):
-        side.open_link(f"slcan://{tmp_path}/none")
-    with pytest.raises(side.LinkError, match="cannot open nocan0"):
-        side.open_link("can://nocan0")
-    assert flightsw.link.LinkError is LinkError
+def test_a_port_that_is_not_there_is_a_link_error(tmp_path):
+    with pytest.raises(LinkError, match=f"cannot open {tmp_path}/none"):
+        open_link(f"serial://{tmp_path}/none", FLIGHT_SIDE)
+    with pytest.raises(LinkError, match=f"cannot open {tmp_path}/none"):
+        open_link(f"slcan://{tmp_path}/none", FLIGHT_SIDE)
+    with pytest.raises(LinkError, match="cannot open nocan0"):
+        open_link("can://nocan0", FLIGHT_SIDE)
 
 
-@BOTH_SIDES
-def test_bytes_pass_unchanged_both_ways(side, terminal):
+def test_bytes_pass_unchanged_both_ways(terminal):
     master, _, name = terminal
     every_byte = bytes(range(256))
-    with side.open_link(f"serial://{name}") as link:
+    with open_link(f"serial://{name}", FLIGHT_SIDE) as link:
         os.write(master, every_byte)
         assert exchange_until(link, lambda data: len(data) >= 256) == every_byte
         link.write(every_byte)
@@ -126,10 +119,9 @@ def test_bytes_pass_unchanged_both_ways(side, terminal):
         assert (link.bytes_read, link.bytes_written) == (256, 257)
 
 
-@BOTH_SIDES
-def test_the_port_makes_the_writer_wait_and_nothing_is_lost(side, terminal):
+def test_the_port_makes_the_writer_wait_and_nothing_is_lost(terminal):
     master, _, name = terminal
-    with side.open_link(f"serial://{name}") as link:
+    with open_link(f"serial://{name}", FLIGHT_SIDE) as link:
         block, written = b"x" * 1000, 0
         while link.ready and written < 1_000_000:
             link.write(block)
@@ -148,10 +140,9 @@ def test_the_port_makes_the_writer_wait_and_nothing_is_lost(side, terminal):
         assert link.ready
 
 
-@BOTH_SIDES
-def test_a_port_that_hung_up_is_opened_again_under_the_same_name(side, terminal):
+def test_a_port_that_hung_up_is_opened_again_under_the_same_name(terminal):
     master, slave, name = terminal
-    with side.open_link(f"serial://{name}") as link:
+    with open_link(f"serial://{name}", FLIGHT_SIDE) as link:
         link.exchange(0.01)
         os.close(slave)
         os.close(master)
@@ -178,10 +169,9 @@ def read_all(descriptor: int) -> bytes:
     return b""
 
 
-@BOTH_SIDES
-def test_an_slcan_adapter_is_set_up_at_opening_and_closed_at_the_end(side, terminal):
+def test_an_slcan_adapter_is_set_up_at_opening_and_closed_at_the_end(terminal):
     master, _, name = terminal
-    with side.open_link(f"slcan://{name}?bitrate=500000") as link:
+    with open_link(f"slcan://{name}?bitrate=500000", FLIGHT_SIDE) as link:
         link.exchange(0.02)
         assert read_all(master) == b"\r\rC\rS6\rO\r"
     assert read_all(master) == b"\rC\r"
@@ -191,32 +181,31 @@ def test_an_slcan_adapter_is_set_up_at_opening_and_closed_at_the_end(side, termi
 def test_a_packet_is_one_iso_tp_message_in_frames_of_the_side_s_identifier(side, terminal):
     master, _, name = terminal
     first_frame, flow_control = b"100B", bytes([0x30, 0, 0])
-    with side.open_link(f"slcan://{name}") as link:
+    with open_link(f"slcan://{name}", side) as link:
         link.exchange(0.02)
         read_all(master)
         link.write(b"abcdefghijk\0")
         link.exchange(0.0)
         assert (
             read_all(master)
-            == f"t{side.OWN_IDS[0]:03X}8".encode() + first_frame + b"abcdef".hex().encode() + b"\r"
+            == f"t{side.own_ids[0]:03X}8".encode() + first_frame + b"abcdef".hex().encode() + b"\r"
         )
-        os.write(master, format_slcan(side.CanMessage(side.OTHER_IDS[0], 3, flow_control)))
+        os.write(master, format_slcan(CanMessage(side.other_ids[0], 3, flow_control)))
         exchange_until(link, lambda data: link.bytes_read)
         link.exchange(0.0)
         assert (
             read_all(master)
-            == f"t{side.OWN_IDS[0]:03X}6".encode() + b"21" + b"ghijk".hex().upper().encode() + b"\r"
+            == f"t{side.own_ids[0]:03X}6".encode() + b"21" + b"ghijk".hex().upper().encode() + b"\r"
         )
-        os.write(master, format_slcan(side.CanMessage(side.OTHER_IDS[1], 4, b"\x03xyz")))
+        os.write(master, format_slcan(CanMessage(side.other_ids[1], 4, b"\x03xyz")))
         assert exchange_until(link, lambda data: data) == b"xyz\0"
 
 
-@BOTH_SIDES
-def test_what_an_slcan_adapter_garbles_is_counted(side, terminal):
+def test_what_an_slcan_adapter_garbles_is_counted(terminal):
     master, _, name = terminal
-    with side.open_link(f"slcan://{name}") as link:
+    with open_link(f"slcan://{name}", FLIGHT_SIDE) as link:
         os.write(
-            master, b"t0C83x\r\xff\xfe\r\a" + format_slcan(side.CanMessage(side.OTHER_IDS[0], 2, b"\x22x"))
+            master, b"t0C83x\r\xff\xfe\r\a" + format_slcan(CanMessage(FLIGHT_SIDE.other_ids[0], 2, b"\x22x"))
         )
         exchange_until(link, lambda data: link.losses["can_frames_discarded"])
         assert link.losses == {
@@ -228,11 +217,10 @@ def test_what_an_slcan_adapter_garbles_is_counted(side, terminal):
         }
 
 
-@BOTH_SIDES
-def test_a_message_without_an_answer_is_given_up_and_counted(side, terminal):
+def test_a_message_without_an_answer_is_given_up_and_counted(terminal):
     _, _, name = terminal
     now_s = [0.0]
-    with side.SlcanLink(f"slcan://{name}", lambda: now_s[0]) as link:
+    with SlcanLink(f"slcan://{name}", FLIGHT_SIDE, lambda: now_s[0]) as link:
         link.write(frame_packet(bytes(range(100))))
         for _ in range(1000):
             now_s[0] += 0.01
@@ -241,14 +229,13 @@ def test_a_message_without_an_answer_is_given_up_and_counted(side, terminal):
         assert link.ready
 
 
-@BOTH_SIDES
-def test_an_adapter_that_came_back_or_fell_silent_is_set_up_again(side, terminal):
+def test_an_adapter_that_came_back_or_fell_silent_is_set_up_again(terminal):
     master, slave, name = terminal
     now_s = [0.0]
-    with side.SlcanLink(f"slcan://{name}", lambda: now_s[0]) as link:
+    with SlcanLink(f"slcan://{name}", FLIGHT_SIDE, lambda: now_s[0]) as link:
         link.exchange(0.02)
         read_all(master)
-        now_s[0] += side.SILENT_S + 1
+        now_s[0] += SILENT_S + 1
         link.exchange(0.0)
         link.exchange(0.02)
         assert b"O\r" in read_all(master)
@@ -291,8 +278,8 @@ def test_a_kernel_interface_carries_packets_both_ways(fd, monkeypatch):
     monkeypatch.setattr(can, "Bus", virtual_bus)
     packets = [frame_packet(os.urandom(size)) for size in (1, 20, 62, 63, 1000, 4096, 30)]
     with (
-        flightsw.link.open_link(f"can://test{fd}?fd={int(fd)}") as flight,
-        ground.link.open_link(f"can://test{fd}?fd={int(fd)}") as own,
+        open_link(f"can://test{fd}?fd={int(fd)}", FLIGHT_SIDE) as flight,
+        open_link(f"can://test{fd}?fd={int(fd)}", GROUND_SIDE) as own,
     ):
         assert pass_packets(flight, own, packets) == b"".join(packets)
         assert pass_packets(own, flight, packets) == b"".join(packets)
@@ -324,7 +311,7 @@ def test_a_kernel_interface_that_goes_away_is_opened_again_and_a_full_queue_only
             pass
 
     monkeypatch.setattr(can, "Bus", Bus)
-    with flightsw.link.open_link("can://can0") as link:
+    with open_link("can://can0", FLIGHT_SIDE) as link:
         link.write(b"abc\0")
         assert (link.connected, link.ready, link.hang_ups) == (True, False, 0)  # full: it waits
         link.exchange(0.0)
@@ -342,7 +329,7 @@ def test_a_real_virtual_can_interface_carries_packets():
     try:
         subprocess.run(["ip", "link", "set", "obbgs0", "up"], check=True)
         packets = [frame_packet(os.urandom(1000)) for _ in range(5)]
-        with flightsw.link.open_link("can://obbgs0") as flight, ground.link.open_link("can://obbgs0") as own:
+        with open_link("can://obbgs0", FLIGHT_SIDE) as flight, open_link("can://obbgs0", GROUND_SIDE) as own:
             assert pass_packets(flight, own, packets) == b"".join(packets)
     finally:
         subprocess.run(["ip", "link", "del", "obbgs0"], check=True)

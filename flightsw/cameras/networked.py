@@ -1,4 +1,7 @@
-"""The simulator's camera over a socket: hil:///path/to/socket or hil://host:port."""
+"""A camera that answers over a socket: hil:///path/to/socket or hil://host:port.
+
+A request is a line of JSON, a reply a line of JSON and the pixels, little-endian 16-bit numbers.
+"""
 
 import contextlib
 import json
@@ -7,16 +10,15 @@ from io import BufferedRWPair
 
 import numpy as np
 
-from flightsw.cameras import Exposure
+from flightsw.cameras import OWN_CLOCK_ANSWER_S, Exposure
 from flightsw.errors import CameraLost, CaptureError
 
 CONNECT_S = 10.0
-TIMEOUT_S = 120.0  # a frame that is not in the simulator's cache has to be rendered first
 MAX_BYTES = 8192 * 8192 * 3 * 2
 
 
-class HilCamera:
-    """Client of the simulator's camera server; its time is the simulator's, which waits for us.
+class NetworkedCamera:
+    """Client of a camera server, which has a clock of its own.
 
     After a broken connection, or a reply that cannot be read, the next exposure connects anew.
 
@@ -24,7 +26,7 @@ class HilCamera:
         CameraLost: there is no server.
     """
 
-    waits = False
+    has_own_clock = True
     packets_lost = 0  # the socket loses none
 
     def __init__(self, url: str):
@@ -45,13 +47,17 @@ class HilCamera:
             if address.startswith("/"):
                 connection = socket.socket(socket.AF_UNIX)
                 connection.settimeout(CONNECT_S)
-                connection.connect(address)
+                try:
+                    connection.connect(address)
+                except OSError:
+                    connection.close()
+                    raise
             else:
                 host, _, port = address.rpartition(":")
                 connection = socket.create_connection((host, int(port)), timeout=CONNECT_S)
         except (OSError, ValueError) as error:
-            raise CameraLost(f"no camera at {self._url}: {error}; start one with `hil camera`") from error
-        connection.settimeout(TIMEOUT_S)
+            raise CameraLost(f"no camera at {self._url}: {error}; start the camera's server") from error
+        connection.settimeout(OWN_CLOCK_ANSWER_S)
         self._stream = connection.makefile("rwb")
         connection.close()  # the stream keeps the connection
 
@@ -77,6 +83,7 @@ class HilCamera:
             raise CameraLost(f"the camera's reply cannot be read: {error}") from error
 
     def close(self) -> None:
+        """Close the connection; the next exposure connects anew."""
         stream, self._stream = self._stream, None
         if stream is not None:
             with contextlib.suppress(OSError):  # a request that was never sent

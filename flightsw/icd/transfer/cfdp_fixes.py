@@ -1,7 +1,7 @@
-"""cfdp-py 0.7.0's state machines with their known defects mended, on a given clock, without a disk.
+"""cfdp-py 0.7.0's state machines with their known defects fixed, on a given clock, without a disk.
 
-Each mend overrides a private method, so the version is pinned, and each has a test that fails when the
-mend is not needed or not enough any more.
+Each fix overrides a private method, so the version is pinned, and each has a test that fails when the fix is not
+needed any more or no longer enough.
 """
 
 import zlib
@@ -176,7 +176,7 @@ class Gaps(LostSegmentTracker):
         return changed
 
 
-class MendedDest(DestHandler):
+class FixedDestHandler(DestHandler):
     """The receiving state machine of one transaction."""
 
     clock: Clock
@@ -266,7 +266,7 @@ class MendedDest(DestHandler):
         return self.states.state == CfdpState.IDLE
 
 
-class MendedSource(SourceHandler):
+class FixedSourceHandler(SourceHandler):
     """The sending state machine of one transaction."""
 
     clock: Clock

@@ -1,0 +1,141 @@
+"""The frames of the outbox as file transfers: what is put in flight next, and what became of each."""
+
+import logging
+from collections import deque
+from dataclasses import dataclass
+
+from flightsw.errors import StoreError
+from flightsw.icd.frame import HEADER, decode_frame, encode_thumbnail
+from flightsw.icd.packet import PacketError
+from flightsw.icd.transfer import Outcome, Sender
+from flightsw.ranking import Ranking
+from flightsw.store import FrameStore
+
+log = logging.getLogger(__name__)
+RETRY_S = 5.0  # before a frame that cannot be read is tried again
+AHEAD = 2  # files put before their data are on the wire: few, so that the order can change
+
+
+@dataclass
+class SendingCounts:
+    """What became of the frames in this run, restarts of the downlink included."""
+
+    delivered: int = 0
+    payload_bytes: int = 0  # of delivered frames
+    segments_sent: int = 0  # before the last restart
+    segments_resent: int = 0
+    transfers_failed: int = 0  # put again afterwards
+    frames_unreadable: int = 0
+
+
+class FrameSender:
+    """Sends frames and thumbnails by CFDP, few at a time, in the order that it was given last."""
+
+    def __init__(
+        self,
+        store: FrameStore,
+        ranking: Ranking,
+        counts: SendingCounts,
+        max_pdu_bytes: int,
+        interval_s: float,
+    ):
+        self.waiting: list[int] = []  # frames still to be delivered, those in flight included
+        self.transfers = Sender(max_pdu_bytes, interval_s)
+        self._store, self._ranking, self._counts = store, ranking, counts
+        self._queue: deque[int] = deque()  # frames to be put, in order
+        self._thumbnails: deque[int] = deque()  # frames whose thumbnail is to be put
+        self._sizes_bytes: dict[int, int] = {}  # of frames in flight
+        self._retry_s: dict[int, float] = {}
+
+    def look(self) -> list[int]:
+        """Read the outbox and return the frames in it."""
+        self.waiting = self._store.outbox()
+        return self.waiting
+
+    def ready(self, now_s: float) -> list[int]:
+        """Return the waiting frames that are not in flight and not known to be unreadable for now."""
+        in_flight = set(self.transfers.in_flight)
+        return [
+            frame_id
+            for frame_id in self.waiting
+            if frame_file_name(frame_id) not in in_flight and self._retry_s.get(frame_id, now_s) <= now_s
+        ]
+
+    def queue(self, frame_ids: list[int]) -> None:
+        """Send these frames next, in this order; it replaces the order given before."""
+        self._queue = deque(frame_ids)
+
+    def queue_thumbnail(self, frame_id: int) -> None:
+        self._thumbnails.append(frame_id)
+
+    def fill(self, now_s: float) -> None:
+        """Put what is next in flight: thumbnails before frames, no more than a little ahead of the wire."""
+        transfers = self.transfers
+        while self._thumbnails and transfers.unsent < AHEAD:
+            self._put_thumbnail(self._thumbnails.popleft(), now_s)
+        while self._queue and transfers.unsent < AHEAD and transfers.has_room:
+            frame_id = self._queue.popleft()
+            container = self._read(frame_id, now_s)
+            if container is not None:
+                self._sizes_bytes[frame_id] = len(container)
+                transfers.put(frame_file_name(frame_id), container, self._store.next_transaction(), now_s)
+                self._ranking.note_sent(frame_id, container[: HEADER.size])
+
+    def outcomes(self) -> tuple[int, list[Outcome]]:
+        """Take account of the transfers that ended; return how many did, and the frames' that failed."""
+        outcomes = self.transfers.outcomes()
+        failed = []
+        for outcome in outcomes:
+            if not outcome.name.endswith(".obf"):
+                continue  # a thumbnail: it is not sent again, its frame follows
+            frame_id = int(outcome.name.removesuffix(".obf"))
+            if outcome.delivered:
+                self._confirm(frame_id)
+            else:
+                self._counts.transfers_failed += 1
+                self._ranking.note_failed(frame_id)
+                log.info("%s: transfer failed (%s), put again", outcome.name, outcome.reason)
+                failed.append(outcome)
+        return len(outcomes), failed
+
+    def stop(self) -> None:
+        """Add this sender's segments to the counts."""
+        self._counts.segments_sent += self.transfers.segments_sent
+        self._counts.segments_resent += self.transfers.segments_resent
+
+    def _read(self, frame_id: int, now_s: float) -> bytes | None:
+        try:
+            return self._store.read(frame_id)
+        except StoreError as error:
+            if frame_id not in self._retry_s:
+                log.error("%s", error)
+                self._counts.frames_unreadable += 1
+            self._retry_s[frame_id] = now_s + RETRY_S
+            return None
+
+    def _put_thumbnail(self, frame_id: int, now_s: float) -> None:
+        container = self._read(frame_id, now_s) if frame_id in self.waiting else None
+        try:
+            thumbnail = encode_thumbnail(decode_frame(container)) if container is not None else None
+        except PacketError as error:
+            log.error("frame %d has no thumbnail: %s", frame_id, error)
+            return
+        if thumbnail is not None:
+            name, transaction = f"{frame_id:08d}.obt", self._store.next_transaction()
+            self.transfers.put(name, thumbnail, transaction, now_s, urgent=True)
+
+    def _confirm(self, frame_id: int) -> None:
+        if frame_id not in self.waiting:  # a late answer may confirm it twice
+            return
+        self._store.mark_delivered(frame_id)
+        self.waiting.remove(frame_id)
+        size_bytes = self._sizes_bytes.pop(frame_id, 0)
+        self._counts.delivered += 1
+        self._counts.payload_bytes += size_bytes
+        self._ranking.note_delivered(frame_id)
+        log.info("frame %d delivered, %d bytes, %d waiting", frame_id, size_bytes, len(self.waiting))
+
+
+def frame_file_name(frame_id: int) -> str:
+    """Return the name of the file by which a frame is sent."""
+    return f"{frame_id:08d}.obf"

@@ -1,0 +1,158 @@
+"""What all ports share: the `Link` that flight and ground use, and opening a port again after it hung up.
+
+The device or the driver slows the writer down; no timer of ours does.
+"""
+
+import contextlib
+import logging
+import time
+from collections.abc import Callable
+from typing import Protocol, Self
+
+import can
+
+from flightsw.icd.can import IsoTpChannels
+from flightsw.icd.link_url import parse_link_url
+from obbgs_base.errors import ObbgsError
+
+log = logging.getLogger(__name__)
+
+REOPEN_S = 0.2  # between attempts to open a port that hung up
+CLOSE_S = 1.5  # for what was sent last to reach the other side, when a CAN port is closed
+CLOSE_STEP_S = 0.01
+ADAPTER_FRAMES = 128  # that an adapter may hold for the bus
+
+
+class LinkError(ObbgsError):
+    """The link's port cannot be opened."""
+
+
+class Link(Protocol):
+    """Framed packets to and from the other side, over whatever wire."""
+
+    baud_rate: int  # of the serial line that is as fast; timers follow it
+    bytes_read: int
+    bytes_written: int
+    hang_ups: int
+
+    @property
+    def connected(self) -> bool: ...
+
+    @property
+    def ready(self) -> bool:
+        """Whether `write` will take a packet: the port is open and has room."""
+        ...
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """What this wire itself dropped, by kind; packets lost that way are counted as missing as well."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Give framed packets to the wire; what it does not take at once is sent by the next `exchange`."""
+        ...
+
+    def exchange(self, timeout_s: float) -> bytes:
+        """Return the bytes that came within `timeout_s`; unsent bytes go out as the wire takes them."""
+        ...
+
+    def close(self) -> None: ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+class Port:
+    """A port that is opened again after it hung up. CFDP sends again what was lost meanwhile.
+
+    Raises:
+        ConfigError: the URL is not usable.
+        LinkError: the port cannot be opened the first time.
+    """
+
+    OPEN_ERRORS = (OSError, ValueError, can.CanError)  # SerialException is an OSError
+
+    def __init__(self, url: str, clock_s: Callable[[], float] = time.monotonic):
+        self.url = parse_link_url(url)
+        self.baud_rate = self.url.payload_baud_rate
+        self.bytes_read = 0
+        self.bytes_written = 0
+        self.hang_ups = 0
+        self._clock_s = clock_s
+        self._next_open_s = float("-inf")
+        try:
+            self._open()
+        except self.OPEN_ERRORS as error:
+            raise LinkError(f"cannot open {self.url.device}: {error}") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def connected(self) -> bool:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+    def _open(self) -> None:
+        raise NotImplementedError
+
+    def _drop(self) -> None:
+        """Give up the port and what it has not sent."""
+        raise NotImplementedError
+
+    def _wait_for_port(self, timeout_s: float) -> bool:
+        """Tell whether the port is open, after an attempt to open it if one is due."""
+        if self.connected:
+            return True
+        now_s = self._clock_s()
+        if now_s >= self._next_open_s:
+            self._next_open_s = now_s + REOPEN_S
+            with contextlib.suppress(*self.OPEN_ERRORS):
+                self._open()
+                log.info("%s is open again", self.url.device)
+                return True
+        time.sleep(min(timeout_s, REOPEN_S))
+        return False
+
+    def _hang_up(self, error: Exception) -> None:
+        log.warning("%s hung up: %s", self.url.device, error)
+        self.hang_ups += 1
+        self._drop()
+
+
+class IsoTpPort(Port):
+    """A port with ISO-TP messages under way, which are finished before it is closed.
+
+    Otherwise the last messages would be cut off: the rest of a message is sent only after the other side has answered
+    its first frame, and an adapter that is closed drops what it has not sent.
+    """
+
+    _channels: IsoTpChannels
+    _last_frame_s = float("-inf")  # when a frame was given to the port
+
+    @property
+    def _has_unsent(self) -> bool:
+        raise NotImplementedError
+
+    def _finish(self) -> None:
+        """Send until every message is out or the other side has not answered for too long; count what remains."""
+        frame_bytes = 63 if self.url.fd else 7
+        quiet_s = 0.02 + ADAPTER_FRAMES * frame_bytes * 10 / self.url.payload_baud_rate
+        end_s = time.monotonic() + CLOSE_S + quiet_s
+        while self.connected and time.monotonic() < end_s:
+            is_out = not self._channels.messages_pending and not self._has_unsent
+            if is_out and self._clock_s() - self._last_frame_s > quiet_s:
+                break
+            self.exchange(CLOSE_STEP_S)
+        if count := self._channels.messages_pending:
+            log.warning("%s is closed with %d messages that nobody took", self.url.device, count)
+        self._channels.abandon()
+
+    def exchange(self, timeout_s: float) -> bytes:
+        raise NotImplementedError

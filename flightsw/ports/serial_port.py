@@ -1,0 +1,83 @@
+"""Links over a serial port."""
+
+import os
+import select
+import termios
+
+import serial
+
+from flightsw.ports.port import Port
+
+READ_BYTES = 65_536
+
+
+class SerialLink(Port):
+    """A serial port."""
+
+    _port: serial.Serial | None = None
+    _unsent = b""
+
+    def close(self) -> None:
+        if self._port is not None:
+            self._port.close()
+            self._port = None
+
+    @property
+    def connected(self) -> bool:
+        return self._port is not None
+
+    @property
+    def ready(self) -> bool:
+        return self._port is not None and not self._unsent
+
+    @property
+    def losses(self) -> dict[str, int]:
+        return {}
+
+    def write(self, data: bytes) -> None:
+        self._unsent += data
+        self._flush()
+
+    def exchange(self, timeout_s: float) -> bytes:
+        if not self._wait_for_port(timeout_s):
+            return b""
+        assert self._port is not None
+        try:
+            descriptor = self._port.fileno()
+            writers = [descriptor] if self._unsent else []
+            readable, writable, _ = select.select([descriptor], writers, [], timeout_s)
+            if writable:
+                self._flush()
+            if not readable or self._port is None:
+                return b""
+            data = os.read(descriptor, READ_BYTES)
+            if not data:
+                raise OSError("the port hung up")
+        except (OSError, ValueError, termios.error) as error:
+            self._hang_up(error)
+            return b""
+        self.bytes_read += len(data)
+        return data
+
+    def _flush(self) -> None:
+        if self._port is None or not self._unsent:
+            return
+        try:
+            count = os.write(self._port.fileno(), self._unsent)
+        except BlockingIOError:
+            return
+        except (OSError, ValueError) as error:
+            self._hang_up(error)
+            return
+        self.bytes_written += count
+        self._unsent = self._unsent[count:]
+
+    def _open(self) -> None:
+        self._port = serial.Serial(
+            self.url.device, self.url.baud_rate, timeout=0, write_timeout=0, exclusive=True
+        )
+        self._unsent = b"\0"  # ends whatever half packet the other side still holds
+
+    def _drop(self) -> None:
+        self._unsent = b""
+        SerialLink.close(self)

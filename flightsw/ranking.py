@@ -1,0 +1,135 @@
+"""The model on board: verified when it comes, ranks the frames that wait, and so decides which goes down first."""
+
+import contextlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from flightsw.icd.mission import CameraSection
+from flightsw.icd.packet import PacketError
+from flightsw.store import FrameStore
+from flightsw.triage import ModelVerified, Ranked, TriageWorker, sending_order, sent_view
+from obbgs_base.files import sync_folder
+
+DECIDED_ONE_BY_ONE = 32  # places of the order by triage: more than are sent before the order is made anew
+RANKING_S = 30.0  # for which frames are held back for a new model to rank them: what is sent first cannot be reordered
+
+
+class Ranking:
+    """Scores of the frames in the outbox by the model in the store, and the sending order that follows from them.
+
+    The store holds the model in use as model.onnx; one that has come is model.onnx.received until it is verified.
+    """
+
+    def __init__(self, store: FrameStore, camera: CameraSection, clock_s: Callable[[], float]):
+        self.model_sha256 = b""  # of the model in use, empty without one
+        self.model_path = store.folder / "model.onnx"
+        self._store, self._clock_s = store, clock_s
+        self._worker = TriageWorker(np.array(camera.K), camera.width, camera.height)
+        self._hold_until_s = float("-inf")
+        self._scores: dict[int, Ranked] = {}
+        self._given_to_worker: set[int] = set()
+        self._being_ranked: set[int] = set()
+        self._sent_views: dict[int, tuple[float, ...]] = {}  # of frames delivered and in flight
+        self._is_verifying = False  # of the model from before a restart
+
+    def start(self) -> None:
+        """Verify the model that the store holds, if it holds one.
+
+        Raises:
+            OSError: the disk refuses.
+        """
+        (self._store.folder / "model.onnx.received").unlink(missing_ok=True)
+        self._is_verifying = self.model_path.exists()
+        if self._is_verifying:
+            self._worker.verify(self.model_path)
+
+    @property
+    def frames_ranked(self) -> int:
+        return len(self._scores)
+
+    def verify(self, model: Path) -> None:
+        """Look at a model file that has come; `collect` says how that ended."""
+        self._worker.verify(model)
+
+    def collect(self) -> list[ModelVerified]:
+        """Take in what the ranking thread has finished; return the models whose verification has ended.
+
+        A good model that came by uplink is in use from now on, a bad one is deleted.
+
+        Raises:
+            OSError: the disk refuses.
+        """
+        verified = []
+        for result in self._worker.results():
+            if isinstance(result, ModelVerified):
+                self._end_verification(result)
+                verified.append(result)
+                continue
+            path, score = result
+            self._being_ranked.discard(int(path.stem))
+            if score is not None:
+                self._scores[score.frame_id] = score
+        return verified
+
+    def rank(self, frame_ids: list[int]) -> None:
+        """Have each frame ranked once by the model in use."""
+        if not self.model_sha256:
+            return
+        for frame_id in frame_ids:
+            if frame_id not in self._given_to_worker:
+                self._given_to_worker.add(frame_id)
+                self._being_ranked.add(frame_id)
+                self._worker.rank(self._store.path(frame_id))
+
+    def ordered(self, frame_ids: list[int], now_s: float) -> list[int]:
+        """Return the frames that may be sent now, in the order by triage.
+
+        Frames that are being ranked are held back, and all frames for a while after a model comes into use. Frames
+        without a score go before those whose score says nothing (in eclipse, pose not valid).
+        """
+        if self._is_verifying or (self._being_ranked and now_s < self._hold_until_s):
+            return []
+        ready = [frame_id for frame_id in frame_ids if frame_id not in self._being_ranked]
+        scores = [self._scores[frame_id] for frame_id in ready if frame_id in self._scores]
+        ordered = sending_order(scores, list(self._sent_views.values()), DECIDED_ONE_BY_ONE)
+        unranked = [frame_id for frame_id in ready if frame_id not in self._scores]
+        comparable = [score.frame_id for score in ordered if score.comparable]
+        return [*comparable, *unranked, *(score.frame_id for score in ordered if not score.comparable)]
+
+    def note_sent(self, frame_id: int, header: bytes) -> None:
+        """Remember the view of a frame that is sent: frames with a similar view go later."""
+        with contextlib.suppress(PacketError):
+            view = sent_view(header)
+            if view is not None:
+                self._sent_views[frame_id] = view
+
+    def note_failed(self, frame_id: int) -> None:
+        """Forget the view of a frame whose transfer failed."""
+        self._sent_views.pop(frame_id, None)
+
+    def note_delivered(self, frame_id: int) -> None:
+        """Forget the score of a frame that needs no place in the order any more."""
+        self._scores.pop(frame_id, None)
+
+    def stop(self) -> None:
+        """End the ranking thread."""
+        self._worker.stop()
+
+    def _end_verification(self, result: ModelVerified) -> None:
+        if result.path == self.model_path:
+            self._is_verifying = False
+            if result.problem:
+                return
+        elif result.problem:
+            result.path.unlink(missing_ok=True)
+            return
+        else:
+            os.replace(result.path, self.model_path)
+            sync_folder(self._store.folder)
+        self.model_sha256 = result.sha256
+        self._hold_until_s = self._clock_s() + RANKING_S
+        self._scores.clear()
+        self._given_to_worker.clear()  # frames that are still waiting for the old model are ranked twice

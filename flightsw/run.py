@@ -1,0 +1,241 @@
+"""One run of the flight software: capture and downlink side by side, and what became of every frame."""
+
+import contextlib
+import dataclasses
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flightsw.cameras import open_camera
+from flightsw.cameras.reconnecting import RETRY_S, ReconnectingCamera
+from flightsw.commands import ReplayCounter
+from flightsw.downlink import DownlinkProgress, run_downlink
+from flightsw.errors import CaptureError
+from flightsw.icd.can import FLIGHT_SIDE
+from flightsw.icd.mission import Mission
+from flightsw.ports import Link, open_link
+from flightsw.sequencer import CaptureCounts, capture
+from flightsw.settings import load_settings
+from flightsw.store import FrameStore, open_store
+
+log = logging.getLogger(__name__)
+LINGER_S = 0.5  # after the last delivery
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What became of the frames of one run."""
+
+    frames_stored: int
+    outbox: int  # frames still to be delivered
+    captured: CaptureCounts | None = None  # None if no camera was asked for
+    camera_losses: int = 0
+    camera_is_lost: bool = False  # at the end of the run
+    sent: DownlinkProgress | None = None  # None if no link was asked for
+
+    def tree(self) -> dict[str, Any]:
+        """Return the result as it is printed with --json."""
+        tree: dict[str, Any] = {"frames_stored": self.frames_stored, "outbox": self.outbox}
+        if self.captured is not None:
+            tree["capture"] = vars(self.captured) | {"camera_losses": self.camera_losses}
+        if self.sent is not None:
+            tree["downlink"] = dataclasses.asdict(self.sent)
+        return tree
+
+
+def run_pass(
+    mission: Mission,
+    store_dir: Path,
+    stop: threading.Event,
+    *,
+    camera_url: str | None = None,
+    link_url: str | None = None,
+    key_file: Path | None = None,
+    exit_when_empty: bool = False,
+    on_captured: Callable[[CaptureCounts], None] = lambda counts: None,
+    on_sent: Callable[[DownlinkProgress], None] = lambda progress: None,
+) -> RunResult:
+    """Capture and send at the same time, whichever are asked for, and return what became of the frames.
+
+    Key, link and camera are opened before the store, so that wrong ones leave no store behind. Without a camera that
+    answers, stored frames are sent all the same, and its error is raised afterwards.
+
+    Args:
+        stop: when set, capture and downlink end cleanly.
+        key_file: the mission's key; without it every command is refused.
+        exit_when_empty: end the downlink once every frame is confirmed, not only when stopped.
+        on_captured: called after each planned exposure.
+        on_sent: called from the downlink's thread, about five times a second.
+
+    Raises:
+        ObbgsError: what could not be opened, or what ended capture or downlink.
+        ValueError: a URL that nothing here can open.
+    """
+    captured, camera, no_camera, thread = CaptureCounts(), None, None, None
+    with contextlib.ExitStack() as opened:
+        link, counter = _open_link(link_url, key_file, opened)
+        if camera_url is not None:
+            try:
+                camera = ReconnectingCamera(open_camera(camera_url, mission.camera), stop.wait)
+                opened.callback(camera.close)
+            except CaptureError as error:
+                if link is None:
+                    raise
+                no_camera = error  # what is stored is sent all the same
+        store = open_store(store_dir, mission)
+        if link is not None:
+            thread = _DownlinkThread(
+                FrameStore(store_dir), link, mission, counter, exit_when_empty, stop, on_sent, camera
+            )
+            if camera_url is not None:
+                thread.capturing.set()
+            thread.start()
+
+        def report(counts: CaptureCounts) -> None:
+            if thread is not None:
+                thread.captured = counts
+            on_captured(counts)
+
+        try:
+            if no_camera is not None:
+                raise no_camera
+            if camera is not None:
+                captured = _capture(mission, camera, store, stop, report)
+        except Exception as error:
+            if thread is not None:  # it may go on for hours until the outbox is empty: log the error now
+                thread.camera_failed = True
+                log.error("no more exposures: %s", str(error) or repr(error))
+            raise
+        finally:
+            if thread is not None:
+                thread.capturing.clear()
+                thread.join()
+        if thread is not None and thread.error is not None:
+            raise thread.error
+    left = FrameStore(store_dir)  # opened again: the downlink has its own
+    return RunResult(
+        frames_stored=len(left.frames),
+        outbox=len(left.outbox()),
+        captured=captured if camera_url is not None else None,
+        camera_losses=camera.losses if camera is not None else 0,
+        camera_is_lost=camera is not None and camera.lost,
+        sent=thread.result if thread is not None else None,
+    )
+
+
+def _open_link(
+    link_url: str | None, key_file: Path | None, opened: contextlib.ExitStack
+) -> tuple[Link | None, ReplayCounter | None]:
+    """Return the link and the counter of the key, each None if it was not asked for; `opened` closes them."""
+    if link_url is None:
+        return None, None
+    counter = ReplayCounter(key_file) if key_file is not None else None
+    if counter is not None:
+        opened.callback(counter.close)
+    return opened.enter_context(open_link(link_url, FLIGHT_SIDE)), counter
+
+
+def _capture(
+    mission: Mission,
+    camera: ReconnectingCamera,
+    store: FrameStore,
+    stop: threading.Event,
+    on_counts: Callable[[CaptureCounts], None],
+) -> CaptureCounts:
+    def wait_until(utc_ns: int) -> None:
+        while (
+            not camera.has_own_clock and not stop.is_set() and (left_s := (utc_ns - time.time_ns()) / 1e9) > 0
+        ):
+            camera.reconnect()
+            stop.wait(min(left_s, RETRY_S) if camera.lost else left_s)
+
+    def on_frame(counts: CaptureCounts) -> None:
+        counts.packets_lost = camera.packets_lost
+        on_counts(counts)
+
+    counts = capture(
+        mission,
+        camera,
+        store,
+        on_frame=on_frame,
+        should_stop=stop.is_set,
+        wait_until=wait_until,
+        settings=lambda: load_settings(store.folder, mission),
+    )
+    if camera.lost:
+        log.error("the camera did not come back: %d exposures were not taken", counts.lost_with_camera)
+    return counts
+
+
+class _DownlinkThread(threading.Thread):
+    """Sends while frames are being taken; an error is kept for the main thread."""
+
+    def __init__(
+        self,
+        store: FrameStore,
+        link: Link,
+        mission: Mission,
+        counter: ReplayCounter | None,
+        exit_when_empty: bool,
+        stop: threading.Event,
+        on_progress: Callable[[DownlinkProgress], None],
+        camera: ReconnectingCamera | None,
+    ):
+        super().__init__(name="downlink", daemon=True)
+        self.capturing = threading.Event()  # set while more frames may come
+        self.captured = CaptureCounts()  # so far
+        self.camera_failed = False
+        self.result = DownlinkProgress()
+        self.error: Exception | None = None
+        self._store, self._link, self._mission, self._counter = store, link, mission, counter
+        self._exit_when_empty, self._stop_event = exit_when_empty, stop
+        self._on_progress, self._camera = on_progress, camera
+        self._empty_since_s: float | None = None
+
+    def run(self) -> None:
+        try:
+            self.result = run_downlink(
+                self._store,
+                self._link,
+                self._mission,
+                on_progress=self._keep,
+                should_stop=self._should_stop,
+                counter=self._counter,
+                capture_values=self._capture_values,
+            )
+        except Exception as error:  # it would be lost with this thread; the main thread raises it
+            self.error = error
+            if self.capturing.is_set():  # the main thread may be busy for hours
+                log.error("the downlink has ended, frames are only stored: %s", str(error) or repr(error))
+
+    def _capture_values(self) -> dict[str, Any]:
+        """Return what capture knows of the housekeeping packet."""
+        if self.camera_failed or (self._camera is not None and self._camera.lost):
+            state = "failed"
+        elif self.capturing.is_set():
+            state = "capturing"
+        else:
+            state = "pass done" if self.captured.planned else "none"
+        return {
+            "camera": state,
+            "frames_failed": self.captured.failed,
+            "frames_refused": self.captured.refused,
+        }
+
+    def _keep(self, now: DownlinkProgress) -> None:
+        self.result = now
+        self._on_progress(now)
+
+    def _should_stop(self) -> bool:
+        """Tell whether all is delivered; lingers a little, as the ground may ask for its last answer once more."""
+        waiting = self.capturing.is_set() or self.result.waiting or not self._exit_when_empty
+        if waiting or self._store.outbox():
+            self._empty_since_s = None
+        elif self._empty_since_s is None:
+            self._empty_since_s = time.monotonic()
+        done = self._empty_since_s is not None and time.monotonic() - self._empty_since_s > LINGER_S
+        return self._stop_event.is_set() or done
