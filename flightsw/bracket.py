@@ -148,7 +148,7 @@ class AutoBracket:
         return bracket_times_s(self._light_at(geometry), self._camera, self._bracket)
 
     def observe(self, frames: Sequence[tuple[np.ndarray, float]], geometry: Geometry | None) -> None:
-        """Learn from a bracket that was taken."""
+        """Update the target's light from a bracket that was taken."""
         if geometry is None or not frames:
             return
         light = measured_light(frames, self._camera, self._light_at(geometry))

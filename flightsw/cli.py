@@ -187,7 +187,7 @@ def fsck_command(
             print(problem)
         print(
             f"{report.frames} good frames, {report.waiting} to be delivered, {report.quarantined} quarantined, "
-            f"{report.missing} missing, {len(report.problems)} problems {'found' if check else 'mended'}"
+            f"{report.missing} missing, {len(report.problems)} problems {'found' if check else 'repaired'}"
         )
     if report.quarantined or report.missing or (check and report.problems):
         raise typer.Exit(1)

@@ -28,7 +28,7 @@ from obbgs_base.files import write_whole
 
 log = logging.getLogger(__name__)
 REMEMBERED = 64  # commands whose reports are sent again when the ground asks again
-ANSWER_S = 0.2  # between answers to commands that come again: a flood of replays must not fill the downlink
+ANSWER_S = 0.2  # between answers to repeated commands: a flood of replays must not fill the downlink
 
 
 class ReplayCounter:

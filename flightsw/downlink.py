@@ -42,7 +42,7 @@ LAST_TELEMETRY_S = 0.5  # for sending the last telemetry at the end
 RESTART_S = 0.5  # from a failure to the new start
 RESTARTS = 5  # in a row, and no more
 SOUND_S = 60.0  # a downlink that ran for so long was in order: its next failure is the first in a row
-REFUSAL_S = 1.0  # between events of refused commands, which anybody can cause; all are counted
+REFUSAL_S = 1.0  # between events of refused commands, which any sender can cause; all are counted
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ class _Downlink:
         return self._frames.waiting
 
     def look(self, now_s: float) -> None:
-        """See what the outbox and triage have brought, and put what waits into its order."""
+        """Take in new frames and results of triage, and order the frames that wait."""
         for verified in self._ranking.collect():
             self._report_model(verified)
         waiting = self._frames.look()
@@ -240,7 +240,7 @@ class _Downlink:
         return bool(ended)
 
     def send_last_telemetry(self) -> None:
-        """Send the telemetry that waits, and that this is the end."""
+        """Send the queued telemetry and the event that the software stops."""
         self.events.add("stopped")
         self._telemetry.append((APID_HOUSEKEEPING, self._housekeeping()))
         self._next_housekeeping_s = float("inf")

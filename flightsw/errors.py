@@ -8,7 +8,7 @@ class FlightError(ObbgsError):
 
 
 class OrbitError(FlightError):
-    """The orbital elements cannot be propagated to the asked time."""
+    """The orbital elements cannot be propagated to the requested time."""
 
 
 class CaptureError(FlightError):
@@ -28,7 +28,7 @@ class StoreFull(StoreError):
 
 
 class NavigationError(FlightError):
-    """The navigation stream cannot be opened, or has no trustworthy state for the asked time."""
+    """The navigation stream cannot be opened, or has no usable state for the requested time."""
 
 
 class DownlinkError(FlightError):

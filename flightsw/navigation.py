@@ -199,7 +199,7 @@ def _hermite(
 
 
 class NavigationStream:
-    """Reads states as they come and gives the state at any time that two of them enclose.
+    """Reads states as they arrive and interpolates to any time between two of them.
 
     Args:
         section: where from, the largest gap, how long to wait for a state that is not there yet.

@@ -8,7 +8,7 @@ ROUNDING_DN = 0.29  # 1 sigma of rounding to whole numbers, 1/sqrt(12)
 
 
 def region_of_interest(dn: np.ndarray, mission: Mission) -> np.ndarray:
-    """Return the mask [H, W] of pixels worth sending: near anything `roi_sigma` above black in a 3x3 mean.
+    """Return the mask [H, W] of pixels that are sent: those near anything `roi_sigma` above black in a 3x3 mean.
 
     Outside it the frame carries the black level, which compresses to nothing.
     """

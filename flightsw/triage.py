@@ -1,4 +1,4 @@
-"""Which frames are worth sending first: those that the uplinked model predicts worst, and that show something new.
+"""Which frames are sent first: those that the uplinked model predicts worst and that show something new.
 
 The residual alone would send the best lit side again and again: it has the most light and so the largest chi², and all
 exposures of a bracket show it. So a residual counts less the closer its view is to one that the ground has already, or
@@ -181,7 +181,7 @@ def sending_order(
     last, oldest first.
 
     Args:
-        sent: the views of frames that are on the ground or under way.
+        sent: the views of frames that are on the ground or in flight.
         first: so many places are decided one by one, the others at once; None: all. It bounds the time.
     """
     candidates = sorted((r for r in ranked if r.comparable), key=lambda r: r.frame_id)
@@ -288,7 +288,7 @@ class TriageWorker:
         return done
 
     def stop(self) -> None:
-        """End after the task under way; the others are forgotten."""
+        """End after the current task; the others are dropped."""
         if self._thread.is_alive():
             while not self._tasks.empty():
                 self._tasks.get()

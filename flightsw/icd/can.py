@@ -1,7 +1,7 @@
 """Packets over CAN: ISO-TP messages in CAN frames, and CAN frames as an slcan adapter's text.
 
-Bytes and the time in, frames out and back, no port and no clock. can-isotp does ISO 15765-2 but for its time-outs,
-which would count the time in which this computer did not look at its port.
+Bytes and the time in, frames out and back, no port and no clock. can-isotp does ISO 15765-2 except for its time-outs,
+which would also count the time during which this computer did not read its port.
 python-can's own slcan (4.6.1) is not used: it reads a byte a call, waits two seconds at opening and for each
 write, and never gets past a byte that is not ASCII. The tests hold this text to it.
 """
@@ -30,21 +30,24 @@ class CanSide(NamedTuple):
 
 
 FLIGHT_SIDE, GROUND_SIDE = CanSide(FLIGHT_IDS, GROUND_IDS), CanSide(GROUND_IDS, FLIGHT_IDS)
-# Some channels wait for their flow control while another's data are on the bus. So many must be under way that
-# the bus stays busy while the ground stores a frame (8 ms and more): 1100 bytes take 20 ms, on FD 2.5 ms. And no
-# more than adapter and terminal hold for a ground that does not read: 16 such messages are 39 kB of slcan text.
+# Some channels wait for their flow control while the data of another are on the bus. There must be enough messages in
+# transit to keep the bus busy while the ground stores a frame (8 ms and more): 1100 bytes take 20 ms, on FD 2.5 ms.
+# There must not be more than adapter and terminal can buffer while the ground does not read: 16 such messages are 39 kB
+# of slcan text.
 CLASSIC_CHANNELS, FD_CHANNELS = 8, 16
-# Of longer packets fewer are under way, so that such a ground has no more to hold.
-CHANNEL_BYTES = 1200  # mean of the messages under way, at most
+# Of longer packets fewer are in transit, so that no more has to be buffered.
+CHANNEL_BYTES = 1200  # mean length of the messages in transit, at most
 MAX_MESSAGE_BYTES = 4200  # the longest packet (4096 bytes) as COBS with its CRC
 ANSWER_S = 0.2  # for the other side to answer at all, on a busy computer too
-# A computer that does not look at its port for a second (it writes to a slow disk) loses nothing. A message whose flow
-# control does not come (N_Bs) is offered again, after twice the time but no more than a second; the offer or its
-# answer may be lost, and nothing else was sent. The receiver waits longer for the rest of a message (N_Cr): it costs
-# nothing, since the next message of the channel ends it too.
+# A computer that does not read its port for a second (it writes to a slow disk) loses nothing. If no flow control comes
+# (N_Bs), the first frame of the message is sent again ("offered"), after twice the time but no more than a second: the
+# first frame or its answer may be lost, and nothing else was sent. The receiver may wait longer for the rest of a
+# message (N_Cr), since the next message of the channel ends the wait as well.
 OFFERS, LONGEST_WAIT_S = 5, 1.0
 REST_S = 2.0
-LOOK_S = 0.05  # the time that passes between two looks at the port counts up to this: frames may wait unread
+LOOK_S = (
+    0.05  # time between two reads of the port counts for time-outs only up to this: frames may wait unread
+)
 FIRST_FRAME, CONSECUTIVE_FRAME, FLOW_CONTROL = 1, 2, 3  # the types in the first half byte, ISO 15765-2
 NEVER_MS = 24 * 3600 * 1000
 FD_SIZES = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)  # bytes by length code, ISO 11898-1
@@ -54,10 +57,10 @@ logging.getLogger(_isotp_log).setLevel(logging.CRITICAL)  # a warning a lost fra
 
 
 class _Channel:
-    """One ISO-TP channel: a message under way in each direction, and until when what it waits for may come."""
+    """One ISO-TP channel: a message in transit in each direction, and the deadlines for their next frames."""
 
     def __init__(self, own_id: int, other_id: int, fd: bool, send_frame: Callable[[isotp.CanMessage], None]):
-        self.offers = 0  # first frames sent of the message under way
+        self.offers = 0  # how often the first frame of the message in transit was sent
         self.answer_until_s = self.rest_until_s = 0.0
         self.errors: list[Exception] = []  # since they were last looked at
         self.frames_repeated = 0
@@ -112,7 +115,7 @@ class _Channel:
         self.offer()
 
     def offer(self) -> None:
-        """Send the first frame of the message under way, perhaps once more."""
+        """Send the first frame of the message in transit, for the first time or again."""
         self.offers += 1
         self._layer.stop_sending()
         self._layer.send(self._message)
@@ -164,7 +167,7 @@ class IsoTpChannels:
 
     `write` takes packets framed for a serial line, and `exchange` returns them so: each travels as one ISO-TP
     message without its zero byte. ISO-TP repairs nothing; a message that lost a frame is dropped and counted. A
-    message that nobody answered is offered again a few times.
+    message without an answer is offered again a few times.
     """
 
     def __init__(self, own_ids: tuple[int, ...], other_ids: tuple[int, ...], url: LinkUrl):
@@ -203,7 +206,7 @@ class IsoTpChannels:
         self._waiting.extend(packet for packet in framed.split(DELIMITER) if packet)
 
     def abandon(self) -> None:
-        """Forget everything under way, and count the messages that are not sent: the port is closed or opened anew."""
+        """Drop all messages in transit and count those not sent; for a port that is closed or opened again."""
         self.messages_failed += self.messages_pending
         self._waiting.clear()
         self._outgoing.clear()
@@ -280,7 +283,7 @@ class IsoTpChannels:
                 return
             self._waiting.popleft()
             if len(idle) < len(self._channels):
-                # without flow control it would overtake those under way; COBS leaves no zero byte in a packet
+                # without flow control it would overtake those in transit; COBS leaves no zero byte in a packet
                 message = message.ljust(self._single_bytes + 1, DELIMITER)
             channel = idle[0]
             channel.send(message)

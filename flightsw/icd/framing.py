@@ -39,7 +39,7 @@ class Deframer:
         self.crc_errors = 0  # runs of bytes between delimiters that are no packet
         self._max_frame_bytes = max_frame_bytes(max_packet_bytes)
         self._pending = bytearray()
-        self._too_long = False  # the frame under way is already thrown away
+        self._too_long = False  # the bytes of the current frame are already dropped
 
     @property
     def pending_bytes(self) -> int:

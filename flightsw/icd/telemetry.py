@@ -19,7 +19,7 @@ Limit = Literal["green", "yellow", "red"]
 
 @dataclass(frozen=True)
 class Item:
-    """One value of a packet. `low` and `high` bound a number; outside `yellow` and `red` it is worth a look."""
+    """One value of a packet. `low` and `high` bound a number; outside `yellow` it warns, outside `red` it alarms."""
 
     name: str
     type: str

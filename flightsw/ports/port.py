@@ -1,6 +1,6 @@
 """What all ports share: the `Link` that flight and ground use, and opening a port again after it hung up.
 
-The device or the driver slows the writer down; no timer of ours does.
+The device or the driver slows the writer down; there is no timer here that does.
 """
 
 import contextlib
@@ -127,7 +127,7 @@ class Port:
 
 
 class IsoTpPort(Port):
-    """A port with ISO-TP messages under way, which are finished before it is closed.
+    """A port with ISO-TP messages in transit, which are finished before it is closed.
 
     Otherwise the last messages would be cut off: the rest of a message is sent only after the other side has answered
     its first frame, and an adapter that is closed drops what it has not sent.

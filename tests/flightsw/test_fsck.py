@@ -1,4 +1,4 @@
-"""fsck: whatever is broken in a store is found, mended, and no good frame is lost by it."""
+"""fsck: whatever is broken in a store is found and repaired, and no good frame is lost by it."""
 
 import json
 import os
@@ -114,7 +114,7 @@ BREAKS = {
 
 
 @pytest.mark.parametrize("damage", BREAKS, ids=lambda damage: damage.__name__)
-def test_damage_is_reported_and_mended_and_what_is_good_stays(folder, make_frame, damage):
+def test_damage_is_reported_and_repaired_and_what_is_good_stays(folder, make_frame, damage):
     at_least, lost = BREAKS[damage]
     damage(folder)
     found = fsck(folder, repair=False)

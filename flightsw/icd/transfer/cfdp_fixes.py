@@ -208,7 +208,7 @@ class FixedDestHandler(DestHandler):
     def _handle_metadata_packet(self, metadata_pdu: MetadataPdu) -> None:
         super()._handle_metadata_packet(metadata_pdu)
         if self._params.acked_params.deferred_lost_segment_detection_active:
-            # the original goes back to waiting for file data, and both sides wait for ever
+            # the original goes back to waiting for file data, and both sides wait forever
             self.states.step = DestStep.WAITING_FOR_MISSING_DATA
 
     def _deferred_lost_segment_handling(self) -> None:

@@ -28,7 +28,7 @@ MAX_NAK_BYTES = 128  # of a PDU: a short one gets through where a CAN bus loses 
 
 @dataclass(frozen=True)
 class Incoming:
-    """A file under way."""
+    """A file that is being received."""
 
     name: str  # the sender's, anything; empty until known
     received_bytes: int  # up to the last byte that came
