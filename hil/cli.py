@@ -106,7 +106,7 @@ def camera(
     """
     from hil.cameras.gige import GigeCameraServer
     from hil.cameras.virtual import CameraServer
-    from hil.sky.blender import RenderFarm
+    from hil.sky.render_farm import RenderFarm
     from hil.world.navigation import write_flight_inputs
     from hil.world.world import load_world
 

@@ -23,8 +23,9 @@ from ground.telemetry import FlightCounts
 from hil import truth
 from hil.choices import SensorKind
 from hil.sky import blender, motion, sensor, stars
-from hil.sky.blender import RenderFarm, mesh_sha256
+from hil.sky.blender import mesh_sha256
 from hil.sky.motion import image_velocity, smear
+from hil.sky.render_farm import RenderFarm
 from hil.sky.sensor import PRESETS, SensorModel, read_out
 from hil.sky.stars import star_radiance
 from hil.world.scenario import Scene, SceneState, load_scenario

@@ -17,7 +17,8 @@ from ground.summary import model_rows, table
 from hil.processes import installed, tied
 from hil.progress import progress_bar
 from hil.simulated_pass import PassConfig, fly, is_fault_count
-from hil.sky.blender import RenderFarm, check_mesh
+from hil.sky.blender import check_mesh
+from hil.sky.render_farm import RenderFarm
 from hil.truth import write_truth
 from hil.world.clock import SimulatedClock
 from hil.world.navigation import write_flight_inputs

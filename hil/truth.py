@@ -12,7 +12,7 @@ from flightsw.icd.mission import Mission
 from flightsw.pose import pose_tag
 from ground import truth
 from ground.session import Session, open_session
-from hil.sky.blender import RenderFarm
+from hil.sky.render_farm import RenderFarm
 
 CLOUD_POINTS = 100_000
 MAX_SAMPLES_PER_POINT = 10  # where less than a tenth of the surface is seen, the cloud stays smaller

@@ -15,7 +15,7 @@ from flightsw.store import FrameStore
 from ground.session_writer import SessionWriter
 from hil.cameras.virtual import CameraServer
 from hil.sky import spacecraft
-from hil.sky.blender import RenderFarm
+from hil.sky.render_farm import RenderFarm
 from hil.truth import write_truth
 from hil.world.scenario import true_exposures
 

@@ -17,8 +17,9 @@ from flightsw.icd.quaternion import matrix_to_quat
 from flightsw.pose import look_along
 from hil import cli
 from hil.sky import spacecraft
-from hil.sky.blender import MeshError, RenderFarm, Worker
+from hil.sky.blender import MeshError, Worker
 from hil.sky.motion import image_velocity
+from hil.sky.render_farm import RenderFarm
 
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT.parent / "shared" / "models"
