@@ -42,7 +42,7 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], CameraSection | None]:
 
 
 def export_nerfstudio(session: Session, out: Path) -> dict[str, int]:
-    """Write a session as a nerfstudio folder, pictures as in `export_nerf`; return the number of frames in each split."""
+    """Write a session as a nerfstudio folder, pictures as in `export_nerf`; return the frames per split."""
     (out / "images").mkdir(parents=True, exist_ok=True)
     split_of = split_brackets(session)
     frames, splits = [], {"train": [], "val": [], "test": []}

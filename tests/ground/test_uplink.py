@@ -1,4 +1,4 @@
-"""Commands on the ground: sealed with a counter of their own, sent until the end is known, executed once."""
+"""Commands on the ground: sealed, each with its own counter, repeated until the result is known, executed once."""
 
 import json
 import random
