@@ -1,4 +1,4 @@
-"""From the wire to the session: receive, check, decode, write. Nothing the link brings ends the pass."""
+"""From the link to the session: receive, check, decode, write. Nothing that arrives can end the pass."""
 
 import logging
 import re
@@ -32,26 +32,25 @@ from obbgs_base.files import write_whole
 
 log = logging.getLogger(__name__)
 
-WAIT_S = 0.02  # longest wait for bytes before timers are looked at again
+WAIT_S = 0.02  # longest wait for bytes before timers are checked again
 SAVE_S = 1.0  # between writes of session.json
-STATUS_S = 0.25  # between looks of the console
-# a picture or a thumbnail by its number; any other name is refused: a name is no path
+STATUS_S = 0.25  # between updates of the console
+# A frame (.obf) or thumbnail (.obt) by its number. Other names are refused, so that none can act as a path.
 FILE_NAME = re.compile(r"(\d{8})\.(obf|obt)", re.ASCII)
-LINGER_INTERVALS = 4  # without a packet before the flight side counts as gone
-SETTLE_INTERVALS = 12  # after the last wanted frame, for a flight side that has not heard of all of them
+# In intervals of the transfer timer, once the session holds all frames that were asked for:
+LINGER_INTERVALS = 4  # without a packet, after which the spacecraft counts as gone
+SETTLE_INTERVALS = 12  # for the spacecraft to learn that all its frames have arrived
 
 
 @dataclass(frozen=True)
 class ListenSummary:
-    """What a pass brought. Counts are of this run; of all runs `frames_in_session` and `frames_captured`."""
+    """What a pass brought. Counts are of this run, except `frames_in_session` and `frames_captured`: of all runs."""
 
     frames_received: int = 0
     frames_in_session: int = 0
-    frames_captured: int | None = (
-        None  # as flight's telemetry told so far, in all runs; None: it told nothing yet
-    )
+    frames_captured: int | None = None  # as the spacecraft's telemetry said; None before the first
     thumbnails_received: int = 0
-    headers_received: int = 0  # of frames, as telemetry
+    headers_received: int = 0  # frame headers, which come as telemetry
     bytes_received: int = 0  # from the port
     bytes_sent: int = 0
     packets_received: int = 0
@@ -62,18 +61,18 @@ class ListenSummary:
     crc_errors: int = 0  # packets damaged on the wire
     packets_missing: int = 0  # gaps in the sequence counts
     packets_foreign: int = 0
-    telemetry_refused: int = 0  # whole packets that the dictionary does not know
+    telemetry_refused: int = 0  # intact packets that the dictionary does not know
     segments_resent: int = 0
     pdus_refused: int = 0
-    frames_rejected: int = 0  # arrived whole, but no usable frame or thumbnail
+    frames_rejected: int = 0  # arrived intact, but not a usable frame or thumbnail
     duplicates: int = 0  # frames that came again
-    store_failures: int = 0  # disk refused; the flight side keeps the frame
+    store_failures: int = 0  # the disk refused them; the spacecraft keeps the frames
     hang_ups: int = 0
-    link_losses: dict[str, int] = field(default_factory=dict)  # the wire's own counts
+    link_losses: dict[str, int] = field(default_factory=dict)  # counts of the link itself, by name
 
     @property
     def losses(self) -> dict[str, int]:
-        """The counts that session.json keeps."""
+        """The counts that go to session.json."""
         names = (
             "skipped_bytes crc_errors packets_missing packets_foreign telemetry_refused segments_resent "
             "pdus_refused frames_rejected duplicates store_failures hang_ups"
@@ -83,7 +82,7 @@ class ListenSummary:
 
 @dataclass(frozen=True)
 class Status:
-    """What the console shows."""
+    """The state of a pass, as the console shows it."""
 
     now_s: float
     summary: ListenSummary
@@ -94,7 +93,7 @@ class Status:
     housekeeping_age_s: float
     frame_header: dict[str, Any]
     events: list[dict[str, Any]]
-    commands: list[tuple[int, str, str]]  # counter, name, stage of those under way
+    commands: list[tuple[int, str, str]]  # counter, name and stage of those without a result
 
 
 def listen(
@@ -109,14 +108,14 @@ def listen(
     on_status: Callable[[Status], None] = lambda status: None,
     on_event: Callable[[dict[str, Any]], None] = lambda event: None,
 ) -> ListenSummary:
-    """Write what comes over the link into a session, new or continued, and return the counts.
+    """Write what arrives over the link into a new or existing session and return the counts.
 
-    Commands that `ground uplink` leaves in the session are sent. Ends when told to stop, when the session holds
-    `exit_after` frames, or when no packet has come for `idle_timeout_s`. `on_progress` is called after each frame
-    and about once a second, `on_status` four times a second, `on_event` at once.
+    Commands that `ground uplink` leaves in the session are sent. Ends when `should_stop` returns True, when the session
+    holds `exit_after` frames, or when no packet has come for `idle_timeout_s`. `on_progress` is called after each frame
+    and about once a second, `on_status` four times a second, `on_event` for each event as it comes.
 
     Raises:
-        ConfigError: the URL is not usable.
+        ConfigError: the URL is not valid.
         LinkError: the port cannot be opened.
         SessionError: the folder cannot be used as this mission's session, or another process listens into it.
     """
@@ -127,7 +126,7 @@ def listen(
             interval_s = timer_s(link.baud_rate)
             now_s = clock_s()
             ingest.last_packet_s = last_save_s = last_status_s = now_s
-            complete_s: float | None = None  # since when the session holds what was wanted
+            complete_s: float | None = None  # when the session first held all frames asked for
             while not should_stop():
                 now_s = clock_s()
                 frames_before = ingest.frames_received
@@ -144,7 +143,7 @@ def listen(
                     log.info("no packet for %.1f s", idle_timeout_s)
                     break
                 if exit_after is not None and writer.frame_count >= exit_after:
-                    # the flight side must hear that its last frames are stored, if it is still there
+                    # If the spacecraft is still there, it must learn that its last frames are stored.
                     complete_s = now_s if complete_s is None else complete_s
                     is_told = ingest.flight_outbox == 0 and not ingest.open_transfers
                     is_gone = now_s - ingest.last_packet_s > LINGER_INTERVALS * interval_s
@@ -157,12 +156,16 @@ def listen(
 
 
 class _Ingest:
+    """Receives packets, hands each to its receiver, and sends what they have to answer."""
+
     def __init__(
         self, link: Link, writer: SessionWriter, mission: Mission, on_event: Callable[[dict[str, Any]], None]
     ):
         self.frames_received = 0
         self.last_packet_s = float("-inf")
-        self.flight_outbox: int | None = None  # as housekeeping said after the last frame
+        self.flight_outbox: int | None = (
+            None  # frames still to come, as housekeeping said after the last frame
+        )
         self._link, self._writer, self._on_event = link, writer, on_event
         self._stream = PacketStream(TELECOMMAND, mission.link.max_packet_bytes)
         interval_s, max_pdu_bytes = timer_s(link.baud_rate), self._stream.max_data_bytes
@@ -182,7 +185,7 @@ class _Ingest:
         return self._receiver.open_transactions
 
     def turn(self, now_s: float) -> None:
-        """Take what came and send what is due: answers, then commands, then a piece of a file."""
+        """Receive what has come and send what is due: acknowledgements, then commands, then a piece of a model."""
         wait_s = 0.0 if self._uplinker.is_sending_file and self._link.ready else WAIT_S
         for apid, content in self._stream.decode(self._link.exchange(wait_s)):
             self.last_packet_s = now_s
@@ -202,16 +205,15 @@ class _Ingest:
             self._link.write(self._stream.encode(APID_UPLINK_FILES, pdu))
 
     def _accept(self, name: str, container: bytes) -> bool:
-        """Store a file that came whole; False only when it is worth sending again.
+        """Store a file that has arrived whole; False if it should be sent again, because the disk failed.
 
-        What is no frame of this mission would be none the next time: it is counted and not asked for again.
-        The flight side's store still has it.
+        A file that is not a frame of this mission would not be one the next time either: it is counted and accepted.
         """
         try:
             match = FILE_NAME.fullmatch(name)
             frame = decode_frame(container)
             if match is None or int(match[1]) != frame.frame_id:
-                raise PacketError(f"frame {frame.frame_id} came under the name {name[:40]!r}")
+                raise PacketError(f"frame {frame.frame_id} has the file name {name[:40]!r}")
             if match[2] == "obt":
                 self._keep_thumbnail(frame)
                 return True
@@ -223,7 +225,7 @@ class _Ingest:
             return True
         except OSError as error:
             self._store_failures += 1
-            log.error("frame %s cannot be written, the flight side keeps it: %s", name, error)
+            log.error("frame %s cannot be written, the spacecraft keeps it: %s", name, error)
             return False
         if is_new:
             self.frames_received += 1
@@ -231,11 +233,11 @@ class _Ingest:
             log.info("frame %d: %d bytes", frame.frame_id, len(container))
         else:
             self._duplicates += 1
-            log.info("frame %d came again", frame.frame_id)
+            log.info("frame %d was received before", frame.frame_id)
         return True
 
     def _keep_thumbnail(self, frame: Frame) -> None:
-        """Write a thumbnail's picture: 16-bit linear like the frames, a few dozen pixels wide."""
+        """Write a thumbnail as a 16-bit linear PNG like the frames; it is a few dozen pixels wide."""
         folder = self._writer.folder / "thumbnails"
         folder.mkdir(exist_ok=True)
         write_whole(folder / f"{frame.frame_id:06d}.png", bytes(imagecodecs.png_encode(frame.dn, level=1)))

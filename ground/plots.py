@@ -14,9 +14,9 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.lighting import mean_radiance
 from obbgs_core.sensor import Sensor
 
-POINTS_SHOWN = 15_000  # more make the page heavy and the view no clearer
-LEAST_OPACITY = 0.2  # fainter Gaussians would only fog the view
-TRACK_RADIUS = 1.6  # of the model's: near enough to be seen with it
+POINTS_SHOWN = 15_000  # more make the page larger and the view no clearer
+LEAST_OPACITY = 0.2  # fainter Gaussians would hide the others like fog
+TRACK_RADIUS = 1.6  # of the model's radius: near enough to be seen together
 SMOOTHED = 10  # logged steps
 BINS = 128
 INK, SPACE, SUN = "#1c2733", "#10161e", "#f0b429"
@@ -26,7 +26,7 @@ RADIANCE_SCALE = [[0.0, "#33465c"], [0.5, "#93a8bd"], [1.0, "#fff4d9"]]
 
 
 def model_figure(gaussians: Gaussians, session: Session) -> tuple[go.Figure, int]:
-    """Return the centres coloured by mean radiance, camera directions and Sun, and how many centres are shown."""
+    """Return the model in 3D (centres coloured by mean radiance, camera track, Sun), and how many centres it shows."""
     frames = session.frames
     solid = torch.nonzero(gaussians.opacities > LEAST_OPACITY)[:, 0]
     if len(solid) > POINTS_SHOWN:
@@ -88,9 +88,9 @@ def model_figure(gaussians: Gaussians, session: Session) -> tuple[go.Figure, int
 
 
 def training_figure(history: Sequence[dict]) -> go.Figure:
-    """Return loss and PSNR over time of each training in metrics.jsonl, as running means."""
+    """Return loss and PSNR over time, as running means, of each training in the lines of metrics.jsonl."""
     figure = make_subplots(
-        rows=1, cols=2, subplot_titles=("loss", "PSNR of the step's own frames, dB"), horizontal_spacing=0.08
+        rows=1, cols=2, subplot_titles=("loss", "PSNR of each step's frames, dB"), horizontal_spacing=0.08
     )
     losses: list[float] = []
     for label, colour in (("known exposure", KNOWN_COLOUR), ("blind to exposure", BLIND_COLOUR)):
@@ -124,7 +124,7 @@ def training_figure(history: Sequence[dict]) -> go.Figure:
 
 
 def histogram_figure(session: Session, sensor: Sensor) -> go.Figure:
-    """Return how many pixels of all frames have which reading, one line for each exposure time."""
+    """Return the histogram of the readings in all frames, one line for each exposure time."""
     figure = go.Figure()
     edges = np.linspace(0, sensor.white_dn + 1, BINS + 1)
     for index, exposure_s in enumerate(sorted({r.exposure_time_s for r in session.frames})):
@@ -157,7 +157,7 @@ def histogram_figure(session: Session, sensor: Sensor) -> go.Figure:
 
 
 def running_mean(values: Sequence[float], window: int = SMOOTHED) -> list[float]:
-    """Return the mean of each value and those before it, `window` at most."""
+    """Return for each value the mean of it and those before it, at most `window` of them."""
     total = np.cumsum([0.0, *values])
     ends = np.arange(1, len(values) + 1)
     starts = np.maximum(0, ends - window)
@@ -169,7 +169,7 @@ def _xyz(points: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _ticks_1_2_5(values: Iterable[float]) -> list[float]:
-    """Return 1, 2 and 5 times powers of ten that cover positive values: Plotly's own labels omit the power."""
+    """Return ticks at 1, 2 and 5 times powers of ten that cover the positive values; Plotly's own omit the power."""
     positive = [value for value in values if value > 0]
     if not positive:
         return [1.0]

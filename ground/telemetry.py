@@ -1,4 +1,4 @@
-"""Telemetry, events and command reports as they come: kept with the session, and the newest at hand."""
+"""Receives telemetry, events and command reports, keeps them with the session and the newest ones in memory."""
 
 import dataclasses
 import json
@@ -22,21 +22,21 @@ from flightsw.icd.telemetry import DICTIONARY
 
 EVENTS_KEPT = 200  # in memory; the file has all
 NS = 1_000_000_000
-SAME_START_NS = 2 * NS  # two starts of flight nearer than this are one: uptime comes in whole seconds
+SAME_START_NS = 2 * NS  # start times nearer than this are the same start: uptime comes in whole seconds
 
 
 @dataclass(frozen=True)
 class FlightCounts:
-    """What flight's telemetry has told of its frames, over all runs of flight and ground; counts never fall.
+    """What telemetry has said of the frames on board, over all runs of flight and ground software; counts never fall.
 
-    Telemetry comes down best-effort: more frames may have been taken since it was last heard.
+    Telemetry may be lost: more frames may have been taken since it was last received.
     """
 
-    frames_stored: int = 0  # ever, deleted ones too: their numbers start at 0, and none is used twice
-    frames_refused: int = 0  # taken, but the store had no room
+    frames_stored: int = 0  # ever stored, deleted ones too: numbers start at 0 and are never used twice
+    frames_refused: int = 0  # taken, but not stored for lack of room
     frames_failed: int = 0  # exposures that gave no frame
-    frames_dropped: int = 0  # stored, then deleted undelivered to make room
-    # the newest housekeeping of flight's present run, in which refused and failed are counted from 0
+    frames_dropped: int = 0  # stored, then deleted before delivery to make room
+    # The newest housekeeping since flight software started; it counts refused and failed frames from that start.
     run_utc_ns: int = 0
     run_uptime_s: int = 0
     run_refused: int = 0
@@ -52,13 +52,13 @@ class FlightCounts:
         return max(self.frames_stored, last_frame_id + 1) + self.frames_refused
 
     def after_header(self, frame_id: int) -> "FlightCounts":
-        """Return the counts after the header of a frame was heard."""
+        """Return the counts after the header of a frame was received."""
         return dataclasses.replace(self, frames_stored=max(self.frames_stored, frame_id + 1))
 
     def after_housekeeping(self, values: Mapping[str, Any]) -> "FlightCounts":
         """Return the counts after a housekeeping packet.
 
-        Frames that were deleted because the ground has them are in none of its items: their numbers tell of them.
+        It does not count frames that were deleted after delivery; those are known by the numbers in their headers.
         """
         utc_ns, uptime_s = values["utc_ns"], values["uptime_s"]
         refused, failed = values["frames_refused"], values["frames_failed"]
@@ -77,10 +77,10 @@ class FlightCounts:
         )
 
     def _is_of_this_run(self, utc_ns: int, uptime_s: int) -> bool:
-        """Tell whether flight has not been started anew since the newest housekeeping.
+        """Tell whether a packet comes from the same start of flight software as the newest housekeeping.
 
-        It has when it started after that packet was made, or when its uptime fell and that is no packet overtaken by
-        another. A step of the clock during a run is not taken for a start unless it exceeds the uptime before it.
+        It does not if its start lies after the newest packet, or if the uptime fell and the packets were not merely
+        received in another order. A step of the clock counts as a start only if it is longer than the uptime before.
         """
         started_since = utc_ns - (uptime_s + 1) * NS > self.run_utc_ns
         start_moved_ns = (utc_ns - uptime_s * NS) - (self.run_utc_ns - self.run_uptime_s * NS)
@@ -89,9 +89,9 @@ class FlightCounts:
 
 
 class TelemetryLog:
-    """Writes telemetry.jsonl, events.jsonl and reports.jsonl below a session; nothing that comes raises.
+    """Writes telemetry.jsonl, events.jsonl and reports.jsonl in a session folder; no packet makes it raise.
 
-    `on_event` is given each event's line: event, severity, text and its values.
+    `on_event` receives each event's line: event, severity, text and its values.
     """
 
     def __init__(
@@ -102,18 +102,18 @@ class TelemetryLog:
         utc_ns: Callable[[], int] = time.time_ns,
         flight: FlightCounts | None = None,
     ):
-        self.flight = flight  # what it told of its frames, to earlier runs of the ground too; None: nothing
-        self.refused = 0  # whole packets that the dictionary does not know
+        self.flight = flight  # also from earlier runs of ground software; None before any telemetry
+        self.refused = 0  # intact packets that the dictionary does not know
         self.write_failures = 0
         self.housekeeping: dict[str, Any] = {}  # the newest, {} before the first
-        self.housekeeping_utc_ns = 0  # when it came
+        self.housekeeping_utc_ns = 0  # when it was received
         self.frame_header: dict[str, Any] = {}
         self.headers_received = 0
         self.events: deque[dict[str, Any]] = deque(maxlen=EVENTS_KEPT)
         self._folder, self._on_event, self._on_report, self._utc_ns = folder, on_event, on_report, utc_ns
 
     def add(self, apid: int, data: bytes) -> None:
-        """Take a packet's data from the link."""
+        """Take the data of a packet from the link."""
         received = {"received_utc_ns": self._utc_ns()}
         try:
             if apid == APID_HOUSEKEEPING:
@@ -142,7 +142,7 @@ class TelemetryLog:
             self.refused += 1
 
     def _write(self, name: str, line: dict[str, Any]) -> None:
-        """Add a line. A line cut off by a power cut stands alone: the next one starts on a line of its own."""
+        """Append a line; after a line left unfinished by a power cut it starts a new one."""
         try:
             with open(self._folder / name, "ab+") as file:
                 if file.tell():
@@ -155,5 +155,5 @@ class TelemetryLog:
 
 
 def plain(line: dict[str, Any]) -> dict[str, Any]:
-    """Return the values as JSON has them: bytes in hexadecimal."""
+    """Return values that JSON can hold: bytes become hexadecimal text."""
     return {name: value.hex() if isinstance(value, bytes) else value for name, value in line.items()}

@@ -1,8 +1,9 @@
-"""Commands on their way up: sealed by `ground uplink`, sent by whoever has the port, `ground listen`.
+"""Commands to the spacecraft: encrypted and authenticated by `ground uplink`, sent by `ground listen`.
 
-`ground uplink` seals a command, so that the key stays with it, and leaves it in the session's folder uplink/ as
-NUMBER.json, NUMBER the command's counter; a model's sealed file lies beside it as NUMBER.bin. The listener sends
-them in that order, keeps on asking until the spacecraft has told the end, and writes it to NUMBER.done.json.
+`ground uplink` seals a command (AES-GCM), so that only it needs the key, and leaves it in the session's folder uplink/
+as NUMBER.json, where NUMBER is the command's counter; the sealed file of a model lies beside it as NUMBER.bin. The
+listener has the port: it sends commands in the order of their counters, repeats each until the spacecraft reports its
+result, and writes that to NUMBER.done.json.
 """
 
 import contextlib
@@ -29,8 +30,8 @@ from obbgs_base.files import write_whole
 log = logging.getLogger(__name__)
 JOB_NAME = re.compile(r"(\d{20})\.json", re.ASCII)
 MAX_MODEL_BYTES = 64 * 1024 * 1024  # as the dictionary's `model.size_bytes`
-LOOK_S = 0.2  # between looks at the folder
-ASK_INTERVALS = 2  # timer intervals before a command that was not answered is sent again
+POLL_S = 0.2  # between looks at the folder
+RESEND_INTERVALS = 2  # timer intervals before an unanswered command is sent again
 UNREADABLE = (
     OSError,
     ValueError,
@@ -39,7 +40,7 @@ UNREADABLE = (
     OverflowError,
     RecursionError,
 )  # a damaged command file
-END_INTERVALS = 4  # the same for one whose end is not known: the spacecraft answers with its reports
+RESULT_INTERVALS = 4  # the same for a command without a result; the spacecraft repeats its reports
 NS = 1_000_000_000
 
 
@@ -47,7 +48,7 @@ def make_key(path: Path, spi: int = 1) -> Key:
     """Write a new key and the counters of both sides beside it: PATH, PATH.sent and PATH.received.
 
     Raises:
-        ConfigError: there is a key already, or the folder cannot be written.
+        ConfigError: one of the files exists already, or the folder cannot be written.
     """
     key = Key(spi, secrets.token_bytes(32))
     try:
@@ -60,17 +61,17 @@ def make_key(path: Path, spi: int = 1) -> Key:
             with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
                 file.write(text)
     except FileExistsError as error:
-        raise ConfigError(str(error.filename), "is there already; a key is never overwritten") from error
+        raise ConfigError(str(error.filename), "exists already; a key is never overwritten") from error
     except OSError as error:
         raise ConfigError(str(path), f"cannot write the key: {error.strerror}") from error
     return key
 
 
 def parse_command(name: str, arguments: list[str]) -> tuple[Command, Path | None]:
-    """Return the command of a command line; for `model` its file too.
+    """Return the command that a command line asks for, and the model file of `model`.
 
     Raises:
-        ValueError: no such command, or arguments that it does not take.
+        ValueError: no such command, or not its arguments.
     """
     match name, arguments:
         case "ping" | "safe" | "resume", []:
@@ -104,11 +105,11 @@ def _number(text: str, kind: type) -> Any:
 def submit(session: Path, key_file: Path, command: Command, model: Path | None, expires_s: float) -> int:
     """Seal a command and leave it for the listener; return its counter.
 
-    The counter is on the disk before the sealed command is: no counter is ever used for two commands.
+    The counter is on disk before the sealed command, so that no counter is ever used for two commands.
 
     Args:
-        command: for `model` its arguments are made here, from the file.
-        expires_s: from now, after which it is not sent any more.
+        command: the arguments of `model` are made here from its file.
+        expires_s: how long from now it may be sent.
 
     Raises:
         ConfigError: the key, its counter or the model file cannot be used.
@@ -118,7 +119,7 @@ def submit(session: Path, key_file: Path, command: Command, model: Path | None, 
     content = b""
     if model is not None:
         content, command = _model_command(model)
-    packed = command.pack()  # before a counter is spent on it
+    packed = command.pack()  # it may be invalid, and should not use up a counter then
     folder = session / "uplink"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -159,7 +160,7 @@ def _model_command(model: Path) -> tuple[bytes, Command]:
 
 @contextlib.contextmanager
 def _next_counter(key_file: Path) -> Iterator[tuple[Key, int]]:
-    """Give the key and a counter that was never given before; commands are made one at a time."""
+    """Give the key and a counter that was never used before; a lock keeps other processes out meanwhile."""
     path = key_file.with_name(key_file.name + ".sent")
     try:
         with open(path.with_name(path.name + ".lock"), "wb") as lock:
@@ -173,20 +174,20 @@ def _next_counter(key_file: Path) -> Iterator[tuple[Key, int]]:
 
 
 def outcome(session: Path, counter: int) -> dict[str, Any] | None:
-    """Return how a command ended (stage, text, reports), None while it has not."""
+    """Return a command's result (stage, text, reports); None while it has none."""
     path = session / "uplink" / f"{counter:020d}.done.json"
     return json.loads(path.read_bytes()) if path.exists() else None
 
 
 def withdraw(session: Path, counter: int) -> None:
-    """Take a command back that is not sent yet; one that is sent may still be executed."""
+    """Take back a command; one that has been sent already may still be executed."""
     for suffix in (".json", ".bin"):
         (session / "uplink" / f"{counter:020d}{suffix}").unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def listening(session: Path) -> Iterator[None]:
-    """Hold the session's lock: one process listens, and `is_listening` knows.
+    """Hold the lock by which only one process listens into a session.
 
     Raises:
         SessionError: another process listens.
@@ -213,7 +214,7 @@ def is_listening(session: Path) -> bool:
 
 @dataclass
 class Job:
-    """A command on its way."""
+    """A command without a result yet."""
 
     counter: int
     command: str
@@ -221,7 +222,7 @@ class Job:
     expires_utc_ns: int
     file: bytes | None
     file_put: bool = False
-    next_ask_s: float = float("-inf")
+    next_send_s: float = float("-inf")
     reports: list[Report] = field(default_factory=list)
 
     @property
@@ -230,7 +231,7 @@ class Job:
 
 
 class Uplinker:
-    """The listener's part: gives packets to send, takes reports, writes outcomes. No port, time passed in."""
+    """The listener's side: gives packets to send, takes reports, writes results. It has no port and no clock."""
 
     def __init__(
         self,
@@ -244,29 +245,29 @@ class Uplinker:
         self.files = Sender(max_pdu_bytes, interval_s, route=UPLINK)
         self._folder, self._on_end, self._utc_ns = session / "uplink", on_end, utc_ns
         self._interval_s = interval_s
-        self._next_look_s = float("-inf")
+        self._next_poll_s = float("-inf")
 
     @property
     def is_sending_file(self) -> bool:
         return bool(self.files.in_flight)
 
     def next_command(self, now_s: float) -> bytes | None:
-        """Return a sealed command to send now: the first that is not accepted, or one whose end is overdue."""
-        if now_s >= self._next_look_s:
-            self._next_look_s = now_s + LOOK_S
-            self._look()
+        """Return a sealed command that is due, None if none is: the first unanswered one, or one without a result."""
+        if now_s >= self._next_poll_s:
+            self._next_poll_s = now_s + POLL_S
+            self._poll()
         for counter in sorted(self.jobs):
             job = self.jobs[counter]
-            if now_s >= job.next_ask_s and not (job.file_put and self.is_sending_file):
-                intervals = END_INTERVALS if job.reports else ASK_INTERVALS
-                job.next_ask_s = now_s + intervals * self._interval_s
+            if now_s >= job.next_send_s and not (job.file_put and self.is_sending_file):
+                intervals = RESULT_INTERVALS if job.reports else RESEND_INTERVALS
+                job.next_send_s = now_s + intervals * self._interval_s
                 return job.packet
             if not job.reports:
-                return None  # the counters must arrive in order
+                return None  # counters must arrive in order
         return None
 
     def next_pdu(self, now_s: float) -> bytes | None:
-        """Return the next PDU of a model file that the spacecraft waits for."""
+        """Return the next PDU of a model file whose command the spacecraft has accepted; None if none is due."""
         for job in self.jobs.values():
             if job.file is not None and job.reports and not job.file_put:
                 job.file_put = True
@@ -281,16 +282,16 @@ class Uplinker:
         return pdu
 
     def take_report(self, report: Report, report_s: float) -> None:
-        """Note what the spacecraft says of a command; what is not ours is left alone."""
+        """Take a report of the spacecraft; one of a command that is not ours is ignored."""
         job = self.jobs.get(report.counter)
         if job is None or any(report.stage == known.stage for known in job.reports):
             return
         job.reports.append(report)
-        job.next_ask_s = report_s + END_INTERVALS * self._interval_s
+        job.next_send_s = report_s + RESULT_INTERVALS * self._interval_s
         if report.stage in ENDED:
             self._end(job, report.stage, report.text)
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         names = os.listdir(self._folder) if self._folder.is_dir() else []
         counters = {int(match[1]) for match in map(JOB_NAME.fullmatch, names) if match}
         for counter in counters - set(self.jobs):

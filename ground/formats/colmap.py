@@ -1,4 +1,4 @@
-"""COLMAP models: cameras and images as text or binary; poses are world to camera in OpenCV axes, as ours.
+"""COLMAP models: cameras and images as text or binary; poses are world to camera in OpenCV axes, like ours.
 
 Source: colmap.github.io/format.html.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from flightsw.icd.quaternion import quat_to_matrix
 from ground.formats.views import FormatError, Intrinsics, View
 
-# model number in binary files: name, and where its parameters go (f is both focal lengths)
+# Model number in binary files: its name and the names of its parameters (f is both focal lengths).
 MODELS = {
     0: ("SIMPLE_PINHOLE", ("f", "cx", "cy")),
     1: ("PINHOLE", ("fx", "fy", "cx", "cy")),
@@ -21,17 +21,17 @@ MODELS = {
     4: ("OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
 }
 PARAMETERS = dict(MODELS.values())
-PLACES = ("", "sparse/0", "sparse")  # of the model below the folder
+PLACES = ("", "sparse/0", "sparse")  # where the model may lie in the folder
 
 
 def read_colmap(folder: Path) -> list[View]:
     """Return the registered pictures of a COLMAP model, in the order of their names.
 
     Args:
-        folder: holds images/ and the model, in itself, sparse/ or sparse/0; binary files stand before text.
+        folder: holds images/, and the model itself or in sparse/0 or sparse/; binary files are preferred to text.
 
     Raises:
-        FormatError: there is no model, it is damaged, or a camera's model is not one of `MODELS`.
+        FormatError: there is no model, it is damaged, or it has a camera model that is not in `MODELS`.
     """
     for place in PLACES:
         model = folder / place

@@ -1,7 +1,7 @@
 """NeRF-synthetic folders: transforms_{train,val,test}.json, camera-to-world in OpenGL axes, pictures of 8 bits.
 
-Extra keys that other readers ignore keep what the format cannot say: the calibration, and for each frame its exposure,
-time, bracket and light.
+Keys that other readers ignore keep what the format has no place for: the calibration, and the exposure time, time,
+bracket and Sun direction of each frame.
 """
 
 import dataclasses
@@ -27,15 +27,16 @@ from ground.session import FrameRecord, Session
 from obbgs_base.files import write_whole
 
 SPLITS = ("train", "val", "test")
-# Of eleven brackets six train, two validate, three test: 363 frames in threes give 198, 66 and 99, as published
+# Of eleven brackets six are for training, two for validation, three for testing; 121 brackets of three frames give
+# 198, 66 and 99 frames, the published split.
 SPLIT_PATTERN = (0, 1, 0, 2, 0, 2, 0, 1, 0, 2, 0)
 
 
 def read_nerf(folder: Path) -> tuple[list[View], CameraSection | None]:
-    """Return the pictures of all splits, in the order of their frame numbers, and the calibration if we wrote it.
+    """Return the pictures of all splits, by frame number, and the calibration if `export_nerf` wrote it.
 
     Raises:
-        FormatError: there is no transforms_*.json, or one is not what it should be.
+        FormatError: there is no transforms_*.json, or one is not valid.
     """
     numbered: list[tuple[int, View]] = []
     camera = None
@@ -57,9 +58,9 @@ def read_nerf(folder: Path) -> tuple[list[View], CameraSection | None]:
 
 
 def export_nerf(session: Session, out: Path) -> dict[str, int]:
-    """Write a session as a NeRF-synthetic folder and return the frames of each split.
+    """Write a session as a NeRF-synthetic folder and return the number of frames in each split.
 
-    Pictures are linear: black level to full scale becomes 0 to 255, opaque. Splits are whole brackets.
+    Pictures are linear and opaque: black level to full scale becomes 0 to 255. A bracket is in one split as a whole.
     """
     split_of = split_brackets(session)
     camera = session.camera
@@ -83,7 +84,7 @@ def export_nerf(session: Session, out: Path) -> dict[str, int]:
 
 
 def split_brackets(session: Session) -> dict[int, str]:
-    """Return the split of each bracket: train, val or test, in the published proportion 6:2:3, mixed along the pass."""
+    """Return the split of each bracket: train, val or test, 6:2:3 as published, interleaved along the pass."""
     brackets = sorted({record.bracket for record in session.frames})
     return {b: SPLITS[SPLIT_PATTERN[i % len(SPLIT_PATTERN)]] for i, b in enumerate(brackets)}
 
@@ -99,7 +100,7 @@ def picture(session: Session, record: FrameRecord) -> bytes:
 
 
 def frame_keys(session: Session, record: FrameRecord) -> dict[str, Any]:
-    """Return a frame's pose, and what is ours alone."""
+    """Return a frame's pose and the keys that only we write."""
     start_ns = session.frames[0].mid_exposure_utc_ns
     return {
         "transform_matrix": world_to_camera_to_opengl(record.world_to_camera).tolist(),
@@ -115,7 +116,7 @@ def frame_keys(session: Session, record: FrameRecord) -> dict[str, Any]:
 
 
 def camera_keys(camera: CameraSection) -> dict[str, Any]:
-    """Return the intrinsics as nerfstudio names them, and our calibration."""
+    """Return the intrinsics under nerfstudio's names, and our calibration."""
     return {
         "fl_x": camera.fx_px,
         "fl_y": camera.fy_px,
@@ -128,10 +129,10 @@ def camera_keys(camera: CameraSection) -> dict[str, Any]:
 
 
 def load_transforms(path: Path) -> dict[str, Any]:
-    """Return a transforms file whose "frames" is a list of objects.
+    """Return the content of a transforms file.
 
     Raises:
-        FormatError: it is not.
+        FormatError: it cannot be read, or its "frames" is not a list of objects.
     """
     try:
         tree = parse_json(path.read_bytes(), "transforms")
@@ -144,7 +145,7 @@ def load_transforms(path: Path) -> dict[str, Any]:
 
 
 def image_path(folder: Path, frame: dict[str, Any], where: Path) -> Path:
-    """Return a frame's picture; NeRF-synthetic leaves the .png away."""
+    """Return the path of a frame's picture; NeRF-synthetic omits the suffix .png."""
     name = frame.get("file_path")
     if not isinstance(name, str):
         raise FormatError(f"{where}: a frame has no file_path")
@@ -156,7 +157,7 @@ def read_frame(frame: dict[str, Any], image: Path, intrinsics: Intrinsics, where
     """Return one frame of a transforms file.
 
     Raises:
-        FormatError: the pose or one of our extra keys is wrong.
+        FormatError: the pose or one of our extra keys is not valid.
     """
     pose = opengl_to_world_to_camera(frame.get("transform_matrix"), f"{where}: {image.name}")
     try:
@@ -181,7 +182,7 @@ def read_frame(frame: dict[str, Any], image: Path, intrinsics: Intrinsics, where
 
 
 def read_calibration(tree: dict[str, Any], where: Path) -> CameraSection | None:
-    """Return the calibration that our export wrote, its noise increased by the 8 bits' rounding; else None.
+    """Return the calibration that our export wrote, with the rounding to 8 bits added to its noise; None without one.
 
     Raises:
         FormatError: it is damaged.
@@ -218,4 +219,4 @@ def _intrinsics(tree: dict[str, Any], image: Path, where: Path) -> Intrinsics:
     except KeyError as error:
         raise FormatError(f"{where}: {error} is missing") from error
     except (TypeError, ValueError) as error:
-        raise FormatError(f"{where}: the camera is not given in numbers: {error}") from error
+        raise FormatError(f"{where}: the intrinsics are not numbers: {error}") from error

@@ -27,10 +27,10 @@ DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 
 
 def read_nerfstudio(folder: Path) -> tuple[list[View], CameraSection | None]:
-    """Return the pictures of a nerfstudio folder, and the calibration if we wrote it.
+    """Return the pictures of a nerfstudio folder, and the calibration if `export_nerfstudio` wrote it.
 
     Raises:
-        FormatError: transforms.json is missing or not what it should be, or the camera is not a perspective one.
+        FormatError: transforms.json is missing or not valid, or its camera is not a perspective camera.
     """
     path = folder / "transforms.json"
     tree = load_transforms(path)
@@ -42,7 +42,7 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], CameraSection | None]:
 
 
 def export_nerfstudio(session: Session, out: Path) -> dict[str, int]:
-    """Write a session as a nerfstudio folder and return the frames of each split; pictures as in the NeRF export."""
+    """Write a session as a nerfstudio folder, pictures as in `export_nerf`; return the frames per split."""
     (out / "images").mkdir(parents=True, exist_ok=True)
     split_of = split_brackets(session)
     frames, splits = [], {"train": [], "val": [], "test": []}
@@ -63,7 +63,7 @@ def export_nerfstudio(session: Session, out: Path) -> dict[str, int]:
 
 
 def _intrinsics(keys: dict[str, Any], where: Path) -> Intrinsics:
-    """Return the camera of a frame; its own keys stand before the file's."""
+    """Return a frame's intrinsics; `keys` are the file's, overridden by the frame's own."""
     model = keys.get("camera_model", "OPENCV")
     if model not in PINHOLE_MODELS:
         raise FormatError(f"{where}: expected a camera model of {', '.join(PINHOLE_MODELS)}, got {model!r}")
@@ -82,4 +82,4 @@ def _intrinsics(keys: dict[str, Any], where: Path) -> Intrinsics:
     except KeyError as error:
         raise FormatError(f"{where}: {error} is missing") from error
     except (TypeError, ValueError) as error:
-        raise FormatError(f"{where}: the camera is not given in numbers: {error}") from error
+        raise FormatError(f"{where}: the intrinsics are not numbers: {error}") from error

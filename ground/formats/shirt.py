@@ -1,6 +1,6 @@
 """SHIRT (Park and D'Amico 2022): rendezvous trajectories ROE1 and ROE2, rendered (synthetic) and in the lab (lightbox).
 
-Every picture has the same exposure, which the data set does not state.
+All pictures have the same exposure time, which the data set does not state.
 """
 
 from pathlib import Path
@@ -17,11 +17,11 @@ def read_shirt(folder: Path) -> list[View]:
     """Return the pictures of one trajectory in one domain, in the order of flight.
 
     Args:
-        folder: shirtv1/roe1/synthetic, for example: images/ in it, roe1.json, camera.json and metadata.json beside or
-            above it.
+        folder: for example shirtv1/roe1/synthetic, which holds images/; roe1.json, camera.json and metadata.json lie in
+            it or in one of the two folders above.
 
     Raises:
-        FormatError: a file is missing or not what it should be.
+        FormatError: a file is missing or not valid.
     """
     trajectory = folder.resolve().parent
     intrinsics = _intrinsics(_load(folder, "camera.json"))
@@ -72,7 +72,7 @@ def _metadata(tree: Any) -> tuple[float, np.ndarray]:
     """Return the seconds between pictures, and the transform [4, 4] from the servicer's axes to the camera's."""
     try:
         mounting = tree["pMdl"]
-        # named like the poses: q_pri2cam turns camera axes to servicer axes, r is the camera's place in the latter
+        # Named like the poses: q_pri2cam rotates camera axes to servicer axes; r is the camera's place in the latter.
         camera_to_servicer = _transform(mounting["q_pri2cam"], mounting["r_pri2cam_pri"])
         return float(tree["pSim"]["cam_step"]), np.linalg.inv(camera_to_servicer)
     except (KeyError, TypeError, ValueError) as error:

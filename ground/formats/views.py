@@ -1,4 +1,4 @@
-"""Pictures with known cameras from elsewhere, made into a session."""
+"""Turns pictures with known cameras, from other tools and data sets, into a session."""
 
 import dataclasses
 import hashlib
@@ -19,7 +19,7 @@ from ground.session import SCHEMA_VERSION, SessionError
 from ground.session_writer import frame_line
 from obbgs_base.files import write_whole
 
-# What nobody says about a foreign picture's noise: a little of it, the same everywhere
+# Other data sets do not state their noise: a small one is assumed, the same in every pixel.
 FOREIGN_READ_NOISE = 2 / 255  # of full scale
 FOREIGN_ELECTRONS_PER_DN = 1e3
 FRAME_SPACING_NS = 1_000_000_000  # between pictures without a time
@@ -28,7 +28,7 @@ FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class FormatError(SessionError):
-    """A folder is not in the format that it was read as; the message says where."""
+    """A folder is not in the expected format; the message names the file."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Intrinsics:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One picture to import. What its format does not say stays at the default."""
+    """One picture to import; what its format does not state has the default value."""
 
     image: Path
     world_to_camera: np.ndarray  # [4, 4], OpenCV axes
@@ -55,7 +55,7 @@ class View:
     mid_exposure_utc_ns: int | None = None
     bracket: int | None = None
     bracket_index: int = 0
-    sun_dir_body: np.ndarray = field(default_factory=lambda: np.zeros(3))  # zero: not known
+    sun_dir_body: np.ndarray = field(default_factory=lambda: np.zeros(3))  # unit; zero where unknown
     in_eclipse: bool = False
 
 
@@ -69,13 +69,13 @@ def write_session(
 ) -> int:
     """Write a new session from pictures and return the number of its frames.
 
-    Distorted pictures are made pinhole pictures; transparent ones are put on black. Radiance 1 is full scale at the
-    longest exposure, unless `camera` gives the calibration that the pictures were exported with.
+    Lens distortion is removed, and transparent pictures are put on black. Radiance 1 is full scale at the longest
+    exposure, unless `camera` gives the calibration that the pictures were exported with.
 
     Args:
-        source: what the session was made from; its digest stands where a mission's would.
-        srgb: undo the sRGB curve; otherwise the pictures' numbers are taken as linear.
-        camera: the original calibration, whose range black to full scale the pictures' 8 bits span.
+        source: what the session was made from; its digest takes the place of the mission file's.
+        srgb: undo the sRGB curve; otherwise pixel values are taken as linear.
+        camera: the original calibration; the pictures' 8 bits span its range from black level to full scale.
 
     Raises:
         FormatError: there are no views, their cameras differ, or a picture cannot be read or has another size.
@@ -130,7 +130,7 @@ def write_session(
 
 
 def undistort(image: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
-    """Return the picture [H, W, C] of a pinhole camera with the same K; black where the lens saw nothing.
+    """Return the picture [H, W, C] that a pinhole camera with the same K would take; black outside the original.
 
     Source: OpenCV's model, radial k1, k2, k3 and tangential p1, p2.
     """
@@ -160,7 +160,7 @@ def opengl_to_world_to_camera(camera_to_world: object, where: str) -> np.ndarray
     """Return world_to_camera [4, 4], OpenCV axes, of a camera-to-world matrix in OpenGL axes.
 
     Raises:
-        FormatError: it is not a rotation and a translation.
+        FormatError: it is not a rotation with a translation.
     """
     try:
         matrix = np.array(camera_to_world, dtype=np.float64)
@@ -184,6 +184,7 @@ def world_to_camera_to_opengl(world_to_camera: np.ndarray) -> np.ndarray:
 
 
 def rigid_inverse(matrix: np.ndarray) -> np.ndarray:
+    """Return the inverse [4, 4] of a rotation with a translation."""
     inverse = np.eye(4)
     inverse[:3, :3] = matrix[:3, :3].T
     inverse[:3, 3] = -matrix[:3, :3].T @ matrix[:3, 3]
@@ -227,7 +228,7 @@ def _channels(image: np.ndarray) -> int:
 def _digital_numbers(
     image: np.ndarray, intrinsics: Intrinsics, camera: CameraSection, srgb: bool
 ) -> np.ndarray:
-    """Return a picture as digital numbers [H, W] or [H, W, 3]; numbers that need no change are not changed."""
+    """Return a picture [H, W, 1 to 4] as digital numbers [H, W] or [H, W, 3] of a camera."""
     full = float(np.iinfo(image.dtype).max)
     colours = _channels(image)
     value = image[..., :colours] / full
@@ -235,7 +236,7 @@ def _digital_numbers(
         value = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     if image.shape[2] > colours:
         value = value * (image[..., colours:] / full)
-    if colours > camera.channels:  # a mono camera's pictures, exported in three equal colours
+    if colours > camera.channels:  # pictures of a mono camera, exported with three equal colours
         value = value.mean(axis=2, keepdims=True)
     value = undistort(value, intrinsics)
     dn = np.rint(camera.black_dn + value * (camera.white_dn - camera.black_dn)).astype(np.uint16)

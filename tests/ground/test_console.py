@@ -1,4 +1,4 @@
-"""Telemetry kept with the session, and the operator's screen: what is red is red, and nothing moves the cursor."""
+"""Telemetry files, and the operator's screen: limits show in colour, and no text from the link moves the cursor."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""What a run is scored on and how that is told: which frames, which pixels, and files that are damaged."""
+"""Which frames and pixels a run is scored on, how report and card name them, and damaged files."""
 
 import json
 import math

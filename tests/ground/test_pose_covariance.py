@@ -1,4 +1,4 @@
-"""A pose tag's covariance on its way from the navigation filter to the training: whole, and rightly turned."""
+"""A pose tag's covariance on its way from the navigation filter to the training, rotated into the right frame."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""A run and its folder: nothing trained is lost, nothing is overwritten, and what was asked for is what happens."""
+"""Run folders: no training is lost, no run is overwritten unasked, and options and settings take effect."""
 
 import io
 import json
@@ -41,7 +41,7 @@ FILES = {"model.ply", "model.spz", "surface.ply", "model.onnx"}
 
 @pytest.fixture(autouse=True, scope="module")
 def few_surface_points():
-    """A hundred thousand take seconds, and nothing here asks how good they are."""
+    """100,000 points take seconds, and no test here measures how good they are."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ground.model_files.SURFACE_POINTS", 1000)
         yield
@@ -54,7 +54,7 @@ def session(tmp_path) -> Path:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Path:
-    """A session with a run; not to be written to."""
+    """A session with a finished run; tests must not write to it."""
     folder = tmp_path_factory.mktemp("finished") / "session"
     shutil.copytree(GOLDEN / "session", folder)
     reconstruct(folder, "run", "obbgs", QUICK)
@@ -261,7 +261,7 @@ def test_two_processes_do_not_make_one_run_at_once(session):
 
 
 def test_a_run_that_another_process_has_just_finished_is_not_replaced(session, monkeypatch):
-    """It appears between the first look at the folder and the lock: the second look sees it."""
+    """The run appears between the first check of the folder and the lock: the check after locking refuses it."""
     reconstruct(session, "run", "obbgs", QUICK)
     model = (session / "runs" / "run" / "model.ply").read_bytes()
     monkeypatch.setattr("ground.reconstruct.check_replaceable", lambda *arguments: None)

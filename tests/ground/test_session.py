@@ -1,4 +1,4 @@
-"""The session folder: written whole or not at all, read strictly, opened again after a cut."""
+"""The session folder: each step written whole or not at all, read strictly, opened again after a power cut."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Commands on the ground: sealed with a counter of their own, sent until the end is known, executed once."""
+"""Commands on the ground: sealed, each with its own counter, repeated until the result is known, executed once."""
 
 import json
 import random
@@ -174,7 +174,7 @@ def test_a_command_that_nobody_answers_expires_and_one_that_is_withdrawn_is_not_
     first, second = (submit(session, key_file, Command("ping", {}), None, 600) for _ in range(2))
     withdraw(session, second)
     assert uplinker.next_command(0.0) is not None
-    assert uplinker.next_command(0.1) is None  # asks again after an interval, not before
+    assert uplinker.next_command(0.1) is None  # sent again after an interval, not before
     assert uplinker.next_command(2 * INTERVAL_S) is not None
     utc_ns[0] = 10**19
     assert uplinker.next_command(10.0) is None
