@@ -72,11 +72,7 @@ def model_card(session_created_utc: str, metrics: dict) -> str:
     if isinstance(chi2 := metrics.get("chi2"), int | float) and math.isfinite(chi2):
         lines.append(f"- Residual chi² {chi2:.2f}: {chi2_explained(chi2)}")
     lines += appearance(metrics)
-    for key, text in (
-        ("growth", "Growth ran {}."),
-        ("poses", "Poses {}."),
-        ("exposures", "Exposure times {}."),
-    ):
+    for key, text in (("growth", "Growth ran {}."), ("poses", "Poses {}.")):
         if key in metrics:  # older runs did not note it
             lines.append("- " + text.format(metrics[key]))
     scored = scored_frames(metrics)

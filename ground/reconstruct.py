@@ -34,8 +34,10 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import native_kernels, render
 from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.presets import MethodConfig, preset
-from obbgs_core.train.trainer import StepInfo, TrainResult, train
+from obbgs_core.train.config import MethodConfig
+from obbgs_core.train.presets import preset
+from obbgs_core.train.result import StepInfo, TrainResult
+from obbgs_core.train.trainer import train
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -91,7 +93,7 @@ def reconstruct(
     """
     if not time_limit_s > 0:
         raise ValueError(f"the time limit must be longer than 0 s, got {time_limit_s:g}")
-    config = preset(method, **(changes or {}))
+    config = preset(method, changes)
     session = open_session(session_dir)
     folder = run_folder(session, name, out)
     if folder.exists():
@@ -431,14 +433,13 @@ def _metrics(
     metrics = {
         "method": method,
         "gaussians": len(result.gaussians),
-        "max_gaussians": result.config.max_gaussians,
+        "max_gaussians": result.config.growth.max_gaussians,
         "budget": result.budget,
         "sh_degree": math.isqrt(result.gaussians.sh.shape[1]) - 1,
         "shading": result.gaussians.shading,
         "appearance": result.appearance,
         "growth": result.growth,
         "poses": result.poses,
-        "exposures": result.exposures,
         "sun_span_deg": round(result.sun_span_deg, 2),
         "shown_under_sun_dir_body": None if sun_dir is None else [round(x, 6) for x in sun_dir.tolist()],
         "train_seconds": round(result.seconds, 3),
@@ -489,6 +490,9 @@ def _write_history(results: dict[str, TrainResult | None], path: Path) -> None:
 
 
 def _plain(value):
+    """Return a setting, or a group of them, as YAML holds it: tuples as lists."""
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
     return [_plain(item) for item in value] if isinstance(value, tuple) else value
 
 
@@ -498,7 +502,7 @@ def _resolved(session: Session, config: MethodConfig, seed: int) -> dict:
     versions = {name: importlib.metadata.version(name) for name in PACKAGES}
     kernels = native_kernels()
     return {
-        "method": {k: _plain(v) for k, v in dataclasses.asdict(config).items()},
+        "method": _plain(dataclasses.asdict(config)),
         "seed": seed,
         "threads": torch.get_num_threads(),
         "rasterizer": f"native {kernels[0]}" if kernels else "reference",
