@@ -15,9 +15,8 @@ CERTAIN_SIGMA = 5.5  # a window's mean above this is light beyond doubt; the tar
 SKY_SIGMA = 1.0  # a 9x9 window's mean up to this may be empty sky
 BRIGHT_SIGMA = 4.0  # of a single pixel
 EDGE_SIGMA = 1.5  # of a single pixel beside brighter ones
-LIKELY_SIGMA = (
-    2.0  # a window's mean above this counts as light in the vote, where one view in twenty may be wrong
-)
+# a window's mean above this counts as light in the vote, where one view in twenty may be wrong
+LIKELY_SIGMA = 2.0
 WINDOWS_PX = (3, 5, 9, 15)  # wide windows find shadowed faces that no single pixel shows
 FEWEST_BRIGHT_PX = 4  # a frame with fewer counts as black
 FEWEST_CHOSEN = 3  # pixels of a window that a mean is taken of

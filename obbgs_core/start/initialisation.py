@@ -30,9 +30,8 @@ class StartSettings:
     """The first Gaussians."""
 
     kind: Literal["random", "hull"] = "random"  # random in a cube around the target | on its visual hull
-    colour: Literal["seen", "grey"] = (
-        "seen"  # the radiance seen where the points project | half of full scale (3DGS)
-    )
+    # the radiance seen where the points project | half of full scale (3DGS)
+    colour: Literal["seen", "grey"] = "seen"
     count: int = at_least_one(100_000)  # at most, because the hull may have fewer points
 
     def __post_init__(self):

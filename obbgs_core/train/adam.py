@@ -24,9 +24,8 @@ class RateSettings:
     log_scales: float = 0.005
     sh: float = 0.0025
     sh_rest: float = 1.0  # factor on the rate of the coefficients above degree 0
-    final_share: float = (
-        1.0  # all rates but that of the means decay exponentially to this share of themselves
-    )
+    # all rates but that of the means decay exponentially to this share of themselves
+    final_share: float = 1.0
 
     def __post_init__(self):
         check(self, "rates")

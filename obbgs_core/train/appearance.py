@@ -26,16 +26,13 @@ class LightSettings:
     """What the radiance of a Gaussian may depend on."""
 
     sh_degree: int = number(3, most=3)  # of the spherical harmonics at the start
-    sh_interval: int = (
-        0  # above 0: only degree 0 is trained at first, and one degree more after each such interval
-    )
-    max_sh_degree: int = number(
-        0, most=3
-    )  # the degree is raised up to this where the gain exceeds the BIC penalty
+    # above 0: only degree 0 is trained at first, and one degree more after each such interval
+    sh_interval: int = 0
+    # the degree is raised up to this where the gain exceeds the BIC penalty
+    max_sh_degree: int = number(0, most=3)
     sun_span_deg: float = 0.0  # above 0: the Sun is tested too where its direction spans more than this
-    sun_shading: Literal["lambert", "linear"] = (
-        "lambert"  # albedo, normal and cast shadows | harmonics towards the Sun
-    )
+    # albedo, normal and cast shadows | harmonics towards the Sun
+    sun_shading: Literal["lambert", "linear"] = "lambert"
 
     def __post_init__(self):
         check(self, "light")

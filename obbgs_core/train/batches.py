@@ -19,9 +19,8 @@ class Batch:
     dn: Tensor  # [B, H, W, C]
     exposure_time_s: Tensor  # [B, 1, 1, 1]
     averaged_pixels: int  # sensor pixels in one pixel of dn
-    sky: Tensor | None = (
-        None  # [B, H, W] share of each pixel that a silhouette shows to be empty, 0 where it has none
-    )
+    # [B, H, W] share of each pixel that a silhouette shows to be empty, 0 where it has none
+    sky: Tensor | None = None
 
 
 class Batches:

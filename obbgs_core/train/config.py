@@ -25,9 +25,8 @@ class MethodConfig:
 
     name: str
     exposure_aware: bool = False  # false: every exposure counts as their mean, as the methods were published
-    length_unit: Literal["target", "cameras"] = (
-        "target"  # the target's radius | the extent of the cameras, as in 3DGS
-    )
+    # the target's radius | the extent of the cameras, as in 3DGS
+    length_unit: Literal["target", "cameras"] = "target"
     frames_per_step: int = at_least_one(1)
     bracket_steps: bool = False  # the frames of a step are one of each exposure time
     steps: int = at_least_one(30_000)

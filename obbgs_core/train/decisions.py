@@ -28,9 +28,8 @@ from obbgs_core.train.state import TrainingState
 from obbgs_core.train.validation import correction_gain
 
 log = logging.getLogger(__name__)
-WORTH_REFINING = (
-    1.5  # times the BIC penalty: 0.5 to 1.3 was measured with exact tags, 2.9 to 5.4 at 1 px of error
-)
+# smallest gain over penalty: 0.5 to 1.3 was measured with exact tags, 2.9 to 5.4 at 1 px of error
+REFINING_RATIO = 1.5
 
 
 def is_growing(setup: TrainingSetup, share: float) -> bool:
@@ -53,14 +52,14 @@ def observe(
 
 
 def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> None:
-    """Refine the poses if correcting the validation brackets is worth its BIC penalty; then train on these too."""
+    """Refine the poses if correcting the validation brackets gains clearly more than its BIC penalty."""
     config = setup.config
     if state.poses_decided or share < config.poses.refine_from:
         return
     scale = config.image_scale(share)
     brackets = [setup.batches.batch(b, scale) for b in state.order.validation_brackets]
     gain, error = correction_gain(state.gaussians.detach(), setup.frames, brackets, setup.sensor)
-    refined = gain - error > WORTH_REFINING
+    refined = gain - error > REFINING_RATIO
     state.poses = PoseCorrections(setup.frames) if refined else None
     state.poses_decided = (
         f"{'refined' if refined else 'as tagged'} (step {state.steps_done + 1}: correcting a validation bracket gains "
@@ -119,7 +118,7 @@ def prune_by_bic(setup: TrainingSetup, state: TrainingState, scale: float) -> No
 def raise_degree(
     setup: TrainingSetup, state: TrainingState, scale: float, directions: tuple[Literal["view", "sun"], ...]
 ) -> None:
-    """Let the radiance turn with the view or the Sun, or with a higher degree, if the likelihood gain is worth it."""
+    """Let the radiance turn with view or Sun, or raise its degree, if the likelihood gain exceeds the BIC penalty."""
     raised, reason = raised_degree(
         state.gaussians, setup.batches, setup.sensor, scale, directions, setup.config.light, state.rng
     )

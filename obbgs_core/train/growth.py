@@ -15,9 +15,8 @@ from obbgs_core.settings import at_least_one, check, fraction
 from obbgs_core.train.adam import Adam
 
 SPLIT_SHRINK = 1.6  # a split's halves are this much smaller (Kerbl et al. 2023)
-SPLIT_SIZE = (
-    0.01  # of the method's unit of length: larger Gaussians are split, smaller ones cloned (the same)
-)
+# of the method's unit of length: larger Gaussians are split, smaller ones cloned (the same)
+SPLIT_SIZE = 0.01
 GRADIENT_THRESHOLD = 0.0002  # mean screen gradient per unit of normalised device coordinates (the same)
 RESET_OPACITY = 0.01  # no opacity is above this after a reset (the same)
 
@@ -27,19 +26,16 @@ class GrowthSettings:
     """When and where Gaussians are added, and which are removed; sizes are in the method's unit of length."""
 
     max_gaussians: int = at_least_one(500_000)
-    pixels_per_gaussian: int = (
-        0  # above 0: so many lit pixels of the long exposures for each, against overfitting
-    )
+    # above 0: so many lit pixels of the long exposures for each, against overfitting
+    pixels_per_gaussian: int = 0
     begin: float = fraction(500 / 30_000)  # share of the steps
     end: float = fraction(0.5)  # share of the steps
     interval: int = at_least_one(100)  # steps between two densifications
-    share: float = (
-        0.0  # above 0: this share of the Gaussians grows, largest gradients first, instead of a threshold
-    )
+    # above 0: this share of the Gaussians grows, largest gradients first, instead of a threshold
+    share: float = 0.0
     pixel_weighted: bool = False  # gradients are averaged over pixels instead of views (Pixel-GS)
-    depth_scale: float = (
-        0.0  # above 0: gradients of Gaussians nearer to the camera than this count less (Pixel-GS)
-    )
+    # above 0: gradients of Gaussians nearer to the camera than this count less (Pixel-GS)
+    depth_scale: float = 0.0
     obb_interval: int = 0  # above 0: steps between extra growth inside the boxes of the worst tiles
     prune_opacity: float = fraction(0.005)  # fainter Gaussians are removed at each densification
     prune_size: float = 0.2  # larger Gaussians are removed at each densification

@@ -18,17 +18,14 @@ from obbgs_core.train.batches import Batch
 class LossSettings:
     """The loss of the images, and the weights of what is added to it."""
 
-    kind: Literal["l1_ssim", "likelihood"] = (
-        "l1_ssim"  # likelihood: the sensor model, saturated pixels censored
-    )
+    # likelihood: the sensor model, saturated pixels censored
+    kind: Literal["l1_ssim", "likelihood"] = "l1_ssim"
     ssim_weight: float = 0.2  # of 1 - SSIM, the rest is L1; without effect on the likelihood
     edge_weight: float = 0.0  # of the difference of Sobel derivatives
-    sh_weight: float = (
-        0.0  # of the mean square of the coefficients that turn with the view: a prior for matt surface
-    )
-    flat_weight: float = (
-        0.0  # of the mean shortest scale over the target's radius: flat Gaussians are surface
-    )
+    # of the mean square of the coefficients that turn with the view: a prior for matt surface
+    sh_weight: float = 0.0
+    # of the mean shortest scale over the target's radius: flat Gaussians are surface
+    flat_weight: float = 0.0
     sky_weight: float = 0.0  # of the mean alpha of pixels that show no light: space is empty
 
     def __post_init__(self):

@@ -23,9 +23,8 @@ class ParsimonySettings:
 
     prune_at: tuple[float, ...] = fraction(())  # shares of the steps; none: never
     bic_factor: float = 1.0  # on the penalty: larger values give smaller models
-    keep_above_opacity: float = fraction(
-        1.0
-    )  # more opaque Gaussians are kept: dark surface explains no light
+    # more opaque Gaussians are kept: dark surface explains no light
+    keep_above_opacity: float = fraction(1.0)
 
     def __post_init__(self):
         check(self, "parsimony")
@@ -56,10 +55,10 @@ def likelihood_gains(
 ) -> tuple[Tensor, int]:
     """Return the likelihood gain of each Gaussian [N], nats over all frames, and the number of values measured.
 
-    The gain is what the log-likelihood would lose if the Gaussian were removed.
-    Without Gaussian j the prediction changes by exactly -o_j d(prediction)/d(o_j), because compositing is linear in
-    each opacity; at the optimum the cost is half the sum of that change squared over the noise variance. The sum of
-    squares over pixels is estimated without bias by back-propagating random signs (Hutchinson 1989), one draw a frame.
+    The gain is what the log-likelihood would lose without the Gaussian. Without Gaussian j the prediction changes by
+    exactly -o_j d(prediction)/d(o_j), because compositing is linear in each opacity; at the optimum the loss is half
+    the sum of that change squared over the noise variance. The sum of squares over pixels is estimated without bias by
+    back-propagating random signs (Hutchinson 1989), one draw a frame.
     """
     model = gaussians.detach()
     model.opacity_logits.requires_grad_()
@@ -68,9 +67,8 @@ def likelihood_gains(
         (slope,) = torch.autograd.grad(
             (view.predicted * view.weight * view.signs).sum(), model.opacity_logits
         )
-        change = slope / (1 - model.opacities.detach()).clamp(
-            min=1e-6
-        )  # o·d/do, from the derivative by the logit
+        # o·d/do, from the derivative by the logit
+        change = slope / (1 - model.opacities.detach()).clamp(min=1e-6)
         gains += 0.5 * change**2
         values, times = values + view.values, view.times
     return gains * times, round(values * times)

@@ -24,12 +24,10 @@ SECOND_MOMENT_DECAY = 0.99  # a step that sees the bracket
 class PoseSettings:
     """Whether the tagged poses are refined together with the Gaussians."""
 
-    refine: Literal["never", "always", "auto"] = (
-        "never"  # auto: if the validation brackets show that it is worth it
-    )
-    refine_from: float = fraction(
-        0.25
-    )  # share of the steps before which the model is too coarse to correct poses
+    # auto: if the likelihood gain on the validation brackets justifies it
+    refine: Literal["never", "always", "auto"] = "never"
+    # share of the steps before which the model is too coarse to correct poses
+    refine_from: float = fraction(0.25)
 
     def __post_init__(self):
         check(self, "poses")
@@ -57,10 +55,8 @@ class PoseCorrections:
         self.of_frame = bracket_numbers(frames)  # the row of each frame
         rows = max(self.of_frame) + 1
         self.value = torch.zeros(rows, 6, requires_grad=True)
-        self.second, self.visits = (
-            torch.zeros(rows, 6),
-            torch.zeros(rows, 1),
-        )  # of the gradient; steps that saw it
+        self.second = torch.zeros(rows, 6)  # running mean of the squared gradient
+        self.visits = torch.zeros(rows, 1)  # steps that saw the bracket
         covariances = torch.zeros(len(frames), 6, 6, dtype=torch.float64)
         for i, frame in enumerate(frames):
             if frame.pose_covariance is not None:
