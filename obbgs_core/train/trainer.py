@@ -131,7 +131,7 @@ class Trainer:
         self._measure(rendered, batch)
         state.steps_done += 1
         state.seconds += time.monotonic() - began
-        return self._told(loss.item())
+        return self._recorded(loss.item())
 
     def _descend(self, share: float) -> None:
         """Move the Gaussians and the poses down their gradients."""
@@ -152,7 +152,7 @@ class Trainer:
             known = not math.isnan(state.chi2)
             state.chi2 = CHI2_MEMORY * state.chi2 + (1 - CHI2_MEMORY) * chi2 if known else chi2
 
-    def _told(self, loss: float) -> StepInfo:
+    def _recorded(self, loss: float) -> StepInfo:
         """Return how the training stands, and keep it in the history."""
         state = self.state
         info = StepInfo(

@@ -12,6 +12,7 @@ from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged, ReconstructionError, TooFewFrames
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.gaussians import TENSORS
+from obbgs_core.sensor import Sensor
 from obbgs_core.train.growth import finite
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
@@ -53,6 +54,15 @@ def test_a_checkpoint_of_another_training_is_not_used(frames, tmp_path):
     assert not Trainer(doubted, SENSOR, preset("obbgs", QUICK), seed=1).resume(tmp_path / "c")
     assert not Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=1).resume(tmp_path / "none")
     assert Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=1).resume(tmp_path / "c")
+
+
+@pytest.mark.parametrize("content", [{"fingerprint": "another"}, {"fingerprint": "x", "state": Sensor}])
+def test_a_checkpoint_of_another_version_is_not_used_and_nothing_else_in_it_is_built(
+    frames, tmp_path, caplog, content
+):
+    torch.save(content, tmp_path / "c")  # the sensor's class is not among those that a checkpoint may hold
+    trainer = Trainer(frames, SENSOR, preset("obbgs", QUICK))
+    assert not trainer.resume(tmp_path / "c") and "belongs to another training" in caplog.text
 
 
 def test_the_time_limit_ends_the_training_and_says_so(frames):
