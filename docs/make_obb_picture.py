@@ -32,12 +32,12 @@ def main(session_dir: Path) -> None:
     session = open_session(session_dir)
     sensor = sensor_of(session.camera)
     frames = [training_frame(session, record) for record in split(session)[0]]
-    trainer = Trainer(frames, sensor, preset("obbgs", pyramid=((0.0, 1.0),)))
+    trainer = Trainer(frames, sensor, preset("obbgs", {"pyramid": ((0.0, 1.0),)}))
     for _ in range(STEPS):
         trainer.step()
-    gaussians = trainer.gaussians.detach()
+    gaussians = trainer.state.gaussians.detach()
     areas = [(f.dn > sensor.black_dn + 6 * sensor.read_noise_dn).sum() for f in frames]
-    batch = trainer.batches.batch([int(np.argmax(areas))], 1.0)
+    batch = trainer.setup.batches.batch([int(np.argmax(areas))], 1.0)
     rendered = render(gaussians, batch.cameras)
     _, residual = likelihood_loss(rendered.radiance, batch.exposure_time_s, batch.dn, sensor)
     tile = obb.worst_tile(residual[0].abs())

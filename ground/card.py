@@ -71,7 +71,6 @@ def _training(metrics: dict) -> list[str]:
         ("budget", "Budget"),
         ("growth", "Growth"),
         ("poses", "Poses"),
-        ("exposures", "Exposures"),
     ):
         if key in metrics:
             lines.append(f"- {name}: {metrics[key]}.")

@@ -52,7 +52,7 @@ def reconstruct_command(
 
     Ctrl-C and SIGTERM save the training and end with exit code 1; the same command resumes it, also after a kill.
 
-    Example: ground reconstruct --session pass-12 --name first --time-limit 120 --set sun_shading=linear
+    Example: ground reconstruct --session pass-12 --name first --time-limit 120 --set light.sun_shading=linear
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning threads slow each other down
     stop, folder = Stop(), None

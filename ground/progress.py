@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 if TYPE_CHECKING:  # torch takes seconds to import, and signals must be handled before that
-    from obbgs_core.train.trainer import StepInfo
+    from obbgs_core.train.result import StepInfo
 
-EVENTS = ("ground.reconstruct", "ground.model_files", "obbgs_core.train.trainer")  # loggers that are shown
+EVENTS = ("ground.reconstruct", "ground.model_files", "obbgs_core.train")  # loggers that are shown
 PLAIN_S = 10.0  # between lines where there is no terminal
 REDRAWN = 5  # steps
 

@@ -15,8 +15,10 @@ from ground.runs import check_replaceable, publish, run_folder, unfinished_run, 
 from ground.session import open_session
 from ground.training_frames import split, training_frame
 from obbgs_core.errors import ReconstructionError
-from obbgs_core.train.presets import MethodConfig, preset
-from obbgs_core.train.trainer import StepInfo, TrainResult, train
+from obbgs_core.train.config import MethodConfig
+from obbgs_core.train.presets import preset
+from obbgs_core.train.result import StepInfo, TrainResult
+from obbgs_core.train.trainer import train
 
 log = logging.getLogger(__name__)
 KNOWN, BLIND = "known exposure", "blind to exposure"  # the trainings of a run
@@ -66,7 +68,7 @@ def reconstruct(
     """
     if not time_limit_s > 0:
         raise ValueError(f"the time limit must be longer than 0 s, got {time_limit_s:g}")
-    config = preset(method, **(changes or {}))
+    config = preset(method, changes)
     session = open_session(session_dir)
     folder = run_folder(session, name, out)
     check_replaceable(folder, overwrite)

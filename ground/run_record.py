@@ -15,8 +15,8 @@ from ground.cameras import median_sun_direction
 from ground.model_files import exposure_times_s
 from ground.session import FrameRecord, Session
 from obbgs_core.render import native_kernels
-from obbgs_core.train.presets import MethodConfig
-from obbgs_core.train.trainer import TrainResult
+from obbgs_core.train.config import MethodConfig
+from obbgs_core.train.result import TrainResult
 
 LOG_EVERY = 10  # steps
 PACKAGES = ("obbgs", "torch", "numpy", "onnxruntime", "plotly")
@@ -35,14 +35,13 @@ def training_metrics(
     metrics = {
         "method": result.config.name,
         "gaussians": len(result.gaussians),
-        "max_gaussians": result.config.max_gaussians,
+        "max_gaussians": result.config.growth.max_gaussians,
         "budget": result.budget,
         "sh_degree": math.isqrt(result.gaussians.sh.shape[1]) - 1,
         "shading": result.gaussians.shading,
         "appearance": result.appearance,
         "growth": result.growth,
         "poses": result.poses,
-        "exposures": result.exposures,
         "sun_span_deg": round(result.sun_span_deg, 2),
         "shown_under_sun_dir_body": None if sun_dir is None else [round(x, 6) for x in sun_dir.tolist()],
         "train_seconds": round(result.seconds, 3),
@@ -89,7 +88,7 @@ def write_config(session: Session, config: MethodConfig, seed: int, path: Path) 
     versions = {name: importlib.metadata.version(name) for name in PACKAGES}
     kernels = native_kernels()
     tree = {
-        "method": {k: _plain(v) for k, v in dataclasses.asdict(config).items()},
+        "method": _plain(dataclasses.asdict(config)),
         "seed": seed,
         "threads": torch.get_num_threads(),
         "rasterizer": f"native {kernels[0]}" if kernels else "reference",
@@ -106,4 +105,6 @@ def write_config(session: Session, config: MethodConfig, seed: int, path: Path) 
 
 def _plain(value):
     """Return tuples as lists, which YAML can write."""
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
     return [_plain(item) for item in value] if isinstance(value, tuple) else value

@@ -1,10 +1,16 @@
-"""Options, `--set` and the mission file as changes to the preset of a training method."""
+"""What a user asks of a training: options, `--set` and the mission file, as changes to a method's preset.
 
+Changes are named as in `preset`: `steps`, or `growth.interval` for a setting of a group.
+"""
+
+import operator
 import re
 from collections.abc import Sequence
 
 from flightsw.icd.mission import ConfigError, ReconstructSection, build, parse_yaml
-from obbgs_core.train.presets import MethodConfig, preset, with_quality
+from obbgs_core.settings import known_names
+from obbgs_core.train.config import MethodConfig
+from obbgs_core.train.presets import preset, quality_changes
 
 
 def all_changes(
@@ -15,15 +21,15 @@ def all_changes(
     steps: int | None,
     assignments: Sequence[str],
 ) -> dict:
-    """Return all changes to a method's preset; `--set` overrides the options, and both override the mission file.
+    """Return the changes to a method's preset: of the mission file, over those the options, over those `--set`.
 
     Raises:
-        ValueError: as in the functions below, or an option and `--set` give the same setting.
+        ValueError: as in the functions below, or an option and `--set` say the same thing twice.
     """
     by_set = set_changes(assignments)
     for name, option, given in (
         ("steps", "--steps", steps is not None),
-        ("max_gaussians", "--budget", budget != "auto"),
+        ("growth.max_gaussians", "--budget", budget != "auto"),
     ):
         if given and name in by_set:
             raise ConfigError(f"--set {name}", f"is given by {option} too: leave one of them out")
@@ -33,23 +39,22 @@ def all_changes(
 def changes_for(
     method: str, quality: str | None = None, budget: str = "auto", steps: int | None = None
 ) -> dict:
-    """Return the changes to a method's preset that the options ask for.
+    """Return the changes to a method's preset that the options of a command ask for.
 
-    A budget given as a number is used as it is: the limit by the number of lit pixels is turned off.
+    A budget in numbers holds as it is: the number of lit pixels does not lower it.
 
     Raises:
         ValueError: no such method or quality, or a budget that is neither `auto` nor a number.
     """
     config, changes = preset(method), {}
     if quality is not None:
-        config = with_quality(config, quality)
-        changes = {name: getattr(config, name) for name in ("steps", "max_gaussians", "start_count")}
+        changes = quality_changes(config, quality)
     if budget != "auto":
         if not (budget.isascii() and budget.isdigit()) or int(budget) == 0:
             raise ValueError(f"--budget must be auto or a number of Gaussians, got {budget!r}")
-        changes["max_gaussians"] = int(budget)
-        changes["start_count"] = min(config.start_count, int(budget))
-        changes["pixels_per_gaussian"] = 0
+        changes["growth.max_gaussians"] = int(budget)
+        changes["start.count"] = min(changes.get("start.count", config.start.count), int(budget))
+        changes["growth.pixels_per_gaussian"] = 0
     if steps is not None:
         changes["steps"] = steps
     return changes
@@ -66,35 +71,48 @@ def mission_changes(section: ReconstructSection) -> dict:
 
 
 def set_changes(assignments: Sequence[str]) -> dict:
-    """Return the settings given as texts such as `sun_shading=linear`; values are YAML.
+    """Return the settings in texts such as `growth.interval=60`; the values are YAML.
 
     Raises:
-        ConfigError: a text is not key=value, a setting is unknown or given twice, or a value has the wrong type.
+        ConfigError: not such a text, no such setting, one given twice, or a value of the wrong type.
     """
-    tree: dict[str, object] = {}
+    changes: dict[str, object] = {}
     for text in assignments:
         key, equals, value = text.partition("=")
         key = key.strip()
         if not equals or not key:
             raise ConfigError("--set", f"expected key=value, got {text!r}")
-        if key in tree:
-            raise ConfigError(f"--set {key}", "is given twice")
-        tree[key] = parse_yaml(value.encode(), f"--set {key}")
-        if isinstance(tree[key], str) and re.fullmatch(r"\s*[+-]?\d+[eE][+-]?\d+\s*", value):
-            tree[key] = float(value)  # YAML reads 2e-3, without a point, as text
-    return checked_settings(tree, "--set")
+        given = parse_yaml(value.encode(), f"--set {key}")
+        if isinstance(given, str) and re.fullmatch(r"\s*[+-]?\d+[eE][+-]?\d+\s*", value):
+            given = float(value)  # YAML takes 2e-3, without a point, for text
+        group, dot, name = key.partition(".")
+        tree = {group: {name: given} if dot else given}
+        for name, setting in checked_settings(tree, "--set").items():
+            if name in changes:
+                raise ConfigError(f"--set {name}", "is given twice")
+            changes[name] = setting
+    return changes
 
 
 def checked_settings(tree: dict, path: str) -> dict:
-    """Return settings by name, converted to the types that MethodConfig declares.
+    """Return settings of a method by names such as `steps` or `growth.interval`, with the types that it wants.
+
+    Args:
+        tree: a mapping of settings; those of a group are a mapping themselves.
 
     Raises:
         ConfigError: no such setting, or a value of the wrong type or out of its range; names its path.
     """
+    given = {name for name, value in tree.items() if not isinstance(value, dict)}
+    given |= {f"{group}.{name}" for group, inner in tree.items() if isinstance(inner, dict) for name in inner}
+    known = [name for name in known_names(MethodConfig) if name != "name"]
+    groups = {name.partition(".")[0] for name in known}
+    for name in sorted(given - {*known, *groups}):
+        raise ConfigError(f"{path}.{name}", f"unknown key; expected one of {', '.join(known)}")
     try:
         config = build(MethodConfig, tree, path, name="")
     except ConfigError:
         raise
     except ValueError as error:
         raise ConfigError(path, str(error)) from error
-    return {name: getattr(config, name) for name in tree}
+    return {name: operator.attrgetter(name)(config) for name in known if name in given}

@@ -1,7 +1,7 @@
 """Image losses: robust likelihood, L1, SSIM and Sobel edges. Images are [B, H, W, C].
 
-`likelihood_loss`, `published_loss` and `fit_figures` run in our C++ (kernels/training.cpp) on float32 CPU tensors:
-value and gradient in one sweep. The same in readable PyTorch is the truth, and runs everywhere else.
+`likelihood_loss`, `published_loss` and `fit_figures` run in our C++ (kernels/training.cpp) on float32 CPU tensors,
+value and gradient in one sweep. The readable PyTorch beside them is the reference in tests, and runs everywhere else.
 """
 
 import math
@@ -12,15 +12,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from obbgs_core import compiled
-from obbgs_core.model.cameras import Cameras
-from obbgs_core.sensor import Sensor, clipped_moments
+from obbgs_core.sensor import Sensor
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Wang et al. 2004
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
-
-
-SOLID_ALPHA = 0.9  # where a depth has a normal
-ON_TARGET_ALPHA = 0.05  # where the model shows at least this much, the fit is judged
+ON_TARGET_ALPHA = 0.05  # pixels with more alpha than this count as target in the figures of a fit
 
 
 def likelihood_loss(
@@ -37,7 +33,7 @@ def likelihood_loss(
 
     Args:
         radiance: predicted [B, H, W, C]; the loss has a gradient by it.
-        exposure_time_s: [B, 1, 1, 1]; the loss has a gradient by it.
+        exposure_time_s: [B, 1, 1, 1].
         dn: read [B, H, W, C].
         averaged_pixels: sensor pixels averaged into each pixel of dn; the noise is smaller by its root.
 
@@ -137,8 +133,8 @@ def fit_figures(
 
     chi² is the squared difference of readings and their expectation over the variance that noise gives them, both
     summed where alpha [B, H, W] exceeds 0.05: 1 when the model is true, above where it errs, NaN where nothing is seen.
-    Clipped readings vary less than others and count less; where a mean of pixels is saturated it counts as nothing,
-    since some of its pixels need not be. The other arguments are as for `likelihood_loss`.
+    Clipped readings vary less than others and have less weight; a saturated mean of several pixels has none, since some
+    of its pixels need not be saturated. The other arguments are as for `likelihood_loss`.
     """
     native = compiled.module_for(radiance, alpha, exposure_time_s, dn)
     if native is not None:
@@ -146,43 +142,20 @@ def fit_figures(
         images = (image.detach().contiguous() for image in (radiance, alpha, dn))
         chi2, mse = native.fit(*images, gains, model, ON_TARGET_ALPHA, torch.get_num_threads())
     else:
-        expected = sensor.expected_dn(radiance, exposure_time_s)
-        noise = sensor.variance_dn2(expected)
-        mean, variance = clipped_moments(expected, noise.sqrt(), sensor.white_dn)
+        prediction = sensor.predicted(radiance, exposure_time_s)
+        noise = prediction.variance_dn2
+        mean, variance = prediction.clipped_moments(sensor.white_dn)
         seen = (alpha > ON_TARGET_ALPHA)[..., None] & ((averaged_pixels == 1) | (dn < sensor.white_dn))
         squares = averaged_pixels * ((mean - dn).square() / noise)[seen].sum()
         chi2 = (squares / (variance / noise)[seen].sum()).item()
-        expected = expected.clamp(max=sensor.white_dn)
-        mse = ((expected - dn) / sensor.white_dn).square().mean().item()
+        visible = prediction.expected_dn.clamp(max=sensor.white_dn)
+        mse = ((visible - dn) / sensor.white_dn).square().mean().item()
     return chi2, -10 * math.log10(max(mse, 1e-12))
 
 
 def charbonnier(normalised_residual: Tensor, knee: float = 2.0) -> Tensor:
     """Return the mean robust penalty: half the square below `knee` sigma, linear beyond."""
     return (knee * knee * ((1 + (normalised_residual / knee) ** 2).sqrt() - 1)).mean()
-
-
-def normal_disagreement(depth: Tensor, alpha: Tensor, normals: Tensor, cameras: Cameras) -> Tensor:
-    """Return 1 - cos(rendered normal, normal of rendered depths), summed where 3x3 pixels are solid, over all pixels.
-
-    Args:
-        depth, alpha: [C, H, W], m; normals: composited [C, H, W, 3], body frame; as `render` returns them.
-
-    Source: Huang et al., 2D Gaussian Splatting, 2024, equation 14.
-    """
-    height, width = depth.shape[1:]
-    rows, columns = (torch.arange(count).to(depth) + 0.5 for count in (height, width))
-    v, u = torch.meshgrid(rows, columns, indexing="ij")
-    pixels = torch.stack([u, v, torch.ones_like(u)], dim=-1)
-    rays = torch.einsum("hwj,cij->chwi", pixels, torch.linalg.inv(cameras.K))
-    points = rays * depth[..., None]
-    across = points[:, 1:-1, 2:] - points[:, 1:-1, :-2]
-    down = points[:, 2:, 1:-1] - points[:, :-2, 1:-1]
-    of_depth = F.normalize(torch.linalg.cross(down, across), dim=-1, eps=1e-9)
-    of_depth = torch.einsum("chwi,cij->chwj", of_depth, cameras.world_to_camera[:, :3, :3])
-    rendered = F.normalize(normals[:, 1:-1, 1:-1], dim=-1, eps=1e-6)
-    solid = F.avg_pool2d((alpha.detach() > SOLID_ALPHA).float()[:, None], 3, 1)[:, 0] > 0.99
-    return (solid * (1 - (of_depth * rendered).sum(dim=-1))).mean()
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
@@ -250,32 +223,27 @@ def _gains(sensor: Sensor, exposure_time_s: Tensor) -> Tensor:
 def _swept(
     sweep, radiance: Tensor, exposure_time_s: Tensor, dn: Tensor, sensor: Sensor, model, *weights: float
 ) -> tuple[Tensor, Tensor]:
-    """Return a compiled loss, with its gradient when one is wanted, and its residual."""
+    """Return a compiled loss, with its gradient if the radiance needs one, and its residual."""
     values = radiance.detach().contiguous()
     residual = torch.empty_like(values)
-    wanted = radiance.requires_grad or exposure_time_s.requires_grad
-    gradient = torch.empty_like(values) if wanted else None
+    gradient = torch.empty_like(values) if radiance.requires_grad else None
     gains, threads = _gains(sensor, exposure_time_s), torch.get_num_threads()
     loss = sweep(values, dn.contiguous(), gains, model, *weights, residual, gradient, threads)
     if gradient is None:
         return radiance.new_tensor(loss), residual
-    return _KnownGradient.apply(radiance, exposure_time_s, loss, gradient), residual
+    return _KnownGradient.apply(radiance, loss, gradient), residual
 
 
 class _KnownGradient(torch.autograd.Function):
-    """A scalar of radiance times exposure time that was computed together with its gradient by the radiance."""
+    """A scalar of the radiance that was computed together with its gradient."""
 
     @staticmethod
-    def forward(ctx, radiance: Tensor, exposure_time_s: Tensor, value: float, gradient: Tensor) -> Tensor:
-        ctx.save_for_backward(radiance, exposure_time_s, gradient)
+    def forward(ctx, radiance: Tensor, value: float, gradient: Tensor) -> Tensor:
+        ctx.save_for_backward(gradient)
         return radiance.new_tensor(value)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, upstream: Tensor):
-        radiance, exposure_time_s, gradient = ctx.saved_tensors
-        by_exposure = None
-        if ctx.needs_input_grad[1]:
-            light = (gradient * radiance).sum(dim=(1, 2, 3), keepdim=True)
-            by_exposure = light / exposure_time_s * upstream
-        return gradient * upstream, by_exposure, None, None
+        (gradient,) = ctx.saved_tensors
+        return gradient * upstream, None, None

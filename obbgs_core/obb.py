@@ -8,7 +8,7 @@ from torch import Tensor
 
 TILE_ROWS, TILE_COLUMNS = 20, 40  # px, the paper's window and stride
 FEWEST = 4  # Gaussians that define a box
-SURFACE_MARGIN = 0.02  # of the depth: how far behind the visible surface still counts as in front of it
+SURFACE_MARGIN = 0.02  # of the depth: Gaussians so far behind the visible surface still belong to it
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,10 @@ class Obb:
         return (local.abs() <= self.half_extents * (1 + 1e-5) + 1e-9).all(dim=-1)
 
 
-def fit(points: Tensor, mean_centre: bool = False) -> Obb:
-    """Return the box of points [N, 3]: axes are the eigenvectors of their covariance (1/(n-1)).
+def fit(points: Tensor) -> Obb:
+    """Return the tight box of points [N, 3] along the eigenvectors of their covariance (1/(n-1)).
 
-    Args:
-        mean_centre: keep the mean as the centre, as the paper does, instead of the middle of min and max.
+    The centre is the middle of the extremes. About the mean, which the paper takes, points of a skewed set lie outside.
 
     Raises:
         ValueError: fewer than two points.
@@ -40,8 +39,7 @@ def fit(points: Tensor, mean_centre: bool = False) -> Obb:
     _, axes = torch.linalg.eigh(torch.cov(points.T))
     local = (points - mean) @ axes
     low, high = local.min(dim=0).values, local.max(dim=0).values
-    centre = mean if mean_centre else mean + axes @ ((low + high) / 2)
-    return Obb(centre, axes, (high - low) / 2)
+    return Obb(mean + axes @ ((low + high) / 2), axes, (high - low) / 2)
 
 
 def worst_tile(error: Tensor) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""The sensor in the image model: scene-linear radiance and exposure to digital numbers, and how sure they are."""
+"""The sensor in the image model: scene-linear radiance and exposure to digital numbers, and the noise of these."""
 
 import math
 from dataclasses import dataclass
@@ -6,7 +6,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-HALF_DN = 0.5  # a reading of 0 is of a signal that rounds to 0 or less
+HALF_DN = 0.5  # a reading of 0 means a signal below this, since signals are rounded
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a sensor is expected to read, before its readings are clipped, and the noise on it; all of one shape."""
+
+    expected_dn: Tensor  # differentiable
+    variance_dn2: Tensor  # of the noise, without gradient
+    sigma_dn: Tensor  # its root
+
+    def clipped_moments(self, white_dn: float) -> tuple[Tensor, Tensor]:
+        """Return mean (DN) and variance (DN²) of the readings clipped at 0 and `white_dn`."""
+        return clipped_moments(self.expected_dn, self.sigma_dn, white_dn)
 
 
 @dataclass(frozen=True)
@@ -34,16 +47,21 @@ class Sensor:
         signal_dn = (expected_dn.detach() - self.black_dn).clamp(min=0)
         return signal_dn / self.electrons_per_dn + self.read_noise_dn**2 + 1 / 12
 
+    def predicted(self, radiance: Tensor, exposure_time_s: float | Tensor) -> Prediction:
+        """Return the expected readings of a radiance and their noise."""
+        expected = self.expected_dn(radiance, exposure_time_s)
+        variance = self.variance_dn2(expected)
+        return Prediction(expected, variance, variance.sqrt())
+
     def normalised_residual(self, radiance: Tensor, exposure_time_s: float | Tensor, dn: Tensor) -> Tensor:
         """Return (expected reading - reading) / deviation of the reading: mean 0 and variance 1 for a true radiance.
 
-        Mean and deviation are those of the clipped reading. Far beyond a clip the reading is certain, and its deviation
-        is taken for a thousandth of the noise, so that the residual stays finite; `fit_figures` weighs such pixels by
-        what their readings can tell.
+        Mean and deviation are those of the clipped reading. Far beyond a clip the reading does not vary; its deviation
+        is then taken as a thousandth of the noise, so that the residual stays finite.
         """
-        expected = self.expected_dn(radiance, exposure_time_s)
-        sigma = self.variance_dn2(expected).sqrt()
-        mean, variance = clipped_moments(expected, sigma, self.white_dn)
+        prediction = self.predicted(radiance, exposure_time_s)
+        sigma = prediction.sigma_dn
+        mean, variance = prediction.clipped_moments(self.white_dn)
         return (mean - dn) / (variance.sqrt() + 1e-3 * sigma * (variance < 1e-6 * sigma**2))
 
     def deviance_residual(
@@ -55,25 +73,25 @@ class Sensor:
         (predicted - read) / sigma. A reading at a clip says only "at most this much" or "at least this much": its
         likelihood is the probability of lying beyond the clip, and a prediction far beyond has no residual.
 
-        A mean of several sensor pixels is no clipped normal variable: its expectation is that of readings clipped at
-        zero, its noise is smaller by the root of their number, and a saturated one is fitted by all that is brighter.
+        A mean of several sensor pixels is not a clipped normal variable: its expectation is that of readings clipped at
+        zero, its noise is smaller by the root of their number, and a prediction above a saturated one has no residual.
 
         Source: Tobin, Estimation of relationships for limited dependent variables, 1958.
         """
-        expected = self.expected_dn(radiance, exposure_time_s)
-        sigma = self.variance_dn2(expected).sqrt()
+        prediction = self.predicted(radiance, exposure_time_s)
+        expected, sigma = prediction.expected_dn, prediction.sigma_dn
         saturated = dn >= self.white_dn
         if averaged_pixels > 1:
             residual = (clipped_mean(expected, sigma) - dn) / sigma * math.sqrt(averaged_pixels)
             return torch.where(saturated, residual.clamp(max=0), residual)
         beyond = torch.where(saturated, expected - (self.white_dn - HALF_DN), HALF_DN - expected) / sigma
-        # the root has no slope at 0, where the likelihood is 1: one rounding keeps it away
+        # the root has no derivative at 0, where the likelihood is 1; 1e-15 keeps the argument above 0
         deviance = (-2 * torch.special.log_ndtr(beyond) + 1e-15).sqrt()
         at_a_clip = torch.where(saturated, -deviance, deviance)
         return torch.where(saturated | (dn <= 0), at_a_clip, (expected - dn) / sigma)
 
     def stabilised(self, dn: Tensor) -> Tensor:
-        """Return readings on a scale where noise has unit variance everywhere, 0 where no light is.
+        """Return readings on a scale where noise has unit variance everywhere and the black level is 0.
 
         The generalised Anscombe transform minus its value at the black level, in the form that loses no digits where
         read noise is far larger than shot noise.

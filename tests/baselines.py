@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from obbgs_core.score.metrics import foreground_psnr_db, psnr_db
-from obbgs_core.train.presets import MethodConfig
+from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.trainer import Trainer
 from tests.benchmarks.targets import Target, predicted
 
@@ -48,7 +48,7 @@ def untrained(target: Target, config: MethodConfig, seed: int = 0) -> Score:
         ReconstructionError: the frames allow no start, as in `Trainer`.
     """
     trainer = Trainer(target.training, target.sensor, config, seed)
-    gaussians, reference_s = trainer.gaussians.detach(), trainer.reference_exposure_s
+    gaussians, reference_s = trainer.state.gaussians.detach(), trainer.setup.reference_exposure_s
     images = [
         predicted(gaussians, f, target.sensor, reference_s or f.exposure_time_s) for f in target.held_out
     ]

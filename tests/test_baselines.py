@@ -17,7 +17,7 @@ from tests.benchmarks import stability, targets
 GOLDEN = Path(__file__).parent / "golden" / "session"
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=4.0, read_noise_dn=8.0)
 K = torch.tensor([[60.0, 0, 8], [0, 60.0, 8], [0, 0, 1]])
-QUICK = {"steps": 30, "start_count": 300, "max_gaussians": 300}
+QUICK = {"steps": 30, "start.count": 300, "growth.max_gaussians": 300}
 
 
 def view(dn: float, exposure_s: float) -> TrainingFrame:
@@ -51,7 +51,7 @@ def test_the_mean_image_is_of_the_frames_of_the_same_exposure():
 
 def test_on_the_golden_session_a_black_image_passes_a_bar_of_30_db_and_no_bar_of_its_own():
     target = targets.from_session(GOLDEN)
-    config = preset("obbgs", **QUICK)
+    config = preset("obbgs", QUICK)
     black, mean = baselines.black(target), baselines.mean_image(target)
     start = baselines.untrained(target, config)
     assert black.clean_db > 33 and mean.clean_db < black.clean_db and start.clean_db < black.clean_db
@@ -66,7 +66,7 @@ def test_a_stability_row_is_ok_only_clearly_above_every_baseline(psnr_db, ok):
 
 
 def test_a_stability_row_shows_its_baselines():
-    target, config = targets.from_session(GOLDEN), preset("obbgs", **QUICK)
+    target, config = targets.from_session(GOLDEN), preset("obbgs", QUICK)
     row = stability.baselines_of(target, config, seed=0)
     assert list(row) == ["mean_image_db", "black_db", "untrained_db"]
     assert row["untrained_db"] == round(baselines.untrained(target, config).clean_db, 3)

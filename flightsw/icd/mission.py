@@ -288,7 +288,7 @@ class ReconstructSection:
     method: Literal["obbgs", "jiang2025", "3dgs", "pixel-gs", "mvgs"] = "obbgs"
     seed: int = 7
     steps: int = 0  # of training; 0: the method's own number
-    settings: dict[str, Any] = field(default_factory=dict, hash=False)  # such as sun_shading: linear
+    settings: dict[str, Any] = field(default_factory=dict, hash=False)  # such as light: {sun_shading: linear}
 
     def __post_init__(self):
         require(

@@ -91,6 +91,11 @@ class Gaussians:
             self, **{name: value.detach() for name, value in self.parameters().items()}
         )
 
+    def trainable(self) -> "Gaussians":
+        """Return the same values as leaves of autograd that collect gradients."""
+        leaves = {n: t.detach().clone().requires_grad_() for n, t in self.parameters().items()}
+        return dataclasses.replace(self, **leaves)
+
     @staticmethod
     def concatenate(parts: "list[Gaussians]") -> "Gaussians":
         tensors = {name: torch.cat([getattr(p, name) for p in parts]) for name in TENSORS}

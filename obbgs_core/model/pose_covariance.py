@@ -11,9 +11,8 @@ from torch import Tensor
 
 TOLERANCE = 2e-6  # of a block's mean variance; twice what flight lets pass, since a tag is turned and mixed after that
 EXACT = 1e-12  # of a block's mean variance: less counts as none, a micrometre beside a metre
-NO_DEVIATION = (
-    1e-30  # stands for that of a block without variance, so that any entry of it that is not zero shows
-)
+# stands for that of a block without variance, so that any entry of it that is not zero shows
+NO_DEVIATION = 1e-30
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A start from silhouettes: the visual hull that most long exposures agree on. Space is black, so light is target."""
+"""The visual hull of silhouettes that most long exposures agree on. Space is black, so what shows light is target."""
 
 import logging
 import math
@@ -11,31 +11,33 @@ from torch import Tensor
 from obbgs_core.sensor import Sensor
 
 log = logging.getLogger(__name__)
-SURE_SIGMA = 5.5  # of a window's mean: certainly light; sizes the target
-SKY_SIGMA = 1.0  # of a 9x9 window's mean: no more is empty sky
+CERTAIN_SIGMA = 5.5  # a window's mean above this is light beyond doubt; the target's radius is measured on it
+SKY_SIGMA = 1.0  # a 9x9 window's mean up to this may be empty sky
 BRIGHT_SIGMA = 4.0  # of a single pixel
 EDGE_SIGMA = 1.5  # of a single pixel beside brighter ones
-LIKELY_SIGMA = 2.0  # perhaps light; enough for a vote, since one view in twenty may be wrong
-WINDOWS_PX = (3, 5, 9, 15)  # wide ones find shadowed faces that no single pixel shows
-FEWEST_BRIGHT_PX = 4  # of the target, for a frame to be of use
-FEWEST_CHOSEN = 3  # pixels of a window
-SPECK = 0.4  # a sure pixel with fewer sure neighbours (share of 3x3) is noise
-INSIDE = 0.9995  # share of all sure pixels that the target's radius must reach
+# a window's mean above this counts as light in the vote, where one view in twenty may be wrong
+LIKELY_SIGMA = 2.0
+WINDOWS_PX = (3, 5, 9, 15)  # wide windows find shadowed faces that no single pixel shows
+FEWEST_BRIGHT_PX = 4  # a frame with fewer counts as black
+FEWEST_CHOSEN = 3  # pixels of a window that a mean is taken of
+SPECK = 0.4  # a certain pixel with a smaller share of certain pixels in its 3x3 window is noise
+INSIDE = 0.9995  # share of all certain pixels that the target's radius encloses
 AGREEMENT = 0.95  # share of views that must see light where a voxel projects
 COARSE_VOXELS = 64  # along each axis of the first grid
-SUBDIVISIONS = 2  # at most
-FINEST_PX = 0.7  # a voxel's least width on the image
-VOXELS_AT_ONCE = 1_000_000
+SUBDIVISIONS = 2  # of the first grid, at most; each halves the voxels
+FINEST_PX = 0.7  # smallest width of a voxel in the image
+VOXELS_AT_ONCE = 1_000_000  # bounds the memory
 
 
 @dataclass(frozen=True)
 class Silhouette:
-    """Where one frame sees light: surely (few false alarms), likely (few misses), not even a hint; [H, W] bool each.
+    """Where one frame sees light, by confidence; [H, W] bool each.
 
-    A third of the empty sky counts as `sky`, and of a face whose light is twice the noise of 5x5 pixels one in fifty.
+    certain: light with few false alarms; likely: light with few misses; sky: no sign of light, about a third of the
+    empty sky and one in fifty pixels of a face whose light is twice the noise of a 5x5 mean.
     """
 
-    sure: Tensor
+    certain: Tensor
     likely: Tensor
     sky: Tensor
     world_to_camera: Tensor
@@ -50,18 +52,18 @@ def silhouette(
     sigma_dn /= math.sqrt(dn.shape[2])
     signal = ((dn.mean(dim=-1) - sky_dn) / sigma_dn)[None, None]  # in sigmas
     bright = signal > BRIGHT_SIGMA
-    sure, likely = torch.zeros_like(bright), bright.clone()
+    certain, likely = torch.zeros_like(bright), bright.clone()
     means = {w: _mean(signal, w) * w for w in WINDOWS_PX}
-    # what is bright does not light its neighbours
+    # bright pixels are left out, so that they do not make their neighbours look lit
     faint = {w: _mean_of(signal, ~bright, w) for w in WINDOWS_PX}
-    for w in WINDOWS_PX:  # light is there, not only nearby
-        sure |= (means[w] > SURE_SIGMA) & (means[3] > LIKELY_SIGMA)
+    for w in WINDOWS_PX:  # the 3x3 test keeps out pixels that are only near to light
+        certain |= (means[w] > CERTAIN_SIGMA) & (means[3] > LIKELY_SIGMA)
         likely |= (faint[w] > LIKELY_SIGMA) & (faint[5] > 0)
-    likely |= (means[3] > SURE_SIGMA) & (signal > EDGE_SIGMA)
-    sure &= _mean(sure.float(), 3) > SPECK
+    likely |= (means[3] > CERTAIN_SIGMA) & (signal > EDGE_SIGMA)
+    certain &= _mean(certain.float(), 3) > SPECK
     lit = likely | (faint[5] > 0) | (faint[9] > SKY_SIGMA)
     likely, lit = _dilated(likely, dilate_px), _dilated(lit, dilate_px)
-    return Silhouette(sure[0, 0], likely[0, 0], ~lit[0, 0], world_to_camera, K)
+    return Silhouette(certain[0, 0], likely[0, 0], ~lit[0, 0], world_to_camera, K)
 
 
 def _mean_of(signal: Tensor, chosen: Tensor, window: int) -> Tensor:
@@ -84,10 +86,10 @@ def _dilated(mask: Tensor, reach_px: int) -> Tensor:
 
 
 def shows_light(dn: Tensor, sensor: Sensor) -> bool:
-    """Return whether anything in dn [H, W, C] surely rises above the noise; in eclipse nothing does."""
+    """Return whether anything in dn [H, W, C] certainly rises above the noise; in eclipse nothing does."""
     sky_dn, sigma_dn = _dark_reading(sensor)
     signal = F.avg_pool2d((dn.mean(dim=-1) - sky_dn)[None], 3, 1)
-    bright = signal > SURE_SIGMA * sigma_dn / math.sqrt(dn.shape[2]) / 3
+    bright = signal > CERTAIN_SIGMA * sigma_dn / math.sqrt(dn.shape[2]) / 3
     return int(bright.sum()) >= FEWEST_BRIGHT_PX
 
 
@@ -102,10 +104,10 @@ def _dark_reading(sensor: Sensor) -> tuple[float, float]:
 
 
 def radius_m(silhouettes: list[Silhouette]) -> float:
-    """Return how far from the origin the light reaches across the lines of sight; 0 when all views are dark."""
+    """Return the target's radius, m: how far from the origin, across the line of sight, light is; 0 if all is dark."""
     reaches = []
     for s in silhouettes:
-        rows, columns = torch.nonzero(s.sure, as_tuple=True)
+        rows, columns = torch.nonzero(s.certain, as_tuple=True)
         origin = s.world_to_camera[:3, 3]
         if len(rows) == 0 or origin[2] <= 0:
             continue
@@ -121,8 +123,8 @@ def radius_m(silhouettes: list[Silhouette]) -> float:
 def hull_points(silhouettes: list[Silhouette], radius: float) -> tuple[Tensor, float]:
     """Return surface points [M, 3] m of the visual hull, and the voxel size, m.
 
-    The grid starts coarse and only what survives is looked at again, twice as fine, down to what a pixel shows. Empty
-    when the views do not agree anywhere.
+    The grid starts coarse, and only voxels that survive are divided again, down to the size of a pixel. The result is
+    empty when the views do not agree anywhere.
     """
     voxel_m = 2 * radius / COARSE_VOXELS
     pixels_m = [float(s.world_to_camera[:3, 3].norm() / s.K[0, 0]) for s in silhouettes]
@@ -164,7 +166,10 @@ def _centres(grid: Tensor, voxel_m: float, radius: float) -> Tensor:
 
 
 def agreement(silhouettes: list[Silhouette], points: Tensor, reach_m: float) -> Tensor:
-    """Return the share [M] of views that see light within `reach_m` of each point; views that miss it do not vote."""
+    """Return the share [M] of views that see light within `reach_m` of each point, of those with the point in view.
+
+    Points in view of less than a third of the views have a share of 0.
+    """
     votes, seen = torch.zeros(len(points)), torch.zeros(len(points))
     for s in silhouettes:
         p = points @ s.world_to_camera[:3, :3].T + s.world_to_camera[:3, 3]

@@ -1,49 +1,87 @@
-"""Growth and pruning: who is cloned, split or removed, with the optimiser's state carried along."""
+"""Growth and pruning of the model: which Gaussians are cloned, split or removed."""
 
-import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from obbgs_core import compiled
-from obbgs_core.model.gaussians import TENSORS, Gaussians
+from obbgs_core import obb
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.rotations import quats_to_matrices
-from obbgs_core.obb import Obb
 from obbgs_core.render import Rendered
-from obbgs_core.train.presets import MethodConfig
+from obbgs_core.settings import at_least_one, check, fraction
+from obbgs_core.train.adam import Adam
 
-RECORDS = ("gradient", "weight", "radius_px")  # of each Gaussian in Growth
 SPLIT_SHRINK = 1.6  # a split's halves are this much smaller (Kerbl et al. 2023)
+# of the method's unit of length: larger Gaussians are split, smaller ones cloned (the same)
+SPLIT_SIZE = 0.01
+GRADIENT_THRESHOLD = 0.0002  # mean screen gradient per unit of normalised device coordinates (the same)
+RESET_OPACITY = 0.01  # no opacity is above this after a reset (the same)
+
+
+@dataclass(frozen=True)
+class GrowthSettings:
+    """When and where Gaussians are added, and which are removed; sizes are in the method's unit of length."""
+
+    max_gaussians: int = at_least_one(500_000)
+    # above 0: so many lit pixels of the long exposures for each, against overfitting
+    pixels_per_gaussian: int = 0
+    begin: float = fraction(500 / 30_000)  # share of the steps
+    end: float = fraction(0.5)  # share of the steps
+    interval: int = at_least_one(100)  # steps between two densifications
+    # above 0: this share of the Gaussians grows, largest gradients first, instead of a threshold
+    share: float = 0.0
+    pixel_weighted: bool = False  # gradients are averaged over pixels instead of views (Pixel-GS)
+    # above 0: gradients of Gaussians nearer to the camera than this count less (Pixel-GS)
+    depth_scale: float = 0.0
+    obb_interval: int = 0  # above 0: steps between extra growth inside the boxes of the worst tiles
+    prune_opacity: float = fraction(0.005)  # fainter Gaussians are removed at each densification
+    prune_size: float = 0.2  # larger Gaussians are removed at each densification
+    prune_size_from: float = fraction(0.0)  # share of the steps before which size is no reason to remove
+    prune_radius_px: float = 0.0  # above 0: so are those whose three sigma are longer than this in an image
+    opacity_reset_interval: int = 3000  # steps between two resets of the opacities; 0: never
+
+    def __post_init__(self):
+        check(self, "growth")
 
 
 @dataclass
 class Growth:
-    """Running screen-space gradients [N], by view or weighted by the pixels each Gaussian covers (Pixel-GS).
+    """Running sums of each Gaussian's screen-space gradient since the last densification.
 
-    radius_px: [N] the longest three sigma that each Gaussian had in a picture.
+    gradient: [N] sum of gradient norms, weighted; weight: [N] sum of the weights;
+    radius_px: [N] the longest three sigma that the Gaussian had in an image.
     """
 
-    count: int
-    pixel_weighted: bool
-    gradient: Tensor = field(init=False)
-    weight: Tensor = field(init=False)
-    radius_px: Tensor = field(init=False)
+    gradient: Tensor
+    weight: Tensor
+    radius_px: Tensor
 
-    def __post_init__(self):
-        self.gradient, self.weight, self.radius_px = (torch.zeros(self.count) for _ in range(3))
+    @staticmethod
+    def of(count: int) -> "Growth":
+        """Return records of `count` Gaussians that have not been seen yet."""
+        return Growth(*(torch.zeros(count) for _ in range(3)))
 
     @torch.no_grad()
-    def observe(self, rendered: Rendered, half_size_px: float, depth_weight: Tensor | None = None) -> None:
+    def observe(
+        self,
+        rendered: Rendered,
+        half_size_px: float,
+        pixel_weighted: bool,
+        depth_weight: Tensor | None = None,
+    ) -> None:
         """Add one step's gradients, per unit of normalised device coordinates as the published thresholds are.
 
         Args:
+            half_size_px: half the longer side of the images.
+            pixel_weighted: weigh each view by the pixels that the Gaussian covers in it, not by one.
             depth_weight: [C, N] factor on the gradients of each camera's Gaussians.
         """
         for camera, gradient in rendered.screen.means2d.items():
             pixels = rendered.screen.pixels[camera]
-            weight = pixels if self.pixel_weighted else (pixels > 0).float()
+            weight = pixels if pixel_weighted else (pixels > 0).float()
             size = gradient.norm(dim=-1) * half_size_px
             if depth_weight is not None:
                 size = size * depth_weight[camera]
@@ -52,62 +90,43 @@ class Growth:
             self.radius_px = torch.maximum(self.radius_px, rendered.radii[camera].to(self.radius_px))
 
     def mean(self) -> Tensor:
+        """Return each Gaussian's mean gradient [N]."""
         return self.gradient / self.weight.clamp(min=1e-9)
 
-    def follow(self, kept: Tensor) -> None:
-        """Keep the records of the Gaussians `kept` (index or mask)."""
-        for name in RECORDS:
-            setattr(self, name, getattr(self, name)[kept])
-        self.count = len(self.gradient)
+    def select(self, kept: Tensor) -> "Growth":
+        """Return the records of the Gaussians `kept` (index or mask)."""
+        return Growth(self.gradient[kept], self.weight[kept], self.radius_px[kept])
+
+    def padded(self, count: int) -> "Growth":
+        """Return these records with empty ones after them, `count` in all."""
+        more = Growth.of(count - len(self.gradient))
+        return Growth(*(torch.cat([getattr(self, name), getattr(more, name)]) for name in vars(self)))
 
 
-class Adam:
-    """Adam over the Gaussians' parameters whose moments follow the Gaussians when they are split or removed."""
+def near_camera_weight(means: Tensor, cameras: Cameras, near_m: float) -> Tensor:
+    """Return the factor [C, N] on the gradients of Gaussians nearer than `near_m` to a camera (Pixel-GS, 2024)."""
+    along = cameras.world_to_camera[:, 2]
+    depths_m = along[:, :3] @ means.detach().T + along[:, 3:]
+    return (depths_m / near_m).clamp(0, 1) ** 2
 
-    def __init__(self, gaussians: Gaussians, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
-        self.betas, self.eps, self.steps = betas, eps, 0
-        self.first = {name: torch.zeros_like(t) for name, t in gaussians.parameters().items()}
-        self.second = {name: torch.zeros_like(t) for name, t in gaussians.parameters().items()}
 
-    @torch.no_grad()
-    def step(self, gaussians: Gaussians, rates: dict[str, float | Tensor]) -> None:
-        """Move every parameter that has a gradient, and drop the gradients; a rate may differ within a parameter."""
-        self.steps += 1
-        b1, b2 = self.betas
-        correction = math.sqrt(1 - b2**self.steps) / (1 - b1**self.steps)
-        for name, parameter in gaussians.parameters().items():
-            if parameter.grad is None:
-                continue
-            values, gradient, rate = parameter.detach(), parameter.grad.contiguous(), rates[name] * correction
-            first, second = self.first[name], self.second[name]
-            native = compiled.module_for(values)
-            if native is not None and not isinstance(rate, Tensor):  # the same in one pass over memory
-                threads = torch.get_num_threads()
-                native.adam_step(values, gradient, first, second, rate, b1, b2, self.eps, threads)
-            else:
-                first.lerp_(gradient, 1 - b1)
-                second.mul_(b2).addcmul_(gradient, gradient, value=1 - b2)
-                values.sub_(rate * first / second.sqrt().add_(self.eps))
-            parameter.grad = None
+def worst_boxes(
+    gaussians: Gaussians, rendered: Rendered, cameras: Cameras, residual: Tensor
+) -> list[obb.Obb]:
+    """Return the boxes around the Gaussians behind the worst tile of each frame; none where they are too few.
 
-    def rest(self, name: str) -> None:
-        """Forget what is known of a parameter's gradients, whose values were changed by hand."""
-        self.first[name].zero_()
-        self.second[name].zero_()
-
-    def widen(self, gaussians: Gaussians) -> None:
-        """Follow coefficients of radiance that were added: theirs start at rest."""
-        for moments in (self.first, self.second):
-            more = torch.zeros_like(gaussians.sh)
-            more[:, : moments["sh"].shape[1]] = moments["sh"]
-            moments["sh"] = more
-
-    def follow(self, kept: Tensor, added: int) -> None:
-        """Keep the moments of the Gaussians `kept` (index) and start `added` new ones at rest."""
-        for moments in (self.first, self.second):
-            for name in TENSORS:
-                rest = torch.zeros(added, *moments[name].shape[1:], dtype=moments[name].dtype)
-                moments[name] = torch.cat([moments[name][kept], rest])
+    Args:
+        residual: [C, H, W, channels].
+    """
+    error, means, boxes = residual.abs(), gaussians.means.detach(), []
+    for i in range(len(cameras)):
+        tile = obb.worst_tile(error[i])
+        members = obb.behind_tile(
+            means, rendered.means2d[i], rendered.depth[i], cameras.world_to_camera[i], tile
+        )
+        if members.sum() >= obb.FEWEST:
+            boxes.append(obb.fit(means[members]))
+    return boxes
 
 
 @torch.no_grad()
@@ -131,7 +150,7 @@ def grow(
         half.log_scales = half.log_scales - math.log(SPLIT_SHRINK)
         parts.append(half)
     adam.follow(kept, len(clones) + 2 * len(splits))
-    return trainable(Gaussians.concatenate(parts)), kept
+    return Gaussians.concatenate(parts).trainable(), kept
 
 
 @torch.no_grad()
@@ -139,7 +158,7 @@ def keep(gaussians: Gaussians, adam: Adam, mask: Tensor) -> Gaussians:
     """Return the model with only the Gaussians in mask [N]."""
     index = torch.nonzero(mask)[:, 0]
     adam.follow(index, 0)
-    return trainable(gaussians.select(index))
+    return gaussians.select(index).trainable()
 
 
 @torch.no_grad()
@@ -149,12 +168,6 @@ def finite(gaussians: Gaussians) -> Tensor:
     for tensor in gaussians.tensors().values():
         kept &= tensor.reshape(len(gaussians), -1).isfinite().all(dim=1)
     return kept
-
-
-def trainable(gaussians: Gaussians) -> Gaussians:
-    """Return the same values as leaves that collect gradients."""
-    leaves = {n: t.detach().clone().requires_grad_() for n, t in gaussians.parameters().items()}
-    return dataclasses.replace(gaussians, **leaves)
 
 
 @torch.no_grad()
@@ -174,7 +187,7 @@ def densify(
     adam: Adam,
     growth: Growth,
     unit_m: float,
-    config: MethodConfig,
+    settings: GrowthSettings,
     share: float,
     rng: torch.Generator,
 ) -> Gaussians:
@@ -184,14 +197,14 @@ def densify(
         unit_m: the method's unit of length.
         share: of the steps that are done.
     """
-    growing = chosen(growth.mean(), gaussians, config)
-    gaussians, kept = grow(gaussians, adam, growing, config.split_over * unit_m, rng)
+    growing = chosen(growth.mean(), gaussians, settings)
+    gaussians, kept = grow(gaussians, adam, growing, SPLIT_SIZE * unit_m, rng)
     with torch.no_grad():
-        wanted = gaussians.opacities > config.prune_opacity
-        if share >= config.prune_over_from:
-            wanted &= gaussians.scales.max(dim=1).values < config.prune_over * unit_m
-            if config.prune_radius_px:
-                wanted[: len(kept)] &= growth.radius_px[kept] <= config.prune_radius_px
+        wanted = gaussians.opacities > settings.prune_opacity
+        if share >= settings.prune_size_from:
+            wanted &= gaussians.scales.max(dim=1).values < settings.prune_size * unit_m
+            if settings.prune_radius_px:
+                wanted[: len(kept)] &= growth.radius_px[kept] <= settings.prune_radius_px
         wanted &= finite(gaussians)
     return keep(gaussians, adam, wanted) if wanted.any() else gaussians
 
@@ -200,28 +213,32 @@ def densify_boxes(
     gaussians: Gaussians,
     adam: Adam,
     growth: Growth,
-    boxes: list[Obb],
+    boxes: list[obb.Obb],
     unit_m: float,
-    config: MethodConfig,
+    settings: GrowthSettings,
     rng: torch.Generator,
 ) -> tuple[Gaussians, Growth]:
-    """Apply the clone/split rule inside the boxes only; what grows starts its gradient record anew."""
+    """Clone and split inside the boxes only; the records of new Gaussians start empty, the others' go on."""
     inside = torch.stack([box.contains(gaussians.means.detach()) for box in boxes]).any(dim=0)
-    growing = chosen(growth.mean(), gaussians, config) & inside
-    gaussians, kept = grow(gaussians, adam, growing, config.split_over * unit_m, rng)
-    anew = Growth(len(gaussians), config.pixel_weighted)
-    for name in RECORDS:
-        getattr(anew, name)[: len(kept)] = getattr(growth, name)[kept]
-    return gaussians, anew
+    growing = chosen(growth.mean(), gaussians, settings) & inside
+    gaussians, kept = grow(gaussians, adam, growing, SPLIT_SIZE * unit_m, rng)
+    return gaussians, growth.select(kept).padded(len(gaussians))
 
 
-def chosen(gradient: Tensor, gaussians: Gaussians, config: MethodConfig) -> Tensor:
+def chosen(gradient: Tensor, gaussians: Gaussians, settings: GrowthSettings) -> Tensor:
     """Return which Gaussians [N] grow: over the threshold, or the given share; never beyond the budget."""
-    room = config.max_gaussians - len(gaussians)
-    count = int((gradient >= config.grow_grad2d).sum())
-    if config.grow_share:
-        count = int(config.grow_share * len(gaussians))
+    room = settings.max_gaussians - len(gaussians)
+    count = int((gradient >= GRADIENT_THRESHOLD).sum())
+    if settings.share:
+        count = int(settings.share * len(gaussians))
     count = max(0, min(count, room, int((gradient > 0).sum())))
     growing = torch.zeros(len(gaussians), dtype=torch.bool)
     growing[gradient.topk(count).indices] = True
     return growing
+
+
+@torch.no_grad()
+def reset_opacities(gaussians: Gaussians, adam: Adam) -> None:
+    """Make every Gaussian nearly transparent, so that only those that are needed become opaque again."""
+    gaussians.opacity_logits.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+    adam.reset("opacity_logits")

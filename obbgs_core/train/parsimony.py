@@ -1,4 +1,4 @@
-"""How much light each Gaussian explains: its likelihood gain, in nats, and whether it earns its parameters."""
+"""Model selection by BIC: the likelihood gain of each Gaussian and of the next harmonic degree, and their penalties."""
 
 import dataclasses
 import math
@@ -8,28 +8,57 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from obbgs_core.frames import Batches
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
+from obbgs_core.settings import check, fraction
+from obbgs_core.train.batches import Batches
 
-VIEWS = 36  # of the training frames, spread evenly; gains are scaled to all of them
+VIEWS = 36  # training frames that are rendered, spread evenly; gains are scaled to all frames
 
 
-def price(gaussians: Gaussians, values: int) -> float:
-    """Return the nats a Gaussian must gain: half its parameters times ln(values measured) (Schwarz 1978)."""
+@dataclass(frozen=True)
+class ParsimonySettings:
+    """When Gaussians whose likelihood gain is below their BIC penalty are pruned."""
+
+    prune_at: tuple[float, ...] = fraction(())  # shares of the steps; none: never
+    bic_factor: float = 1.0  # on the penalty: larger values give smaller models
+    # more opaque Gaussians are kept: dark surface explains no light
+    keep_above_opacity: float = fraction(1.0)
+
+    def __post_init__(self):
+        check(self, "parsimony")
+
+
+def bic_penalty(gaussians: Gaussians, values: int) -> float:
+    """Return the BIC penalty of one Gaussian, nats: half its parameters times ln(values measured) (Schwarz 1978)."""
     parameters = sum(tensor[0].numel() for tensor in gaussians.tensors().values()) - 1  # a quaternion has 3
     return 0.5 * parameters * math.log(max(2, values))
+
+
+def justified(
+    gaussians: Gaussians,
+    batches: Batches,
+    sensor: Sensor,
+    scale: float,
+    settings: ParsimonySettings,
+    rng: torch.Generator,
+) -> Tensor:
+    """Return which Gaussians [N] gain more likelihood than their BIC penalty, or are too opaque to be removed."""
+    gains, values = likelihood_gains(gaussians, batches, sensor, scale, rng)
+    kept = gains >= settings.bic_factor * bic_penalty(gaussians, values)
+    return kept | (gaussians.opacities.detach() > settings.keep_above_opacity)
 
 
 def likelihood_gains(
     gaussians: Gaussians, batches: Batches, sensor: Sensor, scale: float, rng: torch.Generator
 ) -> tuple[Tensor, int]:
-    """Return what removing each Gaussian would cost [N], nats over all frames, and how many values were measured.
+    """Return the likelihood gain of each Gaussian [N], nats over all frames, and the number of values measured.
 
-    Without Gaussian j the prediction changes by exactly -o_j d(prediction)/d(o_j), because compositing is linear in
-    each opacity; at the optimum the cost is half the sum of that change squared over the noise variance. The sum of
-    squares over pixels is estimated without bias by back-propagating random signs (Hutchinson 1989), one draw a frame.
+    The gain is what the log-likelihood would lose without the Gaussian. Without Gaussian j the prediction changes by
+    exactly -o_j d(prediction)/d(o_j), because compositing is linear in each opacity; at the optimum the loss is half
+    the sum of that change squared over the noise variance. The sum of squares over pixels is estimated without bias by
+    back-propagating random signs (Hutchinson 1989), one draw a frame.
     """
     model = gaussians.detach()
     model.opacity_logits.requires_grad_()
@@ -38,7 +67,8 @@ def likelihood_gains(
         (slope,) = torch.autograd.grad(
             (view.predicted * view.weight * view.signs).sum(), model.opacity_logits
         )
-        change = slope / (1 - model.opacities.detach()).clamp(min=1e-6)  # o d/do from the logit's derivative
+        # o·d/do, from the derivative by the logit
+        change = slope / (1 - model.opacities.detach()).clamp(min=1e-6)
         gains += 0.5 * change**2
         values, times = values + view.values, view.times
     return gains * times, round(values * times)
@@ -47,10 +77,10 @@ def likelihood_gains(
 def next_degree_gain(
     gaussians: Gaussians, batches: Batches, sensor: Sensor, scale: float, rng: torch.Generator
 ) -> tuple[float, float]:
-    """Return what the next spherical-harmonic degree would gain, nats, and what it must gain to be worth it.
+    """Return the likelihood gain of the next spherical-harmonic degree and its BIC penalty, both in nats.
 
-    A score test: with slope g and curvature F of the log-likelihood at zero, a coefficient gains g²/(2F). A Sun that
-    hardly moves makes its harmonics hardly different from the constant: what the constant explains is taken out first.
+    A score test (Rao 1948): with slope g and curvature F of the log-likelihood at zero, a coefficient gains g²/(2F).
+    Where the Sun hardly moves, its harmonics are nearly constant: the part that the constant explains is projected out.
     """
     old = gaussians.sh.shape[1]
     model = padded(gaussians.detach(), math.isqrt(old))
@@ -77,14 +107,14 @@ def next_degree_gain(
 
 @dataclass(frozen=True)
 class _View:
-    """One training frame as the model predicts it [1, H, W, C], with random signs to probe the likelihood with."""
+    """One training frame as the model predicts it [1, H, W, C], with the random signs of Hutchinson's estimator."""
 
     predicted: Tensor  # DN, with its graph
     residual: Tensor  # (read - expected) / deviation of the reading: mean 0 where the model is true
-    weight: Tensor  # 1 / sigma, 0 where saturated: such pixels measure nothing
+    weight: Tensor  # 1 / sigma; 0 where saturated, because the reading does not depend on the radiance there
     signs: Tensor
     values: int  # sensor values that show the target above the noise
-    times: float  # training frames for each frame looked at
+    times: float  # training frames for each frame that is rendered
 
 
 def _views(
@@ -95,10 +125,11 @@ def _views(
     for index in chosen:
         batch = batches.batch([index], scale)
         radiance = render(model, batch.cameras).radiance
-        predicted = sensor.expected_dn(radiance, batch.exposure_time_s)
+        prediction = sensor.predicted(radiance, batch.exposure_time_s)
+        predicted = prediction.expected_dn
         residual = -sensor.normalised_residual(radiance.detach(), batch.exposure_time_s, batch.dn)
         residual *= math.sqrt(batch.averaged_pixels)
-        sigma = (sensor.variance_dn2(predicted) / batch.averaged_pixels).sqrt()
+        sigma = (prediction.variance_dn2 / batch.averaged_pixels).sqrt()
         weight = torch.where(batch.dn < sensor.white_dn, 1 / sigma, 0.0)
         signs = torch.randint(0, 2, predicted.shape, generator=rng) * 2.0 - 1
         values = int((predicted.detach() - sensor.black_dn > sigma).sum()) * batch.averaged_pixels

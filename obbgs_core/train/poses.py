@@ -1,35 +1,62 @@
-"""Pose refinement: six small numbers a bracket beside the Gaussians, held by the pose tags' whole covariance."""
+"""Pose refinement: six small numbers for each bracket, with the pose tags' whole covariance as their prior."""
 
 import dataclasses
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from obbgs_core.frames import Batch, TrainingFrame, bracket_numbers
+from obbgs_core.frames import TrainingFrame, bracket_numbers
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.pose_covariance import whitening
 from obbgs_core.model.rotations import from_rotation_vectors, multiply
-from obbgs_core.train.corrections import Corrections
+from obbgs_core.settings import check, fraction
+from obbgs_core.train.batches import Batch
 
 NULL = 1e-9  # a singular value of rows of unit length that is zero up to rounding
+POSE_RATE = 0.3  # learning rate at the first step, in standard deviations of the pose tag
+SECOND_MOMENT_DECAY = 0.99  # a step that sees the bracket
 
 
-class PoseCorrections(Corrections):
-    """Corrections [P, 6] of unit variance; times the root of the tags' covariance they are rigid motions.
+@dataclass(frozen=True)
+class PoseSettings:
+    """Whether the tagged poses are refined together with the Gaussians."""
 
-    Such a motion stands in front of world_to_camera: a rotation about the camera's axes, then a shift along them. What
-    the tags know exactly is not corrected.
+    # auto: if the likelihood gain on the validation brackets justifies it
+    refine: Literal["never", "always", "auto"] = "never"
+    # share of the steps before which the model is too coarse to correct poses
+    refine_from: float = fraction(0.25)
+
+    def __post_init__(self):
+        check(self, "poses")
+
+
+def pose_rate(share: float, settings: PoseSettings) -> float:
+    """Return the learning rate of the corrections after a share of the steps, in standard deviations of the tag."""
+    return POSE_RATE * (1 - share) if share >= settings.refine_from else 0.0
+
+
+class PoseCorrections:
+    """Corrections `value` [P, 6] of unit variance, a row for each bracket.
+
+    Times the root of the tags' covariance they are rigid motions in front of world_to_camera: a rotation about the
+    camera's axes (rad), then a shift along them (m). Directions in which the tags are exact are not corrected.
 
     Frames of one bracket share their motion: the error of a navigation solution hardly changes within it. Its
     covariance is the mean of those that the frames' tags give, each in its own camera's axes; an exact tag counts with
-    zeros. The tags' errors are one and the same, not independent draws, so several tags make it no more certain (which
-    weighing by inverse covariances would say). However they are correlated, the covariance of their mean is never
-    larger than the mean of their covariances, and it is equal where the tags agree.
+    zeros. The tags of a bracket share one error instead of being independent draws, so several tags do not reduce it
+    (weighting by inverse covariances would claim so). However they are correlated, the covariance of their mean is
+    never larger than the mean of their covariances, and it is equal where the tags agree.
     """
 
     def __init__(self, frames: list[TrainingFrame]):
-        super().__init__(bracket_numbers(frames), 6)
+        self.of_frame = bracket_numbers(frames)  # the row of each frame
+        rows = max(self.of_frame) + 1
+        self.value = torch.zeros(rows, 6, requires_grad=True)
+        self.second = torch.zeros(rows, 6)  # running mean of the squared gradient
+        self.visits = torch.zeros(rows, 1)  # steps that saw the bracket
         covariances = torch.zeros(len(frames), 6, 6, dtype=torch.float64)
         for i, frame in enumerate(frames):
             if frame.pose_covariance is not None:
@@ -41,15 +68,35 @@ class PoseCorrections(Corrections):
         """The number of directions [P] in which each bracket may be corrected."""
         return self.whitening.rank
 
+    def rows(self, indices: list[int]) -> Tensor:
+        """Return the rows [B] of frames."""
+        return torch.tensor([self.of_frame[i] for i in indices])
+
     def corrected(self, indices: list[int], world_to_camera: Tensor) -> Tensor:
         """Return the poses [B, 4, 4] of frames with their corrections in front; gradients reach the corrections."""
-        root = self.whitening.root[self.rows(indices)]
-        return rigid_motions(_times(root, self.of(indices))) @ world_to_camera
+        rows = self.rows(indices)
+        return rigid_motions(_times(self.whitening.root[rows], self.value[rows])) @ world_to_camera
+
+    def prior(self, indices: list[int], values: int) -> Tensor:
+        """Return the corrections' part of a step's mean loss: half their squares over the number of its values."""
+        return 0.5 * self.value[self.rows(indices)].square().sum() / values
 
     @torch.no_grad()
     def step(self, rate: float) -> None:
-        """Move the corrections; what moves no pose stays zero, so that the prior counts only what does."""
-        super().step(rate)
+        """Move what has a gradient against it, over its root mean square; `rate` is in deviations of the tag.
+
+        This is Adam without its first moment: a bracket is seen only a few dozen times, and momentum overshoots.
+        Directions in which the tags are exact stay zero, so that the prior counts only those that move a pose.
+        """
+        gradient = self.value.grad
+        if gradient is not None:
+            seen = gradient.abs().sum(1, keepdim=True) > 0
+            self.visits += seen
+            decayed = SECOND_MOMENT_DECAY * self.second + (1 - SECOND_MOMENT_DECAY) * gradient**2
+            self.second = torch.where(seen, decayed, self.second)
+            second = self.second / (1 - SECOND_MOMENT_DECAY ** self.visits.clamp(min=1))
+            self.value -= torch.where(seen, rate * gradient / (second.sqrt() + 1e-15), 0.0)
+            self.value.grad = None
         self.value.copy_(_times(self.whitening.support, self.value))
 
     def cameras(self, batch: Batch) -> Cameras:
@@ -58,12 +105,11 @@ class PoseCorrections(Corrections):
         return dataclasses.replace(batch.cameras, world_to_camera=corrected)
 
     @torch.no_grad()
-    def settle(self, gaussians: Gaussians, frames: list[TrainingFrame]) -> Gaussians:
-        """Fix the gauge: move model and corrections together to where the corrections are least likely noise.
+    def fix_gauge(self, gaussians: Gaussians, frames: list[TrainingFrame]) -> Gaussians:
+        """Return the model moved rigidly to where the corrections, moved with it, are smallest in the tags' deviations.
 
-        Moving the model rigidly by d and every pose by its inverse changes no image; of all such twins the one with
-        the smallest corrections (weighted by the tags) is kept. A motion that would change what a tag knows exactly
-        is none of them.
+        Moving the model rigidly by d and every pose by its inverse changes no image, so training leaves d open. Motions
+        that would change a direction in which a tag is exact are excluded.
         """
         poses = torch.stack([frame.world_to_camera for frame in frames]).double()
         R, t = poses[:, :3, :3], poses[:, :3, 3]

@@ -1,4 +1,4 @@
-"""What each ingredient is worth, one taken away (or added) at a time: python -m tests.benchmarks.ablation"""
+"""What each part of a method contributes, one taken away (or added) at a time: python -m tests.benchmarks.ablation"""
 
 import argparse
 
@@ -11,32 +11,30 @@ from tests.benchmarks.rows import shown
 OURS: dict[str, dict] = {
     "as it is": {},
     "- exposure known": {"exposure_aware": False},
-    "- sensor likelihood": {"loss": "l1_ssim", "ssim_weight": 0.2, "edge_weight": 0.2},
-    "- Sobel": {"edge_weight": 0.0},
+    "- sensor likelihood": {"loss.kind": "l1_ssim", "loss.ssim_weight": 0.2, "loss.edge_weight": 0.2},
+    "- Sobel": {"loss.edge_weight": 0.0},
     "- bracket steps": {"bracket_steps": False},
-    "- visual hull": {"start": "random"},
-    "- OBB growth": {"obb_interval": 0},
-    "- Pixel-GS weights": {"pixel_weighted": False},
+    "- visual hull": {"start.kind": "random"},
+    "- OBB growth": {"growth.obb_interval": 0},
+    "- Pixel-GS weights": {"growth.pixel_weighted": False},
     "- pyramid": {"pyramid": ((0.0, 1.0),)},
-    "- weighing": {"weigh_at": ()},
-    "- harmonics by need": {"most_sh_degree": 0},
-    "- flattening": {"flat_weight": 0.0},
-    "- falling rates": {"lr_end": 1.0},
-    "- growth": {"grow_until": 0.0},
-    "+ solid opacities": {"solid_weight": 0.3},
-    "+ normals of depth": {"normal_weight": 0.1},
+    "- pruning by BIC": {"parsimony.prune_at": ()},
+    "- harmonics by BIC": {"light.max_sh_degree": 0},
+    "- flattening": {"loss.flat_weight": 0.0},
+    "- falling rates": {"rates.final_share": 1.0},
+    "- growth": {"growth.end": 0.0},
     "+ outlier filter": {"outlier_filter": True},
-    "+ degree 1 from the start": {"sh_degree": 1},
-    "+ pose refinement": {"refine_poses": "always"},
+    "+ degree 1 from the start": {"light.sh_degree": 1},
+    "+ pose refinement": {"poses.refine": "always"},
 }
 
 PUBLISHED: dict[str, dict] = {
     "as it is": {},
-    "- Sobel": {"edge_weight": 0.0},
-    "- OBB growth": {"obb_interval": 0},
+    "- Sobel": {"loss.edge_weight": 0.0},
+    "- OBB growth": {"growth.obb_interval": 0},
     "- bracket steps": {"bracket_steps": False},
     "one frame a step": {"bracket_steps": False, "frames_per_step": 1},
-    "- Pixel-GS weights": {"pixel_weighted": False},
+    "- Pixel-GS weights": {"growth.pixel_weighted": False},
     "- outlier filter": {"outlier_filter": False},
 }
 
@@ -57,7 +55,7 @@ def main() -> None:
         for name, changes in (OURS if arguments.method == "obbgs" else PUBLISHED).items():
             if arguments.only and name not in arguments.only.split(","):
                 continue
-            config = configure(arguments.method, arguments.steps_share, **changes)
+            config = configure(arguments.method, arguments.steps_share, changes)
             row = {"method": arguments.method, "ablation": name} | measure(config, target, 0)
             print(shown(row, "ablation", arguments.json), flush=True)
 

@@ -23,13 +23,12 @@ WITHOUT_TRAINING = {"black": baselines.black, "mean": baselines.mean_image}
 CURVE_STEPS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)  # shares of the steps
 
 
-def configure(name: str, steps_share: float, **changes):
+def configure(name: str, steps_share: float, changes: dict | None = None):
     """Return the configuration of `METHOD` or `METHOD+exposure` with its steps scaled."""
     method, _, known = name.partition("+")
     config = preset(method)
-    if known:
-        changes["exposure_aware"] = True
-    return preset(method, **({"steps": max(1, round(config.steps * steps_share))} | changes))
+    scaled = {"steps": max(1, round(config.steps * steps_share))}
+    return preset(method, scaled | ({"exposure_aware": True} if known else {}) | (changes or {}))
 
 
 def measure(
@@ -42,8 +41,8 @@ def measure(
     while not (reason := trainer.stop_reason(time_limit_s)):
         info = trainer.step()
         if info.step in marks:
-            gaussians = trainer.gaussians.detach()
-            clean = targets.clean_psnr_db(gaussians, target, trainer.reference_exposure_s)
+            gaussians = trainer.state.gaussians.detach()
+            clean = targets.clean_psnr_db(gaussians, target, trainer.setup.reference_exposure_s)
             chamfer = targets.cloud_distances(gaussians.means.double().numpy(), target.cloud)["chamfer"]
             way.append((round(info.seconds, 2), round(clean, 3), round(chamfer, 5)))
     result = trainer.result(reason)
@@ -51,11 +50,11 @@ def measure(
         "target": target.name,
         "seed": seed,
         "gaussians": len(result.gaussians),
-        "steps": trainer.steps_done,
+        "steps": trainer.state.steps_done,
     }
     row |= {"seconds": round(result.seconds, 2), "start": result.start, "stop": result.stop_reason}
     row |= {"appearance": result.appearance, "growth": result.growth}
-    row |= {"poses": result.poses, "exposures": result.exposures}
+    row |= {"poses": result.poses}
     row |= targets.image_figures(result.gaussians, target, result.reference_exposure_s)
     row |= targets.cloud_figures(result.gaussians, target, seed)
     row = {key: round(value, 5) if isinstance(value, float) else value for key, value in row.items()}

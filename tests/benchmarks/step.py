@@ -22,9 +22,10 @@ from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
-from obbgs_core.train import trainer as optimize
-from obbgs_core.train.growth import Adam, trainable
-from obbgs_core.train.presets import MethodConfig, preset
+from obbgs_core.start.initialisation import StartSettings
+from obbgs_core.train import decisions, setup, trainer
+from obbgs_core.train.adam import Adam
+from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests.benchmarks.rasterizer import camera, scene
 
@@ -34,10 +35,10 @@ WARM_UP_STEPS = 10
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=2e7, electrons_per_dn=4, read_noise_dn=8)
 # what a step calls besides the rasterizer and backward; drawing frames, priors and bookkeeping are the rest
 PARTS = {
-    "loss_forward": [(optimize, "_image_loss")],
+    "loss_forward": [(trainer, "image_loss")],
     "adam": [(Adam, "step")],
-    "growth": [(Trainer, "_observe"), (Trainer, "_change_number")],
-    "figures": [(Trainer, "_look")],
+    "growth": [(decisions, "observe"), (decisions, "change_number"), (decisions, "select_model")],
+    "figures": [(Trainer, "_measure")],
 }
 COLUMNS = (
     "rasterizer_forward",
@@ -125,12 +126,14 @@ def frames(distance: float) -> list[TrainingFrame]:
     return out
 
 
-def first_gaussians(_frames, _outlines, _sensor, config: MethodConfig, _rng) -> tuple[Gaussians, float, str]:
+def first_gaussians(
+    _frames, _outlines, _sensor, _settings: StartSettings, sh_degree: int, _rng
+) -> tuple[Gaussians, float, str]:
     """Return the frames' own Gaussians, with as many colour coefficients as the method has, and their radius, m."""
     truth = scene(GAUSSIANS)
-    coefficients = torch.zeros(GAUSSIANS, (config.sh_degree + 1) ** 2, 3)
+    coefficients = torch.zeros(GAUSSIANS, (sh_degree + 1) ** 2, 3)
     coefficients[:, :1] = truth.sh
-    return trainable(replace(truth, sh=coefficients)), 1.0, "the truth"
+    return replace(truth, sh=coefficients).trainable(), 1.0, "the truth"
 
 
 def measure(name: str, threads: int, distance: float, steps: int) -> dict:
@@ -139,28 +142,28 @@ def measure(name: str, threads: int, distance: float, steps: int) -> dict:
     The preset is held at 20,000 Gaussians and full images, and grows from the first step on: every step is a dear one.
     """
     torch.set_num_threads(threads)
-    config = replace(
-        preset(name),
-        steps=WARM_UP_STEPS + steps,
-        max_gaussians=GAUSSIANS,
-        pyramid=((0.0, 1.0),),
-        grow_from=0.0,
-        grow_until=1.0,
-        prune_opacity=0.0,
-        weigh_at=(),
-    )
+    changes = {
+        "steps": WARM_UP_STEPS + steps,
+        "pyramid": ((0.0, 1.0),),
+        "growth.max_gaussians": GAUSSIANS,
+        "growth.begin": 0.0,
+        "growth.end": 1.0,
+        "growth.prune_opacity": 0.0,
+        "parsimony.prune_at": (),
+    }
+    config = preset(name, changes)
     data, clock = frames(distance), StepClock()
     with ExitStack() as patches:
-        patches.enter_context(patch.object(optimize, "first_gaussians", first_gaussians))
-        patches.enter_context(patch.object(optimize, "render", clock.render))
+        patches.enter_context(patch.object(setup, "first_gaussians", first_gaussians))
+        patches.enter_context(patch.object(trainer, "render", clock.render))
         patches.enter_context(patch.object(Tensor, "backward", lambda loss: clock.backward(loss)))
         for part, functions in PARTS.items():
             for owner, function in functions:
                 timed = clock.timed(part, getattr(owner, function))
                 patches.enter_context(patch.object(owner, function, timed))
-        trainer = Trainer(data, SENSOR, config)
+        training = Trainer(data, SENSOR, config)
         for _ in range(config.steps):
-            clock.time(trainer.step)
+            clock.time(training.step)
     rows = clock.steps[WARM_UP_STEPS:]
     parts = {p: statistics.median(row.get(p, 0.0) for row in rows) for p in COLUMNS}
     parts["growth"] = statistics.mean(row.get("growth", 0.0) for row in rows)

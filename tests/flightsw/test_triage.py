@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -42,8 +41,8 @@ from flightsw.triage import (
 from ground.ingest import listen
 from hil.links.virtual_serial import VirtualSerial
 from obbgs_core.io.onnx import export_onnx
-from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
+from tests.scenes import ball
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 MISSION = load_mission(GOLDEN / "mission.yaml")
@@ -55,16 +54,8 @@ SENSOR = Sensor(64, 4095, 4e7, 4, 8)
 @pytest.fixture
 def model(tmp_path) -> Path:
     """A small bright ball."""
-    g = torch.Generator().manual_seed(0)
-    ball = Gaussians(
-        torch.randn(200, 3, generator=g) * 0.8,
-        torch.randn(200, 4, generator=g),
-        torch.full((200, 3), -1.5),
-        torch.full((200,), 2.0),
-        torch.full((200, 1, 1), 1.5),
-    )
     path = tmp_path / "model.onnx"
-    export_onnx(ball, SENSOR, path, CAMERA.width, CAMERA.height, CAMERA_EXPOSURES)
+    export_onnx(ball(200, 0.8, -1.5, 1.5), SENSOR, path, CAMERA.width, CAMERA.height, CAMERA_EXPOSURES)
     return path
 
 

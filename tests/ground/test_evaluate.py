@@ -19,7 +19,7 @@ from obbgs_core.score.metrics import foreground_psnr_db, psnr_db
 from tests.benchmarks import targets
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
-QUICK = {"steps": 30, "start_count": 500, "max_gaussians": 600, "sh_degree": 0}
+QUICK = {"steps": 30, "start.count": 500, "growth.max_gaussians": 600, "light.sh_degree": 0}
 
 
 def run_of(folder: Path, wanted=lambda frame: True) -> Path:

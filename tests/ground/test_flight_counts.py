@@ -29,7 +29,7 @@ from ground.telemetry import FlightCounts, TelemetryLog
 from hil.links.virtual_serial import VirtualSerial
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
-QUICK = {"steps": 10, "start_count": 300, "max_gaussians": 300, "sh_degree": 0}
+QUICK = {"steps": 10, "start.count": 300, "growth.max_gaussians": 300, "light.sh_degree": 0}
 NS = 1_000_000_000
 START_NS = 1_784_631_150 * NS
 

@@ -25,7 +25,7 @@ from ground.session import open_session
 from ground.session_writer import SessionWriter
 from ground.training_frames import training_frame
 from obbgs_core.errors import ReconstructionError
-from obbgs_core.frames import Batches, TrainingFrame, sun_span_deg
+from obbgs_core.frames import TrainingFrame, sun_span_deg
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.io.ply import display_sh, load_ply, save_ply
 from obbgs_core.io.spz import load_spz, save_spz
@@ -35,6 +35,7 @@ from obbgs_core.render import lit_from, render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
+from obbgs_core.train.batches import Batches
 from obbgs_core.train.parsimony import next_degree_gain
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
@@ -46,7 +47,7 @@ TOGETHER = (*ALONE, (np.array([0.2, 0.3, 1.5]), np.array([0.6, 0.6, 0.3])))
 K = np.array([[600.0, 0, SIZE_PX / 2], [0, 600.0, SIZE_PX / 2], [0, 0, 1]])
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=4.0, read_noise_dn=8.0)
 EXPOSURES_S = (5e-5, 1e-4, 2e-4)
-QUICK = {"steps": 240, "start_count": 800, "max_gaussians": 1200, "pyramid": ((0.0, 0.5), (0.3, 1.0))}
+QUICK = {"steps": 240, "start.count": 800, "growth.max_gaussians": 1200, "pyramid": ((0.0, 0.5), (0.3, 1.0))}
 
 
 def hits(origin: np.ndarray, towards: np.ndarray) -> np.ndarray:
@@ -155,7 +156,7 @@ def baselines_db(
     for image in (torch.zeros_like(mean), mean):
         true = [torch.from_numpy(lambertian_ellipsoids(*view, bodies)).float()[..., None] for view in seen]
         scores.append(float(np.mean([psnr_db(image, radiance) for radiance in true])))
-    start = Trainer(frames, SENSOR, preset("obbgs", **changes), seed=1).gaussians.detach()
+    start = Trainer(frames, SENSOR, preset("obbgs", changes), seed=1).state.gaussians.detach()
     return max(*scores, clean_db(start, seen, bodies))
 
 
@@ -180,13 +181,13 @@ def moving() -> list[TrainingFrame]:
 
 @pytest.fixture(scope="module")
 def under_the_sun(moving):
-    return train(moving, SENSOR, preset("obbgs", **QUICK), seed=1)
+    return train(moving, SENSOR, preset("obbgs", QUICK), seed=1)
 
 
 def test_under_a_moving_sun_the_model_turns_with_it_and_beats_the_static_one_on_unseen_views(
     moving, under_the_sun
 ):
-    static = train(moving, SENSOR, preset("obbgs", **QUICK, sun_span_deg=0.0), seed=1)
+    static = train(moving, SENSOR, preset("obbgs", QUICK | {"light.sun_span_deg": 0.0}), seed=1)
     unseen = views(12, seed=99)
     assert under_the_sun.gaussians.shading == "lambert" and static.gaussians.shading == "view"
     assert under_the_sun.appearance.startswith("follows Lambert's law with cast shadows, ambient 0.0")
@@ -201,8 +202,8 @@ def test_under_a_moving_sun_the_model_turns_with_it_and_beats_the_static_one_on_
 def test_parts_that_shade_one_another_are_understood_by_lamberts_law_and_not_by_the_linear_one():
     frames, unseen = photographed(views(60), bodies=TOGETHER), views(12, seed=99)
     longer = QUICK | {"steps": 960}
-    linear = train(frames, SENSOR, preset("obbgs", **longer, sun_shading="linear"), seed=1)
-    cast = train(frames, SENSOR, preset("obbgs", **longer), seed=1)
+    linear = train(frames, SENSOR, preset("obbgs", longer | {"light.sun_shading": "linear"}), seed=1)
+    cast = train(frames, SENSOR, preset("obbgs", longer), seed=1)
     assert linear.gaussians.shading == "sun" and linear.appearance.startswith("turns with the sun (step 48")
     # 1.6 to 2.8 dB over trainings whose starts differ by a millionth, as rounding makes them
     assert clean_db(cast.gaussians, unseen, TOGETHER) > clean_db(linear.gaussians, unseen, TOGETHER) + 0.3
@@ -223,7 +224,7 @@ def test_the_static_model_is_kept_when_the_sun_stands_still_or_is_not_known():
     partly = [
         dataclasses.replace(frame, sun_dir=frame.sun_dir if frame.id else None) for frame in moving_few()
     ]
-    results = [train(frames, SENSOR, preset("obbgs", **QUICK), seed=1) for frames in (still, unknown, partly)]
+    results = [train(frames, SENSOR, preset("obbgs", QUICK), seed=1) for frames in (still, unknown, partly)]
     for result in results:
         assert result.gaussians.shading == "view" and result.sun_span_deg == pytest.approx(0, abs=1e-4)
         assert "sun" not in result.appearance
@@ -244,7 +245,7 @@ def test_the_span_is_the_largest_angle_between_two_suns(angle_deg):
     assert sun_span_deg(lit) == pytest.approx(angle_deg, abs=1e-2)  # float32 directions
     with pytest.raises(ReconstructionError, match=r"frame 2 .* expected a unit vector"):
         Trainer(
-            [*lit[:2], dataclasses.replace(lit[2], sun_dir=torch.ones(3))], SENSOR, preset("obbgs", **QUICK)
+            [*lit[:2], dataclasses.replace(lit[2], sun_dir=torch.ones(3))], SENSOR, preset("obbgs", QUICK)
         )
 
 
@@ -268,28 +269,26 @@ def test_light_that_follows_the_sun_asks_for_its_harmonics_and_constant_light_do
     lit.opacity_logits[:], lit.log_scales[:] = 2.0, -1.5
     lit.sh[:, 0] = 2.0
     plain = dataclasses.replace(lit, sh=lit.sh[:, :1])
-    for truth, spread_deg, pays in ((lit, 60, True), (plain, 60, False), (plain, 8, False)):
-        batches = Batches(
-            shown(truth, spread_deg), SENSOR.white_dn, preset("obbgs"), torch.Generator().manual_seed(0)
-        )
-        gain, cost = next_degree_gain(plain, batches, SENSOR, 1.0, torch.Generator().manual_seed(0))
-        assert (gain > cost) == pays, (gain, cost)
+    for truth, spread_deg, justified in ((lit, 60, True), (plain, 60, False), (plain, 8, False)):
+        batches = Batches(shown(truth, spread_deg), SENSOR.white_dn)
+        gain, penalty = next_degree_gain(plain, batches, SENSOR, 1.0, torch.Generator().manual_seed(0))
+        assert (gain > penalty) == justified, (gain, penalty)
 
 
 def test_a_killed_training_under_the_sun_resumes_to_the_same_bits(moving, under_the_sun, tmp_path):
-    first = Trainer(moving, SENSOR, preset("obbgs", **QUICK), seed=1)
+    first = Trainer(moving, SENSOR, preset("obbgs", QUICK), seed=1)
     for _ in range(130):  # the Sun joined at step 12, its shadows were cast anew at 120
         first.step()
-    assert first.gaussians.shading == "lambert" and len(first.shadow_maps) > 10
+    assert first.state.gaussians.shading == "lambert" and len(first.state.shadows.maps) > 10
     first.save(tmp_path / "checkpoint")
-    resumed = train(moving, SENSOR, preset("obbgs", **QUICK), 1, checkpoint=tmp_path / "checkpoint")
+    resumed = train(moving, SENSOR, preset("obbgs", QUICK), 1, checkpoint=tmp_path / "checkpoint")
     assert resumed.appearance == under_the_sun.appearance and len(resumed.history) == 240
     assert resumed.gaussians.shading == "lambert"
     assert torch.equal(resumed.gaussians.ambient, under_the_sun.gaussians.ambient)
     for name, tensor in under_the_sun.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
     moved = [dataclasses.replace(moving[0], sun_dir=-moving[0].sun_dir), *moving[1:]]
-    assert not Trainer(moved, SENSOR, preset("obbgs", **QUICK), 1).resume(tmp_path / "checkpoint")
+    assert not Trainer(moved, SENSOR, preset("obbgs", QUICK), 1).resume(tmp_path / "checkpoint")
 
 
 @pytest.mark.parametrize(("sh_count", "channels"), [(4, 1), (4, 3), (9, 3), (1, 1), (1, 3)])

@@ -30,8 +30,8 @@ from tests import baselines
 from tests.benchmarks import targets
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
-TRAINED = {"steps": 700, "start_count": 2500, "max_gaussians": 3000}
-QUICK = {"steps": 60, "start_count": 1500, "max_gaussians": 2000, "sh_degree": 0}
+TRAINED = {"steps": 700, "start.count": 2500, "growth.max_gaussians": 3000}
+QUICK = {"steps": 60, "start.count": 1500, "growth.max_gaussians": 2000, "light.sh_degree": 0}
 
 
 def copy_session(to: Path) -> Path:
@@ -66,7 +66,7 @@ def test_the_model_exceeds_every_baseline_and_knowing_the_exposure_is_worth_deci
     blindness costs less than in the 256 px demo (docs/experiments/021-the-whole-loop.md).
     """
     session, metrics = trained
-    target, config = targets.from_session(session), preset("obbgs", **TRAINED)
+    target, config = targets.from_session(session), preset("obbgs", TRAINED)
     for baseline, above_db in (
         (baselines.black(target), 1),
         (baselines.mean_image(target), 4),
@@ -162,9 +162,11 @@ reconstruct(Path({str(session)!r}), "killed", "obbgs", {QUICK!r}, on_progress=di
 def test_budget_and_quality_shape_the_training_and_nonsense_is_refused():
     standard = PRESETS["obbgs"]
     assert changes_for("obbgs", "standard", "auto", None)["steps"] == standard.steps
-    assert changes_for("obbgs", "draft", "auto", None)["max_gaussians"] == round(standard.max_gaussians / 3)
+    assert changes_for("obbgs", "draft", "auto", None)["growth.max_gaussians"] == round(
+        standard.growth.max_gaussians / 3
+    )
     tight = changes_for("obbgs", "best", "900", 50)
-    assert tight["max_gaussians"] == tight["start_count"] == 900 and tight["steps"] == 50
+    assert tight["growth.max_gaussians"] == tight["start.count"] == 900 and tight["steps"] == 50
     with pytest.raises(ValueError, match="--budget must be auto or a number"):
         changes_for("obbgs", "standard", "many", None)
     with pytest.raises(ValueError, match="quality must be one of"):

@@ -4,6 +4,7 @@ import io
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -11,7 +12,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 import yaml
 from rich.console import Console
 from typer.testing import CliRunner
@@ -32,10 +32,10 @@ from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged
 from obbgs_core.io.ply import load_ply
 from obbgs_core.train.presets import PRESETS, QUALITIES
-from obbgs_core.train.trainer import StepInfo
+from obbgs_core.train.result import StepInfo
 
 GOLDEN = Path(__file__).parents[1] / "golden"
-QUICK = {"steps": 8, "start_count": 600, "max_gaussians": 800, "sh_degree": 0}
+QUICK = {"steps": 8, "start.count": 600, "growth.max_gaussians": 800, "light.sh_degree": 0}
 FILES = {"model.ply", "model.spz", "surface.ply", "model.onnx"}
 
 
@@ -292,17 +292,17 @@ def test_a_folder_that_cannot_be_written_to_is_named(finished, tmp_path, monkeyp
 
 
 def test_a_budget_in_numbers_is_what_happens_and_a_cap_is_recorded(session):
-    asked = changes_for("obbgs", budget="3000") | {"steps": 2, "weigh_at": ()}
+    asked = changes_for("obbgs", budget="3000") | {"steps": 2, "parsimony.prune_at": ()}
     folder = reconstruct(session, "asked", "obbgs", asked)
     config = yaml.safe_load((folder / "config.yaml").read_text())["method"]
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert config["max_gaussians"] == metrics["max_gaussians"] == config["start_count"] == 3000
+    assert config["growth"]["max_gaussians"] == metrics["max_gaussians"] == config["start"]["count"] == 3000
     asked_for = metrics["gaussians"]
     assert metrics["budget"] == "at most 3,000 Gaussians"
     folder = reconstruct(session, "best", "obbgs", changes_for("obbgs", "best") | {"steps": 2})
     config = yaml.safe_load((folder / "config.yaml").read_text())["method"]
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics["gaussians"] <= config["max_gaussians"] == metrics["max_gaussians"] < asked_for
+    assert metrics["gaussians"] <= config["growth"]["max_gaussians"] == metrics["max_gaussians"] < asked_for
     reason = f"at most {metrics['max_gaussians']:,} Gaussians instead of 30,000: one for each 7 of the "
     assert metrics["budget"].startswith(reason) and f"budget: {reason}" in (folder / "log").read_text()
     assert dict(model_rows(metrics))["budget"].startswith(reason)
@@ -312,7 +312,8 @@ def test_a_mission_file_says_how_to_train_and_the_command_line_says_otherwise(se
     path = tmp_path / "mission.yaml"
     text = (GOLDEN / "mission.yaml").read_text().replace("seed: 7", "seed: 11").replace("obbgs", "mvgs")
     path.write_text(
-        text + "  steps: 6\n  settings: {start_count: 300, max_gaussians: 300, weigh_at: [0.5]}\n"
+        text
+        + "  steps: 6\n  settings: {start: {count: 300}, growth: {max_gaussians: 300}, parsimony: {prune_at: [0.5]}}\n"
     )
 
     def resolved(name: str, *arguments: str) -> dict:
@@ -323,13 +324,13 @@ def test_a_mission_file_says_how_to_train_and_the_command_line_says_otherwise(se
 
     told = resolved("told")
     assert (told["method"]["name"], told["seed"], told["method"]["steps"]) == ("mvgs", 11, 6)
-    assert told["method"]["start_count"] == 300 and told["method"]["weigh_at"] == [0.5]
+    assert told["method"]["start"]["count"] == 300 and told["method"]["parsimony"]["prune_at"] == [0.5]
     hash(load_mission(path))  # flight plans with it as a key
-    more = ["--set", "start_count=200", "--set", "sun_shading=linear", "--set", "lr_means=1e-3"]
+    more = ["--set", "start.count=200", "--set", "light.sun_shading=linear", "--set", "rates.means=1e-3"]
     other = resolved("other", "--method", "obbgs", "--seed", "3", "--steps", "4", *more)
     assert (other["method"]["name"], other["seed"], other["method"]["steps"]) == ("obbgs", 3, 4)
-    assert other["method"]["start_count"] == 200 and other["method"]["sun_shading"] == "linear"
-    assert other["method"]["lr_means"] == 1e-3 and other["method"]["max_gaussians"] == 300
+    assert other["method"]["start"]["count"] == 200 and other["method"]["light"]["sun_shading"] == "linear"
+    assert other["method"]["rates"]["means"] == 1e-3 and other["method"]["growth"]["max_gaussians"] == 300
 
 
 @pytest.mark.parametrize(
@@ -340,6 +341,13 @@ def test_a_mission_file_says_how_to_train_and_the_command_line_says_otherwise(se
         ("settings: {stepz: 3}", r"mission\.reconstruct\.settings\.stepz: unknown key; .*steps"),
         ("settings: {steps: many}", r"settings\.steps: expected a whole number, got 'many'"),
         ("settings: {name: mine}", r"settings\.name: unknown key"),
+        (
+            "settings: {growth: {intervall: 3}}",
+            r"settings\.growth\.intervall: unknown key; .*growth\.interval",
+        ),
+        ("settings: {growth: 3}", r"settings\.growth: expected a mapping of keys, got 3"),
+        ("settings: {steps: {growth: 3}}", r"settings\.steps\.growth: unknown key"),
+        ("settings: {growth: {interval: 0}}", r"settings: growth\.interval must be at least 1, got 0"),
     ],
 )
 def test_a_mission_that_asks_for_what_is_not_there_is_refused_by_its_path(tmp_path, line, message):
@@ -395,12 +403,15 @@ def test_the_methods_of_a_mission_file_are_those_of_the_ground():
     ("assignments", "message"),
     [
         (["stepz=3"], "stepz: unknown key; expected one of exposure_aware, .*steps"),
-        (["sun_shading"], "expected key=value, got 'sun_shading'"),
-        (["lr_means=fast"], "lr_means: expected a number, got 'fast'"),
-        (["start=nowhere"], "start must be random or hull, got 'nowhere'"),
-        (["sh_degree=9"], "sh_degree must be from 0 to 3, got 9"),
-        (["sh_degree=1", "sh_degree=2"], "--set sh_degree: is given twice"),
-        (["weigh_at=[0.5"], "--set weigh_at: is not valid YAML"),
+        (["sun_shading=linear"], r"unknown key; expected one of .*light\.sun_shading"),
+        (["light.sun_shading"], "expected key=value, got 'light.sun_shading'"),
+        (["rates.means=fast"], r"rates\.means: expected a number, got 'fast'"),
+        (["start.kind=nowhere"], r"start\.kind: expected one of random, hull, got 'nowhere'"),
+        (["start=hull"], "start: expected a mapping of keys, got 'hull'"),
+        (["light.sh_degree=9"], r"light\.sh_degree must be from 0 to 3, got 9"),
+        (["light.sh_degree=1", "light.sh_degree=2"], r"--set light\.sh_degree: is given twice"),
+        (["light.sh_degree=1", "light={sh_degree: 2}"], r"--set light\.sh_degree: is given twice"),
+        (["parsimony.prune_at=[0.5"], r"--set parsimony\.prune_at: is not valid YAML"),
         (["steps=5"], "--set steps: is given by --steps too"),
     ],
 )
@@ -410,9 +421,11 @@ def test_a_setting_that_is_not_there_or_of_the_wrong_kind_is_named(assignments, 
 
 
 def test_settings_have_the_types_that_the_method_wants():
-    assert set_changes(["lr_means=2e-3", "weigh_at=[0.5, 1]", "pyramid=[[0, 0.5], [0.5, 1]]"]) == {
-        "lr_means": 0.002,
-        "weigh_at": (0.5, 1.0),
+    assert set_changes(
+        ["rates.means=2e-3", "parsimony.prune_at=[0.5, 1]", "pyramid=[[0, 0.5], [0.5, 1]]"]
+    ) == {
+        "rates.means": 0.002,
+        "parsimony.prune_at": (0.5, 1.0),
         "pyramid": ((0.0, 0.5), (0.5, 1.0)),
     }
 
@@ -430,9 +443,10 @@ def test_a_signal_saves_the_training_and_the_same_command_goes_on(session, numbe
     os.kill(process.pid, number)
     _, said = process.communicate(timeout=120)
     assert process.returncode == 1 and "Traceback" not in said
-    assert "of 100000, saved in" in said and "the same command goes on from there" in said
-    checkpoint = session / "runs" / ".run.part" / "known-exposure.checkpoint"
-    done = torch.load(checkpoint, weights_only=True)["numbers"][2]
+    interrupted = re.search(r"interrupted at step (\d+) of 100000, saved in", said)
+    assert interrupted and "the same command goes on from there" in said
+    assert (session / "runs" / ".run.part" / "known-exposure.checkpoint").exists()
+    done = int(interrupted[1])
     steps = []
     with pytest.raises(Interrupted, match=f"step {done + 1} of"):
         reconstruct(

@@ -16,7 +16,6 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 import pytest
-import torch
 
 from flightsw.commands import ReplayCounter
 from flightsw.downlink import DownlinkProgress, run_downlink
@@ -34,8 +33,8 @@ from hil.cameras.virtual import CameraServer
 from hil.links.faults import Faults
 from hil.links.virtual_serial import VirtualSerial
 from obbgs_core.io.onnx import export_onnx
-from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
+from tests.scenes import ball
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 BRACKETS = 6
@@ -57,14 +56,6 @@ def mission_file(tmp_path_factory) -> Path:
 def model(tmp_path_factory, mission_file) -> Path:
     """A small bright ball as an ONNX renderer for the mission's camera."""
     camera = load_mission(mission_file).camera
-    g = torch.Generator().manual_seed(0)
-    ball = Gaussians(
-        torch.randn(60, 3, generator=g) * 0.8,
-        torch.randn(60, 4, generator=g),
-        torch.full((60, 3), -0.7),
-        torch.full((60,), 2.0),
-        torch.full((60, 1, 1), 0.5),
-    )
     path = tmp_path_factory.mktemp("model") / "ball.onnx"
     sensor = Sensor(
         camera.black_dn,
@@ -73,7 +64,7 @@ def model(tmp_path_factory, mission_file) -> Path:
         camera.electrons_per_dn,
         camera.read_noise_dn,
     )
-    export_onnx(ball, sensor, path, camera.width, camera.height, (5e-5, 2e-4))
+    export_onnx(ball(60, 0.8, -0.7, 0.5), sensor, path, camera.width, camera.height, (5e-5, 2e-4))
     return path
 
 

@@ -5,7 +5,7 @@ import torch
 
 from obbgs_core import compiled
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.train.growth import Adam, trainable
+from obbgs_core.train.adam import Adam
 
 needs_native = pytest.mark.skipif(compiled._rasterizer is None, reason="the compiled module is not installed")
 RATES = {"means": 1e-3, "quats": 2e-3, "log_scales": 5e-3, "opacity_logits": 0.05, "sh": 0.01}
@@ -14,7 +14,7 @@ RATES = {"means": 1e-3, "quats": 2e-3, "log_scales": 5e-3, "opacity_logits": 0.0
 def gaussians(count: int = 3000, dtype=torch.float32) -> Gaussians:
     g = torch.Generator().manual_seed(4)
     shapes = ((3,), (4,), (3,), (), (16, 3))
-    return trainable(Gaussians(*(torch.randn(count, *s, generator=g).to(dtype) for s in shapes)))
+    return Gaussians(*(torch.randn(count, *s, generator=g).to(dtype) for s in shapes)).trainable()
 
 
 def with_gradients(model: Gaussians, step: int) -> Gaussians:

@@ -8,7 +8,7 @@ from obbgs_core.losses import fit_figures, likelihood_loss, published_loss
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import native_kernels
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.growth import Adam, trainable
+from obbgs_core.train.adam import Adam
 
 pytestmark = pytest.mark.skipif(not compiled.kernels(), reason="the compiled module is not installed")
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=2.0, read_noise_dn=3.0)
@@ -63,7 +63,7 @@ def losses_and_a_step() -> list[torch.Tensor]:
     alpha = torch.rand(dn.shape[:3], generator=g)
     results.append(torch.tensor(fit_figures(radiance, alpha, exposures_s, dn, SENSOR)))
     shapes = ((3,), (4,), (3,), (), (4, 1))
-    model = trainable(Gaussians(*(torch.randn(1001, *shape, generator=g) for shape in shapes)))
+    model = Gaussians(*(torch.randn(1001, *shape, generator=g) for shape in shapes)).trainable()
     adam = Adam(model)
     for _ in range(3):
         for tensor in model.tensors().values():

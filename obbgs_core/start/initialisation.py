@@ -2,6 +2,8 @@
 
 import logging
 import math
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from scipy.spatial import KDTree
@@ -12,22 +14,35 @@ from obbgs_core.frames import TrainingFrame, mean_exposure_s
 from obbgs_core.model import sh
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
+from obbgs_core.settings import at_least_one, check
 from obbgs_core.start import hull
-from obbgs_core.train.growth import trainable
-from obbgs_core.train.presets import MethodConfig
 
 log = logging.getLogger(__name__)
-FEWEST_HULL_POINTS = 200
+FEWEST_HULL_POINTS = 200  # with fewer the start is random
 FEWEST_VIEWS = 12  # that carve the hull
-VIEWS_FOR_COLOUR = 24
-MOST_DILATION_PX = 8
+VIEWS_FOR_COLOUR = 24  # about so many frames, spread evenly, give the first radiance
+MOST_DILATION_PX = 8  # of a silhouette, for pose errors
+HULL_OPACITY, RANDOM_OPACITY = 0.5, 0.1  # of the first Gaussians
+
+
+@dataclass(frozen=True)
+class StartSettings:
+    """The first Gaussians."""
+
+    kind: Literal["random", "hull"] = "random"  # random in a cube around the target | on its visual hull
+    # the radiance seen where the points project | half of full scale (3DGS)
+    colour: Literal["seen", "grey"] = "seen"
+    count: int = at_least_one(100_000)  # at most, because the hull may have fewer points
+
+    def __post_init__(self):
+        check(self, "start")
 
 
 def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.Silhouette]:
     """Return silhouettes of the longest exposures by the frame's index, grown by the pose error.
 
-    Shadowed faces are brightest there. Where they are few the next longest join in: a view that misses a shadowed face
-    does less harm than no view.
+    Shadowed faces are brightest there. Where these frames are few those of the next longest exposure join them: a view
+    that misses a shadowed face does less harm than no view.
     """
     chosen: dict[int, TrainingFrame] = {}
     for exposure_s in sorted({f.exposure_time_s for f in frames}, reverse=True):
@@ -39,7 +54,7 @@ def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.S
 
 
 def _pose_error_px(frame: TrainingFrame) -> int:
-    """Return how far, px, one deviation of the pose tag moves the body's origin in the image, the way it moves most."""
+    """Return the largest standard deviation, px, that the pose tag gives the image of the body's origin."""
     if frame.pose_covariance is None:
         return 0
     x, y, z = frame.world_to_camera[:3, 3].tolist()
@@ -59,13 +74,15 @@ def first_gaussians(
     frames: list[TrainingFrame],
     outlines: list[hull.Silhouette],
     sensor: Sensor,
-    config: MethodConfig,
+    settings: StartSettings,
+    sh_degree: int,
     rng: torch.Generator,
 ) -> tuple[Gaussians, float, str]:
     """Return the first Gaussians, the target's radius (m), and where the Gaussians came from.
 
     Args:
-        outlines: of some of the frames.
+        outlines: silhouettes of some of the frames.
+        sh_degree: of the spherical harmonics that the Gaussians have room for.
 
     Raises:
         ReconstructionError: every frame is black.
@@ -75,35 +92,42 @@ def first_gaussians(
         raise ReconstructionError(
             f"all {len(frames)} frames are black (eclipse, or exposures too short): nothing rises above the noise"
         )
-    if config.start == "hull":
+    coefficients = (sh_degree + 1) ** 2
+    if settings.kind == "hull":
         points, voxel_m = hull.hull_points(outlines, radius)
         if len(points) >= FEWEST_HULL_POINTS:
-            chosen = torch.randperm(len(points), generator=rng)[: config.start_count]
+            chosen = torch.randperm(len(points), generator=rng)[: settings.count]
             points = points[chosen] + (torch.rand(len(chosen), 3, generator=rng) - 0.5) * voxel_m
-            return _at(points, frames, sensor, 0.5, config), radius, f"visual hull, {len(chosen)} points"
+            colours = _colours(points, frames, sensor, settings)
+            model = _round_gaussians(points, colours, coefficients, HULL_OPACITY)
+            return model, radius, f"visual hull, {len(chosen)} points"
         log.warning("the silhouettes agree on only %d points; starting at random", len(points))
-    points = (2 * torch.rand(config.start_count, 3, generator=rng) - 1) * radius
-    return _at(points, frames, sensor, 0.1, config), radius, f"random, {config.start_count} points"
+    points = (2 * torch.rand(settings.count, 3, generator=rng) - 1) * radius
+    colours = _colours(points, frames, sensor, settings)
+    model = _round_gaussians(points, colours, coefficients, RANDOM_OPACITY)
+    return model, radius, f"random, {settings.count} points"
 
 
-def _at(
-    points: Tensor, frames: list[TrainingFrame], sensor: Sensor, opacity: float, config: MethodConfig
-) -> Gaussians:
-    """Return round Gaussians at points, as wide as their neighbours are far, with the radiance seen there."""
-    distances, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
-    spacing = torch.from_numpy(distances).float()[:, 1:].mean(dim=1).clamp(min=1e-6)
-    count, channels = len(points), frames[0].dn.shape[2]
-    coefficients = torch.zeros(count, (config.sh_degree + 1) ** 2, channels)
-    if config.start_colour == "grey":
+def _colours(points: Tensor, frames: list[TrainingFrame], sensor: Sensor, settings: StartSettings) -> Tensor:
+    """Return the coefficients of degree 0 [N, C] that Gaussians at points start with."""
+    if settings.colour == "grey":
         gain = sensor.dn_per_radiance_s * mean_exposure_s(frames)
         half = 0.5 * (sensor.white_dn - sensor.black_dn) / gain
-        coefficients[:, 0] = sh.from_radiance(torch.tensor(half))
-    else:
-        coefficients[:, 0] = sh.from_radiance(_seen_radiance(points, frames, sensor))
+        return sh.from_radiance(torch.tensor(half)).expand(len(points), frames[0].dn.shape[2])
+    return sh.from_radiance(_seen_radiance(points, frames, sensor))
+
+
+def _round_gaussians(points: Tensor, colours: Tensor, coefficients: int, opacity: float) -> Gaussians:
+    """Return round Gaussians at points, each as wide as the mean distance of its three nearest neighbours."""
+    distances, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
+    spacing = torch.from_numpy(distances).float()[:, 1:].mean(dim=1).clamp(min=1e-6)
+    count = len(points)
+    radiance = torch.zeros(count, coefficients, colours.shape[1])
+    radiance[:, 0] = colours
     quats = torch.zeros(count, 4)
     quats[:, 0] = 1
     logits = torch.full((count,), math.log(opacity / (1 - opacity)))
-    return trainable(Gaussians(points, quats, spacing.log()[:, None].repeat(1, 3), logits, coefficients))
+    return Gaussians(points, quats, spacing.log()[:, None].repeat(1, 3), logits, radiance).trainable()
 
 
 def _seen_radiance(points: Tensor, frames: list[TrainingFrame], sensor: Sensor) -> Tensor:

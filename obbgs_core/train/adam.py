@@ -1,0 +1,105 @@
+"""Adam over the Gaussians' parameters, and the learning rate of each parameter over the training."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from obbgs_core import compiled
+from obbgs_core.model.gaussians import TENSORS, Gaussians
+from obbgs_core.settings import check
+
+OPACITY_RATE = 0.05  # of opacity logits a step (Kerbl et al. 2023)
+AMBIENT_RATE = 0.001  # of the ambient light a step, in units of the Sun's
+
+
+@dataclass(frozen=True)
+class RateSettings:
+    """Learning rates a step; those of the means are in the method's unit of length."""
+
+    means: float = 1.6e-4  # at the first step
+    means_end: float = 1.6e-6  # at the last step, with exponential decay between them
+    quats: float = 0.001
+    log_scales: float = 0.005
+    sh: float = 0.0025
+    sh_rest: float = 1.0  # factor on the rate of the coefficients above degree 0
+    # all rates but that of the means decay exponentially to this share of themselves
+    final_share: float = 1.0
+
+    def __post_init__(self):
+        check(self, "rates")
+
+
+def learning_rates(
+    rates: RateSettings, share: float, unit_m: float, coefficients: int
+) -> dict[str, float | Tensor]:
+    """Return the rate of each parameter after a share of the steps, of `sh` [1, K, 1] where coefficients differ.
+
+    Args:
+        unit_m: the method's unit of length.
+        coefficients: K, of the radiance.
+    """
+    decay = rates.final_share**share
+    sh: float | Tensor = rates.sh * decay
+    if rates.sh_rest != 1 and coefficients > 1:
+        factors = torch.full((1, coefficients, 1), rates.sh_rest)
+        factors[:, 0] = 1
+        sh = sh * factors
+    return {
+        "means": rates.means ** (1 - share) * rates.means_end**share * unit_m,
+        "quats": rates.quats * decay,
+        "log_scales": rates.log_scales * decay,
+        "opacity_logits": OPACITY_RATE * decay,
+        "sh": sh,
+        "ambient": AMBIENT_RATE * decay,
+    }
+
+
+class Adam:
+    """Adam (Kingma and Ba 2015) whose moments follow the Gaussians when they are split or removed."""
+
+    def __init__(self, gaussians: Gaussians, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
+        self.betas, self.eps, self.steps = betas, eps, 0
+        self.first = {name: torch.zeros_like(t) for name, t in gaussians.parameters().items()}
+        self.second = {name: torch.zeros_like(t) for name, t in gaussians.parameters().items()}
+
+    @torch.no_grad()
+    def step(self, gaussians: Gaussians, rates: dict[str, float | Tensor]) -> None:
+        """Move every parameter that has a gradient, and drop the gradients; a rate may differ within a parameter."""
+        self.steps += 1
+        b1, b2 = self.betas
+        correction = math.sqrt(1 - b2**self.steps) / (1 - b1**self.steps)
+        for name, parameter in gaussians.parameters().items():
+            if parameter.grad is None:
+                continue
+            values, gradient, rate = parameter.detach(), parameter.grad.contiguous(), rates[name] * correction
+            first, second = self.first[name], self.second[name]
+            native = compiled.module_for(values)
+            if native is not None and not isinstance(rate, Tensor):  # the same in one pass over memory
+                threads = torch.get_num_threads()
+                native.adam_step(values, gradient, first, second, rate, b1, b2, self.eps, threads)
+            else:
+                first.lerp_(gradient, 1 - b1)
+                second.mul_(b2).addcmul_(gradient, gradient, value=1 - b2)
+                values.sub_(rate * first / second.sqrt().add_(self.eps))
+            parameter.grad = None
+
+    def reset(self, name: str) -> None:
+        """Set the moments of a parameter to zero, because its values were changed by hand."""
+        self.first[name].zero_()
+        self.second[name].zero_()
+
+    def widen(self, gaussians: Gaussians) -> None:
+        """Follow coefficients of radiance that were added: their moments are zero."""
+        for moments in (self.first, self.second):
+            more = torch.zeros_like(gaussians.sh)
+            more[:, : moments["sh"].shape[1]] = moments["sh"]
+            moments["sh"] = more
+
+    def follow(self, kept: Tensor, added: int) -> None:
+        """Keep the moments of the Gaussians `kept` (index) and append zeros for `added` new ones."""
+        for moments in (self.first, self.second):
+            for name in TENSORS:
+                rest = torch.zeros(added, *moments[name].shape[1:], dtype=moments[name].dtype)
+                moments[name] = torch.cat([moments[name][kept], rest])

@@ -1,0 +1,116 @@
+"""The frames of each step: which are drawn, and their images at the scale of the step."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from obbgs_core.frames import TrainingFrame, cameras_of
+from obbgs_core.model.cameras import Cameras
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The frames of one step at one image scale."""
+
+    indices: list[int]  # into the training frames
+    cameras: Cameras
+    dn: Tensor  # [B, H, W, C]
+    exposure_time_s: Tensor  # [B, 1, 1, 1]
+    averaged_pixels: int  # sensor pixels in one pixel of dn
+    # [B, H, W] share of each pixel that a silhouette shows to be empty, 0 where it has none
+    sky: Tensor | None = None
+
+
+class Batches:
+    """The training frames at every image scale; each scale is averaged once, when it is first asked for.
+
+    white_dn: the sensor's full scale.
+    sky: where silhouettes show empty sky [H, W] bool, by the frame's index; frames without a silhouette are not in it.
+    """
+
+    def __init__(self, frames: list[TrainingFrame], white_dn: float, sky: dict[int, Tensor] | None = None):
+        self.frames, self.white_dn, self.sky = frames, white_dn, sky or {}
+        self._images: dict[int, list[Tensor]] = {}
+        self._sky_shares: dict[int, list[Tensor]] = {}
+
+    def batch(self, indices: list[int], scale: float) -> Batch:
+        """Return given frames, averaged to `scale` (1 / whole number) of their size."""
+        factor = round(1 / scale)
+        if factor not in self._images:
+            self._images[factor] = [averaged(f.dn, factor, self.white_dn) for f in self.frames]
+            self._sky_shares[factor] = self._sky_shares_at(factor)
+        frames = [self.frames[i] for i in indices]
+        cameras = cameras_of(frames)
+        return Batch(
+            indices,
+            cameras.scaled(1 / factor) if factor > 1 else cameras,
+            torch.stack([self._images[factor][i] for i in indices]),
+            torch.tensor([f.exposure_time_s for f in frames]).view(-1, 1, 1, 1),
+            factor * factor,
+            torch.stack([self._sky_shares[factor][i] for i in indices]) if self.sky else None,
+        )
+
+    def _sky_shares_at(self, factor: int) -> list[Tensor]:
+        """Return each frame's share of empty sky [H, W]; frames without a silhouette share one image of zeros."""
+        unknown = torch.zeros(self._images[factor][0].shape[:2])
+        shares = {
+            i: F.avg_pool2d(sky[None].float(), factor, ceil_mode=True)[0] for i, sky in self.sky.items()
+        }
+        return [shares.get(i, unknown) for i in range(len(self.frames))]
+
+
+def averaged(dn: Tensor, factor: int, white_dn: float) -> Tensor:
+    """Return dn [H, W, C] averaged over blocks of factor x factor pixels, those at the right and bottom edge smaller.
+
+    A block with a pixel at full scale is at full scale, because the mean of its true signals is not known.
+    """
+    if factor == 1:
+        return dn
+    image = dn.movedim(-1, 0)[None]
+    mean = F.avg_pool2d(image, factor, ceil_mode=True)
+    largest = F.max_pool2d(image, factor, ceil_mode=True)
+    return torch.where(largest >= white_dn, largest, mean)[0].movedim(0, -1)
+
+
+@dataclass
+class FrameOrder:
+    """Draws frames at random without replacement, from each group in turn.
+
+    groups: indices of the frames to train on, those of one exposure time in each group, or all in one.
+    validation_brackets: indices of the frames that are not drawn, by bracket.
+    remaining: what is left of each group in this round, drawn from the end.
+    turn: frames drawn so far.
+    """
+
+    groups: list[list[int]]
+    validation_brackets: list[list[int]]
+    remaining: list[list[int]]
+    turn: int = 0
+
+    @staticmethod
+    def of(
+        frames: list[TrainingFrame], by_exposure: bool, validation_brackets: list[list[int]], turn: int = 0
+    ) -> "FrameOrder":
+        """Return the order of all frames but those of the validation brackets."""
+        withheld = {index for bracket in validation_brackets for index in bracket}
+        groups: dict[float, list[int]] = {}
+        for index, frame in enumerate(frames):
+            if index not in withheld:
+                groups.setdefault(frame.exposure_time_s if by_exposure else 0.0, []).append(index)
+        return FrameOrder(list(groups.values()), validation_brackets, [[] for _ in groups], turn)
+
+    def draw(self, count: int, rng: torch.Generator) -> list[int]:
+        """Return the indices of the next frames."""
+        drawn = []
+        for _ in range(count):
+            group = self.turn % len(self.groups)
+            if not self.remaining[group]:
+                members = self.groups[group]
+                self.remaining[group] = [
+                    members[i] for i in torch.randperm(len(members), generator=rng).tolist()
+                ]
+            drawn.append(self.remaining[group].pop())
+            self.turn += 1
+        return drawn

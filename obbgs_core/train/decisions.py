@@ -1,0 +1,148 @@
+"""The decisions of a training, each at its time: poses, number of Gaussians, what the radiance depends on."""
+
+import logging
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from obbgs_core.errors import Diverged
+from obbgs_core.render import Rendered
+from obbgs_core.train.appearance import SUN_FROM, described, raised_degree
+from obbgs_core.train.batches import Batch, FrameOrder
+from obbgs_core.train.growth import (
+    Growth,
+    densify,
+    densify_boxes,
+    finite,
+    keep,
+    near_camera_weight,
+    reset_opacities,
+    worst_boxes,
+)
+from obbgs_core.train.parsimony import justified
+from obbgs_core.train.poses import PoseCorrections
+from obbgs_core.train.setup import TrainingSetup
+from obbgs_core.train.state import TrainingState
+from obbgs_core.train.validation import correction_gain
+
+log = logging.getLogger(__name__)
+# smallest gain over penalty: 0.5 to 1.3 was measured with exact tags, 2.9 to 5.4 at 1 px of error
+REFINING_RATIO = 1.5
+
+
+def is_growing(setup: TrainingSetup, share: float) -> bool:
+    """Return whether Gaussians are added at this share of the steps."""
+    return setup.config.growth.begin <= share < setup.config.growth.end
+
+
+@torch.no_grad()
+def observe(
+    setup: TrainingSetup, state: TrainingState, rendered: Rendered, batch: Batch, residual: Tensor
+) -> None:
+    """Record what growth decides by: the screen gradients, and the boxes behind each frame's worst tile."""
+    growth, cameras, depth_weight = setup.config.growth, batch.cameras, None
+    if growth.depth_scale:
+        depth_weight = near_camera_weight(state.gaussians.means, cameras, growth.depth_scale * setup.unit_m)
+    half_size_px = max(cameras.width, cameras.height) / 2
+    state.growth.observe(rendered, half_size_px, growth.pixel_weighted, depth_weight)
+    if growth.obb_interval:
+        state.boxes += worst_boxes(state.gaussians, rendered, cameras, residual)
+
+
+def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> None:
+    """Refine the poses if correcting the validation brackets gains clearly more than its BIC penalty."""
+    config = setup.config
+    if state.poses_decided or share < config.poses.refine_from:
+        return
+    scale = config.image_scale(share)
+    brackets = [setup.batches.batch(b, scale) for b in state.order.validation_brackets]
+    gain, error = correction_gain(state.gaussians.detach(), setup.frames, brackets, setup.sensor)
+    refined = gain - error > REFINING_RATIO
+    state.poses = PoseCorrections(setup.frames) if refined else None
+    state.poses_decided = (
+        f"{'refined' if refined else 'as tagged'} (step {state.steps_done + 1}: correcting a validation bracket gains "
+        f"{gain:.1f} ± {error:.1f} times its BIC penalty)"
+    )
+    log.info("poses %s", state.poses_decided)
+    state.order = FrameOrder.of(setup.frames, config.bracket_steps, [], state.order.turn)
+
+
+def change_number(setup: TrainingSetup, state: TrainingState, share: float) -> None:
+    """Densify everywhere, or inside the boxes of the worst tiles, or reset the opacities, when it is due."""
+    settings, now = setup.config.growth, state.steps_done + 1
+    if not is_growing(setup, share):
+        return
+    if now % settings.interval == 0:
+        drop_not_finite(state)
+        state.gaussians = densify(
+            state.gaussians, state.adam, state.growth, setup.unit_m, settings, share, state.rng
+        )
+        state.growth, state.boxes = Growth.of(len(state.gaussians)), []
+    elif state.boxes and now % settings.obb_interval == 0:
+        drop_not_finite(state)
+        state.gaussians, state.growth = densify_boxes(
+            state.gaussians, state.adam, state.growth, state.boxes, setup.unit_m, settings, state.rng
+        )
+        state.boxes = []
+    if settings.opacity_reset_interval and now % settings.opacity_reset_interval == 0:
+        reset_opacities(state.gaussians, state.adam)
+
+
+def select_model(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
+    """Prune by BIC and test higher degrees, when it is due: does the likelihood gain exceed the penalty?
+
+    Args:
+        scale: of the images that the likelihood is taken of.
+    """
+    steps, now = setup.config.steps, state.steps_done + 1
+    if any(now == round(at * steps) for at in setup.config.parsimony.prune_at):
+        prune_by_bic(setup, state, scale)
+        raise_degree(setup, state, scale, ("sun", "view") if setup.sun_moves else ("view",))
+    elif setup.sun_moves and now == round(SUN_FROM * steps):
+        raise_degree(setup, state, scale, ("sun",))
+
+
+def prune_by_bic(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
+    """Remove the Gaussians whose likelihood gain is below their BIC penalty, unless that were all of them."""
+    drop_not_finite(state)
+    kept = justified(state.gaussians, setup.batches, setup.sensor, scale, setup.config.parsimony, state.rng)
+    if kept.any():
+        removed = len(state.gaussians) - int(kept.sum())
+        state.gaussians = keep(state.gaussians, state.adam, kept)
+        state.growth, state.boxes = Growth.of(len(state.gaussians)), []
+        log.info("step %d: %d Gaussians are pruned by BIC", state.steps_done + 1, removed)
+
+
+def raise_degree(
+    setup: TrainingSetup, state: TrainingState, scale: float, directions: tuple[Literal["view", "sun"], ...]
+) -> None:
+    """Let the radiance turn with view or Sun, or raise its degree, if the likelihood gain exceeds the BIC penalty."""
+    raised, reason = raised_degree(
+        state.gaussians, setup.batches, setup.sensor, scale, directions, setup.config.light, state.rng
+    )
+    if raised is not None:
+        state.gaussians = raised
+        state.adam.widen(raised)
+    if reason:
+        state.appearance_reason = f"step {state.steps_done + 1}, {reason}"
+        log.info("radiance %s", described(state.gaussians, state.appearance_reason))
+
+
+def drop_not_finite(state: TrainingState) -> None:
+    """Remove the Gaussians of which a parameter became NaN or infinite, and count them.
+
+    Raises:
+        Diverged: no Gaussian is finite.
+    """
+    kept = finite(state.gaussians)
+    count = len(kept) - int(kept.sum())
+    if count == len(kept):
+        problem = f"none of {count} Gaussians has finite parameters any more,"
+        raise Diverged(state.steps_done, math.nan, problem)
+    if count:
+        state.gaussians = keep(state.gaussians, state.adam, kept)
+        state.growth = state.growth.select(kept)
+        state.removed_not_finite += count
+        log.warning("step %d: %d Gaussians were not finite and are removed", state.steps_done, count)

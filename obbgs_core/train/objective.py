@@ -1,0 +1,57 @@
+"""What a training step minimises: the loss of its images, and priors on the Gaussians."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from obbgs_core.losses import likelihood_loss, published_loss
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.render import Rendered
+from obbgs_core.sensor import Sensor
+from obbgs_core.settings import check
+from obbgs_core.train.batches import Batch
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """The loss of the images, and the weights of what is added to it."""
+
+    # likelihood: the sensor model, saturated pixels censored
+    kind: Literal["l1_ssim", "likelihood"] = "l1_ssim"
+    ssim_weight: float = 0.2  # of 1 - SSIM, the rest is L1; without effect on the likelihood
+    edge_weight: float = 0.0  # of the difference of Sobel derivatives
+    # of the mean square of the coefficients that turn with the view: a prior for matt surface
+    sh_weight: float = 0.0
+    # of the mean shortest scale over the target's radius: flat Gaussians are surface
+    flat_weight: float = 0.0
+    sky_weight: float = 0.0  # of the mean alpha of pixels that show no light: space is empty
+
+    def __post_init__(self):
+        check(self, "loss")
+
+
+def image_loss(
+    rendered: Rendered, batch: Batch, sensor: Sensor, settings: LossSettings
+) -> tuple[Tensor, Tensor]:
+    """Return the loss of a step's images and the residual [B, H, W, C], in sigmas or in full scales."""
+    images = (rendered.radiance, batch.exposure_time_s, batch.dn, sensor)
+    if settings.kind == "likelihood":
+        return likelihood_loss(*images, batch.averaged_pixels, settings.edge_weight)
+    loss, residual = published_loss(*images, settings.ssim_weight, settings.edge_weight)
+    return loss * len(batch.cameras), residual  # a sum over the step's frames, as published
+
+
+def priors(
+    gaussians: Gaussians, rendered: Rendered, batch: Batch, radius_m: float, settings: LossSettings
+) -> Tensor:
+    """Return the weighted sum of the priors on the Gaussians: matt, flat, and not in front of the empty sky."""
+    total = torch.zeros(())
+    if settings.sh_weight and gaussians.sh.shape[1] > 1 and gaussians.shading == "view":
+        total = total + settings.sh_weight * gaussians.sh[:, 1:].square().mean()
+    if batch.sky is not None:
+        total = total + settings.sky_weight * (rendered.alpha * batch.sky).mean()
+    if settings.flat_weight:
+        total = total + settings.flat_weight * gaussians.scales.amin(dim=1).mean() / radius_m
+    return total

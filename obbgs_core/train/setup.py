@@ -1,0 +1,138 @@
+"""What a training is given and does not change, checked and measured, and the state that it starts from."""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import logging
+from dataclasses import dataclass
+
+import torch
+
+from obbgs_core.errors import ReconstructionError
+from obbgs_core.frames import FEWEST_FRAMES, TrainingFrame, camera_extent_m, sun_span_deg, usable
+from obbgs_core.sensor import Sensor
+from obbgs_core.start.hull import shows_light
+from obbgs_core.start.initialisation import first_gaussians, silhouettes
+from obbgs_core.train.adam import Adam
+from obbgs_core.train.batches import Batches, FrameOrder
+from obbgs_core.train.config import MethodConfig
+from obbgs_core.train.growth import Growth
+from obbgs_core.train.poses import PoseCorrections
+from obbgs_core.train.state import TrainingState
+from obbgs_core.train.validation import validation_brackets
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TrainingSetup:
+    """The frames, the sensor and the method of a training, and what was measured on them before the first step."""
+
+    frames: list[TrainingFrame]  # those that show light
+    sensor: Sensor
+    config: MethodConfig  # with no more Gaussians than the budget allows
+    seed: int
+    batches: Batches
+    radius_m: float  # of the target, as the silhouettes show it
+    unit_m: float  # the method's unit of length
+    sun_span_deg: float  # largest angle between two frames' Suns, body frame
+    start: str  # where the first Gaussians came from
+    budget: str  # the largest number of Gaussians, and what limits it
+    reference_exposure_s: float | None  # what every exposure was taken for when exposure is ignored
+    dark_frames: int  # left out: nothing in them rises above the noise
+
+    @property
+    def sun_moves(self) -> bool:
+        """Whether the Sun moves by enough to be tested as what the radiance depends on."""
+        return 0 < self.config.light.sun_span_deg < self.sun_span_deg
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """A digest of what decides the result of a training: the method, the seed, the sensor and the frames."""
+        digest = hashlib.sha256(json.dumps([dataclasses.asdict(self.config), self.seed]).encode())
+        digest.update(repr(self.sensor).encode())
+        for f in self.frames:
+            digest.update(
+                f.dn.numpy().tobytes() + f.world_to_camera.numpy().tobytes() + f.K.numpy().tobytes()
+            )
+            known = [None if tag is None else tag.tolist() for tag in (f.sun_dir, f.pose_covariance)]
+            digest.update(repr((f.exposure_time_s, f.bracket, known)).encode())
+        return digest.hexdigest()
+
+
+def prepare(
+    frames: list[TrainingFrame], sensor: Sensor, config: MethodConfig, seed: int
+) -> tuple[TrainingSetup, TrainingState]:
+    """Return the setup of a training and its state before the first step.
+
+    Raises:
+        TooFewFrames, ReconstructionError: as in `train`.
+    """
+    checked, reference_exposure_s = usable(frames, config.exposure_aware)
+    lit = [f for f in checked if shows_light(f.dn, sensor)]
+    dark = len(checked) - len(lit)
+    if len(lit) < FEWEST_FRAMES:
+        raise ReconstructionError(
+            f"{dark} of {len(checked)} frames are black (eclipse, or exposures too short): only {len(lit)} rise above "
+            f"the noise, {FEWEST_FRAMES} are needed"
+        )
+    rng = torch.Generator().manual_seed(seed)
+    outlines = silhouettes(lit, sensor)
+    config, budget = _limited(config, sum(int(outline.certain.sum()) for outline in outlines.values()))
+    log.info("budget: %s", budget)
+    gaussians, radius_m, start = first_gaussians(
+        lit, list(outlines.values()), sensor, config.start, config.light.sh_degree, rng
+    )
+    sky = {i: outline.sky for i, outline in outlines.items()} if config.loss.sky_weight else None
+    setup = TrainingSetup(
+        frames=lit,
+        sensor=sensor,
+        config=config,
+        seed=seed,
+        batches=Batches(lit, sensor.white_dn, sky),
+        radius_m=radius_m,
+        unit_m=camera_extent_m(lit) if config.length_unit == "cameras" else radius_m,
+        sun_span_deg=sun_span_deg(lit),
+        start=start,
+        budget=budget,
+        reference_exposure_s=reference_exposure_s,
+        dark_frames=dark,
+    )
+    brackets = validation_brackets(lit)
+    poses_decided = _decided_at_once(config, lit, brackets)
+    state = TrainingState(
+        rng=rng,
+        gaussians=gaussians,
+        adam=Adam(gaussians),
+        growth=Growth.of(len(gaussians)),
+        order=FrameOrder.of(lit, config.bracket_steps, [] if poses_decided else brackets),
+        poses=PoseCorrections(lit) if config.poses.refine == "always" else None,
+        poses_decided=poses_decided,
+        appearance_reason="as configured" if config.light.sh_degree else "",
+    )
+    return setup, state
+
+
+def _limited(config: MethodConfig, lit_pixels: int) -> tuple[MethodConfig, str]:
+    """Return the method with no more Gaussians than its budget and the lit pixels allow, and the budget in words."""
+    most, per_gaussian = config.growth.max_gaussians, config.growth.pixels_per_gaussian
+    budget = f"at most {most:,} Gaussians"
+    if per_gaussian and lit_pixels // per_gaussian < most:
+        most = max(1, lit_pixels // per_gaussian)
+        budget = (
+            f"at most {most:,} Gaussians instead of {config.growth.max_gaussians:,}: one for each "
+            f"{per_gaussian} of the {lit_pixels:,} pixels that are lit in the long exposures"
+        )
+    growth = dataclasses.replace(config.growth, max_gaussians=most)
+    start = dataclasses.replace(config.start, count=min(config.start.count, most))
+    return dataclasses.replace(config, growth=growth, start=start), budget
+
+
+def _decided_at_once(config: MethodConfig, frames: list[TrainingFrame], brackets: list[list[int]]) -> str:
+    """Return whether the poses are refined, and why, where no training is needed to know; else nothing."""
+    if config.poses.refine != "auto":
+        return {"never": "as tagged", "always": "refined"}[config.poses.refine]
+    if not any(f.pose_covariance is not None and f.pose_covariance.any() for f in frames):
+        return "as tagged (the tags are exact)"
+    return "" if brackets else "as tagged (too few brackets for validation)"

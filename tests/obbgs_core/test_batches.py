@@ -1,0 +1,82 @@
+"""The frames of each step: their averaged images, and the order in which they are drawn."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from obbgs_core.train.batches import Batches, FrameOrder, averaged
+from obbgs_core.train.validation import validation_brackets
+from tests.scenes import SENSOR, photographed, target
+
+WHITE_DN = SENSOR.white_dn
+
+
+def image(seed: int, height: int, width: int, channels: int = 1) -> torch.Tensor:
+    """Return readings [H, W, C] of which some tenth is saturated."""
+    rng = np.random.default_rng(seed)
+    dn = np.minimum(rng.integers(0, round(1.1 * WHITE_DN), (height, width, channels)), WHITE_DN)
+    return torch.from_numpy(dn.astype(np.float32))
+
+
+def test_only_full_scale_is_saturated_in_a_smaller_picture():
+    rng = np.random.default_rng(5)
+    dn = torch.from_numpy(rng.normal(2000, 100, (64, 64, 1)).round().astype(np.float32))
+    blocks = dn.reshape(16, 4, 16, 4)
+    torch.testing.assert_close(averaged(dn, 4, 4095.0)[..., 0], blocks.mean(dim=(1, 3)))
+    dn[8, 8] = 4095
+    torch.testing.assert_close(averaged(dn, 4, 4095.0)[2, 2, 0], torch.tensor(4095.0))
+
+
+@given(
+    st.integers(0, 1000), st.integers(3, 40), st.integers(3, 40), st.integers(1, 5), st.sampled_from([1, 3])
+)
+def test_each_pixel_of_a_smaller_picture_is_the_mean_of_its_block_or_saturated(
+    seed, height, width, factor, channels
+):
+    dn = image(seed, height, width, channels)
+    small = averaged(dn, factor, WHITE_DN)
+    assert small.shape == (-(-height // factor), -(-width // factor), channels)
+    for row in range(small.shape[0]):
+        for column in range(small.shape[1]):  # blocks at the edge are smaller where the size is no multiple
+            block = dn[row * factor : (row + 1) * factor, column * factor : (column + 1) * factor].flatten(
+                0, 1
+            )
+            saturated = (block >= WHITE_DN).any(dim=0)
+            expected = torch.where(saturated, WHITE_DN, block.mean(dim=0))
+            torch.testing.assert_close(small[row, column], expected)
+
+
+@given(st.integers(0, 1000), st.integers(3, 33), st.integers(3, 33))
+def test_two_halvings_are_one_quartering_where_nothing_is_saturated(seed, rows, columns):
+    dn = image(seed, 4 * rows, 4 * columns).clamp(max=WHITE_DN - 1)
+    twice = averaged(averaged(dn, 2, WHITE_DN), 2, WHITE_DN)
+    torch.testing.assert_close(twice, averaged(dn, 4, WHITE_DN), rtol=1e-5, atol=1e-3)  # float32 sums
+    torch.testing.assert_close(twice.mean(), dn.mean(), rtol=1e-5, atol=1e-3)  # no light is lost
+
+
+@pytest.mark.parametrize(("size_px", "small_px"), [(61, 16), (64, 16), (65, 17)])
+def test_smaller_pictures_have_the_size_of_their_cameras_and_their_sky(size_px, small_px):
+    frames = photographed(target(5), 3, size_px=size_px)
+    sky = {1: torch.ones(size_px, size_px, dtype=torch.bool)}
+    batch = Batches(frames, WHITE_DN, sky).batch([1, 2], 0.25)
+    assert batch.dn.shape == (2, small_px, small_px, 1) and batch.averaged_pixels == 16
+    assert (batch.cameras.height, batch.cameras.width) == (small_px, small_px)
+    assert batch.sky is not None and batch.sky.shape == (2, small_px, small_px)
+    assert (batch.sky[0] == 1).all() and (batch.sky[1] == 0).all()  # of frame 2 no silhouette is known
+
+
+def test_validation_brackets_are_withheld_whole():
+    exact = photographed(target(), 72)
+    frames = [dataclasses.replace(f, bracket=i // 3) for i, f in enumerate(exact)]
+    brackets = validation_brackets(frames)
+    assert brackets == [[9, 10, 11], [30, 31, 32], [51, 52, 53]]
+    order, rng = FrameOrder.of(frames, True, brackets), torch.Generator().manual_seed(0)
+    drawn = [i for _ in range(42) for i in order.draw(3, rng)]
+    assert (
+        sorted(drawn[:63]) == sorted(drawn[63:]) == sorted(set(range(72)) - {i for b in brackets for i in b})
+    )
+    assert validation_brackets(frames[:51]) == []  # 17 brackets hold only two for validation

@@ -1,0 +1,59 @@
+"""The settings of the methods: presets as data, changes by name, and mistakes that are named."""
+
+import math
+
+import pytest
+
+from obbgs_core.settings import changed
+from obbgs_core.train.presets import PRESETS, preset, quality_changes
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("pyramid", ((0.1, 1.0),), "pairs of a share of the steps, from 0"),
+        ("pyramid", ((0.0, 1.0, 2.0),), "pairs"),
+        ("pyramid", (), "pairs"),
+        ("rates.means", -1.0, "0 or more, got -1.0"),
+        ("rates.means", math.nan, "0 or more, got nan"),
+        ("growth.interval", 0, "at least 1, got 0"),
+        ("parsimony.prune_at", (0.5, 1.5), "from 0 to 1, got 1.5"),
+        ("light.sh_degree", 4, "from 0 to 3, got 4"),
+    ],
+)
+def test_settings_that_no_training_can_have_are_refused(name, value, message):
+    with pytest.raises(ValueError, match=f"{name} must be .*{message}"):
+        preset("obbgs", {name: value})
+
+
+def test_quality_scales_steps_and_size_and_unknown_ones_are_refused():
+    standard = preset("obbgs")
+    assert changed(standard, quality_changes(standard, "standard")) == standard
+    assert quality_changes(standard, "draft")["steps"] == round(standard.steps / 3)
+    assert quality_changes(standard, "best")["growth.max_gaussians"] == 3 * standard.growth.max_gaussians
+    with pytest.raises(ValueError, match="quality must be one of draft, standard, best"):
+        quality_changes(standard, "ultra")
+
+
+def test_presets_are_data_and_mistakes_are_named():
+    assert set(PRESETS) == {"3dgs", "pixel-gs", "mvgs", "jiang2025", "obbgs"}
+    assert preset("jiang2025").loss.edge_weight == 0.2 and not preset("jiang2025").exposure_aware
+    with pytest.raises(ValueError, match="no method 'nerf'"):
+        preset("nerf")
+    with pytest.raises(
+        ValueError, match=r"no setting magic; expected one of name, exposure_aware, .*growth\.interval"
+    ):
+        preset("3dgs", {"magic": 1})
+    with pytest.raises(ValueError, match="steps must be at least 1"):
+        preset("obbgs", {"steps": 0})
+
+
+def test_a_group_is_changed_setting_by_setting_and_keeps_the_others():
+    config = preset("obbgs", {"growth.interval": 33, "light.sun_shading": "linear"})
+    assert (config.growth.interval, config.light.sun_shading) == (33, "linear")
+    assert config.growth.share == preset("obbgs").growth.share and preset("obbgs").growth.interval == 60
+    for wrong in ("growth", "growth.magic", "steps.magic"):
+        with pytest.raises(ValueError, match=f"no setting {wrong}; expected one of .*growth.begin"):
+            preset("obbgs", {wrong: 1})
+    with pytest.raises(ValueError, match=r"loss\.kind must be l1_ssim or likelihood, got 'l2'"):
+        preset("obbgs", {"loss.kind": "l2"})

@@ -1,0 +1,226 @@
+"""The training as a whole: repeatable, resumable, and honest about what it leaves out."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import uniform_filter
+
+from obbgs_base.errors import Interrupted
+from obbgs_core.errors import Diverged, ReconstructionError, TooFewFrames
+from obbgs_core.frames import TrainingFrame
+from obbgs_core.model.gaussians import TENSORS
+from obbgs_core.sensor import Sensor
+from obbgs_core.train.growth import finite
+from obbgs_core.train.presets import preset
+from obbgs_core.train.trainer import Trainer, train
+from tests.scenes import QUICK, SENSOR, SIZE_PX, photographed, target
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[TrainingFrame]:
+    return photographed(target())
+
+
+def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path):
+    config = preset("obbgs", QUICK | {"poses.refine": "always", "parsimony.prune_at": (0.5,)})
+    tagged = [dataclasses.replace(f, pose_covariance=1e-6 * torch.eye(6).double()) for f in frames]
+    whole = train(tagged, SENSOR, config, seed=3)
+    first = Trainer(tagged, SENSOR, config, seed=3)
+    for _ in range(23):
+        first.step()
+    first.save(tmp_path / "training.checkpoint")
+    steps = []
+    resumed = train(
+        tagged,
+        SENSOR,
+        config,
+        3,
+        lambda info: steps.append(info.step),
+        checkpoint=tmp_path / "training.checkpoint",
+    )
+    assert steps == list(range(24, 41)) and [i.step for i in resumed.history] == list(range(1, 41))
+    for name, tensor in whole.gaussians.tensors().items():
+        assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
+
+
+def test_a_checkpoint_of_another_training_is_not_used(frames, tmp_path):
+    Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=1).save(tmp_path / "c")
+    assert not Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=2).resume(tmp_path / "c")
+    assert not Trainer(frames[:-1], SENSOR, preset("obbgs", QUICK), seed=1).resume(tmp_path / "c")
+    doubted = [dataclasses.replace(f, pose_covariance=1e-18 * torch.eye(6).double()) for f in frames]
+    assert not Trainer(doubted, SENSOR, preset("obbgs", QUICK), seed=1).resume(tmp_path / "c")
+    assert not Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=1).resume(tmp_path / "none")
+    assert Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=1).resume(tmp_path / "c")
+
+
+@pytest.mark.parametrize("content", [{"fingerprint": "another"}, {"fingerprint": "x", "state": Sensor}])
+def test_a_checkpoint_of_another_version_is_not_used_and_nothing_else_in_it_is_built(
+    frames, tmp_path, caplog, content
+):
+    torch.save(content, tmp_path / "c")  # the sensor's class is not among those that a checkpoint may hold
+    trainer = Trainer(frames, SENSOR, preset("obbgs", QUICK))
+    assert not trainer.resume(tmp_path / "c") and "belongs to another training" in caplog.text
+
+
+def test_the_time_limit_ends_the_training_and_says_so(frames):
+    result = train(frames, SENSOR, preset("obbgs", QUICK), time_limit_s=0.0)
+    assert len(result.history) == 0 and len(result.gaussians) > 0
+    assert result.stop_reason == "time limit of 0 s, before the first step: the model is its untrained start"
+    trainer = Trainer(frames, SENSOR, preset("obbgs", QUICK))
+    trainer.step()
+    assert trainer.stop_reason(0.0) == "time limit of 0 s"
+
+
+def test_an_interrupted_training_is_saved_at_once_and_goes_on_to_the_same_model(frames, tmp_path):
+    config, checkpoint, steps = preset("obbgs", QUICK), tmp_path / "c", []
+    whole = train(frames, SENSOR, config, seed=3)
+    with pytest.raises(Interrupted, match=r"step 13 of 40, saved in .*: the same command goes on"):
+        train(
+            frames,
+            SENSOR,
+            config,
+            3,
+            lambda info: steps.append(info.step),
+            checkpoint=checkpoint,
+            should_stop=lambda: len(steps) == 13,
+        )
+    resumed = train(frames, SENSOR, config, 3, lambda info: steps.append(info.step), checkpoint=checkpoint)
+    assert steps == list(range(1, 41))
+    again = train(frames, SENSOR, config, 3, lambda info: steps.append(info.step), checkpoint=checkpoint)
+    assert len(steps) == 40 and again.stop_reason == whole.stop_reason  # a finished one is kept too
+    for name, tensor in whole.gaussians.tensors().items():
+        assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
+        assert torch.equal(tensor, getattr(again.gaussians, name)), name
+
+
+def test_a_checkpoint_that_the_disk_does_not_take_costs_no_training(frames, tmp_path, caplog):
+    (tmp_path / "file").write_text("")
+    checkpoint = tmp_path / "file" / "training.checkpoint"
+    result = train(frames, SENSOR, preset("obbgs", QUICK | {"steps": 3}), checkpoint=checkpoint)
+    assert len(result.history) == 3 and f"{checkpoint} cannot be written" in caplog.text
+    with pytest.raises(Interrupted, match="step 1 of 3, not saved"):
+        train(
+            frames,
+            SENSOR,
+            preset("obbgs", QUICK | {"steps": 3}),
+            checkpoint=checkpoint,
+            should_stop=lambda: True,
+        )
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("name", TENSORS)
+def test_gaussians_that_are_not_finite_are_removed_and_counted(frames, tmp_path, caplog, name, value):
+    config = preset("obbgs", QUICK | {"growth.interval": 10})
+    trainer = Trainer(frames, SENSOR, config, seed=3)
+    for _ in range(8):
+        trainer.step()
+    with torch.no_grad():
+        trainer.state.gaussians.opacity_logits[
+            :3
+        ] = -20.0  # none of the three is drawn, as most that are not finite
+        getattr(trainer.state.gaussians, name)[:3] = value
+    while trainer.state.steps_done < 12:  # densification is due at step 10
+        trainer.step()
+    assert trainer.state.removed_not_finite == 3 and "3 Gaussians were not finite" in caplog.text
+    assert all(tensor.isfinite().all() for tensor in trainer.state.gaussians.tensors().values())
+    trainer.save(tmp_path / "c")
+    with torch.no_grad():
+        getattr(trainer.state.gaussians, name)[5] = value  # too late for any densification
+    assert trainer.result("").removed_not_finite == 4
+    resumed = Trainer(frames, SENSOR, config, seed=3)
+    assert resumed.resume(tmp_path / "c")
+    assert resumed.result("").removed_not_finite == 3
+
+
+def test_a_size_beyond_all_numbers_counts_as_not_finite():
+    gaussians = target(5)
+    gaussians.log_scales[2] = 200.0
+    assert finite(gaussians).tolist() == [True, True, False, True, True]
+
+
+def test_a_model_of_which_nothing_is_finite_has_diverged(frames):
+    trainer = Trainer(frames, SENSOR, preset("obbgs", QUICK))
+    with torch.no_grad():
+        trainer.state.gaussians.quats[:] = math.nan
+    with pytest.raises(Diverged, match=r"none of [0-9]+ Gaussians has finite parameters"):
+        trainer.result("")
+
+
+def test_a_model_has_no_more_gaussians_than_the_lit_pixels_of_the_long_exposures_allow(frames):
+    long_s = sorted({f.exposure_time_s for f in frames})[1:]  # six frames of the longest alone are too few
+    dark_dn = SENSOR.black_dn + 3 * SENSOR.read_noise_dn
+    lit = [uniform_filter(f.dn[..., 0].numpy(), 3) > dark_dn for f in frames if f.exposure_time_s in long_s]
+    wanted = QUICK | {"start.count": 100_000, "growth.max_gaussians": 100_000}
+    few = Trainer(frames, SENSOR, preset("obbgs", wanted | {"growth.pixels_per_gaussian": 20}))
+    assert (
+        len(few.state.gaussians)
+        <= few.setup.config.growth.max_gaussians
+        == pytest.approx(np.sum(lit) / 20, rel=0.15)
+    )
+    assert (
+        f"at most {few.setup.config.growth.max_gaussians:,} Gaussians instead of 100,000: one for each 20"
+        in few.setup.budget
+    )
+    result = few.result("")
+    assert result.config == few.setup.config and result.budget == few.setup.budget
+    many = Trainer(frames, SENSOR, preset("obbgs", wanted | {"growth.pixels_per_gaussian": 0}))
+    assert (
+        many.setup.config.growth.max_gaussians == 100_000 and many.setup.budget == "at most 100,000 Gaussians"
+    )
+    start = Trainer(frames, SENSOR, preset("3dgs", QUICK | {"start.count": 500, "growth.max_gaussians": 100}))
+    assert len(start.state.gaussians) == start.setup.config.start.count == 100
+
+
+def test_the_chi2_of_a_good_model_is_near_one(frames):
+    result = train(
+        frames,
+        SENSOR,
+        preset("obbgs", QUICK | {"steps": 700, "start.count": 1000, "growth.max_gaussians": 1500}),
+    )
+    assert result.history[-1].chi2 < 3
+    assert result.history[-1].seconds_left == pytest.approx(0, abs=1e-6)
+
+
+def test_black_frames_are_left_out_and_counted(frames):
+    black = dataclasses.replace(frames[0], dn=torch.full_like(frames[0].dn, SENSOR.black_dn))
+    trainer = Trainer([*frames, black, black], SENSOR, preset("obbgs", QUICK))
+    assert trainer.setup.dark_frames == 2 and len(trainer.setup.frames) == len(frames)
+    with pytest.raises(ReconstructionError, match="5 of 5 frames are black"):
+        Trainer([black] * 5, SENSOR, preset("obbgs", QUICK))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("dn", torch.full((SIZE_PX, SIZE_PX, 1), math.nan)),
+        ("world_to_camera", torch.full((4, 4), math.inf)),
+        ("K", torch.full((3, 3), math.nan)),
+        ("exposure_time_s", 0.0),
+        ("exposure_time_s", math.nan),
+    ],
+)
+def test_hostile_frames_are_named(frames, field, value):
+    hostile = dataclasses.replace(frames[0], id=77, **{field: value})
+    with pytest.raises(ReconstructionError, match="frame 77"):
+        Trainer([*frames, hostile], SENSOR, preset("obbgs", QUICK))
+
+
+def test_too_few_frames_and_a_diverging_rate_are_named_errors(frames):
+    with pytest.raises(TooFewFrames, match="at least 3 frames, got 2"):
+        train(frames[:2], SENSOR, preset("obbgs", QUICK))
+    with pytest.raises(Diverged, match="smaller learning rates"):
+        train(frames, SENSOR, preset("obbgs", QUICK | {"rates.sh": 1e38, "rates.log_scales": 1e30}))
+
+
+def test_cameras_that_never_meet_end_in_a_finite_model():
+    apart = []
+    for i, frame in enumerate(photographed(target(), 6)):
+        moved = frame.world_to_camera.clone()
+        moved[:3, 3] += torch.tensor([40.0 * i, 0, 0])
+        apart.append(dataclasses.replace(frame, world_to_camera=moved))
+    result = train(apart, SENSOR, preset("obbgs", QUICK | {"steps": 5}))
+    assert all(torch.isfinite(t).all() for t in result.gaussians.tensors().values())
