@@ -143,8 +143,8 @@ def fit_figures(
     native = compiled.module_for(radiance, alpha, exposure_time_s, dn)
     if native is not None:
         model, gains = _sensor_model(native, sensor, averaged_pixels), _gains(sensor, exposure_time_s)
-        images = (image.detach().contiguous() for image in (radiance, alpha, dn))
-        chi2, mse = native.fit(*images, gains, model, ON_TARGET_ALPHA, torch.get_num_threads())
+        light, opaque, read = (image.detach().contiguous() for image in (radiance, alpha, dn))
+        chi2, mse = native.fit(light, opaque, read, gains, model, ON_TARGET_ALPHA, torch.get_num_threads())
     else:
         expected = sensor.expected_dn(radiance, exposure_time_s)
         noise = sensor.variance_dn2(expected)

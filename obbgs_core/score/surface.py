@@ -12,7 +12,7 @@ from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.rotations import quats_to_matrices
 from obbgs_core.render import project, render
-from obbgs_core.render.lighting import bare, mean_radiance
+from obbgs_core.render.lighting import constant_radiance, mean_radiance
 
 BLACKEST = 3e-4  # of the bright surface's radiance; fainter Gaussians show no light, so no surface was measured there
 BRIGHT_QUANTILE = 0.97
@@ -78,7 +78,7 @@ def _lit(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
     if len(gaussians) == 0:
         return gaussians
     light = mean_radiance(gaussians, cameras).mean(dim=-1)
-    return bare(gaussians).select(light > BLACKEST * light.quantile(BRIGHT_QUANTILE))
+    return constant_radiance(gaussians).select(light > BLACKEST * light.quantile(BRIGHT_QUANTILE))
 
 
 @torch.no_grad()

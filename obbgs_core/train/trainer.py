@@ -33,7 +33,8 @@ from obbgs_core.losses import fit_figures, likelihood_loss, normal_disagreement,
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import Rendered, render, shadow_map
-from obbgs_core.render.lighting import SHADOW_MAP_PX, ShadowMap, lambertian, lit_shares
+from obbgs_core.render.lighting import lambertian
+from obbgs_core.render.shadows import SHADOW_MAP_PX, ShadowMap, lit_shares
 from obbgs_core.sensor import Sensor
 from obbgs_core.start.hull import shows_light
 from obbgs_core.start.initial import first_gaussians, silhouettes
