@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from flightsw.bracket import AutoBracket, Geometry
-from flightsw.cameras import Camera
+from flightsw.cameras.camera import Camera
 from flightsw.errors import CameraLost, CaptureError, FlightError, OrbitError, StoreFull
 from flightsw.icd.frame import Frame, PoseTag, decode_frame
 from flightsw.icd.mission import Mission

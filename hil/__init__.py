@@ -6,7 +6,3 @@ the shipped spacecraft), `links` (serial line and CAN bus with faults), `cameras
 What stands beside the rooms puts them together: `truth` (from `sky`), `simulated_pass`, `demo`, `dataset`, `cli`;
 no room imports those. A test holds these arrows.
 """
-
-from pathlib import Path
-
-SHIPPED = Path(__file__).parent / "assets" / "spacecraft.glb"  # the target that comes with the project

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import TaskID
 
 from flightsw.icd.mission import load_mission
-from hil import SHIPPED
 from hil.choices import CameraKind, FaultKind, LinkKind, SensorKind
+from hil.sky import SHIPPED
 from obbgs_base.command_line import new_app, run
 
 app = new_app("The simulated world around flight and ground.")

@@ -1,7 +1,8 @@
-"""The compiled module: whether it is here, which of its kernels runs, and which tensors it takes.
+"""The compiled module: whether it is installed, which of its kernels runs, and which tensors it accepts.
 
-Without the module everything runs in plain PyTorch. The module holds each kernel once for each instruction set and
-takes the best that the processor runs; the environment variable OBBGS_KERNEL names another: avx512, avx2 or portable.
+Without the module everything runs in plain PyTorch. The module holds each kernel compiled for several instruction sets
+and takes the best that the processor runs; the environment variable OBBGS_KERNEL chooses another: avx512, avx2 or
+portable.
 """
 
 import functools
@@ -11,13 +12,13 @@ import torch
 from torch import Tensor
 
 try:
-    from obbgs_core import _rasterizer  # pyright: ignore[reportAttributeAccessIssue]
+    from obbgs_core import _rasterizer
 except ImportError:
     _rasterizer = None
 
 
 def module_for(*tensors: Tensor):
-    """Return the compiled module when it is installed and all tensors, if any, are float32 on the CPU, else None.
+    """Return the compiled module if it is installed and all tensors, if any, are float32 on the CPU; else None.
 
     Raises:
         ValueError: OBBGS_KERNEL names no kernel that this processor runs.
@@ -38,11 +39,11 @@ def kernels() -> tuple[str, ...]:
     if _rasterizer is None:
         return ()
     best_first = _rasterizer.kernels()
-    wanted = os.environ.get("OBBGS_KERNEL") or best_first[0]
-    if wanted not in best_first:
+    chosen = os.environ.get("OBBGS_KERNEL") or best_first[0]
+    if chosen not in best_first:
         raise ValueError(
-            f"OBBGS_KERNEL must be one of {', '.join(best_first)} on this processor, got {wanted!r}; "
+            f"OBBGS_KERNEL must be one of {', '.join(best_first)} on this processor, got {chosen!r}; "
             "without it the first of them is used"
         )
-    _rasterizer.use_kernel(wanted)
-    return (wanted, *(name for name in best_first if name != wanted))
+    _rasterizer.use_kernel(chosen)
+    return (chosen, *(name for name in best_first if name != chosen))

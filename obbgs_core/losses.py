@@ -5,6 +5,7 @@ value and gradient in one sweep. The readable PyTorch beside them is the referen
 """
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -139,8 +140,8 @@ def fit_figures(
     native = compiled.module_for(radiance, alpha, exposure_time_s, dn)
     if native is not None:
         model, gains = _sensor_model(native, sensor, averaged_pixels), _gains(sensor, exposure_time_s)
-        images = (image.detach().contiguous() for image in (radiance, alpha, dn))
-        chi2, mse = native.fit(*images, gains, model, ON_TARGET_ALPHA, torch.get_num_threads())
+        light, opaque, read = (image.detach().contiguous() for image in (radiance, alpha, dn))
+        chi2, mse = native.fit(light, opaque, read, gains, model, ON_TARGET_ALPHA, torch.get_num_threads())
     else:
         prediction = sensor.predicted(radiance, exposure_time_s)
         noise = prediction.variance_dn2
@@ -244,6 +245,6 @@ class _KnownGradient(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, upstream: Tensor):
+    def backward(ctx: Any, *grad_outputs: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         (gradient,) = ctx.saved_tensors
-        return gradient * upstream, None, None
+        return gradient * grad_outputs[0], None, None

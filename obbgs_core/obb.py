@@ -7,8 +7,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 TILE_ROWS, TILE_COLUMNS = 20, 40  # px, the paper's window and stride
-FEWEST = 4  # Gaussians that define a box
-SURFACE_MARGIN = 0.02  # of the depth: Gaussians so far behind the visible surface still belong to it
+FEWEST = 4  # Gaussians for a box with a volume
+SURFACE_MARGIN = 0.02  # of the depth: Gaussians this far behind the visible surface still belong to it
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def worst_tile(error: Tensor) -> tuple[int, int]:
     """Return the top row and left column, px, of the tile with the largest mean error in error [H, W, C]."""
     height, width, channels = error.shape
     rows, columns = min(TILE_ROWS, height), min(TILE_COLUMNS, width)
-    tile = (rows, columns * channels)  # channels lie beside each other in memory
+    tile = (rows, columns * channels)  # channels are interleaved
     means = F.avg_pool2d(error.reshape(1, 1, height, width * channels), tile, tile)[0, 0]
     index = int(means.argmax())
     return index // means.shape[1] * rows, index % means.shape[1] * columns
@@ -55,7 +55,7 @@ def worst_tile(error: Tensor) -> tuple[int, int]:
 def behind_tile(
     means: Tensor, means2d: Tensor, depth: Tensor, world_to_camera: Tensor, tile: tuple[int, int]
 ) -> Tensor:
-    """Return which Gaussians [N] lie in the frustum through the tile's corners, in front of the visible surface.
+    """Return which Gaussians [N] lie in the frustum of the tile, no deeper than the visible surface.
 
     Args:
         means: [N, 3] m; means2d: [N, 2] px; depth: [H, W] m, 0 where nothing is.

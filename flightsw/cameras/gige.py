@@ -9,8 +9,8 @@ from urllib.parse import parse_qs
 
 import numpy as np
 
-from flightsw.cameras import OWN_CLOCK_ANSWER_S, Exposure
 from flightsw.cameras.aravis import BUFFER_STATUS, BUFFER_SUCCESS, PIXEL_FORMATS, AravisError, aravis
+from flightsw.cameras.camera import OWN_CLOCK_ANSWER_S, Exposure
 from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.mission import CameraSection
 

@@ -10,7 +10,7 @@ from io import BufferedRWPair
 
 import numpy as np
 
-from flightsw.cameras import OWN_CLOCK_ANSWER_S, Exposure
+from flightsw.cameras.camera import OWN_CLOCK_ANSWER_S, Exposure
 from flightsw.errors import CameraLost, CaptureError
 
 CONNECT_S = 10.0

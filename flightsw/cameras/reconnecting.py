@@ -4,7 +4,7 @@ import logging
 import time
 from collections.abc import Callable
 
-from flightsw.cameras import Camera, Exposure
+from flightsw.cameras.camera import Camera, Exposure
 from flightsw.errors import CameraLost, CaptureError
 
 log = logging.getLogger(__name__)

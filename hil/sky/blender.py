@@ -10,7 +10,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from hil.sky import spacecraft
+from hil.sky import SHIPPED
 from obbgs_base.errors import ObbgsError
 
 log = logging.getLogger(__name__)
@@ -98,7 +98,7 @@ class Worker:
             raise BlenderError(f"Blender did not start: {reason}; {_remedy(reason)}")
         self.version = greeting["ready"]
         load = {"op": "load", "mesh": str(self.mesh.resolve()), "samples": self.samples}
-        load["keep_scale"] = mesh_sha256(self.mesh) == mesh_sha256(spacecraft.SHIPPED)
+        load["keep_scale"] = mesh_sha256(self.mesh) == mesh_sha256(SHIPPED)
         if self.ambient is not None:
             load["ambient"] = self.ambient
         reply = self._exchange(load)

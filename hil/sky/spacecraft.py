@@ -12,8 +12,6 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from hil import SHIPPED as SHIPPED
-
 # base colour (linear), metallic, roughness
 MATERIALS = {
     "gold_foil": ((0.75, 0.48, 0.12), 0.3, 0.35),

@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from flightsw.cameras import OWN_CLOCK_ANSWER_S
+from flightsw.cameras.camera import OWN_CLOCK_ANSWER_S
 from flightsw.icd.mission import Mission
 
 NS = 1_000_000_000

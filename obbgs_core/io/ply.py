@@ -1,12 +1,12 @@
-"""Models and surfaces as PLY: other viewers show them, and reading a model back is exact.
+"""Models and surfaces as PLY files, which other viewers show; a model is read back exactly.
 
-Viewers of 3DGS files take a colour for `0.5 + SH(direction)`, clipped to 0..1 and shown as it is. Our coefficients mean
+Viewers of 3DGS files compute a display colour as `0.5 + SH(direction)`, clipped to 0..1. Our coefficients mean
 `softplus(SH(direction))` in scene-linear light, so f_dc and f_rest hold display colours, `(radiance / white)^(1/2.2)`
 fitted with spherical harmonics, and our own coefficients follow as radiance_sh_<coefficient>_<channel>, which viewers
 ignore. Everything else means the same there and here: metres, logarithms of sigmas, logits, quaternions w, x, y, z.
 
-Where our radiance turns with the Sun instead of the view, a comment of the header says so, and f_dc and f_rest hold the
-colours under the one Sun that the comment names.
+If our radiance depends on the Sun's direction instead of the viewing direction, a comment of the header says so, and
+f_dc and f_rest hold the colours with the Sun in the direction that the comment names.
 """
 
 from pathlib import Path
@@ -27,7 +27,7 @@ LAMBERT = "comment radiance_sh are albedos in units of the Sun's light, ambient 
 
 
 def display_sh(gaussians: Gaussians, white_radiance: float) -> Tensor:
-    """Return coefficients [N, K, 3] of display colours, as 3DGS viewers take them; `white_radiance` shows as 1."""
+    """Return coefficients [N, K, 3] of display colours, as 3DGS viewers expect them; `white_radiance` is shown as 1."""
     directions, to_coefficients = sh.fit(gaussians.sh.shape[1])
     shown = torch.stack(
         [(sh.radiance(gaussians.sh, d.expand(len(gaussians), 3)) / white_radiance) for d in directions], dim=1
@@ -52,11 +52,11 @@ def save_ply(
     """Write the model; the file appears whole or not at all.
 
     Args:
-        white_radiance: what viewers show as white.
-        sun_dir: [3] unit, body frame: the Sun that viewers show the model under, if its radiance turns with the Sun.
+        white_radiance: the radiance that viewers show as white.
+        sun_dir: [3] unit, body frame, towards the Sun: what viewers show, if the radiance depends on it.
 
     Raises:
-        ValueError: the radiance turns with the Sun, and sun_dir is not given.
+        ValueError: the radiance depends on the Sun's direction, and sun_dir is not given.
     """
     gaussians = gaussians.detach()
     count, coefficients, channels = gaussians.sh.shape
@@ -102,7 +102,7 @@ def load_ply(path: Path) -> Gaussians:
     """Return the model in a PLY that `save_ply` wrote.
 
     Raises:
-        ReconstructionError: not such a file, or cut off.
+        ReconstructionError: the file is something else, or truncated.
     """
     data = path.read_bytes()
     head, mark, body = data.partition(b"end_header\n")

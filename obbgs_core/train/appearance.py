@@ -11,7 +11,8 @@ from torch import Tensor
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import shadow_map
-from obbgs_core.render.lighting import ShadowMap, lambertian, lit_shares
+from obbgs_core.render.lighting import lambertian
+from obbgs_core.render.shadows import ShadowMap, lit_shares
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check, number
 from obbgs_core.train.batches import Batches

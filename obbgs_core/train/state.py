@@ -14,7 +14,7 @@ from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.pose_covariance import Whitening
 from obbgs_core.obb import Obb
-from obbgs_core.render.lighting import ShadowMap
+from obbgs_core.render.shadows import ShadowMap
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.appearance import Shadows
 from obbgs_core.train.batches import FrameOrder

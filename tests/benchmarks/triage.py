@@ -33,7 +33,7 @@ from ground.session import FrameRecord, Session, open_session
 from ground.training_frames import split, training_frame
 from ground.truth import Truth
 from hil.dataset import DatasetConfig, make_dataset
-from hil.sky import spacecraft
+from hil.sky import SHIPPED
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.model.gaussians import Gaussians
@@ -214,9 +214,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="one JSON object a row")
     parser.add_argument("--session", type=Path, nargs="+", help="sessions of `hil dataset`")
     parser.add_argument("--scenario", default="fly-around", help="what to render without --session")
-    parser.add_argument(
-        "--mesh", type=Path, default=spacecraft.SHIPPED, help="its target; default the shipped one"
-    )
+    parser.add_argument("--mesh", type=Path, default=SHIPPED, help="its target; default the shipped one")
     parser.add_argument("--out", type=Path, default=Path("triage"), help="where to render")
     parser.add_argument("--choices", default="oldest,triage,random,even,even-after", help=", ".join(CHOICES))
     parser.add_argument("--rounds", type=int, default=1, help="models uplinked")

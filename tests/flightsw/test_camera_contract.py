@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flightsw.cameras import Camera, open_camera
+from flightsw.cameras import open_camera
+from flightsw.cameras.camera import Camera
 from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.mission import Mission, load_mission
 from hil.cameras.gige import GigeCameraServer

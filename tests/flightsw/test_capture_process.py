@@ -162,7 +162,7 @@ def test_poses_from_a_navigation_file_go_into_the_frames_and_gaps_are_counted(tm
 
 def test_frames_outside_the_ephemeris_are_kept_without_a_pose(tmp_path, small_mission):
     """DE421 ends in 2053; the camera does not mind."""
-    from flightsw.cameras import Exposure
+    from flightsw.cameras.camera import Exposure
     from flightsw.sequencer import capture
 
     class Clock:

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flightsw.cameras import Exposure, open_camera
+from flightsw.cameras import open_camera
+from flightsw.cameras.camera import Exposure
 from flightsw.cameras.reconnecting import PATIENCE_S, RETRY_S, ReconnectingCamera
 from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.mission import load_mission

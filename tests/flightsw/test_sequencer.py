@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flightsw.cameras import Exposure
+from flightsw.cameras.camera import Exposure
 from flightsw.errors import CaptureError
 from flightsw.icd.frame import decode_frame
 from flightsw.icd.mission import load_mission

@@ -14,7 +14,7 @@ from flightsw.sequencer import capture
 from flightsw.store import FrameStore
 from ground.session_writer import SessionWriter
 from hil.cameras.virtual import CameraServer
-from hil.sky import spacecraft
+from hil.sky import SHIPPED
 from hil.sky.render_farm import RenderFarm
 from hil.truth import write_truth
 from hil.world.scenario import true_exposures
@@ -28,7 +28,7 @@ def main() -> None:
     shutil.rmtree(session, ignore_errors=True)
     with (
         tempfile.TemporaryDirectory() as folder,
-        RenderFarm(mission, spacecraft.SHIPPED, Path(folder) / "r") as farm,
+        RenderFarm(mission, SHIPPED, Path(folder) / "r") as farm,
     ):
         farm.prerender([e.pose for e in true_exposures(mission)])
         store = FrameStore(Path(folder) / "store")

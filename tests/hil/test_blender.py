@@ -16,7 +16,7 @@ from flightsw.icd.mission import Mission, load_mission
 from flightsw.icd.quaternion import matrix_to_quat
 from flightsw.pose import look_along
 from hil import cli
-from hil.sky import spacecraft
+from hil.sky import SHIPPED, spacecraft
 from hil.sky.blender import MeshError, Worker
 from hil.sky.motion import image_velocity
 from hil.sky.render_farm import RenderFarm
@@ -178,7 +178,7 @@ def test_the_image_velocity_carries_a_picture_to_where_a_later_render_sees_it(tm
         angle = 0.7 + fraction * 0.1
         return pose_at((100 * np.cos(angle), 100 * np.sin(angle), 60.0), (0.4, 0.5, 1.0))
 
-    with RenderFarm(mission, spacecraft.SHIPPED, tmp_path, workers=1) as farm:
+    with RenderFarm(mission, SHIPPED, tmp_path, workers=1) as farm:
         now, later = (farm.radiance(pose(fraction)).astype(float) for fraction in (0.0, 0.5))
         depth, _ = farm.geometry(pose(0.0))
     velocity = image_velocity(
@@ -201,7 +201,7 @@ def test_rendering_is_cached_and_the_same_again(tmp_path):
     mission, pose = camera_mission(48, 1200.0, 24.0), pose_at((150.0, 120.0, 80.0))
     images = []
     for name in ("a", "b"):
-        with RenderFarm(mission, spacecraft.SHIPPED, tmp_path / name, workers=1) as farm:
+        with RenderFarm(mission, SHIPPED, tmp_path / name, workers=1) as farm:
             assert farm.facts["largest_dimension_m"] == pytest.approx(6.0)
             assert farm.prerender([pose]) == 1 and farm.prerender([pose]) == 0
             images.append(farm.radiance(pose))
@@ -211,7 +211,7 @@ def test_rendering_is_cached_and_the_same_again(tmp_path):
 
 def test_after_a_crash_blender_is_restarted_and_the_frame_is_rendered(tmp_path):
     mission = camera_mission(32, 800.0, 16.0)
-    with RenderFarm(mission, spacecraft.SHIPPED, tmp_path, workers=1) as farm:
+    with RenderFarm(mission, SHIPPED, tmp_path, workers=1) as farm:
         farm._first._process.kill()
         assert farm.radiance(pose_at((150.0, 120.0, 80.0))).max() > 0.3
         assert farm._first.restarts == 1
@@ -248,14 +248,12 @@ def test_the_target_command_writes_the_shipped_mesh_byte_for_byte(tmp_path):
     """The shipped mesh is recognised by its SHA-256 and keeps its size; with other rounding it would be rescaled."""
     asked = CliRunner().invoke(cli.app, ["target", "--out", str(tmp_path / "mine.glb")])
     assert asked.exit_code == 0
-    assert (tmp_path / "mine.glb").read_bytes() == spacecraft.SHIPPED.read_bytes()
+    assert (tmp_path / "mine.glb").read_bytes() == SHIPPED.read_bytes()
 
 
 def test_the_shipped_target_is_what_the_code_builds(tmp_path):
     spacecraft.write(tmp_path / "again.glb")
-    built, shipped = (
-        trimesh.load(path, process=False) for path in (tmp_path / "again.glb", spacecraft.SHIPPED)
-    )
+    built, shipped = (trimesh.load(path, process=False) for path in (tmp_path / "again.glb", SHIPPED))
     assert set(built.geometry) == set(shipped.geometry) == set(spacecraft.MATERIALS)
     assert set(built.graph.nodes_geometry) == set(shipped.graph.nodes_geometry) == set(spacecraft.MATERIALS)
     for name, expected in shipped.geometry.items():
@@ -269,7 +267,7 @@ def test_the_shipped_target_is_what_the_code_builds(tmp_path):
         # processors add up rotations in float64 in other orders, and the file keeps float32: 2e-7 m at the panels' tips
         np.testing.assert_allclose(mesh.vertices, expected.vertices, rtol=0, atol=1e-6)
         np.testing.assert_allclose(mesh.vertex_normals, expected.vertex_normals, rtol=0, atol=1e-5)
-    assert spacecraft.SHIPPED.stat().st_size < 300_000
+    assert SHIPPED.stat().st_size < 300_000
     scene = spacecraft.build()
     np.testing.assert_allclose(np.ptp(scene.bounds, axis=0).max(), 6.0)
     assert len(scene.geometry) == len(spacecraft.MATERIALS)

@@ -16,7 +16,7 @@ from ground.formats.nerf import SPLIT_PATTERN
 from ground.session import open_session
 from hil import cli, dataset, truth
 from hil.dataset import DatasetConfig, DatasetError, load_dataset_config, make_dataset, target_meshes
-from hil.sky import spacecraft
+from hil.sky import SHIPPED
 from hil.sky.sensor import PRESETS
 
 POINTS = 5000
@@ -33,7 +33,7 @@ def made(tmp_path_factory, cache) -> tuple[Path, dict]:
     out = tmp_path_factory.mktemp("set") / "one"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(truth, "CLOUD_POINTS", POINTS)
-        return out, make_dataset(SMALL, spacecraft.SHIPPED, out, cache)
+        return out, make_dataset(SMALL, SHIPPED, out, cache)
 
 
 @pytest.fixture(autouse=True)
@@ -118,7 +118,7 @@ def test_a_second_run_needs_no_blender(made, cache, monkeypatch):
     out, facts = made
     monkeypatch.setenv("OBBGS_BLENDER_PYTHON", "/nowhere/python")
     monkeypatch.setattr(dataset, "RenderFarm", None)
-    again = make_dataset(SMALL, spacecraft.SHIPPED, out, cache)
+    again = make_dataset(SMALL, SHIPPED, out, cache)
     assert again == json.loads(json.dumps(facts))
 
 
@@ -133,9 +133,9 @@ def test_an_interrupted_run_goes_on_to_the_same_frames(made, cache, tmp_path):
             raise Killed
 
     with pytest.raises(Killed):
-        make_dataset(SMALL, spacecraft.SHIPPED, tmp_path / "cut", cache, 1, kill)
+        make_dataset(SMALL, SHIPPED, tmp_path / "cut", cache, 1, kill)
     steps = []
-    make_dataset(SMALL, spacecraft.SHIPPED, tmp_path / "cut", cache, 1, steps.append)
+    make_dataset(SMALL, SHIPPED, tmp_path / "cut", cache, 1, steps.append)
     assert steps[-1].done == steps[-1].total == 33
     for name in ("session/frames.jsonl", "transforms_val.json", "train/r_0000.png"):
         assert (tmp_path / "cut" / name).read_bytes() == (out / name).read_bytes()
@@ -144,12 +144,12 @@ def test_an_interrupted_run_goes_on_to_the_same_frames(made, cache, tmp_path):
 def test_another_sensor_or_seed_needs_no_new_rendering_of_the_same_channels(made, cache, tmp_path):
     pictures = set(cache.iterdir())
     config = dataclasses.replace(SMALL, sensor="spacecam")
-    make_dataset(config, spacecraft.SHIPPED, tmp_path / "spacecam", cache, 1)
+    make_dataset(config, SHIPPED, tmp_path / "spacecam", cache, 1)
     new = set(cache.iterdir()) - pictures
     # one channel instead of three is rendered anew; the same sensor again is not
     assert len(new) == 2 * 33 and open_session(tmp_path / "spacecam" / "session").camera.channels == 1
     pictures = set(cache.iterdir())
-    make_dataset(dataclasses.replace(config, seed=2), spacecraft.SHIPPED, tmp_path / "noise", cache, 1)
+    make_dataset(dataclasses.replace(config, seed=2), SHIPPED, tmp_path / "noise", cache, 1)
     assert set(cache.iterdir()) == pictures
     assert PRESETS["spacecam"].channels == 1
 
@@ -157,7 +157,7 @@ def test_another_sensor_or_seed_needs_no_new_rendering_of_the_same_channels(made
 def test_other_settings_do_not_overwrite_a_data_set(made, cache):
     out, _ = made
     with pytest.raises(DatasetError, match="other settings"):
-        make_dataset(dataclasses.replace(SMALL, seed=5), spacecraft.SHIPPED, out, cache)
+        make_dataset(dataclasses.replace(SMALL, seed=5), SHIPPED, out, cache)
 
 
 def test_the_meshes_of_a_set_are_found_and_a_missing_one_is_named(tmp_path):

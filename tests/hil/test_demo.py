@@ -16,7 +16,7 @@ from hil import cli
 from hil.cameras.gige import GVCP_PORT, LOOPBACK
 from hil.demo import simulate_pass
 from hil.simulated_pass import PassConfig, PassError, fly
-from hil.sky import spacecraft
+from hil.sky import SHIPPED
 from hil.world.scenario import Scene, load_scenario
 from hil.world.world import load_world
 from tests import baselines
@@ -126,7 +126,7 @@ def test_a_pass_that_stalls_is_an_error(quick, tmp_path, monkeypatch):
 def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_path):
     out = tmp_path / "demo"
     config = PassConfig(link="slcan-fd", scenario="tumbling", real_time=3000.0, navigation_noise=3)
-    simulation = simulate_pass(out, quick, spacecraft.SHIPPED, config, Console(stderr=True))
+    simulation = simulate_pass(out, quick, SHIPPED, config, Console(stderr=True))
     assert simulation["frames"] == {"captured": 4, "received": 4, "without_valid_pose": 0}
     link = simulation["link"]  # without faults, a CAN bus
     assert link["can_frames_lost"] == link["can_frames_overrun"] == link["segments_resent"] == 0
@@ -178,7 +178,7 @@ def test_a_demo_that_cannot_start_leaves_no_files_and_an_earlier_one_as_it_was(
     (old / "session" / "runs").mkdir(parents=True)
     (old / "demo.json").write_text('{"chamfer": 0.01}\n')
     for out in (tmp_path / "new", old):
-        for mesh, reason in ((spacecraft.SHIPPED, "Blender is missing"), ("nowhere.glb", "no such file")):
+        for mesh, reason in ((SHIPPED, "Blender is missing"), ("nowhere.glb", "no such file")):
             command = ["hil", "demo", "--out", str(out), "--mission", str(mission), "--mesh", str(mesh)]
             monkeypatch.setattr(sys, "argv", command)
             with pytest.raises(SystemExit) as ended:
@@ -195,7 +195,7 @@ def test_a_pass_that_cannot_start_leaves_only_rendered_frames(quick, tmp_path, t
         taken.bind((LOOPBACK, GVCP_PORT))
         config = PassConfig(camera="gige", scenario="tumbling")
         with pytest.raises(OSError, match="is in use"):
-            simulate_pass(out, quick, spacecraft.SHIPPED, config, Console(stderr=True))
+            simulate_pass(out, quick, SHIPPED, config, Console(stderr=True))
     assert [path.name for path in out.iterdir()] == ["renders"]
 
 

@@ -1,12 +1,19 @@
-"""Which kernels run: the best by themselves, another by name, and all of them with the same result."""
+"""Which kernels run: the best by default, another by name, all with the same result; and what the module holds."""
 
+import ast
+import math
+import re
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
 
 from obbgs_core import compiled
 from obbgs_core.losses import fit_figures, likelihood_loss, published_loss
+from obbgs_core.model import sh
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.render import native_kernels
+from obbgs_core.render import native_kernels, projection, reference
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.adam import Adam
 
@@ -80,3 +87,40 @@ def test_losses_and_adam_are_the_same_with_every_kernel(choose):
     for kernel in choose(""):
         choose(kernel)
         assert all(torch.equal(a, b) for a, b in zip(losses_and_a_step(), truth, strict=True)), kernel
+
+
+def test_python_and_the_kernels_share_their_constants():
+    module = compiled.module_for()
+    assert module is not None
+    python = {
+        "MIN_ALPHA": reference.MIN_ALPHA,
+        "LOG2_MIN_ALPHA": math.log2(reference.MIN_ALPHA),
+        "MAX_ALPHA": reference.MAX_ALPHA,
+        "MIN_TRANSMITTANCE": reference.MIN_TRANSMITTANCE,
+        "MIN_DEPTH_ALPHA": reference.MIN_DEPTH_ALPHA,
+        "DILATION_PX2": projection.DILATION_PX2,
+        "FOV_MARGIN": projection.FOV_MARGIN,
+        "SOFTNESS": sh.SOFTNESS,
+    }
+    for name, value in python.items():
+        assert getattr(module, name) == np.float32(value), name
+
+
+def test_the_stub_names_everything_in_the_module_and_nothing_else():
+    def names(tree: ast.Module | ast.ClassDef) -> set[str]:
+        found = {node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+        targets = (node.target for node in tree.body if isinstance(node, ast.AnnAssign))
+        return found | {target.id for target in targets if isinstance(target, ast.Name)} - {"Array"}
+
+    def public(thing: object) -> set[str]:
+        return {name for name in dir(thing) if not name.startswith("_")}
+
+    stub = ast.parse((Path(compiled.__file__).parent / "_rasterizer.pyi").read_text())
+    module = compiled.module_for()
+    assert names(stub) == public(module)
+    for node in stub.body:
+        if isinstance(node, ast.ClassDef):
+            assert names(node) - {"__init__"} == public(getattr(module, node.name)), node.name
+        elif isinstance(node, ast.FunctionDef):  # nanobind writes the arguments' names into the docstring
+            signature = getattr(module, node.name).__doc__.partition("->")[0]
+            assert [a.arg for a in node.args.args] == re.findall(r"(\w+):", signature), node.name

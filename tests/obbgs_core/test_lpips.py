@@ -71,7 +71,7 @@ def random_tree(network: str) -> dict:
         kernel = rng.standard_normal(shape, dtype=np.float32) * np.float32((2 / np.prod(shape[:3])) ** 0.5)
         trunk[f"Conv_{i}"] = {"kernel": kernel, "bias": 0.1 * rng.standard_normal(conv.channels, np.float32)}
         channels = conv.channels
-        if conv.judged:
+        if conv.compared:
             head = rng.random((1, 1, channels, 1), np.float32)
             heads[f"NetLinLayer_{len(heads)}"] = {"Conv_0": {"kernel": head}}
     return {NETWORKS[network].trunk_key: trunk, **heads}

@@ -157,7 +157,7 @@ class Faults(DefaultFaultHandlerBase):
 class NoCheckTimer(CheckTimerProvider):
     """Class 2 uses no check timer."""
 
-    def provide_check_timer(self, *_: Any) -> Countdown:
+    def provide_check_timer(self, local_entity_id: Any, remote_entity_id: Any, entity_type: Any) -> Countdown:
         raise AssertionError("the check timer belongs to class 1")
 
 
@@ -181,7 +181,7 @@ class FixedDestHandler(DestHandler):
 
     clock: Clock
     cfg: Any
-    user: Indications
+    user: Indications  # pyright: ignore[reportIncompatibleVariableOverride]  # it is given no other
 
     def _common_first_packet_handler(self, pdu: Any) -> bool | None:
         # the original's default tracker is one object shared by all transactions: files get each other's gaps
@@ -271,7 +271,7 @@ class FixedSourceHandler(SourceHandler):
 
     clock: Clock
     cfg: Any
-    user: Indications
+    user: Indications  # pyright: ignore[reportIncompatibleVariableOverride]  # it is given no other
 
     def _start_positive_ack_procedure(self) -> None:
         super()._start_positive_ack_procedure()

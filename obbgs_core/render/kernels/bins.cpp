@@ -12,7 +12,9 @@ namespace obbgs {
 namespace KERNEL {
 namespace {
 
-struct Found {  // a pair before it is put in its tile
+constexpr size_t kSplatsPerThread = 8192;  // with fewer, another thread takes longer to wake than it saves
+
+struct Found {  // a pair and the tile it belongs to
   uint32_t tile, splat;
   uint64_t blocks;
 };
@@ -24,10 +26,12 @@ void sort_by_depth(Buffer<DepthKey>& keys, size_t count) {
   other.resize(count);
   std::vector<uint32_t> begin(kPasses * kValues, 0);
   for (size_t i = 0; i < count; ++i)
-    for (int pass = 0; pass < kPasses; ++pass) ++begin[pass * kValues + ((keys[i].depth_bits >> (pass * kDigit)) & (kValues - 1))];
+    for (int pass = 0; pass < kPasses; ++pass)
+      ++begin[pass * kValues + ((keys[i].depth_bits >> (pass * kDigit)) & (kValues - 1))];
   for (int pass = 0; pass < kPasses; ++pass) {
     uint32_t* next = &begin[pass * kValues];
-    if (count && next[(keys[0].depth_bits >> (pass * kDigit)) & (kValues - 1)] == count) continue;  // all alike in this digit
+    if (count && next[(keys[0].depth_bits >> (pass * kDigit)) & (kValues - 1)] == count)
+      continue;  // this digit is the same everywhere
     uint32_t total = 0;
     for (int v = 0; v < kValues; ++v) total += std::exchange(next[v], total);
     for (size_t i = 0; i < count; ++i) other[next[(keys[i].depth_bits >> (pass * kDigit)) & (kValues - 1)]++] = keys[i];
@@ -35,22 +39,29 @@ void sort_by_depth(Buffer<DepthKey>& keys, size_t count) {
   }
 }
 
-// Appends a pair for each tile where the splat's ellipse alpha >= kMinAlpha reaches a pixel centre. A block is marked where the
-// ellipse meets the square of its outermost pixel centres; sixteen rows of blocks, two tiles, are worked out at a time.
+// Returns a place in the image, px, rounded down; places far outside, which int could not hold, are moved closer.
+inline int pixel(float place) { return int(std::min(std::max(0.0f, place), 1e6f)); }
+
+// Appends a pair for each tile where the splat's ellipse alpha >= kMinAlpha reaches a pixel centre. A block is marked
+// where the ellipse meets the square of its outermost pixel centres; sixteen rows of blocks, two tiles, are computed at
+// a time.
 void find_pairs(const Scene& s, const Splat& splat, uint32_t index, std::vector<Found>& found) {
   const int blocks_y = (s.height + kBlock - 1) / kBlock, tiles_x = s.tiles_x();
   const uint32_t first_tile = index / uint32_t(s.gaussians) * uint32_t(tiles_x * s.tiles_y());
-  const float q = std::max(splat.level + 7.99435344f, 0.0f), root = std::sqrt(q);  // u^2 + v^2 <= q where alpha >= 1/255
+  const float q = std::max(splat.level - kLog2MinAlpha, 0.0f),
+              root = std::sqrt(q);  // u^2 + v^2 <= q where alpha >= kMinAlpha
   const float tilt = splat.k2 / splat.k3, stretch = std::sqrt(1 + tilt * tilt);
   const float narrow = 1 / splat.k1, widest = root * narrow * stretch, tallest = root / splat.k3;
-  const float slack = 0.01f + 1e-6f * (std::abs(splat.x) + std::abs(splat.y) + widest + tallest);  // px, covers rounding
+  const float slack =
+      0.01f + 1e-6f * (std::abs(splat.x) + std::abs(splat.y) + widest + tallest);  // px, covers rounding
   const float reach_x = widest + slack, reach_y = tallest + slack;
-  const float turn = tilt * tallest / stretch;  // the rightmost point of the ellipse is at dy = -turn, the leftmost at turn
+  const float turn =
+      tilt * tallest / stretch;  // the rightmost point of the ellipse is at dy = -turn, the leftmost at turn
   // the first and last row of blocks, and tile, whose pixel centres are within reach
-  const int row0 = int(std::max(splat.y - reach_y + 0.5f, 0.0f)) / kBlock;
-  const int row1 = std::min(int(std::max(splat.y + reach_y - 0.5f, 0.0f)) / kBlock, blocks_y - 1);
-  const int tile0 = int(std::max(splat.x - reach_x + 0.5f, 0.0f)) / kTile;
-  const int tile1 = std::min(int(std::max(splat.x + reach_x - 0.5f, 0.0f)) / kTile, tiles_x - 1);
+  const int row0 = pixel(splat.y - reach_y + 0.5f) / kBlock;
+  const int row1 = std::min(pixel(splat.y + reach_y - 0.5f) / kBlock, blocks_y - 1);
+  const int tile0 = pixel(splat.x - reach_x + 0.5f) / kTile;
+  const int tile1 = std::min(pixel(splat.x + reach_x - 0.5f) / kTile, tiles_x - 1);
 
   alignas(64) static constexpr float kRows[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
   const vf rows = load(kRows);
@@ -66,14 +77,17 @@ void find_pairs(const Scene& s, const Splat& splat, uint32_t index, std::vector<
     for (int tile_x = tile0; tile_x <= tile1; ++tile_x) {
       // columns begin .. end - 1: their pixel centres 4b + 0.5 .. 4b + 3.5 reach into left .. right
       const float x0 = float(tile_x * kTile);
-      const float columns = std::min(8.0f, float((s.width - tile_x * kTile + kBlock - 1) / kBlock));
-      const vf begin = larger(smaller((left - (x0 + 3.5f)) * (1.0f / kBlock), columns), 0.0f) + 0.999999f;  // rounded up
+      const int blocks_left = (s.width - tile_x * kTile + kBlock - 1) / kBlock;
+      const float columns = float(std::min(8, blocks_left));
+      const vf begin =
+          larger(smaller((left - (x0 + 3.5f)) * (1.0f / kBlock), columns), 0.0f) + 0.999999f;  // rounded up
       const vf end = zero_unless(inside, larger(smaller((right - (x0 - 3.5f)) * (1.0f / kBlock), columns), 0.0f));
       const vi bits = (vi(1) << truncate(end)) - vi(1), skipped = (vi(1) << truncate(begin)) - vi(1);
       uint64_t blocks[2];
       store_bytes(blocks, bits & ~skipped);
       for (int half = 0; half < 2; ++half)
-        if (blocks[half]) found.push_back({first_tile + uint32_t((tile_y + half) * tiles_x + tile_x), index, blocks[half]});
+        if (blocks[half])
+          found.push_back({first_tile + uint32_t((tile_y + half) * tiles_x + tile_x), index, blocks[half]});
     }
   }
 }
@@ -85,8 +99,9 @@ void bin(const Scene& s, Frame& frame, int threads) {
   const size_t count = frame.visible_count, tiles = s.tiles();
   const size_t chunk = std::max<size_t>(256, (count + 63) / 64), chunks = (count + chunk - 1) / chunk;
   std::vector<std::vector<Found>> found(chunks);
-  std::vector<uint32_t> next(chunks * tiles, 0);  // pairs of each chunk in each tile, then where they go
-  const int useful = worthwhile(threads, count, 8192);
+  std::vector<uint32_t> next(chunks * tiles,
+                             0);  // first the number of pairs of each chunk in each tile, then where they are put
+  const int useful = worthwhile(threads, count, kSplatsPerThread);
   parallel_for(int(chunks), useful, [&](int c) {
     found[c].reserve(2 * chunk);
     for (size_t i = c * chunk; i < std::min(count, (c + 1) * chunk); ++i) {
@@ -113,7 +128,8 @@ void bin(const Scene& s, Frame& frame, int threads) {
       const Found& f = found[c][i];
       frame.pairs[next[c * tiles + f.tile]++] = {f.splat, first_record[c] + i, f.blocks};
     }
-    for (size_t i = c * chunk; i < std::min(count, (c + 1) * chunk); ++i) frame.splats[frame.visible[i].splat].first_record += first_record[c];
+    for (size_t i = c * chunk; i < std::min(count, (c + 1) * chunk); ++i)
+      frame.splats[frame.visible[i].splat].first_record += first_record[c];
   });
 }
 

@@ -1,5 +1,6 @@
-// The CPU rasterizer: projection (project.cpp), which 4x4 pixel blocks each Gaussian touches (bins.cpp), compositing over them
-// (composite.cpp). These three are compiled once for each instruction set; binding.cpp picks one at run time.
+// The CPU rasterizer: projection (project.cpp), which 4x4 pixel blocks each Gaussian touches (bins.cpp), compositing
+// over them (composite.cpp), and the gradient (composite_backward.cpp, project_backward.cpp). These are compiled once
+// for each instruction set; binding.cpp picks one at run time.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -7,16 +8,22 @@
 
 namespace obbgs {
 
-constexpr int kBlock = 4;                 // pixels along a block's side: one 16-lane vector a block
-constexpr int kTile = 32;                 // pixels along a tile's side: 8x8 blocks, one 64-bit mask
-constexpr float kMinAlpha = 1.0f / 255;   // fainter contributions are skipped
+constexpr int kBlock = 4;  // pixels along a block's side: one 16-lane vector a block
+constexpr int kTile = 32;  // pixels along a tile's side: 8x8 blocks, one 64-bit mask
+
+// Python has the same numbers; binding.cpp shows these to the test that compares them. Source: Kerbl et al. 2023.
+constexpr float kMinAlpha = 1.0f / 255;        // fainter contributions are skipped
+constexpr float kLog2MinAlpha = -7.99435344f;  // log2(kMinAlpha)
 constexpr float kMaxAlpha = 0.99f;
-constexpr float kMinTransmittance = 1e-4f;  // a pixel is finished before it falls below
-constexpr float kMinDepthAlpha = 1e-6f;   // depth is 0 where alpha is no more
-constexpr float kDilation = 0.3f;         // px^2 added to the 2D covariance (Kerbl et al. 2023)
-constexpr float kFovMargin = 1.3f;        // the affine approximation is clamped this far outside the image (Kerbl et al. 2023)
-constexpr int kMaxFeatures = 7;           // radiance 3, depth 1, normal 3
-constexpr int kRecord = 16;               // floats of a gradient record: one cache line
+constexpr float kMinTransmittance = 1e-4f;  // a pixel is finished before its transmittance would fall below
+constexpr float kMinDepthAlpha = 1e-6f;     // the depth is 0 where alpha is not above this
+constexpr float kDilation = 0.3f;           // px^2 added to the 2D covariance
+constexpr float kFovMargin = 1.3f;          // the affine approximation is clamped this far outside the image
+constexpr float kSoftness = 10.0f;          // radiance = softplus(kSoftness x) / kSoftness
+
+constexpr int kMaxChannels = 3, kMaxCoefficients = 16;
+constexpr int kMaxFeatures = kMaxChannels + 4;  // radiance, depth, normal
+constexpr int kRecord = 16;                     // floats of a gradient record: one cache line
 
 // The model and the cameras, row-major float32 as in Gaussians and Cameras.
 struct Scene {
@@ -24,9 +31,9 @@ struct Scene {
   float near_m;
   bool normals;
   const float *means, *quats, *log_scales, *opacity_logits, *sh, *world_to_camera, *K;
-  const float* sun_dir;  // [cameras, 3] where the harmonics are taken; null: along each line of sight
-  const float* sunlit;   // [cameras, gaussians] share of the Sun that arrives: sh is an albedo, lit by Lambert's law; or null
-  float ambient;         // light on every side besides
+  const float* sun_dir;  // [cameras, 3] direction at which the harmonics are evaluated; null: the viewing direction
+  const float* sunlit;  // [cameras, gaussians] visibility of the Sun; sh is then an albedo under Lambert's law; or null
+  float ambient;        // added to the Sun's light on every side
 
   int features() const { return channels + 1 + 3 * normals; }  // radiance, depth, normal: in this order
   int tiles_x() const { return (width + kTile - 1) / kTile; }
@@ -39,7 +46,7 @@ struct Scene {
 struct alignas(64) Splat {
   float x, y, k1, k2, k3, level;
   float feature[kMaxFeatures];
-  uint32_t first_record, records;  // its gradient records, one a tile it touches; no records: not drawn
+  uint32_t first_record, records;  // its gradient records, one for each tile it touches; none if it is not drawn
 };
 
 // One splat in one tile.
@@ -49,7 +56,7 @@ struct Pair {
 };
 
 template <typename T>
-class Buffer {  // uninitialised array
+class Buffer {  // a resizable array; resizing leaves it uninitialised
  public:
   void resize(size_t size) {
     data_.reset(new T[size]);
@@ -72,19 +79,20 @@ struct DepthKey {
 
 // What the forward pass leaves for the backward pass.
 struct Frame {
-  Buffer<Splat> splats;          // [cameras * gaussians]
-  Buffer<DepthKey> visible;      // splats on an image, nearest first once binned
+  Buffer<Splat> splats;      // [cameras * gaussians]
+  Buffer<DepthKey> visible;  // splats on an image, nearest first once binned
   size_t visible_count = 0;
-  Buffer<uint32_t> tile_begin;   // [tiles + 1] into pairs
-  Buffer<Pair> pairs;            // by tile, then by depth
-  Buffer<float> transmittance;   // [cameras, height, width]
+  Buffer<uint32_t> tile_begin;  // [tiles + 1] into pairs
+  Buffer<Pair> pairs;           // by tile, then by depth
+  Buffer<float> transmittance;  // [cameras, height, width]
 };
 
 struct Images {  // [cameras, height, width] and, for radiance and normals, channels
   float *radiance, *alpha, *depth, *median_depth, *normals;
 };
 
-// Gradient of an image with its strides in floats (camera, row, column, channel); zero where the loss does not depend on it.
+// Gradient of an image with its strides in floats (camera, row, column, channel); zero if the loss does not depend on
+// it.
 struct ImageGradient {
   static constexpr float kZero = 0.0f;
   const float* data = &kZero;
@@ -107,20 +115,22 @@ struct SceneGradients {
   float *means2d, *pixels;  // [cameras, gaussians, 2] loss per px, [cameras, gaussians] pixels touched
 };
 
-// Sums over one splat's pixels in one tile of g = dL/dalpha * alpha and of its features' gradients. `slot` is where the i-th
-// sum lies: the order that falls out of adding up sixteen vectors at once.
+// Sums over one splat's pixels in one tile of g = dL/dalpha * alpha and of its features' gradients. `slot` is where the
+// i-th sum lies: the order that falls out of adding up sixteen vectors at once.
 enum Sum { kG, kGU, kGV, kGUU, kGUV, kGVV, kFirstFeature };
 constexpr int slot(int sum) { return 4 * (sum % 4) + sum / 4; }
 constexpr int kPixels = 15;
 static_assert(kFirstFeature + kMaxFeatures < kRecord, "the last slot holds the pixel count");
 
-#define OBBGS_DECLARE_KERNEL(name)                                                                                      \
-  namespace name {                                                                                                      \
-  void project(const Scene&, Frame&, float* means2d, float* radii, int threads);                                         \
-  void bin(const Scene&, Frame&, int threads);                                                                          \
-  void composite(const Scene&, Frame&, const Images&, int threads);                                                     \
-  void composite_backward(const Scene&, const Frame&, const Images&, const ImageGradients&, float* records, int threads); \
-  void project_backward(const Scene&, const Frame&, const float* records, int features, const SceneGradients&, int threads); \
+#define OBBGS_DECLARE_KERNEL(name)                                                                             \
+  namespace name {                                                                                             \
+  void project(const Scene&, Frame&, float* means2d, float* radii, int threads);                               \
+  void bin(const Scene&, Frame&, int threads);                                                                 \
+  void composite(const Scene&, Frame&, const Images&, int threads);                                            \
+  void composite_backward(const Scene&, const Frame&, const Images&, const ImageGradients&, float* records,    \
+                          int threads);                                                                        \
+  void project_backward(const Scene&, const Frame&, const float* records, int features, const SceneGradients&, \
+                        int threads);                                                                          \
   }
 OBBGS_DECLARE_KERNEL(portable)
 OBBGS_DECLARE_KERNEL(avx2)

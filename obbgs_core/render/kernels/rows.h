@@ -1,8 +1,8 @@
-// Loops over one row of an image (or one block of parameters) that the compiler vectorises: losses and their gradients.
+// Loops over one row of an image (or one block of parameters) that the compiler vectorises: losses, gradients, Adam.
 // Rows hold width * channels values, channels interleaved: a pixel's neighbour is `c` (channels) values away.
-// Compiled once for each instruction set, in rows.cpp; others call what RowLoops points to. No loop adds up across lanes and
-// a*b + c is never contracted, so every instruction set gives the same bits.
-// Compile with -fno-math-errno -fno-trapping-math: square roots and conditions are scalar without them.
+// Compiled once for each instruction set, in rows.cpp; training.cpp calls them through RowLoops. No loop adds up across
+// lanes and a*b + c is never contracted, so every instruction set gives the same bits. Compile with -fno-math-errno
+// -fno-trapping-math: square roots and conditions are scalar without them.
 #pragma once
 #include <cmath>
 #include <cstddef>
@@ -13,8 +13,8 @@ namespace obbgs {
 
 constexpr int kReach = 5, kTaps = 2 * kReach + 1;  // SSIM window of Wang et al. 2004: 11 pixels, sigma 1.5
 constexpr float kSsimC1 = 1e-4f, kSsimC2 = 9e-4f;  // (0.01)^2, (0.03)^2
-constexpr float kKnee = 2;                         // of the Charbonnier penalty, sigma
-constexpr float kHalfDn = 0.5f;                    // a reading of 0 is of a signal that rounds to 0 or less
+constexpr float kKnee = 2;                         // sigma, where the Charbonnier penalty turns from square to linear
+constexpr float kHalfDn = 0.5f;                    // rounding: a reading of 0 means a signal below this
 
 struct SensorModel {
   float black, white, dn_per_electron, electrons_per_dn;
@@ -23,7 +23,9 @@ struct SensorModel {
   float root_averaged;   // sqrt of the sensor pixels in one pixel: averaging shrinks the noise
 };
 
-struct Window { float taps[kTaps]; };
+struct Window {
+  float taps[kTaps];
+};
 
 namespace rows {
 namespace {
@@ -31,7 +33,8 @@ namespace {
 // exp(x) for -41 <= x <= 0, relative error 2e-7.
 inline float exp_negative(float x) {
   const float t = x * 1.44269504f;
-  const int32_t n = int32_t(t - 0.5f);  // truncation towards zero of a negative number rounds it
+  const float bounded = t >= -60.0f ? t : -60.0f;  // NaN has no integer; below, f and so the result are still NaN
+  const int32_t n = int32_t(bounded - 0.5f);       // truncation towards zero of a negative number rounds it
   const float f = (t - float(n)) * 0.693147181f;
   float p = f * 1.3888889e-3f + 8.3333333e-3f;
   p = p * f + 4.1666667e-2f;
@@ -64,7 +67,7 @@ inline float log_positive(float x, float x_minus_1) {
   int32_t bits;
   std::memcpy(&bits, &x, sizeof bits);
   const int32_t exponent = (bits - 0x3f3504f3) >> 23;  // of x over the root of one half
-  bits -= exponent << 23;
+  bits -= exponent * (1 << 23);
   float m;
   std::memcpy(&m, &bits, sizeof m);
   const float s = (exponent == 0 ? x_minus_1 : m - 1.0f) / (m + 1.0f), w = s * s;
@@ -75,7 +78,9 @@ inline float log_positive(float x, float x_minus_1) {
 }
 
 // The normal distribution at z: its density, and Phi(-|z|) with 0 beyond 9.
-struct Normal { float density, tail; };
+struct Normal {
+  float density, tail;
+};
 inline Normal normal(float z) {
   float u = std::fabs(z) * 0.707106781f;
   u = u > 6.36396103f ? 6.36396103f : u;
@@ -105,7 +110,8 @@ void likelihood_row(int n, const float* __restrict radiance, const float* __rest
     const float expected = expected_dn(gain * radiance[x], s, inverse_sigma);
     const bool saturated = dn[x] >= s.white, clipped = saturated || dn[x] <= 0;
     const float b = (saturated ? expected - (s.white - kHalfDn) : kHalfDn - expected) * inverse_sigma;
-    // -2 log Phi(b) and phi(b) / Phi(b), by the tail over its bell where Phi is small; past 9 sigma the tail's asymptote
+    // -2 log Phi(b) and phi(b) / Phi(b), by the tail over its bell where Phi is small; past 9 sigma the tail's
+    // asymptote
     float u = std::fabs(b) * 0.707106781f;
     u = u > 6.36396103f ? 6.36396103f : u;
     const float bell = exp_negative(-u * u), i = 1.0f / (b * b + 1e-6f);
@@ -160,7 +166,7 @@ void averaged_likelihood_row(int n, const float* __restrict radiance, const floa
 }
 
 // Squared differences of readings and their expectation, and the variance of the readings, both over that of the
-// noise, times `seen` (0 or 1). A mean of several pixels that is saturated counts as nothing.
+// noise, times `seen` (0 or 1). A saturated mean of several pixels is left out.
 void chi2_row(int n, const float* __restrict radiance, const float* __restrict dn, const float* __restrict seen,
               float gain, const SensorModel s, float* __restrict squares, float* __restrict variances) {
   for (int x = 0; x < n; ++x) {
@@ -174,7 +180,7 @@ void chi2_row(int n, const float* __restrict radiance, const float* __restrict d
     const float shift = lifted - lowered;
     const float inside = 1.0f - below - above + low * at_low.density - high * at_high.density;
     float spread = inside + low * low * below + high * high * above - shift * shift;
-    spread = (below >= 1.0f || above >= 1.0f || spread < 0) ? 0.0f : spread;  // certain: beyond a clip
+    spread = (below >= 1.0f || above >= 1.0f || spread < 0) ? 0.0f : spread;  // always clipped: no variance
     float r = (expected - dn[x]) * inverse_sigma + shift;
     r = above >= 1.0f ? (s.white - dn[x]) * inverse_sigma : (below >= 1.0f ? -dn[x] * inverse_sigma : r);
     const float counts = s.root_averaged == 1.0f || dn[x] < s.white ? seen[x] : 0.0f;
@@ -275,7 +281,7 @@ void ssim_row(int n, int c, const Window w, const float* __restrict column_a, co
   for (int x = 0; x < n; ++x) {
     const float a = blur_along(column_a + x, c, w), b = blur_along(column_b + x, c, w);
     const float squares = blur_along(column_squares + x, c, w), product = blur_along(column_product + x, c, w);
-    const float l1 = 2 * a * b + kSsimC1, l2 = a * a + b * b + kSsimC1;            // luminance l1 / l2
+    const float l1 = 2 * a * b + kSsimC1, l2 = a * a + b * b + kSsimC1;                        // luminance l1 / l2
     const float s1 = 2 * (product - a * b) + kSsimC2, s2 = squares - a * a - b * b + kSsimC2;  // structure s1 / s2
     const float inverse = 1.0f / (l2 * s2), ssim = l1 * s1 * inverse;
     sums[x] += 1.0f - ssim;
@@ -291,8 +297,9 @@ void ssim_gradient_row(int n, int c, const Window w, float scale, const float* _
                        const float* __restrict by_product, const float* __restrict a, const float* __restrict b,
                        float* __restrict gradient) {
   for (int x = 0; x < n; ++x)
-    gradient[x] += scale * slope[x] * (blur_along(by_mean + x, c, w) + 2 * a[x] * blur_along(by_squares + x, c, w) +
-                                       b[x] * blur_along(by_product + x, c, w));
+    gradient[x] += scale * slope[x] *
+                   (blur_along(by_mean + x, c, w) + 2 * a[x] * blur_along(by_squares + x, c, w) +
+                    b[x] * blur_along(by_product + x, c, w));
 }
 
 // difference = a - b; its size goes to `sums`; gradient = sign(difference) * slope.
@@ -347,22 +354,27 @@ void adam_block(size_t n, float* __restrict parameter, const float* __restrict g
 }  // namespace
 }  // namespace rows
 
-// Every loop above that is called from elsewhere.
-#define OBBGS_ROW_LOOPS(each) \
-  each(likelihood_row) each(unclipped_likelihood_row) each(averaged_likelihood_row) each(chi2_row) \
-  each(stabilised_row) \
-  each(difference_row) each(sobel_row) each(sobel_gradient_row) each(blur_down_products) each(blur_down) \
-  each(ssim_row) each(ssim_gradient_row) each(absolute_row) each(clamped_row) each(scaled_row) \
-  each(scale_row) each(squared_error_row) each(adam_block)
+// The loops above that are called from training.cpp.
+#define OBBGS_ROW_LOOPS(each)                                                                                          \
+  each(likelihood_row) each(unclipped_likelihood_row) each(averaged_likelihood_row) each(chi2_row)                     \
+      each(stabilised_row) each(difference_row) each(sobel_row) each(sobel_gradient_row) each(blur_down_products)      \
+          each(blur_down) each(ssim_row) each(ssim_gradient_row) each(absolute_row) each(clamped_row) each(scaled_row) \
+              each(scale_row) each(squared_error_row) each(adam_block)
 
-struct RowLoops {  // the loops as one instruction set has them; rows.cpp fills it
+struct RowLoops {  // pointers to the loops of one instruction set; rows.cpp fills it
 #define OBBGS_MEMBER(name) decltype(&rows::name) name;
   OBBGS_ROW_LOOPS(OBBGS_MEMBER)
 #undef OBBGS_MEMBER
 };
-namespace portable { extern const RowLoops row_loops; }
-namespace avx2 { extern const RowLoops row_loops; }
-namespace avx512 { extern const RowLoops row_loops; }
+namespace portable {
+extern const RowLoops row_loops;
+}
+namespace avx2 {
+extern const RowLoops row_loops;
+}
+namespace avx512 {
+extern const RowLoops row_loops;
+}
 
 void use_row_loops(const RowLoops& loops);  // from now on; training.cpp
 

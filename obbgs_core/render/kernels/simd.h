@@ -1,6 +1,6 @@
 // Sixteen float lanes in every instruction set: one 4x4 pixel block, or sixteen Gaussians.
-// Included once for each instruction set; KERNEL names the namespace. Built without contraction of a*b+c: `fma` rounds once
-// everywhere, so that every instruction set takes the same decisions at the cutoffs.
+// Included once for each instruction set; KERNEL names the namespace. Built without contraction of a*b+c: `fma` rounds
+// once everywhere, so that every instruction set takes the same decisions at the cutoffs.
 #pragma once
 #include <cstdint>
 #include <cstring>
@@ -48,10 +48,10 @@ struct vi {
   int32_t operator[](int lane) const { return reinterpret_cast<const int32_t*>(part)[lane]; }
 };
 
-#define OBBGS_LANEWISE(type, op)                                              \
-  OBBGS_INLINE type operator op(type a, type b) {                                   \
-    for (int p = 0; p < kParts; ++p) a.part[p] = a.part[p] op b.part[p];      \
-    return a;                                                                 \
+#define OBBGS_LANEWISE(type, op)                                         \
+  OBBGS_INLINE type operator op(type a, type b) {                        \
+    for (int p = 0; p < kParts; ++p) a.part[p] = a.part[p] op b.part[p]; \
+    return a;                                                            \
   }
 OBBGS_LANEWISE(vf, +)
 OBBGS_LANEWISE(vf, -)
@@ -120,7 +120,8 @@ OBBGS_INLINE vf fma(vf a, vf b, vf c) {
     c.part[p] = vfmaq_f32(c.part[p], a.part[p], b.part[p]);
 #else
     typedef double DoublePart __attribute__((vector_size(8 * kWidth)));
-    const DoublePart product = __builtin_convertvector(a.part[p], DoublePart) * __builtin_convertvector(b.part[p], DoublePart);
+    const DoublePart product =
+        __builtin_convertvector(a.part[p], DoublePart) * __builtin_convertvector(b.part[p], DoublePart);
     c.part[p] = __builtin_convertvector(product + __builtin_convertvector(c.part[p], DoublePart), FloatPart);
 #endif
   }
@@ -256,7 +257,8 @@ OBBGS_INLINE float sum(vf v) {
   return lane[0];
 }
 
-// 2^x, relative error 2e-7. Below -126 the result is negative or not a number, which no cutoff lets pass; below -380 it is wrong.
+// 2^x, relative error 2e-7. Below -126 the result is negative or not a number, which no cutoff lets pass; below -380 it
+// is wrong.
 OBBGS_INLINE vf exp2_unbounded(vf x) {
   const vf shifted = x + 12582912.0f;  // 1.5 * 2^23: the low bits now hold x rounded to an integer
   const vf f = x - (shifted - 12582912.0f);

@@ -13,26 +13,24 @@ namespace {
 
 using Clock = std::chrono::steady_clock;
 
-// Waking a thread costs some tenths of a millisecond: it pays to look this long for what is about to happen.
-constexpr std::chrono::microseconds kPatience{300};
+// How long threads poll before they sleep: waking a sleeping one takes some tenths of a millisecond.
+constexpr std::chrono::microseconds kPollTime{300};
+constexpr std::chrono::microseconds kTolerance{200};  // a helper that ends this long after the caller is not late yet
+constexpr int kMostSerialLoops = 100;                 // after a late helper
 
-// Returns whether done() comes true soon; meanwhile whoever waits for this core gets it.
+// Polls until done() is true or kPollTime is over; meanwhile other threads may have the core.
 template <typename Done>
-bool soon(Done done) {
-  for (const auto until = Clock::now() + kPatience; !done();) {
-    if (Clock::now() > until) return false;
-    std::this_thread::yield();
-  }
-  return true;
+void poll(Done done) {
+  for (const auto until = Clock::now() + kPollTime; !done() && Clock::now() <= until;) std::this_thread::yield();
 }
 
 class Pool {
  public:
   void run(int units, int threads, const std::function<void(int)>& work) {
     const int helpers = std::min(threads, units) - 1;
-    std::unique_lock<std::mutex> only(callers_, std::try_to_lock);
-    if (helpers < 1 || !only || alone_ > 0) {
-      if (only && alone_ > 0) --alone_;
+    std::unique_lock<std::mutex> only_caller(callers_, std::try_to_lock);
+    if (helpers < 1 || !only_caller || serial_loops_left_ > 0) {
+      if (only_caller && serial_loops_left_ > 0) --serial_loops_left_;
       for (int unit = 0; unit < units; ++unit) work(unit);
       return;
     }
@@ -52,12 +50,12 @@ class Pool {
     std::unique_lock<std::mutex> lock(mutex_);
     wanted_ = 0;
     lock.unlock();
-    soon([this] { return active_ == 0; });
+    poll([this] { return active_ == 0; });
     lock.lock();
     idle_.wait(lock, [this] { return active_ == 0; });
-    const bool late = Clock::now() - drained > (drained - begun) / 2 + std::chrono::microseconds(200);
-    penalty_ = late ? std::min(2 * penalty_ + 4, 100) : penalty_ / 2;
-    alone_ = late ? penalty_ : 0;
+    const bool late = Clock::now() - drained > (drained - begun) / 2 + kTolerance;
+    backoff_ = late ? std::min(2 * backoff_ + 4, kMostSerialLoops) : backoff_ / 2;
+    serial_loops_left_ = late ? backoff_ : 0;
     if (error_) std::rethrow_exception(error_);
   }
 
@@ -75,7 +73,7 @@ class Pool {
     std::unique_lock<std::mutex> lock(mutex_);
     for (;;) {
       lock.unlock();
-      soon([this] { return wanted_ > 0; });
+      poll([this] { return wanted_ > 0; });
       lock.lock();
       wake_.wait(lock, [this] { return wanted_ > 0; });
       --wanted_;
@@ -90,16 +88,16 @@ class Pool {
   std::mutex callers_, mutex_;
   std::condition_variable wake_, idle_;
   const std::function<void(int)>* work_ = nullptr;
-  std::atomic<int> next_{0}, wanted_{0}, active_{0};  // the last two change under the mutex
+  std::atomic<int> next_{0}, wanted_{0}, active_{0};  // wanted_ and active_ change only under mutex_
   std::exception_ptr error_;
   int units_ = 0, started_ = 0;
-  int alone_ = 0, penalty_ = 0;  // loops to run alone yet, and after the next late helper
+  int serial_loops_left_ = 0, backoff_ = 0;  // loops to run without helpers: now, and after the last late helper
 };
 
 }  // namespace
 
 void parallel_for(int units, int threads, const std::function<void(int)>& work) {
-  static Pool& pool = *new Pool;  // never destroyed: its threads wait in it until the process ends
+  static Pool& pool = *new Pool;  // never destroyed: its threads use it until the process ends
   pool.run(units, threads, work);
 }
 

@@ -1,9 +1,9 @@
 // What a training step does to every pixel and every parameter besides rendering: the losses with their gradients in
-// one sweep, figures of the fit, and Adam. The readable versions are in losses.py and densify.py; tests compare them.
+// one pass, figures of the fit, and Adam. The same in PyTorch is in losses.py and train/; tests compare the two.
 //
 // Images are [count, height, width, channels] float32. Work is cut into bands of rows (or blocks of parameters) of a
-// fixed size whose sums are added in order, so the result does not depend on the number of threads. The loops over each row
-// are in rows.h, once for each instruction set.
+// fixed size whose sums are added in order, so the result does not depend on the number of threads. The loops over each
+// row are in rows.h, once for each instruction set.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -41,9 +41,11 @@ struct Shape {
   double edges() const { return double(count) * (height - 2) * (width - 2) * channels; }
 };
 
-struct Band { int image, begin, end; };  // rows begin .. end - 1
+struct Band {
+  int image, begin, end;
+};  // rows begin .. end - 1
 
-// Returns the sum of work(band) over all bands of all images, added in their order; Sum{} is nothing.
+// Returns the sum of work(band) over all bands of all images, added in their order.
 template <typename Sum = double, typename Work>
 Sum sum_over_bands(const Shape& shape, int threads, Work work) {
   const int per_image = (shape.height + kBandRows - 1) / kBandRows;
@@ -80,12 +82,14 @@ double edge_band(const Shape& shape, const Band& band, float scale, float* gradi
   Rows sign_x(band.begin - 1, band.end + 1, n, c), sign_y(band.begin - 1, band.end + 1, n, c);
   std::vector<float> inside(n, 0.0f), halo(n);
   for (int y = std::max(band.begin - 1, 1); y < std::min(band.end + 1, shape.height - 1); ++y) {
-    float* sums = y >= band.begin && y < band.end ? inside.data() : halo.data();  // a neighbour counts its own rows
+    float* sums = y >= band.begin && y < band.end
+                      ? inside.data()
+                      : halo.data();  // the other rows are counted by the neighbouring bands
     loops->sobel_row(n, c, difference[y - 1], difference[y], difference[y + 1], sign_x[y], sign_y[y], sums);
   }
   for (int y = band.begin; gradient && y < band.end; ++y)
-    loops->sobel_gradient_row(n, c, scale, sign_x[y - 1], sign_x[y], sign_x[y + 1], sign_y[y - 1], sign_y[y + 1], slope[y],
-                              gradient + size_t(y) * n);
+    loops->sobel_gradient_row(n, c, scale, sign_x[y - 1], sign_x[y], sign_x[y + 1], sign_y[y - 1], sign_y[y + 1],
+                              slope[y], gradient + size_t(y) * n);
   return total(inside);
 }
 
@@ -103,7 +107,7 @@ double ssim_band(const Shape& shape, const Band& band, float scale, Rows& a, Row
   static const Window w = gaussian_window();
   const int n = shape.row(), c = shape.channels, reach = gradient ? kReach : 0;
   const int first = std::max(band.begin - reach, 0), last = std::min(band.end + reach, shape.height);
-  const std::vector<float> sky(n, 0.0f);  // what lies outside the image
+  const std::vector<float> outside_image(n, 0.0f);
   Rows columns(0, 4, n, kReach * c), by_mean(first, last, n), by_squares(first, last, n), by_product(first, last, n);
   std::vector<float> inside(n, 0.0f), halo(n);
   const float *rows_a[kTaps], *rows_b[kTaps];
@@ -111,8 +115,8 @@ double ssim_band(const Shape& shape, const Band& band, float scale, Rows& a, Row
     for (int k = 0; k < kTaps; ++k) {
       const int row = y + k - kReach;
       const bool outside = row < 0 || row >= shape.height;
-      rows_a[k] = outside ? sky.data() : a[row];
-      rows_b[k] = outside ? sky.data() : b[row];
+      rows_a[k] = outside ? outside_image.data() : a[row];
+      rows_b[k] = outside ? outside_image.data() : b[row];
     }
     loops->blur_down_products(n, w, rows_a, rows_b, columns[0], columns[1], columns[2], columns[3]);
     float* sums = y >= band.begin && y < band.end ? inside.data() : halo.data();
@@ -124,7 +128,7 @@ double ssim_band(const Shape& shape, const Band& band, float scale, Rows& a, Row
     for (int s = 0; s < 3; ++s) {
       for (int k = 0; k < kTaps; ++k) {
         const int row = y + k - kReach;
-        rows_a[k] = row < first || row >= last ? sky.data() : (*slopes[s])[row];
+        rows_a[k] = row < first || row >= last ? outside_image.data() : (*slopes[s])[row];
       }
       loops->blur_down(n, w, rows_a, columns[s]);
     }
@@ -134,7 +138,8 @@ double ssim_band(const Shape& shape, const Band& band, float scale, Rows& a, Row
   return total(inside);
 }
 
-// ------------------------------------------------------------------------------------------------ doors to Python
+// ------------------------------------------------------------------------------------------------ the interface to
+// Python
 
 Shape shape_of(const Array& images, const char* name) {
   if (images.ndim() != 4)
@@ -220,8 +225,7 @@ double published(Array radiance, Array dn, Array gains, const SensorModel& s, do
       loops->scale_row(n, float(l1_scale), by_radiance);
     }
     double sum = l1_scale * total(sums);
-    if (ssim_weight != 0)
-      sum += ssim_scale * ssim_band(shape, band, float(-ssim_scale), a, slope, b, image_gradient);
+    if (ssim_weight != 0) sum += ssim_scale * ssim_band(shape, band, float(-ssim_scale), a, slope, b, image_gradient);
     if (edge_weight != 0)
       sum += edge_scale * edge_band(shape, band, float(edge_scale), image_gradient,
                                     [&](int y, float* difference, float* by_radiance) {
@@ -256,7 +260,7 @@ std::pair<double, double> fit(Array radiance, Array alpha, Array dn, Array gains
       const size_t at = band.image * shape.image() + size_t(y) * n;
       loops->squared_error_row(n, r + at, d + at, gain[band.image], s, errors.data());
       const float* row = opaque + at / c;
-      int x0 = 0, x1 = shape.width;  // the part of the row that may hold target
+      int x0 = 0, x1 = shape.width;  // beyond x0 and x1 - 1 nothing is opaque enough
       while (x0 < x1 && !(row[x0] > least_alpha)) ++x0;
       while (x0 < x1 && !(row[x1 - 1] > least_alpha)) --x1;
       for (int x = x0; x < x1; ++x) std::fill_n(seen.begin() + x * c, c, row[x] > least_alpha ? 1.0f : 0.0f);
@@ -300,11 +304,15 @@ void bind_training(nb::module_& m) {
       .def("__init__", [](SensorModel* self, double black_dn, double white_dn, double electrons_per_dn,
                           double read_noise_dn, double averaged_pixels) {
         const double read_noise_e = read_noise_dn * electrons_per_dn;
-        new (self) SensorModel{float(black_dn), float(white_dn), float(1 / electrons_per_dn), float(electrons_per_dn),
+        new (self) SensorModel{float(black_dn),
+                               float(white_dn),
+                               float(1 / electrons_per_dn),
+                               float(electrons_per_dn),
                                float(read_noise_dn * read_noise_dn + 1.0 / 12),
-                               float(3.0 / 8 + read_noise_e * read_noise_e), float(std::sqrt(averaged_pixels))};
+                               float(3.0 / 8 + read_noise_e * read_noise_e),
+                               float(std::sqrt(averaged_pixels))};
       });
-  // what is filled in place must not be converted: the caller would get back an untouched original
+  // arrays that are filled in place must not be converted: the result would go into a copy
   m.def("likelihood", &obbgs::likelihood, "radiance"_a, "dn"_a, "gains"_a, "sensor"_a, "edge_weight"_a,
         "residual"_a.noconvert(), "gradient"_a.none().noconvert(), "threads"_a);
   m.def("published", &obbgs::published, "radiance"_a, "dn"_a, "gains"_a, "sensor"_a, "ssim_weight"_a, "edge_weight"_a,

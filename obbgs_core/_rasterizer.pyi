@@ -1,0 +1,128 @@
+"""Types of the compiled module; its source is render/kernels/. Arrays are float32, C-contiguous and on the CPU."""
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+Array: TypeAlias = NDArray[np.float32] | Tensor
+
+MIN_ALPHA: float
+LOG2_MIN_ALPHA: float
+MAX_ALPHA: float
+MIN_TRANSMITTANCE: float
+MIN_DEPTH_ALPHA: float
+DILATION_PX2: float
+FOV_MARGIN: float
+SOFTNESS: float
+
+def kernels() -> list[str]: ...
+def use_kernel(name: str) -> None: ...
+
+class Rasterization:
+    def __init__(
+        self,
+        kernel: str,
+        width: int,
+        height: int,
+        near_m: float,
+        means: Array,
+        quats: Array,
+        log_scales: Array,
+        opacity_logits: Array,
+        sh: Array,
+        world_to_camera: Array,
+        K: Array,
+        sun_dir: Array | None,
+        sunlit: Array | None,
+        ambient: float,
+    ) -> None: ...
+    def forward(
+        self,
+        threads: int,
+        radiance: Array,
+        alpha: Array,
+        depth: Array,
+        median_depth: Array,
+        normals: Array | None,
+        means2d: Array,
+        radii: Array,
+    ) -> None: ...
+    def backward(
+        self,
+        threads: int,
+        radiance: Array,
+        depth: Array,
+        normals: Array | None,
+        grad_radiance: Array | None,
+        grad_alpha: Array | None,
+        grad_depth: Array | None,
+        grad_normals: Array | None,
+        grad_means2d: Array | None,
+        means: Array,
+        quats: Array,
+        log_scales: Array,
+        opacity_logits: Array,
+        sh: Array,
+        world_to_camera: Array,
+        ambient: Array,
+        screen_means2d: Array,
+        pixels: Array,
+    ) -> None: ...
+    @property
+    def pairs(self) -> int: ...
+    @property
+    def bytes(self) -> int: ...
+
+class SensorModel:
+    def __init__(
+        self,
+        black_dn: float,
+        white_dn: float,
+        electrons_per_dn: float,
+        read_noise_dn: float,
+        averaged_pixels: float,
+    ) -> None: ...
+
+def likelihood(
+    radiance: Array,
+    dn: Array,
+    gains: Array,
+    sensor: SensorModel,
+    edge_weight: float,
+    residual: Array,
+    gradient: Array | None,
+    threads: int,
+) -> float: ...
+def published(
+    radiance: Array,
+    dn: Array,
+    gains: Array,
+    sensor: SensorModel,
+    ssim_weight: float,
+    edge_weight: float,
+    residual: Array,
+    gradient: Array | None,
+    threads: int,
+) -> float: ...
+def fit(
+    radiance: Array,
+    alpha: Array,
+    dn: Array,
+    gains: Array,
+    sensor: SensorModel,
+    least_alpha: float,
+    threads: int,
+) -> tuple[float, float]: ...
+def adam_step(
+    parameter: Array,
+    gradient: Array,
+    first: Array,
+    second: Array,
+    rate: float,
+    b1: float,
+    b2: float,
+    eps: float,
+    threads: int,
+) -> None: ...

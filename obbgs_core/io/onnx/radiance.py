@@ -1,0 +1,101 @@
+"""The radiance of `render.lighting` in an ONNX graph."""
+
+import numpy as np
+
+from obbgs_core.io.onnx.graph import Graph, to_numpy
+from obbgs_core.io.onnx.projection import View
+from obbgs_core.io.onnx.shadow import lit_shares
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.sh import (
+    C0,
+    C1,
+    C2_XX_YY,
+    C2_XY,
+    C2_ZZ,
+    C3_XYZ,
+    C3_YXX,
+    C3_YZZ,
+    C3_ZXX,
+    C3_ZZZ,
+    SOFTNESS,
+)
+from obbgs_core.render.lighting import shortest_axes
+
+# The harmonics of `sh.sh_basis` as polynomials of the direction: terms (coefficient, powers of x, y and z).
+SH_TERMS = [
+    [(C0, 0, 0, 0)],
+    [(-C1, 0, 1, 0)],
+    [(C1, 0, 0, 1)],
+    [(-C1, 1, 0, 0)],
+    [(C2_XY, 1, 1, 0)],
+    [(-C2_XY, 0, 1, 1)],
+    [(2 * C2_ZZ, 0, 0, 2), (-C2_ZZ, 2, 0, 0), (-C2_ZZ, 0, 2, 0)],
+    [(-C2_XY, 1, 0, 1)],
+    [(C2_XX_YY, 2, 0, 0), (-C2_XX_YY, 0, 2, 0)],
+    [(-3 * C3_YXX, 2, 1, 0), (C3_YXX, 0, 3, 0)],
+    [(C3_XYZ, 1, 1, 1)],
+    [(-4 * C3_YZZ, 0, 1, 2), (C3_YZZ, 2, 1, 0), (C3_YZZ, 0, 3, 0)],
+    [(2 * C3_ZZZ, 0, 0, 3), (-3 * C3_ZZZ, 2, 0, 1), (-3 * C3_ZZZ, 0, 2, 1)],
+    [(-4 * C3_YZZ, 1, 0, 2), (C3_YZZ, 3, 0, 0), (C3_YZZ, 1, 2, 0)],
+    [(C3_ZXX, 2, 0, 1), (-C3_ZXX, 0, 2, 1)],
+    [(-C3_YXX, 3, 0, 0), (3 * C3_YXX, 1, 2, 0)],
+]
+
+
+def radiance_towards(g: Graph, gaussians: Gaussians, camera: View) -> str:
+    """Return the radiance [N, C] towards the camera, as `render.lighting.radiance_along`."""
+    sh = to_numpy(gaussians.sh)
+    constant = (np.logaddexp(0, SOFTNESS * C0 * sh[:, 0]) / SOFTNESS).astype(np.float32)
+    if gaussians.shading == "lambert":
+        return g.op("Mul", constant, g.op("Unsqueeze", _light(g, gaussians, camera), g.ints(1)))
+    if sh.shape[1] == 1:
+        return g.value(constant)
+    if gaussians.shading == "sun":
+        direction = g.op("Reshape", "sun_dir", g.ints(1, 3))
+    else:
+        direction = _directions(g, gaussians, camera)
+    basis = _sh_basis(g, direction, sh.shape[1])  # [N, K, 1], or [1, K, 1] for the Sun's direction
+    return _softplus(g, g.op("ReduceSum", g.op("Mul", basis, sh), g.ints(1), keepdims=0))
+
+
+def _directions(g: Graph, gaussians: Gaussians, camera: View) -> str:
+    """Return unit vectors from the camera to each Gaussian [N, 3]."""
+    centre = g.op("Neg", g.op("MatMul", camera.t, camera.R))  # [1, 3]
+    direction = g.op("Sub", to_numpy(gaussians.means), centre)
+    length = g.op("Sqrt", g.op("ReduceSum", g.op("Mul", direction, direction), g.ints(1), keepdims=1))
+    return g.op("Div", direction, g.op("Max", length, 1e-12))
+
+
+def _light(g: Graph, gaussians: Gaussians, camera: View) -> str:
+    """Return the irradiance of each Gaussian [N] over that of a surface that faces the Sun, ambient light included."""
+    normals = to_numpy(shortest_axes(gaussians))
+    along = g.op("ReduceSum", g.op("Mul", _directions(g, gaussians, camera), normals), g.ints(1), keepdims=0)
+    facing = g.op("Neg", g.op("Sign", along))
+    cosine = g.op("Mul", g.op("MatMul", normals, "sun_dir"), facing)
+    light = g.op("Mul", _softplus(g, cosine), lit_shares(g, gaussians))
+    return g.op("Add", light, float(gaussians.ambient))
+
+
+def _softplus(g: Graph, value: str) -> str:
+    return g.op("Div", g.op("Softplus", g.op("Mul", value, SOFTNESS)), SOFTNESS)
+
+
+def _sh_basis(g: Graph, direction: str, count: int) -> str:
+    """Return the first `count` harmonics [N, count, 1] at directions [N, 3]: all monomials times a matrix."""
+    monomials = sorted(
+        {powers for terms in SH_TERMS[:count] for _, *rest in terms for powers in [tuple(rest)]}
+    )
+    axes = [g.op("Gather", direction, g.ints(i), axis=1) for i in range(3)]  # [N, 1]
+    columns = []
+    for powers in monomials:
+        column = g.op("Add", g.op("Mul", axes[0], 0.0), 1.0)
+        for axis, power in zip(axes, powers, strict=True):
+            for _ in range(power):
+                column = g.op("Mul", column, axis)
+        columns.append(column)
+    matrix = np.zeros((len(monomials), count), dtype=np.float32)
+    for k, terms in enumerate(SH_TERMS[:count]):
+        for coefficient, *powers in terms:
+            matrix[monomials.index(tuple(powers)), k] += coefficient
+    basis = g.op("MatMul", g.op("Concat", *columns, axis=1), matrix)
+    return g.op("Unsqueeze", basis, g.ints(2))

@@ -1,0 +1,115 @@
+"""The rasterizer in readable PyTorch: the truth that every compiled kernel is compared with; any dtype and device."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.render.lighting import normals_towards, radiance_along
+from obbgs_core.render.projection import project, with_zeros_for_invalid
+from obbgs_core.render.rendered import Rendered, ScreenGradients
+
+# The kernels have the same numbers in kernels/rasterizer.h; a test compares them.
+MIN_ALPHA = 1 / 255  # fainter contributions are skipped (Kerbl et al. 2023)
+MAX_ALPHA = 0.99
+MIN_TRANSMITTANCE = 1e-4  # a pixel is finished before its transmittance would fall below
+MIN_DEPTH_ALPHA = 1e-6  # the depth is 0 where alpha is not above this
+BAND_ELEMENTS = 4_000_000  # pixels times Gaussians that are composited at once: bounds the memory
+
+
+def render_reference(
+    gaussians: Gaussians, cameras: Cameras, suns: Tensor | None, sunlit: Tensor | None, normals: bool
+) -> Rendered:
+    """Render with plain PyTorch; arguments as of `backends.rasterize`."""
+    projected = project(gaussians, cameras)
+    gaussians, _ = with_zeros_for_invalid(gaussians)
+    directions = gaussians.means[None] - cameras.centres[:, None]  # [C, N, 3]
+    directions = directions / directions.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+    channels = gaussians.sh.shape[2]
+    screen = ScreenGradients()
+    images, alphas, medians = [], [], []
+    for c in range(len(cameras)):
+        means2d, conics, depths = projected.means2d[c], projected.conics[c], projected.depths[c]
+        sun, share = (None if each is None else each[c] for each in (suns, sunlit))
+        features = [radiance_along(gaussians, directions[c], sun, share), depths[:, None]]
+        if normals:
+            features.append(normals_towards(gaussians, directions[c]))
+        image, transmittance, median = composite(
+            means2d,
+            conics,
+            gaussians.opacities,
+            depths,
+            torch.cat(features, dim=1),
+            cameras.width,
+            cameras.height,
+        )
+        screen.watch(c, means2d, _pixels_touched(conics, gaussians.opacities, depths))
+        images.append(image)
+        alphas.append(1 - transmittance)
+        medians.append(median)
+    image, alpha = torch.stack(images), torch.stack(alphas)
+    depth = image[..., channels] / alpha.clamp(min=MIN_DEPTH_ALPHA)
+    return Rendered(
+        radiance=image[..., :channels],
+        alpha=alpha,
+        depth=torch.where(alpha > MIN_DEPTH_ALPHA, depth, torch.zeros_like(depth)),
+        median_depth=torch.stack(medians),
+        means2d=projected.means2d,
+        radii=projected.radii,
+        normals=image[..., channels + 1 :] if normals else None,
+        screen=screen,
+    )
+
+
+def composite(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    depths: Tensor,
+    features: Tensor,
+    width: int,
+    height: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Composite one camera's Gaussians front to back.
+
+    Args:
+        means2d: [N, 2] px; conics: [N, 3] px⁻²; opacities: [N]; depths: [N] m, 0 for those not drawn.
+        features: [N, F] of each Gaussian, blended like its colour.
+
+    Returns:
+        image [H, W, F], transmittance [H, W], median depth [H, W] m.
+    """
+    order = torch.argsort(depths, stable=True)
+    order = order[depths[order] > 0]
+    rows = max(1, BAND_ELEMENTS // max(1, width * len(order)))
+    ys = torch.arange(height, dtype=means2d.dtype, device=means2d.device) + 0.5
+    xs = torch.arange(width, dtype=means2d.dtype, device=means2d.device) + 0.5
+    bands = []
+    for band in ys.split(rows):
+        dx = xs[None, :, None] - means2d[order, 0]  # [h, W, N]
+        dy = band[:, None, None] - means2d[order, 1]
+        a, b, c = conics[order].unbind(-1)
+        power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
+        alpha = (opacities[order] * power.clamp(max=0).exp()).clamp(max=MAX_ALPHA)
+        alpha = torch.where(alpha >= MIN_ALPHA, alpha, torch.zeros_like(alpha))
+        after = torch.cumprod(1 - alpha, dim=-1)
+        alpha = torch.where(after >= MIN_TRANSMITTANCE, alpha, torch.zeros_like(alpha))
+        after = torch.cumprod(1 - alpha, dim=-1)
+        before = torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], dim=-1)
+        crossing = (before > 0.5) & (after <= 0.5)
+        final = after[..., -1].clone() if len(order) else torch.ones(dx.shape[:2]).to(means2d)
+        median = (crossing * depths[order]).sum(-1).detach()
+        bands.append(((alpha * before) @ features[order], final, median))
+    image, transmittance, median = (torch.cat(parts) for parts in zip(*bands, strict=True))
+    return image, transmittance, median
+
+
+@torch.no_grad()
+def _pixels_touched(conics: Tensor, opacities: Tensor, depths: Tensor) -> Tensor:
+    """Return the area [N] px of each ellipse alpha >= MIN_ALPHA; the kernels count the pixels instead."""
+    squared_radius = 2 * torch.log((opacities / MIN_ALPHA).clamp(min=1))  # in sigmas
+    determinant = (conics[:, 0] * conics[:, 2] - conics[:, 1] ** 2).clamp(min=1e-12)
+    area = math.pi * squared_radius / determinant.sqrt()
+    return torch.where(depths > 0, area, torch.zeros_like(area))

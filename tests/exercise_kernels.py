@@ -1,0 +1,190 @@
+"""Calls every function of a compiled module with NumPy arrays, many threads and awkward shapes, without PyTorch.
+
+`tests/sanitize.py` runs it under the sanitizers: python -m tests.exercise_kernels MODULE.so
+"""
+
+import importlib.machinery
+import importlib.util
+import sys
+import time
+from types import ModuleType
+
+import numpy as np
+
+THREADS = (1, 2, 4)
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+SIZES = [(33, 70), (1, 1), (97, 31)]  # height and width, px: neither is a multiple of a block or tile
+KINDS = [
+    (1, 1, "view"),
+    (4, 3, "view"),
+    (16, 3, "view"),
+    (9, 1, "sun"),
+    (1, 3, "lambert"),
+]  # coefficients, channels
+
+
+def load(path: str) -> ModuleType:
+    """Return the compiled module in a file, whatever is installed."""
+    loader = importlib.machinery.ExtensionFileLoader("_rasterizer", path)
+    spec = importlib.util.spec_from_loader("_rasterizer", loader)
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    loader.exec_module(module)
+    return module
+
+
+def model(rng: np.random.Generator, count: int, coefficients: int, channels: int, hostile: bool) -> dict:
+    """Return the arrays of a model; a hostile one holds infinities, NaN, zeros and huge numbers as well."""
+    arrays = {
+        "means": rng.normal(size=(count, 3)) * 0.5,
+        "quats": rng.normal(size=(count, 4)),
+        "log_scales": rng.uniform(-5, -1, (count, 3)),
+        "opacity_logits": 2 * rng.normal(size=count),
+        "sh": rng.uniform(-0.3, 1.0, (count, coefficients, channels)),
+    }
+    if hostile and count:
+        awkward = [np.nan, np.inf, -np.inf, 0.0, 1e30, -1e30, FLOAT32_MAX, 200.0, -200.0, 1e-40]
+        for array in arrays.values():
+            flat = array.reshape(-1)
+            flat[rng.integers(0, flat.size, max(1, flat.size // 20))] = rng.choice(awkward)
+            flat[rng.integers(0, flat.size, max(1, flat.size // 20))] = rng.choice(awkward)
+    return {name: array.astype(np.float32) for name, array in arrays.items()}
+
+
+def cameras(rng: np.random.Generator, count: int, height: int, width: int) -> dict:
+    """Return cameras that look at the origin from 4 m, and the Sun's directions."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    poses[:, 2, 3] = 4.0
+    K = np.array([[1.2 * width, 0, width / 2 - 0.7], [0, 1.1 * width, height / 2 + 1.3], [0, 0, 1]])
+    suns = rng.normal(size=(count, 3))
+    suns /= np.linalg.norm(suns, axis=1, keepdims=True)
+    arrays = {"world_to_camera": poses, "K": np.tile(K, (count, 1, 1)), "sun_dir": suns}
+    return {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in arrays.items()}
+
+
+def rasterize(
+    module: ModuleType, kernel: str, scene: dict, size: tuple[int, int], threads: int
+) -> list[np.ndarray]:
+    """Return all that the forward and the backward pass write."""
+    gaussians, views = len(scene["means"]), len(scene["world_to_camera"])
+    rasterization = module.Rasterization(
+        kernel=kernel, height=size[0], width=size[1], near_m=0.01, ambient=0.1, **scene
+    )
+    channels = scene["sh"].shape[2]
+    radiance, normals = empty(views, *size, channels), empty(views, *size, 3)
+    alpha, depth, median_depth = (empty(views, *size) for _ in range(3))
+    means2d, radii = empty(views, gaussians, 2), empty(views, gaussians)
+    rasterization.forward(threads, radiance, alpha, depth, median_depth, normals, means2d, radii)
+    names = ("means", "quats", "log_scales", "opacity_logits", "sh", "world_to_camera")
+    gradients = [np.empty_like(scene[name]) for name in names]
+    gradients += [empty(1), empty(views, gaussians, 2), empty(views, gaussians)]
+    images = (np.ones_like(image) for image in (radiance, alpha, depth, normals))
+    rasterization.backward(threads, radiance, depth, normals, *images, np.ones_like(means2d), *gradients)
+    assert rasterization.bytes >= rasterization.pairs >= 0
+    return [radiance, alpha, depth, median_depth, normals, means2d, radii, *gradients]
+
+
+def empty(*shape: int) -> np.ndarray:
+    return np.full(shape, np.nan, dtype=np.float32)
+
+
+def exercise_rasterizer(module: ModuleType, kernel: str) -> None:
+    for coefficients, channels, shading in KINDS:
+        for height, width in SIZES:
+            for count in (0, 1, 17, 1500):
+                rng = np.random.default_rng(count)
+                scene = model(rng, count, coefficients, channels, hostile=False)
+                scene |= cameras(rng, 2, height, width)
+                scene["sunlit"] = rng.random((2, count), dtype=np.float32) if shading == "lambert" else None
+                scene["sun_dir"] = None if shading == "view" else scene["sun_dir"]
+                results = [rasterize(module, kernel, scene, (height, width), threads) for threads in THREADS]
+                for other in results[1:]:  # the number of threads changes no bit
+                    assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
+                assert all(np.isfinite(array).all() for array in results[0])
+                hostile = scene | model(rng, count, coefficients, channels, hostile=True)
+                rasterize(module, kernel, hostile, (height, width), 2)
+
+
+def exercise_losses(module: ModuleType) -> None:
+    """Call the losses on images with clipped and invalid readings."""
+    rng = np.random.default_rng(1)
+    for averaged_pixels in (1.0, 4.0):
+        sensor = module.SensorModel(64.0, 4095.0, 2.0, 3.0, averaged_pixels)
+        for shape in [(2, 53, 37, 3), (1, 3, 3, 1), (3, 130, 20, 1)]:
+            dn = np.round(np.clip(rng.uniform(-200, 4500, shape), 0, 4095)).astype(np.float32)
+            gains = np.full(shape[0], 4e3, dtype=np.float32)
+            radiance = ((dn - 64) / 4e3 * rng.uniform(0.8, 1.2, shape)).astype(np.float32)
+            for invalid in (False, True):
+                if invalid:
+                    flat = radiance.reshape(-1)
+                    flat[rng.integers(0, flat.size, 9)] = [
+                        np.nan,
+                        np.inf,
+                        -np.inf,
+                        1e38,
+                        -1e38,
+                        1e-40,
+                        0,
+                        1e9,
+                        -1e9,
+                    ]
+                results = []
+                for threads in THREADS:
+                    residual, gradient = np.empty_like(dn), np.empty_like(dn)
+                    value = module.likelihood(radiance, dn, gains, sensor, 0.2, residual, gradient, threads)
+                    results.append([np.float64(value), residual.copy(), gradient.copy()])
+                    value = module.published(
+                        radiance, dn, gains, sensor, 0.2, 0.1, residual, gradient, threads
+                    )
+                    results[-1] += [np.float64(value), residual, gradient]
+                    alpha = rng.random(shape[:3], dtype=np.float32)
+                    module.fit(radiance, alpha, dn, gains, sensor, 0.05, threads)
+                    module.likelihood(radiance, dn, gains, sensor, 0.0, residual, None, threads)
+                for other in results[1:]:
+                    assert all(
+                        np.array_equal(a, b, equal_nan=True) for a, b in zip(results[0], other, strict=True)
+                    )
+
+
+def exercise_adam(module: ModuleType) -> None:
+    for count in (1, 1000, 100_003):
+        results = []
+        for threads in THREADS:
+            rng = np.random.default_rng(count)
+            parameter, first, second = (rng.random(count, dtype=np.float32) for _ in range(3))
+            for _ in range(3):
+                gradient = rng.normal(size=count).astype(np.float32)
+                module.adam_step(parameter, gradient, first, second, 0.01, 0.9, 0.999, 1e-15, threads)
+            results.append([parameter, first, second])
+        for other in results[1:]:
+            assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def exercise_refusals(module: ModuleType) -> None:
+    """Arrays of wrong sizes must raise errors before anything is read."""
+    rng = np.random.default_rng(0)
+    scene = model(rng, 5, 4, 3, hostile=False) | cameras(rng, 1, 8, 8) | {"sunlit": None}
+    wrong = {"means": empty(4, 3), "sh": empty(5, 5, 3), "K": empty(2, 3, 3), "sun_dir": empty(2, 3)}
+    for name, array in wrong.items():
+        try:
+            rasterize(module, "portable", scene | {name: array}, (8, 8), 1)
+        except ValueError:
+            continue
+        raise AssertionError(f"{name} of a wrong size was accepted")
+
+
+def main() -> None:
+    module = load(sys.argv[1])
+    exercise_refusals(module)
+    for kernel in module.kernels():
+        began = time.monotonic()
+        module.use_kernel(kernel)
+        exercise_rasterizer(module, kernel)
+        exercise_losses(module)
+        exercise_adam(module)
+        print(f"  {kernel}: {time.monotonic() - began:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()
