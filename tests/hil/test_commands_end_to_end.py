@@ -292,7 +292,7 @@ def test_without_a_listener_the_command_opens_the_link_itself_and_without_a_link
     ):
         options = ("--session", session, "--key", key)
         nobody = tools.run("ground", "uplink", "ping", *options)
-        assert nobody.returncode == 1 and "no `ground listen` has the link" in nobody.stderr
+        assert nobody.returncode == 1 and "no `ground listen` receives into" in nobody.stderr
         direct = tools.run(
             "ground", "uplink", "ping", *options, "--link", line.ground_url, "--mission", mission
         )
