@@ -65,15 +65,17 @@ class TrainingState:
 
     @staticmethod
     def load(path: Path, fingerprint: str) -> "TrainingState | None":
-        """Return the state in a file; None if there is no file, or if it is of another training or version."""
+        """Return the state in a file; None if there is none, or if it is damaged or of another training or version."""
         if not path.exists():
             return None
         try:
             with torch.serialization.safe_globals(SAVED):
                 saved = torch.load(path, weights_only=True)
             same = saved["fingerprint"] == f"{FORMAT} {fingerprint}"
-        except pickle.UnpicklingError:  # another version of this program saved it, with other classes
-            saved, same = {}, False
+        except (pickle.UnpicklingError, RuntimeError, EOFError, LookupError, TypeError) as error:
+            # half a file, or one that another version of this program saved, with other classes
+            log.warning("%s is damaged or of another version, it is not used: %s", path, error)
+            return None
         if not same:
             log.warning("%s belongs to another training: it is not used", path)
             return None

@@ -62,7 +62,16 @@ def test_a_checkpoint_of_another_version_is_not_used_and_nothing_else_in_it_is_b
 ):
     torch.save(content, tmp_path / "c")  # the sensor's class is not among those that a checkpoint may hold
     trainer = Trainer(frames, SENSOR, preset("obbgs", QUICK))
-    assert not trainer.resume(tmp_path / "c") and "belongs to another training" in caplog.text
+    assert not trainer.resume(tmp_path / "c") and "it is not used" in caplog.text
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
+def test_a_damaged_checkpoint_is_not_used(frames, tmp_path, caplog, share):
+    trainer = Trainer(frames, SENSOR, preset("obbgs", QUICK))
+    trainer.save(tmp_path / "c")
+    whole = (tmp_path / "c").read_bytes()
+    (tmp_path / "c").write_bytes(whole[: round(share * len(whole))])
+    assert not trainer.resume(tmp_path / "c") and "is damaged" in caplog.text
 
 
 def test_the_time_limit_ends_the_training_and_says_so(frames):
