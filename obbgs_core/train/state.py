@@ -72,7 +72,7 @@ class TrainingState:
             with torch.serialization.safe_globals(SAVED):
                 saved = torch.load(path, weights_only=True)
             same = saved["fingerprint"] == f"{FORMAT} {fingerprint}"
-        except (pickle.UnpicklingError, RuntimeError, EOFError, LookupError, TypeError) as error:
+        except (pickle.UnpicklingError, RuntimeError, OSError, EOFError, LookupError, TypeError) as error:
             # half a file, or one that another version of this program saved, with other classes
             log.warning("%s is damaged or of another version, it is not used: %s", path, error)
             return None
