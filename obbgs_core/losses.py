@@ -30,7 +30,8 @@ def likelihood_loss(
 ) -> tuple[Tensor, Tensor]:
     """Return the robust negative log likelihood of readings plus weighted edges, and the noise-normalised residual.
 
-    Edges are compared on the scale where noise is the same everywhere, with the prediction clamped at full scale.
+    Edges are compared after `Sensor.stabilised`, where noise is the same everywhere, with the prediction clamped at
+    full scale.
 
     Args:
         radiance: predicted [B, H, W, C]; the loss has a gradient by it.
@@ -134,8 +135,9 @@ def fit_figures(
 
     chi² is the squared difference of readings and their expectation over the variance that noise gives them, both
     summed where alpha [B, H, W] exceeds 0.05: 1 when the model is true, above where it errs, NaN where nothing is seen.
-    Clipped readings vary less than others and have less weight; a saturated mean of several pixels has none, since some
-    of its pixels need not be saturated. The other arguments are as for `likelihood_loss`.
+    Mean and variance are those of clipped readings, which vary less than others and so have less weight; a saturated
+    mean of several pixels has none, since some of its pixels need not be saturated. The other arguments are as for
+    `likelihood_loss`.
     """
     native = compiled.module_for(radiance, alpha, exposure_time_s, dn)
     if native is not None:
@@ -155,7 +157,7 @@ def fit_figures(
 
 
 def charbonnier(normalised_residual: Tensor, knee: float = 2.0) -> Tensor:
-    """Return the mean robust penalty: half the square below `knee` sigma, linear beyond."""
+    """Return the mean robust penalty: half the square well below `knee` sigma, growing by `knee` a sigma well above."""
     return (knee * knee * ((1 + (normalised_residual / knee) ** 2).sqrt() - 1)).mean()
 
 

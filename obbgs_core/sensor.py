@@ -73,8 +73,9 @@ class Sensor:
         (predicted - read) / sigma. A reading at a clip says only "at most this much" or "at least this much": its
         likelihood is the probability of lying beyond the clip, and a prediction far beyond has no residual.
 
-        A mean of several sensor pixels is not a clipped normal variable: its expectation is that of readings clipped at
-        zero, its noise is smaller by the root of their number, and a prediction above a saturated one has no residual.
+        A mean of `averaged_pixels` readings is no clipped normal variable: its expectation is that of readings clipped
+        at zero, its noise is smaller by the root of their number. One that holds a saturated reading is given as full
+        scale (`train.batches.averaged`), and a prediction above it has no residual.
 
         Source: Tobin, Estimation of relationships for limited dependent variables, 1958.
         """
@@ -91,10 +92,11 @@ class Sensor:
         return torch.where(saturated | (dn <= 0), at_a_clip, (expected - dn) / sigma)
 
     def stabilised(self, dn: Tensor) -> Tensor:
-        """Return readings on a scale where noise has unit variance everywhere and the black level is 0.
+        """Return readings on a scale where shot and read noise have nearly unit variance everywhere and black is 0.
 
-        The generalised Anscombe transform minus its value at the black level, in the form that loses no digits where
-        read noise is far larger than shot noise.
+        The generalised Anscombe transform minus its value at the black level, written so that it loses no digits where
+        read noise is far larger than shot noise: 2 (sqrt(e + f) - sqrt(f)) = 2 e / (sqrt(e + f) + sqrt(f)) for e
+        electrons and the floor f. Quantisation is left out of it.
         """
         signal_e = (dn - self.black_dn) * self.electrons_per_dn
         floor = 3 / 8 + (self.read_noise_dn * self.electrons_per_dn) ** 2

@@ -11,8 +11,8 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.rotations import quats_to_matrices
 from obbgs_core.model.sh import C0, fit, from_radiance, radiance, sh_basis, softplus
 
-INITIAL_ALBEDO = 2.0  # over a Gaussian's mean radiance: half of its Suns shine on its other side
-INITIAL_AMBIENT = 0.02
+INITIAL_ALBEDO = 2.0  # over a Gaussian's mean radiance: half of the Suns, about, shine on its other side
+INITIAL_AMBIENT = 0.02  # in units of the Sun's light
 
 
 def radiance_along(

@@ -19,14 +19,12 @@ from obbgs_core.render.lighting import constant_radiance, without_sun
 
 SHADOW_MAP_PX = 256  # width and height
 SHADOW_MARGIN_PX = 2  # added around the map, lit everywhere
-SUN_DISTANCE = (
-    300.0  # in radii of the model: its rays are parallel to 0.2 degrees, less than the Sun's diameter
-)
+# in radii of the model: its rays are parallel to 0.2 degrees, less than the Sun's diameter
+SUN_DISTANCE = 300.0
 INLIER_QUANTILE = 0.99  # of the centres' distances: Gaussians farther out neither cast nor receive shadows
 BALL_MARGIN = 1.1
-# How deep behind the first surface a Gaussian is still fully lit, and from which depth on it is in full shadow. The
-# unit is a pixel's width plus the Gaussian's own sigma along the ray. The tolerance keeps surfaces from shading
-# themselves.
+# How far behind the first surface a Gaussian is still fully lit, and from where on it is in full shadow, in units of a
+# pixel's width plus the Gaussian's own sigma along the ray. The tolerance keeps surfaces from shading themselves.
 LIT_UNTIL, DARK_FROM = 2.0, 4.0
 
 

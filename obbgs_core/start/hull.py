@@ -1,4 +1,7 @@
-"""The visual hull of silhouettes that most long exposures agree on. Space is black, so what shows light is target."""
+"""The visual hull: the voxels in which most long exposures see light. Space is black, so light is target.
+
+A "sigma" here is the deviation of an unlit reading, or of the mean of a window of such readings.
+"""
 
 import logging
 import math
@@ -11,16 +14,17 @@ from torch import Tensor
 from obbgs_core.sensor import Sensor
 
 log = logging.getLogger(__name__)
-CERTAIN_SIGMA = 5.5  # a window's mean above this is light beyond doubt; the target's radius is measured on it
+# a window's mean above this is light with few false alarms; the target's radius is taken from it
+CERTAIN_SIGMA = 5.5
 SKY_SIGMA = 1.0  # a 9x9 window's mean up to this may be empty sky
 BRIGHT_SIGMA = 4.0  # of a single pixel
 EDGE_SIGMA = 1.5  # of a single pixel beside brighter ones
-# a window's mean above this counts as light in the vote, where one view in twenty may be wrong
+# a window's mean above this is likely light: some of it is noise, but one view in twenty may disagree on a voxel
 LIKELY_SIGMA = 2.0
 WINDOWS_PX = (3, 5, 9, 15)  # wide windows find shadowed faces that no single pixel shows
 FEWEST_BRIGHT_PX = 4  # a frame with fewer counts as black
 FEWEST_CHOSEN = 3  # pixels of a window that a mean is taken of
-SPECK = 0.4  # a certain pixel with a smaller share of certain pixels in its 3x3 window is noise
+SPECK = 0.4  # a certain pixel is noise where no more than this share of its 3x3 window is certain
 INSIDE = 0.9995  # share of all certain pixels that the target's radius encloses
 AGREEMENT = 0.95  # share of views that must see light where a voxel projects
 COARSE_VOXELS = 64  # along each axis of the first grid
@@ -33,8 +37,8 @@ VOXELS_AT_ONCE = 1_000_000  # bounds the memory
 class Silhouette:
     """Where one frame sees light, by confidence; [H, W] bool each.
 
-    certain: light with few false alarms; likely: light with few misses; sky: no sign of light, about a third of the
-    empty sky and one in fifty pixels of a face whose light is twice the noise of a 5x5 mean.
+    certain: light with few false alarms; likely: light with few misses; sky: no sign of light. A third of the truly
+    empty pixels pass as sky, and of a face whose light is twice the noise of a 5x5 mean one pixel in fifty.
     """
 
     certain: Tensor

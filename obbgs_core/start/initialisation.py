@@ -20,7 +20,7 @@ from obbgs_core.start import hull
 log = logging.getLogger(__name__)
 FEWEST_HULL_POINTS = 200  # with fewer the start is random
 FEWEST_VIEWS = 12  # that carve the hull
-VIEWS_FOR_COLOUR = 24  # about so many frames, spread evenly, give the first radiance
+VIEWS_FOR_COLOUR = 24  # about so many frames, spread evenly, are averaged for the first radiance
 MOST_DILATION_PX = 8  # of a silhouette, for pose errors
 HULL_OPACITY, RANDOM_OPACITY = 0.5, 0.1  # of the first Gaussians
 
@@ -29,10 +29,10 @@ HULL_OPACITY, RANDOM_OPACITY = 0.5, 0.1  # of the first Gaussians
 class StartSettings:
     """The first Gaussians."""
 
-    kind: Literal["random", "hull"] = "random"  # random in a cube around the target | on its visual hull
-    # the radiance seen where the points project | half of full scale (3DGS)
+    kind: Literal["random", "hull"] = "random"  # in a cube around the target, or on its hull
+    # seen: the radiance that the frames show where the points project; grey: half of full scale (3DGS)
     colour: Literal["seen", "grey"] = "seen"
-    count: int = at_least_one(100_000)  # at most, because the hull may have fewer points
+    count: int = at_least_one(100_000)  # at most: the hull may have fewer points
 
     def __post_init__(self):
         check(self, "start")

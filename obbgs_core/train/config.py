@@ -24,15 +24,16 @@ class MethodConfig:
     """
 
     name: str
-    exposure_aware: bool = False  # false: every exposure counts as their mean, as the methods were published
-    # the target's radius | the extent of the cameras, as in 3DGS
+    # false: every exposure time is replaced by the geometric mean of all, as the methods were published
+    exposure_aware: bool = False
+    # target: its radius as the silhouettes show it; cameras: the extent of the cameras, as in 3DGS
     length_unit: Literal["target", "cameras"] = "target"
     frames_per_step: int = at_least_one(1)
     bracket_steps: bool = False  # the frames of a step are one of each exposure time
     steps: int = at_least_one(30_000)
-    pyramid: tuple[tuple[float, float], ...] = ((0.0, 1.0),)  # (from this share of the steps, image scale)
+    pyramid: tuple[tuple[float, float], ...] = ((0.0, 1.0),)  # (from this share of the steps on, image scale)
     outlier_filter: bool = False  # remove Gaussians far from the centre from the finished model
-    chi2_end: float = 0.0  # above 0: stop after growth when the residual chi² falls to this
+    chi2_end: float = 0.0  # above 0: stop after growth when the running chi² falls to this; 1 is pure noise
     start: StartSettings = field(default_factory=StartSettings)
     loss: LossSettings = field(default_factory=LossSettings)
     growth: GrowthSettings = field(default_factory=GrowthSettings)

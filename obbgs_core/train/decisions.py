@@ -1,4 +1,4 @@
-"""The decisions of a training, each at its time: poses, number of Gaussians, what the radiance depends on."""
+"""The decisions of a training, and when each is due: poses, number of Gaussians, what the radiance depends on."""
 
 import logging
 import math
@@ -28,7 +28,8 @@ from obbgs_core.train.state import TrainingState
 from obbgs_core.train.validation import correction_gain
 
 log = logging.getLogger(__name__)
-# smallest gain over penalty: 0.5 to 1.3 was measured with exact tags, 2.9 to 5.4 at 1 px of error
+# Poses are refined if their likelihood gain, less its standard error, exceeds its BIC penalty by this factor. Gains of
+# 0.5 to 1.3 penalties were measured with exact tags, 2.9 to 5.4 at 1 px of error (docs/experiments/012).
 REFINING_RATIO = 1.5
 
 
@@ -52,7 +53,10 @@ def observe(
 
 
 def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> None:
-    """Refine the poses if correcting the validation brackets gains clearly more than its BIC penalty."""
+    """Refine the poses if correcting the validation brackets gains `REFINING_RATIO` times its BIC penalty.
+
+    The validation brackets are trained on from then on.
+    """
     config = setup.config
     if state.poses_decided or share < config.poses.refine_from:
         return
@@ -70,7 +74,7 @@ def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> No
 
 
 def change_number(setup: TrainingSetup, state: TrainingState, share: float) -> None:
-    """Densify everywhere, or inside the boxes of the worst tiles, or reset the opacities, when it is due."""
+    """Densify everywhere, or between two such times inside the boxes of the worst tiles; reset opacities; when due."""
     settings, now = setup.config.growth, state.steps_done + 1
     if not is_growing(setup, share):
         return
@@ -91,7 +95,7 @@ def change_number(setup: TrainingSetup, state: TrainingState, share: float) -> N
 
 
 def select_model(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
-    """Prune by BIC and test higher degrees, when it is due: does the likelihood gain exceed the penalty?
+    """Prune by BIC and test a higher harmonic degree, when due; a moving Sun is tested once before that as well.
 
     Args:
         scale: of the images that the likelihood is taken of.

@@ -14,10 +14,10 @@ from obbgs_core.render import Rendered
 from obbgs_core.settings import at_least_one, check, fraction
 from obbgs_core.train.adam import Adam
 
-SPLIT_SHRINK = 1.6  # a split's halves are this much smaller (Kerbl et al. 2023)
+SPLIT_SHRINK = 1.6  # the two Gaussians of a split have its deviations divided by this (Kerbl et al. 2023)
 # of the method's unit of length: larger Gaussians are split, smaller ones cloned (the same)
 SPLIT_SIZE = 0.01
-GRADIENT_THRESHOLD = 0.0002  # mean screen gradient per unit of normalised device coordinates (the same)
+GRADIENT_THRESHOLD = 0.0002  # mean screen gradient per half of the longer side of an image (the same)
 RESET_OPACITY = 0.01  # no opacity is above this after a reset (the same)
 
 
@@ -26,7 +26,7 @@ class GrowthSettings:
     """When and where Gaussians are added, and which are removed; sizes are in the method's unit of length."""
 
     max_gaussians: int = at_least_one(500_000)
-    # above 0: so many lit pixels of the long exposures for each, against overfitting
+    # above 0: no more Gaussians than one for so many lit pixels of the long exposures, against overfitting
     pixels_per_gaussian: int = 0
     begin: float = fraction(500 / 30_000)  # share of the steps
     end: float = fraction(0.5)  # share of the steps
@@ -40,7 +40,7 @@ class GrowthSettings:
     prune_opacity: float = fraction(0.005)  # fainter Gaussians are removed at each densification
     prune_size: float = 0.2  # larger Gaussians are removed at each densification
     prune_size_from: float = fraction(0.0)  # share of the steps before which size is no reason to remove
-    prune_radius_px: float = 0.0  # above 0: so are those whose three sigma are longer than this in an image
+    prune_radius_px: float = 0.0  # above 0: and those whose three sigma are longer than this in an image
     opacity_reset_interval: int = 3000  # steps between two resets of the opacities; 0: never
 
     def __post_init__(self):
@@ -51,7 +51,8 @@ class GrowthSettings:
 class Growth:
     """Running sums of each Gaussian's screen-space gradient since the last densification.
 
-    gradient: [N] sum of gradient norms, weighted; weight: [N] sum of the weights;
+    gradient: [N] sum of gradient norms, weighted; weight: [N] sum of the weights: a view counts by the pixels that the
+        Gaussian covers in it (Pixel-GS), or as one (3DGS).
     radius_px: [N] the longest three sigma that the Gaussian had in an image.
     """
 
@@ -72,11 +73,11 @@ class Growth:
         pixel_weighted: bool,
         depth_weight: Tensor | None = None,
     ) -> None:
-        """Add one step's gradients, per unit of normalised device coordinates as the published thresholds are.
+        """Add one step's gradients, per half of an image's longer side, the unit of the published thresholds.
 
         Args:
             half_size_px: half the longer side of the images.
-            pixel_weighted: weigh each view by the pixels that the Gaussian covers in it, not by one.
+            pixel_weighted: whether a view counts by the pixels that the Gaussian covers in it, or as one.
             depth_weight: [C, N] factor on the gradients of each camera's Gaussians.
         """
         for camera, gradient in rendered.screen.means2d.items():
@@ -135,8 +136,8 @@ def grow(
 ) -> tuple[Gaussians, Tensor]:
     """Return the model with the growing Gaussians [N] bool cloned (small ones) or split in two (large ones).
 
-    Those that were not split stand first in it, unchanged; their old indices are returned too. Splitting draws the
-    halves' centres from the Gaussian itself and shrinks them, as in Kerbl et al. 2023.
+    Those that were not split stand first in it, unchanged; their old indices are returned too. Splitting draws two
+    centres from the Gaussian itself and divides its deviations by `SPLIT_SHRINK`, as in Kerbl et al. 2023.
     """
     large = gaussians.scales.max(dim=1).values > split_over_m
     clones = torch.nonzero(growing & ~large)[:, 0]
@@ -174,8 +175,8 @@ def finite(gaussians: Gaussians) -> Tensor:
 def outliers(gaussians: Gaussians, spread: float = 4.0, faint: float = 0.1) -> Tensor:
     """Return which Gaussians [N] the centre-constrained filter removes: far from the robust centre, or faint and far.
 
-    Distance is from the median centre, in units of the median distance; the limit adapts to the target. A faint
-    Gaussian is removed at half of it (Jiang et al. 2025, section 3.6).
+    Distance is from the median centre and limited to `spread` times the median distance. A faint Gaussian, one with
+    an opacity below `faint`, is removed at half of that (Jiang et al. 2025, section 3.6).
     """
     distance = (gaussians.means - gaussians.means.median(dim=0).values).norm(dim=1)
     limit = spread * distance.median().clamp(min=1e-9)
@@ -218,7 +219,7 @@ def densify_boxes(
     settings: GrowthSettings,
     rng: torch.Generator,
 ) -> tuple[Gaussians, Growth]:
-    """Clone and split inside the boxes only; the records of new Gaussians start empty, the others' go on."""
+    """Grow, of the Gaussians that `chosen` picks, those inside a box; records of new ones start empty, others go on."""
     inside = torch.stack([box.contains(gaussians.means.detach()) for box in boxes]).any(dim=0)
     growing = chosen(growth.mean(), gaussians, settings) & inside
     gaussians, kept = grow(gaussians, adam, growing, SPLIT_SIZE * unit_m, rng)
@@ -226,7 +227,7 @@ def densify_boxes(
 
 
 def chosen(gradient: Tensor, gaussians: Gaussians, settings: GrowthSettings) -> Tensor:
-    """Return which Gaussians [N] grow: over the threshold, or the given share; never beyond the budget."""
+    """Return which Gaussians [N] grow: those above the threshold, or the share with the largest; within the budget."""
     room = settings.max_gaussians - len(gaussians)
     count = int((gradient >= GRADIENT_THRESHOLD).sum())
     if settings.share:

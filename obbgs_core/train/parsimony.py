@@ -1,4 +1,7 @@
-"""Model selection by BIC: the likelihood gain of each Gaussian and of the next harmonic degree, and their penalties."""
+"""Model selection by the Bayesian information criterion (BIC): which Gaussians, and which degree of the harmonics.
+
+A parameter is justified if its likelihood gain exceeds its BIC penalty. The equations are in docs/method.md.
+"""
 
 import dataclasses
 import math
@@ -23,7 +26,7 @@ class ParsimonySettings:
 
     prune_at: tuple[float, ...] = fraction(())  # shares of the steps; none: never
     bic_factor: float = 1.0  # on the penalty: larger values give smaller models
-    # more opaque Gaussians are kept: dark surface explains no light
+    # Gaussians above it are kept in any case: dark surface explains no light and is surface nevertheless
     keep_above_opacity: float = fraction(1.0)
 
     def __post_init__(self):
@@ -31,7 +34,11 @@ class ParsimonySettings:
 
 
 def bic_penalty(gaussians: Gaussians, values: int) -> float:
-    """Return the BIC penalty of one Gaussian, nats: half its parameters times ln(values measured) (Schwarz 1978)."""
+    """Return the BIC penalty of one Gaussian, nats: half its parameters times ln(values) (Schwarz 1978).
+
+    Args:
+        values: sensor values that show the target above the noise, over all frames.
+    """
     parameters = sum(tensor[0].numel() for tensor in gaussians.tensors().values()) - 1  # a quaternion has 3
     return 0.5 * parameters * math.log(max(2, values))
 
@@ -53,12 +60,12 @@ def justified(
 def likelihood_gains(
     gaussians: Gaussians, batches: Batches, sensor: Sensor, scale: float, rng: torch.Generator
 ) -> tuple[Tensor, int]:
-    """Return the likelihood gain of each Gaussian [N], nats over all frames, and the number of values measured.
+    """Return the likelihood gain of each Gaussian [N], nats over all frames, and the number of values above noise.
 
     The gain is what the log-likelihood would lose without the Gaussian. Without Gaussian j the prediction changes by
-    exactly -o_j d(prediction)/d(o_j), because compositing is linear in each opacity; at the optimum the loss is half
-    the sum of that change squared over the noise variance. The sum of squares over pixels is estimated without bias by
-    back-propagating random signs (Hutchinson 1989), one draw a frame.
+    exactly -o_j d(prediction)/d(o_j), because compositing is linear in each opacity; at the optimum the log-likelihood
+    falls by half the sum of that change squared over the noise variance. The sum of squares over pixels is estimated
+    without bias by back-propagating random signs (Hutchinson 1989), one draw a frame.
     """
     model = gaussians.detach()
     model.opacity_logits.requires_grad_()
@@ -80,7 +87,8 @@ def next_degree_gain(
     """Return the likelihood gain of the next spherical-harmonic degree and its BIC penalty, both in nats.
 
     A score test (Rao 1948): with slope g and curvature F of the log-likelihood at zero, a coefficient gains g²/(2F).
-    Where the Sun hardly moves, its harmonics are nearly constant: the part that the constant explains is projected out.
+    F is the diagonal of the Fisher information: coefficients that explain the same light are counted twice. Where the
+    Sun hardly moves, its harmonics are nearly constant: the part that the constant explains is projected out.
     """
     old = gaussians.sh.shape[1]
     model = padded(gaussians.detach(), math.isqrt(old))

@@ -1,4 +1,4 @@
-"""The training loop, readable top to bottom: frames and a method in, Gaussians out."""
+"""The training loop: frames, a sensor and a method in, Gaussians out. `Trainer.step` is one step of it."""
 
 import logging
 import math
@@ -27,9 +27,9 @@ from obbgs_core.train.setup import prepare
 from obbgs_core.train.state import TrainingState
 
 log = logging.getLogger(__name__)
-CHI2_MEMORY = 0.98  # decay of the running chi² a step
+CHI2_MEMORY = 0.98  # share of the running chi² that a step keeps; the rest is the step's own
 CHECKPOINT_EVERY_S = 20.0
-FIXED_COST = 0.25  # part of a step's time that does not shrink with the image
+FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
 PACE_STEPS = 50  # the time left is estimated from the pace of so many steps
 
 
@@ -47,8 +47,8 @@ def train(
 
     The same seed, thread count and machine give the same result bit for bit, also when the training was killed and
     called again with the same checkpoint file; a checkpoint of another training is not used. The time limit counts
-    the time spent before a kill too. The checkpoint of a finished training stays, so that nothing that is done with the
-    model afterwards can lose it.
+    the time spent before a kill too. The checkpoint of a finished training stays, so that the model is not lost where
+    what is done with it afterwards fails.
 
     Args:
         should_stop: called after each step; when it returns true, the training is saved and ends in `Interrupted`.
@@ -102,7 +102,7 @@ class Trainer:
         self.state.seconds = time.monotonic() - began
 
     def step(self) -> StepInfo:
-        """Render some frames, move the Gaussians down the gradient, and decide what is due.
+        """Render some frames, move Gaussians and poses down the gradient, and take the decisions that are due.
 
         Raises:
             Diverged: the loss, or all of the Gaussians, stopped being finite.

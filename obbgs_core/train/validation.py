@@ -1,4 +1,4 @@
-"""Validation brackets: frames withheld from a part of the training, which decide whether poses are refined."""
+"""Validation brackets: held out of the first part of the training, they decide whether poses are refined."""
 
 import math
 
@@ -12,7 +12,8 @@ from obbgs_core.sensor import Sensor
 from obbgs_core.train.batches import Batch
 from obbgs_core.train.poses import POSE_RATE, PoseCorrections
 
-INTERVAL, FEWEST = 7, 3  # brackets; a prime number, so that the choice follows no cycle of the capture
+# One bracket in seven, at least three in all; a prime number, so that no cycle of the capture repeats with it.
+INTERVAL, FEWEST = 7, 3
 FEWEST_FRAMES_IN_ALL = 24  # with fewer, every frame is needed for training
 FIT_STEPS = 20  # of a validation bracket's correction
 
@@ -32,9 +33,9 @@ def correction_gain(
     """Return the likelihood gain of correcting a bracket's pose over its BIC penalty: the mean, and its standard error.
 
     The model was not trained on these brackets, so it cannot have adapted to their tags. The gain is that of fitting a
-    bracket's correction to the fixed model, in nats, divided by chi² because a coarse model errs by more than noise and
-    alike in neighbouring pixels (Lebreton et al. 1992). The penalty is half the number of corrected directions times
-    ln(values) (Schwarz 1978).
+    bracket's correction to the fixed model, in nats. It is divided by chi² as for overdispersed counts (Lebreton et al.
+    1992), because a coarse model errs by more than noise, and alike in neighbouring pixels. The penalty is half the
+    number of corrected directions times ln(values on the target) (Schwarz 1978).
     """
     poses, ratios = PoseCorrections(frames), []
     for batch in brackets:
