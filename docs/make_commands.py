@@ -3,6 +3,7 @@
 import enum
 import importlib
 import inspect
+import math
 import typing
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,9 @@ and prints JSON with `--json` where it prints a result. Exit codes: 0, 1 (the wo
 interrupted), 2 (wrong usage or configuration). Shell completion: `ground --install-completion`.
 
 Links are `serial:///dev/ttyUSB0?baud=921600`, `slcan:///dev/ttyACM0?bitrate=1000000` or
-`can://can0`; cameras are `hil://HOST:PORT`, `hil:///path/to/socket` or `gige://ID`.
+`can://can0?bitrate=1000000`; cameras are `gige://ID`, or simulated `hil://HOST:PORT` and
+`hil:///path/to/socket`. Put a link's URL in quotes: `?` and `&` mean something to a shell. An
+option without a default is off, or its text says what holds without it.
 """
 
 
@@ -54,8 +57,10 @@ def _row(option: Any, hint: Any) -> str:
     for choice in (hint, *typing.get_args(hint)):
         if isinstance(choice, type) and issubclass(choice, enum.Enum):
             names += ": " + ", ".join(str(member.value) for member in choice)
+        elif typing.get_origin(choice) is typing.Literal:
+            names += ": " + ", ".join(typing.get_args(choice))
     default = getattr(option.default, "value", option.default)
-    empty = default in (None, False, (), []) or callable(default)
+    empty = default in (None, False, "", (), [], math.inf) or callable(default) or not option.show_default
     shown = "required" if option.required else "" if empty else f"`{default}`"
     return f"| {names} | {shown} | {option.help or ''} |"
 

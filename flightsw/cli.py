@@ -24,27 +24,42 @@ from flightsw.sequencer import plan
 from obbgs_base.command_line import new_app, run
 
 log = logging.getLogger(__name__)
-app = new_app("The flight side: what flies.")
+app = new_app("The flight software: takes frames, stores them, sends them down and obeys commands.")
 stderr = Console(stderr=True)
 START_NOW_S = 2.0  # from the command to the first trigger of --start now: a camera takes a second to open
 
-MissionFile = Annotated[Path, typer.Option("--mission", help="The mission file.")]
-StoreDir = Annotated[Path, typer.Option("--store", help="The frame store.")]
+MissionFile = Annotated[Path, typer.Option("--mission", help="The mission file, the same as on the ground.")]
+StoreDir = Annotated[Path, typer.Option("--store", help="The folder of the frame store.")]
 BracketMs = Annotated[
-    str | None, typer.Option("--bracket", help="Exposure times, ms, comma separated, or auto.")
+    str | None,
+    typer.Option(
+        "--bracket", help="Exposure times in ms, such as 0.05,0.1,0.2, or auto; default: the mission's."
+    ),
 ]
-Count = Annotated[int | None, typer.Option(help="Number of brackets.")]
+Count = Annotated[int | None, typer.Option(help="Number of brackets; default: the mission's.")]
 Duration = Annotated[
-    float | None, typer.Option("--for", help="Seconds of brackets, instead of --count.", min=0.0)
+    float | None,
+    typer.Option("--for", help="Take brackets for so many seconds; instead of --count.", min=0.0),
 ]
-Start = Annotated[str | None, typer.Option(help="First trigger: now, or UTC as 2026-07-21T10:52:30Z.")]
-Interval = Annotated[float | None, typer.Option(help="Seconds from one trigger to the next.")]
+Start = Annotated[
+    str | None,
+    typer.Option(help="First trigger: now, or UTC as 2026-07-21T10:52:30Z; default: the mission's."),
+]
+Interval = Annotated[
+    float | None, typer.Option(help="Seconds from one trigger to the next; default: the mission's.")
+]
 CameraUrl = Annotated[
-    str, typer.Option("--camera", help="hil:///path/to/socket, hil://host:port or gige://ID.")
+    str,
+    typer.Option(
+        "--camera", help="gige://ID (or its IP address); simulated: hil:///path/to/socket or hil://host:port."
+    ),
 ]
-LinkUrl = Annotated[str, typer.Option("--link", help="serial:///dev/ttyUSB0?baud=921600")]
+LinkUrl = Annotated[
+    str, typer.Option("--link", help="The link's URL, such as serial:///dev/ttyUSB0?baud=921600.")
+]
 KeyFile = Annotated[
-    Path | None, typer.Option("--key", help="The mission's key; without it no command is taken.")
+    Path | None,
+    typer.Option("--key", help="The file of the mission's key; without it every command is refused."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
@@ -59,13 +74,15 @@ def capture_command(
     start: Start = None,
     mission: MissionFile = Path("mission.yaml"),
     store: StoreDir = Path("store"),
-    link: Annotated[str | None, typer.Option(help="Send the frames too, until the outbox is empty.")] = None,
+    link: Annotated[
+        str | None, typer.Option(help="Send the frames over this link too, until all are confirmed.")
+    ] = None,
     json_: AsJson = False,
 ) -> None:
     """Take exposure brackets, tag and store them; started again, it takes what the store does not hold.
 
-    A camera with a clock of its own takes each exposure at once. With any other one flightsw waits for the time of each
-    exposure: give --start now on a bench.
+    With a real camera flightsw waits for the planned time of each exposure: give --start now on a bench. A simulated
+    camera lives in the mission's time and takes each exposure at once.
 
     Example: flightsw capture --bracket 0.05,0.1,0.2 --count 40 --camera hil:///tmp/camera.sock --store store
     """
@@ -82,9 +99,9 @@ def serve(
     key: KeyFile = None,
     json_: AsJson = False,
 ) -> None:
-    """Capture the planned pass, send frames and take commands until stopped (SIGTERM or Ctrl-C end it cleanly).
+    """Take the planned brackets, send frames and obey commands until stopped (SIGTERM or Ctrl-C end it cleanly).
 
-    Example: flightsw serve --camera hil:///tmp/camera.sock --link serial:///dev/ttyUSB0?baud=921600 --key mission.key
+    Example: flightsw serve --camera gige://192.168.0.10 --link 'serial:///dev/ttyS1?baud=921600' --key mission.key
     """
     _run(load_mission(mission), store, camera, link, exit_when_empty=False, as_json=json_, key_file=key)
 
@@ -98,19 +115,19 @@ def downlink(
     key: KeyFile = None,
     json_: AsJson = False,
 ) -> None:
-    """Send the outbox, each frame until the ground confirms it, in the mission's or the commanded order.
+    """Send the frames that the ground has not confirmed, in the mission's or the commanded order; no camera is needed.
 
-    Example: flightsw downlink --link serial:///dev/ttyUSB0?baud=921600 --store store --exit-when-empty
+    Example: flightsw downlink --link 'serial:///dev/ttyUSB0?baud=921600' --store store --exit-when-empty
     """
     _run(load_mission(mission), store, None, link, exit_when_empty, as_json=json_, key_file=key)
 
 
 @app.command()
 def triage(
-    model: Annotated[Path, typer.Option(help="The uplinked model.onnx.")],
-    frames: Annotated[Path, typer.Option(help="A frame store, or a folder of .obf containers.")],
+    model: Annotated[Path, typer.Option(help="The model, a run's model.onnx.")],
+    frames: Annotated[Path, typer.Option(help="A frame store, or a folder of frames as .obf files.")],
     mission: MissionFile = Path("mission.yaml"),
-    top: Annotated[int, typer.Option(help="How many to print.")] = 20,
+    top: Annotated[int, typer.Option(help="How many frames to print.")] = 20,
     json_: AsJson = False,
 ) -> None:
     """Rank stored frames by how badly the model predicts them and how new their view is, as the downlink would.
@@ -137,7 +154,10 @@ def triage(
 
 @app.command("plan")
 def plan_command(mission: MissionFile = Path("mission.yaml"), json_: AsJson = False) -> None:
-    """Print the planned pass: each bracket's time, range, light, exposures and expected counts; passes and eclipses.
+    """Print the planned brackets: time, range, light and the readings to expect; then sunlit passes and eclipses.
+
+    Phase is the angle between Sun and camera as the target sees it, Sun the angle between line of sight and Sun, DN the
+    reading that a white surface turned to the Sun would give.
 
     Example: flightsw plan --mission mission.yaml
     """
@@ -173,7 +193,7 @@ def fsck_command(
     check: Annotated[bool, typer.Option("--check", help="Report only, change nothing.")] = False,
     json_: AsJson = False,
 ) -> None:
-    """Check a frame store and repair it; damaged containers go to quarantine/. Stop `flightsw` first.
+    """Check a frame store and repair it; damaged frames go to its quarantine/. Stop flight first.
 
     Exits with 1 when the store is damaged and --check leaves it so, or when frames were lost.
 

@@ -25,7 +25,9 @@ stderr = Console(stderr=True)
 def listen_command(
     link: Annotated[str, typer.Option(help="The link's URL, such as serial:///dev/ttyUSB0?baud=921600.")],
     session: SessionDir,
-    mission: Annotated[Path, typer.Option(help="The mission file.")] = Path("mission.yaml"),
+    mission: Annotated[Path, typer.Option(help="The mission file, the same as in flight.")] = Path(
+        "mission.yaml"
+    ),
     exit_after: Annotated[
         int | None, typer.Option(help="Stop when the session holds this many frames.")
     ] = None,
@@ -34,12 +36,12 @@ def listen_command(
     ] = None,
     json_: AsJson = False,
 ) -> None:
-    """Receive frames and telemetry into a session folder until stopped, send commands, show the link.
+    """Receive frames and telemetry into a session folder until stopped, send commands, show the state of the pass.
 
     On a terminal it shows a screen; elsewhere it prints a line every ten seconds and each event. --json prints a line a
     second and each event; its last line is the summary.
 
-    Example: ground listen --link serial:///dev/ttyUSB0?baud=921600 --session pass-12
+    Example: ground listen --link 'serial:///dev/ttyUSB0?baud=921600' --session pass-12
     """
     from ground.console import statuses_shown
     from ground.ingest import listen
@@ -68,8 +70,10 @@ def listen_command(
 
 @app.command()
 def key(
-    file: Annotated[Path, typer.Argument(help="Where to write the key.")],
-    spi: Annotated[int, typer.Option(min=1, max=65534, help="The key's number.")] = 1,
+    file: Annotated[Path, typer.Argument(help="Where to write the key; an existing one is never replaced.")],
+    spi: Annotated[
+        int, typer.Option(min=1, max=65534, help="The key's number (security parameter index).")
+    ] = 1,
     json_: AsJson = False,
 ) -> None:
     """Make the key that authenticates a mission's commands, and a counter for each side.
@@ -90,20 +94,25 @@ def key(
 @app.command()
 def uplink(
     command: Annotated[UplinkCommand, typer.Argument(help="The command.")],
-    arguments: Annotated[list[str] | None, typer.Argument(help="The arguments of the command.")] = None,
+    arguments: Annotated[list[str] | None, typer.Argument(help="Its arguments, as above.")] = None,
     session: Annotated[Path, typer.Option("--session", help="The session folder.")] = Path("session"),
-    key_file: Annotated[Path, typer.Option("--key", help="The mission's key.")] = Path("mission.key"),
+    key_file: Annotated[Path, typer.Option("--key", help="The file of the mission's key.")] = Path(
+        "mission.key"
+    ),
     link: Annotated[
         str | None, typer.Option(help="The link's URL, if no `ground listen` has it open.")
     ] = None,
-    mission: Annotated[Path, typer.Option(help="The mission file, with --link.")] = Path("mission.yaml"),
+    mission: Annotated[Path, typer.Option(help="The mission file; read with --link only.")] = Path(
+        "mission.yaml"
+    ),
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the result.")] = 120.0,
     json_: AsJson = False,
 ) -> None:
     """Send a command through the session's `ground listen`, or over --link, and wait for its result.
 
-    bracket 0.05,0.1,0.2 (ms) · near 2 (DN) · priority oldest|triage|thumbnail-first · model FILE · safe · ping;
-    delete FIRST LAST and resume need `arm delete` or `arm resume` just before.
+    ping · bracket 0.05,0.1,0.2 (exposure times, ms) · near 2 (largest coding error, DN) · priority oldest, triage or
+    thumbnail-first · model FILE (a run's model.onnx) · safe (no more exposures). `arm delete` and then delete FIRST
+    LAST (numbers of frames), `arm resume` and then resume, each at most 30 s later.
 
     Example: ground uplink bracket 0.02,0.05,0.1 --session pass-12 --key mission.key
     """
@@ -159,8 +168,12 @@ def import_command(
     folder: Annotated[Path, typer.Option("--from", help="The data set's folder.")],
     session: Annotated[Path, typer.Option(help="The session folder to make.")],
     format_: Annotated[ImportFormat, typer.Option("--format", help="The data set's format.")],
-    srgb: Annotated[bool, typer.Option(help="Undo the sRGB curve of the pictures.")] = False,
-    frames: Annotated[int | None, typer.Option(min=1, help="Import only the first so many pictures.")] = None,
+    srgb: Annotated[
+        bool, typer.Option(help="Undo the sRGB curve: the pictures are not linear in light.")
+    ] = False,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Import only the first so many pictures; default: all.")
+    ] = None,
     json_: AsJson = False,
 ) -> None:
     """Make a session of pictures with known cameras: NeRF-synthetic, nerfstudio, COLMAP or SHIRT.
@@ -200,7 +213,7 @@ def export_command(
     ] = ExportFormat.NERF,
     json_: AsJson = False,
 ) -> None:
-    """Write a session's frames for other tools, split by brackets into train, val and test (6:2:3).
+    """Write a session's frames for other software, whole brackets split into train, val and test (6:2:3).
 
     Example: ground export --session pass-12 --format nerfstudio --out pass-12-nerfstudio
     """

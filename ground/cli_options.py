@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 SessionDir = Annotated[Path, typer.Option("--session", help="The session folder.")]
-RunName = Annotated[str, typer.Option("--name", help="The run's name.")]
+RunName = Annotated[str, typer.Option("--name", help="The run's name: its folder below runs/.")]
 RunsDir = Annotated[
     Path | None, typer.Option("--out", help="The folder of runs; default: runs/ in the session.")
 ]

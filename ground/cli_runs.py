@@ -25,22 +25,35 @@ def reconstruct_command(
     method: Annotated[Method | None, typer.Option(help="The training method; default: obbgs.")] = None,
     quality: Annotated[
         Quality | None,
-        typer.Option(help="A third, all or three times the method's steps and Gaussians; default: standard."),
+        typer.Option(
+            help="draft has a third of the steps and Gaussians of standard, best three times; default: standard."
+        ),
     ] = None,
     budget: Annotated[
-        str, typer.Option(help="Most Gaussians, a number; auto: limited by the number of lit pixels.")
+        str, typer.Option(help="The largest number of Gaussians; auto: by the number of lit pixels.")
     ] = "auto",
-    steps: Annotated[int | None, typer.Option(min=1, help="Training steps.")] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Number of training steps; default: the method's.")
+    ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", help="A setting of the method, key=value (YAML); can be repeated."),
+        typer.Option(
+            "--set",
+            help="A setting of the method, GROUP.NAME=VALUE; can be repeated. A wrong name lists them all.",
+        ),
     ] = None,
     mission: Annotated[
         Path | None,
-        typer.Option(help="A mission file; its reconstruct section applies where no option is given."),
+        typer.Option(
+            help="A mission file: its reconstruct section counts where no option is given; default: none is read."
+        ),
     ] = None,
-    time_limit: Annotated[float, typer.Option(help="Seconds for each training.")] = math.inf,
-    seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same model; default: 7.")] = None,
+    time_limit: Annotated[
+        float, typer.Option(help="Seconds for each training; then the model is made as it is.")
+    ] = math.inf,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="The same seed makes the same model; default: 7.")
+    ] = None,
     blind_reference: Annotated[
         bool, typer.Option(help="Train a second time without exposure times, for comparison.")
     ] = False,
@@ -50,7 +63,8 @@ def reconstruct_command(
 ) -> None:
     """Train a model on a session, export it, score it and write its report.
 
-    Ctrl-C and SIGTERM save the training and end with exit code 1; the same command resumes it, also after a kill.
+    Ctrl-C and SIGTERM save the training and end with exit code 1; the same command resumes it, also after a kill. Only
+    one process at a time makes a run.
 
     Example: ground reconstruct --session pass-12 --name first --time-limit 120 --set light.sun_shading=linear
     """
@@ -115,7 +129,7 @@ def evaluate_command(
 def report_command(
     session: SessionDir, name: RunName = "run", out: RunsDir = None, json_: AsJson = False
 ) -> None:
-    """Write the report of a finished run again, report.html in its folder.
+    """Write report.html into the folder of a finished run again.
 
     Example: ground report --session demo/session --name demo
     """

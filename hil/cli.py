@@ -19,19 +19,19 @@ from hil.choices import CameraKind, FaultKind, LinkKind, SensorKind
 from hil.sky import SHIPPED
 from obbgs_base.command_line import new_app, run
 
-app = new_app("The simulated world around flight and ground.")
+app = new_app("The simulated world: sky, target, camera and link, so that a pass runs on a desk.")
 MissionFile = Annotated[Path, typer.Option("--mission", help="The mission file.")]
 Mesh = Annotated[
     Path,
     typer.Option(
-        "--mesh", help="The target: GLB, OBJ or STL; default the shipped spacecraft.", show_default=False
+        "--mesh", help="The target: GLB, OBJ or STL; default: the shipped spacecraft.", show_default=False
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 ScenarioName = Annotated[
     str,
     typer.Option(
-        "--scenario", help="A ready-made scenario or a YAML file; default the mission's own orbits."
+        "--scenario", help="A ready-made scenario or a YAML file; default: the mission's own orbits."
     ),
 ]
 RealTime = Annotated[
@@ -48,22 +48,26 @@ def demo(
     mission: MissionFile = Path("mission.yaml"),
     mesh: Mesh = SHIPPED,
     camera: Annotated[
-        CameraKind, typer.Option(help="A socket of our own, or GigE Vision on 127.0.0.1.")
+        CameraKind,
+        typer.Option(help="hil: this project's own protocol on a socket; gige: GigE Vision on 127.0.0.1."),
     ] = "hil",
     link: Annotated[
-        LinkKind, typer.Option(help="A serial line, a CAN or a CAN FD bus (at 1 Mbit/s).")
+        LinkKind,
+        typer.Option(
+            help="serial: a serial line; slcan: a CAN bus, slcan-fd: a CAN FD bus, both at 1 Mbit/s."
+        ),
     ] = "serial",
     faults: Annotated[
         FaultKind,
         typer.Option(
-            help="standard: 2 % of the packets lost, damaged, doubled and reordered each, and a cut of 5 s."
+            help="standard: 2 % of the packets each lost, damaged, doubled and reordered, and a cut of 5 s."
         ),
     ] = "none",
     scenario: ScenarioName = "",
     real_time: RealTime = 0.0,
     navigation_noise: Annotated[
         int | None,
-        typer.Option(help="Seed of random navigation errors with the mission's sigmas; default none."),
+        typer.Option(help="Seed of random navigation errors with the mission's sigmas; default: no errors."),
     ] = None,
     json_: AsJson = False,
 ) -> None:
@@ -90,11 +94,15 @@ def camera(
     mission: MissionFile = Path("mission.yaml"),
     mesh: Mesh = SHIPPED,
     cache: Annotated[Path, typer.Option(help="Folder in which rendered frames are kept.")] = Path("renders"),
-    gige: Annotated[bool, typer.Option("--gige", help="Serve GigE Vision on 127.0.0.1 instead.")] = False,
+    gige: Annotated[
+        bool, typer.Option("--gige", help="Serve GigE Vision on 127.0.0.1 instead of --listen.")
+    ] = False,
     scenario: ScenarioName = "",
     inputs: Annotated[
         Path,
-        typer.Option(help="With --scenario: folder for flight's mission.yaml and navigation states."),
+        typer.Option(
+            help="With --scenario: where the mission.yaml and navigation states for flight and ground are written."
+        ),
     ] = Path("scenario"),
     real_time: RealTime = 0.0,
 ) -> None:
@@ -142,18 +150,18 @@ def link(
         float, typer.Option(help="Delay from one end to the other, s, in addition to the transmission time.")
     ] = 0.0,
     loss: Annotated[float, typer.Option(help="Fraction of packets (CAN: frames) lost.")] = 0.0,
-    flip: Annotated[float, typer.Option(help="Fraction with a flipped bit.")] = 0.0,
-    duplicate: Annotated[float, typer.Option(help="Fraction sent twice.")] = 0.0,
-    reorder: Annotated[float, typer.Option(help="Fraction that changes places with the next.")] = 0.0,
+    flip: Annotated[float, typer.Option(help="Fraction of packets (CAN: frames) with a flipped bit.")] = 0.0,
+    duplicate: Annotated[float, typer.Option(help="Fraction of them sent twice.")] = 0.0,
+    reorder: Annotated[float, typer.Option(help="Fraction of them that changes places with the next.")] = 0.0,
     overrun: Annotated[
         bool, typer.Option(help="Serial: no flow control; bytes that are not read in time are lost.")
     ] = False,
     one_shot: Annotated[
         bool, typer.Option(help="CAN: the controller does not repeat a frame that is destroyed on the bus.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Seed of the faults.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the random faults.")] = 0,
 ) -> None:
-    """Run a virtual serial line or CAN bus with seeded faults until stopped; prints both ends, then the counts.
+    """Run a virtual serial line or CAN bus with faults until stopped; prints the URLs of both ends, then the counts.
 
     While it runs it reads commands from standard input, one a line: cut, mend, latency 0.2, loss 0.1, and bit_flip,
     duplicate or reorder with a fraction. SIGUSR1 and SIGUSR2 also cut and mend.
@@ -199,15 +207,22 @@ def scenario(
         bool, typer.Option("--fly-around", help="Design a fly-around about the mission's target instead.")
     ] = False,
     mission: MissionFile = Path("mission.yaml"),
-    radial: Annotated[float, typer.Option(help="Half of the ellipse's height, m.")] = 200.0,
+    radial: Annotated[
+        float, typer.Option(help="With --fly-around: half of the ellipse's height, m.")
+    ] = 200.0,
     out_of_plane: Annotated[
         float | None,
-        typer.Option(help="Half of its width across the orbit, m; default: that of a constant range."),
+        typer.Option(help="Half of its width across the orbit, m; default: what keeps the range constant."),
     ] = None,
-    out: Annotated[Path, typer.Option(help="The chaser's TLE is written here.")] = Path("chaser.tle"),
+    out: Annotated[Path, typer.Option(help="Where --fly-around writes the chaser's TLE.")] = Path(
+        "chaser.tle"
+    ),
     json_: AsJson = False,
 ) -> None:
     """Print a scenario's range, phase angle and eclipses; or design a fly-around and write the chaser's TLE.
+
+    The errors are distances between the orbit of the printed elements and the intended one, the unrounded one without
+    the rounding to a TLE's digits. Elements (da to diy) are relative orbital elements in metres.
 
     Example: hil scenario tumbling --json; hil scenario --fly-around --radial 150 --out chaser.tle
     """
@@ -231,7 +246,7 @@ def dataset(
         Path, typer.Option(help="The data set's folder; with --set it holds one folder a target.")
     ],
     mesh: Annotated[
-        Path | None, typer.Option(help="GLB, OBJ or STL; default the shipped spacecraft.")
+        Path | None, typer.Option(help="The target: GLB, OBJ or STL; default: the shipped spacecraft.")
     ] = None,
     set_: Annotated[
         str | None,
@@ -243,13 +258,14 @@ def dataset(
         int, typer.Option(help="Number of frames, a multiple of the bracket's exposures.")
     ] = 363,
     size: Annotated[int, typer.Option(help="Width and height of a frame, px.")] = 800,
-    bracket: Annotated[str, typer.Option(help="Exposure times, ms.")] = "0.05,0.1,0.2",
+    bracket: Annotated[str, typer.Option(help="Exposure times in ms, comma separated.")] = "0.05,0.1,0.2",
     sensor: Annotated[
-        SensorKind, typer.Option(help="8 bits with the paper's noise, or a scientific CMOS.")
+        SensorKind,
+        typer.Option(help="paper: 8 bits with the noise of Jiang et al. 2025; spacecam: a scientific CMOS."),
     ] = "paper",
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 1,
     cache: Annotated[Path, typer.Option(help="Folder in which rendered frames are kept.")] = Path("renders"),
-    workers: Annotated[int, typer.Option(min=1, help="Blender processes.")] = 2,
+    workers: Annotated[int, typer.Option(min=1, help="Number of Blender processes.")] = 2,
     json_: AsJson = False,
 ) -> None:
     """Make a data set with its truth, as a session and in NeRF-synthetic layout; an interrupted one is continued.
