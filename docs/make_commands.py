@@ -55,7 +55,7 @@ def _row(option: Any, hint: Any) -> str:
         if isinstance(choice, type) and issubclass(choice, enum.Enum):
             names += ": " + ", ".join(str(member.value) for member in choice)
     default = getattr(option.default, "value", option.default)
-    empty = default in (None, False, (), []) or callable(default)
+    empty = default in (None, False, (), []) or callable(default) or option.show_default is False
     shown = "required" if option.required else "" if empty else f"`{default}`"
     return f"| {names} | {shown} | {option.help or ''} |"
 

@@ -1,4 +1,4 @@
-"""The decisions of a training, each at its time: poses, number of Gaussians, what the radiance depends on."""
+"""What a training decides on the way: pose refinement, adding and removing Gaussians, what the radiance depends on."""
 
 import logging
 import math

@@ -1,4 +1,4 @@
-"""The methods as data: what each published method, and ours, does differently. No subclasses."""
+"""The training methods as data: which settings each published method, and ours, changes. No subclasses."""
 
 from dataclasses import replace
 from typing import Any
