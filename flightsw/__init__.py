@@ -1,0 +1,1 @@
+"""The flight software: takes exposure brackets, tags and stores frames, sends them down, obeys commands."""

@@ -1,4 +1,4 @@
-"""flightsw: capture, downlink, serve, triage, plan, fsck."""
+"""The command line `flightsw`: capture, downlink, serve, triage, plan, fsck."""
 
 import dataclasses
 import json

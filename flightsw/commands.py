@@ -1,4 +1,4 @@
-"""Commands from the ground: unsealed, checked, counted, executed at most once, and reported stage by stage.
+"""Commands from the ground: decrypted, checked, counted, executed at most once, and reported stage by stage.
 
 Nothing has an effect before its tag, its counter, its arguments and, where it destroys, its arming are good, and the
 counter is on the disk before the effect. A command that comes again is answered with its reports, never executed.

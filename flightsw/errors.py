@@ -1,4 +1,4 @@
-"""What can go wrong in flight. The sequencer catches FlightError, counts it and goes on."""
+"""The errors of the flight software. The sequencer catches FlightError, counts it and goes on."""
 
 from obbgs_base.errors import ObbgsError
 

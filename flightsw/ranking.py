@@ -1,4 +1,4 @@
-"""The model on board: verified when it comes, ranks the frames that wait, and so decides which goes down first."""
+"""The model on board: verified when it arrives; it ranks the waiting frames and so decides the order of sending."""
 
 import contextlib
 import os

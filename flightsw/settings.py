@@ -1,4 +1,4 @@
-"""What the ground has commanded, kept in the store's folder so that it survives a restart."""
+"""Settings that the ground has commanded, kept in the store's folder so that they survive a restart."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""ground: listen, key, uplink, reconstruct, evaluate, report, import, export."""
+"""The command line `ground`: listen, key, uplink, reconstruct, evaluate, report, import, export."""
 
 import dataclasses
 import json

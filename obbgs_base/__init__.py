@@ -1,1 +1,1 @@
-"""What every part stands on: the root of our errors, files that appear whole, command lines that end alike."""
+"""What all parts share: the base class of errors, files written whole or not at all, start and end of commands."""

@@ -1,4 +1,4 @@
-"""The root of every error that is raised on purpose."""
+"""The base class of every error that is raised on purpose."""
 
 from typing import ClassVar
 

@@ -1,4 +1,4 @@
-"""What to install when a module is missing that only some commands need; no more than that may be imported here."""
+"""Which modules belong to which extra of the package, so that a command can say what to install for a missing one."""
 
 EXTRAS = {
     "ground": {"gsply", "onnx", "onnxruntime", "plotly", "plyfile", "scipy", "torch"},

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, power cuts included: what every part of the product writes with."""
+"""Writes files whole or not at all, even through a power cut; every part writes with these functions."""
 
 import os
 from pathlib import Path

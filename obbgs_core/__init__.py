@@ -15,14 +15,15 @@
 >>> len(result.history), bool(psnr_db(again, seen) > 20)
 (20, True)
 
-The names below can be imported from here, and the functions `render` and `train` from the packages of these names. A
-name is loaded when it is first used, because PyTorch takes seconds to import.
+The names in `__all__` can be imported from `obbgs_core`; the function `render` comes from `obbgs_core.render` and
+`train` from `obbgs_core.train`. Each module is imported when one of its names is first used, since PyTorch takes
+seconds to load.
 """
 
 import importlib
 from typing import Any
 
-_MODULES = {
+_MODULES = {  # public name: the module that defines it
     "Cameras": "model.cameras",
     "Gaussians": "model.gaussians",
     "MethodConfig": "train.config",

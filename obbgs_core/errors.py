@@ -1,4 +1,4 @@
-"""What can go wrong in a reconstruction."""
+"""The errors of a reconstruction."""
 
 from obbgs_base.errors import ObbgsError
 

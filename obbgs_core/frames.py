@@ -1,4 +1,4 @@
-"""The input of a training: exposures with their poses, checked, and what they tell together."""
+"""The input of a training: exposures with their poses, checked, and figures of all of them together."""
 
 import dataclasses
 import math

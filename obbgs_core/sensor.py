@@ -1,4 +1,4 @@
-"""The sensor in the image model: scene-linear radiance and exposure to digital numbers, and the noise of these."""
+"""The sensor model: from scene-linear radiance and exposure time to digital numbers (DN), and their noise."""
 
 import math
 from dataclasses import dataclass

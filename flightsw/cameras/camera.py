@@ -1,4 +1,4 @@
-"""What every camera promises, and what it delivers."""
+"""The protocol `Camera` that every camera driver fulfils, and the `Exposure` that it returns."""
 
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,4 +1,4 @@
-"""Commands and what is reported of them, by the dictionary."""
+"""Commands and the reports on them, packed and unpacked as dictionary.yaml describes them."""
 
 from dataclasses import dataclass
 from typing import Any, Self

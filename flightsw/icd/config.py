@@ -1,4 +1,4 @@
-"""Files that a person writes: YAML and JSON read strictly, and made into frozen dataclasses key by key."""
+"""Strict reader of the YAML and JSON that a person writes: each file becomes frozen dataclasses, key by key."""
 
 import contextlib
 import dataclasses

@@ -1,4 +1,4 @@
-"""One frame on the wire: exposure, time, pose tag and pixels in a container that proves its own integrity."""
+"""One frame on the wire: exposure, time, pose tag and pixels in a container with checksums."""
 
 import struct
 import zlib

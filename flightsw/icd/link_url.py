@@ -1,4 +1,4 @@
-"""The links a command line can name, as URLs. Opening them is each side's own business."""
+"""Links named by URLs on command lines: parsed and checked here, opened by `flightsw.ports`."""
 
 from dataclasses import dataclass
 from urllib.parse import parse_qs, urlsplit

@@ -1,0 +1,1 @@
+"""Simulated links with faults: a serial line, and a CAN bus with slcan adapters."""

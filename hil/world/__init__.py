@@ -1,0 +1,1 @@
+"""Orbits, attitude, scenarios, navigation states and clock of the simulated world."""

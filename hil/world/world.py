@@ -1,4 +1,4 @@
-"""The truth of a simulated pass as the camera and the navigation simulator ask for it, for a scenario or a mission."""
+"""True states and poses of a simulated pass, of a scenario or the mission's orbits; camera and navigation read them."""
 
 import dataclasses
 import functools

@@ -1,0 +1,1 @@
+"""What a model is made of: Gaussians, cameras, rotations, spherical harmonics."""

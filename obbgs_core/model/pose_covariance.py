@@ -1,4 +1,4 @@
-"""Covariances of pose tags: what may pass for one, and the coordinates in which a tag's error has unit variance.
+"""Covariances of pose tags: whether a matrix is one, and the coordinates in which a tag's error has unit variance.
 
 A covariance [6, 6] is that of the small motion which, in front of world_to_camera, makes a tagged pose the true one:
 a rotation vector about the camera's axes (rad), then a shift along them (m).

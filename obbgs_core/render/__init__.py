@@ -1,4 +1,4 @@
-"""The one door to rendering: `render`, in our C++ or in plain PyTorch, with shadows where the model casts them."""
+"""Rendering: the function `render`, in compiled C++ or plain PyTorch, with cast shadows where the model has them."""
 
 from torch import Tensor
 

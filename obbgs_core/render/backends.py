@@ -1,4 +1,4 @@
-"""Which rasterizer draws: the compiled one where it can, or the reference in plain PyTorch."""
+"""Chooses the rasterizer: the compiled one where it can run, else the reference in plain PyTorch."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""The rasterizer in readable PyTorch: the truth that every compiled kernel is compared with; any dtype and device."""
+"""The rasterizer in readable PyTorch, for any dtype and device; each compiled kernel is compared with it."""
 
 import math
 

@@ -1,0 +1,1 @@
+"""Scores of a model: image metrics, surface points, distances of point clouds."""

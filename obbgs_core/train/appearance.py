@@ -1,4 +1,4 @@
-"""What the radiance depends on: harmonics of the view or of the Sun, or Lambert's law, as the likelihood decides."""
+"""Chooses by likelihood what the radiance depends on: the direction of view, that of the Sun, or Lambert's law."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""The decisions of a training, and when each is due: poses, number of Gaussians, what the radiance depends on."""
+"""What a training decides on the way: pose refinement, adding and removing Gaussians, what the radiance depends on."""
 
 import logging
 import math

@@ -1,4 +1,4 @@
-"""What a training tells of itself: one line for each step, and the finished model with how it came about."""
+"""What a training returns: figures of each step, and the finished model with how it was made."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What a training is given and does not change, checked and measured, and the state that it starts from."""
+"""Prepares a training: checks and measures what it is given, and makes the state that it starts from."""
 
 import dataclasses
 import functools

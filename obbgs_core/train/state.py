@@ -1,4 +1,4 @@
-"""The state of a training: everything that the next step depends on, and how it is kept over a kill."""
+"""The state of a training: everything that the next step depends on, and the checkpoint that it is saved in."""
 
 import io
 import logging

@@ -1,4 +1,4 @@
-"""What both ends of a transfer share: entities, timers, the library's configuration, and PDUs taken apart strictly."""
+"""What both ends of a file transfer share: entities, timers, configuration of the library, strict parsing of PDUs."""
 
 import struct
 from collections import OrderedDict

@@ -53,7 +53,8 @@ def export_onnx(
     graph renders the Sun's shadow map first.
 
     Args:
-        width, height: of the rendered image, px.
+        width: of the rendered image, px.
+        height: the same.
         exposures_s: the exposure times of the training frames; their range goes into the metadata.
 
     Raises:

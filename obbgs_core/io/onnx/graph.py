@@ -1,4 +1,4 @@
-"""A builder of ONNX graphs: a value is its name, an operator is a method call by its ONNX name."""
+"""A small builder of ONNX graphs: `graph.op("Add", a, b)` adds an operator and returns the name of its output."""
 
 import numpy as np
 import onnx
