@@ -60,3 +60,37 @@ class UplinkCommand(StrEnum):
     DELETE = "delete"
     SAFE = "safe"
     RESUME = "resume"
+
+
+# of `ground reconstruct`
+MethodName = Annotated[Method | None, typer.Option(help="The training method; default: obbgs.")]
+QualityName = Annotated[
+    Quality | None,
+    typer.Option(
+        help="draft has a third of the steps and Gaussians of standard, best three times; default: standard."
+    ),
+]
+Budget = Annotated[
+    str, typer.Option(help="The largest number of Gaussians; auto: by the number of lit pixels.")
+]
+Steps = Annotated[int | None, typer.Option(min=1, help="Number of training steps; default: the method's.")]
+SettingsGiven = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        help="A setting of the method, GROUP.NAME=VALUE; can be repeated. A wrong name lists them all.",
+    ),
+]
+ReconstructMission = Annotated[
+    Path | None,
+    typer.Option(
+        help="A mission file: its reconstruct section counts where no option is given; default: none is read."
+    ),
+]
+TimeLimit = Annotated[float, typer.Option(help="Seconds for each training; then the model is made as it is.")]
+Seed = Annotated[int | None, typer.Option(min=0, help="The same seed makes the same model; default: 7.")]
+BlindReference = Annotated[
+    bool, typer.Option(help="Train a second time without exposure times, for comparison.")
+]
+Overwrite = Annotated[bool, typer.Option(help="Replace a finished run of the same name.")]
+Threads = Annotated[int | None, typer.Option(min=1, help="Processor cores; default: all.")]

@@ -4,13 +4,27 @@ import json
 import math
 import os
 from pathlib import Path
-from typing import Annotated
 
-import typer
 from rich.console import Console
 
 from flightsw.icd.mission import ReconstructSection, load_mission
-from ground.cli_options import AsJson, Method, Quality, RunName, RunsDir, SessionDir
+from ground.cli_options import (
+    AsJson,
+    BlindReference,
+    Budget,
+    MethodName,
+    Overwrite,
+    QualityName,
+    ReconstructMission,
+    RunName,
+    RunsDir,
+    Seed,
+    SessionDir,
+    SettingsGiven,
+    Steps,
+    Threads,
+    TimeLimit,
+)
 from ground.progress import Stop, say, steps_shown
 from ground.summary import frames_row, model_rows, table
 from obbgs_base.errors import Interrupted
@@ -22,43 +36,17 @@ def reconstruct_command(
     session: SessionDir,
     name: RunName = "run",
     out: RunsDir = None,
-    method: Annotated[Method | None, typer.Option(help="The training method; default: obbgs.")] = None,
-    quality: Annotated[
-        Quality | None,
-        typer.Option(
-            help="draft has a third of the steps and Gaussians of standard, best three times; default: standard."
-        ),
-    ] = None,
-    budget: Annotated[
-        str, typer.Option(help="The largest number of Gaussians; auto: by the number of lit pixels.")
-    ] = "auto",
-    steps: Annotated[
-        int | None, typer.Option(min=1, help="Number of training steps; default: the method's.")
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            help="A setting of the method, GROUP.NAME=VALUE; can be repeated. A wrong name lists them all.",
-        ),
-    ] = None,
-    mission: Annotated[
-        Path | None,
-        typer.Option(
-            help="A mission file: its reconstruct section counts where no option is given; default: none is read."
-        ),
-    ] = None,
-    time_limit: Annotated[
-        float, typer.Option(help="Seconds for each training; then the model is made as it is.")
-    ] = math.inf,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="The same seed makes the same model; default: 7.")
-    ] = None,
-    blind_reference: Annotated[
-        bool, typer.Option(help="Train a second time without exposure times, for comparison.")
-    ] = False,
-    overwrite: Annotated[bool, typer.Option(help="Replace a finished run of the same name.")] = False,
-    threads: Annotated[int | None, typer.Option(min=1, help="Processor cores; default: all.")] = None,
+    method: MethodName = None,
+    quality: QualityName = None,
+    budget: Budget = "auto",
+    steps: Steps = None,
+    settings: SettingsGiven = None,
+    mission: ReconstructMission = None,
+    time_limit: TimeLimit = math.inf,
+    seed: Seed = None,
+    blind_reference: BlindReference = False,
+    overwrite: Overwrite = False,
+    threads: Threads = None,
     json_: AsJson = False,
 ) -> None:
     """Train a model on a session, export it, score it and write its report.
