@@ -7,6 +7,7 @@ import importlib.machinery
 import importlib.util
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 
 import numpy as np
@@ -14,13 +15,11 @@ import numpy as np
 THREADS = (1, 2, 4)
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 SIZES = [(33, 70), (1, 1), (97, 31)]  # height and width, px: neither is a multiple of a block or tile
-KINDS = [
-    (1, 1, "view"),
-    (4, 3, "view"),
-    (16, 3, "view"),
-    (9, 1, "sun"),
-    (1, 3, "lambert"),
-]  # coefficients, channels
+# coefficients, channels, what lights them
+KINDS = [(1, 1, "view"), (4, 3, "view"), (16, 3, "view"), (9, 1, "sun"), (1, 3, "lambert")]
+# Images that the loss depends on, each with those before it: each choice has loops of its own.
+ASKED = ("radiance", "depth", "normals")
+CROWD = 20_000  # Gaussians in two views: enough work for four threads in every loop of the rasterizer
 
 
 def load(path: str) -> ModuleType:
@@ -48,6 +47,9 @@ def model(rng: np.random.Generator, count: int, coefficients: int, channels: int
             flat = array.reshape(-1)
             flat[rng.integers(0, flat.size, max(1, flat.size // 20))] = rng.choice(awkward)
             flat[rng.integers(0, flat.size, max(1, flat.size // 20))] = rng.choice(awkward)
+        if count > 1:  # one that is drawn although its edge lies beyond 2^31 px
+            arrays["means"][-1], arrays["quats"][-1] = 0.0, 1.0
+            arrays["log_scales"][-1], arrays["opacity_logits"][-1], arrays["sh"][-1] = 18.0, 3.0, 0.5
     return {name: array.astype(np.float32) for name, array in arrays.items()}
 
 
@@ -64,7 +66,12 @@ def cameras(rng: np.random.Generator, count: int, height: int, width: int) -> di
 
 
 def rasterize(
-    module: ModuleType, kernel: str, scene: dict, size: tuple[int, int], threads: int
+    module: ModuleType,
+    kernel: str,
+    scene: dict,
+    size: tuple[int, int],
+    threads: int,
+    asked: str = "normals",
 ) -> list[np.ndarray]:
     """Return all that the forward and the backward pass write."""
     gaussians, views = len(scene["means"]), len(scene["world_to_camera"])
@@ -75,35 +82,68 @@ def rasterize(
     radiance, normals = empty(views, *size, channels), empty(views, *size, 3)
     alpha, depth, median_depth = (empty(views, *size) for _ in range(3))
     means2d, radii = empty(views, gaussians, 2), empty(views, gaussians)
-    rasterization.forward(threads, radiance, alpha, depth, median_depth, normals, means2d, radii)
+    seen = normals if asked == "normals" else None
+    rasterization.forward(threads, radiance, alpha, depth, median_depth, seen, means2d, radii)
     names = ("means", "quats", "log_scales", "opacity_logits", "sh", "world_to_camera")
     gradients = [np.empty_like(scene[name]) for name in names]
     gradients += [empty(1), empty(views, gaussians, 2), empty(views, gaussians)]
-    images = (np.ones_like(image) for image in (radiance, alpha, depth, normals))
-    rasterization.backward(threads, radiance, depth, normals, *images, np.ones_like(means2d), *gradients)
+    of_radiance = np.broadcast_to(np.float32(1), radiance.shape)  # its strides are zero
+    of_depth = None if asked == "radiance" else np.ones_like(depth)
+    of_normals = np.ones_like(normals[..., ::-1])[..., ::-1] if asked == "normals" else None
+    of_means2d = None if asked == "depth" else np.ones_like(means2d)
+    rasterization.backward(
+        threads,
+        radiance,
+        depth,
+        seen,
+        of_radiance,
+        np.ones_like(alpha),
+        of_depth,
+        of_normals,
+        of_means2d,
+        *gradients,
+    )
     assert rasterization.bytes >= rasterization.pairs >= 0
-    return [radiance, alpha, depth, median_depth, normals, means2d, radii, *gradients]
+    images = [radiance, alpha, depth, median_depth, *([] if seen is None else [seen])]
+    return [*images, means2d, radii, *gradients]
 
 
 def empty(*shape: int) -> np.ndarray:
     return np.full(shape, np.nan, dtype=np.float32)
 
 
+def same(results: list[list[np.ndarray]]) -> bool:
+    """Return whether all hold the same numbers, bit for bit."""
+    pairs = (pair for other in results[1:] for pair in zip(results[0], other, strict=True))
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+
+
 def exercise_rasterizer(module: ModuleType, kernel: str) -> None:
     for coefficients, channels, shading in KINDS:
-        for height, width in SIZES:
+        for size in SIZES:
             for count in (0, 1, 17, 1500):
                 rng = np.random.default_rng(count)
                 scene = model(rng, count, coefficients, channels, hostile=False)
-                scene |= cameras(rng, 2, height, width)
+                scene |= cameras(rng, 2, *size)
                 scene["sunlit"] = rng.random((2, count), dtype=np.float32) if shading == "lambert" else None
                 scene["sun_dir"] = None if shading == "view" else scene["sun_dir"]
-                results = [rasterize(module, kernel, scene, (height, width), threads) for threads in THREADS]
-                for other in results[1:]:  # the number of threads changes no bit
-                    assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
-                assert all(np.isfinite(array).all() for array in results[0])
-                hostile = scene | model(rng, count, coefficients, channels, hostile=True)
-                rasterize(module, kernel, hostile, (height, width), 2)
+                for asked in ASKED if count == 17 else ["normals"]:
+                    results = [rasterize(module, kernel, scene, size, threads, asked) for threads in THREADS]
+                    assert same(results)  # the number of threads changes no bit
+                    assert all(np.isfinite(array).all() for array in results[0])
+                    hostile = scene | model(rng, count, coefficients, channels, hostile=True)
+                    rasterize(module, kernel, hostile, size, 2, asked)
+
+
+def exercise_threads(module: ModuleType, kernel: str) -> None:
+    """Draw more Gaussians, which the helper threads share, also for two callers at the same time."""
+    rng, size = np.random.default_rng(3), (200, 130)
+    scene = model(rng, CROWD, 1, 3, hostile=False) | cameras(rng, 2, *size)
+    scene["sunlit"] = rng.random((2, CROWD), dtype=np.float32)
+    results = [rasterize(module, kernel, scene, size, threads) for threads in THREADS]
+    with ThreadPoolExecutor(2) as callers:
+        results += callers.map(lambda threads: rasterize(module, kernel, scene, size, threads), (2, 2))
+    assert same(results)
 
 
 def exercise_losses(module: ModuleType) -> None:
@@ -111,7 +151,7 @@ def exercise_losses(module: ModuleType) -> None:
     rng = np.random.default_rng(1)
     for averaged_pixels in (1.0, 4.0):
         sensor = module.SensorModel(64.0, 4095.0, 2.0, 3.0, averaged_pixels)
-        for shape in [(2, 53, 37, 3), (1, 3, 3, 1), (3, 130, 20, 1)]:
+        for shape in [(2, 53, 37, 3), (1, 3, 3, 1), (1, 1, 1, 3), (2, 2, 5, 1), (3, 130, 20, 1)]:
             dn = np.round(np.clip(rng.uniform(-200, 4500, shape), 0, 4095)).astype(np.float32)
             gains = np.full(shape[0], 4e3, dtype=np.float32)
             radiance = ((dn - 64) / 4e3 * rng.uniform(0.8, 1.2, shape)).astype(np.float32)
@@ -140,11 +180,10 @@ def exercise_losses(module: ModuleType) -> None:
                     results[-1] += [np.float64(value), residual, gradient]
                     alpha = rng.random(shape[:3], dtype=np.float32)
                     module.fit(radiance, alpha, dn, gains, sensor, 0.05, threads)
-                    module.likelihood(radiance, dn, gains, sensor, 0.0, residual, None, threads)
-                for other in results[1:]:
-                    assert all(
-                        np.array_equal(a, b, equal_nan=True) for a, b in zip(results[0], other, strict=True)
-                    )
+                    residual = np.empty_like(dn)
+                    module.likelihood(radiance, dn, gains, sensor, 0.2, residual, None, threads)
+                    module.published(radiance, dn, gains, sensor, 0.2, 0.1, residual, None, threads)
+                assert same(results)
 
 
 def exercise_adam(module: ModuleType) -> None:
@@ -157,8 +196,7 @@ def exercise_adam(module: ModuleType) -> None:
                 gradient = rng.normal(size=count).astype(np.float32)
                 module.adam_step(parameter, gradient, first, second, 0.01, 0.9, 0.999, 1e-15, threads)
             results.append([parameter, first, second])
-        for other in results[1:]:
-            assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
+        assert same(results)
 
 
 def exercise_refusals(module: ModuleType) -> None:
@@ -181,6 +219,7 @@ def main() -> None:
         began = time.monotonic()
         module.use_kernel(kernel)
         exercise_rasterizer(module, kernel)
+        exercise_threads(module, kernel)
         exercise_losses(module)
         exercise_adam(module)
         print(f"  {kernel}: {time.monotonic() - began:.0f} s", flush=True)

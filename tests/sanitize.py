@@ -64,9 +64,7 @@ def run(sanitizer: str, *arguments: str) -> None:
     command = [*fixed_addresses, sys.executable, *arguments]
     code = subprocess.run(command, cwd=ROOT, env=environment).returncode
     if code:
-        sys.exit(
-            f"sanitize: {sanitizer}: exit code {code} of {' '.join(arguments[:3])}; the report stands above"
-        )
+        sys.exit(f"sanitize: {sanitizer}: Python ended with {code}; the report stands above")
 
 
 def runtime(library: str) -> str:

@@ -341,6 +341,24 @@ def test_one_gaussian_of_any_shape_covers_the_pixels_it_covers_in_the_reference(
 
 
 @needs_native
+@pytest.mark.parametrize("kernel", native_kernels())
+@pytest.mark.parametrize("sideways_m", [0.0, 5e7, -5e7])
+def test_a_gaussian_that_reaches_beyond_two_to_the_31_pixels_is_drawn_as_in_the_reference(kernel, sideways_m):
+    cameras = looking_at_origin(1, 150, height=110)
+    cameras.world_to_camera[0, :3, :3] = torch.eye(3)  # so that its depth is exact
+    small, huge = random_gaussians(2).select(torch.tensor([0])), random_gaussians(2).select(torch.tensor([1]))
+    small.log_scales += 3.0
+    huge.means[0] = torch.tensor([sideways_m, 0.1, 0.2])
+    huge.log_scales[:] = float(np.log(5e7))
+    huge.opacity_logits[:] = 1.0
+    both = Gaussians.concatenate([small, huge])
+    ours, truth = render(both, cameras, f"native-{kernel}"), render(both, cameras, "reference")
+    assert truth.alpha.min() > 0.2 and truth.radii[0, 1] > 2**31
+    for name in ("radiance", "alpha", "depth"):
+        torch.testing.assert_close(getattr(ours, name), getattr(truth, name), rtol=1e-4, atol=1e-4, msg=name)
+
+
+@needs_native
 def test_a_graph_can_be_differentiated_twice_but_not_after_its_model_changed():
     gaussians, cameras = random_gaussians(50, 1), looking_at_origin(1, 32)
     leaves = {n: t.clone().requires_grad_() for n, t in gaussians.tensors().items()}
