@@ -13,6 +13,7 @@ demo: setup
 test: setup
 	.venv/bin/ruff format --check .
 	.venv/bin/ruff check .
+	.venv/bin/clang-format --dry-run --Werror obbgs_core/render/kernels/*.cpp obbgs_core/render/kernels/*.h
 	.venv/bin/pyright
 	.venv/bin/pytest -n 2 --dist loadfile $(ARGS)
 
