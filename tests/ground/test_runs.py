@@ -386,8 +386,13 @@ def test_an_interrupted_command_ends_with_one_line_and_exit_code_1(monkeypatch, 
 
     monkeypatch.setattr(work, interrupted)
     monkeypatch.setattr("sys.argv", ["ground", *command])
-    with pytest.raises(SystemExit) as exit_info:
-        cli.main()
+    # a shell that starts the tests in the background lets them ignore Ctrl-C, and Python keeps it so
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(SystemExit) as exit_info:
+            cli.main()
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert exit_info.value.code == 1
     assert capsys.readouterr().err.startswith("ground: interrupted; ")
 
