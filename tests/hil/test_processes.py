@@ -55,7 +55,13 @@ def end_in_the_middle(command: list[str], number: int, tmp_path: Path) -> int:
     """
     with open(tmp_path / "log", "wb") as log:
         process = subprocess.Popen(
-            command, cwd=ROOT, env=os.environ | {"TMPDIR": str(tmp_path)}, stdout=log, stderr=log
+            command,
+            cwd=ROOT,
+            env=os.environ | {"TMPDIR": str(tmp_path)},
+            stdout=log,
+            stderr=log,
+            # a shell that starts the tests in the background lets them ignore Ctrl-C, and the command would inherit it
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
     started: dict[int, str] = {}
     try:
