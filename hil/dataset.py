@@ -28,7 +28,7 @@ from hil.sky.motion import image_velocity, smear
 from hil.sky.render_farm import RenderFarm
 from hil.sky.sensor import PRESETS, SensorModel, read_out
 from hil.sky.stars import star_radiance
-from hil.world.scenario import Scene, SceneState, load_scenario
+from hil.world.scenario import Scene, SceneState, load_scenario, ready_made
 from obbgs_base.errors import ObbgsError
 from obbgs_base.files import write_whole
 
@@ -84,14 +84,7 @@ def load_dataset_config(name: str | Path) -> DatasetConfig:
     Raises:
         ConfigError: it does not exist or is wrong; the message names the file and the key's path.
     """
-    path = DATASETS / f"{name}.yaml"
-    if not path.is_file():
-        path = Path(name)
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        names = ", ".join(sorted(p.stem for p in DATASETS.glob("*.yaml")))
-        raise ConfigError(str(name), f"no such data set: expected a YAML file or one of {names}") from error
+    path, content = ready_made(name, DATASETS, "data set")
     with in_file(path):
         return build(DatasetConfig, parse_yaml(content, "dataset"), "dataset")
 

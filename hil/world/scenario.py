@@ -220,20 +220,32 @@ def describe(scenario: Scenario) -> dict:
     return facts
 
 
+def ready_made(name: str | Path, folder: Path, what: str) -> tuple[Path, bytes]:
+    """Return the path and content of a YAML file: by its name in a folder of ready-made ones, or by its own path.
+
+    Args:
+        what: what the file holds, for the message.
+
+    Raises:
+        ConfigError: it cannot be read; the message lists the ready-made ones.
+    """
+    path = folder / f"{name}.yaml"
+    if not path.is_file():
+        path = Path(name)
+    try:
+        return path, path.read_bytes()
+    except OSError as error:
+        names = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
+        raise ConfigError(str(name), f"no such {what}: expected a YAML file or one of {names}") from error
+
+
 def load_scenario(name: str | Path) -> Scenario:
     """Return a ready-made scenario by its name, or the one in a YAML file.
 
     Raises:
         ConfigError: no such scenario, or the file is wrong; the message names the file and the key's path.
     """
-    path = SCENARIOS / f"{name}.yaml"
-    if not path.is_file():
-        path = Path(name)
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        names = ", ".join(sorted(p.stem for p in SCENARIOS.glob("*.yaml")))
-        raise ConfigError(str(name), f"no such scenario: expected a YAML file or one of {names}") from error
+    path, content = ready_made(name, SCENARIOS, "scenario")
     with in_file(path):
         tree = parse_yaml(content, "scenario")
         return build(Scenario, tree, "scenario", sha256=hashlib.sha256(content).hexdigest())
