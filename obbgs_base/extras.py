@@ -1,7 +1,8 @@
 """Which modules belong to which extra of the package, so that a command can say what to install for a missing one."""
 
 EXTRAS = {
-    "ground": {"gsply", "onnx", "onnxruntime", "plotly", "plyfile", "scipy", "torch"},
+    "ground": {"cv2", "gsply", "onnx", "onnxruntime", "plotly", "plyfile", "scipy", "torch"},
+    "compare": {"distributed", "matplotlib", "pycolmap"},  # and those of ground
     "hil": {"trimesh"},  # and those of ground
 }
 
@@ -10,7 +11,7 @@ def how_to_install(error: ModuleNotFoundError, extra: str) -> str | None:
     """Return how to get a missing module that belongs to an extra of this package; None for any other module.
 
     Args:
-        extra: the one to name, that of the tool: ground or hil.
+        extra: the one to name, ground, compare or hil.
     """
     module = (error.name or "").partition(".")[0]
     if not any(module in modules for modules in EXTRAS.values()):
