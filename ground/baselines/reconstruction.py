@@ -1,0 +1,56 @@
+"""What every compared method returns, and how the comparison follows and interrupts its work."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from obbgs_core.model.cameras import Cameras
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What a method made of some frames.
+
+    points: [N, 3] its own points, m, body frame: the centres of Gaussians, or a point cloud.
+    surface: [M, 3] points on the surface that the training views see, m, body frame; empty where it has none.
+    image: from one camera and an exposure time (s) to a noiseless image [H, W, C] as a fraction of full scale, 0 to 1;
+        None where the method makes no images.
+    size_bytes: of the file or the parameters that one would keep.
+    seconds: of the method's own work, without scoring, over all interrupted parts.
+    figures: further columns of its row, such as the number of registered frames.
+    """
+
+    points: Tensor
+    surface: Tensor
+    image: Callable[[Cameras, float], Tensor] | None
+    size_bytes: int
+    seconds: float
+    figures: dict[str, Any] = field(default_factory=dict)
+
+    @staticmethod
+    def nothing(seconds: float, reason: str) -> "Reconstruction":
+        """Return the reconstruction of a method that failed, with the reason in its row."""
+        empty = torch.zeros(0, 3)
+        return Reconstruction(empty, empty, None, 0, seconds, {"failed": reason})
+
+
+@dataclass(frozen=True)
+class Work:
+    """How one reconstruction is followed, kept and interrupted.
+
+    folder: where checkpoints and other intermediate files go; a killed reconstruction goes on from them when it is
+        called again. None: nothing is kept.
+    on_step: called with the share of the work that is done, the seconds spent so far, and a function that returns the
+        reconstruction as it stands; its own time does not count as the method's.
+    should_stop: asked after each step; when it returns true, the work is saved and ends in `Interrupted`.
+    """
+
+    folder: Path | None = None
+    on_step: Callable[[float, float, Callable[[], Reconstruction]], None] = lambda share, seconds, snapshot: (
+        None
+    )
+    should_stop: Callable[[], bool] = lambda: False

@@ -1,0 +1,1 @@
+"""`ground compare`: grids of methods, sessions, seeds and conditions, trained, scored and drawn."""
