@@ -1,1 +1,0 @@
-"""`ground compare`: grids of methods, sessions, seeds and conditions, trained, scored and drawn."""
