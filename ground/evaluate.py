@@ -1,7 +1,6 @@
 """The scores of a finished run: against its held-out frames and, where a simulator left it, against the truth."""
 
 import json
-import logging
 import math
 from pathlib import Path
 
@@ -11,14 +10,12 @@ import torch
 from ground.cameras import camera_of, exposed, predicted_image
 from ground.card import model_card
 from ground.runs import Run, open_run, written_to
+from ground.scores import ScoredView, clean_scores, cloud_scores, noisy_psnr_db
 from ground.session import FrameRecord
 from ground.truth import Truth, read_points
 from obbgs_base.files import write_whole
 from obbgs_core.render import render
-from obbgs_core.score.lpips import WeightsMissing, lpips
-from obbgs_core.score.metrics import cloud_distances, foreground_psnr_db, psnr_db, ssim
-
-log = logging.getLogger(__name__)
+from obbgs_core.score.metrics import psnr_db
 
 
 def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
@@ -33,8 +30,7 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     errors of the model:
 
     - psnr_clean_db, ssim_clean, lpips_clean (AlexNet; where its weights were fetched): against noiseless exposures.
-    - psnr_clean_<exposure>_db: the same by exposure time.
-    - psnr_clean_foreground_db: the same, of the pixels that the target covers; missing where it covers none.
+    - psnr_clean_<exposure>_db, psnr_clean_pooled_db, psnr_clean_foreground_db: as in `clean_scores`.
     - psnr_clean_blind_db: psnr_clean_db of the training that ignored exposure times.
     - psnr_radiance_db: of scene-linear radiance, the brightest true pixel of a frame as 1.
     - chamfer, hausdorff, accuracy, completeness: of the Gaussians' centres, in units where the target's largest
@@ -44,26 +40,19 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
         SessionError: no such session or run, damaged metrics or truth, or a run folder that cannot be written.
     """
     run = open_run(session_dir, name, out)
-    figures: dict[str, float] = {}
-    figures["psnr_noisy_db"] = _mean(
-        psnr_db(
-            predicted_image(run.gaussians, run.session, r, run.sensor, _exposure_s(run, r)), _noisy(run, r)
-        )
-        for r in run.scored
-    )
+    figures = {
+        "psnr_noisy_db": noisy_psnr_db((_image(run, record), _noisy(run, record)) for record in run.scored)
+    }
     if Truth.exists(run.session):
         truth = Truth(run.session)
-        figures |= _clean_figures(run, truth)
-        scale = 2 / truth.largest_dimension_m
-        true_cloud = truth.cloud_m * scale
-        centres = run.gaussians.means.double().numpy() * scale
-        figures |= cloud_distances(centres, true_cloud)
+        records = list(map(truth.posed, run.scored))
+        figures |= clean_scores([_scored(run, truth, record) for record in records])
+        figures |= _radiance_figures(run, truth, records)
         surface = np.zeros((0, 3))
         if (run.folder / "surface.ply").exists():
-            surface = read_points(run.folder / "surface.ply") * scale
-        if len(surface):
-            on_surface = cloud_distances(surface, true_cloud)
-            figures |= {f"{key}_surface": value for key, value in on_surface.items()}
+            surface = read_points(run.folder / "surface.ply")
+        centres = run.gaussians.means.double().numpy()
+        figures |= cloud_scores(centres, surface, truth.cloud_m, 2 / truth.largest_dimension_m)
     metrics = {**run.metrics, **{key: round(value, 5) for key, value in figures.items()}}
     with written_to(run.folder):
         write_whole(run.folder / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
@@ -71,38 +60,33 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     return metrics
 
 
-def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:
-    by_exposure: dict[float, list[float]] = {}
-    similarity, blind, linear = [], [], []
-    views: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []  # image, truth, coverage
-    for record in map(truth.posed, run.scored):
-        true, coverage = map(torch.from_numpy, truth.radiance(record))
-        clean = exposed(true, run.sensor, record.exposure_time_s)
+def _image(run: Run, record: FrameRecord) -> torch.Tensor:
+    """Return the model's image of a frame."""
+    return predicted_image(run.gaussians, run.session, record, run.sensor, _exposure_s(run, record))
+
+
+def _scored(run: Run, truth: Truth, record: FrameRecord) -> ScoredView:
+    """Return the model's image of a frame with its truth."""
+    coverage = torch.from_numpy(truth.radiance(record)[1])
+    return ScoredView(_image(run, record), clean_image(run, truth, record), coverage, record.exposure_time_s)
+
+
+def _radiance_figures(run: Run, truth: Truth, records: list[FrameRecord]) -> dict[str, float]:
+    """Return the scores of scene-linear radiance, and of the training that ignored exposure times if there was one."""
+    linear, blind = [], []
+    for record in records:
+        true = torch.from_numpy(truth.radiance(record)[0])
         with torch.no_grad():
             radiance = render(run.gaussians, camera_of(run.session, record)).radiance[0]
-        predicted = exposed(radiance, run.sensor, _exposure_s(run, record))
-        views.append((predicted, clean, coverage))
-        by_exposure.setdefault(record.exposure_time_s, []).append(psnr_db(predicted, clean))
-        similarity.append(ssim(predicted, clean))
         brightest = true.max().clamp(min=1e-6)
         linear.append(psnr_db(radiance / brightest, true / brightest))
         if run.blind is not None:
             exposure_s = run.metrics["blind_reference_exposure_s"]
             ignoring = predicted_image(run.blind, run.session, record, run.sensor, exposure_s)
-            blind.append(psnr_db(ignoring, clean))
-    figures = {"psnr_clean_db": _mean(value for values in by_exposure.values() for value in values)}
-    for exposure_s, values in sorted(by_exposure.items()):
-        figures[f"psnr_clean_{exposure_s * 1e3:g}ms_db"] = _mean(values)
-    if not math.isnan(foreground_db := foreground_psnr_db(views)):
-        figures["psnr_clean_foreground_db"] = foreground_db
-    figures["ssim_clean"] = _mean(similarity)
-    try:
-        figures["lpips_clean"] = _mean(lpips(image, clean, network="alex") for image, clean, _ in views)
-    except WeightsMissing as error:
-        log.info("LPIPS is left out: %s", error)
-    figures["psnr_radiance_db"] = _mean(linear)
+            blind.append(psnr_db(ignoring, clean_image(run, truth, record)))
+    figures = {"psnr_radiance_db": math.fsum(linear) / len(linear)}
     if blind:
-        figures["psnr_clean_blind_db"] = _mean(blind)
+        figures["psnr_clean_blind_db"] = math.fsum(blind) / len(blind)
     return figures
 
 
@@ -120,8 +104,3 @@ def _noisy(run: Run, record: FrameRecord) -> torch.Tensor:
     """Return a frame as received [H, W, C], as a fraction of full scale."""
     dn = run.session.dn(record).astype(np.float32)
     return torch.from_numpy(dn.reshape(*dn.shape[:2], -1) / run.sensor.white_dn)
-
-
-def _mean(values) -> float:
-    values = list(values)
-    return math.fsum(values) / len(values)

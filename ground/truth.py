@@ -48,6 +48,7 @@ def write_truth(
     faces: np.ndarray,
     cloud_m: np.ndarray,
     simulation: dict[str, dict] | None = None,
+    largest_dimension_m: float | None = None,
 ) -> None:
     """Write the truth folder of a session whole; one that exists is replaced when the new one is complete.
 
@@ -57,6 +58,7 @@ def write_truth(
         vertices_m, faces: [V, 3] body frame and [F, 3], the target's mesh.
         cloud_m: [N, 3] body frame, points on the surface that the frames see.
         simulation: what was simulated, by part (camera, link, ...) and quantity, for the report.
+        largest_dimension_m: of the target; None: that of the mesh.
 
     Raises:
         OSError: the disk refuses.
@@ -69,7 +71,7 @@ def write_truth(
         "frames": [_write_frame(part, frame) for frame in frames],
         "cloud": "cloud.ply",
         "mesh": "mesh.ply",
-        "largest_dimension_m": float(np.ptp(vertices_m, axis=0).max()),
+        "largest_dimension_m": largest_dimension_m or float(np.ptp(vertices_m, axis=0).max()),
         "simulation": simulation or {},
     }
     triangles = np.zeros(len(faces), dtype=[("vertex_indices", "i4", (3,))])

@@ -7,10 +7,10 @@ from tests.benchmarks import rows
 
 
 def test_a_row_says_commit_machine_load_and_command():
-    row = json.loads(rows.shown({"method": "obbgs", "psnr_clean_db": 40.0}, "methods", as_json=True))
-    assert row["bench"] == "methods" and row["psnr_clean_db"] == 40.0
+    row = json.loads(rows.shown({"method": "obbgs", "psnr_clean_db": 40.0}, "triage", as_json=True))
+    assert row["bench"] == "triage" and row["psnr_clean_db"] == 40.0
     assert {"commit", "machine", "threads", "load", "utc", "command"} <= set(row)
-    assert row["command"].startswith("python -m tests.benchmarks.methods")
+    assert row["command"].startswith("python -m tests.benchmarks.triage")
 
 
 def test_the_page_has_a_line_a_method_and_target_with_the_mean_over_seeds(tmp_path):

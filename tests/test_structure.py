@@ -37,7 +37,9 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     "ground.session_writer": {"obbgs_base", "flightsw.icd", "ground.session", "ground.telemetry"},
     "ground.formats": {"obbgs_base", "flightsw.icd", "ground.session", "ground.session_writer"},
     "ground.baselines": {"obbgs_core.model"},
-    "ground": CONTRACT | {"flightsw.ports", "ground.formats"} | SESSIONS | LIBRARY,
+    "ground.compare": {"obbgs_base", "flightsw.icd", "ground", "ground.baselines", "ground.session"}
+    | LIBRARY,
+    "ground": CONTRACT | {"flightsw.ports", "ground.formats", "ground.compare"} | SESSIONS | LIBRARY,
     "hil.watched": {"obbgs_base"},
     "hil.sky": {"obbgs_base", "flightsw.icd"},
     "hil.world": {"obbgs_base", "flightsw.icd", "flightsw", "flightsw.cameras"},

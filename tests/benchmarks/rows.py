@@ -6,18 +6,11 @@ worth keeping are appended to `results/NAME.jsonl` and committed; `python -m tes
 """
 
 import json
-import os
-import platform
 import statistics
-import subprocess
-import sys
 from collections.abc import Iterable
-from datetime import UTC, datetime
 from pathlib import Path
 
-import torch
-
-from obbgs_core.render import native_kernels
+from ground.compare.origin import this_command, with_origin
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "results"
@@ -39,58 +32,12 @@ FIGURES = {  # key of a row: column title and format
 }
 
 
-def with_origin(row: dict, bench: str) -> dict:
-    """Return a row with the benchmark, commit, machine, load, date and command that it comes from."""
-    return {"bench": bench} | row | _origin(bench)
-
-
 def shown(row: dict, bench: str, as_json: bool) -> str:
     """Return the line that a benchmark prints for a row: JSON with its origin, or the row as text."""
     if as_json:
-        return json.dumps(with_origin(row, bench))
-    return "  ".join(f"{key} {value}" for key, value in row.items() if key != "curve")
-
-
-def _origin(bench: str) -> dict:
-    return {
-        "commit": COMMIT,
-        "machine": _machine(),
-        "threads": torch.get_num_threads(),
-        "load": round(os.getloadavg()[0], 1),
-        "utc": datetime.now(UTC).strftime("%Y-%m-%dT%H:%MZ"),
-        "command": " ".join(["python -m", f"tests.benchmarks.{bench}", *sys.argv[1:]]),
-    }
-
-
-def _commit() -> str:
-    """Return the commit that is checked out, `+changes` where files differ from it."""
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(ROOT), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-
-    commit = git("rev-parse", "--short", "HEAD") or "unknown"
-    if git("status", "--porcelain", "--untracked-files=no", "--", ":!results"):
-        commit += "+changes"
-    return commit
-
-
-COMMIT = _commit()  # when the benchmark began: files may change while it runs
-
-
-def _machine() -> str:
-    kernels = native_kernels()
-    return f"{_processor()}, {os.cpu_count()} cores, kernel {kernels[0] if kernels else 'reference'}"
-
-
-def _processor() -> str:
-    """Return the processor's name as the system tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
+        command = this_command(f"python -m tests.benchmarks.{bench}")
+        return json.dumps(with_origin(row, bench, command))
+    return "  ".join(f"{key} {value}" for key, value in row.items())
 
 
 def page(files: Iterable[Path]) -> str:

@@ -2,29 +2,35 @@
 
 The folder (default ../shared/data, or OBBGS_TARGETS) holds NAME_400.npz: radiance [120, 400, 400, 3] (scene-linear),
 alpha [120, 400, 400] (255 = full), world_to_camera [120, 4, 4], K [3, 3] px and cloud [M, 3]; the target's largest
-dimension is 2 units. Nothing else of the project reads them.
+dimension is 2 units, here 2 m. Nothing else of the project reads them. `ground compare` takes them as sessions:
+
+    python -m tests.benchmarks.targets --size 200 --out sessions TDRS DSCOVR
 """
 
-import dataclasses
+import argparse
+import hashlib
+import json
 import os
-from dataclasses import dataclass
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ground.cameras import exposed, sensor_of
-from ground.session import open_session
-from ground.training_frames import split, training_frame
-from ground.truth import Truth
+from flightsw.icd.frame import Frame, PoseTag
+from flightsw.icd.mission import CameraSection
+from flightsw.icd.quaternion import matrix_to_quat
+from ground.compare.case import Case
+from ground.session import SCHEMA_VERSION
+from ground.session_writer import frame_line
+from ground.truth import TrueFrame, write_truth
 from hil.sky.sensor import converted
-from obbgs_core.frames import TrainingFrame, cameras_of
-from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.render import render
-from obbgs_core.score.metrics import cloud_distances, foreground_psnr_db, psnr_db, ssim
-from obbgs_core.score.surface import surface_points
+from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
 
 FOLDER = Path(os.environ.get("OBBGS_TARGETS", Path(__file__).parents[3] / "shared" / "data"))
@@ -32,19 +38,26 @@ BRACKET_S = (5e-5, 1e-4, 2e-4)
 HELD_OUT = 8  # views i mod 8 = 7
 MID_SIGNAL = 0.7  # of full scale: the 97th percentile of covered pixels at the middle exposure
 PAPER_SIGMA = 0.025  # of full scale
-SURFACE_POINTS = 100_000
+BIT_DEPTH, ELECTRONS_PER_DN = 8, 1e9  # the paper's camera has no shot noise
+LARGEST_DIMENSION = 2.0
+
+
+@dataclass(frozen=True)
+class View:
+    """One view of a target: its frame, and its truth without noise."""
+
+    frame: TrainingFrame
+    radiance: Tensor  # [H, W, 3]
+    alpha: Tensor  # [H, W] in 0..1
 
 
 @dataclass(frozen=True)
 class Target:
-    """One target's frames, what they look like without noise, and its visible surface."""
+    """A target's views as an 8-bit camera of the paper sees them: Gaussian noise, then clipped."""
 
     name: str
     sensor: Sensor
-    training: list[TrainingFrame]
-    held_out: list[TrainingFrame]
-    clean: list[Tensor]  # [H, W, C] in 0..1, one a held-out frame
-    alpha: list[Tensor]  # [H, W] in 0..1, one a held-out frame
+    views: list[View]
     cloud: np.ndarray  # [M, 3]
 
 
@@ -53,22 +66,12 @@ def names() -> list[str]:
     return sorted(path.name.removesuffix("_400.npz") for path in FOLDER.glob("*_400.npz"))
 
 
-def load(
-    name: str,
-    size: int = 400,
-    sigma: float = PAPER_SIGMA,
-    bracket_s: tuple[float, ...] = BRACKET_S,
-    frames: int = 120,
-    seed: int = 0,
-    exposure_error: float = 0.0,
-) -> Target:
-    """Return a target seen by an 8-bit camera of the paper: Gaussian noise of `sigma` (full scale 1), then clipped.
+def expose(name: str, size: int = 400, sigma: float = PAPER_SIGMA, seed: int = 0) -> Target:
+    """Return a target's views; view i has exposure time i mod 3.
 
     Args:
         size: pixels along a side; 400, or 200 and 100 by averaging.
-        bracket_s: exposure times; view i takes number i mod len(bracket_s).
-        frames: how many of the 120 views, spread evenly.
-        exposure_error: deviation of ln(true / tagged exposure time) of the training frames.
+        sigma: of the noise, full scale 1.
 
     Raises:
         FileNotFoundError: no such target.
@@ -80,104 +83,147 @@ def load(
         K = torch.from_numpy(arrays["K"].astype(np.float32))
         cloud = arrays["cloud"].astype(np.float64)
     lit = radiance.mean(-1)[alpha >= 230 / 255]
-    mid_s = BRACKET_S[1]
-    gain = MID_SIGNAL / (float(np.percentile(lit.numpy(), 97)) * mid_s)  # full scale per radiance and second
+    # full scale per radiance and second
+    gain = MID_SIGNAL / (float(np.percentile(lit.numpy(), 97)) * BRACKET_S[1])
     if size != radiance.shape[1]:
         factor = radiance.shape[1] // size
         radiance = F.avg_pool2d(radiance.movedim(-1, 1), factor).movedim(1, -1)
         alpha = F.avg_pool2d(alpha[:, None], factor)[:, 0]
         K = K * torch.tensor([[1 / factor], [1 / factor], [1.0]])
-    sensor = Sensor(0.0, 255.0, 255.0 * gain, 1e9, 255.0 * sigma)
-    noise = np.random.default_rng(seed)
-    shutter = np.random.default_rng([seed, 1])  # a stream of its own: the noise stays the same
-    training, held_out, clean, covers = [], [], [], []
-    for i in np.unique(np.linspace(0, len(radiance) - 1, frames).round().astype(int)).tolist():
-        exposure_s = bracket_s[i % len(bracket_s)]
-        kept = i % HELD_OUT == HELD_OUT - 1
-        longer = 1.0 if kept else float(np.exp(shutter.normal(0, exposure_error)))
-        signal = radiance[i] * gain * exposure_s * longer  # full scale = 1, not clipped yet
+    sensor = Sensor(0.0, 255.0, 255.0 * gain, ELECTRONS_PER_DN, 255.0 * sigma)
+    noise, views = np.random.default_rng(seed), []
+    for i in range(len(radiance)):
+        exposure_s = BRACKET_S[i % len(BRACKET_S)]
+        signal = radiance[i] * gain * exposure_s  # full scale = 1, not clipped yet
         dn = converted(255 * signal.double().numpy(), 255 * sigma, 255, noise)
         frame = TrainingFrame(torch.from_numpy(dn.astype(np.float32)), exposure_s, poses[i], K, i)
-        if kept:
-            held_out.append(frame)
-            clean.append(signal.clamp(0, 1))
-            covers.append(alpha[i])
-        else:
-            training.append(frame)
-    return Target(name, sensor, training, held_out, clean, covers, cloud)
+        views.append(View(frame, radiance[i], alpha[i]))
+    return Target(name, sensor, views, cloud)
 
 
-def from_session(folder: Path) -> Target:
-    """Return a simulated session with its truth, such as `hil dataset` makes, in the same units.
+def load(name: str, size: int = 400, sigma: float = PAPER_SIGMA, seed: int = 0) -> Case:
+    """Return a target as a case of a comparison, every eighth view held out; the arguments are those of `expose`."""
+    target = expose(name, size, sigma, seed)
+    held_out = target.views[HELD_OUT - 1 :: HELD_OUT]
+    training = [view.frame for i, view in enumerate(target.views) if i % HELD_OUT != HELD_OUT - 1]
+    return Case(
+        name,
+        target.sensor,
+        training,
+        [view.frame for view in held_out],
+        [view.radiance for view in held_out],
+        [view.alpha for view in held_out],
+        target.cloud,
+        2 / LARGEST_DIMENSION,
+    )
 
-    Raises:
-        SessionError: there is no such session, or no truth beside it.
+
+def write(name: str, size: int, folder: Path) -> Path:
+    """Write a target as a session with its truth and return its folder, NAME-SIZE; one that is there is left as it is.
+
+    Each view is a bracket of its own, so that every eighth is held out.
     """
-    session = open_session(folder)
-    truth, sensor = Truth(session), sensor_of(session.camera)
-    units_per_m = 2 / truth.largest_dimension_m
-    sides: list[list[TrainingFrame]] = []
-    training, held_out = split(session)
-    for records in (training, map(truth.posed, held_out)):
-        sides.append([])
-        for record in records:
-            frame = training_frame(session, record)
-            pose = frame.world_to_camera.clone()
-            pose[:3, 3] *= units_per_m
-            sides[-1].append(dataclasses.replace(frame, world_to_camera=pose, pose_covariance=None))
-    true = [tuple(map(torch.from_numpy, truth.radiance(record))) for record in held_out]
-    clean = [exposed(light, sensor, r.exposure_time_s) for (light, _), r in zip(true, held_out, strict=True)]
-    alpha, cloud = [alpha for _, alpha in true], truth.cloud_m * units_per_m
-    return Target(session.path.parent.name, sensor, sides[0], sides[1], clean, alpha, cloud)
-
-
-@torch.no_grad()
-def predicted(gaussians: Gaussians, frame: TrainingFrame, sensor: Sensor, exposure_s: float) -> Tensor:
-    """Return the model's image of a frame [H, W, C] in 0..1."""
-    radiance = render(gaussians, cameras_of([frame])).radiance[0]
-    return (sensor.expected_dn(radiance, exposure_s) / sensor.white_dn).clamp(0, 1)
-
-
-def clean_psnr_db(gaussians: Gaussians, target: Target, reference_exposure_s: float | None = None) -> float:
-    """Return the mean PSNR over the held-out views against the noiseless exposures."""
-    values = [
-        psnr_db(predicted(gaussians, f, target.sensor, reference_exposure_s or f.exposure_time_s), exact)
-        for f, exact in zip(target.held_out, target.clean, strict=True)
-    ]
-    return sum(values) / len(values)
-
-
-def image_figures(
-    gaussians: Gaussians, target: Target, reference_exposure_s: float | None
-) -> dict[str, float]:
-    """Return the mean clean and noisy PSNR, the clean PSNR of the foreground, and the clean SSIM."""
-    sums = {"psnr_clean_db": 0.0, "psnr_noisy_db": 0.0, "ssim_clean": 0.0}
-    images = [
-        predicted(gaussians, frame, target.sensor, reference_exposure_s or frame.exposure_time_s)
-        for frame in target.held_out
-    ]
-    for image, frame, exact in zip(images, target.held_out, target.clean, strict=True):
-        sums["psnr_clean_db"] += psnr_db(image, exact)
-        sums["psnr_noisy_db"] += psnr_db(image, frame.dn / target.sensor.white_dn)
-        sums["ssim_clean"] += ssim(image, exact)
-    figures = {key: value / len(target.held_out) for key, value in sums.items()}
-    return figures | {
-        "psnr_foreground_db": foreground_psnr_db(zip(images, target.clean, target.alpha, strict=True))
+    session = folder / f"{name}-{size}"
+    if session.exists():
+        return session
+    target, part = expose(name, size), folder / f".{name}-{size}.part"
+    shutil.rmtree(part, ignore_errors=True)
+    (part / "frames").mkdir(parents=True)
+    camera = _camera(target)
+    lines = []
+    for view in target.views:
+        file = f"frames/{view.frame.id:06d}.png"
+        picture = bytes(imagecodecs.png_encode(view.frame.dn.numpy().astype(np.uint16), level=1))
+        (part / file).write_bytes(picture)
+        line = frame_line(_frame(view, camera), file, hashlib.sha256(picture).hexdigest())
+        # exactly the pose that the frame has: one made of a quaternion differs in the last digits
+        lines.append(json.dumps(line | {"world_to_camera": view.frame.world_to_camera.tolist()}))
+    (part / "frames.jsonl").write_text("\n".join(lines) + "\n")
+    header = {
+        "schema_version": SCHEMA_VERSION,
+        "mission_sha256": hashlib.sha256(f"{name} {size}".encode()).hexdigest(),
+        "imported_from": f"rendered target {name}",
+        "camera": asdict(camera),
+        "tles": {},
+        "losses": {},
+        "frames_received": len(target.views),
+        "bytes_received": 0,
+        "created_utc": "2026-01-01T00:00:00+00:00",
     }
+    (part / "session.json").write_text(json.dumps(header, indent=2) + "\n")
+    write_truth(
+        part, _true_frames(target), target.cloud, np.empty((0, 3), int), target.cloud, {}, LARGEST_DIMENSION
+    )
+    part.rename(session)
+    return session
 
 
-def cloud_figures(gaussians: Gaussians, target: Target, seed: int = 0) -> dict[str, float]:
-    """Return Chamfer, Hausdorff, completeness of the centres; completeness, accuracy of 100,000 surface points."""
-    centres = cloud_distances(gaussians.means.double().numpy(), target.cloud)
-    points, _ = surface_points(gaussians, cameras_of(target.training), SURFACE_POINTS, seed)
-    figures = {
-        "chamfer": centres["chamfer"],
-        "hausdorff": centres["hausdorff"],
-        "completeness_centres": centres["completeness"],
-        "completeness_surface": 0.0,
-        "accuracy_surface": float("inf"),
-    }
-    if len(points):
-        surface = cloud_distances(points.double().numpy(), target.cloud)
-        figures |= {"completeness_surface": surface["completeness"], "accuracy_surface": surface["accuracy"]}
-    return figures
+def _camera(target: Target) -> CameraSection:
+    frame, sensor = target.views[0].frame, target.sensor
+    height, width, channels = frame.dn.shape
+    K = frame.K.double()
+    return CameraSection(
+        width=width,
+        height=height,
+        fx_px=K[0, 0].item(),
+        fy_px=K[1, 1].item(),
+        cx_px=K[0, 2].item(),
+        cy_px=K[1, 2].item(),
+        channels=channels,
+        bit_depth=BIT_DEPTH,
+        black_dn=sensor.black_dn,
+        dn_per_radiance_s=sensor.dn_per_radiance_s,
+        electrons_per_dn=sensor.electrons_per_dn,
+        read_noise_dn=sensor.read_noise_dn,
+    )
+
+
+def _frame(view: View, camera: CameraSection) -> Frame:
+    frame, pose = view.frame, view.frame.world_to_camera.double().numpy()
+    dn = frame.dn.numpy().astype(np.uint16)
+    return Frame(
+        frame_id=frame.id,
+        bracket_id=frame.id,
+        bracket_index=0,
+        bracket_count=1,
+        exposure_time_s=frame.exposure_time_s,
+        mid_exposure_utc_ns=frame.id * 1_000_000_000,
+        pose=PoseTag(
+            quat_body_to_camera=matrix_to_quat(pose[:3, :3]),
+            position_body_m=-pose[:3, :3].T @ pose[:3, 3],
+            covariance=np.zeros((6, 6)),
+            sun_dir_body=np.zeros(3),
+            in_eclipse=False,
+            valid=True,
+            source="none",
+        ),
+        dn=dn,
+        bit_depth=camera.bit_depth,
+        black_dn=camera.black_dn,
+        saturated_count=int((dn >= camera.white_dn).any(axis=2).sum()),
+    )
+
+
+def _true_frames(target: Target) -> Iterator[TrueFrame]:
+    for view in target.views:
+        alpha = (255 * view.alpha).round().numpy().astype(np.uint8)
+        pose = view.frame.world_to_camera.double().numpy()
+        yield TrueFrame(view.frame.id, pose, view.radiance.numpy(), alpha)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("targets", nargs="*", help="names; default: all")
+    parser.add_argument("--size", type=int, default=400, choices=(400, 200, 100), help="pixels along a side")
+    parser.add_argument("--out", type=Path, required=True, help="where to write NAME-SIZE")
+    arguments = parser.parse_args()
+    if wrong := set(arguments.targets).difference(names()):
+        parser.error(f"no target {', '.join(sorted(wrong))} in {FOLDER}; there are {', '.join(names())}")
+    for name in arguments.targets or names():
+        print(write(name, arguments.size, arguments.out))
+
+
+if __name__ == "__main__":
+    main()

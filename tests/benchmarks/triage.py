@@ -41,8 +41,8 @@ from obbgs_core.render import render
 from obbgs_core.score.metrics import cloud_distances, psnr_db
 from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
+from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import train
-from tests.benchmarks.methods import configure
 
 FIRST, BUDGET = 8, 4  # an eighth comes down before there is a model, a quarter in all
 RANKED_BY = ("triage", "residual", "novelty")
@@ -181,7 +181,12 @@ def evenly(frame_ids: list[int], count: int) -> list[int]:
 def trained(the_pass: Pass, frame_ids: list[int], steps_share: float, seed: int) -> Gaussians:
     """Return the model trained on those of the frames that can be used."""
     frames = [the_pass.training[i] for i in sorted(frame_ids) if i in the_pass.training]
-    return train(frames, the_pass.sensor, configure("obbgs", steps_share), seed).gaussians
+    return train(
+        frames,
+        the_pass.sensor,
+        preset("obbgs", {"steps": max(1, round(preset("obbgs").steps * steps_share))}),
+        seed,
+    ).gaussians
 
 
 @torch.no_grad()

@@ -16,6 +16,11 @@ import yaml
 from typer.testing import CliRunner
 
 from ground import cli
+from ground.baselines.reconstruction import Work
+from ground.compare.case import load_case
+from ground.compare.follow import image_of
+from ground.compare.methods import Task, method
+from ground.compare.references import black, mean_image
 from ground.evaluate import evaluate
 from ground.pictures import bounding_box
 from ground.reconstruct import reconstruct
@@ -25,9 +30,7 @@ from ground.settings import changes_for
 from ground.training_frames import split
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.io.ply import load_ply
-from obbgs_core.train.presets import PRESETS, preset
-from tests import baselines
-from tests.benchmarks import targets
+from obbgs_core.train.presets import PRESETS
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
 TRAINED = {"steps": 700, "start.count": 2500, "growth.max_gaussians": 3000}
@@ -66,14 +69,16 @@ def test_the_model_exceeds_every_baseline_and_knowing_the_exposure_is_worth_deci
     blindness costs less than in the 256 px demo (docs/experiments/021-the-whole-loop.md).
     """
     session, metrics = trained
-    target, config = targets.from_session(session), preset("obbgs", TRAINED)
-    for baseline, above_db in (
-        (baselines.black(target), 1),
-        (baselines.mean_image(target), 4),
-        (baselines.untrained(target, config, seed=7), 4),
+    case = load_case(session)
+    start = method("untrained").run(Task(case, case.training, case.sensor, 7, 1.0, 3000, {}, Work()))
+    for images, above_db in (
+        (black(case, case.training), 1),
+        (mean_image(case, case.training), 4),
+        ([image_of(start.reconstruction, frame) for frame in case.held_out], 4),
     ):
-        assert metrics["psnr_clean_db"] >= baseline.clean_db + above_db
-        assert metrics["psnr_clean_foreground_db"] >= baseline.foreground_db + above_db
+        scores = case.image_scores(images)
+        for key in ("psnr_clean_db", "psnr_clean_foreground_db"):
+            assert metrics[key] >= scores[key] + above_db
     assert metrics["psnr_clean_db"] >= metrics["psnr_clean_blind_db"] + 0.7
     assert metrics["chamfer"] < 0.15  # of a half size of 1, from 14 views of 72 pixels
 
@@ -97,8 +102,9 @@ def test_the_run_folder_holds_what_it_should(trained):
     folder = session / "runs" / "run"
     assert len(load_ply(folder / "model.ply")) == metrics["gaussians"]
     assert metrics["frames_received"] == 48 and metrics["frames_captured"] is None  # no telemetry was heard
-    black = baselines.black(targets.from_session(session))
-    assert metrics["onnx_parity_db"] >= black.clean_db + 15  # 33.8 dB; the renderers agree to 100 dB and more
+    case = load_case(session)
+    black_db = case.image_scores(black(case, case.training))["psnr_clean_db"]
+    assert metrics["onnx_parity_db"] >= black_db + 15  # 33.8 dB; the renderers agree to 100 dB and more
     onnxruntime.InferenceSession(str(folder / "model.onnx"))
     config = yaml.safe_load((folder / "config.yaml").read_text())
     assert config["method"]["steps"] == 700 and config["seed"] == 7 and "torch" in config["versions"]

@@ -1,0 +1,154 @@
+"""One session as a comparison sees it: what every method is given, and what its result is compared with."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ground.cameras import exposed, sensor_of
+from ground.compare.errors import CompareError
+from ground.scores import ScoredView, clean_scores, cloud_scores, noisy_psnr_db
+from ground.session import Session, open_session, read_header
+from ground.training_frames import split, training_frame
+from ground.truth import Truth
+from obbgs_core.frames import TrainingFrame
+from obbgs_core.sensor import Sensor
+
+# what session.json holds besides what decides a comparison: how the frames came, and when
+INCIDENTAL = ("created_utc", "losses", "flight", "frames_received", "bytes_received", "tles")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A session's frames, and where a simulator left its truth, what they look like without noise.
+
+    held_out: in their true poses where the truth is known, so that errors of their tags do not count.
+    radiance: [H, W, C], scene-linear, and coverage: [H, W] in 0..1, of each held-out frame; empty without truth.
+    cloud_m: [N, 3], points of the true surface, body frame; None without truth.
+    units_per_m: 2 over the target's largest dimension.
+    session: where the frames came from; None for frames that are in no session.
+    """
+
+    name: str
+    sensor: Sensor
+    training: list[TrainingFrame]
+    held_out: list[TrainingFrame]
+    radiance: list[Tensor]
+    coverage: list[Tensor]
+    cloud_m: np.ndarray | None
+    units_per_m: float = 1.0
+    session: Session | None = None
+
+    @property
+    def clean(self) -> list[Tensor]:
+        """The noiseless exposures [H, W, C] of the held-out frames in 0..1; empty without truth."""
+        pairs = zip(self.radiance, self.held_out[: len(self.radiance)], strict=True)
+        return [exposed(light, self.sensor, frame.exposure_time_s) for light, frame in pairs]
+
+    @property
+    def noisy(self) -> list[Tensor]:
+        """The held-out frames as received [H, W, C] in 0..1."""
+        return [frame.dn / self.sensor.white_dn for frame in self.held_out]
+
+    def image_scores(self, images: Sequence[Tensor]) -> dict[str, float]:
+        """Return the scores of a method's images [H, W, C] of the held-out frames: noisy, and clean where known."""
+        figures = {"psnr_noisy_db": noisy_psnr_db(zip(images, self.noisy, strict=True))}
+        if not self.radiance:
+            return figures
+        exposures_s = [frame.exposure_time_s for frame in self.held_out]
+        true = zip(images, self.clean, self.coverage, exposures_s, strict=True)
+        return figures | clean_scores([ScoredView(*view) for view in true])
+
+    def cloud_scores(self, points_m: Tensor, surface_m: Tensor) -> dict[str, float]:
+        """Return the scores of a method's points [N, 3] and surface points [M, 3]; {} where no surface is known."""
+        if self.cloud_m is None:
+            return {}
+        points, surface = points_m.double().numpy(), surface_m.double().numpy()
+        return cloud_scores(points, surface, self.cloud_m, self.units_per_m)
+
+    def true_radiance(self) -> Callable[[TrainingFrame], Tensor]:
+        """Return a function from a training frame to its true radiance [H, W, C].
+
+        Raises:
+            CompareError: the session has no truth.
+        """
+        session = self.session
+        if session is None or not Truth.exists(session):
+            raise CompareError(
+                f"{self.name} has no truth, so its frames cannot be exposed anew: leave out the conditions that change "
+                "exposures, noise or response, or take a simulated session"
+            )
+        truth, records = Truth(session), {record.id: record for record in session.frames}
+        return lambda frame: torch.from_numpy(truth.radiance(records[frame.id])[0])
+
+
+def load_case(folder: Path) -> Case:
+    """Return the case of a session folder, named after the folder, or after the one above where it is `session`.
+
+    Raises:
+        SessionError: the session or its truth cannot be used.
+        CompareError: no frame is held out.
+    """
+    session = open_session(folder)
+    training, held_out = split(session)
+    if not held_out:
+        raise CompareError(
+            f"{folder} holds out no frames, so nothing can be scored: it needs two brackets or more"
+        )
+    sensor, truth = sensor_of(session.camera), Truth(session) if Truth.exists(session) else None
+    given = [training_frame(session, record) for record in training]
+    if truth is None:
+        scored = [training_frame(session, record) for record in held_out]
+        return Case(case_name(folder), sensor, given, scored, [], [], None, session=session)
+    records = list(map(truth.posed, held_out))
+    scored = [
+        dataclasses.replace(training_frame(session, record), pose_covariance=None) for record in records
+    ]
+    true = [tuple(map(torch.from_numpy, truth.radiance(record))) for record in records]
+    return Case(
+        case_name(folder),
+        sensor,
+        given,
+        scored,
+        [radiance for radiance, _ in true],
+        [coverage for _, coverage in true],
+        truth.cloud_m,
+        2 / truth.largest_dimension_m,
+        session,
+    )
+
+
+def case_name(folder: Path) -> str:
+    """Return what a session is called: its folder's name, or that of the folder above one named `session`."""
+    folder = folder.resolve()
+    return folder.parent.name if folder.name == "session" else folder.name
+
+
+def content_digest(folder: Path) -> str:
+    """Return the SHA-256 of everything in a session that a comparison depends on: frames, tags, calibration, truth.
+
+    It is the same for a copy of the session, wherever it lies.
+
+    Raises:
+        SessionError: the session or its truth cannot be used.
+    """
+    session = open_session(folder)
+    header = {key: value for key, value in read_header(folder).items() if key not in INCIDENTAL}
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    digest.update((folder / "frames.jsonl").read_bytes())
+    truth = Truth(session) if Truth.exists(session) else None
+    for record in session.frames:
+        digest.update(session.dn(record).tobytes())
+        if truth is not None:
+            digest.update(repr(truth.posed(record).world_to_camera.tolist()).encode())
+            for array in truth.radiance(record):
+                digest.update(array.tobytes())
+    if truth is not None:
+        digest.update(repr(truth.largest_dimension_m).encode() + truth.cloud_m.tobytes())
+    return digest.hexdigest()

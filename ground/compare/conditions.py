@@ -1,0 +1,241 @@
+"""Stability conditions: what is changed about a session's training frames before a method sees them.
+
+Held-out frames stay as they are. Whatever is drawn at random is drawn from the frame's number, so that every method and
+seed sees the same frames.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from flightsw.icd.config import ConfigError, build, in_file, parse_yaml, require
+from ground.compare.case import Case
+from ground.compare.errors import CompareError
+from ground.settings import checked_settings
+from obbgs_core.frames import TrainingFrame
+from obbgs_core.sensor import Sensor
+from obbgs_core.train.poses import rigid_motions
+
+NOISE, SHUTTER, DARK, POSE, LOSS = range(5)  # streams of random numbers, one a purpose
+MOST_ELECTRONS = 1e15  # NumPy's Poisson refuses about 9e18
+UNCERTAIN_SHIFT_M = 1e-6  # of a pose error that turns only: a covariance must not be singular
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One condition; the defaults leave the frames as they were taken.
+
+    These expose the training frames anew, for which a session needs its truth:
+
+    - exposure_ratios: the session's exposure times, shortest first, become its shortest times these.
+    - noise: factor on the standard deviation of the noise.
+    - exposure_error: standard deviation of ln(true / tagged exposure time), frame by frame.
+    - response_gamma: the readings follow signal ** gamma (full scale 1), while the method takes them for linear.
+
+    These need no truth:
+
+    - believed_noise, believed_gain: factors on the noise, and on the signal per light, that the method is told.
+    - frames: how many of the training frames are left, evenly spaced; 0: all.
+    - lost_percent: so many of the frames are lost at random.
+    - missing_exposure: the frames of this exposure time are lost, 1 is the shortest; 0: none.
+    - eclipse: the frames between these two shares of the session show only noise.
+    - pose_error_deg: every pose is turned at random by this standard deviation about each axis, and tagged with it.
+    - set: settings of a training, such as `growth.interval: 60`; only methods that train Gaussians run under them.
+    """
+
+    exposure_ratios: tuple[float, ...] = ()
+    noise: float = 1.0
+    exposure_error: float = 0.0
+    response_gamma: float = 1.0
+    believed_noise: float = 1.0
+    believed_gain: float = 1.0
+    frames: int = 0
+    lost_percent: float = 0.0
+    missing_exposure: int = 0
+    eclipse: tuple[float, ...] = ()
+    pose_error_deg: float = 0.0
+    set: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self):
+        for name in ("noise", "response_gamma", "believed_noise", "believed_gain"):
+            require(getattr(self, name) > 0, name, f"expected more than 0, got {getattr(self, name):g}")
+        for name in ("exposure_error", "frames", "missing_exposure", "pose_error_deg"):
+            require(getattr(self, name) >= 0, name, f"expected 0 or more, got {getattr(self, name):g}")
+        require(
+            0 <= self.lost_percent < 100,
+            "lost_percent",
+            f"expected 0 to less than 100, got {self.lost_percent:g}",
+        )
+        require(
+            all(ratio > 0 for ratio in self.exposure_ratios),
+            "exposure_ratios",
+            f"expected numbers above 0, got {list(self.exposure_ratios)}",
+        )
+        whole = not self.eclipse or (len(self.eclipse) == 2 and 0 <= self.eclipse[0] < self.eclipse[1] <= 1)
+        require(whole, "eclipse", f"expected two shares of the session in order, got {list(self.eclipse)}")
+
+    @property
+    def exposes_anew(self) -> bool:
+        """Whether frames are made from the truth."""
+        return bool(self.exposure_ratios or self.exposure_error) or (self.noise, self.response_gamma) != (
+            1,
+            1,
+        )
+
+    def stated(self) -> dict[str, Any]:
+        """Return what differs from the frames as they were taken, by name."""
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        default = Condition()
+        return {name: value for name, value in fields.items() if value != getattr(default, name)}
+
+
+AS_TAKEN = "as taken"  # the name of the condition that changes nothing
+
+
+def load_conditions(path: Path) -> dict[str, Condition]:
+    """Return the conditions of a YAML file, a mapping of names to conditions, in their order.
+
+    Raises:
+        ConfigError: the file is not such a mapping, or two conditions are the same; names the file and the key.
+        OSError: the file cannot be read.
+    """
+    with in_file(path):
+        tree = parse_yaml(path.read_bytes(), "conditions")
+        require(
+            isinstance(tree, dict) and bool(tree), "conditions", "expected a mapping of names to conditions"
+        )
+        conditions: dict[str, Condition] = {}
+        for name, content in tree.items():
+            conditions[str(name)] = _condition(content or {}, f"conditions.{name}")
+            for other in list(conditions)[:-1]:
+                same = conditions[other].stated() == conditions[str(name)].stated()
+                require(not same, f"conditions.{name}", f"is the same as {other}: leave one of them out")
+    return conditions
+
+
+def _condition(tree: Any, path: str) -> Condition:
+    """Return a condition of a file, its settings checked and of the types that a training wants."""
+    try:
+        condition = build(Condition, tree, path)
+    except ConfigError as error:  # the class names its fields without the place in the file
+        raise ConfigError(
+            error.path if error.path.startswith(path) else f"{path}.{error.path}", error.problem
+        ) from error
+    grouped: dict[str, Any] = {}
+    for key, value in condition.set.items():
+        group, dot, name = str(key).partition(".")
+        if dot:
+            grouped.setdefault(group, {})[name] = value
+        else:
+            grouped[group] = value
+    return dataclasses.replace(condition, set=checked_settings(grouped, f"{path}.set"))
+
+
+def given(case: Case, condition: Condition) -> tuple[list[TrainingFrame], Sensor]:
+    """Return the training frames of a case under a condition, and the sensor that the method is told.
+
+    Raises:
+        CompareError: the condition does not fit the session.
+    """
+    frames = case.training
+    if condition.exposes_anew:
+        frames = _exposed_anew(case, condition)
+    if condition.eclipse:
+        first, last = condition.eclipse
+        frames = [
+            _unlit(f, case.sensor) if first <= i / len(frames) < last else f for i, f in enumerate(frames)
+        ]
+    if condition.pose_error_deg:
+        frames = [_turned(f, math.radians(condition.pose_error_deg)) for f in frames]
+    frames = _left(frames, condition)
+    sensor = dataclasses.replace(
+        case.sensor,
+        dn_per_radiance_s=case.sensor.dn_per_radiance_s * condition.believed_gain,
+        electrons_per_dn=case.sensor.electrons_per_dn / condition.believed_noise**2,
+        read_noise_dn=case.sensor.read_noise_dn * condition.believed_noise,
+    )
+    return frames, sensor
+
+
+def _exposed_anew(case: Case, condition: Condition) -> list[TrainingFrame]:
+    """Return the training frames with the exposure times, the noise and the response of a condition."""
+    times_s = sorted({frame.exposure_time_s for frame in case.training})
+    ratios = condition.exposure_ratios
+    if ratios and len(ratios) != len(times_s):
+        raise CompareError(
+            f"{case.name} has {len(times_s)} exposure times, but exposure_ratios names {len(ratios)}: give one for each"
+        )
+    tagged_s = (
+        {old_s: times_s[0] * ratio for old_s, ratio in zip(times_s, ratios, strict=True)} if ratios else {}
+    )
+    radiance, frames = case.true_radiance(), []
+    for frame in case.training:
+        exposure_s = tagged_s.get(frame.exposure_time_s, frame.exposure_time_s)
+        longer = math.exp(_random(SHUTTER, frame).normal(0, condition.exposure_error))
+        light = radiance(frame).double().numpy()
+        dn = read_out(light, exposure_s * longer, case.sensor, condition, _random(NOISE, frame))
+        dn = torch.from_numpy(dn.astype(np.float32))
+        frames.append(dataclasses.replace(frame, dn=dn, exposure_time_s=exposure_s))
+    return frames
+
+
+def read_out(
+    radiance: np.ndarray, exposure_s: float, sensor: Sensor, condition: Condition, rng: np.random.Generator
+) -> np.ndarray:
+    """Return the readings (DN) of a radiance: shot and read noise times the condition's factor, rounded, then clipped.
+
+    The response bends the signal before the noise: signal ** response_gamma, full scale as 1.
+    """
+    range_dn = sensor.white_dn - sensor.black_dn
+    signal_dn = sensor.dn_per_radiance_s * exposure_s * radiance.clip(min=0)
+    signal_dn = range_dn * (signal_dn / range_dn) ** condition.response_gamma
+    mean_e = np.minimum(signal_dn * sensor.electrons_per_dn, MOST_ELECTRONS)
+    shot_dn = (rng.poisson(mean_e) - mean_e) / sensor.electrons_per_dn
+    noise_dn = shot_dn + sensor.read_noise_dn * rng.standard_normal(radiance.shape)
+    return np.rint(sensor.black_dn + signal_dn + condition.noise * noise_dn).clip(0, sensor.white_dn)
+
+
+def _unlit(frame: TrainingFrame, sensor: Sensor) -> TrainingFrame:
+    """Return a frame of the same camera that shows no light, only noise."""
+    dark = read_out(
+        np.zeros(tuple(frame.dn.shape)), frame.exposure_time_s, sensor, Condition(), _random(DARK, frame)
+    )
+    return dataclasses.replace(frame, dn=torch.from_numpy(dark.astype(np.float32)))
+
+
+def _turned(frame: TrainingFrame, sigma_rad: float) -> TrainingFrame:
+    """Return a frame with its camera turned at random about its own axes, and tagged as that uncertain."""
+    sigma = torch.tensor([sigma_rad] * 3 + [UNCERTAIN_SHIFT_M] * 3, dtype=torch.float64)
+    drawn = torch.from_numpy(_random(POSE, frame).standard_normal(6)) * sigma
+    pose = rigid_motions(drawn[None].float())[0] @ frame.world_to_camera
+    return dataclasses.replace(frame, world_to_camera=pose, pose_covariance=torch.diag(sigma**2))
+
+
+def _left(frames: list[TrainingFrame], condition: Condition) -> list[TrainingFrame]:
+    """Return the frames that are not lost."""
+    if condition.missing_exposure:
+        times_s = sorted({frame.exposure_time_s for frame in frames})
+        if condition.missing_exposure > len(times_s):
+            raise CompareError(
+                f"missing_exposure is {condition.missing_exposure}, but there are only {len(times_s)} exposure times"
+            )
+        frames = [f for f in frames if f.exposure_time_s != times_s[condition.missing_exposure - 1]]
+    if condition.frames:
+        if condition.frames > len(frames):
+            raise CompareError(f"{condition.frames} frames are asked for, only {len(frames)} are there")
+        frames = [frames[i] for i in np.linspace(0, len(frames) - 1, condition.frames).round().astype(int)]
+    if condition.lost_percent:
+        order = np.random.default_rng(LOSS).permutation(len(frames))
+        lost = set(order[: int(len(frames) * condition.lost_percent / 100)].tolist())
+        frames = [frame for i, frame in enumerate(frames) if i not in lost]
+    return frames
+
+
+def _random(stream: int, frame: TrainingFrame) -> np.random.Generator:
+    """Return the random numbers of a frame for one purpose."""
+    return np.random.default_rng((stream, frame.id))

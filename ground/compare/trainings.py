@@ -1,0 +1,131 @@
+"""Trainings of Gaussians as compared methods: resumable, followed on the way, ended early where they have converged."""
+
+import time
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ground.baselines.reconstruction import Reconstruction, Work
+from ground.cameras import exposed
+from ground.model_files import SURFACE_POINTS
+from obbgs_base.errors import Interrupted
+from obbgs_core.frames import TrainingFrame, cameras_of
+from obbgs_core.io.ply import save_ply
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.render import render
+from obbgs_core.score.surface import surface_points
+from obbgs_core.sensor import Sensor
+from obbgs_core.train.config import MethodConfig
+from obbgs_core.train.trainer import CHECKPOINT_EVERY_S, Trainer
+
+CHECKPOINT, MODEL = "training.checkpoint", "model.ply"
+NEVER_BEFORE = 0.5  # of the steps: no training ends early before
+
+
+def reconstruct_gaussians(
+    frames: list[TrainingFrame],
+    sensor: Sensor,
+    config: MethodConfig,
+    seed: int,
+    work: Work,
+    settled: Callable[[], bool] = lambda: False,
+    time_limit_s: float = float("inf"),
+) -> Reconstruction:
+    """Return the Gaussians that a method trains; its figures say how the training went.
+
+    The same call goes on from the checkpoint of a killed one and ends in the same model. A limit of 0 s returns the
+    Gaussians that the training starts from.
+
+    Args:
+        settled: asked after growth and resets are over and half of the steps are done; when it is true the training
+            ends as converged. A method with a rule of its own for its end (`chi2_end`) is not asked.
+
+    Raises:
+        ReconstructionError: the frames allow no model, or the training diverged.
+        Interrupted: work.should_stop returned true; the training is saved.
+        OSError: it cannot be saved.
+    """
+    trainer = Trainer(frames, sensor, config, seed)
+    checkpoint = None if work.folder is None else work.folder / CHECKPOINT
+    if checkpoint is not None:
+        trainer.resume(checkpoint)
+
+    def save() -> None:
+        if checkpoint is not None:
+            trainer.save(checkpoint)
+
+    saved_s = time.monotonic()
+    while not (reason := trainer.stop_reason(time_limit_s)):
+        if converged := _may_end(trainer) and settled():
+            reason = f"converged at step {trainer.state.steps_done} of {config.steps}"
+            break
+        info = trainer.step()
+        work.on_step(info.step / info.steps, info.seconds, lambda: _snapshot(trainer, frames))
+        if work.should_stop():
+            save()
+            raise Interrupted(f"interrupted at step {info.step} of {info.steps}")
+        if time.monotonic() - saved_s > CHECKPOINT_EVERY_S:
+            save()
+            saved_s = time.monotonic()
+    else:
+        converged = False
+    save()
+    result = trainer.result(reason)
+    if work.folder is not None:
+        save_ply(result.gaussians, work.folder / MODEL, sun_dir=frames[0].sun_dir)
+    points, _ = surface_points(result.gaussians, cameras_of(frames), SURFACE_POINTS, seed)
+    return Reconstruction(
+        points=result.gaussians.means,
+        surface=points,
+        image=imaging(result.gaussians, sensor, result.reference_exposure_s),
+        size_bytes=sum(4 * tensor.numel() for tensor in result.gaussians.parameters().values()),
+        seconds=result.seconds,
+        figures={
+            "gaussians": len(result.gaussians),
+            "steps": trainer.state.steps_done,
+            "converged": converged,
+            "start": result.start,
+            "stop": result.stop_reason,
+            "appearance": result.appearance,
+            "growth": result.growth,
+            "poses": result.poses,
+        },
+    )
+
+
+def imaging(
+    gaussians: Gaussians, sensor: Sensor, reference_exposure_s: float | None
+) -> Callable[[Cameras, float], Tensor]:
+    """Return the function from a camera and an exposure time (s) to a model's image [H, W, C] in 0..1.
+
+    Args:
+        reference_exposure_s: what a method that ignores exposure takes every exposure for; None: it knows them.
+    """
+
+    @torch.no_grad()
+    def image(camera: Cameras, exposure_time_s: float) -> Tensor:
+        radiance = render(gaussians, camera).radiance[0]
+        return exposed(radiance, sensor, reference_exposure_s or exposure_time_s)
+
+    return image
+
+
+def _may_end(trainer: Trainer) -> bool:
+    """Return whether growth and resets are over and half of the steps are done, of a method without an own end."""
+    config = trainer.setup.config
+    first = max(NEVER_BEFORE, config.growth.end)
+    return not config.chi2_end and trainer.state.steps_done >= first * config.steps
+
+
+def _snapshot(trainer: Trainer, frames: list[TrainingFrame]) -> Reconstruction:
+    """Return the training as it stands, without points on its surface, which take long."""
+    gaussians = trainer.state.gaussians.detach()
+    return Reconstruction(
+        points=gaussians.means,
+        surface=torch.zeros(0, 3),
+        image=imaging(gaussians, trainer.setup.sensor, trainer.setup.reference_exposure_s),
+        size_bytes=0,
+        seconds=trainer.state.seconds,
+    )

@@ -1,0 +1,92 @@
+"""The scores of a model on held-out views and against the true surface, defined once for runs and comparisons."""
+
+import logging
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from obbgs_core.score.lpips import SMALLEST_PX, WeightsMissing, lpips
+from obbgs_core.score.metrics import cloud_distances, foreground_psnr_db, psnr_db, ssim
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ScoredView:
+    """A model's image of a held-out view and the truth that it is compared with, as fractions of full scale.
+
+    image: [H, W, C], predicted without noise.
+    clean: [H, W, C], the true noiseless exposure.
+    coverage: [H, W], the share of each pixel that the target covers.
+    """
+
+    image: Tensor
+    clean: Tensor
+    coverage: Tensor
+    exposure_time_s: float
+
+
+def noisy_psnr_db(images: Iterable[tuple[Tensor, Tensor]]) -> float:
+    """Return the mean PSNR of predicted images against frames as received, pairs of [H, W, C] in 0..1."""
+    return _mean([psnr_db(image, noisy) for image, noisy in images])
+
+
+def clean_scores(views: Sequence[ScoredView]) -> dict[str, float]:
+    """Return the scores of some views against the truth, means over them.
+
+    - psnr_clean_db, ssim_clean, lpips_clean (AlexNet; where its weights were fetched, and pictures are large enough).
+    - psnr_clean_<exposure>_db: the first by exposure time.
+    - psnr_clean_pooled_db: of the mean squared error over all views together. The mean above is lifted by single views
+      that are nearly exact (each counts up to 120 dB), this is not.
+    - psnr_clean_foreground_db: of the pixels that the target covers; missing where it covers none.
+    """
+    by_exposure: dict[float, list[float]] = {}
+    for view in views:
+        by_exposure.setdefault(view.exposure_time_s, []).append(psnr_db(view.image, view.clean))
+    figures = {"psnr_clean_db": _mean([value for values in by_exposure.values() for value in values])}
+    for exposure_s, values in sorted(by_exposure.items()):
+        figures[f"psnr_clean_{exposure_s * 1e3:g}ms_db"] = _mean(values)
+    errors = [(view.image.double() - view.clean.double()).square().mean().item() for view in views]
+    figures["psnr_clean_pooled_db"] = -10 * math.log10(max(_mean(errors), 1e-12))
+    foreground_db = foreground_psnr_db((view.image, view.clean, view.coverage) for view in views)
+    if not math.isnan(foreground_db):
+        figures["psnr_clean_foreground_db"] = foreground_db
+    figures["ssim_clean"] = _mean([ssim(view.image, view.clean) for view in views])
+    if min(views[0].image.shape[:2]) >= SMALLEST_PX:
+        try:
+            figures["lpips_clean"] = _mean([lpips(view.image, view.clean, network="alex") for view in views])
+        except WeightsMissing as error:
+            log.info("LPIPS is left out: %s", error)
+    return figures
+
+
+def cloud_scores(
+    points_m: np.ndarray, surface_m: np.ndarray, true_cloud_m: np.ndarray, units_per_m: float
+) -> dict[str, float]:
+    """Return the distances of a model's points from the true surface, where the target's largest dimension is 2 units.
+
+    Args:
+        points_m: [N, 3], the Gaussians' centres, or the points of a cloud.
+        surface_m: [M, 3], points on the model's surface.
+        true_cloud_m: [K, 3], points of the true surface.
+        units_per_m: 2 over the target's largest dimension.
+
+    Returns:
+        chamfer, hausdorff, accuracy and completeness as `cloud_distances` has them; the same with _surface of the
+        points on the surface. Those of an empty cloud are missing.
+    """
+    true_cloud = true_cloud_m * units_per_m
+    figures: dict[str, float] = {}
+    if len(points_m):
+        figures |= cloud_distances(points_m * units_per_m, true_cloud)
+    if len(surface_m):
+        on_surface = cloud_distances(surface_m * units_per_m, true_cloud)
+        figures |= {f"{key}_surface": value for key, value in on_surface.items()}
+    return figures
+
+
+def _mean(values: list[float]) -> float:
+    return math.fsum(values) / len(values)
