@@ -24,11 +24,8 @@ CURVE_STEPS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)  # shares of the steps
 
 
 def configure(name: str, steps_share: float, changes: dict | None = None):
-    """Return the configuration of `METHOD` or `METHOD+exposure` with its steps scaled."""
-    method, _, known = name.partition("+")
-    config = preset(method)
-    scaled = {"steps": max(1, round(config.steps * steps_share))}
-    return preset(method, scaled | ({"exposure_aware": True} if known else {}) | (changes or {}))
+    """Return the configuration of a method or variant with its steps scaled."""
+    return preset(name, {"steps": max(1, round(preset(name).steps * steps_share))} | (changes or {}))
 
 
 def measure(
