@@ -6,22 +6,14 @@ from typing import Annotated
 
 import typer
 
+from flightsw.icd.mission import METHODS, VARIANTS
+
 SessionDir = Annotated[Path, typer.Option("--session", help="The session folder.")]
 RunName = Annotated[str, typer.Option("--name", help="The run's name: its folder below runs/.")]
 RunsDir = Annotated[
     Path | None, typer.Option("--out", help="The folder of runs; default: runs/ in the session.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-
-
-class Method(StrEnum):
-    """The training methods."""
-
-    OBBGS = "obbgs"
-    JIANG2025 = "jiang2025"
-    GAUSSIAN_SPLATTING = "3dgs"
-    PIXEL_GS = "pixel-gs"
-    MVGS = "mvgs"
 
 
 class Quality(StrEnum):
@@ -63,7 +55,14 @@ class UplinkCommand(StrEnum):
 
 
 # of `ground reconstruct`
-MethodName = Annotated[Method | None, typer.Option(help="The training method; default: obbgs.")]
+MethodName = Annotated[
+    str | None,
+    typer.Option(
+        metavar="METHOD[+VARIANT]...",
+        help=f"The training method: {', '.join(METHODS)}; default: obbgs. "
+        f"Variants ({', '.join(VARIANTS)}) are added to its name, as in 3dgs+exposure.",
+    ),
+]
 QualityName = Annotated[
     Quality | None,
     typer.Option(

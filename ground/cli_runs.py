@@ -68,7 +68,7 @@ def reconstruct_command(
             from ground.settings import all_changes
 
             section = load_mission(mission).reconstruct if mission else ReconstructSection()
-            chosen = method.value if method else section.method
+            chosen = method or section.method
             changes = all_changes(section, chosen, quality, budget, steps, settings or [])
             torch.set_num_threads(threads or os.cpu_count() or 1)
             stop.raise_at_once()

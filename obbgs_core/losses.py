@@ -77,14 +77,17 @@ def published_loss(
     sensor: Sensor,
     ssim_weight: float = 0.2,
     edge_weight: float = 0.0,
+    clamped: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """Return (1 - ssim_weight)·L1 + ssim_weight·(1 - SSIM) + edge_weight·Sobel and the residual, as in publications.
 
     The loss of 3DGS (Kerbl et al. 2023) with the edges of Jiang et al. 2025, each a mean over images of which 0 is
-    black and 1 full scale. The prediction is clamped at full scale, as the sensor clamps the readings.
+    black and 1 full scale.
 
     Args:
         radiance, exposure_time_s, dn: as for `likelihood_loss`.
+        clamped: the prediction is clamped at full scale, as the sensor clamps the readings: a saturated reading then
+            asks for no more than full scale. Otherwise it asks for exactly full scale.
 
     Returns:
         loss: scalar; residual: [B, H, W, C] predicted - read in full scales, without gradient.
@@ -95,9 +98,13 @@ def published_loss(
     _check(radiance, exposure_time_s, dn)
     native = compiled.module_for(radiance, exposure_time_s, dn)
     if native is None:
-        return published_loss_reference(radiance, exposure_time_s, dn, sensor, ssim_weight, edge_weight)
+        return published_loss_reference(
+            radiance, exposure_time_s, dn, sensor, ssim_weight, edge_weight, clamped
+        )
     model = _sensor_model(native, sensor)
-    return _swept(native.published, radiance, exposure_time_s, dn, sensor, model, ssim_weight, edge_weight)
+    return _swept(
+        native.published, radiance, exposure_time_s, dn, sensor, model, ssim_weight, edge_weight, clamped
+    )
 
 
 def published_loss_reference(
@@ -107,12 +114,13 @@ def published_loss_reference(
     sensor: Sensor,
     ssim_weight: float = 0.2,
     edge_weight: float = 0.0,
+    clamped: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """Return what `published_loss` does, in readable PyTorch."""
     full_scale_dn = sensor.white_dn - sensor.black_dn
     predicted = (sensor.expected_dn(radiance, exposure_time_s) - sensor.black_dn) / full_scale_dn
-    # clamped at full scale; what is not finite stays so
-    predicted = torch.where(predicted > 1, 1 + 0 * predicted, predicted)
+    if clamped:  # what is not finite stays so
+        predicted = torch.where(predicted > 1, 1 + 0 * predicted, predicted)
     truth = (dn - sensor.black_dn) / full_scale_dn
     loss = (1 - ssim_weight) * (predicted - truth).abs().mean()
     if ssim_weight:

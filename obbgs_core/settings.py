@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+import operator
 import typing
 from typing import Any, Literal
 
@@ -74,6 +75,11 @@ def changed(settings: Any, changes: dict[str, Any]) -> Any:
                 raise ValueError(f"there is no setting {name}; expected one of {', '.join(known)}")
         values[group] = dataclasses.replace(current, **inner) if is_group else inner[""]  # pyright: ignore
     return dataclasses.replace(settings, **values)
+
+
+def flat(settings: Any) -> dict[str, Any]:
+    """Return all settings by names such as `steps` or `growth.interval`."""
+    return {name: operator.attrgetter(name)(settings) for name in known_names(type(settings))}
 
 
 @functools.cache

@@ -175,14 +175,14 @@ def exercise_losses(module: ModuleType) -> None:
                     value = module.likelihood(radiance, dn, gains, sensor, 0.2, residual, gradient, threads)
                     results.append([np.float64(value), residual.copy(), gradient.copy()])
                     value = module.published(
-                        radiance, dn, gains, sensor, 0.2, 0.1, residual, gradient, threads
+                        radiance, dn, gains, sensor, 0.2, 0.1, True, residual, gradient, threads
                     )
                     results[-1] += [np.float64(value), residual, gradient]
                     alpha = rng.random(shape[:3], dtype=np.float32)
                     module.fit(radiance, alpha, dn, gains, sensor, 0.05, threads)
                     residual = np.empty_like(dn)
                     module.likelihood(radiance, dn, gains, sensor, 0.2, residual, None, threads)
-                    module.published(radiance, dn, gains, sensor, 0.2, 0.1, residual, None, threads)
+                    module.published(radiance, dn, gains, sensor, 0.2, 0.1, False, residual, None, threads)
                 assert same(results)
 
 

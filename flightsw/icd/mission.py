@@ -281,16 +281,28 @@ class LinkSection:
         )
 
 
+# the ground's training methods, and what can be added to their names
+METHODS = ("obbgs", "jiang2025", "3dgs", "pixel-gs", "mvgs")
+VARIANTS = ("exposure", "blind", "hull", "random")
+
+
 @dataclass(frozen=True)
 class ReconstructSection:
     """How the ground trains; `settings` change the method's own, and the ground knows their names."""
 
-    method: Literal["obbgs", "jiang2025", "3dgs", "pixel-gs", "mvgs"] = "obbgs"
+    method: str = "obbgs"  # one of METHODS, each of VARIANTS that it wants after it: 3dgs+exposure+hull
     seed: int = 7
     steps: int = 0  # of training; 0: the method's own number
     settings: dict[str, Any] = field(default_factory=dict, hash=False)  # such as light: {sun_shading: linear}
 
     def __post_init__(self):
+        method, *variants = self.method.split("+")
+        require(
+            method in METHODS and set(variants) <= set(VARIANTS),
+            "mission.reconstruct.method",
+            f"expected one of {', '.join(METHODS)}, with variants such as 3dgs+exposure ({', '.join(VARIANTS)}), got "
+            f"{self.method!r}",
+        )
         require(
             0 <= self.seed < 1 << 32, "mission.reconstruct.seed", f"expected 0 to 2^32 - 1, got {self.seed}"
         )

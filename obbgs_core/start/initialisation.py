@@ -30,7 +30,8 @@ class StartSettings:
     """The first Gaussians."""
 
     kind: Literal["random", "hull"] = "random"  # in a cube around the target, or on its hull
-    # seen: the radiance that the frames show where the points project; grey: half of full scale (3DGS)
+    # seen: the radiance that the frames show where the points project; grey: half of full scale, plus up to 0.0011 of
+    # it at random (3DGS, on data sets without a point cloud)
     colour: Literal["seen", "grey"] = "seen"
     count: int = at_least_one(100_000)  # at most: the hull may have fewer points
 
@@ -98,29 +99,55 @@ def first_gaussians(
         if len(points) >= FEWEST_HULL_POINTS:
             chosen = torch.randperm(len(points), generator=rng)[: settings.count]
             points = points[chosen] + (torch.rand(len(chosen), 3, generator=rng) - 0.5) * voxel_m
-            colours = _colours(points, frames, sensor, settings)
-            model = _round_gaussians(points, colours, coefficients, HULL_OPACITY)
+            colours = _colours(points, frames, sensor, settings, rng)
+            model = _round_gaussians(points, colours, _mean_spacing(points), coefficients, HULL_OPACITY)
             return model, radius, f"visual hull, {len(chosen)} points"
         log.warning("the silhouettes agree on only %d points; starting at random", len(points))
     points = (2 * torch.rand(settings.count, 3, generator=rng) - 1) * radius
-    colours = _colours(points, frames, sensor, settings)
-    model = _round_gaussians(points, colours, coefficients, RANDOM_OPACITY)
+    colours = _colours(points, frames, sensor, settings, rng)
+    spacing = _root_mean_square_spacing if settings.kind == "random" else _mean_spacing
+    model = _round_gaussians(points, colours, spacing(points), coefficients, RANDOM_OPACITY)
     return model, radius, f"random, {settings.count} points"
 
 
-def _colours(points: Tensor, frames: list[TrainingFrame], sensor: Sensor, settings: StartSettings) -> Tensor:
+def full_scale_radiance(frames: list[TrainingFrame], sensor: Sensor) -> float:
+    """Return the radiance that saturates a pixel at the frames' mean exposure time."""
+    return (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * mean_exposure_s(frames))
+
+
+def _colours(
+    points: Tensor,
+    frames: list[TrainingFrame],
+    sensor: Sensor,
+    settings: StartSettings,
+    rng: torch.Generator,
+) -> Tensor:
     """Return the coefficients of degree 0 [N, C] that Gaussians at points start with."""
     if settings.colour == "grey":
-        gain = sensor.dn_per_radiance_s * mean_exposure_s(frames)
-        half = 0.5 * (sensor.white_dn - sensor.black_dn) / gain
-        return sh.from_radiance(torch.tensor(half)).expand(len(points), frames[0].dn.shape[2])
+        noise = torch.rand(len(points), frames[0].dn.shape[2], generator=rng)
+        return sh.from_radiance((0.5 + sh.C0 * noise / 255) * full_scale_radiance(frames, sensor))
     return sh.from_radiance(_seen_radiance(points, frames, sensor))
 
 
-def _round_gaussians(points: Tensor, colours: Tensor, coefficients: int, opacity: float) -> Gaussians:
-    """Return round Gaussians at points, each as wide as the mean distance of its three nearest neighbours."""
+def _neighbour_distances_m(points: Tensor) -> Tensor:
+    """Return the distances [N, 3] of each point's three nearest neighbours, fewer where there are fewer points."""
     distances, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
-    spacing = torch.from_numpy(distances).float()[:, 1:].mean(dim=1).clamp(min=1e-6)
+    return torch.from_numpy(distances).float()[:, 1:]
+
+
+def _mean_spacing(points: Tensor) -> Tensor:
+    return _neighbour_distances_m(points).mean(dim=1)
+
+
+def _root_mean_square_spacing(points: Tensor) -> Tensor:  # as in 3DGS
+    return _neighbour_distances_m(points).square().mean(dim=1).sqrt()
+
+
+def _round_gaussians(
+    points: Tensor, colours: Tensor, spacing_m: Tensor, coefficients: int, opacity: float
+) -> Gaussians:
+    """Return round Gaussians at points, of deviations spacing_m [N]."""
+    spacing = spacing_m.clamp(min=1e-6)
     count = len(points)
     radiance = torch.zeros(count, coefficients, colours.shape[1])
     radiance[:, 0] = colours

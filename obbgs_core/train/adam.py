@@ -16,7 +16,7 @@ AMBIENT_RATE = 0.001  # of the ambient light a step, in units of the Sun's
 
 @dataclass(frozen=True)
 class RateSettings:
-    """Learning rates a step; those of the means are in the method's unit of length."""
+    """Learning rates a step, of the means in the method's unit of length and of `sh` in its unit of radiance."""
 
     means: float = 1.6e-4  # at the first step
     means_end: float = 1.6e-6  # at the last step, with exponential decay between them
@@ -32,16 +32,17 @@ class RateSettings:
 
 
 def learning_rates(
-    rates: RateSettings, share: float, unit_m: float, coefficients: int
+    rates: RateSettings, share: float, unit_m: float, coefficients: int, radiance_unit: float = 1.0
 ) -> dict[str, float | Tensor]:
     """Return the rate of each parameter after a share of the steps, of `sh` [1, K, 1] where coefficients differ.
 
     Args:
         unit_m: the method's unit of length.
         coefficients: K, of the radiance.
+        radiance_unit: the method's unit of radiance.
     """
     decay = rates.final_share**share
-    sh: float | Tensor = rates.sh * decay
+    sh: float | Tensor = rates.sh * decay * radiance_unit
     if rates.sh_rest != 1 and coefficients > 1:
         factors = torch.full((1, coefficients, 1), rates.sh_rest)
         factors[:, 0] = 1

@@ -61,7 +61,7 @@ class Shadows:
 
 
 def freeze_later_degrees(gaussians: Gaussians, step: int, settings: LightSettings) -> None:
-    """Clear the gradients of the coefficients whose degree is not trained yet (Kerbl et al. 2023)."""
+    """Clear the gradients of the coefficients whose degree is not trained yet at a step, the first is 1 (3DGS)."""
     gradient = gaussians.sh.grad
     if settings.sh_interval and gradient is not None:
         degree = step // settings.sh_interval

@@ -28,6 +28,9 @@ class MethodConfig:
     exposure_aware: bool = False
     # target: its radius as the silhouettes show it; cameras: the extent of the cameras, as in 3DGS
     length_unit: Literal["target", "cameras"] = "target"
+    # of the rate of the radiance coefficients. full_scale: what saturates a pixel at the frames' mean exposure time, as
+    # where pictures of 0 to 1 are fitted; one: radiance as it is
+    radiance_unit: Literal["one", "full_scale"] = "one"
     frames_per_step: int = at_least_one(1)
     bracket_steps: bool = False  # the frames of a step are one of each exposure time
     steps: int = at_least_one(30_000)

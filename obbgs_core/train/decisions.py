@@ -33,6 +33,12 @@ log = logging.getLogger(__name__)
 REFINING_RATIO = 1.5
 
 
+def is_recorded(setup: TrainingSetup, share: float) -> bool:
+    """Return whether what growth decides by is recorded at this share of the steps."""
+    growth = setup.config.growth
+    return min(growth.begin, growth.recorded_from) <= share < growth.end
+
+
 def is_growing(setup: TrainingSetup, share: float) -> bool:
     """Return whether Gaussians are added at this share of the steps."""
     return setup.config.growth.begin <= share < setup.config.growth.end
@@ -40,15 +46,23 @@ def is_growing(setup: TrainingSetup, share: float) -> bool:
 
 @torch.no_grad()
 def observe(
-    setup: TrainingSetup, state: TrainingState, rendered: Rendered, batch: Batch, residual: Tensor
+    setup: TrainingSetup,
+    state: TrainingState,
+    rendered: Rendered,
+    batch: Batch,
+    residual: Tensor,
+    share: float,
 ) -> None:
     """Record what growth decides by: the screen gradients, and the boxes behind each frame's worst tile."""
     growth, cameras, depth_weight = setup.config.growth, batch.cameras, None
     if growth.depth_scale:
         depth_weight = near_camera_weight(state.gaussians.means, cameras, growth.depth_scale * setup.unit_m)
-    half_size_px = max(cameras.width, cameras.height) / 2
+    half_x_px, half_y_px = cameras.width / 2, cameras.height / 2  # the unit of the published threshold
+    if growth.share:  # ranks by the gradient itself
+        half_x_px = half_y_px = max(half_x_px, half_y_px)
+    half_size_px = half_x_px, half_y_px
     state.growth.observe(rendered, half_size_px, growth.pixel_weighted, depth_weight)
-    if growth.obb_interval:
+    if growth.obb_interval and is_growing(setup, share):
         state.boxes += worst_boxes(state.gaussians, rendered, cameras, residual)
 
 

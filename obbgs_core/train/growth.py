@@ -17,7 +17,7 @@ from obbgs_core.train.adam import Adam
 SPLIT_SHRINK = 1.6  # the two Gaussians of a split have its deviations divided by this (Kerbl et al. 2023)
 # of the method's unit of length: larger Gaussians are split, smaller ones cloned (the same)
 SPLIT_SIZE = 0.01
-GRADIENT_THRESHOLD = 0.0002  # mean screen gradient per half of the longer side of an image (the same)
+GRADIENT_THRESHOLD = 0.0002  # mean screen gradient, per half of an image's width and height (the same)
 RESET_OPACITY = 0.01  # no opacity is above this after a reset (the same)
 
 
@@ -29,6 +29,8 @@ class GrowthSettings:
     # above 0: no more Gaussians than one for so many lit pixels of the long exposures, against overfitting
     pixels_per_gaussian: int = 0
     begin: float = fraction(500 / 30_000)  # share of the steps
+    # share of the steps from which gradients are recorded, where that is before `begin`
+    recorded_from: float = fraction(1.0)
     end: float = fraction(0.5)  # share of the steps
     interval: int = at_least_one(100)  # steps between two densifications
     # above 0: this share of the Gaussians grows, largest gradients first, instead of a threshold
@@ -69,21 +71,25 @@ class Growth:
     def observe(
         self,
         rendered: Rendered,
-        half_size_px: float,
+        half_size_px: tuple[float, float],
         pixel_weighted: bool,
         depth_weight: Tensor | None = None,
     ) -> None:
-        """Add one step's gradients, per half of an image's longer side, the unit of the published thresholds.
+        """Add one step's gradients.
 
         Args:
-            half_size_px: half the longer side of the images.
-            pixel_weighted: whether a view counts by the pixels that the Gaussian covers in it, or as one.
+            half_size_px: the units of the gradients along x and y.
+            pixel_weighted: whether a view counts by the pixels that the Gaussian covers in it, or as one where the
+                circle of its radius reaches the image.
             depth_weight: [C, N] factor on the gradients of each camera's Gaussians.
         """
+        half_x_px, half_y_px = half_size_px
         for camera, gradient in rendered.screen.means2d.items():
-            pixels = rendered.screen.pixels[camera]
-            weight = pixels if pixel_weighted else (pixels > 0).float()
-            size = gradient.norm(dim=-1) * half_size_px
+            weight = rendered.screen.pixels[camera] if pixel_weighted else in_view(rendered, camera).float()
+            if half_x_px == half_y_px:
+                size = gradient.norm(dim=-1) * half_x_px
+            else:
+                size = (gradient * torch.tensor(half_size_px)).norm(dim=-1)
             if depth_weight is not None:
                 size = size * depth_weight[camera]
             self.gradient += size * weight
@@ -102,6 +108,15 @@ class Growth:
         """Return these records with empty ones after them, `count` in all."""
         more = Growth.of(count - len(self.gradient))
         return Growth(*(torch.cat([getattr(self, name), getattr(more, name)]) for name in vars(self)))
+
+
+def in_view(rendered: Rendered, camera: int) -> Tensor:
+    """Return which Gaussians [N] have a circle of their radius around the projected mean that reaches the image."""
+    height, width = rendered.alpha.shape[1:]
+    radius = rendered.radii[camera]
+    x, y = rendered.means2d[camera].detach().unbind(-1)
+    inside = (x + radius > 0) & (x - radius < width) & (y + radius > 0) & (y - radius < height)
+    return (radius > 0) & inside
 
 
 def near_camera_weight(means: Tensor, cameras: Cameras, near_m: float) -> Tensor:

@@ -22,6 +22,8 @@ class LossSettings:
     kind: Literal["l1_ssim", "likelihood"] = "l1_ssim"
     ssim_weight: float = 0.2  # of 1 - SSIM, the rest is L1; without effect on the likelihood
     edge_weight: float = 0.0  # of the difference of Sobel derivatives
+    # of l1_ssim: the prediction is clamped at full scale as the sensor clips, so that a saturated pixel does not pull
+    clamped: bool = True
     # of the mean square of the coefficients that turn with the view: a prior for matt surface
     sh_weight: float = 0.0
     # of the mean shortest scale over the target's radius: flat Gaussians are surface
@@ -39,7 +41,7 @@ def image_loss(
     images = (rendered.radiance, batch.exposure_time_s, batch.dn, sensor)
     if settings.kind == "likelihood":
         return likelihood_loss(*images, batch.averaged_pixels, settings.edge_weight)
-    loss, residual = published_loss(*images, settings.ssim_weight, settings.edge_weight)
+    loss, residual = published_loss(*images, settings.ssim_weight, settings.edge_weight, settings.clamped)
     return loss * len(batch.cameras), residual  # a sum over the step's frames, as published
 
 

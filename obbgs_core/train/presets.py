@@ -1,6 +1,6 @@
 """The methods as settings: what each published method, and ours, does differently from 3DGS."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 from obbgs_core.settings import changed
@@ -17,11 +17,14 @@ from obbgs_core.train.poses import PoseSettings
 _3DGS = MethodConfig(
     name="3dgs",
     length_unit="cameras",
+    radiance_unit="full_scale",
     start=StartSettings(colour="grey"),
+    loss=LossSettings(clamped=False),
     growth=GrowthSettings(
+        recorded_from=0.0,
+        end=14_999 / 30_000,  # the last densification and reset come before step 15,000
         prune_size=0.1,
         prune_size_from=3000 / 30_000,  # after the first reset of the opacities
-        prune_radius_px=20.0,
     ),
     rates=RateSettings(sh_rest=1 / 20),
     light=LightSettings(sh_interval=1000),
@@ -85,15 +88,49 @@ PRESETS: dict[str, MethodConfig] = {
 }
 
 
+# What can be added to a method's name, `3dgs+exposure`, and the settings that it changes.
+VARIANTS: dict[str, dict[str, Any]] = {
+    "exposure": {
+        "exposure_aware": True,
+        "loss.clamped": True,
+    },  # known exposure times, saturation as the sensor's
+    "blind": {"exposure_aware": False},  # exposure times are not known
+    "hull": {f"start.{f.name}": getattr(PRESETS["obbgs"].start, f.name) for f in fields(StartSettings)},
+    "random": {"start.kind": "random"},
+}
+
+
 def preset(name: str, changes: dict[str, Any] | None = None) -> MethodConfig:
-    """Return a preset with some settings changed, by names such as `steps` or `growth.interval`.
+    """Return the settings of `METHOD` or `METHOD+VARIANT+VARIANT`, with some of them changed.
+
+    Args:
+        name: of one of `PRESETS`, with any of `VARIANTS` that change something in it. The method's own name has its
+            variants in the order of `VARIANTS`.
+        changes: by names such as `steps` or `growth.interval`.
 
     Raises:
-        ValueError: no such method or setting, or a value that no training can have.
+        ValueError: no such method, variant or setting; a variant that changes nothing or contradicts another; or a
+            value that no training can have.
     """
-    if name not in PRESETS:
-        raise ValueError(f"no method {name!r}; expected one of {', '.join(PRESETS)}")
-    return changed(PRESETS[name], changes or {})
+    method, *variants = name.split("+")
+    if method not in PRESETS:
+        raise ValueError(f"no method {method!r}; expected one of {', '.join(PRESETS)}")
+    if unknown := [variant for variant in variants if variant not in VARIANTS]:
+        raise ValueError(
+            f"no variant {unknown[0]!r} of a method in {name!r}; expected METHOD+VARIANT with one of "
+            f"{', '.join(VARIANTS)}"
+        )
+    variants.sort(key=list(VARIANTS).index)
+    config, varied = PRESETS[method], {}
+    for variant in variants:
+        more = VARIANTS[variant]
+        if any(varied.get(setting, value) != value for setting, value in more.items()):
+            raise ValueError(f"the variants in {name!r} contradict each other")
+        varied |= more
+        if (with_variant := changed(config, more)) == config:
+            raise ValueError(f"{variant!r} changes nothing in {config.name!r}; leave it out of {name!r}")
+        config = replace(with_variant, name=f"{config.name}+{variant}")
+    return changed(config, changes or {})
 
 
 QUALITIES = {"draft": 1 / 3, "standard": 1.0, "best": 3.0}  # factor on the method's own steps and Gaussians

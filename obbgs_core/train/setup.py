@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import hashlib
-import json
 import logging
 from dataclasses import dataclass
 
@@ -12,14 +11,15 @@ import torch
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import FEWEST_FRAMES, TrainingFrame, camera_extent_m, sun_span_deg, usable
 from obbgs_core.sensor import Sensor
+from obbgs_core.settings import flat
 from obbgs_core.start.hull import shows_light
-from obbgs_core.start.initialisation import first_gaussians, silhouettes
+from obbgs_core.start.initialisation import first_gaussians, full_scale_radiance, silhouettes
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.batches import Batches, FrameOrder
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.poses import PoseCorrections
-from obbgs_core.train.state import TrainingState
+from obbgs_core.train.state import Identity, TrainingState
 from obbgs_core.train.validation import validation_brackets
 
 log = logging.getLogger(__name__)
@@ -36,6 +36,7 @@ class TrainingSetup:
     batches: Batches
     radius_m: float  # of the target, as the silhouettes show it
     unit_m: float  # the method's unit of length
+    radiance_unit: float  # the method's unit of radiance
     sun_span_deg: float  # largest angle between two frames' Suns, body frame
     start: str  # where the first Gaussians came from
     budget: str  # the largest number of Gaussians, and what limits it
@@ -48,17 +49,16 @@ class TrainingSetup:
         return 0 < self.config.light.sun_span_deg < self.sun_span_deg
 
     @functools.cached_property
-    def fingerprint(self) -> str:
-        """A digest of what decides the result of a training: the method, the seed, the sensor and the frames."""
-        digest = hashlib.sha256(json.dumps([dataclasses.asdict(self.config), self.seed]).encode())
-        digest.update(repr(self.sensor).encode())
+    def identity(self) -> Identity:
+        """What decides the result of a training: the method's settings, the seed, the sensor and the frames."""
+        digest = hashlib.sha256(repr((self.seed, self.sensor)).encode())
         for f in self.frames:
             digest.update(
                 f.dn.numpy().tobytes() + f.world_to_camera.numpy().tobytes() + f.K.numpy().tobytes()
             )
             known = [None if tag is None else tag.tolist() for tag in (f.sun_dir, f.pose_covariance)]
             digest.update(repr((f.exposure_time_s, f.bracket, known)).encode())
-        return digest.hexdigest()
+        return Identity(digest.hexdigest(), flat(self.config), flat(MethodConfig(self.config.name)))
 
 
 def prepare(
@@ -93,6 +93,7 @@ def prepare(
         batches=Batches(lit, sensor.white_dn, sky),
         radius_m=radius_m,
         unit_m=camera_extent_m(lit) if config.length_unit == "cameras" else radius_m,
+        radiance_unit=full_scale_radiance(lit, sensor) if config.radiance_unit == "full_scale" else 1.0,
         sun_span_deg=sun_span_deg(lit),
         start=start,
         budget=budget,

@@ -1,11 +1,13 @@
 """The state of a training: everything that the next step depends on, and the checkpoint that it is saved in."""
 
 import io
+import json
 import logging
 import math
 import pickle
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -23,7 +25,41 @@ from obbgs_core.train.poses import PoseCorrections
 from obbgs_core.train.result import StepInfo
 
 log = logging.getLogger(__name__)
-FORMAT = 1  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 2  # of checkpoints; raise it when the fields of a class below change
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What decides the result of a training, to tell whether a checkpoint belongs to it.
+
+    inputs: a digest of the seed, the sensor and the frames.
+    settings: of the method, by name.
+    defaults: the value of each setting at which a training is as it was before there was this setting.
+    """
+
+    inputs: str
+    settings: dict[str, Any]
+    defaults: dict[str, Any]
+
+    def text(self) -> str:
+        """Return inputs and settings as JSON."""
+        return json.dumps({"inputs": self.inputs, "settings": self.settings})
+
+    def difference(self, text: str) -> str:
+        """Return in what the training whose `text` this is differs from this one; nothing if it is the same.
+
+        All of its settings are compared, whatever their defaults are by now. One that it does not have is newer than
+        it; it stands for its default.
+
+        Raises:
+            ValueError, LookupError, TypeError: not such a text.
+        """
+        other = json.loads(text)
+        mine = json.loads(self.text())["settings"]
+        theirs = json.loads(json.dumps(self.defaults)) | other["settings"]
+        if different := sorted(name for name in mine | theirs if mine.get(name) != theirs.get(name)):
+            return f"in {', '.join(different)}"
+        return "" if other["inputs"] == self.inputs else "in its frames, its sensor or its seed"
 
 
 @dataclass
@@ -53,31 +89,41 @@ class TrainingState:
     def __setstate__(self, saved: dict) -> None:
         vars(self).update(saved | {"rng": torch.Generator().set_state(saved["rng"])})
 
-    def save(self, path: Path, fingerprint: str) -> None:
-        """Write the state with the fingerprint of its training, whole or not at all.
+    def save(self, path: Path, identity: Identity) -> None:
+        """Write the state with the identity of its training, whole or not at all.
 
         Raises:
             OSError: the disk does not take it.
         """
         content = io.BytesIO()
-        torch.save({"fingerprint": f"{FORMAT} {fingerprint}", "state": self}, content)
+        torch.save({"format": FORMAT, "identity": identity.text(), "state": self}, content)
         write_whole(path, content.getvalue())
 
     @staticmethod
-    def load(path: Path, fingerprint: str) -> "TrainingState | None":
+    def load(path: Path, identity: Identity) -> "TrainingState | None":
         """Return the state in a file; None if there is none, or if it is damaged or of another training or version."""
         if not path.exists():
             return None
         try:
             with torch.serialization.safe_globals(SAVED):
                 saved = torch.load(path, weights_only=True)
-            same = saved["fingerprint"] == f"{FORMAT} {fingerprint}"
-        except (pickle.UnpicklingError, RuntimeError, OSError, EOFError, LookupError, TypeError) as error:
+            if saved["format"] != FORMAT:
+                raise ValueError(f"expected format {FORMAT}, got {saved['format']}")
+            difference = identity.difference(saved["identity"])
+        except (
+            pickle.UnpicklingError,
+            RuntimeError,
+            OSError,
+            EOFError,
+            LookupError,
+            TypeError,
+            ValueError,
+        ) as error:
             # half a file, or one that another version of this program saved, with other classes
             log.warning("%s is damaged or of another version, it is not used: %s", path, error)
             return None
-        if not same:
-            log.warning("%s belongs to another training: it is not used", path)
+        if difference:
+            log.warning("%s belongs to another training, which differs %s: it is not used", path, difference)
             return None
         return saved["state"]
 

@@ -122,8 +122,8 @@ class Trainer:
         if state.poses is not None:
             prior = prior + state.poses.prior(batch.indices, batch.dn.numel())
         (loss + prior).backward()
-        if decisions.is_growing(setup, share):
-            decisions.observe(setup, state, rendered, batch, residual)
+        if decisions.is_recorded(setup, share):
+            decisions.observe(setup, state, rendered, batch, residual, share)
         self._descend(share)
         decisions.decide_poses(setup, state, share)
         decisions.change_number(setup, state, share)
@@ -136,8 +136,9 @@ class Trainer:
     def _descend(self, share: float) -> None:
         """Move the Gaussians and the poses down their gradients."""
         state, config = self.state, self.setup.config
-        freeze_later_degrees(state.gaussians, state.steps_done, config.light)
-        rates = learning_rates(config.rates, share, self.setup.unit_m, state.gaussians.sh.shape[1])
+        freeze_later_degrees(state.gaussians, state.steps_done + 1, config.light)
+        coefficients = state.gaussians.sh.shape[1]
+        rates = learning_rates(config.rates, share, self.setup.unit_m, coefficients, self.setup.radiance_unit)
         state.adam.step(state.gaussians, rates)
         state.gaussians.ambient.detach().clamp_(min=0)
         if state.poses is not None:
@@ -181,6 +182,13 @@ class Trainer:
             return f"all {config.steps} steps done (residual chi² {state.chi2:.2f})"
         return ""
 
+    @property
+    def is_past_growth(self) -> bool:
+        """Whether growth and resets of opacities are over and the pictures have their full size for good."""
+        config = self.setup.config
+        last_change = max(config.growth.end, config.pyramid[-1][0])
+        return self.state.steps_done >= last_change * config.steps
+
     def result(self, stop_reason: str) -> TrainResult:
         """Return the model as it stands, filtered as the method asks, and with its gauge fixed where poses moved.
 
@@ -216,11 +224,11 @@ class Trainer:
 
     def save(self, path: Path) -> None:
         """Write everything that the next step depends on, whole or not at all."""
-        self.state.save(path, self.setup.fingerprint)
+        self.state.save(path, self.setup.identity)
 
     def resume(self, path: Path) -> bool:
         """Go on from a checkpoint of this very training; return False when there is none."""
-        state = TrainingState.load(path, self.setup.fingerprint)
+        state = TrainingState.load(path, self.setup.identity)
         if state is not None:
             self.state = state
         return state is not None

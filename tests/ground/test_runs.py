@@ -17,10 +17,10 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from flightsw import model_file
-from flightsw.icd.mission import ConfigError, ReconstructSection, load_mission
+from flightsw.icd.mission import METHODS, VARIANTS, ConfigError, ReconstructSection, load_mission
 from flightsw.icd.telemetry import DICTIONARY
 from ground import cli, uplink
-from ground.cli_options import ExportFormat, ImportFormat, Method, Quality, UplinkCommand
+from ground.cli_options import ExportFormat, ImportFormat, Quality, UplinkCommand
 from ground.evaluate import evaluate
 from ground.progress import Stop, steps_shown
 from ground.reconstruct import reconstruct
@@ -31,6 +31,7 @@ from ground.summary import model_rows
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged
 from obbgs_core.io.ply import load_ply
+from obbgs_core.train import presets
 from obbgs_core.train.presets import PRESETS, QUALITIES
 from obbgs_core.train.result import StepInfo
 
@@ -336,7 +337,7 @@ def test_a_mission_file_says_how_to_train_and_the_command_line_says_otherwise(se
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("method: obgs", r"mission\.reconstruct\.method: expected one of obbgs, .*mvgs, got 'obgs'"),
+        ("method: obgs", r"mission\.reconstruct\.method: expected one of obbgs, .*mvgs, with variants .*got 'obgs'"),
         ("settings: 3", r"mission\.reconstruct\.settings: expected a mapping of keys, got 3"),
         ("settings: {stepz: 3}", r"mission\.reconstruct\.settings\.stepz: unknown key; .*steps"),
         ("settings: {steps: many}", r"settings\.steps: expected a whole number, got 'many'"),
@@ -359,10 +360,11 @@ def test_a_mission_that_asks_for_what_is_not_there_is_refused_by_its_path(tmp_pa
 
 
 def test_the_choices_of_the_commands_are_those_of_the_library_and_the_dictionary():
-    assert set(Method) == set(PRESETS) and set(Quality) == set(QUALITIES)
+    assert set(METHODS) == set(PRESETS) and tuple(VARIANTS) == tuple(presets.VARIANTS)
+    assert set(Quality) == set(QUALITIES)
     assert set(UplinkCommand) == set(DICTIONARY.commands)
     for command, choices in (
-        ("reconstruct", (*Method, *Quality)),
+        ("reconstruct", (*METHODS, *VARIANTS, *Quality)),
         ("import", ImportFormat),
         ("export", ExportFormat),
         ("uplink", UplinkCommand),

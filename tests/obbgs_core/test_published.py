@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from obbgs_core.frames import TrainingFrame, camera_extent_m
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.model.sh import from_radiance
+from obbgs_core.model.sh import from_radiance, radiance
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.adam import Adam, learning_rates
-from obbgs_core.train.decisions import drop_not_finite
+from obbgs_core.train.decisions import drop_not_finite, is_growing, is_recorded
 from obbgs_core.train.growth import Growth, densify
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
@@ -59,11 +60,33 @@ def test_lengths_are_multiples_of_the_cameras_extent(frames):
         )
 
 
-def test_the_start_is_grey_of_half_the_full_scale(frames):
-    trainer = Trainer(frames, SENSOR, quick("3dgs"))
-    colours = trainer.state.gaussians.sh
-    assert (colours[:, 1:] == 0).all() and (colours[:, 0] == colours[0, 0]).all()
-    torch.testing.assert_close(colours[0, 0], from_radiance(torch.tensor([0.5])))  # of 255 DN in 0.1 ms
+def test_the_start_is_that_of_the_authors_on_pictures_without_a_point_cloud(frames):
+    """100,000 points at random, colours RGB = 0.5 + 0.2820948 u / 255 (their SH2RGB(u / 255)), opacity 0.1."""
+    assert preset("3dgs").start.count == 100_000
+    start = Trainer(frames, SENSOR, quick("3dgs")).state.gaussians
+    start = start.detach()
+    assert (start.sh[:, 1:] == 0).all()
+    noise = (
+        (radiance(start.sh[:, :1], torch.zeros(300, 3)) - 0.5) * 255 / 0.28209479
+    )  # 255 DN in 0.1 ms are 1
+    assert noise.min() == pytest.approx(0, abs=0.05) and noise.max() == pytest.approx(1, abs=0.05)
+    torch.testing.assert_close(start.opacities, torch.full((300,), 0.1))
+    points = start.means.detach().double().numpy()
+    squares = np.sort(((points[:, None] - points[None]) ** 2).sum(-1), axis=1)[:, 1:4]
+    np.testing.assert_allclose(start.scales[:, 0].numpy(), np.sqrt(squares.mean(1)), rtol=1e-4)
+    assert (start.scales == start.scales[:, :1]).all()
+
+
+def test_rates_of_colours_are_for_pictures_from_0_to_1(frames):
+    """Whatever radiance saturates a pixel: scenes that are darker by a factor move by as much less."""
+    longer = [replace(f, exposure_time_s=4 * f.exposure_time_s) for f in frames]
+    moved = []
+    for given in (frames, longer):
+        trainer = Trainer(given, SENSOR, quick("3dgs"))
+        before = trainer.state.gaussians.sh.detach().clone()
+        trainer.step()
+        moved.append((trainer.state.gaussians.sh.detach() - before)[:, 0].abs().max())
+    assert moved[0] == pytest.approx(0.0025, rel=1e-3) and moved[1] == pytest.approx(0.0025 / 4, rel=1e-3)
 
 
 def test_the_degree_rises_by_one_after_every_interval(frames):
@@ -71,7 +94,7 @@ def test_the_degree_rises_by_one_after_every_interval(frames):
     for step in range(1, 14):
         trainer.step()
         moved = trainer.state.gaussians.sh.detach().abs().amax(dim=(0, 2)) > 0
-        degree = min((step - 1) // 4, 3)
+        degree = min(step // 4, 3)  # their oneupSHdegree comes before the rendering
         assert moved[: (degree + 1) ** 2].all() and not moved[(degree + 1) ** 2 :].any(), step
 
 
@@ -96,6 +119,7 @@ def test_what_is_large_in_space_or_in_a_picture_is_pruned_after_the_first_reset_
     model = ball(6)
     model.log_scales[1] = math.log(0.11 * unit_m)  # limit: 0.1 of the extent
     model.opacity_logits[2] = -6.0  # opacity 0.0025, limit 0.005
+    settings = replace(settings, prune_radius_px=20.0)
     for share, left in ((0.05, 5), (0.2, 3)):
         growth = Growth.of(6)
         growth.radius_px[3] = 21.0
@@ -123,6 +147,40 @@ def test_the_records_of_growth_follow_the_gaussians_that_are_kept(frames):
     for _ in range(8):  # past growth in the boxes and everywhere
         trainer.step()
     assert len(trainer.state.growth.radius_px) == len(trainer.state.gaussians)
+
+
+def test_densifications_and_resets_come_when_the_authors_have_them():
+    """if iteration < 15000: every 100 after 500; and every 3000 a reset; sizes count after the first reset."""
+    config = preset("3dgs")
+    setup = SimpleNamespace(config=config)
+    now = range(1, config.steps + 1)
+    growing = [
+        i for i in now if i % config.growth.interval == 0 and is_growing(setup, (i - 1) / config.steps)
+    ]
+    assert growing == [i for i in range(0, 15_000, 100) if i > 500]
+    recorded = [i for i in now if is_recorded(setup, (i - 1) / config.steps)]
+    assert recorded == list(range(1, 15_000))
+    resets = [i for i in recorded if i % config.growth.opacity_reset_interval == 0]
+    assert resets == [3000, 6000, 9000, 12_000]
+    assert next(i for i in growing if (i - 1) / config.steps >= config.growth.prune_size_from) == 3100
+
+
+def test_a_view_counts_where_the_gaussian_reaches_the_picture_and_gradients_are_per_half_width_and_height():
+    wide = Cameras(scenes.pose(np.eye(3), RANGE_M)[None], K[None], width=60, height=SIZE_PX)
+    model = ball(4)
+    model.means = torch.tensor(
+        [[0.0, 0, 0], [3.4, 0, 0], [4.5, 0, 0], [0, 0, 1.0]]
+    )  # in the picture, at its edge, beyond it, in it
+    model.opacity_logits[3] = -8.0  # fainter than 1/255: it adds to no pixel, but reaches the picture
+    model = model.trainable()
+    rendered = render(model, wide)
+    means2d = rendered.means2d.detach()[0]
+    (rendered.radiance[..., 0] * torch.linspace(0, 1, 60)).sum().backward()
+    growth = Growth.of(4)
+    growth.observe(rendered, (30.0, 20.0), pixel_weighted=False)
+    assert growth.weight.tolist() == [1, 1, 0, 1] and means2d[2, 0] - 3 * 60 * 0.1 / RANGE_M > 60
+    gradient = rendered.screen.means2d[0][0]
+    assert growth.gradient[0] == pytest.approx(math.hypot(30 * gradient[0], 20 * gradient[1]), rel=1e-5)
 
 
 def test_a_reset_of_the_opacities_forgets_their_moments(frames):

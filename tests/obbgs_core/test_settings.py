@@ -38,7 +38,7 @@ def test_quality_scales_steps_and_size_and_unknown_ones_are_refused():
 def test_presets_are_data_and_mistakes_are_named():
     assert set(PRESETS) == {"3dgs", "pixel-gs", "mvgs", "jiang2025", "obbgs"}
     assert preset("jiang2025").loss.edge_weight == 0.2 and not preset("jiang2025").exposure_aware
-    with pytest.raises(ValueError, match="no method 'nerf'"):
+    with pytest.raises(ValueError, match="no method 'nerf'; expected one of 3dgs, "):
         preset("nerf")
     with pytest.raises(
         ValueError, match=r"no setting magic; expected one of name, exposure_aware, .*growth\.interval"
@@ -46,6 +46,27 @@ def test_presets_are_data_and_mistakes_are_named():
         preset("3dgs", {"magic": 1})
     with pytest.raises(ValueError, match="steps must be at least 1"):
         preset("obbgs", {"steps": 0})
+
+
+def test_variants_are_added_to_a_methods_name_in_any_order():
+    known = preset("3dgs+exposure")
+    assert known.exposure_aware and known.loss.clamped and not preset("3dgs").loss.clamped
+    both = preset("3dgs+hull+exposure", {"steps": 7})
+    assert both == preset("3dgs+exposure+hull", {"steps": 7}) and both.name == "3dgs+exposure+hull"
+    assert both.start == preset("obbgs").start and both.growth == preset("3dgs").growth
+    assert preset("obbgs+blind").exposure_aware is False and preset("obbgs+random").start.kind == "random"
+    for wrong, message in (
+        ("3dgs+magic", r"no variant 'magic' .* expected METHOD\+VARIANT with one of exposure, blind"),
+        ("3dgs+", "no variant ''"),
+        ("+exposure", "no method ''"),
+        ("obbgs+exposure", "'exposure' changes nothing in 'obbgs'"),
+        ("3dgs+blind", "'blind' changes nothing in '3dgs'"),
+        ("3dgs+hull+hull", "'hull' changes nothing"),
+        ("3dgs+exposure+blind", "contradict each other"),
+        ("3dgs+hull+random", "contradict each other"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            preset(wrong)
 
 
 def test_a_group_is_changed_setting_by_setting_and_keeps_the_others():

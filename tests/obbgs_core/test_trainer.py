@@ -1,6 +1,7 @@
 """The training as a whole: repeatable, resumable, and honest about what it leaves out."""
 
 import dataclasses
+import json
 import math
 
 import numpy as np
@@ -15,6 +16,7 @@ from obbgs_core.model.gaussians import TENSORS
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.growth import finite
 from obbgs_core.train.presets import preset
+from obbgs_core.train.state import SAVED
 from obbgs_core.train.trainer import Trainer, train
 from tests.scenes import QUICK, SENSOR, SIZE_PX, photographed, target
 
@@ -56,13 +58,43 @@ def test_a_checkpoint_of_another_training_is_not_used(frames, tmp_path):
     assert Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=1).resume(tmp_path / "c")
 
 
-@pytest.mark.parametrize("content", [{"fingerprint": "another"}, {"fingerprint": "x", "state": Sensor}])
+@pytest.mark.parametrize(
+    "content",
+    [{"format": 1, "identity": "{}"}, {"identity": ""}, {"format": 2, "identity": "[]", "state": Sensor}],
+)
 def test_a_checkpoint_of_another_version_is_not_used_and_nothing_else_in_it_is_built(
     frames, tmp_path, caplog, content
 ):
     torch.save(content, tmp_path / "c")  # the sensor's class is not among those that a checkpoint may hold
     trainer = Trainer(frames, SENSOR, preset("obbgs", QUICK))
     assert not trainer.resume(tmp_path / "c") and "it is not used" in caplog.text
+
+
+def test_a_checkpoint_outlives_settings_that_are_added_later(frames, tmp_path, caplog):
+    """A file without a setting was saved before there was one: it is used where the setting has its default."""
+    config = preset("obbgs", QUICK)
+    trainer = Trainer(frames, SENSOR, config)
+    trainer.step()
+    trainer.save(tmp_path / "c")
+    with torch.serialization.safe_globals(SAVED):
+        saved = torch.load(tmp_path / "c", weights_only=True)
+    older = json.loads(saved["identity"])
+    del older["settings"]["growth.obb_interval"]  # 30 in obbgs, 0 by default
+    torch.save(saved | {"identity": json.dumps(older)}, tmp_path / "older")
+    without = Trainer(frames, SENSOR, preset("obbgs", QUICK | {"growth.obb_interval": 0}))
+    assert without.resume(tmp_path / "older") and without.state.steps_done == 1
+    assert not Trainer(frames, SENSOR, config).resume(tmp_path / "older")
+    assert "another training, which differs in growth.obb_interval: it is not used" in caplog.text
+
+
+def test_a_default_that_changed_since_a_checkpoint_is_noticed(frames):
+    """The file holds every setting as it was, so that it does not matter where today's value comes from."""
+    saved = Trainer(frames, SENSOR, preset("obbgs", QUICK)).setup.identity
+    raised = saved.defaults | {"growth.prune_size": 0.3}
+    now = dataclasses.replace(saved, settings=saved.settings | {"growth.prune_size": 0.3}, defaults=raised)
+    assert now.difference(saved.text()) == "in growth.prune_size" and not saved.difference(saved.text())
+    gone = {name: value for name, value in saved.settings.items() if name != "growth.prune_size"}
+    assert dataclasses.replace(saved, settings=gone).difference(saved.text()) == "in growth.prune_size"
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])

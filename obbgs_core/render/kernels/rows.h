@@ -313,12 +313,13 @@ void absolute_row(int n, const float* __restrict slope, const float* __restrict 
   }
 }
 
-// A prediction row * gain clamped at 1, and `slope`: its derivative by the row. What is not finite becomes NaN.
-void clamped_row(int n, const float* __restrict row, float gain, float* __restrict clamped, float* __restrict slope) {
+// A prediction row * gain clamped at `most`, and `slope`: its derivative by the row. What is not finite becomes NaN.
+void clamped_row(int n, const float* __restrict row, float gain, float most, float* __restrict clamped,
+                 float* __restrict slope) {
   for (int x = 0; x < n; ++x) {
     const float value = row[x] * gain;
-    clamped[x] = value > 1.0f ? 1.0f + 0 * value : value;
-    slope[x] = value > 1.0f ? 0.0f : gain;
+    clamped[x] = value > most ? most + 0 * value : value;
+    slope[x] = value > most ? 0.0f : gain;
   }
 }
 

@@ -11,6 +11,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <numeric>
 #include <optional>
 #include <stdexcept>
@@ -193,9 +194,9 @@ double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, d
 }
 
 // (1 - ssim_weight) * mean |a - b| + ssim_weight * (1 - mean SSIM) + edge_weight * mean Sobel difference, where a is
-// the prediction clamped at 1 and b the reading, in full scales above black; the residual is a - b.
+// the prediction, clamped at 1 if wanted, and b the reading, in full scales above black; the residual is a - b.
 double published(Array radiance, Array dn, Array gains, const SensorModel& s, double ssim_weight, double edge_weight,
-                 Array residual, std::optional<Array> gradient, int threads) {
+                 bool clamped, Array residual, std::optional<Array> gradient, int threads) {
   const Shape shape = shape_of(radiance, "radiance");
   expect(dn, "dn", radiance.size());
   expect(gains, "gains", shape.count);
@@ -209,11 +210,11 @@ double published(Array radiance, Array dn, Array gains, const SensorModel& s, do
   return sum_over_bands(shape, threads, [&](const Band& band) {
     const int n = shape.row();
     const size_t image = band.image * shape.image();
-    const float per_dn = 1 / (s.white - s.black);
+    const float per_dn = 1 / (s.white - s.black), most = clamped ? 1.0f : std::numeric_limits<float>::max();
     const int first = std::max(band.begin - 2 * kReach, 0), last = std::min(band.end + 2 * kReach, shape.height);
     Rows a(first, last, n), slope(first, last, n), b(first, last, n);  // slope: of a by radiance
     for (int y = first; y < last; ++y) {
-      loops->clamped_row(n, r + image + size_t(y) * n, gain[band.image] * per_dn, a[y], slope[y]);
+      loops->clamped_row(n, r + image + size_t(y) * n, gain[band.image] * per_dn, most, a[y], slope[y]);
       loops->scaled_row(n, d + image + size_t(y) * n, s.black, per_dn, b[y]);
     }
     float* image_gradient = g ? g + image : nullptr;
@@ -316,7 +317,7 @@ void bind_training(nb::module_& m) {
   m.def("likelihood", &obbgs::likelihood, "radiance"_a, "dn"_a, "gains"_a, "sensor"_a, "edge_weight"_a,
         "residual"_a.noconvert(), "gradient"_a.none().noconvert(), "threads"_a);
   m.def("published", &obbgs::published, "radiance"_a, "dn"_a, "gains"_a, "sensor"_a, "ssim_weight"_a, "edge_weight"_a,
-        "residual"_a.noconvert(), "gradient"_a.none().noconvert(), "threads"_a);
+        "clamped"_a, "residual"_a.noconvert(), "gradient"_a.none().noconvert(), "threads"_a);
   m.def("fit", &obbgs::fit, "radiance"_a, "alpha"_a, "dn"_a, "gains"_a, "sensor"_a, "least_alpha"_a, "threads"_a);
   m.def("adam_step", &obbgs::adam_step, "parameter"_a.noconvert(), "gradient"_a, "first"_a.noconvert(),
         "second"_a.noconvert(), "rate"_a, "b1"_a, "b2"_a, "eps"_a, "threads"_a);
