@@ -64,8 +64,10 @@ def compare_command(
     with stop.on_signals():
         from ground.compare.command import run_grid
         from ground.compare.conditions import AS_TAKEN, Condition, load_conditions
+        from ground.compare.figures import write_figures
         from ground.compare.grid import cells_of, parse_budgets, session_facts
         from ground.compare.origin import this_command
+        from ground.compare.page import write_page
 
         os.nice(nice)
         say(stderr, "reading the sessions")
@@ -76,13 +78,15 @@ def compare_command(
         with _shown(stderr) as on_state:
             command = this_command("ground")
             summary = run_grid(cells, out, command, scheduler, workers, on_state, lambda: stop.requested)
+        page, figures = write_page(out), write_figures(out)
     for label, reason in summary.failed.items():
         say(stderr, f"not made: {label}: {reason}")
     if json_:
         counts = {"made": summary.made, "were_done": summary.were_done, "failed": summary.failed}
-        print(json.dumps({"rows": str(out / "rows.jsonl")} | counts))
+        print(json.dumps({"rows": str(out / "rows.jsonl"), "page": str(page)} | counts))
     else:
         print(f"{summary.made} rows made, {summary.were_done} were there, in {out / 'rows.jsonl'}")
+        print(f"page: {page}, and {len(figures)} figures beside it")
     if summary.failed:
         raise typer.Exit(1)
 

@@ -1,6 +1,7 @@
 """Follows one piece of work: its curve of held-out scores, its energy, how far it is, and whether it should stop."""
 
 import json
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,14 +12,13 @@ import torch
 from ground.baselines.reconstruction import Reconstruction
 from ground.compare.case import Case
 from ground.compare.energy import EnergyMeter
-from ground.scores import cloud_scores
 from obbgs_base.files import write_whole
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.score.metrics import psnr_db
 
 MARKS = (0.02, *(0.05 * i for i in range(1, 20)))  # shares of the work at which the curve is measured
-CURVE_VIEWS = 5  # held-out frames, evenly spaced: enough for a curve; final scores use all
-CURVE_POINTS = 20_000  # of the true surface, and of the model's centres
+FEW_MARKS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)  # of methods whose images take long
+CURVE_VIEWS = 16  # held-out frames, evenly spaced; final scores use all
 SETTLED_DB, SETTLED_OVER = (
     0.05,
     0.2,
@@ -34,11 +34,12 @@ class Follower:
     Args:
         folder: of the work's own files.
         stop: a file; when it appears, the work should save itself and end.
+        marks: shares of the work at which it is measured.
     """
 
-    def __init__(self, case: Case, folder: Path, stop: Path):
+    def __init__(self, case: Case, folder: Path, stop: Path, marks: tuple[float, ...] = MARKS):
         self.points: list[dict[str, float]] = []  # share, seconds, PSNR, Chamfer distance
-        self._case, self._folder, self._stop = case, folder, stop
+        self._case, self._folder, self._stop, self._marks = case, folder, stop, marks
         self._psnr = "psnr_clean_db" if case.radiance else "psnr_noisy_db"
         count = len(case.held_out)
         self._views = sorted({round(i * (count - 1) / max(1, CURVE_VIEWS - 1)) for i in range(CURVE_VIEWS)})
@@ -55,13 +56,13 @@ class Follower:
             self.points = [point for point in self.points if point["share"] <= share]
         self._share = share
         measured = self.points[-1]["share"] if self.points else 0.0
-        if share < 1 and any(measured < mark <= share for mark in MARKS):
+        if share < 1 and any(measured < mark <= share for mark in self._marks):
             self._add(share, seconds, snapshot())
         now_s = time.monotonic()
         if now_s - self._told_s > TELL_EVERY_S:
             self._told_s = now_s
             self._meter.sample()
-            told = {"share": share, "seconds": seconds}
+            told = {"share": share, "seconds": seconds, "pid": os.getpid()}
             (self._folder / PROGRESS).write_text(json.dumps(told))
 
     def finish(self, reconstruction: Reconstruction) -> list[dict[str, float]]:
@@ -111,9 +112,7 @@ class Follower:
                 values.append(psnr_db(image, self._expected[i]))
             figures[self._psnr] = round(sum(values) / len(values), 4)
         if self._case.cloud_m is not None and len(reconstruction.points):
-            points = thinned(reconstruction.points).double().numpy()
-            true = thinned(torch.from_numpy(self._case.cloud_m)).numpy()
-            scores = cloud_scores(points, points[:0], true, self._case.units_per_m)
+            scores = self._case.cloud_scores(reconstruction.points, torch.zeros(0, 3))
             figures["chamfer"] = round(scores["chamfer"], 5)
         return figures
 
@@ -127,13 +126,6 @@ def image_of(reconstruction: Reconstruction, frame: TrainingFrame) -> torch.Tens
     assert reconstruction.image is not None
     with torch.no_grad():
         return reconstruction.image(cameras_of([frame]), frame.exposure_time_s)
-
-
-def thinned(points: torch.Tensor) -> torch.Tensor:
-    """Return at most `CURVE_POINTS` of some points [N, 3], evenly spaced in their order."""
-    if len(points) <= CURVE_POINTS:
-        return points
-    return points[torch.linspace(0, len(points) - 1, CURVE_POINTS).round().long()]
 
 
 def progress(folder: Path) -> tuple[float, float] | None:

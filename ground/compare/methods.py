@@ -1,7 +1,6 @@
 """The registry of compared methods: how each is run, and which axes of a grid change what it does."""
 
 import dataclasses
-import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,15 +8,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ground.baselines.plane_sweep import reconstruct_mvs
 from ground.baselines.reconstruction import Reconstruction, Work
 from ground.compare import references
 from ground.compare.case import Case
 from ground.compare.trainings import reconstruct_gaussians
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
-from obbgs_core.settings import changed, known_names
+from obbgs_core.settings import changed, flat
 from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.presets import PRESETS, preset
+from obbgs_core.train.presets import preset
 
 
 @dataclass(frozen=True)
@@ -70,38 +70,27 @@ class Method:
 
 
 def method(name: str) -> Method:
-    """Return a method by its name.
+    """Return a method by its name: a reference, a baseline, or a training as `preset` names it, `3dgs+exposure`.
 
     Raises:
         ValueError: there is no such method; the message names the known ones.
     """
     if name in _REFERENCES:
         return Method(name, lambda task: _reference(task, _REFERENCES[name]))
+    if name in _BASELINES:
+        return _BASELINES[name]
     if name == UNTRAINED:
-        return dataclasses.replace(_training(STARTED, name, 0.0), stepped=False)
+        return dataclasses.replace(_training(preset("obbgs"), name, 0.0), stepped=False)
     try:
-        config = configured(name)
+        return _training(preset(name), name)
     except ValueError as error:
-        raise ValueError(f"no method {name!r}; expected one of {', '.join(known_methods())}") from error
-    return _training(config, name)
+        others = ", ".join([*reference_names(), *_BASELINES])
+        raise ValueError(f"{error}; or {others}, which are no trainings of Gaussians") from error
 
 
-def known_methods() -> list[str]:
-    """Return the names of all methods, each published one also with `+exposure`."""
-    blind = [f"{name}+exposure" for name, config in PRESETS.items() if not config.exposure_aware]
-    return [*_REFERENCES, UNTRAINED, *PRESETS, *blind]
-
-
-def configured(name: str) -> MethodConfig:
-    """Return the settings of `METHOD` or `METHOD+exposure`, the second with exposure times and gain known.
-
-    Raises:
-        ValueError: there is no such method.
-    """
-    base, plus, variant = name.partition("+")
-    if plus and variant != "exposure":
-        raise ValueError(f"no variant {variant!r}; expected exposure")
-    return preset(base, {"exposure_aware": True} if plus else {})
+def reference_names() -> list[str]:
+    """Return the names of the methods that reconstruct nothing, in the order in which tables show them."""
+    return [*_REFERENCES, UNTRAINED]
 
 
 _REFERENCES: dict[str, Callable[[Case, list[TrainingFrame]], list[Tensor]]] = {
@@ -110,12 +99,23 @@ _REFERENCES: dict[str, Callable[[Case, list[TrainingFrame]], list[Tensor]]] = {
     "ceiling": references.ceiling,
     "noise": references.noise,
 }
-UNTRAINED, STARTED = "untrained", preset("obbgs")  # the Gaussians that `obbgs` starts from
+UNTRAINED = "untrained"  # the Gaussians that `obbgs` starts from
+_BASELINES: dict[str, Method] = {
+    method.name: method
+    for method in (
+        Method("mvs", lambda task: _stereo(task, one_exposure=True)),
+        Method("mvs+raw", lambda task: _stereo(task, one_exposure=False)),
+    )
+}
 
 
 def _reference(task: Task, images: Callable[[Case, list[TrainingFrame]], list[Tensor]]) -> Outcome:
     empty = torch.zeros(0, 3)
     return Outcome(Reconstruction(empty, empty, None, 0, 0.0), images(task.case, task.frames))
+
+
+def _stereo(task: Task, one_exposure: bool) -> Outcome:
+    return Outcome(reconstruct_mvs(task.frames, task.sensor, task.work, one_exposure))
 
 
 def _training(config: MethodConfig, name: str, time_limit_s: float = float("inf")) -> Method:
@@ -146,9 +146,5 @@ def _training(config: MethodConfig, name: str, time_limit_s: float = float("inf"
 
 def differing(config: MethodConfig) -> dict[str, Any]:
     """Return the settings of a method that are not the defaults, so that a new setting changes no digest."""
-    default = MethodConfig(name="")
-    values = {
-        name: (operator.attrgetter(name)(config), operator.attrgetter(name)(default))
-        for name in known_names(MethodConfig)
-    }
-    return {name: value for name, (value, usual) in values.items() if value != usual}
+    usual = flat(MethodConfig(name=""))
+    return {name: value for name, value in flat(config).items() if value != usual[name]}

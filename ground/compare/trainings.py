@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ground.baselines.reconstruction import Reconstruction, Work
 from ground.cameras import exposed
+from ground.compare.follow import MARKS
 from ground.model_files import SURFACE_POINTS
 from obbgs_base.errors import Interrupted
 from obbgs_core.frames import TrainingFrame, cameras_of
@@ -15,7 +16,7 @@ from obbgs_core.io.ply import save_ply
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
-from obbgs_core.score.surface import surface_points
+from obbgs_core.score.surface import surface_positions
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.trainer import CHECKPOINT_EVERY_S, Trainer
@@ -51,6 +52,7 @@ def reconstruct_gaussians(
     checkpoint = None if work.folder is None else work.folder / CHECKPOINT
     if checkpoint is not None:
         trainer.resume(checkpoint)
+    resumed_at = trainer.state.steps_done
 
     def save() -> None:
         if checkpoint is not None:
@@ -66,7 +68,8 @@ def reconstruct_gaussians(
         if work.should_stop():
             save()
             raise Interrupted(f"interrupted at step {info.step} of {info.steps}")
-        if time.monotonic() - saved_s > CHECKPOINT_EVERY_S:
+        marked = any((info.step - 1) / info.steps < mark <= info.step / info.steps for mark in MARKS)
+        if marked or time.monotonic() - saved_s > CHECKPOINT_EVERY_S:
             save()
             saved_s = time.monotonic()
     else:
@@ -75,10 +78,9 @@ def reconstruct_gaussians(
     result = trainer.result(reason)
     if work.folder is not None:
         save_ply(result.gaussians, work.folder / MODEL, sun_dir=frames[0].sun_dir)
-    points, _ = surface_points(result.gaussians, cameras_of(frames), SURFACE_POINTS, seed)
     return Reconstruction(
         points=result.gaussians.means,
-        surface=points,
+        surface=surface_positions(result.gaussians, cameras_of(frames), SURFACE_POINTS, seed),
         image=imaging(result.gaussians, sensor, result.reference_exposure_s),
         size_bytes=sum(4 * tensor.numel() for tensor in result.gaussians.parameters().values()),
         seconds=result.seconds,
@@ -86,6 +88,7 @@ def reconstruct_gaussians(
             "gaussians": len(result.gaussians),
             "steps": trainer.state.steps_done,
             "converged": converged,
+            **({"resumed_at": resumed_at} if resumed_at else {}),
             "start": result.start,
             "stop": result.stop_reason,
             "appearance": result.appearance,
@@ -115,8 +118,8 @@ def imaging(
 def _may_end(trainer: Trainer) -> bool:
     """Return whether growth and resets are over and half of the steps are done, of a method without an own end."""
     config = trainer.setup.config
-    first = max(NEVER_BEFORE, config.growth.end)
-    return not config.chi2_end and trainer.state.steps_done >= first * config.steps
+    half_done = trainer.state.steps_done >= NEVER_BEFORE * config.steps
+    return half_done and trainer.is_past_growth and not config.chi2_end
 
 
 def _snapshot(trainer: Trainer, frames: list[TrainingFrame]) -> Reconstruction:

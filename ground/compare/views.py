@@ -10,20 +10,21 @@ from torch import Tensor
 from ground.compare.case import Case
 from obbgs_base.files import write_whole
 from obbgs_core.score.metrics import psnr_db
+from obbgs_core.sensor import Sensor
 
 SHOWN, WORST = "shown", "worst"
 
 
 @dataclass(frozen=True)
 class KeptView:
-    """A held-out view: what was expected and what a method made of it, [H, W, C] in 0..1; black is the black level."""
+    """A held-out view: what was expected and what a method made of it, [H, W, C] in 0..1."""
 
     frame: int
     exposure_time_s: float
     expected: np.ndarray
     image: np.ndarray
     psnr_db: float
-    black: float
+    sensor: Sensor  # of which only black level and full scale (1) count
 
 
 def write_views(case: Case, images: list[Tensor], path: Path) -> None:
@@ -51,10 +52,10 @@ def read_views(path: Path) -> dict[str, KeptView]:
     if not path.exists():
         return {}
     with np.load(path) as arrays:
-        black = float(arrays["black"])
+        sensor = Sensor(float(arrays["black"]), 1.0, 1.0, 1.0, 0.0)
         views = {}
         for name in (SHOWN, WORST):
             frame, exposure_s, value_db = arrays[f"{name}_facts"].tolist()
             expected, image = (arrays[f"{name}_{kind}"].astype(np.float32) for kind in ("expected", "image"))
-            views[name] = KeptView(int(frame), exposure_s, expected, image, value_db, black)
+            views[name] = KeptView(int(frame), exposure_s, expected, image, value_db, sensor)
     return views

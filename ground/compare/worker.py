@@ -10,7 +10,7 @@ from ground.baselines.reconstruction import Work
 from ground.compare.case import Case, load_case
 from ground.compare.conditions import given
 from ground.compare.errors import CompareError
-from ground.compare.follow import Follower, image_of
+from ground.compare.follow import FEW_MARKS, MARKS, Follower, image_of
 from ground.compare.grid import Cell
 from ground.compare.methods import Outcome, Task, method
 from ground.compare.origin import commit, with_origin
@@ -47,7 +47,8 @@ def run_cell(cell: Cell, out: Path, stop: Path, command: str) -> dict[str, Any]:
 
 def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict[str, Any]:
     case = load_case(cell.session.path)
-    follower = Follower(case, folder, stop)
+    wanted = method(cell.method)
+    follower = Follower(case, folder, stop, MARKS if wanted.settable else FEW_MARKS)
     row: dict[str, Any] = {
         "digest": cell.digest,
         "method": cell.method,
@@ -74,7 +75,7 @@ def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict
             Work(folder, follower.on_step, follower.should_stop),
             follower.settled,
         )
-        outcome = method(cell.method).run(task)
+        outcome = wanted.run(task)
         row |= scores(case, outcome, out / VIEWS / f"{cell.digest}.npz")
         if curve := follower.finish(outcome.reconstruction):
             row["curve"] = curve

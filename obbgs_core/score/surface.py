@@ -46,11 +46,30 @@ def surface_points(
         ValueError: no camera, or a count under 1; the radiance depends on the Sun's direction, and the cameras do not
             hold it.
     """
+    points, seen_by = _sampled(gaussians, cameras, count, seed)
+    if len(points) == 0:
+        return points, torch.zeros(0, 3)
+    return points, _fitted_normals(points, cameras.centres[seen_by] - points)
+
+
+@torch.no_grad()
+def surface_positions(gaussians: Gaussians, cameras: Cameras, count: int = 100_000, seed: int = 0) -> Tensor:
+    """Return the points [count, 3] of `surface_points` without their normals, which take most of its time.
+
+    Raises:
+        ValueError: as there.
+    """
+    return _sampled(gaussians, cameras, count, seed)[0]
+
+
+def _sampled(gaussians: Gaussians, cameras: Cameras, count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Return points [count, 3] on the seen surface, and the camera [count] that sees each."""
     if len(cameras) == 0 or count < 1:
         raise ValueError(f"expected a camera and a count of at least 1, got {len(cameras)} and {count}")
+    nothing = torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)
     gaussians = _bright(gaussians, cameras)
     if len(gaussians) == 0:
-        return torch.zeros(0, 3), torch.zeros(0, 3)
+        return nothing
     generator = torch.Generator().manual_seed(seed)
     views, patches = [], []
     for c in range(len(cameras)):
@@ -64,15 +83,14 @@ def surface_points(
     patch = torch.cat(patches)  # [P, 6]: camera, u, v, depth, slopes
     patch = patch[_confirmed(_back_project(patch, cameras), views, cameras)]
     if len(patch) == 0:
-        return torch.zeros(0, 3), torch.zeros(0, 3)
+        return nothing
     patch = patch.repeat(math.ceil(OVERSAMPLING * count / len(patch)), 1)
     shift = torch.rand(len(patch), 2, generator=generator) - 0.5
     patch[:, 3] += (patch[:, 4:] * shift).sum(dim=1)
     patch[:, 1:3] += shift
     points = _back_project(patch, cameras)
     chosen = _evenly(points, count, generator)
-    points, patch = points[chosen], patch[chosen]
-    return points, _fitted_normals(points, cameras.centres[patch[:, 0].long()] - points)
+    return points[chosen], patch[chosen, 0].long()
 
 
 def _bright(gaussians: Gaussians, cameras: Cameras) -> Gaussians:

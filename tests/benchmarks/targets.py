@@ -10,6 +10,7 @@ dimension is 2 units, here 2 m. Nothing else of the project reads them. `ground 
 import argparse
 import hashlib
 import json
+import math
 import os
 import shutil
 from collections.abc import Iterator
@@ -38,7 +39,7 @@ BRACKET_S = (5e-5, 1e-4, 2e-4)
 HELD_OUT = 8  # views i mod 8 = 7
 MID_SIGNAL = 0.7  # of full scale: the 97th percentile of covered pixels at the middle exposure
 PAPER_SIGMA = 0.025  # of full scale
-BIT_DEPTH, ELECTRONS_PER_DN = 8, 1e9  # the paper's camera has no shot noise
+ELECTRONS_PER_DN = 1e9  # the paper's camera has no shot noise
 LARGEST_DIMENSION = 2.0
 
 
@@ -53,7 +54,7 @@ class View:
 
 @dataclass(frozen=True)
 class Target:
-    """A target's views as an 8-bit camera of the paper sees them: Gaussian noise, then clipped."""
+    """A target's views as a camera sees them."""
 
     name: str
     sensor: Sensor
@@ -67,7 +68,7 @@ def names() -> list[str]:
 
 
 def expose(name: str, size: int = 400, sigma: float = PAPER_SIGMA, seed: int = 0) -> Target:
-    """Return a target's views; view i has exposure time i mod 3.
+    """Return a target's views by the paper's 8-bit camera (Gaussian noise, then clipped); view i has exposure i mod 3.
 
     Args:
         size: pixels along a side; 400, or 200 and 100 by averaging.
@@ -118,31 +119,29 @@ def load(name: str, size: int = 400, sigma: float = PAPER_SIGMA, seed: int = 0) 
     )
 
 
-def write(name: str, size: int, folder: Path) -> Path:
-    """Write a target as a session with its truth and return its folder, NAME-SIZE; one that is there is left as it is.
+def write(target: Target, session: Path) -> None:
+    """Write a target as a session with its truth, whole or not at all.
 
     Each view is a bracket of its own, so that every eighth is held out.
     """
-    session = folder / f"{name}-{size}"
-    if session.exists():
-        return session
-    target, part = expose(name, size), folder / f".{name}-{size}.part"
+    part = session.with_name(f".{session.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     (part / "frames").mkdir(parents=True)
     camera = _camera(target)
     lines = []
     for view in target.views:
         file = f"frames/{view.frame.id:06d}.png"
-        picture = bytes(imagecodecs.png_encode(view.frame.dn.numpy().astype(np.uint16), level=1))
+        frame = _frame(view, camera)
+        picture = bytes(imagecodecs.png_encode(frame.dn, level=1))
         (part / file).write_bytes(picture)
-        line = frame_line(_frame(view, camera), file, hashlib.sha256(picture).hexdigest())
+        line = frame_line(frame, file, hashlib.sha256(picture).hexdigest())
         # exactly the pose that the frame has: one made of a quaternion differs in the last digits
         lines.append(json.dumps(line | {"world_to_camera": view.frame.world_to_camera.tolist()}))
     (part / "frames.jsonl").write_text("\n".join(lines) + "\n")
     header = {
         "schema_version": SCHEMA_VERSION,
-        "mission_sha256": hashlib.sha256(f"{name} {size}".encode()).hexdigest(),
-        "imported_from": f"rendered target {name}",
+        "mission_sha256": hashlib.sha256(target.name.encode()).hexdigest(),
+        "imported_from": f"rendered target {target.name}",
         "camera": asdict(camera),
         "tles": {},
         "losses": {},
@@ -152,10 +151,14 @@ def write(name: str, size: int, folder: Path) -> Path:
     }
     (part / "session.json").write_text(json.dumps(header, indent=2) + "\n")
     write_truth(
-        part, _true_frames(target), target.cloud, np.empty((0, 3), int), target.cloud, {}, LARGEST_DIMENSION
+        part,
+        _true_frames(target),
+        target.cloud,
+        np.empty((0, 3), int),
+        target.cloud,
+        largest_dimension_m=LARGEST_DIMENSION,
     )
     part.rename(session)
-    return session
 
 
 def _camera(target: Target) -> CameraSection:
@@ -170,7 +173,7 @@ def _camera(target: Target) -> CameraSection:
         cx_px=K[0, 2].item(),
         cy_px=K[1, 2].item(),
         channels=channels,
-        bit_depth=BIT_DEPTH,
+        bit_depth=round(math.log2(sensor.white_dn + 1)),
         black_dn=sensor.black_dn,
         dn_per_radiance_s=sensor.dn_per_radiance_s,
         electrons_per_dn=sensor.electrons_per_dn,
@@ -197,7 +200,7 @@ def _frame(view: View, camera: CameraSection) -> Frame:
             valid=True,
             source="none",
         ),
-        dn=dn,
+        dn=dn if camera.channels == 3 else dn[..., 0],
         bit_depth=camera.bit_depth,
         black_dn=camera.black_dn,
         saturated_count=int((dn >= camera.white_dn).any(axis=2).sum()),
@@ -222,7 +225,10 @@ def main() -> None:
     if wrong := set(arguments.targets).difference(names()):
         parser.error(f"no target {', '.join(sorted(wrong))} in {FOLDER}; there are {', '.join(names())}")
     for name in arguments.targets or names():
-        print(write(name, arguments.size, arguments.out))
+        session = arguments.out / f"{name}-{arguments.size}"
+        if not session.exists():
+            write(expose(name, arguments.size), session)
+        print(session)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,247 @@
+"""The page of a comparison: one HTML file that opens without a network, made of all rows in the folder."""
+
+import html
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from ground.compare.charts import failure_figure, gain_figure, size_figure, speed_figure
+from ground.compare.methods import reference_names
+from ground.compare.results import HOLDS_DB, MARGIN_DB, METRICS, SHAKEN_DB, Metric, Results
+from ground.compare.rows import Rows
+from ground.compare.views import SHOWN, WORST, KeptView, read_views
+from ground.compare.worker import VIEWS
+from ground.page import grid, label, page, picture, plot, section
+from ground.pictures import ERROR_FULL_SCALE, heat, tone
+from obbgs_base.files import write_whole
+
+PAGE = "compare.html"
+WORST_SHOWN = 6
+COLUMNS = 5  # pictures in a row
+
+
+def write_page(out: Path) -> Path:
+    """Write compare.html into a comparison's folder and return its path.
+
+    Raises:
+        CompareError: the rows are damaged.
+        OSError: the folder cannot be written.
+    """
+    results = Results(Rows(out).rows.values())
+    targets = f"{len(results.targets)} target{'s' if len(results.targets) != 1 else ''}"
+    content = page(
+        "Comparison of methods",
+        f"{len(results.rows)} rows: {len(results.labels)} methods, {targets}, {len(results.conditions)} conditions.",
+        [
+            _tables(results),
+            _speed(results),
+            _failures(results, out),
+            _size(results),
+            _gains(results),
+            _side_by_side(results, out),
+            _origin(results),
+        ],
+    )
+    path = out / PAGE
+    write_whole(path, content.encode())
+    return path
+
+
+def _tables(results: Results) -> str:
+    """Return the table of means over the targets, and one of each target."""
+    truth = (
+        "Clean figures compare with noiseless exposures of held-out views, full scale as 1; foreground counts only the "
+        "pixels that the target covers; pooled is of the mean squared error over all views together, which single "
+        "nearly exact views do not lift. Distances are in units where the target's largest dimension is 2: Chamfer, "
+        "Hausdorff and centres complete are of the Gaussians' centres or the points of a cloud; surface complete and "
+        "accuracy of 100,000 points on the surface that the training views see."
+        if results.truth
+        else "No truth is known of these sessions: methods are compared with received held-out frames."
+    )
+    notes = (
+        f"{truth} Complete: within 0.01 of a point. The best of each column is bold, without regard to size and time. "
+        "The ceiling is a perfect model that ignores exposure: true radiance at the geometric mean of the exposure "
+        "times; at that exposure it is exact (120 dB), so that only its pooled figure tells. Noise is the noisy frame "
+        "itself, which of course equals itself (120 dB). ± is the deviation over seeds."
+    )
+    several = len(results.targets) > 1
+    body = _table(results, None) if several else ""
+    for target in results.targets:
+        body += f"<h3>{html.escape(target)}</h3>{_table(results, target)}"
+    return section(f"Scores, {html.escape(results.base)}", notes, body)
+
+
+def _table(results: Results, target: str | None) -> str:
+    """Return the table of one target, or of the means over all."""
+    shown = [m for m in METRICS if any(row.get(m.key) is not None for row in results.rows)]
+
+    def value(label: str, metric: Metric) -> tuple[float | None, str]:
+        if target is None:
+            mean, count = results.over_targets(label, results.base, metric.key)
+            more = (
+                ""
+                if count in (0, len(results.targets))
+                else f" <small>({count} of {len(results.targets)})</small>"
+            )
+        else:
+            mean = results.mean(label, target, results.base, metric.key)
+            spread = results.spread(label, target, results.base, metric.key)
+            more = "" if spread is None else f" ± {metric.form.format(_scaled(metric, spread))}"
+        return mean, "" if mean is None else metric.form.format(_scaled(metric, mean)) + more
+
+    lines = []
+    best = {m.key: _best(results, m, lambda label, m=m: value(label, m)[0]) for m in shown}
+    for name in results.labels:
+        cells = [f"<td>{html.escape(name)}</td>"]
+        reason = None if target is None else results.error(name, target, results.base)
+        for metric in shown:
+            mean, text = value(name, metric)
+            text = f"<b>{text}</b>" if mean is not None and mean == best[metric.key] else text
+            cells.append(f'<td class="n">{text}</td>')
+        if reason is not None:
+            cells = [cells[0], f'<td colspan="{len(shown)}">{html.escape(reason)}</td>']
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    head = "".join(f"<th>{html.escape(m.title)}</th>" for m in shown)
+    title = "<h3>Mean of the targets</h3>" if target is None else ""
+    return f'{title}<div style="overflow-x: auto"><table><tr><th>method</th>{head}</tr>{"".join(lines)}</table></div>'
+
+
+def _scaled(metric: Metric, value: float) -> float:
+    return value / 1e3 if metric.key == "bytes" else value
+
+
+def _best(results: Results, metric: Metric, value: Callable[[str], float | None]) -> float | None:
+    """Return the best value of a column among the methods that reconstruct something."""
+    known = [found for name in results.trained if (found := value(name)) is not None]
+    if not known or metric.more_is_better is None:
+        return None
+    return max(known) if metric.more_is_better else min(known)
+
+
+def _speed(results: Results) -> str:
+    note = (
+        "Curves are measured on the way, on up to 16 of the held-out views; measuring is not counted as time. "
+        "Diamonds are final scores over all held-out views, and the dotted line their Pareto front: no other "
+        "method is both faster and better than those on it."
+    )
+    body = "".join(
+        f"<h3>{html.escape(target)}</h3>{plot(speed_figure(results, target))}" for target in results.targets
+    )
+    return section("Speed against accuracy", note, body if results.trained else "No method was trained.")
+
+
+def _failures(results: Results, out: Path) -> str:
+    """Return the map of conditions and methods, and the worst views of all."""
+    note = (
+        f"Numbers are mean scores over targets and seeds; the colour is that of the worst target. Holds: at most "
+        f"{HOLDS_DB:g} dB below {html.escape(results.base)}; shaken: at most {SHAKEN_DB:g} dB; suffers: more; fails: "
+        f"less than {MARGIN_DB:g} dB above the best image without training (black, mean, untrained); refused: ended in "
+        "an error that says why. Point at a cell for its figures."
+    )
+    worst = []
+    for row in results.rows:
+        view = read_views(out / VIEWS / f"{row['digest']}.npz").get(WORST)
+        if view is not None and row["method"] not in reference_names():
+            worst.append((view.psnr_db, f"{row['method']}, {row['target']}, {row['condition']}", view))
+    worst.sort(key=lambda entry: entry[0])
+    cells = [label(""), label("expected"), label("render"), label("error")]
+    for _, words, view in worst[:WORST_SHOWN]:
+        cells += [label(f"{html.escape(words)}, frame {view.frame}"), *_compared(view)]
+    pictures = f"<h3>Worst views</h3>{grid('180px repeat(3, 1fr)', cells)}" if worst else ""
+    return section(
+        "Where methods fail", note, (plot(failure_figure(results)) if results.trained else "") + pictures
+    )
+
+
+def _size(results: Results) -> str:
+    note = "A marker for each method and target: left up is what one wants, no more model than a scene needs."
+    return section("Size against accuracy", note, plot(size_figure(results)) if results.trained else "")
+
+
+def _gains(results: Results) -> str:
+    base = results.gain_base
+    others = [name for name in results.trained if name != base]
+    if base is None or not others or not results.truth:
+        return ""
+    note = (
+        f"By how many per cent a method is better than {html.escape(base)}, tile by tile; for distances and LPIPS a "
+        "smaller value is the better one, so that a positive gain is always an improvement."
+    )
+    body = "".join(f"<h3>{html.escape(name)}</h3>{plot(gain_figure(results, name, base))}" for name in others)
+    return section(f"Relative gains over {html.escape(base)}", note, body)
+
+
+def _side_by_side(results: Results, out: Path) -> str:
+    """Return for each target the view that all methods share: truth, renders, errors."""
+    note = (
+        "The held-out view in which the target is brightest, the same for all methods; brightness is the square root "
+        "of the signal above black. Error is the absolute difference: 0<span class='ramp'></span>"
+        f"{ERROR_FULL_SCALE:.0%} of full scale or more."
+    )
+    body = []
+    for target in results.targets:
+        kept = [
+            (name, view)
+            for name in results.labels
+            if (view := shown_view(results, out, name, target)) is not None
+        ]
+        if not kept:
+            continue
+        body.append(f"<h3>{html.escape(target)}, frame {kept[0][1].frame}</h3>")
+        truth = tone(kept[0][1].expected, kept[0][1].sensor)
+        cells = [picture(truth, "expected", "expected")]
+        for name, view in kept:
+            _, render, error = _compared(view)
+            cells.append(f'<div>{render}{error}<div class="label">{html.escape(name)}</div></div>')
+        body.append(grid(f"repeat({COLUMNS}, 1fr)", cells))
+    return section("Side by side", note, "".join(body))
+
+
+def shown_view(results: Results, out: Path, name: str, target: str) -> KeptView | None:
+    """Return the view of a target that all methods share, of a method's first seed; None where none was kept."""
+    rows = results.of(name, target, results.base)
+    views = [read_views(out / VIEWS / f"{row['digest']}.npz").get(SHOWN) for row in rows]
+    return next((view for view in views if view is not None), None)
+
+
+def error_of(view: KeptView) -> np.ndarray:
+    """Return the error of a view's image [H, W, 1], 1 at `ERROR_FULL_SCALE` of full scale and above."""
+    error = np.abs(view.image - view.expected).mean(axis=2, keepdims=True)
+    return np.clip(error / ERROR_FULL_SCALE, 0, 1)
+
+
+def _compared(view: KeptView) -> list[str]:
+    return [
+        picture(tone(view.expected, view.sensor), "expected", f"{view.exposure_time_s * 1e3:g} ms"),
+        picture(tone(view.image, view.sensor), "render", f"{view.psnr_db:.1f} dB"),
+        picture(heat(error_of(view)), "error", "&nbsp;"),
+    ]
+
+
+def _origin(results: Results) -> str:
+    """Return where the rows come from."""
+    lines = []
+    for key, title in (
+        ("commit", "commit"),
+        ("machine", "machine"),
+        ("threads", "threads"),
+        ("command", "command"),
+    ):
+        values = list(dict.fromkeys(str(row[key]) for row in results.rows if key in row))
+        lines += [f"<tr><td>{title}</td><td>{html.escape(value)}</td></tr>" for value in values]
+    loads = [row["load"] for row in results.rows if "load" in row]
+    if loads:
+        lines.append(f"<tr><td>load</td><td>{min(loads):g} to {max(loads):g}</td></tr>")
+    changes = {row["condition"]: row["changes"] for row in results.rows if "changes" in row}
+    lines += [
+        f"<tr><td>{html.escape(name)}</td><td>{html.escape(json.dumps(change))}</td></tr>"
+        for name, change in changes.items()
+    ]
+    early = sum(bool(row.get("converged")) for row in results.rows)
+    note = (
+        f"Every row is a line of rows.jsonl with its own commit, machine, load and date. {early} trainings ended early "
+        "because their curve had moved by less than 0.05 dB over its last fifth (`converged`)."
+    )
+    return section("Where the rows come from", note, f"<table>{''.join(lines)}</table>")
