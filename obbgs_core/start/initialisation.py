@@ -110,11 +110,6 @@ def first_gaussians(
     return model, radius, f"random, {settings.count} points"
 
 
-def full_scale_radiance(frames: list[TrainingFrame], sensor: Sensor) -> float:
-    """Return the radiance that saturates a pixel at the frames' mean exposure time."""
-    return (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * mean_exposure_s(frames))
-
-
 def _colours(
     points: Tensor,
     frames: list[TrainingFrame],
@@ -125,7 +120,8 @@ def _colours(
     """Return the coefficients of degree 0 [N, C] that Gaussians at points start with."""
     if settings.colour == "grey":
         noise = torch.rand(len(points), frames[0].dn.shape[2], generator=rng)
-        return sh.from_radiance((0.5 + sh.C0 * noise / 255) * full_scale_radiance(frames, sensor))
+        full_scale = sensor.full_scale_radiance(mean_exposure_s(frames))
+        return sh.from_radiance((0.5 + sh.C0 * noise / 255) * full_scale)
     return sh.from_radiance(_seen_radiance(points, frames, sensor))
 
 

@@ -337,7 +337,10 @@ def test_a_mission_file_says_how_to_train_and_the_command_line_says_otherwise(se
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("method: obgs", r"mission\.reconstruct\.method: expected one of obbgs, .*mvgs, with variants .*got 'obgs'"),
+        (
+            "method: obgs",
+            r"mission\.reconstruct\.method: expected one of obbgs, .*mvgs, with variants .*got 'obgs'",
+        ),
         ("settings: 3", r"mission\.reconstruct\.settings: expected a mapping of keys, got 3"),
         ("settings: {stepz: 3}", r"mission\.reconstruct\.settings\.stepz: unknown key; .*steps"),
         ("settings: {steps: many}", r"settings\.steps: expected a whole number, got 'many'"),
