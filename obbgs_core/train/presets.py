@@ -44,7 +44,7 @@ PRESETS: dict[str, MethodConfig] = {
                 "growth.multi_view": True,
             },
         ),
-        changed(_3DGS, {"name": "mip-splatting", "smoothing_px2": 0.2}),
+        changed(_3DGS, {"name": "mip-splatting", "smoothing_px2": 0.2, "footprint": "mip-splatting"}),
         changed(
             _3DGS,
             {

@@ -95,6 +95,7 @@ def prepare(
     gaussians, radius_m, start = first_gaussians(
         lit, list(outlines.values()), sensor, config.start, config.light.sh_degree, rng
     )
+    gaussians = dataclasses.replace(gaussians, footprint=config.footprint)
     sky = {i: outline.sky for i, outline in outlines.items()} if config.loss.sky_weight else None
     setup = TrainingSetup(
         frames=lit,

@@ -20,6 +20,8 @@ from obbgs_core.io.onnx.composite import composite
 from obbgs_core.io.onnx.graph import Graph
 from obbgs_core.io.onnx.projection import camera_view, project
 from obbgs_core.io.onnx.radiance import radiance_towards
+from obbgs_core.model.cameras import DEFAULT_PSF_SIGMA_PX
+from obbgs_core.model.footprint import variance_px2
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.reference import MIN_DEPTH_ALPHA
 from obbgs_core.sensor import Sensor
@@ -44,6 +46,7 @@ def export_onnx(
     width: int,
     height: int,
     exposures_s: Sequence[float],
+    psf_sigma_px: float = DEFAULT_PSF_SIGMA_PX,
 ) -> Exported:
     """Write the renderer; the file appears whole or not at all.
 
@@ -56,12 +59,13 @@ def export_onnx(
         width: of the rendered image, px.
         height: the same.
         exposures_s: the exposure times of the training frames; their range goes into the metadata.
+        psf_sigma_px: the point spread of the optics that are rendered, as in `Cameras`.
 
     Raises:
         ExportError: the model is empty, not finite or too large for an ONNX file, or there is no exposure time.
     """
     _check(gaussians, exposures_s)
-    graph = _graph(gaussians, sensor, width, height)
+    graph = _graph(gaussians, sensor, width, height, float(variance_px2(gaussians.footprint, psf_sigma_px)))
     size_bytes = sum(len(constant.raw_data) for constant in graph.constants)
     if size_bytes > MAX_PROTOBUF_BYTES:
         raise ExportError(
@@ -75,6 +79,8 @@ def export_onnx(
         "width": width,
         "height": height,
         "gaussians": len(gaussians),
+        "footprint": gaussians.footprint,
+        "psf_sigma_px": psf_sigma_px,
         "exposure_min_s": min(exposures_s),
         "exposure_max_s": max(exposures_s),
         "format": FORMAT_VERSION,
@@ -96,10 +102,10 @@ def _check(gaussians: Gaussians, exposures_s: Sequence[float]) -> None:
             raise ExportError(f"{name} holds values that are not finite")
 
 
-def _graph(gaussians: Gaussians, sensor: Sensor, width: int, height: int) -> Graph:
+def _graph(gaussians: Gaussians, sensor: Sensor, width: int, height: int, footprint_px2: float) -> Graph:
     """Return the nodes from the inputs to the outputs."""
     graph = Graph()
-    camera = camera_view(graph, width, height)
+    camera = camera_view(graph, width, height, footprint_px2)
     projected = project(graph, gaussians, camera)
     radiance = radiance_towards(graph, gaussians, camera)
     channels = gaussians.sh.shape[2]
