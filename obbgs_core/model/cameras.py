@@ -1,6 +1,7 @@
 """Pinhole cameras: OpenCV axes, pixel centres at +0.5."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ class Cameras:
 
     sun_dir [C, 3] (no gradient): towards the Sun when each picture is taken, unit, body frame; only models whose
     radiance turns with the Sun need it.
+    background: radiance, the same in all channels, of what is seen where no Gaussian is; space is black.
     """
 
     world_to_camera: Tensor
@@ -22,6 +24,7 @@ class Cameras:
     height: int
     near_m: float = 0.01
     sun_dir: Tensor | None = None
+    background: float = 0.0
 
     def __post_init__(self):
         count = self.world_to_camera.shape[0]
@@ -37,6 +40,8 @@ class Cameras:
             raise ValueError(
                 f"width, height and near_m must be positive: {self.width}, {self.height}, {self.near_m}"
             )
+        if not 0 <= self.background < math.inf:
+            raise ValueError(f"background must be a radiance of at least 0, got {self.background}")
 
     def __len__(self) -> int:
         return self.world_to_camera.shape[0]

@@ -12,7 +12,7 @@ import torch
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import FEWEST_FRAMES, TrainingFrame, camera_extent_m, sun_span_deg, usable
 from obbgs_core.sensor import Sensor
-from obbgs_core.start.hull import shows_light
+from obbgs_core.start.hull import light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.batches import Batches, FrameOrder
@@ -52,6 +52,8 @@ class TrainingSetup:
         """A digest of what decides the result of a training: the method, the seed, the sensor and the frames."""
         digest = hashlib.sha256(json.dumps([dataclasses.asdict(self.config), self.seed]).encode())
         digest.update(repr(self.sensor).encode())
+        if background := self.frames[0].background:
+            digest.update(f"background {background}".encode())
         for f in self.frames:
             digest.update(
                 f.dn.numpy().tobytes() + f.world_to_camera.numpy().tobytes() + f.K.numpy().tobytes()
@@ -70,7 +72,7 @@ def prepare(
         TooFewFrames, ReconstructionError: as in `train`.
     """
     checked, reference_exposure_s = usable(frames, config.exposure_aware)
-    lit = [f for f in checked if shows_light(f.dn, sensor)]
+    lit = [f for f in checked if shows_light(light(f.dn, sensor, f.background, f.exposure_time_s), sensor)]
     dark = len(checked) - len(lit)
     if len(lit) < FEWEST_FRAMES:
         raise ReconstructionError(
