@@ -10,6 +10,7 @@ import torch
 
 from ground.cameras import camera_of, exposed, predicted_image
 from ground.card import model_card
+from ground.formats.srgb import from_srgb, to_srgb
 from ground.runs import Run, open_run, written_to
 from ground.session import FrameRecord
 from ground.truth import Truth, read_points
@@ -28,6 +29,8 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
 
     - scored_frames: "held_out", or "training" where nothing was held out and the training frames are scored.
     - psnr_noisy_db: against the frames as received.
+    - psnr_srgb_db, psnr_linear_db: of imported pictures in colour, the same of display values (sRGB-coded, black 0,
+      full scale 1), as most publications measure it, and of values that are linear in light.
 
     With a simulator's truth also, from true poses, so that errors of the scored frames' pose tags do not count as
     errors of the model:
@@ -51,6 +54,8 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
         )
         for r in run.scored
     )
+    if run.session.frames_imported is not None and run.session.camera.channels == 3:
+        figures |= _display_figures(run)
     if Truth.exists(run.session):
         truth = Truth(run.session)
         figures |= _clean_figures(run, truth)
@@ -69,6 +74,20 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
         write_whole(run.folder / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
         write_whole(run.folder / "model_card.md", model_card(run.session.created_utc, metrics).encode())
     return metrics
+
+
+def _display_figures(run: Run) -> dict[str, float]:
+    black = run.sensor.black_dn / run.sensor.white_dn
+    convert = from_srgb if run.session.encoding == "srgb" else to_srgb
+    other = "psnr_linear_db" if run.session.encoding == "srgb" else "psnr_srgb_db"
+    figures: dict[str, list[float]] = {"psnr_srgb_db": [], "psnr_linear_db": []}
+    for record in run.scored:
+        predicted = predicted_image(run.gaussians, run.session, record, run.sensor, _exposure_s(run, record))
+        pair = [((image - black) / (1 - black)).clamp(min=0) for image in (predicted, _noisy(run, record))]
+        converted = [torch.from_numpy(convert(image.numpy())) for image in pair]
+        for key in figures:
+            figures[key].append(psnr_db(*(converted if key == other else pair)))
+    return {key: _mean(values) for key, values in figures.items()}
 
 
 def _clean_figures(run: Run, truth: Truth) -> dict[str, float]:

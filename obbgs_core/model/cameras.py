@@ -1,6 +1,7 @@
 """Pinhole cameras: OpenCV axes, pixel centres at +0.5."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ class Cameras:
     radiance turns with the Sun need it.
     psf_sigma_px: standard deviation of the optics' point spread, in pixels of these images (may be a tensor [] with a
     gradient); only models whose footprint is the camera's need it, see `footprint`.
+    background: radiance, the same in all channels, of what is seen where no Gaussian is; space is black.
     """
 
     world_to_camera: Tensor
@@ -28,6 +30,7 @@ class Cameras:
     near_m: float = 0.01
     sun_dir: Tensor | None = None
     psf_sigma_px: float | Tensor = DEFAULT_PSF_SIGMA_PX
+    background: float = 0.0
 
     def __post_init__(self):
         count = self.world_to_camera.shape[0]
@@ -43,6 +46,8 @@ class Cameras:
             raise ValueError(
                 f"width, height and near_m must be positive: {self.width}, {self.height}, {self.near_m}"
             )
+        if not 0 <= self.background < math.inf:
+            raise ValueError(f"background must be a radiance of at least 0, got {self.background}")
 
     def __len__(self) -> int:
         return self.world_to_camera.shape[0]

@@ -49,9 +49,11 @@ def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.S
     for exposure_s in sorted({f.exposure_time_s for f in frames}, reverse=True):
         if len(chosen) < FEWEST_VIEWS:
             chosen |= {i: f for i, f in enumerate(frames) if f.exposure_time_s == exposure_s}
-    return {
-        i: hull.silhouette(f.dn, sensor, f.world_to_camera, f.K, _pose_error_px(f)) for i, f in chosen.items()
-    }
+    outlines = {}
+    for i, f in chosen.items():
+        light = hull.light(f.dn, sensor, f.background, f.exposure_time_s)
+        outlines[i] = hull.silhouette(light, sensor, f.world_to_camera, f.K, _pose_error_px(f))
+    return outlines
 
 
 def _pose_error_px(frame: TrainingFrame) -> int:

@@ -104,6 +104,13 @@ def change_number(
 ) -> None:
     """Densify everywhere, or between two such times inside the boxes of the worst tiles; reset opacities; when due."""
     settings, now = setup.config.growth, moment.step
+    whole = setup.config.steps_until(1) - setup.config.steps_until(0)
+    if (
+        setup.frames[0].background
+        and settings.opacity_reset_interval
+        and now == round(settings.begin * whole)
+    ):
+        reset_opacities(state.gaussians, state.adam, state.log_lowering)  # as in 3DGS on a white background
     if not is_growing(setup, moment.share):
         if moment.share >= settings.end and now % settings.interval == 0:
             left = setup.config.steps - state.steps_done - 1

@@ -19,7 +19,7 @@ from obbgs_core.frames import (
 )
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import flat
-from obbgs_core.start.hull import shows_light
+from obbgs_core.start.hull import light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.batches import Batches, FrameOrder
@@ -62,6 +62,8 @@ class TrainingSetup:
     def identity(self) -> Identity:
         """What decides the result of a training: the method's settings, the seed, the sensor and the frames."""
         digest = hashlib.sha256(repr((self.seed, self.sensor)).encode())
+        if background := self.frames[0].background:
+            digest.update(f"background {background}".encode())
         for f in self.frames:
             digest.update(
                 f.dn.numpy().tobytes() + f.world_to_camera.numpy().tobytes() + f.K.numpy().tobytes()
@@ -80,7 +82,7 @@ def prepare(
         TooFewFrames, ReconstructionError: as in `train`.
     """
     checked, reference_exposure_s = usable(frames, config.exposure_aware)
-    shown = [shows_light(f.dn, sensor) for f in checked]
+    shown = [shows_light(light(f.dn, sensor, f.background, f.exposure_time_s), sensor) for f in checked]
     lit = [f for f, shows in zip(checked, shown, strict=True) if shows]
     dark = len(checked) - len(lit)
     if len(lit) < FEWEST_FRAMES:

@@ -47,6 +47,7 @@ def export_onnx(
     height: int,
     exposures_s: Sequence[float],
     psf_sigma_px: float = DEFAULT_PSF_SIGMA_PX,
+    background: float = 0.0,
 ) -> Exported:
     """Write the renderer; the file appears whole or not at all.
 
@@ -60,12 +61,14 @@ def export_onnx(
         height: the same.
         exposures_s: the exposure times of the training frames; their range goes into the metadata.
         psf_sigma_px: the point spread of the optics that are rendered, as in `Cameras`.
+        background: radiance of what is seen where no Gaussian is.
 
     Raises:
         ExportError: the model is empty, not finite or too large for an ONNX file, or there is no exposure time.
     """
     _check(gaussians, exposures_s)
-    graph = _graph(gaussians, sensor, width, height, float(variance_px2(gaussians.footprint, psf_sigma_px)))
+    footprint = float(variance_px2(gaussians.footprint, psf_sigma_px))
+    graph = _graph(gaussians, sensor, width, height, footprint, background)
     size_bytes = sum(len(constant.raw_data) for constant in graph.constants)
     if size_bytes > MAX_PROTOBUF_BYTES:
         raise ExportError(
@@ -102,7 +105,9 @@ def _check(gaussians: Gaussians, exposures_s: Sequence[float]) -> None:
             raise ExportError(f"{name} holds values that are not finite")
 
 
-def _graph(gaussians: Gaussians, sensor: Sensor, width: int, height: int, footprint_px2: float) -> Graph:
+def _graph(
+    gaussians: Gaussians, sensor: Sensor, width: int, height: int, footprint_px2: float, background: float
+) -> Graph:
     """Return the nodes from the inputs to the outputs."""
     graph = Graph()
     camera = camera_view(graph, width, height, footprint_px2)
@@ -113,16 +118,18 @@ def _graph(gaussians: Gaussians, sensor: Sensor, width: int, height: int, footpr
     depth = graph.op("Unsqueeze", projected.depth, graph.ints(1))
     features = graph.op("Concat", radiance, depth, ones, axis=1)
     composed = composite(graph, projected, features, channels + 2, camera)
-    _name_outputs(graph, composed, channels, sensor)
+    _name_outputs(graph, composed, channels, sensor, background)
     return graph
 
 
-def _name_outputs(g: Graph, composed: str, channels: int, sensor: Sensor) -> None:
+def _name_outputs(g: Graph, composed: str, channels: int, sensor: Sensor, background: float) -> None:
     """Turn the composited features [channels + 2, H, W] into the outputs; here the exposure time is applied."""
     parts = []
     for start, end in ((0, channels), (channels, channels + 1), (channels + 1, channels + 2)):
         parts.append(g.op("Slice", composed, g.ints(start), g.ints(end), g.ints(0)))
     radiance, depth_sum, alpha = parts
+    if background:
+        radiance = g.op("Add", radiance, g.op("Mul", g.op("Sub", 1.0, alpha), background))
     radiance = g.op("Transpose", radiance, perm=[1, 2, 0])
     signal = g.op("Mul", radiance, g.op("Mul", "exposure_time_s", sensor.dn_per_radiance_s))
     g.op("Clip", g.op("Div", g.op("Add", signal, sensor.black_dn), sensor.white_dn), 0.0, 1.0, name="image")
