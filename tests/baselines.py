@@ -48,7 +48,7 @@ def untrained(target: Target, config: MethodConfig, seed: int = 0) -> Score:
         ReconstructionError: the frames allow no start, as in `Trainer`.
     """
     trainer = Trainer(target.training, target.sensor, config, seed)
-    gaussians, reference_s = trainer.state.gaussians.detach(), trainer.setup.reference_exposure_s
+    gaussians, reference_s = trainer.gaussians, trainer.setup.reference_exposure_s
     images = [
         predicted(gaussians, f, target.sensor, reference_s or f.exposure_time_s) for f in target.held_out
     ]

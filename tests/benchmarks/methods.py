@@ -38,7 +38,7 @@ def measure(
     while not (reason := trainer.stop_reason(time_limit_s)):
         info = trainer.step()
         if info.step in marks:
-            gaussians = trainer.state.gaussians.detach()
+            gaussians = trainer.gaussians
             clean = targets.clean_psnr_db(gaussians, target, trainer.setup.reference_exposure_s)
             chamfer = targets.cloud_distances(gaussians.means.double().numpy(), target.cloud)["chamfer"]
             way.append((round(info.seconds, 2), round(clean, 3), round(chamfer, 5)))
