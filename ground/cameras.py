@@ -34,10 +34,11 @@ def cameras_of(session: Session, records: list[FrameRecord]) -> Cameras:
     camera = session.camera
     return Cameras(
         poses,
-        torch.tensor(camera.K).expand(len(records), 3, 3),
+        torch.stack([torch.from_numpy(session.K(r)) for r in records]),
         camera.width,
         camera.height,
         sun_dir=stacked_suns([sun_direction(record) for record in records]),
+        background=session.background,
     )
 
 

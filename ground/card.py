@@ -108,6 +108,8 @@ def _quality(metrics: dict) -> list[str]:
     scored = scored_frames(metrics)
     for key, text in (
         ("psnr_noisy_db", f"PSNR of {scored} against their noisy readings: {{:.2f}} dB."),
+        ("psnr_srgb_db", "The same of display values (sRGB): {:.2f} dB."),
+        ("psnr_linear_db", "The same of values that are linear in light: {:.2f} dB."),
         ("psnr_clean_db", f"PSNR of {scored} against their noiseless exposures: {{:.2f}} dB."),
         ("psnr_clean_foreground_db", "The same on the pixels that the target covers: {:.2f} dB."),
         ("chamfer", "Chamfer distance of the centres (the target's largest dimension = 2): {:.4f}."),

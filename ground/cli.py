@@ -14,7 +14,16 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from flightsw.icd.mission import load_mission
 from ground.cli_compare import compare_command
-from ground.cli_options import AsJson, ExportFormat, ImportFormat, SessionDir, UplinkCommand
+from ground.cli_options import (
+    AsJson,
+    Background,
+    BackgroundGiven,
+    ExportFormat,
+    ImportFormat,
+    SessionDir,
+    UplinkCommand,
+    ValuesGiven,
+)
 from ground.cli_runs import evaluate_command, reconstruct_command, report_command
 from obbgs_base.command_line import new_app, run
 
@@ -170,15 +179,18 @@ def import_command(
     folder: Annotated[Path, typer.Option("--from", help="The data set's folder.")],
     session: Annotated[Path, typer.Option(help="The session folder to make.")],
     format_: Annotated[ImportFormat, typer.Option("--format", help="The data set's format.")],
-    srgb: Annotated[
-        bool, typer.Option(help="Undo the sRGB curve: the pictures are not linear in light.")
-    ] = False,
+    values: ValuesGiven = None,
+    background: BackgroundGiven = None,
     frames: Annotated[
-        int | None, typer.Option(min=1, help="Import only the first so many pictures; default: all.")
+        int | None,
+        typer.Option(min=1, help="Import only the first so many pictures (of each split); default: all."),
     ] = None,
     json_: AsJson = False,
 ) -> None:
     """Make a session of pictures with known cameras: NeRF-synthetic, nerfstudio, COLMAP or SHIRT.
+
+    Splits that the data set states are kept: `ground reconstruct` trains on train and holds out test, or val if there
+    is no test.
 
     Example: ground import --format shirt --from shirtv1/roe1/lightbox --frames 363 --session roe1
     """
@@ -186,23 +198,27 @@ def import_command(
     from ground.formats.nerf import read_nerf
     from ground.formats.nerfstudio import read_nerfstudio
     from ground.formats.shirt import read_shirt
-    from ground.formats.views import write_session
+    from ground.formats.views import Values, first_of_each_split, is_transparent, write_session
 
-    camera = None
+    exported = None
+    white = None if background is None else background is Background.WHITE
     match format_:
         case ImportFormat.NERF:
-            views, camera = read_nerf(folder)
+            views, exported = read_nerf(folder)
+            if exported is None and white is None:
+                white = is_transparent(views[0].image)
         case ImportFormat.NERFSTUDIO:
-            views, camera = read_nerfstudio(folder)
+            views, exported = read_nerfstudio(folder)
         case ImportFormat.COLMAP:
             views = read_colmap(folder)
         case ImportFormat.SHIRT:
             views = read_shirt(folder)
-    views = views[:frames]
+    views = first_of_each_split(views, frames)
+    given = None if values is None else Values(values.value)
     with Progress(TextColumn("importing"), BarColumn(), TimeRemainingColumn(), console=stderr) as progress:
         task = progress.add_task("import", total=len(views))
         source = f"{format_.value}: {folder}"
-        count = write_session(views, session, source, srgb, camera, lambda: progress.advance(task))
+        count = write_session(views, session, source, given, white, exported, lambda: progress.advance(task))
     print(json.dumps({"frames": count, "session": str(session)}) if json_ else f"{count} frames in {session}")
 
 

@@ -33,6 +33,21 @@ class ImportFormat(StrEnum):
     SHIRT = "shirt"
 
 
+class PixelValues(StrEnum):
+    """What the values of imported pictures stand for, as `ground.formats.views.Values`."""
+
+    LINEAR = "linear"
+    DISPLAY = "display"
+    DECODE = "decode"
+
+
+class Background(StrEnum):
+    """What transparent pictures are put on."""
+
+    BLACK = "black"
+    WHITE = "white"
+
+
 class ExportFormat(StrEnum):
     """Formats that a session can be written in."""
 
@@ -54,6 +69,23 @@ class UplinkCommand(StrEnum):
     RESUME = "resume"
 
 
+# of `ground import`
+ValuesGiven = Annotated[
+    PixelValues | None,
+    typer.Option(
+        "--values",
+        help="linear: proportional to light; display: sRGB-coded, kept as they are, which is how published PSNR is "
+        "measured; decode: sRGB-coded, made linear. Default: display for colours of 8 bits, otherwise linear.",
+    ),
+]
+BackgroundGiven = Annotated[
+    Background | None,
+    typer.Option(
+        "--background",
+        help="What is seen where the target is not; transparent pictures are put on it. Default: white for transparent "
+        "pictures of the format nerf, otherwise black.",
+    ),
+]
 # of `ground reconstruct`
 MethodName = Annotated[
     str | None,

@@ -10,7 +10,7 @@ import torch
 from ground.cameras import camera_of, exposed, predicted_image
 from ground.card import model_card
 from ground.runs import Run, open_run, written_to
-from ground.scores import ScoredView, clean_scores, cloud_scores, noisy_psnr_db
+from ground.scores import ScoredView, clean_scores, cloud_scores, display_scores, noisy_psnr_db
 from ground.session import FrameRecord
 from ground.truth import Truth, read_points
 from obbgs_base.files import write_whole
@@ -25,6 +25,8 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
 
     - scored_frames: "held_out", or "training" where nothing was held out and the training frames are scored.
     - psnr_noisy_db: against the frames as received.
+    - psnr_srgb_db, psnr_linear_db: of imported pictures in colour, the same of display values (sRGB-coded, black 0,
+      full scale 1), as most publications measure it, and of values that are linear in light.
 
     With a simulator's truth also, from true poses, so that errors of the scored frames' pose tags do not count as
     errors of the model:
@@ -43,6 +45,9 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     figures = {
         "psnr_noisy_db": noisy_psnr_db((_image(run, record), _noisy(run, record)) for record in run.scored)
     }
+    if run.session.frames_imported is not None and run.session.camera.channels == 3:
+        pairs = ((_image(run, record), _noisy(run, record)) for record in run.scored)
+        figures |= display_scores(pairs, run.sensor, run.session.encoding)
     if Truth.exists(run.session):
         truth = Truth(run.session)
         records = list(map(truth.posed, run.scored))

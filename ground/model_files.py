@@ -94,7 +94,9 @@ def write_models(
     outputs.make("surface.ply", lambda path: _write_surface(gaussians, session, training, path))
     exported = outputs.make(
         "model.onnx",
-        lambda path: export_onnx(gaussians, sensor, path, camera.width, camera.height, exposures_s),
+        lambda path: export_onnx(
+            gaussians, sensor, path, camera.width, camera.height, exposures_s, session.background
+        ),
     )
     if exported is None:
         return None
@@ -116,12 +118,11 @@ def onnx_parity_db(
 ) -> float:
     """Return the lowest PSNR over some views of ONNX Runtime's images against our renderer's, full scale 1."""
     runtime = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    K = np.array(session.camera.K, dtype=np.float32)
     worst = math.inf
     for record in views:
         feed = {
             "world_to_camera": record.world_to_camera.astype(np.float32),
-            "K": K,
+            "K": session.K(record),
             "exposure_time_s": np.array(record.exposure_time_s, dtype=np.float32),
         }
         if (sun_dir := sun_direction(record)) is not None and gaussians.shading != "view":

@@ -8,13 +8,16 @@ from obbgs_core.sensor import Sensor
 ERROR_FULL_SCALE = 0.1  # of full scale: this error and larger ones are shown white
 
 
-def tone(image: np.ndarray, sensor: Sensor) -> np.ndarray:
+def tone(image: np.ndarray, sensor: Sensor, encoding: str = "linear") -> np.ndarray:
     """Return an image [H, W, C] (fractions of full scale) for the screen, as bytes [H, W, 3].
 
-    Brightness is the square root of the signal above black; full scale is white.
+    Brightness is the square root of the signal above black, of display values (encoding `srgb`) the signal itself; full
+    scale is white.
     """
     black = sensor.black_dn / sensor.white_dn
-    shown = np.sqrt(np.clip((image - black) / (1 - black), 0, 1))
+    shown = np.clip((image - black) / (1 - black), 0, 1)
+    if encoding == "linear":
+        shown = np.sqrt(shown)
     return np.broadcast_to((255 * shown).round().astype(np.uint8), (*image.shape[:2], 3))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 import yaml
 
-from ground.cameras import predicted_image
+from ground.cameras import exposed, predicted_image
 from ground.card import chi2_explained, frames_captured, scored_frames
 from ground.evaluate import clean_image
 from ground.page import as_yaml, cards, grid, label, page, picture, plot, section, two_tables
@@ -24,7 +24,9 @@ from obbgs_core.score.metrics import COMPLETENESS_RADIUS, psnr_db
 COLUMNS = 6  # brackets shown for each exposure
 VIEWS_SHOWN = 3
 MARGIN_PX = 10
-ABOVE_BLACK = 0.01  # of full scale: brighter pixels count as target when pictures are cropped
+ABOVE_EMPTY = (
+    0.01  # of full scale: pixels that differ more from the background are target when pictures are cropped
+)
 
 
 def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
@@ -125,6 +127,8 @@ def _details(m: dict) -> list[tuple[str, str]]:
         "psnr_clean_foreground_db": "… of the foreground, dB",
         "psnr_clean_blind_db": "… of the training without exposure times, dB",
         "psnr_noisy_db": f"PSNR of {scored_frames(m)} against their noisy readings, dB",
+        "psnr_srgb_db": "… of display values (sRGB), dB",
+        "psnr_linear_db": "… of values that are linear in light, dB",
         "psnr_radiance_db": "PSNR of scene-linear radiance (brightest pixel = 1), dB",
         "ssim_clean": "SSIM, clean (structural similarity, 1 is identical)",
         "chamfer": "Chamfer distance of the centres",
@@ -166,7 +170,7 @@ def _frames(run: Run) -> str:
             caption = f"frame {record.id}, {_range_m(record):.0f} m"
             if record.saturated:
                 caption += f"<br>{record.saturated:,} px saturated"
-            cells.append(picture(tone(_noisy_image(run, record), run.sensor), f"frame {record.id}", caption))
+            cells.append(picture(_tone(run, _noisy_image(run, record)), f"frame {record.id}", caption))
     return section(
         "Frames by exposure",
         "Frames as received: each column is a bracket, each row an exposure time; below each frame stand its number "
@@ -205,21 +209,25 @@ def _compared(run: Run, truth: Truth | None, of_view: list[FrameRecord]) -> str:
     expected = [
         clean_image(run, truth, r) if truth else torch.from_numpy(_noisy_image(run, r)) for r in of_view
     ]
-    black = run.sensor.black_dn / run.sensor.white_dn
-    box = bounding_box(expected[-1].mean(-1) > black + ABOVE_BLACK, MARGIN_PX)  # of the longest exposure
+    background = torch.tensor(run.session.background)
+    empty = exposed(background, run.sensor, of_view[-1].exposure_time_s)
+    signal = expected[-1] - empty  # of the longest exposure
+    if run.session.background:
+        signal = signal.abs()
+    box = bounding_box(signal.mean(-1) > ABOVE_EMPTY, MARGIN_PX)
     cells = [label(""), *(label(name) for name in names)]
     models = [(run.gaussians, run.metrics.get("reference_exposure_s"))]
     if run.blind:
         models.append((run.blind, run.metrics["blind_reference_exposure_s"]))
     for record, image in zip(of_view, expected, strict=True):
         cells.append(label(f"{record.exposure_time_s * 1e3:g} ms"))
-        cells.append(picture(tone(image[box].numpy(), run.sensor), reference, f"frame {record.id}"))
+        cells.append(picture(_tone(run, image[box].numpy()), reference, f"frame {record.id}"))
         for gaussians, reference_exposure_s in models:
             exposure_s = reference_exposure_s or record.exposure_time_s
             render = predicted_image(gaussians, run.session, record, run.sensor, exposure_s)
             error = ((render - image).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
             caption = f"{psnr_db(render, image):.1f} dB"
-            cells.append(picture(tone(render[box].numpy(), run.sensor), "render", caption))
+            cells.append(picture(_tone(run, render[box].numpy()), "render", caption))
             cells.append(picture(heat(error[box].numpy()), "error", "&nbsp;"))
     return grid(f"60px repeat({len(names)}, 1fr)", cells)
 
@@ -340,6 +348,10 @@ def _spread(values: list[int], count: int) -> list[int]:
 
 def _range_m(record: FrameRecord) -> float:
     return float(np.linalg.norm(record.position_body_m))
+
+
+def _tone(run: Run, image: np.ndarray) -> np.ndarray:
+    return tone(image, run.sensor, run.session.encoding)
 
 
 def _noisy_image(run: Run, record: FrameRecord) -> np.ndarray:

@@ -6,10 +6,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from ground.formats.srgb import from_srgb, to_srgb
 from obbgs_core.score.lpips import SMALLEST_PX, WeightsMissing, lpips
 from obbgs_core.score.metrics import cloud_distances, foreground_psnr_db, psnr_db, ssim
+from obbgs_core.sensor import Sensor
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +35,26 @@ class ScoredView:
 def noisy_psnr_db(images: Iterable[tuple[Tensor, Tensor]]) -> float:
     """Return the mean PSNR of predicted images against frames as received, pairs of [H, W, C] in 0..1."""
     return _mean([psnr_db(image, noisy) for image, noisy in images])
+
+
+def display_scores(
+    images: Iterable[tuple[Tensor, Tensor]], sensor: Sensor, encoding: str
+) -> dict[str, float]:
+    """Return psnr_srgb_db and psnr_linear_db of pairs as in `noisy_psnr_db`: of display values, and of linear ones.
+
+    Args:
+        encoding: of the pairs, `srgb` or `linear`.
+    """
+    black = sensor.black_dn / sensor.white_dn
+    convert = from_srgb if encoding == "srgb" else to_srgb
+    other = "psnr_linear_db" if encoding == "srgb" else "psnr_srgb_db"
+    figures: dict[str, list[float]] = {"psnr_srgb_db": [], "psnr_linear_db": []}
+    for pair in images:
+        signals = [((image - black) / (1 - black)).clamp(min=0) for image in pair]
+        converted = [torch.from_numpy(convert(signal.numpy())) for signal in signals]
+        for key in figures:
+            figures[key].append(psnr_db(*(converted if key == other else signals)))
+    return {key: _mean(values) for key, values in figures.items()}
 
 
 def clean_scores(views: Sequence[ScoredView]) -> dict[str, float]:

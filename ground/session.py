@@ -1,7 +1,8 @@
 """A session: a folder with the frames of one pass, their pose tags, and a count of everything that was lost.
 
     session.json        schema version, digest of the mission file, camera calibration, TLEs, losses, bytes received,
-                        what the spacecraft's telemetry said of its frames, time of creation
+                        what the spacecraft's telemetry said of its frames, time of creation; of imported pictures
+                        also the background's radiance and whether values are linear in light or sRGB-coded
     frames.jsonl        one line per frame, a `FrameRecord`, in the order of arrival
     frames/000123.png   the frame's digital numbers, 16-bit linear, mono or RGB
     truth/              only from a simulator: true poses, radiance and surface; never read in training
@@ -30,6 +31,8 @@ from ground.telemetry import FlightCounts
 from obbgs_base.errors import ObbgsError
 
 SCHEMA_VERSION = 1
+SPLITS = ("train", "val", "test")
+ENCODINGS = ("linear", "srgb")
 # No other file name is opened: a session may come from someone else.
 FRAME_FILE = re.compile(r"frames/\d{6,10}\.png", re.ASCII)
 
@@ -71,6 +74,10 @@ class FrameRecord:
     sha256: str  # of the container as received
     bit_depth: int
     black_dn: float
+    split: str | None = (
+        None  # train, val or test, where an imported data set states it: for all frames or for none
+    )
+    K: np.ndarray | None = None  # [3, 3] px, where it is not the session's camera's
 
 
 ARRAY_SHAPES = {
@@ -79,6 +86,7 @@ ARRAY_SHAPES = {
     "position_body_m": (3,),
     "covariance": (6, 6),
     "sun_dir_body": (3,),
+    "K": (3, 3),
 }
 
 
@@ -96,6 +104,8 @@ class Session:
     created_utc: str
     flight: FlightCounts | None  # what the spacecraft's telemetry said of its frames; None: none was received
     frames_imported: int | None  # pictures that were imported; None: the frames came over a link
+    background: float  # radiance of what is seen where the target is not
+    encoding: str  # of the digital numbers: linear in light, or srgb (display values)
 
     @property
     def frames_captured(self) -> int | None:
@@ -106,6 +116,10 @@ class Session:
         if self.flight is None:
             return self.frames_imported
         return self.flight.captured(self.frames[-1].id)
+
+    def K(self, record: FrameRecord) -> np.ndarray:
+        """Return the pinhole matrix [3, 3] of a frame, float32, px."""
+        return np.array(self.camera.K if record.K is None else record.K, dtype=np.float32)
 
     def dn(self, record: FrameRecord) -> np.ndarray:
         """Return a frame's digital numbers, uint16 [H, W] or [H, W, 3].
@@ -151,6 +165,8 @@ def open_session(folder: str | Path) -> Session:
             str(header["created_utc"]),
             flight_counts(header),
             int(header["frames_received"]) if "imported_from" in header else None,
+            _background(header),
+            _encoding(header),
         )
     except (ConfigError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise SessionCorrupt(f"{folder / 'session.json'}: {error}") from error
@@ -162,6 +178,12 @@ def open_session(folder: str | Path) -> Session:
         named = ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
         raise MissingFrames(
             f"{folder}: {len(missing)} of {len(frames)} pictures are missing: {named}", missing
+        )
+    unstated = [record.id for record in frames if record.split is None]
+    if 0 < len(unstated) < len(frames):
+        raise SessionCorrupt(
+            f"{folder / 'frames.jsonl'}: expected a split for all frames or for none, {len(unstated)} of "
+            f"{len(frames)} have none, the first of them frame {unstated[0]}; complete or remove them"
         )
     return Session(folder, camera, frames, losses, *facts)
 
@@ -198,6 +220,20 @@ def flight_counts(header: dict[str, Any]) -> FlightCounts | None:
     return None if told is None else FlightCounts(**told)
 
 
+def _background(header: dict[str, Any]) -> float:
+    background = header.get("background", 0.0)
+    if type(background) not in (int, float) or not 0 <= background < math.inf:
+        raise ValueError(f"background must be a radiance of at least 0, got {background!r}")
+    return float(background)
+
+
+def _encoding(header: dict[str, Any]) -> str:
+    encoding = header.get("encoding", "linear")
+    if encoding not in ENCODINGS:
+        raise ValueError(f"encoding must be one of {', '.join(ENCODINGS)}, got {encoding!r}")
+    return encoding
+
+
 def read_records(folder: Path) -> list[FrameRecord]:
     """Return the whole lines of frames.jsonl in their order; [] where there is no such file.
 
@@ -225,6 +261,8 @@ def _record(tree: Any) -> FrameRecord:
         raise ValueError("expected an object")
     values: dict[str, Any] = {}
     for field in dataclasses.fields(FrameRecord):
+        if field.default is None and tree.get(field.name) is None:
+            continue
         if field.name not in tree:
             raise ValueError(f"{field.name} is missing")
         value = tree[field.name]
@@ -232,11 +270,24 @@ def _record(tree: Any) -> FrameRecord:
             value = np.array(value, dtype=np.float64)
             if value.shape != ARRAY_SHAPES[field.name] or not np.isfinite(value).all():
                 raise ValueError(f"{field.name} must be {ARRAY_SHAPES[field.name]} finite numbers")
+        elif field.name == "split":
+            if value not in SPLITS:
+                raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {value!r}")
         elif field.type is float and type(value) is int:
             value = float(value)
         elif type(value) is not field.type or (field.type is float and not math.isfinite(value)):
             raise ValueError(f"{field.name} is {value!r}")
         values[field.name] = value
+    if "K" in values and not is_pinhole(values["K"]):
+        raise ValueError(
+            f"K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive, got {tree['K']}"
+        )
     if not FRAME_FILE.fullmatch(values["file"]):
         raise ValueError(f"file is {values['file']!r}, expected frames/000123.png")
     return FrameRecord(**values)
+
+
+def is_pinhole(K: np.ndarray) -> bool:
+    """Return whether [3, 3] finite numbers are a pinhole matrix without skew."""
+    expected = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
+    return bool((expected == K).all() and K[0, 0] > 0 and K[1, 1] > 0)

@@ -9,6 +9,8 @@ PSNR_LABELS = {
     "psnr_clean_db": "against noiseless exposures",
     "psnr_clean_foreground_db": "the same, pixels that show the target",
     "psnr_noisy_db": "against the noisy frames",
+    "psnr_srgb_db": "the same of display values (sRGB)",
+    "psnr_linear_db": "the same of linear values",
 }
 REMOVED = {
     "dark_frames": "black frames",

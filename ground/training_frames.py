@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ground.cameras import sun_direction
-from ground.session import FrameRecord, Session, SessionError
+from ground.session import SPLITS, FrameRecord, Session, SessionError
 from obbgs_core.frames import TrainingFrame
 
 log = logging.getLogger(__name__)
@@ -16,11 +16,13 @@ TEST_INTERVAL = 8  # every eighth bracket is held out
 def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
     """Return the training frames and the held-out test frames of a session.
 
-    Every eighth bracket is held out as a whole; of 2 to 7 brackets the last one; a single bracket is all for training.
-    Frames in eclipse and frames whose pose is not valid are in neither list.
+    Where the frames state their splits, those of `test` are held out, or those of `val` where there is no test frame;
+    otherwise the frames of `val` are in neither list. Where nothing but `train` is stated, and where no split is, every
+    eighth bracket is held out as a whole; of 2 to 7 brackets the last one; a single bracket is all for training. Frames
+    in eclipse and frames whose pose is not valid are in neither list.
 
     Raises:
-        SessionError: no frame is left.
+        SessionError: no frame is left, or none that is for training.
     """
     usable = [r for r in session.frames if r.pose_valid and not r.in_eclipse]
     if not usable:
@@ -33,6 +35,13 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
         log.warning(
             "%d frames are left out: in eclipse, or without a valid pose", len(session.frames) - len(usable)
         )
+    stated = {name: [r for r in usable if r.split == name] for name in SPLITS}
+    if any(stated.values()) and not stated["train"]:
+        raise SessionError(
+            f"none of the {len(usable)} usable frames is in the split train: import the training pictures too"
+        )
+    if held_out := stated["test"] or stated["val"]:
+        return stated["train"], held_out
     brackets = sorted({r.bracket for r in usable})
     chosen = set(brackets[TEST_INTERVAL - 1 :: TEST_INTERVAL])
     if not chosen and len(brackets) > 1:
@@ -51,13 +60,14 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
         dn=torch.from_numpy(dn.reshape(*dn.shape[:2], session.camera.channels)),
         exposure_time_s=record.exposure_time_s,
         world_to_camera=torch.tensor(record.world_to_camera, dtype=torch.float32),
-        K=torch.tensor(session.camera.K),
+        K=torch.from_numpy(session.K(record)),
         id=record.id,
         bracket=record.bracket,
         pose_covariance=torch.from_numpy(
             motion_covariance(record.covariance, record.world_to_camera[:3, :3])
         ),
         sun_dir=sun_direction(record),
+        background=session.background,
     )
 
 

@@ -12,8 +12,8 @@ MIN_ALPHA: float
 LOG2_MIN_ALPHA: float
 MAX_ALPHA: float
 MIN_TRANSMITTANCE: float
+MIN_PEAK_SHARE: float
 MIN_DEPTH_ALPHA: float
-DILATION_PX2: float
 FOV_MARGIN: float
 SOFTNESS: float
 
@@ -37,6 +37,8 @@ class Rasterization:
         sun_dir: Array | None,
         sunlit: Array | None,
         ambient: float,
+        footprint_px2: Array,
+        peak_lowered: bool,
     ) -> None: ...
     def forward(
         self,
@@ -45,7 +47,6 @@ class Rasterization:
         alpha: Array,
         depth: Array,
         median_depth: Array,
-        normals: Array | None,
         means2d: Array,
         radii: Array,
     ) -> None: ...
@@ -54,11 +55,9 @@ class Rasterization:
         threads: int,
         radiance: Array,
         depth: Array,
-        normals: Array | None,
         grad_radiance: Array | None,
         grad_alpha: Array | None,
         grad_depth: Array | None,
-        grad_normals: Array | None,
         grad_means2d: Array | None,
         means: Array,
         quats: Array,
@@ -67,6 +66,7 @@ class Rasterization:
         sh: Array,
         world_to_camera: Array,
         ambient: Array,
+        footprint_px2: Array,
         screen_means2d: Array,
         pixels: Array,
     ) -> None: ...

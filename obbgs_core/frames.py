@@ -21,6 +21,7 @@ class TrainingFrame:
     pose_covariance: [6, 6] float64, of the motion that in front of world_to_camera makes the tagged pose the true one:
         rotation vector about the camera's axes (rad), then shift along them (m); None or zeros: the pose is exact.
     sun_dir: [3] towards the Sun, unit, body frame; None: not known.
+    background: radiance of what is seen where the target is not, the same in all frames of a training; space is black.
     """
 
     dn: Tensor
@@ -31,6 +32,7 @@ class TrainingFrame:
     bracket: int | None = None  # frames of one trigger share a pose correction
     pose_covariance: Tensor | None = None
     sun_dir: Tensor | None = None
+    background: float = 0.0
 
 
 def sun_span_deg(frames: list[TrainingFrame]) -> float:
@@ -55,10 +57,11 @@ def camera_extent_m(frames: list[TrainingFrame]) -> float:
 
 
 def cameras_of(frames: list[TrainingFrame]) -> Cameras:
-    """Return the cameras of some frames of one size, with their Sun where it is known in all."""
+    """Return the cameras of some frames of one size and background, with their Sun where it is known in all."""
     height, width = frames[0].dn.shape[:2]
     poses, K = torch.stack([f.world_to_camera for f in frames]), torch.stack([f.K for f in frames])
-    return Cameras(poses, K, width, height, sun_dir=stacked_suns([f.sun_dir for f in frames]))
+    suns = stacked_suns([f.sun_dir for f in frames])
+    return Cameras(poses, K, width, height, sun_dir=suns, background=frames[0].background)
 
 
 def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[TrainingFrame], float | None]:
@@ -66,13 +69,19 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
 
     Raises:
         TooFewFrames: fewer than three.
-        ReconstructionError: sizes differ, a value is not finite, or a pose covariance is not a covariance.
+        ReconstructionError: sizes or backgrounds differ, a value is not finite, or a pose covariance is not a
+            covariance.
     """
     if len(frames) < FEWEST_FRAMES:
         raise TooFewFrames(f"a reconstruction needs at least {FEWEST_FRAMES} frames, got {len(frames)}")
     shapes = {tuple(f.dn.shape) for f in frames}
     if len(shapes) > 1:
         raise ReconstructionError(f"all frames must have one size and channel count, got {sorted(shapes)}")
+    backgrounds = sorted({f.background for f in frames})
+    if len(backgrounds) > 1 or not 0 <= backgrounds[0] < math.inf:
+        raise ReconstructionError(
+            f"all frames must have one background radiance of at least 0, got {', '.join(map(str, backgrounds))}"
+        )
     for f in frames:
         finite = torch.isfinite(f.dn).all() and torch.isfinite(f.world_to_camera).all()
         if f.sun_dir is not None and not abs(float(f.sun_dir.norm()) - 1) < 1e-3:

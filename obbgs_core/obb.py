@@ -1,6 +1,7 @@
 """Oriented bounding boxes around the Gaussians behind an image's worst tile (Jiang et al. 2025, section 3.4.2)."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -25,10 +26,12 @@ class Obb:
         return (local.abs() <= self.half_extents * (1 + 1e-5) + 1e-9).all(dim=-1)
 
 
-def fit(points: Tensor) -> Obb:
-    """Return the tight box of points [N, 3] along the eigenvectors of their covariance (1/(n-1)).
+def fit(points: Tensor, centre: Literal["middle", "mean"] = "middle") -> Obb:
+    """Return the box of points [N, 3] along the eigenvectors of their covariance (1/(n-1)).
 
-    The centre is the middle of the extremes. About the mean, which the paper takes, points of a skewed set lie outside.
+    Args:
+        centre: the middle of the extremes, around which the box is tight, or the mean, as published: then points of a
+            skewed set lie outside.
 
     Raises:
         ValueError: fewer than two points.
@@ -39,7 +42,8 @@ def fit(points: Tensor) -> Obb:
     _, axes = torch.linalg.eigh(torch.cov(points.T))
     local = (points - mean) @ axes
     low, high = local.min(dim=0).values, local.max(dim=0).values
-    return Obb(mean + axes @ ((low + high) / 2), axes, (high - low) / 2)
+    middle = mean + axes @ ((low + high) / 2)
+    return Obb(middle if centre == "middle" else mean, axes, (high - low) / 2)
 
 
 def worst_tile(error: Tensor) -> tuple[int, int]:

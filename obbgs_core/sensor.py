@@ -42,6 +42,10 @@ class Sensor:
         """Return the noiseless reading, not clipped at full scale, so that a saturated prediction keeps a gradient."""
         return self.black_dn + self.dn_per_radiance_s * exposure_time_s * radiance
 
+    def full_scale_radiance(self, exposure_time_s: float) -> float:
+        """Return the radiance whose noiseless reading is full scale."""
+        return (self.white_dn - self.black_dn) / (self.dn_per_radiance_s * exposure_time_s)
+
     def variance_dn2(self, expected_dn: Tensor) -> Tensor:
         """Return shot + read + quantisation variance, DN², of an expected reading; no gradient flows through it."""
         signal_dn = (expected_dn.detach() - self.black_dn).clamp(min=0)

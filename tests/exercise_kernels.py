@@ -18,7 +18,7 @@ SIZES = [(33, 70), (1, 1), (97, 31)]  # height and width, px: neither is a multi
 # coefficients, channels, what lights them
 KINDS = [(1, 1, "view"), (4, 3, "view"), (16, 3, "view"), (9, 1, "sun"), (1, 3, "lambert")]
 # Images that the loss depends on, each with those before it: each choice has loops of its own.
-ASKED = ("radiance", "depth", "normals")
+ASKED = ("radiance", "depth")
 CROWD = 20_000  # Gaussians in two views: enough work for four threads in every loop of the rasterizer
 
 
@@ -54,7 +54,7 @@ def model(rng: np.random.Generator, count: int, coefficients: int, channels: int
 
 
 def cameras(rng: np.random.Generator, count: int, height: int, width: int) -> dict:
-    """Return cameras that look at the origin from 4 m, and the Sun's directions."""
+    """Return cameras that look at the origin from 4 m, their footprints, and the Sun's directions."""
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
     poses[:, 2, 3] = 4.0
@@ -62,6 +62,7 @@ def cameras(rng: np.random.Generator, count: int, height: int, width: int) -> di
     suns = rng.normal(size=(count, 3))
     suns /= np.linalg.norm(suns, axis=1, keepdims=True)
     arrays = {"world_to_camera": poses, "K": np.tile(K, (count, 1, 1)), "sun_dir": suns}
+    arrays["footprint_px2"] = rng.uniform(0.1, 0.4, count)
     return {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in arrays.items()}
 
 
@@ -71,7 +72,7 @@ def rasterize(
     scene: dict,
     size: tuple[int, int],
     threads: int,
-    asked: str = "normals",
+    asked: str = "depth",
 ) -> list[np.ndarray]:
     """Return all that the forward and the backward pass write."""
     gaussians, views = len(scene["means"]), len(scene["world_to_camera"])
@@ -79,32 +80,28 @@ def rasterize(
         kernel=kernel, height=size[0], width=size[1], near_m=0.01, ambient=0.1, **scene
     )
     channels = scene["sh"].shape[2]
-    radiance, normals = empty(views, *size, channels), empty(views, *size, 3)
+    radiance = empty(views, *size, channels)
     alpha, depth, median_depth = (empty(views, *size) for _ in range(3))
     means2d, radii = empty(views, gaussians, 2), empty(views, gaussians)
-    seen = normals if asked == "normals" else None
-    rasterization.forward(threads, radiance, alpha, depth, median_depth, seen, means2d, radii)
+    rasterization.forward(threads, radiance, alpha, depth, median_depth, means2d, radii)
     names = ("means", "quats", "log_scales", "opacity_logits", "sh", "world_to_camera")
     gradients = [np.empty_like(scene[name]) for name in names]
-    gradients += [empty(1), empty(views, gaussians, 2), empty(views, gaussians)]
+    gradients += [empty(1), empty(views), empty(views, gaussians, 2), empty(views, gaussians)]
     of_radiance = np.broadcast_to(np.float32(1), radiance.shape)  # its strides are zero
     of_depth = None if asked == "radiance" else np.ones_like(depth)
-    of_normals = np.ones_like(normals[..., ::-1])[..., ::-1] if asked == "normals" else None
-    of_means2d = None if asked == "depth" else np.ones_like(means2d)
+    of_means2d = None if asked == "radiance" else np.ones_like(means2d)
     rasterization.backward(
         threads,
         radiance,
         depth,
-        seen,
         of_radiance,
         np.ones_like(alpha),
         of_depth,
-        of_normals,
         of_means2d,
         *gradients,
     )
     assert rasterization.bytes >= rasterization.pairs >= 0
-    images = [radiance, alpha, depth, median_depth, *([] if seen is None else [seen])]
+    images = [radiance, alpha, depth, median_depth]
     return [*images, means2d, radii, *gradients]
 
 
@@ -127,7 +124,8 @@ def exercise_rasterizer(module: ModuleType, kernel: str) -> None:
                 scene |= cameras(rng, 2, *size)
                 scene["sunlit"] = rng.random((2, count), dtype=np.float32) if shading == "lambert" else None
                 scene["sun_dir"] = None if shading == "view" else scene["sun_dir"]
-                for asked in ASKED if count == 17 else ["normals"]:
+                scene["peak_lowered"] = channels == 3
+                for asked in ASKED if count == 17 else ["depth"]:
                     results = [rasterize(module, kernel, scene, size, threads, asked) for threads in THREADS]
                     assert same(results)  # the number of threads changes no bit
                     assert all(np.isfinite(array).all() for array in results[0])
@@ -139,7 +137,7 @@ def exercise_threads(module: ModuleType, kernel: str) -> None:
     """Draw more Gaussians, which the helper threads share, also for two callers at the same time."""
     rng, size = np.random.default_rng(3), (200, 130)
     scene = model(rng, CROWD, 1, 3, hostile=False) | cameras(rng, 2, *size)
-    scene["sunlit"] = rng.random((2, CROWD), dtype=np.float32)
+    scene["sunlit"], scene["peak_lowered"] = rng.random((2, CROWD), dtype=np.float32), True
     results = [rasterize(module, kernel, scene, size, threads) for threads in THREADS]
     with ThreadPoolExecutor(2) as callers:
         results += callers.map(lambda threads: rasterize(module, kernel, scene, size, threads), (2, 2))
@@ -202,8 +200,16 @@ def exercise_adam(module: ModuleType) -> None:
 def exercise_refusals(module: ModuleType) -> None:
     """Arrays of wrong sizes must raise errors before anything is read."""
     rng = np.random.default_rng(0)
-    scene = model(rng, 5, 4, 3, hostile=False) | cameras(rng, 1, 8, 8) | {"sunlit": None}
-    wrong = {"means": empty(4, 3), "sh": empty(5, 5, 3), "K": empty(2, 3, 3), "sun_dir": empty(2, 3)}
+    scene = (
+        model(rng, 5, 4, 3, hostile=False) | cameras(rng, 1, 8, 8) | {"sunlit": None, "peak_lowered": False}
+    )
+    wrong = {
+        "means": empty(4, 3),
+        "sh": empty(5, 5, 3),
+        "K": empty(2, 3, 3),
+        "sun_dir": empty(2, 3),
+        "footprint_px2": empty(2),
+    }
     for name, array in wrong.items():
         try:
             rasterize(module, "portable", scene | {name: array}, (8, 8), 1)

@@ -282,8 +282,8 @@ class LinkSection:
 
 
 # the ground's training methods, and what can be added to their names
-METHODS = ("obbgs", "jiang2025", "3dgs", "pixel-gs", "mvgs")
-VARIANTS = ("exposure", "blind", "hull", "random")
+METHODS = ("obbgs", "jiang2025", "3dgs", "pixel-gs", "mip-splatting", "mvgs")
+VARIANTS = ("exposure", "blind", "affine", "hull", "random")
 
 
 @dataclass(frozen=True)

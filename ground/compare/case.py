@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ground.cameras import exposed, sensor_of
 from ground.compare.errors import CompareError
-from ground.scores import ScoredView, clean_scores, cloud_scores, noisy_psnr_db
+from ground.scores import ScoredView, clean_scores, cloud_scores, display_scores, noisy_psnr_db
 from ground.session import Session, open_session, read_header
 from ground.training_frames import split, training_frame
 from ground.truth import Truth
@@ -58,8 +58,11 @@ class Case:
 
     def image_scores(self, images: Sequence[Tensor]) -> dict[str, float]:
         """Return the scores of a method's images [H, W, C] of the held-out frames: noisy, and clean where known."""
-        figures = {"psnr_noisy_db": noisy_psnr_db(zip(images, self.noisy, strict=True))}
+        pairs = list(zip(images, self.noisy, strict=True))
+        figures = {"psnr_noisy_db": noisy_psnr_db(pairs)}
         if not self.radiance:
+            if self.session is not None and images[0].shape[2] == 3:  # pictures of another data set
+                figures |= display_scores(pairs, self.sensor, self.session.encoding)
             return figures
         exposures_s = [frame.exposure_time_s for frame in self.held_out]
         true = zip(images, self.clean, self.coverage, exposures_s, strict=True)

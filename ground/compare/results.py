@@ -30,6 +30,7 @@ METRICS = (
     Metric("psnr_clean_pooled_db", "pooled, dB", "{:.2f}", True),
     Metric("psnr_foreground_db", "foreground, dB", "{:.2f}", True),
     Metric("psnr_noisy_db", "noisy, dB", "{:.2f}", True),
+    Metric("psnr_srgb_db", "sRGB, dB", "{:.2f}", True),
     Metric("ssim_clean", "SSIM", "{:.4f}", True),
     Metric("lpips", "LPIPS", "{:.4f}", False),
     Metric("chamfer", "Chamfer", "{:.4f}", False),

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from ground.baselines.reconstruction import Reconstruction, Work
-from ground.cameras import exposed
 from ground.compare.follow import MARKS
 from ground.model_files import SURFACE_POINTS
 from obbgs_base.errors import Interrupted
@@ -19,6 +18,7 @@ from obbgs_core.render import render
 from obbgs_core.score.surface import surface_positions
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.config import MethodConfig
+from obbgs_core.train.result import Exposing
 from obbgs_core.train.trainer import CHECKPOINT_EVERY_S, Trainer
 
 CHECKPOINT, MODEL = "training.checkpoint", "model.ply"
@@ -81,7 +81,7 @@ def reconstruct_gaussians(
     return Reconstruction(
         points=result.gaussians.means,
         surface=surface_positions(result.gaussians, cameras_of(frames), SURFACE_POINTS, seed),
-        image=imaging(result.gaussians, sensor, result.reference_exposure_s),
+        image=imaging(result.gaussians, sensor, result.exposing),
         size_bytes=sum(4 * tensor.numel() for tensor in result.gaussians.parameters().values()),
         seconds=result.seconds,
         figures={
@@ -98,19 +98,18 @@ def reconstruct_gaussians(
     )
 
 
-def imaging(
-    gaussians: Gaussians, sensor: Sensor, reference_exposure_s: float | None
-) -> Callable[[Cameras, float], Tensor]:
+def imaging(gaussians: Gaussians, sensor: Sensor, exposing: Exposing) -> Callable[[Cameras, float], Tensor]:
     """Return the function from a camera and an exposure time (s) to a model's image [H, W, C] in 0..1.
 
     Args:
-        reference_exposure_s: what a method that ignores exposure takes every exposure for; None: it knows them.
+        exposing: what the pictures are made with: the exposure that a blind method takes every other for, and the gains
+            that a method has learnt.
     """
 
     @torch.no_grad()
     def image(camera: Cameras, exposure_time_s: float) -> Tensor:
         radiance = render(gaussians, camera).radiance[0]
-        return exposed(radiance, sensor, reference_exposure_s or exposure_time_s)
+        return exposing.image(radiance, sensor, exposure_time_s)
 
     return image
 
@@ -124,11 +123,11 @@ def _may_end(trainer: Trainer) -> bool:
 
 def _snapshot(trainer: Trainer, frames: list[TrainingFrame]) -> Reconstruction:
     """Return the training as it stands, without points on its surface, which take long."""
-    gaussians = trainer.state.gaussians.detach()
+    gaussians = trainer.gaussians
     return Reconstruction(
         points=gaussians.means,
         surface=torch.zeros(0, 3),
-        image=imaging(gaussians, trainer.setup.sensor, trainer.setup.reference_exposure_s),
+        image=imaging(gaussians, trainer.setup.sensor, trainer.exposing),
         size_bytes=0,
         seconds=trainer.state.seconds,
     )

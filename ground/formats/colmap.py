@@ -4,7 +4,7 @@ Source: colmap.github.io/format.html.
 """
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,8 @@ PLACES = ("", "sparse/0", "sparse")  # where the model may lie in the folder
 def read_colmap(folder: Path) -> list[View]:
     """Return the registered pictures of a COLMAP model, in the order of their names.
 
+    A file test.txt beside the model, with the names of the test pictures, states the splits, as for 3DGS.
+
     Args:
         folder: holds images/, and the model itself or in sparse/0 or sparse/; binary files are preferred to text.
 
@@ -42,14 +44,28 @@ def read_colmap(folder: Path) -> list[View]:
             if (model / f"cameras{suffix}").is_file() and (model / f"images{suffix}").is_file():
                 try:
                     known = dict(cameras(model / f"cameras{suffix}"))
+                    split_of = _splits(model / "test.txt")
                     views = [
-                        View(folder / "images" / name, _world_to_camera(quat, t), known[camera_id])
+                        View(
+                            folder / "images" / name,
+                            _world_to_camera(quat, t),
+                            known[camera_id],
+                            split=split_of(name),
+                        )
                         for quat, t, camera_id, name in images(model / f"images{suffix}")
                     ]
                 except (ValueError, IndexError, KeyError, struct.error, OSError) as error:
                     raise FormatError(f"{model}: damaged or not a COLMAP model: {error}") from error
                 return sorted(views, key=lambda view: view.image.name)
     raise FormatError(f"{folder}: no cameras and images files (.bin or .txt), nor in sparse/0")
+
+
+def _splits(path: Path) -> Callable[[str], str | None]:
+    """Return the function from a picture's name to its split, which a list of test pictures gives."""
+    if not path.is_file():
+        return lambda name: None
+    held_out = {line.strip() for line in path.read_text().splitlines()}
+    return lambda name: "test" if name in held_out else "train"
 
 
 def _cameras_txt(path: Path) -> Iterator[tuple[int, Intrinsics]]:

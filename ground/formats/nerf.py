@@ -16,6 +16,7 @@ import numpy as np
 from flightsw.icd.config import ConfigError, build, keys_below, parse_json
 from flightsw.icd.mission import CameraSection
 from ground.formats.views import (
+    Exported,
     FormatError,
     Intrinsics,
     View,
@@ -23,51 +24,53 @@ from ground.formats.views import (
     opengl_to_world_to_camera,
     world_to_camera_to_opengl,
 )
-from ground.session import FrameRecord, Session
+from ground.session import SPLITS, FrameRecord, Session
 from obbgs_base.files import write_whole
 
-SPLITS = ("train", "val", "test")
 # Of eleven brackets six are for training, two for validation, three for testing; 121 brackets of three frames give
 # 198, 66 and 99 frames, the published split.
 SPLIT_PATTERN = (0, 1, 0, 2, 0, 2, 0, 1, 0, 2, 0)
 
 
-def read_nerf(folder: Path) -> tuple[list[View], CameraSection | None]:
-    """Return the pictures of all splits, by frame number, and the calibration if `export_nerf` wrote it.
+def read_nerf(folder: Path) -> tuple[list[View], Exported | None]:
+    """Return the pictures of all splits, by frame number, and what `export_nerf` says of them if it wrote them.
 
     Raises:
         FormatError: there is no transforms_*.json, or one is not valid.
     """
     numbered: list[tuple[int, View]] = []
-    camera = None
+    exported = None
     for split in SPLITS:
         path = folder / f"transforms_{split}.json"
         if not path.is_file():
             continue
         tree = load_transforms(path)
-        camera = camera or read_calibration(tree, path)
+        exported = exported or read_exported(tree, path)
         for frame in tree["frames"]:
             image = image_path(folder, frame, path)
-            intrinsics = _intrinsics(tree, image, path)
-            numbered.append(
-                (frame.get("frame_id", len(numbered)), read_frame(frame, image, intrinsics, path))
-            )
+            view = read_frame(frame, image, _intrinsics({**tree, **frame}, image, path), path)
+            number = frame.get("frame_id", len(numbered))
+            if type(number) is not int:
+                raise FormatError(
+                    f"{path}: {image.name}: expected a whole number as frame_id, got {number!r}"
+                )
+            numbered.append((number, dataclasses.replace(view, split=split)))
     if not numbered:
         raise FormatError(f"{folder}: no transforms_train.json, transforms_val.json or transforms_test.json")
-    return [view for _, view in sorted(numbered, key=lambda entry: entry[0])], camera
+    return [view for _, view in sorted(numbered, key=lambda entry: entry[0])], exported
 
 
 def export_nerf(session: Session, out: Path) -> dict[str, int]:
     """Write a session as a NeRF-synthetic folder and return the number of frames in each split.
 
-    Pictures are linear and opaque: black level to full scale becomes 0 to 255. A bracket is in one split as a whole.
+    Pictures are opaque: black level to full scale becomes 0 to 255. Frames are in the splits of `split_frames`.
     """
-    split_of = split_brackets(session)
+    split_of = split_frames(session)
     camera = session.camera
     counts = {}
     for split in SPLITS:
         (out / split).mkdir(parents=True, exist_ok=True)
-        records = [record for record in session.frames if split_of[record.bracket] == split]
+        records = [record for record in session.frames if split_of[record.id] == split]
         frames = []
         for record in records:
             name = f"{split}/r_{record.id:04d}"
@@ -75,7 +78,7 @@ def export_nerf(session: Session, out: Path) -> dict[str, int]:
             frames.append({"file_path": f"./{name}", "rotation": 0.0, **frame_keys(session, record)})
         tree = {
             "camera_angle_x": 2 * math.atan(camera.width / (2 * camera.fx_px)),
-            **camera_keys(camera),
+            **camera_keys(session),
             "frames": frames,
         }
         write_whole(out / f"transforms_{split}.json", json.dumps(tree, indent=1).encode() + b"\n")
@@ -83,14 +86,18 @@ def export_nerf(session: Session, out: Path) -> dict[str, int]:
     return counts
 
 
-def split_brackets(session: Session) -> dict[int, str]:
-    """Return the split of each bracket: train, val or test, 6:2:3 as published, interleaved along the pass."""
+def split_frames(session: Session) -> dict[int, str]:
+    """Return the split of each frame by its number: the stated one.
+
+    Where none is stated, whole brackets are in train, val or test, 6:2:3 as published, interleaved along the pass.
+    """
     brackets = sorted({record.bracket for record in session.frames})
-    return {b: SPLITS[SPLIT_PATTERN[i % len(SPLIT_PATTERN)]] for i, b in enumerate(brackets)}
+    split_of = {b: SPLITS[SPLIT_PATTERN[i % len(SPLIT_PATTERN)]] for i, b in enumerate(brackets)}
+    return {record.id: record.split or split_of[record.bracket] for record in session.frames}
 
 
 def picture(session: Session, record: FrameRecord) -> bytes:
-    """Return a frame as PNG, RGBA of 8 bits, linear and opaque."""
+    """Return a frame as PNG, RGBA of 8 bits, its values as in the session and opaque."""
     camera = session.camera
     dn = session.dn(record).astype(np.float64)
     value = np.clip((dn - camera.black_dn) / (camera.white_dn - camera.black_dn), 0, 1)
@@ -100,9 +107,11 @@ def picture(session: Session, record: FrameRecord) -> bytes:
 
 
 def frame_keys(session: Session, record: FrameRecord) -> dict[str, Any]:
-    """Return a frame's pose and the keys that only we write."""
+    """Return a frame's pose, its intrinsics where they are its own, and the keys that only we write."""
     start_ns = session.frames[0].mid_exposure_utc_ns
+    own = {} if record.K is None else intrinsics_keys(record.K.tolist())
     return {
+        **own,
         "transform_matrix": world_to_camera_to_opengl(record.world_to_camera).tolist(),
         "exposure_time_s": record.exposure_time_s,
         "time": (record.mid_exposure_utc_ns - start_ns) * 1e-9,  # s since the first frame
@@ -115,17 +124,22 @@ def frame_keys(session: Session, record: FrameRecord) -> dict[str, Any]:
     }
 
 
-def camera_keys(camera: CameraSection) -> dict[str, Any]:
-    """Return the intrinsics under nerfstudio's names, and our calibration."""
+def camera_keys(session: Session) -> dict[str, Any]:
+    """Return the intrinsics under nerfstudio's names, our calibration, and what the values stand for."""
+    camera = session.camera
     return {
-        "fl_x": camera.fx_px,
-        "fl_y": camera.fy_px,
-        "cx": camera.cx_px,
-        "cy": camera.cy_px,
+        **intrinsics_keys(camera.K),
         "w": camera.width,
         "h": camera.height,
         "calibration": dataclasses.asdict(camera),
+        "background": session.background,
+        "encoding": session.encoding,
     }
+
+
+def intrinsics_keys(K: list[list[float]]) -> dict[str, float]:
+    """Return a pinhole matrix under nerfstudio's names, px."""
+    return {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2]}
 
 
 def load_transforms(path: Path) -> dict[str, Any]:
@@ -181,8 +195,8 @@ def read_frame(frame: dict[str, Any], image: Path, intrinsics: Intrinsics, where
         raise FormatError(f"{where}: {image.name}: {error}") from error
 
 
-def read_calibration(tree: dict[str, Any], where: Path) -> CameraSection | None:
-    """Return the calibration that our export wrote, with the rounding to 8 bits added to its noise; None without one.
+def read_exported(tree: dict[str, Any], where: Path) -> Exported | None:
+    """Return what our export says of its pictures, the rounding to 8 bits added to the noise; None if it is not ours.
 
     Raises:
         FormatError: it is damaged.
@@ -192,16 +206,18 @@ def read_calibration(tree: dict[str, Any], where: Path) -> CameraSection | None:
     try:
         with keys_below("transforms.calibration", "mission.camera"):
             camera: CameraSection = build(CameraSection, tree["calibration"], "transforms.calibration")
-    except ConfigError as error:
+        exported = Exported(camera, tree.get("background", 0.0), tree.get("encoding", "linear"))
+    except (ConfigError, ValueError) as error:
         raise FormatError(f"{where}: {error}") from error
     step_dn = (camera.white_dn - camera.black_dn) / 255
     if step_dn <= 1:
-        return camera
-    rounding_dn = step_dn / math.sqrt(12)
-    return dataclasses.replace(camera, read_noise_dn=math.hypot(camera.read_noise_dn, rounding_dn))
+        return exported
+    noise_dn = math.hypot(camera.read_noise_dn, step_dn / math.sqrt(12))
+    return dataclasses.replace(exported, camera=dataclasses.replace(camera, read_noise_dn=noise_dn))
 
 
 def _intrinsics(tree: dict[str, Any], image: Path, where: Path) -> Intrinsics:
+    """Return a frame's intrinsics; `tree` holds the file's keys, overridden by the frame's own."""
     try:
         if "w" in tree and "h" in tree:
             width, height = int(tree["w"]), int(tree["h"])
@@ -219,4 +235,4 @@ def _intrinsics(tree: dict[str, Any], image: Path, where: Path) -> Intrinsics:
     except KeyError as error:
         raise FormatError(f"{where}: {error} is missing") from error
     except (TypeError, ValueError) as error:
-        raise FormatError(f"{where}: the intrinsics are not numbers: {error}") from error
+        raise FormatError(f"{where}: {image.name}: the intrinsics are not valid: {error}") from error

@@ -3,63 +3,95 @@
 Source: docs.nerf.studio, data conventions.
 """
 
+import dataclasses
 import json
+import logging
 from pathlib import Path
 from typing import Any
 
-from flightsw.icd.mission import CameraSection
 from ground.formats.nerf import (
     camera_keys,
     frame_keys,
     image_path,
     load_transforms,
     picture,
-    read_calibration,
+    read_exported,
     read_frame,
-    split_brackets,
+    split_frames,
 )
-from ground.formats.views import FormatError, Intrinsics, View
-from ground.session import Session
+from ground.formats.views import Exported, FormatError, Intrinsics, View
+from ground.session import SPLITS, Session
 from obbgs_base.files import write_whole
 
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
+log = logging.getLogger(__name__)
 
 
-def read_nerfstudio(folder: Path) -> tuple[list[View], CameraSection | None]:
-    """Return the pictures of a nerfstudio folder, and the calibration if `export_nerfstudio` wrote it.
+def read_nerfstudio(folder: Path) -> tuple[list[View], Exported | None]:
+    """Return the pictures of a nerfstudio folder, and what `export_nerfstudio` says of them if it wrote them.
+
+    Where the file lists the pictures of its splits, those in no list are left out. Many data sets list the same ones
+    for val and test: a picture is then in test, and one that is listed for training too is not trained on.
 
     Raises:
         FormatError: transforms.json is missing or not valid, or its camera is not a perspective camera.
     """
     path = folder / "transforms.json"
     tree = load_transforms(path)
+    split_of = _splits(folder, tree, path)
     views = []
     for frame in tree["frames"]:
         image = image_path(folder, frame, path)
-        views.append(read_frame(frame, image, _intrinsics({**tree, **frame}, path), path))
-    return views, read_calibration(tree, path)
+        if split_of and image not in split_of:
+            continue
+        view = read_frame(frame, image, _intrinsics({**tree, **frame}, path), path)
+        views.append(dataclasses.replace(view, split=split_of.get(image)))
+    if left_out := len(tree["frames"]) - len(views):
+        log.warning("%s: %d pictures are in none of its splits and left out", path, left_out)
+    return views, read_exported(tree, path)
 
 
 def export_nerfstudio(session: Session, out: Path) -> dict[str, int]:
     """Write a session as a nerfstudio folder, pictures as in `export_nerf`; return the frames per split."""
     (out / "images").mkdir(parents=True, exist_ok=True)
-    split_of = split_brackets(session)
+    split_of = split_frames(session)
     frames, splits = [], {"train": [], "val": [], "test": []}
     for record in session.frames:
         name = f"images/frame_{record.id:06d}.png"
         write_whole(out / name, picture(session, record))
         frames.append({"file_path": name, **frame_keys(session, record)})
-        splits[split_of[record.bracket]].append(name)
+        splits[split_of[record.id]].append(name)
     tree = {
         "camera_model": "OPENCV",
-        **camera_keys(session.camera),
+        **camera_keys(session),
         **dict.fromkeys(DISTORTION_KEYS, 0.0),
         **{f"{split}_filenames": names for split, names in splits.items()},
         "frames": frames,
     }
     write_whole(out / "transforms.json", json.dumps(tree, indent=1).encode() + b"\n")
     return {split: len(names) for split, names in splits.items()}
+
+
+def _splits(folder: Path, tree: dict[str, Any], where: Path) -> dict[Path, str]:
+    """Return the split of each listed picture; empty where the file lists none."""
+    pictures = {image_path(folder, frame, where) for frame in tree["frames"]}
+    split_of: dict[Path, str] = {}
+    for split in SPLITS:  # test comes last and wins
+        key = f"{split}_filenames"
+        names = tree.get(key, [])
+        if not isinstance(names, list):
+            raise FormatError(f"{where}: expected a list of file names as {key}, got {names!r}")
+        for name in names:
+            image = image_path(folder, {"file_path": name}, where)
+            if image not in pictures:
+                raise FormatError(f"{where}: {key} names {name}, which is not one of the frames")
+            if split_of.get(image) == "train":
+                log.warning(
+                    "%s: %s is in train and in %s: it is held out of the training", where, name, split
+                )
+            split_of[image] = split
+    return split_of
 
 
 def _intrinsics(keys: dict[str, Any], where: Path) -> Intrinsics:
@@ -82,4 +114,4 @@ def _intrinsics(keys: dict[str, Any], where: Path) -> Intrinsics:
     except KeyError as error:
         raise FormatError(f"{where}: {error} is missing") from error
     except (TypeError, ValueError) as error:
-        raise FormatError(f"{where}: the intrinsics are not numbers: {error}") from error
+        raise FormatError(f"{where}: the intrinsics are not valid: {error}") from error

@@ -88,8 +88,7 @@ def _intrinsics(tree: Any) -> Intrinsics:
         if len(distortion) not in (4, 5):
             raise ValueError(f"expected 4 or 5 distortion coefficients, got {len(distortion)}")
         k1, k2, p1, p2, k3 = [*distortion, 0.0][:5]
-        width, height = int(tree["Nu"]), int(tree["Nv"])
+        fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return Intrinsics(int(tree["Nu"]), int(tree["Nv"]), fx, fy, cx, cy, (k1, k2, p1, p2, k3))
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"camera.json: expected cameraMatrix, distCoeffs, Nu and Nv: {error!r}") from error
-    fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return Intrinsics(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))

@@ -3,9 +3,11 @@
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from enum import StrEnum
 from pathlib import Path
 
 import imagecodecs
@@ -15,7 +17,8 @@ from scipy.ndimage import map_coordinates
 from flightsw.icd.frame import Frame, PoseTag
 from flightsw.icd.mission import CameraSection
 from flightsw.icd.quaternion import matrix_to_quat
-from ground.session import SCHEMA_VERSION, SessionError
+from ground.formats.srgb import from_srgb
+from ground.session import ENCODINGS, SCHEMA_VERSION, SessionError
 from ground.session_writer import frame_line
 from obbgs_base.files import write_whole
 
@@ -43,6 +46,16 @@ class Intrinsics:
     cy_px: float
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
 
+    def __post_init__(self):
+        numbers = (*(value for row in self.K for value in row), *self.distortion)
+        if not (all(map(math.isfinite, numbers)) and self.fx_px > 0 and self.fy_px > 0):
+            raise ValueError(f"expected finite intrinsics with positive focal lengths, got {self}")
+
+    @property
+    def K(self) -> list[list[float]]:
+        """The 3x3 pinhole matrix, px."""
+        return [[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]]
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -57,61 +70,78 @@ class View:
     bracket_index: int = 0
     sun_dir_body: np.ndarray = field(default_factory=lambda: np.zeros(3))  # unit; zero where unknown
     in_eclipse: bool = False
+    split: str | None = None  # train, val or test; stated for all views or for none
+
+
+class Values(StrEnum):
+    """What the values of imported pictures stand for, and whether a session keeps them."""
+
+    LINEAR = "linear"  # light
+    DISPLAY = "display"  # sRGB-coded values for a display, which are kept
+    DECODE = "decode"  # the same, which are made linear
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What our own export says of its pictures beside their cameras; the fields are those of `Session`."""
+
+    camera: CameraSection
+    background: float
+    encoding: str
+
+    def __post_init__(self):
+        if type(self.background) not in (int, float) or not 0 <= self.background < math.inf:
+            raise ValueError(f"background must be a radiance of at least 0, got {self.background!r}")
+        if self.encoding not in ENCODINGS:
+            raise ValueError(f"encoding must be one of {', '.join(ENCODINGS)}, got {self.encoding!r}")
 
 
 def write_session(
     views: Sequence[View],
     folder: Path,
     source: str,
-    srgb: bool = False,
-    camera: CameraSection | None = None,
+    values: Values | None = None,
+    white_background: bool | None = None,
+    exported: Exported | None = None,
     on_view: Callable[[], None] = lambda: None,
 ) -> int:
     """Write a new session from pictures and return the number of its frames.
 
-    Lens distortion is removed, and transparent pictures are put on black. Radiance 1 is full scale at the longest
-    exposure, unless `camera` gives the calibration that the pictures were exported with.
+    Lens distortion is removed, and transparent pictures are put on the background. Radiance 1 is full scale at the
+    longest exposure, unless the pictures bring their calibration along.
 
     Args:
         source: what the session was made from; its digest takes the place of the mission file's.
-        srgb: undo the sRGB curve; otherwise pixel values are taken as linear.
-        camera: the original calibration; the pictures' 8 bits span its range from black level to full scale.
+        values: what the pixel values stand for; None: what the export says, otherwise display values where the
+            pictures have colours of 8 bits, and linear ones where they have not.
+        white_background: whether what is seen where the target is not has full scale at the longest exposure, or is
+            black; None: as the export says, otherwise black.
+        exported: what our own export says of the pictures; their 8 bits span its camera's range from black level to
+            full scale.
 
     Raises:
-        FormatError: there are no views, their cameras differ, or a picture cannot be read or has another size.
+        FormatError: there are no views, their sizes differ, or a picture cannot be read or has another size.
         SessionError: the folder holds a session already.
     """
     if not views:
         raise FormatError(f"{source}: no pictures found")
     if (folder / "session.json").exists():
         raise SessionError(f"{folder} holds a session already; choose a new folder")
-    intrinsics = views[0].intrinsics
-    for view in views:
-        if view.intrinsics != intrinsics:
-            raise FormatError(
-                f"{view.image}: a session has one camera, but this picture's {view.intrinsics} is not the first's "
-                f"{intrinsics}"
-            )
-    first = _read_image(views[0].image, intrinsics)
-    if camera is None:
-        bit_depth = 16 if srgb or first.dtype == np.uint16 else 8
-        camera = _foreign_camera(
-            intrinsics, _channels(first), bit_depth, max(v.exposure_time_s for v in views)
-        )
+    target = _target(views, values, white_background, exported)
+    camera = target.camera
     (folder / "frames").mkdir(parents=True, exist_ok=True)
     lines = []
     for number, view in enumerate(views):
-        image = _read_image(view.image, intrinsics)
-        if _channels(image) < camera.channels:
-            raise FormatError(
-                f"{view.image}: expected {camera.channels} colours a pixel, got {_channels(image)}"
-            )
-        dn = _digital_numbers(image, intrinsics, camera, srgb)
         name = f"frames/{number:06d}.png"
+        dn = _digital_numbers(view, target)
         write_whole(folder / name, bytes(imagecodecs.png_encode(dn, level=1)))
-        frame = _frame(view, number, dn, camera)
         sha256 = hashlib.sha256(view.image.read_bytes()).hexdigest()
-        lines.append(json.dumps(frame_line(frame, name, sha256), allow_nan=False))
+        line = frame_line(_frame(view, number, dn, camera), name, sha256)
+        if view.split is not None:
+            line["split"] = view.split
+        if view.intrinsics.K != camera.K:
+            line["K"] = view.intrinsics.K
+        lines.append(json.dumps(line, allow_nan=False))
         on_view()
     write_whole(folder / "frames.jsonl", ("\n".join(lines) + "\n").encode())
     header = {
@@ -119,6 +149,8 @@ def write_session(
         "mission_sha256": hashlib.sha256(source.encode()).hexdigest(),
         "imported_from": source,
         "camera": dataclasses.asdict(camera),
+        "background": target.background,
+        "encoding": target.encoding,
         "tles": {},
         "losses": {},
         "frames_received": len(views),
@@ -129,8 +161,70 @@ def write_session(
     return len(views)
 
 
-def undistort(image: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
-    """Return the picture [H, W, C] that a pinhole camera with the same K would take; black outside the original.
+@dataclass(frozen=True)
+class _Target:
+    """What the digital numbers of a session stand for."""
+
+    camera: CameraSection
+    background: float  # radiance
+    encoding: str
+    decode: bool  # whether the sRGB curve of the pictures is undone
+
+
+def _target(
+    views: Sequence[View], values: Values | None, white_background: bool | None, exported: Exported | None
+) -> _Target:
+    """Return what the session will hold; the arguments are those of `write_session`."""
+    first = views[0].intrinsics
+    for view in views:
+        size = (view.intrinsics.width, view.intrinsics.height)
+        if size != (first.width, first.height):
+            raise FormatError(
+                f"{view.image}: the pictures of a session have one size, but this one is {size[0]}x{size[1]} and the "
+                f"first is {first.width}x{first.height}; make them equal, or import them as two sessions"
+            )
+    image = _read_image(views[0].image, first)
+    if values is None and exported is None:
+        coloured = _channels(image) == 3 and image.dtype == np.uint8
+        values = Values.DISPLAY if coloured else Values.LINEAR
+    decode = values is Values.DECODE
+    encoding = "srgb" if values is Values.DISPLAY else "linear"
+    longest_s = max(view.exposure_time_s for view in views)
+    if exported is not None:
+        camera, background = exported.camera, exported.background
+        encoding = exported.encoding if values is None else encoding
+    else:
+        bit_depth = 16 if decode or image.dtype == np.uint16 else 8
+        camera, background = _foreign_camera(first, _channels(image), bit_depth, longest_s), 0.0
+    if white_background is not None:
+        full_scale = (camera.white_dn - camera.black_dn) / (camera.dn_per_radiance_s * longest_s)
+        background = full_scale if white_background else 0.0
+    return _Target(camera, background, encoding, decode)
+
+
+def first_of_each_split(views: Sequence[View], count: int | None) -> list[View]:
+    """Return the first `count` views of each split, or of all where no split is stated; None: all views."""
+    taken: dict[str | None, int] = {}
+    chosen = []
+    for view in views:
+        taken[view.split] = taken.get(view.split, 0) + 1
+        if count is None or taken[view.split] <= count:
+            chosen.append(view)
+    return chosen
+
+
+def is_transparent(path: Path) -> bool:
+    """Return whether a picture has pixels that are not opaque.
+
+    Raises:
+        FormatError: it cannot be read.
+    """
+    image = _decode(path)
+    return image.shape[2] in (2, 4) and bool((image[..., -1] < np.iinfo(image.dtype).max).any())
+
+
+def undistort(image: np.ndarray, intrinsics: Intrinsics, empty: float = 0.0) -> np.ndarray:
+    """Return the picture [H, W, C] that a pinhole camera with the same K would take; `empty` outside the original.
 
     Source: OpenCV's model, radial k1, k2, k3 and tangential p1, p2.
     """
@@ -151,7 +245,8 @@ def undistort(image: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
         ]
     )
     channels = [
-        map_coordinates(image[..., c].astype(np.float64), source, order=1) for c in range(image.shape[2])
+        map_coordinates(image[..., c].astype(np.float64), source, order=1, cval=empty)
+        for c in range(image.shape[2])
     ]
     return np.stack(channels, axis=2)
 
@@ -225,20 +320,24 @@ def _channels(image: np.ndarray) -> int:
     return 1 if image.shape[2] <= 2 else 3
 
 
-def _digital_numbers(
-    image: np.ndarray, intrinsics: Intrinsics, camera: CameraSection, srgb: bool
-) -> np.ndarray:
-    """Return a picture [H, W, 1 to 4] as digital numbers [H, W] or [H, W, 3] of a camera."""
-    full = float(np.iinfo(image.dtype).max)
+def _digital_numbers(view: View, target: _Target) -> np.ndarray:
+    """Return a picture as digital numbers [H, W] or [H, W, 3] of the session's camera."""
+    image, camera = _read_image(view.image, view.intrinsics), target.camera
     colours = _channels(image)
+    if colours < camera.channels:
+        raise FormatError(f"{view.image}: expected {camera.channels} colours a pixel, got {colours}")
+    full = float(np.iinfo(image.dtype).max)
     value = image[..., :colours] / full
-    if srgb:
-        value = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    if target.decode:
+        value = from_srgb(value)
+    empty_dn = target.background * camera.dn_per_radiance_s * view.exposure_time_s
+    empty = min(1.0, empty_dn / (camera.white_dn - camera.black_dn))
     if image.shape[2] > colours:
-        value = value * (image[..., colours:] / full)
+        alpha = image[..., colours:] / full
+        value = value * alpha + (1 - alpha) * empty
     if colours > camera.channels:  # pictures of a mono camera, exported with three equal colours
         value = value.mean(axis=2, keepdims=True)
-    value = undistort(value, intrinsics)
+    value = undistort(value, view.intrinsics, empty)
     dn = np.rint(camera.black_dn + value * (camera.white_dn - camera.black_dn)).astype(np.uint16)
     return np.ascontiguousarray(dn[..., 0] if camera.channels == 1 else dn)
 

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from obbgs_core.model.footprint import FOOTPRINTS, Footprint
 from obbgs_core.model.rotations import quats_to_matrices
 
 Shading = Literal["view", "sun", "lambert"]
@@ -25,6 +26,9 @@ class Gaussians:
     - `lambert`: K = 1, an albedo. Radiance is albedo·(max(0, n·s)·V(s) + ambient): n the shortest axis on the camera's
       side, s the Sun, V the share of it that other Gaussians let through (`render.sunlit_shares`), all of the light in
       units of the Sun's. The maximum is as soft as `sh.radiance`, and ambient [] is one number for all.
+
+    The `footprint` says what each pixel averages over when the model is rendered (see `footprint`); it belongs to the
+    model, because opacities and scales were fitted with it.
     """
 
     means: Tensor
@@ -34,6 +38,7 @@ class Gaussians:
     sh: Tensor
     shading: Shading = "view"
     ambient: Tensor = field(default_factory=lambda: torch.zeros(()))
+    footprint: Footprint = "kerbl"
 
     def __post_init__(self):
         n = self.means.shape[0]
@@ -49,6 +54,8 @@ class Gaussians:
             raise ValueError(f"sh must be [{n}, K, 1 or 3], got {list(self.sh.shape)}")
         if self.shading not in get_args(Shading):
             raise ValueError(f"shading must be one of {', '.join(get_args(Shading))}, got {self.shading!r}")
+        if self.footprint not in FOOTPRINTS:
+            raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {self.footprint!r}")
         if self.shading == "lambert" and self.sh.shape[1] != 1:
             raise ValueError(f"an albedo is sh [{n}, 1, 1 or 3], got {list(self.sh.shape)}")
 

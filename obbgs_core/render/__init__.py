@@ -27,14 +27,14 @@ def render(
     gaussians: Gaussians,
     cameras: Cameras,
     backend: str = "auto",
-    normals: bool = False,
     sunlit: Tensor | None = None,
 ) -> Rendered:
-    """Render radiance, alpha, depth and (on request) normals of all cameras.
+    """Render radiance, alpha and depth of all cameras.
 
-    Front-to-back compositing on a black background (Kerbl et al. 2023): alpha = min(0.99, opacity·exp(-d²/2)), where d
-    is the Mahalanobis distance from the projected mean; contributions under 1/255 are skipped, and a pixel is finished
-    before its transmittance would fall below 1e-4.
+    Front-to-back compositing on the cameras' background (Kerbl et al. 2023): alpha = min(0.99, opacity·exp(-d²/2)),
+    where d is the Mahalanobis distance from the projected mean; contributions under 1/255 are skipped, and a pixel is
+    finished before its transmittance would fall below 1e-4. What a pixel averages over is the model's `footprint`;
+    where that lowers a Gaussian's peak, it lowers the 1/255 as much.
 
     Args:
         backend: `native` (C++, float32), `native-KERNEL` (the same with one of `native_kernels()`), `reference` (plain
@@ -51,4 +51,7 @@ def render(
         sunlit = None
     elif suns is not None and sunlit is None:
         sunlit = sunlit_shares(gaussians, suns, backend)
-    return rasterize(gaussians, cameras, backend, suns, sunlit, normals)
+    rendered = rasterize(gaussians, cameras, backend, suns, sunlit)
+    if cameras.background:
+        rendered.radiance = rendered.radiance + (1 - rendered.alpha)[..., None] * cameras.background
+    return rendered

@@ -16,7 +16,6 @@ def rasterize(
     backend: str,
     suns: Tensor | None = None,
     sunlit: Tensor | None = None,
-    normals: bool = False,
 ) -> Rendered:
     """Render with a known illumination, by the backend of this name (see `render`).
 
@@ -29,8 +28,8 @@ def rasterize(
     """
     kernel = _kernel(backend, gaussians.means)
     if kernel is None:
-        return render_reference(gaussians, cameras, suns, sunlit, normals)
-    return render_native(kernel, gaussians, cameras, suns, sunlit, normals)
+        return render_reference(gaussians, cameras, suns, sunlit)
+    return render_native(kernel, gaussians, cameras, suns, sunlit)
 
 
 def _kernel(backend: str, like: Tensor) -> str | None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from obbgs_core import compiled
 from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.footprint import footprint_px2, lowers_peak
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.rendered import Rendered, ScreenGradients
 
@@ -30,15 +31,14 @@ def render_native(
     cameras: Cameras,
     suns: Tensor | None,
     sunlit: Tensor | None,
-    normals: bool,
 ) -> Rendered:
     """Render with one of `native_kernels()`, in float32 on the CPU; other arguments as of `backends.rasterize`."""
-    request = _Request(kernel, cameras, suns, sunlit, normals, ScreenGradients())
-    tensors = (*gaussians.tensors().values(), cameras.world_to_camera, gaussians.ambient)
-    images = _Rasterize.apply(request, *tensors)
-    radiance, alpha, depth, median_depth, means2d, radii, *more = images
-    normal_image = more[0] if more else None
-    return Rendered(radiance, alpha, depth, median_depth, means2d, radii, normal_image, request.screen)
+    peak_lowered = lowers_peak(gaussians.footprint)
+    request = _Request(kernel, cameras, suns, sunlit, peak_lowered, ScreenGradients())
+    footprint = footprint_px2(gaussians.footprint, cameras)
+    tensors = (*gaussians.tensors().values(), cameras.world_to_camera, gaussians.ambient, footprint)
+    images: Any = _Rasterize.apply(request, *tensors)
+    return Rendered(*images, screen=request.screen)
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class _Request:
     cameras: Cameras
     suns: Tensor | None
     sunlit: Tensor | None
-    normals: bool
+    peak_lowered: bool
     screen: ScreenGradients  # filled by the backward pass
 
 
@@ -58,7 +58,16 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx, request: _Request, means, quats, log_scales, opacity_logits, sh, world_to_camera, ambient
+        ctx,
+        request: _Request,
+        means,
+        quats,
+        log_scales,
+        opacity_logits,
+        sh,
+        world_to_camera,
+        ambient,
+        footprint,
     ):
         cameras = request.cameras
         module = compiled.module_for()
@@ -78,44 +87,42 @@ class _Rasterize(torch.autograd.Function):
             sun_dir=None if request.suns is None else _float32(request.suns),
             sunlit=None if request.sunlit is None else _float32(request.sunlit),
             ambient=ambient.item(),
+            footprint_px2=_float32(footprint),
+            peak_lowered=request.peak_lowered,
         )
         shape, splats = (len(cameras), cameras.height, cameras.width), (len(cameras), means.shape[0])
         radiance = torch.empty(*shape, sh.shape[2])
         alpha, depth, median_depth = (torch.empty(shape) for _ in range(3))
         means2d, radii = torch.empty(*splats, 2), torch.empty(splats)
-        normal_images = [torch.empty(*shape, 3)] if request.normals else []
         rasterization.forward(
             torch.get_num_threads(),
             radiance,
             alpha,
             depth,
             median_depth,
-            normal_images[0] if normal_images else None,
             means2d,
             radii,
         )
         ctx.set_materialize_grads(False)
-        inputs = (means, quats, log_scales, opacity_logits, sh, world_to_camera, ambient)
-        ctx.save_for_backward(*inputs, radiance, depth, *normal_images)
+        inputs = (means, quats, log_scales, opacity_logits, sh, world_to_camera, ambient, footprint)
+        ctx.save_for_backward(*inputs, radiance, depth)
         ctx.rasterization, ctx.screen = rasterization, request.screen
         ctx.mark_non_differentiable(median_depth, radii)
-        return radiance, alpha, depth, median_depth, means2d, radii, *normal_images
+        return radiance, alpha, depth, median_depth, means2d, radii
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor | None):  # pyright: ignore[reportIncompatibleMethodOverride]
-        radiance, alpha, depth, _, means2d, _, *more = grad_outputs
-        normals = more[0] if more else None
-        inputs, images = ctx.saved_tensors[:7], ctx.saved_tensors[7:]
+        radiance, alpha, depth, _, means2d, _ = grad_outputs
+        *inputs, radiance_image, depth_image = ctx.saved_tensors
         gradients = [torch.empty(t.shape) for t in inputs]
         count, n = inputs[5].shape[0], inputs[0].shape[0]
         screen_means2d, pixels = torch.empty(count, n, 2), torch.empty(count, n)
         ctx.rasterization.backward(
             torch.get_num_threads(),
-            images[0],
-            images[1],
-            images[2] if len(images) > 2 else None,
-            *(None if g is None else g.float() for g in (radiance, alpha, depth, normals)),
+            radiance_image,
+            depth_image,
+            *(None if g is None else g.float() for g in (radiance, alpha, depth)),
             None if means2d is None else means2d.float().contiguous(),
             *gradients,
             screen_means2d,

@@ -7,11 +7,13 @@ import torch
 from torch import Tensor
 
 from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.footprint import footprint_px2, lowers_peak
 from obbgs_core.model.gaussians import Gaussians
 
-DILATION_PX2 = 0.3  # added to the 2D covariance: no Gaussian is thinner than a pixel (Kerbl et al. 2023)
 FOV_MARGIN = 1.3  # the affine approximation is clamped this far outside the image (Kerbl et al. 2023)
 RADIUS_SIGMAS = 3  # of the longer axis
+# A Gaussian whose peak falls to less than this share is not drawn: fainter than one step of a 12-bit sensor.
+MIN_PEAK_SHARE = 1 / 4096
 
 
 @dataclass
@@ -19,7 +21,8 @@ class Projected:
     """Gaussians on each image plane."""
 
     means2d: Tensor  # [C, N, 2] px
-    conics: Tensor  # [C, N, 3] px⁻² (xx, xy, yy): inverse of the dilated 2D covariance
+    conics: Tensor  # [C, N, 3] px⁻² (xx, xy, yy): inverse of the widened 2D covariance
+    peak_shares: Tensor  # [C, N] of the opacity, at the projected mean: below 1 where the peak is lowered
     depths: Tensor  # [C, N] m; 0 where the Gaussian is not drawn
     radii: Tensor  # [C, N] px, three sigma of the longer axis, rounded up; 0 where the Gaussian is not drawn
 
@@ -27,9 +30,11 @@ class Projected:
 def project(gaussians: Gaussians, cameras: Cameras) -> Projected:
     """Project Gaussians onto each image plane by the local affine (EWA) approximation.
 
+    The covariance is widened by what a pixel averages over, its footprint. Unless the footprint is `kerbl`, opacities
+    fall by the root of the ratio of the determinants before and after, so that the integral over the image is kept.
     Gaussians nearer than `cameras.near_m`, or not finite, get depth and radius 0 and no gradient, never NaN.
 
-    Source: Zwicker et al., EWA Volume Splatting, 2001.
+    Source: Zwicker et al., EWA Volume Splatting, 2001; the lowered peak: Yu et al., Mip-Splatting, 2024.
     """
     gaussians, finite = with_zeros_for_invalid(gaussians)
     R, t = cameras.world_to_camera[:, :3, :3], cameras.world_to_camera[:, :3, 3]
@@ -48,19 +53,27 @@ def project(gaussians: Gaussians, cameras: Cameras) -> Projected:
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * x / z, zero, fy / z, -fy * y / z], dim=-1).unflatten(-1, (2, 3))
     M = J @ (R[:, None] @ gaussians.axes[None])  # [C, N, 2, 3]; Sigma' = M M^T
-    xx = (M[..., 0, :] ** 2).sum(-1) + DILATION_PX2
+    footprint = footprint_px2(gaussians.footprint, cameras)[:, None]
+    xx = (M[..., 0, :] ** 2).sum(-1) + footprint
     xy = (M[..., 0, :] * M[..., 1, :]).sum(-1)
-    yy = (M[..., 1, :] ** 2).sum(-1) + DILATION_PX2
+    yy = (M[..., 1, :] ** 2).sum(-1) + footprint
     determinant = xx * yy - xy * xy
     drawn = drawn & torch.isfinite(determinant) & (determinant > 0)
     determinant = torch.where(drawn, determinant, torch.ones_like(determinant))
     conics = torch.stack([yy, -xy, xx], dim=-1) / determinant[..., None]
     conics = torch.where(drawn[..., None], conics, torch.zeros_like(conics))
+    shares = torch.ones_like(z)
+    if lowers_peak(gaussians.footprint):
+        # the determinant of M Mᵀ as a square, in which nothing cancels; the root has no derivative at 0
+        narrow = torch.linalg.cross(M[..., 0, :], M[..., 1, :]).square().sum(-1)
+        shares = (torch.where(narrow > 0, narrow, 1) / determinant).sqrt()
+        drawn = drawn & (narrow > 0) & (shares >= MIN_PEAK_SHARE)
     with torch.no_grad():
         middle = (xx + yy) / 2
         largest_eigenvalue = middle + (middle**2 - determinant).clamp(min=0.1).sqrt()
         radii = torch.where(drawn, RADIUS_SIGMAS * largest_eigenvalue.sqrt(), 0.0).ceil()
-    return Projected(means2d, conics, torch.where(drawn, z, torch.zeros_like(z)), radii)
+    depths = torch.where(drawn, z, torch.zeros_like(z))
+    return Projected(means2d, conics, shares, depths, radii)
 
 
 def with_zeros_for_invalid(gaussians: Gaussians) -> tuple[Gaussians, Tensor]:

@@ -7,12 +7,14 @@ from torch import Tensor
 
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.render.lighting import normals_towards, radiance_along
+from obbgs_core.render.lighting import radiance_along
 from obbgs_core.render.projection import project, with_zeros_for_invalid
 from obbgs_core.render.rendered import Rendered, ScreenGradients
 
 # The kernels have the same numbers in kernels/rasterizer.h; a test compares them.
-MIN_ALPHA = 1 / 255  # fainter contributions are skipped (Kerbl et al. 2023)
+# Fainter contributions are skipped (Kerbl et al. 2023); where a peak is lowered, this is lowered as much, so that the
+# same share of the light is cut off at every distance.
+MIN_ALPHA = 1 / 255
 MAX_ALPHA = 0.99
 MIN_TRANSMITTANCE = 1e-4  # a pixel is finished before its transmittance would fall below
 MIN_DEPTH_ALPHA = 1e-6  # the depth is 0 where alpha is not above this
@@ -20,7 +22,7 @@ BAND_ELEMENTS = 4_000_000  # pixels times Gaussians that are composited at once:
 
 
 def render_reference(
-    gaussians: Gaussians, cameras: Cameras, suns: Tensor | None, sunlit: Tensor | None, normals: bool
+    gaussians: Gaussians, cameras: Cameras, suns: Tensor | None, sunlit: Tensor | None
 ) -> Rendered:
     """Render with plain PyTorch; arguments as of `backends.rasterize`."""
     projected = project(gaussians, cameras)
@@ -32,14 +34,15 @@ def render_reference(
     images, alphas, medians = [], [], []
     for c in range(len(cameras)):
         means2d, conics, depths = projected.means2d[c], projected.conics[c], projected.depths[c]
+        shares = projected.peak_shares[c]
+        opacities = gaussians.opacities * shares
         sun, share = (None if each is None else each[c] for each in (suns, sunlit))
         features = [radiance_along(gaussians, directions[c], sun, share), depths[:, None]]
-        if normals:
-            features.append(normals_towards(gaussians, directions[c]))
         image, transmittance, median = composite(
             means2d,
             conics,
-            gaussians.opacities,
+            opacities,
+            MIN_ALPHA * shares.detach(),
             depths,
             torch.cat(features, dim=1),
             cameras.width,
@@ -58,7 +61,6 @@ def render_reference(
         median_depth=torch.stack(medians),
         means2d=projected.means2d,
         radii=projected.radii,
-        normals=image[..., channels + 1 :] if normals else None,
         screen=screen,
     )
 
@@ -67,6 +69,7 @@ def composite(
     means2d: Tensor,
     conics: Tensor,
     opacities: Tensor,
+    cutoffs: Tensor,
     depths: Tensor,
     features: Tensor,
     width: int,
@@ -76,6 +79,7 @@ def composite(
 
     Args:
         means2d: [N, 2] px; conics: [N, 3] px⁻²; opacities: [N]; depths: [N] m, 0 for those not drawn.
+        cutoffs: [N] alphas below which a contribution is skipped.
         features: [N, F] of each Gaussian, blended like its colour.
 
     Returns:
@@ -93,7 +97,7 @@ def composite(
         a, b, c = conics[order].unbind(-1)
         power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
         alpha = (opacities[order] * power.clamp(max=0).exp()).clamp(max=MAX_ALPHA)
-        alpha = torch.where(alpha >= MIN_ALPHA, alpha, torch.zeros_like(alpha))
+        alpha = torch.where(alpha >= cutoffs[order], alpha, torch.zeros_like(alpha))
         after = torch.cumprod(1 - alpha, dim=-1)
         alpha = torch.where(after >= MIN_TRANSMITTANCE, alpha, torch.zeros_like(alpha))
         after = torch.cumprod(1 - alpha, dim=-1)
@@ -108,7 +112,7 @@ def composite(
 
 @torch.no_grad()
 def _pixels_touched(conics: Tensor, opacities: Tensor, depths: Tensor) -> Tensor:
-    """Return the area [N] px of each ellipse alpha >= MIN_ALPHA; the kernels count the pixels instead."""
+    """Return the area [N] px of each ellipse that is not cut off; the kernels count the pixels instead."""
     squared_radius = 2 * torch.log((opacities / MIN_ALPHA).clamp(min=1))  # in sigmas
     determinant = (conics[:, 0] * conics[:, 2] - conics[:, 1] ** 2).clamp(min=1e-12)
     area = math.pi * squared_radius / determinant.sqrt()

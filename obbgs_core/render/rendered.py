@@ -38,5 +38,4 @@ class Rendered:
     )
     means2d: Tensor  # [C, N, 2] px
     radii: Tensor  # [C, N] px
-    normals: Tensor | None = None  # [C, H, W, 3] composited, body frame; only on request
     screen: ScreenGradients = field(default_factory=ScreenGradients)

@@ -19,6 +19,7 @@ from obbgs_core.render.lighting import constant_radiance, without_sun
 
 SHADOW_MAP_PX = 256  # width and height
 SHADOW_MARGIN_PX = 2  # added around the map, lit everywhere
+SHADOW_PSF_SIGMA_PX = 0.0  # no optics look from the Sun
 # in radii of the model: its rays are parallel to 0.2 degrees, less than the Sun's diameter
 SUN_DISTANCE = 300.0
 INLIER_QUANTILE = 0.99  # of the centres' distances: Gaussians farther out neither cast nor receive shadows
@@ -106,7 +107,7 @@ def sun_camera(gaussians: Gaussians, sun_dir: Tensor) -> Cameras:
     pose[:3, 3] = -pose[:3, :3] @ (centre - distance_m * forward)
     focal_px = half_px * SUN_DISTANCE
     K = centre.new_tensor([[focal_px, 0, half_px], [0, focal_px, half_px], [0, 0, 1]])
-    return Cameras(pose[None], K[None], SHADOW_MAP_PX, SHADOW_MAP_PX)
+    return Cameras(pose[None], K[None], SHADOW_MAP_PX, SHADOW_MAP_PX, psf_sigma_px=SHADOW_PSF_SIGMA_PX)
 
 
 def bounding_ball(gaussians: Gaussians) -> tuple[Tensor, float]:

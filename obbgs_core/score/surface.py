@@ -94,10 +94,10 @@ def _sampled(gaussians: Gaussians, cameras: Cameras, count: int, seed: int) -> t
 
 
 def _bright(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
-    """Return the Gaussians that are not black: black ones in front of a black sky change no image."""
+    """Return the Gaussians that differ from the background: black ones in front of a black sky change no image."""
     if len(gaussians) == 0:
         return gaussians
-    light = mean_radiance(gaussians, cameras).mean(dim=-1)
+    light = (mean_radiance(gaussians, cameras).mean(dim=-1) - cameras.background).abs()
     return constant_radiance(gaussians).select(light > MIN_RADIANCE * light.quantile(BRIGHT_QUANTILE))
 
 

@@ -1,5 +1,7 @@
 """The visual hull: the voxels in which most long exposures see light. Space is black, so light is target.
 
+In front of another background, how far a reading departs from the background's takes the place of light (`light`).
+
 A "sigma" here is the deviation of an unlit reading, or of the mean of a window of such readings.
 """
 
@@ -68,6 +70,18 @@ def silhouette(
     lit = likely | (faint[5] > 0) | (faint[9] > SKY_SIGMA)
     likely, lit = _dilated(likely, dilate_px), _dilated(lit, dilate_px)
     return Silhouette(certain[0, 0], likely[0, 0], ~lit[0, 0], world_to_camera, K)
+
+
+def light(dn: Tensor, sensor: Sensor, background: float, exposure_time_s: float) -> Tensor:
+    """Return readings [H, W, C] as if on black sky: the black level plus how far each is from that of the background.
+
+    Args:
+        background: radiance of what is seen where the target is not.
+    """
+    if not background:
+        return dn
+    empty_dn = sensor.expected_dn(torch.tensor(background), exposure_time_s).clamp(max=sensor.white_dn)
+    return sensor.black_dn + (dn - empty_dn).abs()
 
 
 def _mean_of(signal: Tensor, chosen: Tensor, window: int) -> Tensor:

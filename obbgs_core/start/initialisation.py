@@ -49,9 +49,11 @@ def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.S
     for exposure_s in sorted({f.exposure_time_s for f in frames}, reverse=True):
         if len(chosen) < FEWEST_VIEWS:
             chosen |= {i: f for i, f in enumerate(frames) if f.exposure_time_s == exposure_s}
-    return {
-        i: hull.silhouette(f.dn, sensor, f.world_to_camera, f.K, _pose_error_px(f)) for i, f in chosen.items()
-    }
+    outlines = {}
+    for i, f in chosen.items():
+        light = hull.light(f.dn, sensor, f.background, f.exposure_time_s)
+        outlines[i] = hull.silhouette(light, sensor, f.world_to_camera, f.K, _pose_error_px(f))
+    return outlines
 
 
 def _pose_error_px(frame: TrainingFrame) -> int:
@@ -110,11 +112,6 @@ def first_gaussians(
     return model, radius, f"random, {settings.count} points"
 
 
-def full_scale_radiance(frames: list[TrainingFrame], sensor: Sensor) -> float:
-    """Return the radiance that saturates a pixel at the frames' mean exposure time."""
-    return (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * mean_exposure_s(frames))
-
-
 def _colours(
     points: Tensor,
     frames: list[TrainingFrame],
@@ -125,7 +122,8 @@ def _colours(
     """Return the coefficients of degree 0 [N, C] that Gaussians at points start with."""
     if settings.colour == "grey":
         noise = torch.rand(len(points), frames[0].dn.shape[2], generator=rng)
-        return sh.from_radiance((0.5 + sh.C0 * noise / 255) * full_scale_radiance(frames, sensor))
+        full_scale = sensor.full_scale_radiance(mean_exposure_s(frames))
+        return sh.from_radiance((0.5 + sh.C0 * noise / 255) * full_scale)
     return sh.from_radiance(_seen_radiance(points, frames, sensor))
 
 

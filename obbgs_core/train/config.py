@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from obbgs_core.model.footprint import Footprint
 from obbgs_core.settings import at_least_one, check
 from obbgs_core.start.initialisation import StartSettings
 from obbgs_core.train.adam import RateSettings
@@ -11,6 +12,16 @@ from obbgs_core.train.growth import GrowthSettings
 from obbgs_core.train.objective import LossSettings
 from obbgs_core.train.parsimony import ParsimonySettings
 from obbgs_core.train.poses import PoseSettings
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Where a training stands in the schedule of its stage, in the step that is under way."""
+
+    step: int  # of the stage, from 1
+    share: float  # of the steps of the training that were done in the stage, 0 in the first
+    image_scale: float
+    frames: int  # of the step
 
 
 @dataclass(frozen=True)
@@ -35,6 +46,14 @@ class MethodConfig:
     bracket_steps: bool = False  # the frames of a step are one of each exposure time
     steps: int = at_least_one(30_000)
     pyramid: tuple[tuple[float, float], ...] = ((0.0, 1.0),)  # (from this share of the steps on, image scale)
+    footprint: Footprint = "kerbl"  # what a pixel averages over, see obbgs_core/model/footprint.py
+    # (image scale, frames of a step, share of the steps) of trainings that come first and hand over their model; each
+    # counts its steps from 0, so that the rate of the means and growth begin again (MVGS)
+    coarse: tuple[tuple[float, int, float], ...] = ()
+    # above 0: variance, px², of the 3D filter that keeps Gaussians as wide as the pictures sample (Mip-Splatting)
+    smoothing_px2: float = 0.0
+    # an affine map of the colours of each training frame is learnt with the model (later 3DGS)
+    compensation: bool = False
     outlier_filter: bool = False  # remove Gaussians far from the centre from the finished model
     chi2_end: float = 0.0  # above 0: stop after growth when the running chi² falls to this; 1 is pure noise
     start: StartSettings = field(default_factory=StartSettings)
@@ -57,6 +76,40 @@ class MethodConfig:
                 "pyramid must be pairs of a share of the steps, from 0 upwards, and an image scale of 0 to 1, got "
                 f"{self.pyramid}"
             )
+
+        if not all(len(stage) == 3 and 0 < stage[0] <= 1 and stage[1] >= 1 for stage in self.coarse) or not (
+            sum(stage[2] for stage in self.coarse) < 1
+        ):
+            raise ValueError(
+                "coarse must be triples of an image scale of 0 to 1, a number of frames and a share of the steps, of "
+                f"less than 1 in all, got {self.coarse}"
+            )
+
+    def stages(self) -> list[tuple[int, float, int]]:
+        """Return the stages of the training: the first step, counted from 0, the image scale and the frames of a step.
+
+        The last one is the training itself, its image scale the first of the pyramid.
+        """
+        stages, first = [], 0
+        for scale, frames, share in self.coarse:
+            stages.append((first, scale, frames))
+            first += round(share * self.steps)
+        return [*stages, (first, self.pyramid[0][1], self.frames_per_step)]
+
+    def moment(self, steps_done: int) -> Moment:
+        """Return where in its schedule a training stands after some steps."""
+        stages = self.stages()
+        main, _, _ = stages[-1]
+        first, scale, frames = next(stage for stage in reversed(stages) if steps_done >= stage[0])
+        share = (steps_done - first) / max(1, self.steps - main)
+        if first == main:
+            scale = self.image_scale(share)
+        return Moment(steps_done - first + 1, share, scale, frames)
+
+    def steps_until(self, share: float) -> float:
+        """Return how many steps are done when a share of the training, coarse stages left out, is."""
+        main = self.stages()[-1][0]
+        return main + share * (self.steps - main)
 
     def image_scale(self, share: float) -> float:
         """Return the scale of the images after a share of the steps."""

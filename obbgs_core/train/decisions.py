@@ -11,7 +11,9 @@ from obbgs_core.errors import Diverged
 from obbgs_core.render import Rendered
 from obbgs_core.train.appearance import SUN_FROM, described, raised_degree
 from obbgs_core.train.batches import Batch, FrameOrder
+from obbgs_core.train.config import Moment
 from obbgs_core.train.growth import (
+    GRADIENT_THRESHOLD,
     Growth,
     densify,
     densify_boxes,
@@ -21,9 +23,11 @@ from obbgs_core.train.growth import (
     reset_opacities,
     worst_boxes,
 )
+from obbgs_core.train.multi_view import crossing_boxes, inside, threshold_factor
 from obbgs_core.train.parsimony import justified
 from obbgs_core.train.poses import PoseCorrections
 from obbgs_core.train.setup import TrainingSetup
+from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import TrainingState
 from obbgs_core.train.validation import correction_gain
 
@@ -31,6 +35,14 @@ log = logging.getLogger(__name__)
 # Poses are refined if their likelihood gain, less its standard error, exceeds its BIC penalty by this factor. Gains of
 # 0.5 to 1.3 penalties were measured with exact tags, 2.9 to 5.4 at 1 px of error (docs/experiments/012).
 REFINING_RATIO = 1.5
+
+
+def smooth(setup: TrainingSetup, state: TrainingState) -> None:
+    """Find the widths of the 3D filter anew, where the method has one, because Gaussians have moved or are others."""
+    if setup.config.smoothing_px2:
+        state.smoothing_m = sampling_deviation_m(
+            state.gaussians.means, setup.frames, setup.config.smoothing_px2
+        )
 
 
 def is_recorded(setup: TrainingSetup, share: float) -> bool:
@@ -63,7 +75,7 @@ def observe(
     half_size_px = half_x_px, half_y_px
     state.growth.observe(rendered, half_size_px, growth.pixel_weighted, depth_weight)
     if growth.obb_interval and is_growing(setup, share):
-        state.boxes += worst_boxes(state.gaussians, rendered, cameras, residual)
+        state.boxes += worst_boxes(state.gaussians, rendered, cameras, residual, growth.obb_centre)
 
 
 def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> None:
@@ -76,7 +88,7 @@ def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> No
         return
     scale = config.image_scale(share)
     brackets = [setup.batches.batch(b, scale) for b in state.order.validation_brackets]
-    gain, error = correction_gain(state.gaussians.detach(), setup.frames, brackets, setup.sensor)
+    gain, error = correction_gain(state.model.detach(), setup.frames, brackets, setup.sensor)
     refined = gain - error > REFINING_RATIO
     state.poses = PoseCorrections(setup.frames) if refined else None
     state.poses_decided = (
@@ -87,25 +99,43 @@ def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> No
     state.order = FrameOrder.of(setup.frames, config.bracket_steps, [], state.order.turn)
 
 
-def change_number(setup: TrainingSetup, state: TrainingState, share: float) -> None:
+def change_number(
+    setup: TrainingSetup, state: TrainingState, batch: Batch, residual: Tensor, moment: Moment
+) -> None:
     """Densify everywhere, or between two such times inside the boxes of the worst tiles; reset opacities; when due."""
-    settings, now = setup.config.growth, state.steps_done + 1
-    if not is_growing(setup, share):
+    settings, now = setup.config.growth, moment.step
+    whole = setup.config.steps_until(1) - setup.config.steps_until(0)
+    if (
+        setup.frames[0].background
+        and settings.opacity_reset_interval
+        and now == round(settings.begin * whole)
+    ):
+        reset_opacities(state.gaussians, state.adam, state.log_lowering)  # as in 3DGS on a white background
+    if not is_growing(setup, moment.share):
+        if moment.share >= settings.end and now % settings.interval == 0:
+            left = setup.config.steps - state.steps_done - 1
+            if left >= settings.interval:  # Gaussians end under the filter that they were trained with
+                smooth(setup, state)
         return
     if now % settings.interval == 0:
         drop_not_finite(state)
-        state.gaussians = densify(
-            state.gaussians, state.adam, state.growth, setup.unit_m, settings, share, state.rng
-        )
+        crossed, threshold = None, GRADIENT_THRESHOLD
+        if settings.multi_view:
+            crossed = inside(state.gaussians.means.detach(), crossing_boxes(batch.cameras, residual))
+            threshold *= threshold_factor(batch.cameras)
+        model = (state.gaussians, state.adam, state.growth, setup.unit_m, settings, moment.share, state.rng)
+        state.gaussians = densify(*model, crossed, threshold)
         state.growth, state.boxes = Growth.of(len(state.gaussians)), []
+        smooth(setup, state)
     elif state.boxes and now % settings.obb_interval == 0:
         drop_not_finite(state)
         state.gaussians, state.growth = densify_boxes(
             state.gaussians, state.adam, state.growth, state.boxes, setup.unit_m, settings, state.rng
         )
         state.boxes = []
+        smooth(setup, state)
     if settings.opacity_reset_interval and now % settings.opacity_reset_interval == 0:
-        reset_opacities(state.gaussians, state.adam)
+        reset_opacities(state.gaussians, state.adam, state.log_lowering)
 
 
 def select_model(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
@@ -114,22 +144,23 @@ def select_model(setup: TrainingSetup, state: TrainingState, scale: float) -> No
     Args:
         scale: of the images that the likelihood is taken of.
     """
-    steps, now = setup.config.steps, state.steps_done + 1
-    if any(now == round(at * steps) for at in setup.config.parsimony.prune_at):
+    config, now = setup.config, state.steps_done + 1
+    if any(now == round(config.steps_until(at)) for at in config.parsimony.prune_at):
         prune_by_bic(setup, state, scale)
         raise_degree(setup, state, scale, ("sun", "view") if setup.sun_moves else ("view",))
-    elif setup.sun_moves and now == round(SUN_FROM * steps):
+    elif setup.sun_moves and now == round(config.steps_until(SUN_FROM)):
         raise_degree(setup, state, scale, ("sun",))
 
 
 def prune_by_bic(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
     """Remove the Gaussians whose likelihood gain is below their BIC penalty, unless that were all of them."""
     drop_not_finite(state)
-    kept = justified(state.gaussians, setup.batches, setup.sensor, scale, setup.config.parsimony, state.rng)
+    kept = justified(state.model, setup.batches, setup.sensor, scale, setup.config.parsimony, state.rng)
     if kept.any():
         removed = len(state.gaussians) - int(kept.sum())
         state.gaussians = keep(state.gaussians, state.adam, kept)
         state.growth, state.boxes = Growth.of(len(state.gaussians)), []
+        smooth(setup, state)
         log.info("step %d: %d Gaussians are pruned by BIC", state.steps_done + 1, removed)
 
 
@@ -162,5 +193,7 @@ def drop_not_finite(state: TrainingState) -> None:
     if count:
         state.gaussians = keep(state.gaussians, state.adam, kept)
         state.growth = state.growth.select(kept)
+        if state.smoothing_m is not None:
+            state.smoothing_m = state.smoothing_m[kept]
         state.removed_not_finite += count
         log.warning("step %d: %d Gaussians were not finite and are removed", state.steps_done, count)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -39,6 +40,11 @@ class GrowthSettings:
     # above 0: gradients of Gaussians nearer to the camera than this count less (Pixel-GS)
     depth_scale: float = 0.0
     obb_interval: int = 0  # above 0: steps between extra growth inside the boxes of the worst tiles
+    # of these boxes: where they are tight, or the mean of what is in them (Jiang et al. 2025)
+    obb_centre: Literal["middle", "mean"] = "middle"
+    # also clone what lies where the worst tiles of a step's views cross, and halve the threshold where two of the
+    # step's cameras are far apart (MVGS)
+    multi_view: bool = False
     prune_opacity: float = fraction(0.005)  # fainter Gaussians are removed at each densification
     prune_size: float = 0.2  # larger Gaussians are removed at each densification
     prune_size_from: float = fraction(0.0)  # share of the steps before which size is no reason to remove
@@ -127,7 +133,11 @@ def near_camera_weight(means: Tensor, cameras: Cameras, near_m: float) -> Tensor
 
 
 def worst_boxes(
-    gaussians: Gaussians, rendered: Rendered, cameras: Cameras, residual: Tensor
+    gaussians: Gaussians,
+    rendered: Rendered,
+    cameras: Cameras,
+    residual: Tensor,
+    centre: Literal["middle", "mean"],
 ) -> list[obb.Obb]:
     """Return the boxes around the Gaussians behind the worst tile of each frame; none where they are too few.
 
@@ -141,21 +151,30 @@ def worst_boxes(
             means, rendered.means2d[i], rendered.depth[i], cameras.world_to_camera[i], tile
         )
         if members.sum() >= obb.FEWEST:
-            boxes.append(obb.fit(means[members]))
+            boxes.append(obb.fit(means[members], centre))
     return boxes
 
 
 @torch.no_grad()
 def grow(
-    gaussians: Gaussians, adam: Adam, growing: Tensor, split_over_m: float, rng: torch.Generator
+    gaussians: Gaussians,
+    adam: Adam,
+    growing: Tensor,
+    split_over_m: float,
+    rng: torch.Generator,
+    cloned: Tensor | None = None,
 ) -> tuple[Gaussians, Tensor]:
     """Return the model with the growing Gaussians [N] bool cloned (small ones) or split in two (large ones).
 
     Those that were not split stand first in it, unchanged; their old indices are returned too. Splitting draws two
     centres from the Gaussian itself and divides its deviations by `SPLIT_SHRINK`, as in Kerbl et al. 2023.
+
+    Args:
+        cloned: [N] bool of further Gaussians to be cloned, whatever their size.
     """
     large = gaussians.scales.max(dim=1).values > split_over_m
-    clones = torch.nonzero(growing & ~large)[:, 0]
+    cloning = growing & ~large
+    clones = torch.nonzero(cloning if cloned is None else cloning | cloned)[:, 0]
     splits = torch.nonzero(growing & large)[:, 0]
     kept = torch.nonzero(~(growing & large))[:, 0]
     parts = [gaussians.select(kept), gaussians.select(clones)]
@@ -206,15 +225,23 @@ def densify(
     settings: GrowthSettings,
     share: float,
     rng: torch.Generator,
+    crossed: Tensor | None = None,
+    threshold: float = GRADIENT_THRESHOLD,
 ) -> Gaussians:
     """Grow where screen gradients are large, within the budget; prune what is faint or too large.
 
     Args:
         unit_m: the method's unit of length.
         share: of the steps that are done.
+        crossed: [N] bool of Gaussians that are cloned whatever their gradients, as many as the budget allows.
+        threshold: of the gradients.
     """
-    growing = chosen(growth.mean(), gaussians, settings)
-    gaussians, kept = grow(gaussians, adam, growing, SPLIT_SIZE * unit_m, rng)
+    growing = chosen(growth.mean(), gaussians, settings, threshold)
+    if crossed is not None:
+        room = settings.max_gaussians - len(gaussians) - int(growing.sum())
+        crossed = crossed & ~growing
+        crossed &= crossed.cumsum(dim=0) <= room
+    gaussians, kept = grow(gaussians, adam, growing, SPLIT_SIZE * unit_m, rng, crossed)
     with torch.no_grad():
         wanted = gaussians.opacities > settings.prune_opacity
         if share >= settings.prune_size_from:
@@ -241,10 +268,12 @@ def densify_boxes(
     return gaussians, growth.select(kept).padded(len(gaussians))
 
 
-def chosen(gradient: Tensor, gaussians: Gaussians, settings: GrowthSettings) -> Tensor:
+def chosen(
+    gradient: Tensor, gaussians: Gaussians, settings: GrowthSettings, threshold: float = GRADIENT_THRESHOLD
+) -> Tensor:
     """Return which Gaussians [N] grow: those above the threshold, or the share with the largest; within the budget."""
     room = settings.max_gaussians - len(gaussians)
-    count = int((gradient >= GRADIENT_THRESHOLD).sum())
+    count = int((gradient >= threshold).sum())
     if settings.share:
         count = int(settings.share * len(gaussians))
     count = max(0, min(count, room, int((gradient > 0).sum())))
@@ -254,7 +283,15 @@ def chosen(gradient: Tensor, gaussians: Gaussians, settings: GrowthSettings) -> 
 
 
 @torch.no_grad()
-def reset_opacities(gaussians: Gaussians, adam: Adam) -> None:
-    """Make every Gaussian nearly transparent, so that only those that are needed become opaque again."""
-    gaussians.opacity_logits.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+def reset_opacities(gaussians: Gaussians, adam: Adam, log_lowering: Tensor | None = None) -> None:
+    """Make every Gaussian nearly transparent, so that only those that are needed become opaque again.
+
+    Args:
+        log_lowering: [N] logarithm of the factor by which opacities are lower when they are rendered; None: zeros.
+    """
+    if log_lowering is None:
+        gaussians.opacity_logits.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+    else:
+        most = (RESET_OPACITY / log_lowering.exp()).clamp(max=1 - 1e-6)
+        gaussians.opacity_logits.copy_(torch.minimum(gaussians.opacity_logits, most.logit()))
     adam.reset("opacity_logits")

@@ -140,7 +140,8 @@ def _views(
         sigma = (prediction.variance_dn2 / batch.averaged_pixels).sqrt()
         weight = torch.where(batch.dn < sensor.white_dn, 1 / sigma, 0.0)
         signs = torch.randint(0, 2, predicted.shape, generator=rng) * 2.0 - 1
-        values = int((predicted.detach() - sensor.black_dn > sigma).sum()) * batch.averaged_pixels
+        empty_dn = sensor.expected_dn(torch.tensor(batch.cameras.background), batch.exposure_time_s)
+        values = int(((predicted.detach() - empty_dn).abs() > sigma).sum()) * batch.averaged_pixels
         yield _View(predicted, residual, weight, signs, values, len(batches.frames) / len(chosen))
 
 

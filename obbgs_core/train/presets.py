@@ -34,7 +34,17 @@ PRESETS: dict[str, MethodConfig] = {
     for c in (
         _3DGS,
         changed(_3DGS, {"name": "pixel-gs", "growth.pixel_weighted": True, "growth.depth_scale": 0.37}),
-        replace(_3DGS, name="mvgs", frames_per_step=4),
+        changed(
+            _3DGS,
+            {  # run_360.py and train.py of the authors' code
+                "name": "mvgs",
+                "steps": 39_000,
+                "coarse": ((1 / 8, 48, 3 / 39), (1 / 4, 24, 3 / 39), (1 / 2, 12, 3 / 39)),
+                "frames_per_step": 8,
+                "growth.multi_view": True,
+            },
+        ),
+        changed(_3DGS, {"name": "mip-splatting", "smoothing_px2": 0.2, "footprint": "mip-splatting"}),
         changed(
             _3DGS,
             {
@@ -95,6 +105,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "loss.clamped": True,
     },  # known exposure times, saturation as the sensor's
     "blind": {"exposure_aware": False},  # exposure times are not known
+    "affine": {"compensation": True, "loss.clamped": True},  # the colours of each frame are learnt
     "hull": {f"start.{f.name}": getattr(PRESETS["obbgs"].start, f.name) for f in fields(StartSettings)},
     "random": {"start.kind": "random"},
 }

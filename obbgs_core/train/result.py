@@ -1,8 +1,12 @@
 """What a training returns: figures of each step, and the finished model with how it was made."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from torch import Tensor
 
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.sensor import Sensor
+from obbgs_core.train.compensation import mapped, nearest
 from obbgs_core.train.config import MethodConfig
 
 
@@ -20,6 +24,29 @@ class StepInfo:
     seconds_left: float  # if the pace per pixel stays as it is
 
 
+@dataclass(frozen=True)
+class Exposing:
+    """How a trained model is turned into the picture of an exposure time.
+
+    reference_exposure_s: what a method that ignores exposure takes every exposure for; None: it knows them.
+    maps: of a method that learnt the colours of each training frame, the mean map [C, C + 1] of the frames of each
+        exposure time, s. A held-out picture takes that of the nearest exposure time: unlike the publications, which
+        fit a map to the held-out picture itself, it needs no look at the picture.
+    """
+
+    reference_exposure_s: float | None = None
+    maps: dict[float, Tensor] = field(default_factory=dict)
+
+    def image(self, radiance: Tensor, sensor: Sensor, exposure_time_s: float) -> Tensor:
+        """Return the noiseless picture of radiance [H, W, C], a fraction of full scale, clipped as the sensor clips."""
+        exposure_s = self.reference_exposure_s or exposure_time_s
+        if self.maps:
+            full_scale = sensor.full_scale_radiance(exposure_s)
+            maps = nearest(self.maps, exposure_time_s)[None]
+            radiance = mapped(radiance[None], maps, radiance.new_tensor(full_scale))[0]
+        return (sensor.expected_dn(radiance, exposure_s) / sensor.white_dn).clamp(0, 1)
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainResult:
     """A finished model, and how its training went."""
@@ -33,9 +60,14 @@ class TrainResult:
     appearance: str  # what the radiance depends on, and why
     growth: str  # the step until which Gaussians were added
     poses: str  # whether the poses were refined, and why
-    reference_exposure_s: float | None  # what every exposure was taken for when exposure is ignored
+    exposing: Exposing  # what its pictures are made with
     sun_span_deg: float  # largest angle between two frames' Suns, body frame
     dark_frames: int  # left out: nothing in them rises above the noise
     removed_outliers: int
     removed_not_finite: int  # Gaussians removed because a parameter became NaN or infinite
     seconds: float
+
+    @property
+    def reference_exposure_s(self) -> float | None:
+        """What every exposure was taken for when exposure is ignored."""
+        return self.exposing.reference_exposure_s

@@ -9,16 +9,25 @@ from dataclasses import dataclass
 import torch
 
 from obbgs_core.errors import ReconstructionError
-from obbgs_core.frames import FEWEST_FRAMES, TrainingFrame, camera_extent_m, sun_span_deg, usable
+from obbgs_core.frames import (
+    FEWEST_FRAMES,
+    TrainingFrame,
+    camera_extent_m,
+    mean_exposure_s,
+    sun_span_deg,
+    usable,
+)
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import flat
-from obbgs_core.start.hull import shows_light
-from obbgs_core.start.initialisation import first_gaussians, full_scale_radiance, silhouettes
+from obbgs_core.start.hull import light, shows_light
+from obbgs_core.start.initialisation import first_gaussians, silhouettes
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.batches import Batches, FrameOrder
+from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.poses import PoseCorrections
+from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import Identity, TrainingState
 from obbgs_core.train.validation import validation_brackets
 
@@ -42,6 +51,7 @@ class TrainingSetup:
     budget: str  # the largest number of Gaussians, and what limits it
     reference_exposure_s: float | None  # what every exposure was taken for when exposure is ignored
     dark_frames: int  # left out: nothing in them rises above the noise
+    tagged_exposures_s: list[float]  # of the frames, also where the method ignores them
 
     @property
     def sun_moves(self) -> bool:
@@ -52,6 +62,8 @@ class TrainingSetup:
     def identity(self) -> Identity:
         """What decides the result of a training: the method's settings, the seed, the sensor and the frames."""
         digest = hashlib.sha256(repr((self.seed, self.sensor)).encode())
+        if background := self.frames[0].background:
+            digest.update(f"background {background}".encode())
         for f in self.frames:
             digest.update(
                 f.dn.numpy().tobytes() + f.world_to_camera.numpy().tobytes() + f.K.numpy().tobytes()
@@ -70,7 +82,8 @@ def prepare(
         TooFewFrames, ReconstructionError: as in `train`.
     """
     checked, reference_exposure_s = usable(frames, config.exposure_aware)
-    lit = [f for f in checked if shows_light(f.dn, sensor)]
+    shown = [shows_light(light(f.dn, sensor, f.background, f.exposure_time_s), sensor) for f in checked]
+    lit = [f for f, shows in zip(checked, shown, strict=True) if shows]
     dark = len(checked) - len(lit)
     if len(lit) < FEWEST_FRAMES:
         raise ReconstructionError(
@@ -84,6 +97,7 @@ def prepare(
     gaussians, radius_m, start = first_gaussians(
         lit, list(outlines.values()), sensor, config.start, config.light.sh_degree, rng
     )
+    gaussians = dataclasses.replace(gaussians, footprint=config.footprint)
     sky = {i: outline.sky for i, outline in outlines.items()} if config.loss.sky_weight else None
     setup = TrainingSetup(
         frames=lit,
@@ -93,12 +107,15 @@ def prepare(
         batches=Batches(lit, sensor.white_dn, sky),
         radius_m=radius_m,
         unit_m=camera_extent_m(lit) if config.length_unit == "cameras" else radius_m,
-        radiance_unit=full_scale_radiance(lit, sensor) if config.radiance_unit == "full_scale" else 1.0,
+        radiance_unit=sensor.full_scale_radiance(mean_exposure_s(lit))
+        if config.radiance_unit == "full_scale"
+        else 1.0,
         sun_span_deg=sun_span_deg(lit),
         start=start,
         budget=budget,
         reference_exposure_s=reference_exposure_s,
         dark_frames=dark,
+        tagged_exposures_s=[f.exposure_time_s for f, shows in zip(frames, shown, strict=True) if shows],
     )
     brackets = validation_brackets(lit)
     poses_decided = _decided_at_once(config, lit, brackets)
@@ -112,6 +129,10 @@ def prepare(
         poses_decided=poses_decided,
         appearance_reason="as configured" if config.light.sh_degree else "",
     )
+    if config.smoothing_px2:
+        state.smoothing_m = sampling_deviation_m(gaussians.means, lit, config.smoothing_px2)
+    if config.compensation:
+        state.compensation = Compensation(len(lit), lit[0].dn.shape[2])
     return setup, state
 
 

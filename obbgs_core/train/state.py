@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from obbgs_base.files import write_whole
 from obbgs_core.model.cameras import Cameras
@@ -20,9 +21,11 @@ from obbgs_core.render.shadows import ShadowMap
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.appearance import Shadows
 from obbgs_core.train.batches import FrameOrder
+from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.poses import PoseCorrections
 from obbgs_core.train.result import StepInfo
+from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
 FORMAT = 2  # of checkpoints; raise it when the fields of a class below change
@@ -74,6 +77,8 @@ class TrainingState:
     poses: PoseCorrections | None  # None: as tagged
     poses_decided: str  # whether the poses are refined, and why; empty: the validation brackets will decide
     appearance_reason: str  # why the radiance depends on what it does
+    smoothing_m: Tensor | None = None  # [N] deviations of the 3D filter; None: the method has none
+    compensation: Compensation | None = None  # None: the colours of all frames are the model's
     boxes: list[Obb] = field(default_factory=list)  # behind the worst tiles since the last growth inside them
     shadows: Shadows = field(default_factory=Shadows)
     chi2: float = math.nan  # running mean
@@ -82,6 +87,16 @@ class TrainingState:
     seconds: float = 0.0
     removed_not_finite: int = 0
     history: list[StepInfo] = field(default_factory=list)
+
+    @property
+    def model(self) -> Gaussians:
+        """The Gaussians as they are rendered; gradients reach those that are trained."""
+        return self.gaussians if self.smoothing_m is None else smoothed(self.gaussians, self.smoothing_m)
+
+    @property
+    def log_lowering(self) -> Tensor | None:
+        """The logarithm [N] of the factor by which the 3D filter lowers opacities."""
+        return None if self.smoothing_m is None else log_lowering(self.gaussians, self.smoothing_m)
 
     def __getstate__(self) -> dict:
         return vars(self) | {"rng": self.rng.get_state()}
@@ -134,6 +149,7 @@ SAVED = [
     Gaussians,
     Adam,
     Growth,
+    Compensation,
     FrameOrder,
     PoseCorrections,
     Whitening,

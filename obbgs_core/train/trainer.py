@@ -1,5 +1,6 @@
 """The training loop: frames, a sensor and a method in, Gaussians out. `Trainer.step` is one step of it."""
 
+import dataclasses
 import logging
 import math
 import time
@@ -12,6 +13,7 @@ from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.losses import fit_figures
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train import decisions
@@ -22,7 +24,7 @@ from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import outliers
 from obbgs_core.train.objective import image_loss, priors
 from obbgs_core.train.poses import pose_rate
-from obbgs_core.train.result import StepInfo, TrainResult
+from obbgs_core.train.result import Exposing, StepInfo, TrainResult
 from obbgs_core.train.setup import prepare
 from obbgs_core.train.state import TrainingState
 
@@ -109,12 +111,13 @@ class Trainer:
         """
         began = time.monotonic()
         setup, state, config = self.setup, self.state, self.setup.config
-        share, scale = state.steps_done / config.steps, config.image_scale(state.steps_done / config.steps)
-        drawn = state.order.draw(min(config.frames_per_step, len(setup.frames)), state.rng)
+        moment = config.moment(state.steps_done)
+        share, scale = moment.share, moment.image_scale
+        drawn = state.order.draw(min(moment.frames, len(setup.frames)), state.rng)
         batch = setup.batches.batch(drawn, scale)
         cameras = batch.cameras if state.poses is None else state.poses.cameras(batch)
         sunlit = state.shadows.sunlit(state.gaussians, cameras, state.steps_done)
-        rendered = render(state.gaussians, cameras, sunlit=sunlit)
+        rendered = self._compensated(render(state.model, cameras, sunlit=sunlit), batch)
         loss, residual = image_loss(rendered, batch, setup.sensor, config.loss)
         if not torch.isfinite(loss):
             raise Diverged(state.steps_done, loss.item())
@@ -126,15 +129,24 @@ class Trainer:
             decisions.observe(setup, state, rendered, batch, residual, share)
         self._descend(share)
         decisions.decide_poses(setup, state, share)
-        decisions.change_number(setup, state, share)
+        decisions.change_number(setup, state, batch, residual, moment)
         decisions.select_model(setup, state, scale)
         self._measure(rendered, batch)
         state.steps_done += 1
         state.seconds += time.monotonic() - began
         return self._recorded(loss.item())
 
+    def _compensated(self, rendered: Rendered, batch: Batch) -> Rendered:
+        """Return what was rendered in the colours of its frames, where the method learns those."""
+        compensation, sensor = self.state.compensation, self.setup.sensor
+        if compensation is None:
+            return rendered
+        full_scale = (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * batch.exposure_time_s)
+        radiance = compensation.applied(rendered.radiance, batch.indices, full_scale)
+        return dataclasses.replace(rendered, radiance=radiance)
+
     def _descend(self, share: float) -> None:
-        """Move the Gaussians and the poses down their gradients."""
+        """Move the Gaussians, the poses and the colours of the frames down their gradients."""
         state, config = self.state, self.setup.config
         freeze_later_degrees(state.gaussians, state.steps_done + 1, config.light)
         coefficients = state.gaussians.sh.shape[1]
@@ -143,6 +155,8 @@ class Trainer:
         state.gaussians.ambient.detach().clamp_(min=0)
         if state.poses is not None:
             state.poses.step(pose_rate(share, config.poses))
+        if state.compensation is not None:
+            state.compensation.step(share)
 
     def _measure(self, rendered: Rendered, batch: Batch) -> None:
         """Keep the running chi² on the target, and the PSNR of this step's frames."""
@@ -175,7 +189,7 @@ class Trainer:
         if state.seconds >= time_limit_s:
             untrained = ", before the first step: the model is its untrained start"
             return f"time limit of {time_limit_s:g} s" + (untrained if state.steps_done == 0 else "")
-        grown = state.steps_done >= config.growth.end * config.steps
+        grown = state.steps_done >= config.steps_until(config.growth.end)
         if config.chi2_end and state.chi2 <= config.chi2_end and grown:
             return f"residual chi² reached the noise ({state.chi2:.3f})"
         if state.steps_done >= config.steps:
@@ -187,7 +201,19 @@ class Trainer:
         """Whether growth and resets of opacities are over and the pictures have their full size for good."""
         config = self.setup.config
         last_change = max(config.growth.end, config.pyramid[-1][0])
-        return self.state.steps_done >= last_change * config.steps
+        return self.state.steps_done >= config.steps_until(last_change)
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The model as it stands, without gradients, with the 3D filter in its scales and opacities."""
+        return self.state.model.detach()
+
+    @property
+    def exposing(self) -> Exposing:
+        """What pictures of the model as it stands are made with."""
+        compensation, tagged_s = self.state.compensation, self.setup.tagged_exposures_s
+        maps = {} if compensation is None else compensation.by_exposure(tagged_s)
+        return Exposing(self.setup.reference_exposure_s, maps)
 
     def result(self, stop_reason: str) -> TrainResult:
         """Return the model as it stands, filtered as the method asks, and with its gauge fixed where poses moved.
@@ -197,7 +223,7 @@ class Trainer:
         """
         setup, state = self.setup, self.state
         decisions.drop_not_finite(state)
-        gaussians, removed = state.gaussians.detach(), 0
+        gaussians, removed = self.gaussians, 0
         if setup.config.outlier_filter:
             stray = outliers(gaussians)
             removed = int(stray.sum())
@@ -212,9 +238,9 @@ class Trainer:
             start=setup.start,
             budget=setup.budget,
             appearance=described(state.gaussians, state.appearance_reason),
-            growth=f"until step {min(state.steps_done, round(setup.config.growth.end * setup.config.steps))}",
+            growth=f"until step {min(state.steps_done, round(setup.config.steps_until(setup.config.growth.end)))}",
             poses=state.poses_decided or "as tagged (training ended before this was decided)",
-            reference_exposure_s=setup.reference_exposure_s,
+            exposing=self.exposing,
             sun_span_deg=setup.sun_span_deg,
             dark_frames=setup.dark_frames,
             removed_outliers=removed,
@@ -237,11 +263,17 @@ class Trainer:
 def _seconds_left(state: TrainingState, config: MethodConfig) -> float:
     """Return the time that the remaining steps will take: their work at the pace of the last steps."""
 
+    *coarse, (_, _, frames) = config.stages()
+    levels = [
+        *coarse,
+        *((round(config.steps_until(share)), scale, frames) for share, scale in config.pyramid),
+    ]
+
     def work(first: int, last: int) -> float:
-        starts = [round(start * config.steps) for start, _ in config.pyramid] + [config.steps]
+        ends = [*(start for start, _, _ in levels[1:]), config.steps]
         return sum(
-            max(0, min(last, until) - max(first, start)) * (FIXED_COST + scale**2)
-            for (_, scale), start, until in zip(config.pyramid, starts[:-1], starts[1:], strict=True)
+            max(0, min(last, until) - max(first, start)) * (FIXED_COST + scale**2) * frames
+            for (start, scale, frames), until in zip(levels, ends, strict=True)
         )
 
     before = state.history[-PACE_STEPS] if len(state.history) >= PACE_STEPS else None

@@ -18,6 +18,7 @@ from ground.session import SessionError
 from obbgs_core.frames import cameras_of
 from obbgs_core.io.ply import load_ply
 from obbgs_core.score.metrics import foreground_psnr_db, psnr_db
+from obbgs_core.train.result import Exposing
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
 QUICK = {"steps": 30, "start.count": 500, "growth.max_gaussians": 600, "light.sh_degree": 0}
@@ -73,7 +74,7 @@ def test_the_foreground_is_the_pixels_that_the_target_covers():
 def test_a_run_and_a_comparison_score_the_same(session):
     metrics = evaluate(session, "run")
     case = load_case(session)
-    image = imaging(load_ply(session / "runs/run/model.ply"), case.sensor, None)
+    image = imaging(load_ply(session / "runs/run/model.ply"), case.sensor, Exposing())
     figures = case.image_scores([image(cameras_of([f]), f.exposure_time_s) for f in case.held_out])
     figures.pop("psnr_noisy_db")  # a run's is from the tagged poses, a comparison's from the true ones
     assert {key: metrics[key] for key in figures} == pytest.approx(figures, abs=1e-4)

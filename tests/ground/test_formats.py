@@ -17,12 +17,13 @@ from hypothesis import strategies as st
 from flightsw.icd.frame import encode_frame
 from flightsw.icd.quaternion import quat_to_matrix
 from ground.formats.colmap import read_colmap
-from ground.formats.nerf import export_nerf, read_nerf, split_brackets
+from ground.formats.nerf import export_nerf, read_nerf, split_frames
 from ground.formats.nerfstudio import export_nerfstudio, read_nerfstudio
 from ground.formats.shirt import read_shirt
 from ground.formats.views import (
     FormatError,
     Intrinsics,
+    Values,
     opengl_to_world_to_camera,
     undistort,
     world_to_camera_to_opengl,
@@ -107,8 +108,8 @@ def nerf_folder(folder: Path, suffix: str = "") -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("suffix", ["", ".png"])
 def test_nerf_synthetic_becomes_a_session(tmp_path, suffix):
     poses = nerf_folder(tmp_path / "lego", suffix)
-    views, camera = read_nerf(tmp_path / "lego")
-    assert camera is None and write_session(views, tmp_path / "s", "lego") == 6
+    views, exported = read_nerf(tmp_path / "lego")
+    assert exported is None and write_session(views, tmp_path / "s", "lego") == 6
     session = open_session(tmp_path / "s")
     assert session.camera.fx_px == pytest.approx(12 / math.tan(0.6911112070083618 / 2))
     assert (session.camera.cx_px, session.camera.cy_px, session.camera.channels) == (12, 10, 3)
@@ -123,7 +124,7 @@ def test_nerf_synthetic_becomes_a_session(tmp_path, suffix):
 def test_srgb_is_undone_on_request(tmp_path):
     nerf_folder(tmp_path / "lego")
     views, _ = read_nerf(tmp_path / "lego")
-    write_session(views, tmp_path / "s", "lego", srgb=True)
+    write_session(views, tmp_path / "s", "lego", Values.DECODE)
     session = open_session(tmp_path / "s")
     rgba = imagecodecs.imread(views[0].image) / 255
     linear = np.where(rgba <= 0.04045, rgba / 12.92, ((rgba + 0.055) / 1.055) ** 2.4)[..., :3] * rgba[..., 3:]
@@ -134,8 +135,8 @@ def test_srgb_is_undone_on_request(tmp_path):
 def test_a_session_survives_export_and_import(tmp_path, session):
     counts = export_nerf(session, tmp_path / "nerf")
     assert counts == {"train": 6, "val": 3, "test": 3}
-    views, camera = read_nerf(tmp_path / "nerf")
-    write_session(views, tmp_path / "again", "nerf", camera=camera)
+    views, exported = read_nerf(tmp_path / "nerf")
+    write_session(views, tmp_path / "again", "nerf", exported=exported)
     again = open_session(tmp_path / "again")
     step_dn = (session.camera.white_dn - session.camera.black_dn) / 255
     for a, b in zip(session.frames, again.frames, strict=True):
@@ -157,7 +158,8 @@ def test_a_session_survives_export_and_import(tmp_path, session):
 
 
 def test_whole_brackets_go_to_one_split(session):
-    assert split_brackets(session) == {0: "train", 1: "val", 2: "train", 3: "test"}
+    by_bracket = {0: "train", 1: "val", 2: "train", 3: "test"}
+    assert split_frames(session) == {record.id: by_bracket[record.bracket] for record in session.frames}
 
 
 def test_what_we_export_is_what_a_plain_nerf_loader_expects(tmp_path, session):
@@ -364,7 +366,7 @@ def test_what_cannot_be_one_session_is_refused(tmp_path):
         write_session(views, tmp_path / "s", "lego")
     write_png(tmp_path / "lego/val/r_0.png", np.zeros((5, 5, 3), dtype=np.uint8))
     views, _ = read_nerf(tmp_path / "lego")
-    with pytest.raises(FormatError, match="one camera"):
+    with pytest.raises(FormatError, match="have one size"):
         write_session(views, tmp_path / "t", "lego")
     (tmp_path / "lego/val/r_0.png").write_bytes(b"no picture")
     with pytest.raises(FormatError, match="cannot be read"):

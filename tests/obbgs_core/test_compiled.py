@@ -97,8 +97,8 @@ def test_python_and_the_kernels_share_their_constants():
         "LOG2_MIN_ALPHA": math.log2(reference.MIN_ALPHA),
         "MAX_ALPHA": reference.MAX_ALPHA,
         "MIN_TRANSMITTANCE": reference.MIN_TRANSMITTANCE,
+        "MIN_PEAK_SHARE": projection.MIN_PEAK_SHARE,
         "MIN_DEPTH_ALPHA": reference.MIN_DEPTH_ALPHA,
-        "DILATION_PX2": projection.DILATION_PX2,
         "FOV_MARGIN": projection.FOV_MARGIN,
         "SOFTNESS": sh.SOFTNESS,
     }

@@ -199,6 +199,20 @@ def test_a_reset_of_the_opacities_forgets_their_moments(frames):
     assert (trainer.state.adam.second["means"] > 0).any()
 
 
+@pytest.mark.parametrize(("background", "reset"), [(0.0, False), (1.0, True)])
+def test_in_front_of_a_background_opacities_are_reset_where_growth_begins(frames, background, reset):
+    """white_background and iteration == densify_from_iter, in the authors' train.py."""
+    given = [replace(f, background=background) for f in frames]
+    trainer = Trainer(given, SENSOR, quick("3dgs", {"growth.begin": 0.1}))
+    for step in range(1, 8):
+        trainer.step()
+        first = trainer.state.adam.first["opacity_logits"]
+        assert first.any() != (reset and step == 6)
+    assert (
+        trainer.state.gaussians.opacities < 0.06
+    ).all() == reset  # a step at a rate of 0.05 after 0.01; 0.1 before
+
+
 def test_pixel_gs_counts_gradients_near_the_camera_less(frames):
     plain, scaled = (
         Trainer(

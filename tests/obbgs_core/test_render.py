@@ -52,16 +52,14 @@ def looking_at_origin(
     )
 
 
-def outputs_and_gradients(
-    gaussians: Gaussians, cameras: Cameras, backend: str, normals: bool = False, sunlit=None
-):
+def outputs_and_gradients(gaussians: Gaussians, cameras: Cameras, backend: str, sunlit=None):
     parameters = gaussians.parameters() if gaussians.shading == "lambert" else gaussians.tensors()
     leaves = {name: value.clone().requires_grad_() for name, value in parameters.items()}
     pose = cameras.world_to_camera.clone().requires_grad_()
     moved = dataclasses.replace(cameras, world_to_camera=pose)
-    out = render(dataclasses.replace(gaussians, **leaves), moved, backend, normals, sunlit)
+    out = render(dataclasses.replace(gaussians, **leaves), moved, backend, sunlit=sunlit)
     g = torch.Generator().manual_seed(5)
-    images = [out.radiance, out.alpha[..., None], out.depth[..., None]] + ([out.normals] if normals else [])
+    images = [out.radiance, out.alpha[..., None], out.depth[..., None]]
     loss = sum((i * torch.rand(i.shape, generator=g).to(i.dtype)).sum() for i in images)
     loss.backward()
     return out, {**{n: t.grad for n, t in leaves.items()}, "world_to_camera": pose.grad}
@@ -72,9 +70,9 @@ def outputs_and_gradients(
 @pytest.mark.parametrize(("channels", "width", "height"), [(1, 64, 64), (3, 75, 41)])
 def test_kernels_match_the_reference_in_values_and_gradients(kernel, channels, width, height):
     gaussians, cameras = random_gaussians(300, channels), looking_at_origin(2, width, height=height)
-    truth, truth_gradients = outputs_and_gradients(gaussians, cameras, "reference", normals=True)
-    ours, our_gradients = outputs_and_gradients(gaussians, cameras, f"native-{kernel}", normals=True)
-    for name in ("radiance", "alpha", "depth", "normals"):
+    truth, truth_gradients = outputs_and_gradients(gaussians, cameras, "reference")
+    ours, our_gradients = outputs_and_gradients(gaussians, cameras, f"native-{kernel}")
+    for name in ("radiance", "alpha", "depth"):
         # a contribution within rounding of the 1/255 cutoff may fall on either side: at most 4e-3 of a value there
         error = (getattr(ours, name) - getattr(truth, name)).abs()
         assert error.max() < 2e-2 and error.mean() < 1e-5, name
@@ -100,8 +98,8 @@ def test_native_gradients_match_the_reference_in_float64(sh_count, channels):
     double = Gaussians(**{name: value.double() for name, value in single.tensors().items()})
     cameras = looking_at_origin(3, 48)
     exact = Cameras(cameras.world_to_camera.double(), cameras.K.double(), 48, 48)
-    _, expected = outputs_and_gradients(double, exact, "reference", normals=True)
-    _, ours = outputs_and_gradients(single, cameras, "native", normals=True)
+    _, expected = outputs_and_gradients(double, exact, "reference")
+    _, ours = outputs_and_gradients(single, cameras, "native")
     for name, gradient in expected.items():
         torch.testing.assert_close(
             ours[name].double(), gradient, rtol=0, atol=2e-4 * float(gradient.abs().max()), msg=name
@@ -135,9 +133,9 @@ def test_under_the_sun_kernels_match_the_reference_in_float64(kernel, shading, s
         K=cameras.K.double(),
         sun_dir=cameras.sun_dir.double(),
     )
-    truth, expected = outputs_and_gradients(double, exact, "reference", True, sunlit)
-    ours, gradients = outputs_and_gradients(single, cameras, f"native-{kernel}", True, sunlit)
-    for name in ("radiance", "alpha", "depth", "normals"):
+    truth, expected = outputs_and_gradients(double, exact, "reference", sunlit)
+    ours, gradients = outputs_and_gradients(single, cameras, f"native-{kernel}", sunlit)
+    for name in ("radiance", "alpha", "depth"):
         # float32 rounding; one contribution on the 1/255 cutoff may fall on either side
         error = (getattr(ours, name).double() - getattr(truth, name)).abs()
         assert error.max() < 2e-2 and error.mean() < 1e-5, name
@@ -290,10 +288,10 @@ def test_gradients_of_projected_means_reach_the_model_as_in_the_reference():
 @needs_native
 def test_all_kernels_agree():
     gaussians, cameras = random_gaussians(500), looking_at_origin(2, 96)
-    truth, truth_gradients = outputs_and_gradients(gaussians, cameras, "native-portable", normals=True)
+    truth, truth_gradients = outputs_and_gradients(gaussians, cameras, "native-portable")
     for kernel in native_kernels():
-        out, gradients = outputs_and_gradients(gaussians, cameras, f"native-{kernel}", normals=True)
-        for name in ("radiance", "alpha", "depth", "median_depth", "normals"):
+        out, gradients = outputs_and_gradients(gaussians, cameras, f"native-{kernel}")
+        for name in ("radiance", "alpha", "depth", "median_depth"):
             assert (getattr(out, name) - getattr(truth, name)).abs().max() < 1e-5, (kernel, name)
         for name, expected in truth_gradients.items():
             assert (gradients[name] - expected).abs().max() < 1e-5 * expected.abs().max(), (kernel, name)
@@ -415,7 +413,7 @@ def test_order_of_gaussians_does_not_matter():
 @pytest.mark.parametrize("backend", ["reference", *(["native"] if native_kernels() else [])])
 def test_gaussians_behind_the_camera_or_not_finite_are_not_drawn_and_give_no_nan(backend):
     gaussians, cameras = random_gaussians(12), looking_at_origin(1, 32)
-    sound = outputs_and_gradients(gaussians.select(torch.arange(9, 12)), cameras, backend, normals=True)
+    sound = outputs_and_gradients(gaussians.select(torch.arange(9, 12)), cameras, backend)
     gaussians.means[0] = cameras.centres[0]
     gaussians.means[1] = 2 * cameras.centres[0]
     gaussians.means[2] = float("nan")
@@ -425,9 +423,9 @@ def test_gaussians_behind_the_camera_or_not_finite_are_not_drawn_and_give_no_nan
     gaussians.log_scales[6] = 200.0
     gaussians.opacity_logits[7] = float("nan")
     gaussians.sh[8, 1, 0] = float("nan")
-    out, gradients = outputs_and_gradients(gaussians, cameras, backend, normals=True)
+    out, gradients = outputs_and_gradients(gaussians, cameras, backend)
     assert (out.radii[0, :8] == 0).all() and (out.radii[0, 9:] > 0).all()
-    for name in ("radiance", "alpha", "depth", "median_depth", "normals"):
+    for name in ("radiance", "alpha", "depth", "median_depth"):
         torch.testing.assert_close(getattr(out, name), getattr(sound[0], name), msg=name)
     for name, gradient in gradients.items():
         expected = sound[1][name]

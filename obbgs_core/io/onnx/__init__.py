@@ -20,6 +20,8 @@ from obbgs_core.io.onnx.composite import composite
 from obbgs_core.io.onnx.graph import Graph
 from obbgs_core.io.onnx.projection import camera_view, project
 from obbgs_core.io.onnx.radiance import radiance_towards
+from obbgs_core.model.cameras import DEFAULT_PSF_SIGMA_PX
+from obbgs_core.model.footprint import variance_px2
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.reference import MIN_DEPTH_ALPHA
 from obbgs_core.sensor import Sensor
@@ -44,6 +46,8 @@ def export_onnx(
     width: int,
     height: int,
     exposures_s: Sequence[float],
+    psf_sigma_px: float = DEFAULT_PSF_SIGMA_PX,
+    background: float = 0.0,
 ) -> Exported:
     """Write the renderer; the file appears whole or not at all.
 
@@ -56,12 +60,15 @@ def export_onnx(
         width: of the rendered image, px.
         height: the same.
         exposures_s: the exposure times of the training frames; their range goes into the metadata.
+        psf_sigma_px: the point spread of the optics that are rendered, as in `Cameras`.
+        background: radiance of what is seen where no Gaussian is.
 
     Raises:
         ExportError: the model is empty, not finite or too large for an ONNX file, or there is no exposure time.
     """
     _check(gaussians, exposures_s)
-    graph = _graph(gaussians, sensor, width, height)
+    footprint = float(variance_px2(gaussians.footprint, psf_sigma_px))
+    graph = _graph(gaussians, sensor, width, height, footprint, background)
     size_bytes = sum(len(constant.raw_data) for constant in graph.constants)
     if size_bytes > MAX_PROTOBUF_BYTES:
         raise ExportError(
@@ -75,6 +82,8 @@ def export_onnx(
         "width": width,
         "height": height,
         "gaussians": len(gaussians),
+        "footprint": gaussians.footprint,
+        "psf_sigma_px": psf_sigma_px,
         "exposure_min_s": min(exposures_s),
         "exposure_max_s": max(exposures_s),
         "format": FORMAT_VERSION,
@@ -96,10 +105,12 @@ def _check(gaussians: Gaussians, exposures_s: Sequence[float]) -> None:
             raise ExportError(f"{name} holds values that are not finite")
 
 
-def _graph(gaussians: Gaussians, sensor: Sensor, width: int, height: int) -> Graph:
+def _graph(
+    gaussians: Gaussians, sensor: Sensor, width: int, height: int, footprint_px2: float, background: float
+) -> Graph:
     """Return the nodes from the inputs to the outputs."""
     graph = Graph()
-    camera = camera_view(graph, width, height)
+    camera = camera_view(graph, width, height, footprint_px2)
     projected = project(graph, gaussians, camera)
     radiance = radiance_towards(graph, gaussians, camera)
     channels = gaussians.sh.shape[2]
@@ -107,16 +118,18 @@ def _graph(gaussians: Gaussians, sensor: Sensor, width: int, height: int) -> Gra
     depth = graph.op("Unsqueeze", projected.depth, graph.ints(1))
     features = graph.op("Concat", radiance, depth, ones, axis=1)
     composed = composite(graph, projected, features, channels + 2, camera)
-    _name_outputs(graph, composed, channels, sensor)
+    _name_outputs(graph, composed, channels, sensor, background)
     return graph
 
 
-def _name_outputs(g: Graph, composed: str, channels: int, sensor: Sensor) -> None:
+def _name_outputs(g: Graph, composed: str, channels: int, sensor: Sensor, background: float) -> None:
     """Turn the composited features [channels + 2, H, W] into the outputs; here the exposure time is applied."""
     parts = []
     for start, end in ((0, channels), (channels, channels + 1), (channels + 1, channels + 2)):
         parts.append(g.op("Slice", composed, g.ints(start), g.ints(end), g.ints(0)))
     radiance, depth_sum, alpha = parts
+    if background:
+        radiance = g.op("Add", radiance, g.op("Mul", g.op("Sub", 1.0, alpha), background))
     radiance = g.op("Transpose", radiance, perm=[1, 2, 0])
     signal = g.op("Mul", radiance, g.op("Mul", "exposure_time_s", sensor.dn_per_radiance_s))
     g.op("Clip", g.op("Div", g.op("Add", signal, sensor.black_dn), sensor.white_dn), 0.0, 1.0, name="image")

@@ -39,7 +39,7 @@ def composite(
     # the first tile is always composited, so that the loop is never empty
     active = g.op("Concat", g.value(np.zeros((2, 1), dtype=np.int64)), active, axis=1)
     tile_y, tile_x = (g.op("Gather", active, np.array(i, dtype=np.int64), axis=0) for i in range(2))
-    body = _tile_body(splats, features, in_rows, in_columns, channels, median)
+    body = _tile_body(splats, features, in_rows, in_columns, channels, projected.peak_lowered, median)
     tiles = g.op("Scan", tile_y, tile_x, body=body, num_scan_inputs=2)  # [A, channels, TILE²]
     index = g.op("Unsqueeze", g.op("Add", g.op("Mul", tile_y, g.ints(tiles_x)), tile_x), g.ints(1))
     background = np.zeros((tiles_y * tiles_x, channels, TILE * TILE), dtype=np.float32)
@@ -59,7 +59,13 @@ def _tiles_reached(g: Graph, centre: str, extent: str, order: str, tiles: int) -
 
 
 def _tile_body(
-    splats: str, features: str, in_rows: str, in_columns: str, channels: int, median: bool
+    splats: str,
+    features: str,
+    in_rows: str,
+    in_columns: str,
+    channels: int,
+    peak_lowered: bool,
+    median: bool,
 ) -> onnx.GraphProto:
     """Return the loop's body: the Gaussians that reach one tile, sorted by depth, composited front to back."""
     b = Graph("tile_")
@@ -68,9 +74,13 @@ def _tile_body(
         for mask, tile in ((in_rows, "tile_row"), (in_columns, "tile_column"))
     )
     chosen = b.op("Squeeze", b.op("NonZero", b.op("And", in_row, in_column)), b.ints(0))  # [M]
-    log_alpha = _log_alpha(b, b.op("Gather", splats, chosen, axis=0))
-    alpha = b.op("Exp", b.op("Min", log_alpha, math.log(MAX_ALPHA)))  # [M, TILE²]
-    alpha = b.op("ThresholdedRelu", alpha, alpha=MIN_ALPHA)
+    columns = b.split(b.op("Gather", splats, chosen, axis=0), 2, 4, 1, *([1] if peak_lowered else []))
+    log_alpha = _log_alpha(b, *columns[:3])
+    if not peak_lowered:
+        log_alpha = b.op("Min", log_alpha, math.log(MAX_ALPHA))
+    alpha = b.op("ThresholdedRelu", b.op("Exp", log_alpha), alpha=MIN_ALPHA)  # [M, TILE²]
+    if peak_lowered:  # afterwards, because the cutoff is lowered with the peak
+        alpha = b.op("Min", b.op("Mul", alpha, columns[3]), MAX_ALPHA)
     before = b.op("CumSum", b.op("Log", b.op("Sub", 1.0, alpha)), np.array(0, dtype=np.int64), exclusive=1)
     before = b.op("Exp", before)  # the transmittance in front of each Gaussian
     weight = b.op("Mul", alpha, before)
@@ -91,9 +101,12 @@ def _tile_body(
     )
 
 
-def _log_alpha(b: Graph, splats: str) -> str:
-    """Return the logarithm of alpha [M, TILE²], before its clamp, of splats [M, 7] in the tile's pixels."""
-    mean, root, log_opacity = b.split(splats, 2, 4, 1)
+def _log_alpha(b: Graph, mean: str, root: str, log_opacity: str) -> str:
+    """Return the logarithm of alpha [M, TILE²], before its clamp, in the tile's pixels.
+
+    Args:
+        mean: [M, 2]; root: [M, 4] of the conic; log_opacity: [M, 1].
+    """
     tile = b.op("Concat", *(b.op("Unsqueeze", n, b.ints(0)) for n in ("tile_column", "tile_row")), axis=0)
     middle = b.op("Add", b.op("Mul", b.op("Cast", tile, to=TensorProto.FLOAT), float(TILE)), TILE / 2)
     # two linear forms of the pixel's place, measured from the tile's middle; the exponent is the sum of their squares

@@ -6,8 +6,9 @@ import numpy as np
 
 from obbgs_core.io.onnx.graph import Graph, to_numpy
 from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.footprint import lowers_peak
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.render.projection import DILATION_PX2, FOV_MARGIN
+from obbgs_core.render.projection import FOV_MARGIN, MIN_PEAK_SHARE
 from obbgs_core.render.reference import MIN_ALPHA
 
 NOT_REACHED_PX = (
@@ -27,6 +28,7 @@ class View:
     cy: str
     width: int
     height: int
+    footprint_px2: float  # added to both axes of every projected Gaussian
 
 
 @dataclass(frozen=True)
@@ -36,17 +38,20 @@ class Projected:
     depth: str  # [N] m
     centres: list[str]  # x and y, [N] px
     extents: list[str]  # half width and half height of the bounding box, [N] px; negative if not drawn
-    splats: str  # [N, 7]: centre, square root of the conic (2 x 2), logarithm of the opacity
+    # [N, 7]: centre, square root of the conic (2 x 2), logarithm of the opacity; and where peaks are lowered an eighth
+    # column, the share of the opacity that is left
+    splats: str
+    peak_lowered: bool
     depth_axes: str  # [N, 3] m: change of depth along each axis of the Gaussian, over one sigma
 
 
-def camera_view(g: Graph, width: int, height: int) -> View:
+def camera_view(g: Graph, width: int, height: int, footprint_px2: float) -> View:
     """Return the camera that the inputs world_to_camera and K describe."""
     pose = "world_to_camera"
     R = g.op("Slice", pose, g.ints(0, 0), g.ints(3, 3), g.ints(0, 1))
     t = g.op("Reshape", g.op("Slice", pose, g.ints(0, 3), g.ints(3, 4), g.ints(0, 1)), g.ints(1, 3))
     fx, fy, cx, cy = (_intrinsic(g, row, column) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return View(R, t, fx, fy, cx, cy, width, height)
+    return View(R, t, fx, fy, cx, cy, width, height, footprint_px2)
 
 
 def _intrinsic(g: Graph, row: int, column: int) -> str:
@@ -73,8 +78,9 @@ def project(g: Graph, gaussians: Gaussians, view: View) -> Projected:
         scale = g.op("Unsqueeze", g.op("Div", f, z), g.ints(1))
         slope = g.op("Unsqueeze", tangent, g.ints(1))
         M.append(g.op("Mul", scale, g.op("Sub", row, g.op("Mul", slope, rows[2]))))
-    extents, splats = _ellipses(g, gaussians, M, in_front, mean_x, mean_y)
-    return Projected(pz, [mean_x, mean_y], extents, splats, depth_axes=rows[2])
+    extents, splats = _ellipses(g, gaussians, M, in_front, mean_x, mean_y, view.footprint_px2)
+    peak_lowered = lowers_peak(gaussians.footprint)
+    return Projected(pz, [mean_x, mean_y], extents, splats, peak_lowered, depth_axes=rows[2])
 
 
 def _clamped(g: Graph, tangent: str, focal: str, centre: str, size: int) -> str:
@@ -85,17 +91,23 @@ def _clamped(g: Graph, tangent: str, focal: str, centre: str, size: int) -> str:
 
 
 def _ellipses(
-    g: Graph, gaussians: Gaussians, M: list[str], in_front: str, mean_x: str, mean_y: str
+    g: Graph,
+    gaussians: Gaussians,
+    M: list[str],
+    in_front: str,
+    mean_x: str,
+    mean_y: str,
+    footprint_px2: float,
 ) -> tuple[list[str], str]:
-    """Return `Projected.extents` and `Projected.splats` from the two rows [N, 3] of M; the covariance is M Mᵀ + dI."""
+    """Return `Projected.extents` and `Projected.splats` from the two rows [N, 3] of M; the covariance is M Mᵀ + fI."""
     last = g.ints(1)
-    xx = g.op("Add", g.op("ReduceSum", g.op("Mul", M[0], M[0]), last, keepdims=0), DILATION_PX2)
+    xx = g.op("Add", g.op("ReduceSum", g.op("Mul", M[0], M[0]), last, keepdims=0), footprint_px2)
     xy = g.op("ReduceSum", g.op("Mul", M[0], M[1]), last, keepdims=0)
-    yy = g.op("Add", g.op("ReduceSum", g.op("Mul", M[1], M[1]), last, keepdims=0), DILATION_PX2)
+    yy = g.op("Add", g.op("ReduceSum", g.op("Mul", M[1], M[1]), last, keepdims=0), footprint_px2)
     # its determinant as a sum of squares: xx·yy - xy² would cancel for long thin Gaussians
     squared_cross = g.op("ReduceSumSquare", cross_product(g, M[0], M[1], axis=1), last, keepdims=0)
-    dilated = g.op("Mul", g.op("Sub", g.op("Add", xx, yy), DILATION_PX2), DILATION_PX2)
-    determinant = g.op("Add", squared_cross, dilated)
+    widened = g.op("Mul", g.op("Sub", g.op("Add", xx, yy), footprint_px2), footprint_px2)
+    determinant = g.op("Add", squared_cross, widened)
     opacities = np.maximum(
         to_numpy(gaussians.opacities), np.float32(1e-12)
     )  # so that the logarithm is finite
@@ -106,6 +118,10 @@ def _ellipses(
     drawn = g.op("And", in_front, g.value(opacities >= MIN_ALPHA))
     # a Gaussian too large for float32 is not drawn, as in `render`
     drawn = g.op("And", drawn, g.op("LessOrEqual", determinant, float(np.finfo(np.float32).max)))
+    share = None
+    if lowers_peak(gaussians.footprint):
+        share = g.op("Sqrt", g.op("Div", squared_cross, determinant))
+        drawn = g.op("And", drawn, g.op("GreaterOrEqual", share, MIN_PEAK_SHARE))
     squared_radius = g.op("Where", drawn, squared_radius, 0.0)
     nothing = g.op("Where", drawn, 0.0, NOT_REACHED_PX)
     extent_x = g.op("Sub", g.op("Sqrt", g.op("Mul", squared_radius, xx)), nothing)
@@ -114,7 +130,8 @@ def _ellipses(
     a = g.op("Sqrt", g.op("Div", yy, determinant))
     b = g.op("Neg", g.op("Mul", a, g.op("Div", xy, yy)))
     c = g.op("Reciprocal", g.op("Sqrt", yy))
-    columns = (mean_x, mean_y, a, b, g.op("Mul", c, 0.0), c, np.log(opacities))
+    columns = [mean_x, mean_y, a, b, g.op("Mul", c, 0.0), c, np.log(opacities)]
+    columns += [] if share is None else [share]
     splats = g.op("Concat", *(g.op("Unsqueeze", column, last) for column in columns), axis=1)
     return [extent_x, extent_y], splats
 

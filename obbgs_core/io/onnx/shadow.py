@@ -6,12 +6,14 @@ from onnx import TensorProto
 from obbgs_core.io.onnx.composite import composite
 from obbgs_core.io.onnx.graph import Graph, to_numpy
 from obbgs_core.io.onnx.projection import View, cross_product, project
+from obbgs_core.model.footprint import variance_px2
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.shadows import (
     DARK_FROM,
     LIT_UNTIL,
     SHADOW_MAP_PX,
     SHADOW_MARGIN_PX,
+    SHADOW_PSF_SIGMA_PX,
     SUN_DISTANCE,
     bounding_ball,
 )
@@ -62,7 +64,8 @@ def _sun_view(g: Graph, gaussians: Gaussians) -> View:
     t = g.op("Reshape", g.op("Neg", g.op("MatMul", R, place)), g.ints(1, 3))
     half_px = SHADOW_MAP_PX / 2
     focal, middle = (g.value(np.array([v], dtype=np.float32)) for v in (half_px * SUN_DISTANCE, half_px))
-    return View(R, t, focal, focal, middle, middle, SHADOW_MAP_PX, SHADOW_MAP_PX)
+    footprint = float(variance_px2(gaussians.footprint, SHADOW_PSF_SIGMA_PX))
+    return View(R, t, focal, focal, middle, middle, SHADOW_MAP_PX, SHADOW_MAP_PX, footprint)
 
 
 def _spline_weights(g: Graph, place: str, axis: int) -> str:

@@ -70,8 +70,10 @@ class Rasterization {
  public:
   Rasterization(const std::string& kernel, int width, int height, float near_m, Array means, Array quats,
                 Array log_scales, Array opacity_logits, Array sh, Array world_to_camera, Array K,
-                std::optional<Array> sun_dir, std::optional<Array> sunlit, float ambient)
-      : kernel_(kernel_called(kernel)), arrays_{means, quats, log_scales, opacity_logits, sh, world_to_camera, K} {
+                std::optional<Array> sun_dir, std::optional<Array> sunlit, float ambient, Array footprint_px2,
+                bool peak_lowered)
+      : kernel_(kernel_called(kernel)),
+        arrays_{means, quats, log_scales, opacity_logits, sh, world_to_camera, K, footprint_px2} {
     if (sun_dir) arrays_.push_back(*sun_dir);
     if (sunlit) arrays_.push_back(*sunlit);
     const size_t n = opacity_logits.size(), cameras = world_to_camera.size() / 16;
@@ -91,7 +93,6 @@ class Rasterization {
               width,
               height,
               near_m,
-              false,
               data_of(means, "means", 3 * n),
               data_of(quats, "quats", 4 * n),
               data_of(log_scales, "log_scales", 3 * n),
@@ -101,14 +102,14 @@ class Rasterization {
               data_of(K, "K", 9 * cameras),
               sun_dir ? data_of(*sun_dir, "sun_dir", 3 * cameras) : nullptr,
               sunlit ? data_of(*sunlit, "sunlit", n * cameras) : nullptr,
-              ambient};
+              ambient,
+              data_of(footprint_px2, "footprint_px2", cameras),
+              peak_lowered};
   }
 
-  void forward(int threads, Array radiance, Array alpha, Array depth, Array median_depth, std::optional<Array> normals,
-               Array means2d, Array radii) {
-    scene_.normals = normals.has_value();
+  void forward(int threads, Array radiance, Array alpha, Array depth, Array median_depth, Array means2d, Array radii) {
     const size_t splats = size_t(scene_.cameras) * scene_.gaussians;
-    const obbgs::Images images = images_of(radiance, alpha, depth, median_depth, normals);
+    const obbgs::Images images = images_of(radiance, alpha, depth, median_depth);
     float *to_means2d = data_of(means2d, "means2d", 2 * splats), *to_radii = data_of(radii, "radii", splats);
     nb::gil_scoped_release release;
     kernel_.project(scene_, frame_, to_means2d, to_radii, threads);
@@ -116,17 +117,16 @@ class Rasterization {
     kernel_.composite(scene_, frame_, images, threads);
   }
 
-  void backward(int threads, Array radiance, Array depth, std::optional<Array> normals,
-                std::optional<Strided> grad_radiance, std::optional<Strided> grad_alpha,
-                std::optional<Strided> grad_depth, std::optional<Strided> grad_normals,
-                std::optional<Array> grad_means2d, Array means, Array quats, Array log_scales, Array opacity_logits,
-                Array sh, Array world_to_camera, Array ambient, Array screen_means2d, Array pixels) const {
+  void backward(int threads, Array radiance, Array depth, std::optional<Strided> grad_radiance,
+                std::optional<Strided> grad_alpha, std::optional<Strided> grad_depth, std::optional<Array> grad_means2d,
+                Array means, Array quats, Array log_scales, Array opacity_logits, Array sh, Array world_to_camera,
+                Array ambient, Array footprint_px2, Array screen_means2d, Array pixels) const {
     const obbgs::Scene& s = scene_;
     if (!frame_.tile_begin.size()) throw std::logic_error("backward before forward");
     const size_t n = s.gaussians, splats = n * s.cameras;
-    const obbgs::Images images = images_of(radiance, depth, depth, depth, normals);
+    const obbgs::Images images = images_of(radiance, depth, depth, depth);
     const obbgs::ImageGradients g{gradient_of(grad_radiance, s.channels), gradient_of(grad_alpha, 0),
-                                  gradient_of(grad_depth, 0), gradient_of(grad_normals, 3)};
+                                  gradient_of(grad_depth, 0)};
     const obbgs::SceneGradients out{grad_means2d ? data_of(*grad_means2d, "grad_means2d", 2 * splats) : nullptr,
                                     data_of(means, "means", 3 * n),
                                     data_of(quats, "quats", 4 * n),
@@ -135,6 +135,7 @@ class Rasterization {
                                     data_of(sh, "sh", n * s.sh_count * s.channels),
                                     data_of(world_to_camera, "world_to_camera", 16 * size_t(s.cameras)),
                                     data_of(ambient, "ambient", 1),
+                                    data_of(footprint_px2, "footprint_px2", s.cameras),
                                     data_of(screen_means2d, "screen_means2d", 2 * splats),
                                     data_of(pixels, "pixels", splats)};
     nb::gil_scoped_release release;
@@ -156,13 +157,11 @@ class Rasterization {
   }
 
  private:
-  obbgs::Images images_of(const Array& radiance, const Array& alpha, const Array& depth, const Array& median_depth,
-                          const std::optional<Array>& normals) const {
+  obbgs::Images images_of(const Array& radiance, const Array& alpha, const Array& depth,
+                          const Array& median_depth) const {
     const size_t pixels = size_t(scene_.cameras) * scene_.width * scene_.height;
-    if (normals.has_value() != scene_.normals) throw std::invalid_argument("normals: as in the forward pass");
     return {data_of(radiance, "radiance", pixels * scene_.channels), data_of(alpha, "alpha", pixels),
-            data_of(depth, "depth", pixels), data_of(median_depth, "median_depth", pixels),
-            normals ? data_of(*normals, "normals", 3 * pixels) : nullptr};
+            data_of(depth, "depth", pixels), data_of(median_depth, "median_depth", pixels)};
   }
 
   // A gradient of shape [cameras, height, width] or, with channels, [cameras, height, width, channels]; any strides.
@@ -195,8 +194,8 @@ NB_MODULE(_rasterizer, m) {
   m.attr("LOG2_MIN_ALPHA") = obbgs::kLog2MinAlpha;
   m.attr("MAX_ALPHA") = obbgs::kMaxAlpha;
   m.attr("MIN_TRANSMITTANCE") = obbgs::kMinTransmittance;
+  m.attr("MIN_PEAK_SHARE") = obbgs::kMinPeakShare;
   m.attr("MIN_DEPTH_ALPHA") = obbgs::kMinDepthAlpha;
-  m.attr("DILATION_PX2") = obbgs::kDilation;
   m.attr("FOV_MARGIN") = obbgs::kFovMargin;
   m.attr("SOFTNESS") = obbgs::kSoftness;
   m.def("kernels", [] {
@@ -210,18 +209,18 @@ NB_MODULE(_rasterizer, m) {
   obbgs::use_row_loops(*available_kernels().front().row_loops);
   nb::class_<Rasterization>(m, "Rasterization")
       .def(nb::init<const std::string&, int, int, float, Array, Array, Array, Array, Array, Array, Array,
-                    std::optional<Array>, std::optional<Array>, float>(),
+                    std::optional<Array>, std::optional<Array>, float, Array, bool>(),
            nb::arg("kernel"), nb::arg("width"), nb::arg("height"), nb::arg("near_m"), nb::arg("means"),
            nb::arg("quats"), nb::arg("log_scales"), nb::arg("opacity_logits"), nb::arg("sh"),
            nb::arg("world_to_camera"), nb::arg("K"), nb::arg("sun_dir").none(), nb::arg("sunlit").none(),
-           nb::arg("ambient"))
+           nb::arg("ambient"), nb::arg("footprint_px2"), nb::arg("peak_lowered"))
       .def("forward", &Rasterization::forward, nb::arg("threads"), nb::arg("radiance"), nb::arg("alpha"),
-           nb::arg("depth"), nb::arg("median_depth"), nb::arg("normals").none(), nb::arg("means2d"), nb::arg("radii"))
+           nb::arg("depth"), nb::arg("median_depth"), nb::arg("means2d"), nb::arg("radii"))
       .def("backward", &Rasterization::backward, nb::arg("threads"), nb::arg("radiance"), nb::arg("depth"),
-           nb::arg("normals").none(), nb::arg("grad_radiance").none(), nb::arg("grad_alpha").none(),
-           nb::arg("grad_depth").none(), nb::arg("grad_normals").none(), nb::arg("grad_means2d").none(),
-           nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("opacity_logits"), nb::arg("sh"),
-           nb::arg("world_to_camera"), nb::arg("ambient"), nb::arg("screen_means2d"), nb::arg("pixels"))
+           nb::arg("grad_radiance").none(), nb::arg("grad_alpha").none(), nb::arg("grad_depth").none(),
+           nb::arg("grad_means2d").none(), nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"),
+           nb::arg("opacity_logits"), nb::arg("sh"), nb::arg("world_to_camera"), nb::arg("ambient"),
+           nb::arg("footprint_px2"), nb::arg("screen_means2d"), nb::arg("pixels"))
       .def_prop_ro("pairs", &Rasterization::pairs)
       .def_prop_ro("bytes", &Rasterization::bytes);
   bind_training(m);

@@ -42,14 +42,13 @@ void sort_by_depth(Buffer<DepthKey>& keys, size_t count) {
 // Returns a place in the image, px, rounded down; places far outside, which int could not hold, are moved closer.
 inline int pixel(float place) { return int(std::min(std::max(0.0f, place), 1e6f)); }
 
-// Appends a pair for each tile where the splat's ellipse alpha >= kMinAlpha reaches a pixel centre. A block is marked
+// Appends a pair for each tile where the splat's ellipse reaches a pixel centre. A block is marked
 // where the ellipse meets the square of its outermost pixel centres; sixteen rows of blocks, two tiles, are computed at
 // a time.
 void find_pairs(const Scene& s, const Splat& splat, uint32_t index, std::vector<Found>& found) {
   const int blocks_y = (s.height + kBlock - 1) / kBlock, tiles_x = s.tiles_x();
   const uint32_t first_tile = index / uint32_t(s.gaussians) * uint32_t(tiles_x * s.tiles_y());
-  const float q = std::max(splat.level - kLog2MinAlpha, 0.0f),
-              root = std::sqrt(q);  // u^2 + v^2 <= q where alpha >= kMinAlpha
+  const float q = splat.reach, root = std::sqrt(q);
   const float tilt = splat.k2 / splat.k3, stretch = std::sqrt(1 + tilt * tilt);
   const float narrow = 1 / splat.k1, widest = root * narrow * stretch, tallest = root / splat.k3;
   const float slack =

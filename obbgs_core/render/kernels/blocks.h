@@ -55,9 +55,9 @@ struct Grid {
 
 // What of a splat is constant over the blocks of a tile; u0 and v0 belong to the block at the tile's corner.
 struct Brush {
-  vf k1, k2, k3, level, u0, v0;
+  vf k1, k2, k3, level, cutoff, u0, v0;
   OBBGS_INLINE Brush(const Splat& s, const Tile& tile, const Grid& grid)
-      : k1(s.k1), k2(s.k2), k3(s.k3), level(s.level) {
+      : k1(s.k1), k2(s.k2), k3(s.k3), level(s.level), cutoff(s.cutoff) {
     const float x = s.x - float(tile.x0), y = s.y - float(tile.y0);
     u0 = fma(k1, grid.lane_x - x, k2 * (grid.lane_y - y));
     v0 = k3 * (grid.lane_y - y);
@@ -74,7 +74,7 @@ OBBGS_INLINE Touch touch(const Brush& b, const Grid& grid, int k, vf T) {
   const vf u = fma(b.k1, grid.block_x[k], fma(b.k2, grid.block_y[k], b.u0));
   const vf v = fma(b.k3, grid.block_y[k], b.v0);
   const vf alpha = exp2_unbounded(minus_fma(u, u, minus_fma(v, v, b.level)));
-  mask on = (vf(kMinAlpha) <= alpha) & (vf(0.0f) < T);
+  mask on = (b.cutoff <= alpha) & (vf(0.0f) < T);
   vf weight = zero_unless(on, smaller(alpha, kMaxAlpha) * T), after = T - weight;
   const mask stop = on & (after < vf(kMinTransmittance));
   if (__builtin_expect(any(stop), 0)) {  // these pixels end here, before this splat
@@ -94,10 +94,8 @@ OBBGS_INLINE Touch touch(const Brush& b, const Grid& grid, int k, vf T) {
   switch (10 * scene.channels + count) {                                                  \
     case 11: run(work<1, 1>); break;                                                      \
     case 12: run(work<1, 2>); break;                                                      \
-    case 15: run(work<1, 5>); break;                                                      \
     case 33: run(work<3, 3>); break;                                                      \
-    case 34: run(work<3, 4>); break;                                                      \
-    default: run(work<3, 7>); break;                                                      \
+    default: run(work<3, 4>); break;                                                      \
   }
 
 }  // namespace

@@ -14,8 +14,6 @@ void composite_tile(const Scene& s, Frame& frame, const Images& out, const Grid&
       frame.transmittance[pixel] = 1.0f;
       out.alpha[pixel] = out.depth[pixel] = out.median_depth[pixel] = 0.0f;
       for (int f = 0; f < C; ++f) out.radiance[pixel * C + f] = 0.0f;
-      if (out.normals)
-        for (int f = 0; f < 3; ++f) out.normals[pixel * 3 + f] = 0.0f;
     });
     return;
   }
@@ -56,8 +54,6 @@ void composite_tile(const Scene& s, Frame& frame, const Images& out, const Grid&
     for (int f = 0; f < C; ++f) out.radiance[pixel * C + f] = value(f);
     out.depth[pixel] = alpha > kMinDepthAlpha ? value(C) / alpha : 0.0f;
     out.median_depth[pixel] = median[k][lane];
-    if (out.normals)
-      for (int f = 0; f < 3; ++f) out.normals[pixel * 3 + f] = value(C + 1 + f);
   });
 }
 
@@ -66,7 +62,7 @@ void composite_tile(const Scene& s, Frame& frame, const Images& out, const Grid&
 void composite(const Scene& s, Frame& frame, const Images& out, int threads) {
   const Grid grid;
   frame.transmittance.resize(size_t(s.cameras) * s.width * s.height);
-  OBBGS_FOR_TILES(s, s.features(), composite_tile, threads, s, frame, out, grid)
+  OBBGS_FOR_TILES(s, s.channels + 1, composite_tile, threads, s, frame, out, grid)
 }
 
 }  // namespace KERNEL

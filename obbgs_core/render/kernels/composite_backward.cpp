@@ -61,10 +61,6 @@ OBBGS_INLINE void load_gradients(const Scene& s, const Frame& frame, const Image
       add(C, grad_depth, depth * alpha);
       grad_alpha -= grad_depth * depth;
     }
-    for (int f = C + 1; f < F; ++f) {
-      const int axis = f - C - 1;
-      add(f, g.normals.at(tile.camera, y, x, axis), out.normals[pixel * 3 + axis]);
-    }
     T[k][lane] = 1.0f;
     behind[k][lane] = total - grad_alpha * transmittance;
   });

@@ -28,7 +28,8 @@ OBBGS_INLINE void write_means(const Group& group, const Projection& p, vf mx, vf
 OBBGS_INLINE uint32_t write_splats(const Scene& s, const Group& group, const Model& model, const Camera& camera,
                                    const Projection& p, vf mx, vf my, uint32_t first_splat, Splat* splats,
                                    DepthKey* keys) {
-  const vf level = log2(model.opacity), reach = sqrt(larger(level - kLog2MinAlpha, 0.0f)) * (kReachMargin / kHalfLog2E);
+  const vf level = log2(model.opacity), squared = larger(level - kLog2MinAlpha, 0.0f);
+  const vf reach = sqrt(squared) * (kReachMargin / kHalfLog2E);
   const vf reach_x = reach * sqrt(p.xx), reach_y = reach * sqrt(p.yy);
   const mask in_x = (vf(0.0f) <= mx + reach_x) & (mx - reach_x <= vf(float(s.width)));
   const mask in_y = (vf(0.0f) <= my + reach_y) & (my - reach_y <= vf(float(s.height)));
@@ -44,9 +45,8 @@ OBBGS_INLINE uint32_t write_splats(const Scene& s, const Group& group, const Mod
     valid = valid & finite(feature[f]);
   }
   feature[s.channels] = p.p[2];
-  if (s.normals)
-    for (int i = 0; i < 3; ++i) feature[s.channels + 1 + i] = shading.normal[i] * shading.facing;
-  const vf flags = zero_unless(valid, 1.0f);
+  const vf flags = zero_unless(valid, 1.0f), cutoff = p.share * kMinAlpha;
+  const vf lowered = s.peak_lowered ? level + log2(p.share) : level;
   uint32_t count = 0;
   for (int l = 0; l < group.size; ++l) {
     if (flags[l] == 0.0f) continue;
@@ -56,8 +56,10 @@ OBBGS_INLINE uint32_t write_splats(const Scene& s, const Group& group, const Mod
     splat.k1 = k1[l];
     splat.k2 = k2[l];
     splat.k3 = k3[l];
-    splat.level = level[l];
-    for (int f = 0; f < s.features(); ++f) splat.feature[f] = feature[f][l];
+    splat.level = lowered[l];
+    splat.cutoff = cutoff[l];
+    splat.reach = squared[l];
+    for (int f = 0; f <= s.channels; ++f) splat.feature[f] = feature[f][l];
     keys[count] = {0, first_splat + uint32_t(l)};
     std::memcpy(&keys[count].depth_bits, &splat.feature[s.channels], 4);
     ++count;

@@ -11,7 +11,7 @@ namespace KERNEL {
 namespace {
 
 constexpr float kLn2 = 0.693147181f;
-constexpr int kPose = 12;  // numbers of a pose gradient: R, then t
+constexpr int kCamera = 13;  // numbers of a camera's gradient: R, t, then the footprint
 
 // The gradient records of one group in one camera, added up, and the shapes of its splats.
 struct SplatSums {
@@ -61,7 +61,8 @@ struct GroupGradients {
   }
 };
 
-// Derivatives by the projected mean (px) and by the dilated covariance (px^2).
+// Derivatives by the projected mean (px) and by the widened covariance (px^2): xy is by each of its two off-diagonal
+// elements.
 struct ScreenGradient {
   vf x, y, xx, xy, yy;
 
@@ -79,18 +80,34 @@ struct ScreenGradient {
   }
 };
 
-// Through covariance = M M^T, M = U A, U = J R: adds to d_A and sets d_U.
-OBBGS_INLINE void covariance_backward(const Model& m, const Projection& p, mask on, const ScreenGradient& d,
-                                      vf (&d_A)[3][3], vf (&d_U)[2][3]) {
+// Through covariance = M M^T + footprint, M = U A, U = J R: adds to d_A, sets d_U and returns the derivative by the
+// footprint. A lowered peak has the factor sqrt(|cross|^2 / determinant); d_peak is the derivative by its logarithm.
+OBBGS_INLINE vf covariance_backward(const Scene& s, const Model& m, const Projection& p, mask on, ScreenGradient d,
+                                    vf d_peak, vf (&d_A)[3][3], vf (&d_U)[2][3]) {
+  if (s.peak_lowered) {
+    const vf half = d_peak / p.determinant * 0.5f;
+    d.xx = d.xx - half * p.yy;
+    d.xy = d.xy + half * p.xy;
+    d.yy = d.yy - half * p.xx;
+  }
   vf d_M[2][3];
   for (int i = 0; i < 3; ++i) {
     d_M[0][i] = (d.xx * p.M[0][i] + d.xy * p.M[1][i]) * 2.0f;
     d_M[1][i] = (d.xy * p.M[0][i] + d.yy * p.M[1][i]) * 2.0f;
   }
+  if (s.peak_lowered) {
+    const vf square = dot(p.cross, p.cross), by_square = zero_unless(vf(0.0f) < square, d_peak / square);
+    for (int i = 0; i < 3; ++i) {
+      const int a = (i + 1) % 3, b = (i + 2) % 3;
+      d_M[0][i] = d_M[0][i] + by_square * (p.M[1][a] * p.cross[b] - p.M[1][b] * p.cross[a]);
+      d_M[1][i] = d_M[1][i] - by_square * (p.M[0][a] * p.cross[b] - p.M[0][b] * p.cross[a]);
+    }
+  }
   for (int i = 0; i < 3; ++i) {
     for (int r = 0; r < 2; ++r) d_U[r][i] = dot(d_M[r], m.A[i]);
     for (int a = 0; a < 3; ++a) d_A[i][a] = d_A[i][a] + zero_unless(on, p.U[0][i] * d_M[0][a] + p.U[1][i] * d_M[1][a]);
   }
+  return zero_unless(on, d.xx + d.yy);
 }
 
 // Through the projected mean and J: sets d_p, the derivative by the mean in the camera frame.
@@ -105,7 +122,7 @@ OBBGS_INLINE void point_backward(const Camera& camera, const Projection& p, cons
   d_p[2] = d_depth - along * p.inverse_z;
 }
 
-// Through radiance and normals: adds to the group's gradients and d_ambient, and sets d_direction, the derivative by
+// Through the radiance: adds to the group's gradients and d_ambient, and sets d_direction, the derivative by
 // the vector from the camera to the Gaussian.
 OBBGS_INLINE void shading_backward(const Scene& s, const Group& group, const Model& m, const Camera& camera,
                                    const SplatSums& sums, int features, mask on, GroupGradients& d,
@@ -135,34 +152,32 @@ OBBGS_INLINE void shading_backward(const Scene& s, const Group& group, const Mod
     const vf radial = dot(d_unit, shading.direction);
     for (int j = 0; j < 3; ++j) d_direction[j] = (d_unit[j] - shading.direction[j] * radial) / shading.distance;
   }
-  const bool normals = features > s.channels + 1;
-  for (int i = 0; i < 3 && (normals || s.sunlit); ++i) {
-    vf d_normal = normals ? sums.get(kFirstFeature + s.channels + 1 + i) : vf(0.0f);
-    if (s.sunlit) d_normal = d_normal + d_cosine * shading.sun[i];
-    d_normal = zero_unless(on, d_normal * shading.facing);
+  for (int i = 0; i < 3 && s.sunlit; ++i) {
+    const vf d_normal = zero_unless(on, d_cosine * shading.sun[i] * shading.facing);
     for (int a = 0; a < 3; ++a) d.R[i][a] = d.R[i][a] + d_normal * m.shortest[a];
   }
 }
 
-// Through p = R mean + t and direction = mean + R^T t: adds to d_mean and d_pose.
+// Through p = R mean + t and direction = mean + R^T t: adds to d_mean and d_camera.
 OBBGS_INLINE void pose_backward(const Model& m, const Camera& camera, const Projection& p, const vf (&R)[3][3], mask on,
                                 const vf (&d_p)[3], const vf (&d_U)[2][3], const vf (&d_direction)[3], vf (&d_mean)[3],
-                                vf* d_pose) {
+                                vf* d_camera) {
   for (int j = 0; j < 3; ++j)
     d_mean[j] = d_mean[j] + zero_unless(on, d_p[0] * R[0][j] + d_p[1] * R[1][j] + d_p[2] * R[2][j] + d_direction[j]);
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) {
       const vf by_J = i == 0 ? p.J00 * d_U[0][j] : i == 1 ? p.J11 * d_U[1][j] : p.J02 * d_U[0][j] + p.J12 * d_U[1][j];
-      d_pose[3 * i + j] = d_pose[3 * i + j] + zero_unless(on, d_p[i] * m.mean[j] + by_J + d_direction[j] * camera.t[i]);
+      d_camera[3 * i + j] =
+          d_camera[3 * i + j] + zero_unless(on, d_p[i] * m.mean[j] + by_J + d_direction[j] * camera.t[i]);
     }
-    d_pose[9 + i] = d_pose[9 + i] + zero_unless(on, d_p[i] + dot(d_direction, R[i]));
+    d_camera[9 + i] = d_camera[9 + i] + zero_unless(on, d_p[i] + dot(d_direction, R[i]));
   }
 }
 
-// One group in one camera: from the sums over its splats to the group, the pose and the ambient light.
+// One group in one camera: from the sums over its splats to the group, the camera and the ambient light.
 OBBGS_INLINE void camera_backward(const Scene& s, const Group& group, const Model& m, const Camera& camera,
                                   const SplatSums& sums, int features, const float* means2d_in, float* means2d,
-                                  GroupGradients& d, vf* d_pose, vf& d_ambient) {
+                                  GroupGradients& d, vf* d_camera, vf& d_ambient) {
   const Projection p(s, m, camera);
   const mask on = p.drawn & (vf(0.0f) < load(sums.lit));
   d.logit = d.logit + zero_unless(on, sums.get(kG) * (vf(1.0f) - m.opacity));
@@ -177,11 +192,11 @@ OBBGS_INLINE void camera_backward(const Scene& s, const Group& group, const Mode
   vf R[3][3], d_U[2][3], d_p[3], d_direction[3];
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) R[i][j] = camera.R[i][j];
-  covariance_backward(m, p, on, screen, d.A, d_U);
+  d_camera[12] = d_camera[12] + covariance_backward(s, m, p, on, screen, sums.get(kG), d.A, d_U);
   const vf d_depth = features > s.channels ? sums.get(kFirstFeature + s.channels) : vf(0.0f);
   point_backward(camera, p, R, d_x, d_y, d_depth, d_U, d_p);
   shading_backward(s, group, m, camera, sums, features, on, d, d_direction, d_ambient);
-  pose_backward(m, camera, p, R, on, d_p, d_U, d_direction, d.mean, d_pose);
+  pose_backward(m, camera, p, R, on, d_p, d_U, d_direction, d.mean, d_camera);
 }
 
 // Writes the gradients of a group's stored parameters.
@@ -216,19 +231,20 @@ OBBGS_INLINE void write_gradients(const Scene& s, const Group& group, const Mode
   for (int i = 0; i < coefficients; ++i) group.put(out.sh, coefficients, i, d.sh[i]);
 }
 
-// Adds up the chunks' pose gradients, [chunks, cameras, kPose], in their order.
-void write_pose_gradients(const Scene& s, int chunks, const std::vector<float>& poses, float* world_to_camera) {
+// Adds up the chunks' camera gradients, [chunks, cameras, kCamera], in their order.
+void write_camera_gradients(const Scene& s, int chunks, const std::vector<float>& parts, const SceneGradients& out) {
   for (int c = 0; c < s.cameras; ++c) {
-    double total[kPose] = {};
+    double total[kCamera] = {};
     for (int chunk = 0; chunk < chunks; ++chunk)
-      for (int i = 0; i < kPose; ++i) total[i] += poses[(size_t(chunk) * s.cameras + c) * kPose + i];
-    float* matrix = world_to_camera + 16 * c;
+      for (int i = 0; i < kCamera; ++i) total[i] += parts[(size_t(chunk) * s.cameras + c) * kCamera + i];
+    float* matrix = out.world_to_camera + 16 * c;
     for (int i = 0; i < 3; ++i) {
       for (int j = 0; j < 3; ++j) matrix[4 * i + j] = float(total[3 * i + j]);
       matrix[4 * i + 3] = float(total[9 + i]);
       matrix[12 + i] = 0.0f;
     }
     matrix[15] = 0.0f;
+    out.footprint_px2[c] = float(total[12]);
   }
 }
 
@@ -241,9 +257,9 @@ void project_backward(const Scene& s, const Frame& frame, const float* records, 
   std::vector<Camera> cameras;
   cameras.reserve(s.cameras);
   for (int c = 0; c < s.cameras; ++c) cameras.emplace_back(s, c);
-  std::vector<float> poses(size_t(chunks) * s.cameras * kPose), ambient(chunks);  // of each chunk
+  std::vector<float> of_cameras(size_t(chunks) * s.cameras * kCamera), ambient(chunks);  // of each chunk
   parallel_for(chunks, worthwhile(threads, n * s.cameras, kSplatsPerThread), [&](int chunk) {
-    std::vector<vf> pose(size_t(s.cameras) * kPose, vf(0.0f));
+    std::vector<vf> d_cameras(size_t(s.cameras) * kCamera, vf(0.0f));
     vf d_ambient = 0.0f;
     for (int first = chunk * kChunk; first < std::min(s.gaussians, (chunk + 1) * kChunk); first += kLanes) {
       const Group group(s, first);
@@ -259,18 +275,19 @@ void project_backward(const Scene& s, const Frame& frame, const float* records, 
           continue;
         }
         const float* means2d_in = out.means2d_in ? out.means2d_in + 2 * base : nullptr;
-        camera_backward(s, group, m, cameras[c], sums, features, means2d_in, means2d, d, &pose[size_t(c) * kPose],
-                        d_ambient);
+        camera_backward(s, group, m, cameras[c], sums, features, means2d_in, means2d, d,
+                        &d_cameras[size_t(c) * kCamera], d_ambient);
       }
       write_gradients(s, group, m, d, out);
     }
-    for (int i = 0; i < s.cameras * kPose; ++i) poses[size_t(chunk) * s.cameras * kPose + i] = sum(pose[i]);
+    for (int i = 0; i < s.cameras * kCamera; ++i)
+      of_cameras[size_t(chunk) * s.cameras * kCamera + i] = sum(d_cameras[i]);
     ambient[chunk] = sum(d_ambient);
   });
   double all_ambient = 0;
   for (const float part : ambient) all_ambient += part;
   *out.ambient = float(all_ambient);
-  write_pose_gradients(s, chunks, poses, out.world_to_camera);
+  write_camera_gradients(s, chunks, of_cameras, out);
 }
 
 }  // namespace KERNEL

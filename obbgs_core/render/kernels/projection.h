@@ -80,7 +80,7 @@ struct Model {
 };
 
 struct Camera {
-  float R[3][3], t[3], fx, fy, cx, cy, limit_x, limit_y;
+  float R[3][3], t[3], fx, fy, cx, cy, limit_x, limit_y, footprint_px2;
   const float *sun_dir, *sunlit;  // [3] and [gaussians], or null
 
   Camera(const Scene& s, int index) {
@@ -95,16 +95,18 @@ struct Camera {
     cy = K[5];
     limit_x = kFovMargin * std::max(cx, s.width - cx) / fx;
     limit_y = kFovMargin * std::max(cy, s.height - cy) / fy;
+    footprint_px2 = s.footprint_px2[index];
     sun_dir = s.sun_dir ? s.sun_dir + 3 * index : nullptr;
     sunlit = s.sunlit ? s.sunlit + size_t(index) * s.gaussians : nullptr;
   }
 };
 
-// A group in one camera, in the symbols of Zwicker et al. 2001: the covariance is M M^T + dilation, M = J R A.
+// A group in one camera, in the symbols of Zwicker et al. 2001: the covariance is M M^T + footprint, M = J R A.
 struct Projection {
   vf p[3], inverse_z, x, y, clamped_x, clamped_y;  // p: camera frame, m; x, y: at distance 1
   vf J00, J02, J11, J12, U[2][3], M[2][3];         // U = J R
-  vf xx, xy, yy, determinant;                      // of the dilated covariance, px^2
+  vf xx, xy, yy, determinant;                      // of the widened covariance, px^2
+  vf cross[3], share;  // cross: M0 x M1, its square is the determinant of M M^T; share: of the opacity, at the peak
   mask drawn;
 
   Projection(const Scene& s, const Model& m, const Camera& c) {
@@ -129,18 +131,22 @@ struct Projection {
     }
     for (int r = 0; r < 2; ++r)
       for (int k = 0; k < 3; ++k) M[r][k] = fma(U[r][2], m.A[2][k], fma(U[r][1], m.A[1][k], U[r][0] * m.A[0][k]));
-    const vf undilated = dot(M[0], M[0]) + dot(M[1], M[1]);
-    vf cross[3];
+    const vf footprint = c.footprint_px2, trace = dot(M[0], M[0]) + dot(M[1], M[1]);
     for (int k = 0; k < 3; ++k) {
       const int a = (k + 1) % 3, b = (k + 2) % 3;
       cross[k] = fma(M[0][a], M[1][b], -(M[0][b] * M[1][a]));
     }
-    xx = dot(M[0], M[0]) + kDilation;
+    xx = dot(M[0], M[0]) + footprint;
     xy = dot(M[0], M[1]);
-    yy = dot(M[1], M[1]) + kDilation;
-    determinant =
-        dot(cross, cross) + undilated * kDilation + kDilation * kDilation;  // a sum of squares: nothing cancels
+    yy = dot(M[1], M[1]) + footprint;
+    const vf narrow = dot(cross, cross);
+    determinant = narrow + trace * footprint + footprint * footprint;  // a sum of squares: nothing cancels
     drawn = drawn & finite(determinant);
+    share = 1.0f;
+    if (s.peak_lowered) {
+      share = sqrt(narrow / determinant);
+      drawn = drawn & (vf(kMinPeakShare) <= share);
+    }
   }
 };
 

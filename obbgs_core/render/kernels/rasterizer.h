@@ -12,39 +12,40 @@ constexpr int kBlock = 4;  // pixels along a block's side: one 16-lane vector a 
 constexpr int kTile = 32;  // pixels along a tile's side: 8x8 blocks, one 64-bit mask
 
 // Python has the same numbers; binding.cpp shows these to the test that compares them. Source: Kerbl et al. 2023.
-constexpr float kMinAlpha = 1.0f / 255;        // fainter contributions are skipped
+constexpr float kMinAlpha = 1.0f / 255;        // fainter contributions are skipped; lowered with a peak
 constexpr float kLog2MinAlpha = -7.99435344f;  // log2(kMinAlpha)
 constexpr float kMaxAlpha = 0.99f;
-constexpr float kMinTransmittance = 1e-4f;  // a pixel is finished before its transmittance would fall below
-constexpr float kMinDepthAlpha = 1e-6f;     // the depth is 0 where alpha is not above this
-constexpr float kDilation = 0.3f;           // px^2 added to the 2D covariance
-constexpr float kFovMargin = 1.3f;          // the affine approximation is clamped this far outside the image
-constexpr float kSoftness = 10.0f;          // radiance = softplus(kSoftness x) / kSoftness
+constexpr float kMinTransmittance = 1e-4f;    // a pixel is finished before its transmittance would fall below
+constexpr float kMinPeakShare = 1.0f / 4096;  // a Gaussian whose peak falls to less of its opacity is not drawn
+constexpr float kMinDepthAlpha = 1e-6f;       // the depth is 0 where alpha is not above this
+constexpr float kFovMargin = 1.3f;            // the affine approximation is clamped this far outside the image
+constexpr float kSoftness = 10.0f;            // radiance = softplus(kSoftness x) / kSoftness
 
 constexpr int kMaxChannels = 3, kMaxCoefficients = 16;
-constexpr int kMaxFeatures = kMaxChannels + 4;  // radiance, depth, normal
+constexpr int kMaxFeatures = kMaxChannels + 1;  // radiance, depth
 constexpr int kRecord = 16;                     // floats of a gradient record: one cache line
 
 // The model and the cameras, row-major float32 as in Gaussians and Cameras.
 struct Scene {
   int gaussians, cameras, sh_count, channels, width, height;
   float near_m;
-  bool normals;
   const float *means, *quats, *log_scales, *opacity_logits, *sh, *world_to_camera, *K;
   const float* sun_dir;  // [cameras, 3] direction at which the harmonics are evaluated; null: the viewing direction
   const float* sunlit;  // [cameras, gaussians] visibility of the Sun; sh is then an albedo under Lambert's law; or null
   float ambient;        // added to the Sun's light on every side
+  const float* footprint_px2;  // [cameras] variance of what a pixel averages over, added to the 2D covariance
+  bool peak_lowered;           // so that the added variance leaves a Gaussian's light as it is
 
-  int features() const { return channels + 1 + 3 * normals; }  // radiance, depth, normal: in this order
   int tiles_x() const { return (width + kTile - 1) / kTile; }
   int tiles_y() const { return (height + kTile - 1) / kTile; }
   int tiles() const { return cameras * tiles_x() * tiles_y(); }  // a camera's tiles follow the previous camera's
 };
 
 // One Gaussian in one camera. At offset d px from (x, y): alpha = 2^(level - u^2 - v^2), u = k1 dx + k2 dy, v = k3 dy,
-// which is the Cholesky factor of the conic; level = log2(opacity).
+// which is the Cholesky factor of the conic; 2^level is the opacity, lowered as the footprint wants. Where alpha is
+// below `cutoff`, which is where u^2 + v^2 is above `reach`, nothing is drawn.
 struct alignas(64) Splat {
-  float x, y, k1, k2, k3, level;
+  float x, y, k1, k2, k3, level, cutoff, reach;
   float feature[kMaxFeatures];
   uint32_t first_record, records;  // its gradient records, one for each tile it touches; none if it is not drawn
 };
@@ -87,8 +88,8 @@ struct Frame {
   Buffer<float> transmittance;  // [cameras, height, width]
 };
 
-struct Images {  // [cameras, height, width] and, for radiance and normals, channels
-  float *radiance, *alpha, *depth, *median_depth, *normals;
+struct Images {  // [cameras, height, width] and, for radiance, channels
+  float *radiance, *alpha, *depth, *median_depth;
 };
 
 // Gradient of an image with its strides in floats (camera, row, column, channel); zero if the loss does not depend on
@@ -104,14 +105,13 @@ struct ImageGradient {
 };
 
 struct ImageGradients {
-  ImageGradient radiance, alpha, depth, normals;
-  // Features that the loss depends on: a prefix of radiance, depth, normal.
-  int features(const Scene& s) const { return s.channels + (normals.given() ? 4 : depth.given() ? 1 : 0); }
+  ImageGradient radiance, alpha, depth;
+  int features(const Scene& s) const { return s.channels + depth.given(); }  // those that the loss depends on
 };
 
 struct SceneGradients {
   const float* means2d_in;  // [cameras, gaussians, 2] gradient of the projected means from elsewhere, or null
-  float *means, *quats, *log_scales, *opacity_logits, *sh, *world_to_camera, *ambient;
+  float *means, *quats, *log_scales, *opacity_logits, *sh, *world_to_camera, *ambient, *footprint_px2;
   float *means2d, *pixels;  // [cameras, gaussians, 2] loss per px, [cameras, gaussians] pixels touched
 };
 

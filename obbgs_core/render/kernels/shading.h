@@ -103,7 +103,7 @@ struct Shading {
         raw[f] = fma(basis[k], g.get(s.sh, s.sh_count * s.channels, k * s.channels + f), raw[f]);
     }
     light = 1.0f;
-    if (s.normals || c.sunlit) {
+    if (c.sunlit) {
       for (int i = 0; i < 3; ++i) normal[i] = dot(m.R[i], m.shortest);
       const vf along = dot(normal, direction);
       facing = zero_unless(along < vf(0.0f), 1.0f) - zero_unless(vf(0.0f) < along, 1.0f);

@@ -1,0 +1,58 @@
+"""The 3D smoothing filter of Mip-Splatting: no Gaussian has more detail than the pictures sample (Yu et al. 2024)."""
+
+import dataclasses
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from obbgs_core.frames import TrainingFrame
+from obbgs_core.model.gaussians import Gaussians
+
+MARGIN = 0.15  # of the image's width and height: a Gaussian as far outside still counts as in view
+FULL_LOG_OPACITY = -1e-6  # opacities stay below 1, where the logit is infinite
+
+
+@torch.no_grad()
+def sampling_deviation_m(means: Tensor, frames: list[TrainingFrame], variance_px2: float) -> Tensor:
+    """Return the deviation [N], m, of the filter of each Gaussian: that many pixels where it is seen largest.
+
+    The sampling rate of a Gaussian is the largest focal length over depth, px/m, of the frames that have it in view.
+    Gaussians in no view take the smallest rate of all others.
+
+    Args:
+        means: [N, 3] m.
+        variance_px2: of the filter, where the sampling rate is that of the pixels.
+    """
+    rate = torch.zeros(len(means))
+    for frame in frames:
+        height, width = frame.dn.shape[:2]
+        x, y, z = (means @ frame.world_to_camera[:3, :3].T + frame.world_to_camera[:3, 3]).unbind(dim=1)
+        depth = z.clamp(min=1e-6)
+        u = frame.K[0, 0] * x / depth + frame.K[0, 2]
+        v = frame.K[1, 1] * y / depth + frame.K[1, 2]
+        in_view = (z > 1e-6) & ((u / width - 0.5).abs() <= 0.5 + MARGIN)
+        in_view &= (v / height - 0.5).abs() <= 0.5 + MARGIN
+        rate = torch.where(in_view, torch.maximum(rate, frame.K[0, 0] / depth), rate)
+    seen = rate > 0
+    if seen.any():
+        rate = torch.where(seen, rate, rate[seen].min())
+    return math.sqrt(variance_px2) / rate
+
+
+def smoothed(gaussians: Gaussians, deviation_m: Tensor) -> Gaussians:
+    """Return Gaussians convolved with round ones of deviation_m [N], their light unchanged; differentiable.
+
+    Variances grow by the filter's, opacities fall by the root of the ratio of the determinants.
+    """
+    log_scales = 0.5 * torch.log((2 * gaussians.log_scales).exp() + deviation_m[:, None] ** 2)
+    log_opacities = F.logsigmoid(gaussians.opacity_logits) + log_lowering(gaussians, deviation_m)
+    log_opacities = log_opacities.clamp(max=FULL_LOG_OPACITY)
+    logits = log_opacities - torch.log(-torch.expm1(log_opacities))
+    return dataclasses.replace(gaussians, log_scales=log_scales, opacity_logits=logits)
+
+
+def log_lowering(gaussians: Gaussians, deviation_m: Tensor) -> Tensor:
+    """Return the logarithm [N] of the factor by which `smoothed` lowers opacities."""
+    return -0.5 * torch.log1p((deviation_m[:, None] / gaussians.scales) ** 2).sum(dim=1)
