@@ -1,6 +1,7 @@
 """Points with normals on the surface that the cameras see, fused from depth maps of the model."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -46,15 +47,31 @@ def surface_points(
         ValueError: no camera, or a count under 1; the radiance depends on the Sun's direction, and the cameras do not
             hold it.
     """
-    if len(cameras) == 0 or count < 1:
-        raise ValueError(f"expected a camera and a count of at least 1, got {len(cameras)} and {count}")
     gaussians = _bright(gaussians, cameras)
     if len(gaussians) == 0:
         return torch.zeros(0, 3), torch.zeros(0, 3)
+    return fused_points(lambda c: depth_map(gaussians, cameras.one(c)), cameras, count, seed)
+
+
+@torch.no_grad()
+def fused_points(
+    depth_and_slope: Callable[[int], tuple[Tensor, Tensor]], cameras: Cameras, count: int, seed: int = 0
+) -> tuple[Tensor, Tensor]:
+    """Return points and normals as `surface_points` does, of whatever gives the depths of each camera.
+
+    Args:
+        depth_and_slope: from the index of a camera to depths [H, W] m, infinite where nothing solid is seen, and
+            their slopes [H, W, 2] m/px.
+
+    Raises:
+        ValueError: no camera, or a count under 1.
+    """
+    if len(cameras) == 0 or count < 1:
+        raise ValueError(f"expected a camera and a count of at least 1, got {len(cameras)} and {count}")
     generator = torch.Generator().manual_seed(seed)
     views, patches = [], []
     for c in range(len(cameras)):
-        depth, slope = depth_map(gaussians, cameras.one(c))
+        depth, slope = depth_and_slope(c)
         low_m, high_m = _neighbourhood(depth)
         pixels = _candidates(
             depth, slope, low_m, high_m, cameras.K[c], -(-CANDIDATES // len(cameras)), generator
