@@ -77,10 +77,8 @@ def reconstruct_nerf(
         training.step()
         work.on_step(training.steps_done / training.steps, training.seconds, training.reconstruction)
         if work.should_stop():
-            where = "not saved, since no folder was given"
-            if checkpoint is not None:
-                training.save(checkpoint)
-                where = f"saved in {checkpoint}: the same call goes on from there"
+            kept = checkpoint is not None and training.save(checkpoint)
+            where = f"saved in {checkpoint}: the same call goes on from there" if kept else "not saved"
             raise Interrupted(f"interrupted at step {training.steps_done} of {training.steps}, {where}")
         if checkpoint is not None and time.monotonic() - saved > CHECKPOINT_EVERY_S:
             training.save(checkpoint)
@@ -185,12 +183,8 @@ class Training:
             figures={"parameters": sum(p.numel() for p in parameters), "steps": self.steps_done},
         )
 
-    def save(self, path: Path) -> None:
-        """Write everything that the next step depends on, whole or not at all.
-
-        Raises:
-            OSError: the disk does not take it.
-        """
+    def save(self, path: Path) -> bool:
+        """Write everything that the next step depends on, whole or not at all, and return whether the disk took it."""
         occupancy = self.model.occupancy
         content = io.BytesIO()
         state = {
@@ -203,8 +197,13 @@ class Training:
             "seconds": self.seconds,
         }
         torch.save(state, content)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, content.getvalue())
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(path, content.getvalue())
+        except OSError as error:  # a full disk must not end the training
+            log.warning("step %d: %s cannot be written: %s", self.steps_done, path, error)
+            return False
+        return True
 
     def resume(self, path: Path) -> bool:
         """Go on from a checkpoint, and return whether there is one of this very training."""

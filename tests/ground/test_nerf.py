@@ -199,6 +199,8 @@ def test_a_checkpoint_of_another_training_or_half_a_file_is_not_used(small, tmp_
     assert not first.resume(tmp_path / "a.ckpt")
     assert "damaged" in caplog.text
     assert not first.resume(tmp_path / "b.ckpt")
+    assert not first.save(tmp_path / "a.ckpt" / "c.ckpt")  # below a file there is no room for a folder
+    assert "cannot be written" in caplog.text
 
 
 def test_frames_that_allow_no_field_are_refused(small):
