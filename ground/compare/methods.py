@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ground.baselines.nerf import reconstruct_nerf
 from ground.baselines.plane_sweep import reconstruct_mvs
 from ground.baselines.reconstruction import Reconstruction, Work
 from ground.compare import references
@@ -103,6 +104,8 @@ UNTRAINED = "untrained"  # the Gaussians that `obbgs` starts from
 _BASELINES: dict[str, Method] = {
     method.name: method
     for method in (
+        Method("nerf", lambda task: _nerf(task, exposure_aware=False), seeded=True, stepped=True),
+        Method("nerf+exposure", lambda task: _nerf(task, exposure_aware=True), seeded=True, stepped=True),
         Method("mvs", lambda task: _stereo(task, one_exposure=True)),
         Method("mvs+raw", lambda task: _stereo(task, one_exposure=False)),
     )
@@ -112,6 +115,11 @@ _BASELINES: dict[str, Method] = {
 def _reference(task: Task, images: Callable[[Case, list[TrainingFrame]], list[Tensor]]) -> Outcome:
     empty = torch.zeros(0, 3)
     return Outcome(Reconstruction(empty, empty, None, 0, 0.0), images(task.case, task.frames))
+
+
+def _nerf(task: Task, exposure_aware: bool) -> Outcome:
+    settings = (task.seed, task.work, task.steps_share, exposure_aware)
+    return Outcome(reconstruct_nerf(task.frames, task.sensor, *settings))
 
 
 def _stereo(task: Task, one_exposure: bool) -> Outcome:

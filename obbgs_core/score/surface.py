@@ -1,6 +1,7 @@
 """Points with normals on the surface that the cameras see, fused from depth maps of the model."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -46,10 +47,10 @@ def surface_points(
         ValueError: no camera, or a count under 1; the radiance depends on the Sun's direction, and the cameras do not
             hold it.
     """
-    points, seen_by = _sampled(gaussians, cameras, count, seed)
-    if len(points) == 0:
-        return points, torch.zeros(0, 3)
-    return points, _fitted_normals(points, cameras.centres[seen_by] - points)
+    gaussians = _bright(gaussians, cameras)
+    if len(gaussians) == 0:
+        return torch.zeros(0, 3), torch.zeros(0, 3)
+    return fused_points(lambda c: depth_map(gaussians, cameras.one(c)), cameras, count, seed)
 
 
 @torch.no_grad()
@@ -59,21 +60,41 @@ def surface_positions(gaussians: Gaussians, cameras: Cameras, count: int = 100_0
     Raises:
         ValueError: as there.
     """
-    return _sampled(gaussians, cameras, count, seed)[0]
-
-
-def _sampled(gaussians: Gaussians, cameras: Cameras, count: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Return points [count, 3] on the seen surface, and the camera [count] that sees each."""
-    if len(cameras) == 0 or count < 1:
-        raise ValueError(f"expected a camera and a count of at least 1, got {len(cameras)} and {count}")
-    nothing = torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)
     gaussians = _bright(gaussians, cameras)
     if len(gaussians) == 0:
-        return nothing
+        return torch.zeros(0, 3)
+    return _fused(lambda c: depth_map(gaussians, cameras.one(c)), cameras, count, seed)[0]
+
+
+@torch.no_grad()
+def fused_points(
+    depth_and_slope: Callable[[int], tuple[Tensor, Tensor]], cameras: Cameras, count: int, seed: int = 0
+) -> tuple[Tensor, Tensor]:
+    """Return points and normals as `surface_points` does, of whatever gives the depths of each camera.
+
+    Args:
+        depth_and_slope: from the index of a camera to depths [H, W] m, infinite where nothing solid is seen, and
+            their slopes [H, W, 2] m/px.
+
+    Raises:
+        ValueError: no camera, or a count under 1.
+    """
+    points, seen_by = _fused(depth_and_slope, cameras, count, seed)
+    if len(points) == 0:
+        return points, torch.zeros(0, 3)
+    return points, _fitted_normals(points, cameras.centres[seen_by] - points)
+
+
+def _fused(
+    depth_and_slope: Callable[[int], tuple[Tensor, Tensor]], cameras: Cameras, count: int, seed: int
+) -> tuple[Tensor, Tensor]:
+    """Return points [count, 3] on the seen surface, and the index [count] of the camera that sees each."""
+    if len(cameras) == 0 or count < 1:
+        raise ValueError(f"expected a camera and a count of at least 1, got {len(cameras)} and {count}")
     generator = torch.Generator().manual_seed(seed)
     views, patches = [], []
     for c in range(len(cameras)):
-        depth, slope = depth_map(gaussians, cameras.one(c))
+        depth, slope = depth_and_slope(c)
         low_m, high_m = _neighbourhood(depth)
         pixels = _candidates(
             depth, slope, low_m, high_m, cameras.K[c], -(-CANDIDATES // len(cameras)), generator
@@ -83,7 +104,7 @@ def _sampled(gaussians: Gaussians, cameras: Cameras, count: int, seed: int) -> t
     patch = torch.cat(patches)  # [P, 6]: camera, u, v, depth, slopes
     patch = patch[_confirmed(_back_project(patch, cameras), views, cameras)]
     if len(patch) == 0:
-        return nothing
+        return torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)
     patch = patch.repeat(math.ceil(OVERSAMPLING * count / len(patch)), 1)
     shift = torch.rand(len(patch), 2, generator=generator) - 0.5
     patch[:, 3] += (patch[:, 4:] * shift).sum(dim=1)
