@@ -1,4 +1,4 @@
-"""The command line `ground`: listen, key, uplink, reconstruct, evaluate, report, compare, import, export."""
+"""The command line `ground`: listen, key, uplink, reconstruct, evaluate, report, list, compare, import, export."""
 
 import dataclasses
 import json
@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from flightsw.icd.mission import load_mission
 from ground.cli_compare import compare_command
+from ground.cli_list import compare_runs_command, list_command
 from ground.cli_options import (
     AsJson,
     Background,
@@ -172,6 +173,8 @@ app.command("reconstruct")(reconstruct_command)
 app.command("evaluate")(evaluate_command)
 app.command("report")(report_command)
 app.command("compare")(compare_command)
+app.command("list")(list_command)
+app.command("compare-runs")(compare_runs_command)
 
 
 @app.command("import")
