@@ -1,4 +1,4 @@
-"""The command line `ground`: listen, key, uplink, reconstruct, evaluate, report, import, export."""
+"""The command line `ground`: listen, key, uplink, reconstruct, evaluate, report, list, import, export."""
 
 import dataclasses
 import json
@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from flightsw.icd.mission import load_mission
+from ground.cli_list import compare_runs_command, list_command
 from ground.cli_options import (
     AsJson,
     Background,
@@ -170,6 +171,8 @@ def uplink(
 app.command("reconstruct")(reconstruct_command)
 app.command("evaluate")(evaluate_command)
 app.command("report")(report_command)
+app.command("list")(list_command)
+app.command("compare-runs")(compare_runs_command)
 
 
 @app.command("import")

@@ -5,6 +5,7 @@ In front of another background, how far a reading departs from the background's 
 A "sigma" here is the deviation of an unlit reading, or of the mean of a window of such readings.
 """
 
+import dataclasses
 import logging
 import math
 from dataclasses import dataclass
@@ -49,11 +50,16 @@ class Silhouette:
     world_to_camera: Tensor
     K: Tensor
 
+    def dilated(self, reach_px: int) -> "Silhouette":
+        """Return the silhouette with its likely light grown, and its sky shrunk, by `reach_px` for pose errors."""
+        if reach_px == 0:
+            return self
+        likely, lit = (_dilated(mask[None, None], reach_px)[0, 0] for mask in (self.likely, ~self.sky))
+        return dataclasses.replace(self, likely=likely, sky=~lit)
 
-def silhouette(
-    dn: Tensor, sensor: Sensor, world_to_camera: Tensor, K: Tensor, dilate_px: int = 0
-) -> Silhouette:
-    """Return the pixels of dn [H, W, C] that are brighter than noise, grown by `dilate_px` for pose errors."""
+
+def silhouette(dn: Tensor, sensor: Sensor, world_to_camera: Tensor, K: Tensor) -> Silhouette:
+    """Return the pixels of dn [H, W, C] that are brighter than noise."""
     sky_dn, sigma_dn = _dark_reading(sensor)
     sigma_dn /= math.sqrt(dn.shape[2])
     signal = ((dn.mean(dim=-1) - sky_dn) / sigma_dn)[None, None]  # in sigmas
@@ -68,7 +74,6 @@ def silhouette(
     likely |= (means[3] > CERTAIN_SIGMA) & (signal > EDGE_SIGMA)
     certain &= _mean(certain.float(), 3) > SPECK
     lit = likely | (faint[5] > 0) | (faint[9] > SKY_SIGMA)
-    likely, lit = _dilated(likely, dilate_px), _dilated(lit, dilate_px)
     return Silhouette(certain[0, 0], likely[0, 0], ~lit[0, 0], world_to_camera, K)
 
 
@@ -159,6 +164,34 @@ def hull_points(silhouettes: list[Silhouette], radius: float) -> tuple[Tensor, f
         if not inside.any():
             break
     return _centres(inside & ~_eroded(inside), voxel_m, radius), voxel_m
+
+
+def coherence(silhouettes: list[Silhouette], points: Tensor, voxel_m: float) -> float:
+    """Return the share of all certain light that the projection of a hull covers; 1 where poses and silhouettes agree.
+
+    A hull that was carved with wrong poses lacks parts that some views show, since other views carved them away.
+
+    Source: Hernandez, Schmitt and Cipolla, Silhouette coherence for camera calibration under circular motion, 2007.
+
+    Args:
+        points: [M, 3] of the hull's surface, a voxel of `voxel_m` apart.
+    """
+    covered = total = 0
+    for s in silhouettes:
+        p = points @ s.world_to_camera[:3, :3].T + s.world_to_camera[:3, 3]
+        p = p[p[:, 2] > 1e-6]
+        u, v = (s.K[i, i] * p[:, i] / p[:, 2] + s.K[i, 2] for i in (0, 1))
+        height, width = s.certain.shape
+        inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        image = torch.zeros(height, width, dtype=torch.bool)
+        image[v[inside].long(), u[inside].long()] = True
+        reach_px = max(
+            1, math.ceil(float(s.K[0, 0]) * voxel_m / 2 / max(float(s.world_to_camera[2, 3]), 1e-6))
+        )
+        image = _dilated(image[None, None], reach_px)[0, 0]
+        covered += int((s.certain & image).sum())
+        total += int(s.certain.sum())
+    return covered / max(total, 1)
 
 
 def _doubled(grid: Tensor) -> Tensor:

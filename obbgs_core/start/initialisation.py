@@ -40,10 +40,13 @@ class StartSettings:
 
 
 def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.Silhouette]:
-    """Return silhouettes of the longest exposures by the frame's index, grown by the pose error.
+    """Return silhouettes of the longest exposures by the frame's index, grown by as much as the poses err.
 
     Shadowed faces are brightest there. Where these frames are few those of the next longest exposure join them: a view
     that misses a shadowed face does less harm than no view.
+
+    The pose tags state how much the poses may err. They are grown by no more than that, and by no more than what their
+    coherence asks for: a tag may be honest and its pose still exact, and silhouettes grown for nothing carve nothing.
     """
     chosen: dict[int, TrainingFrame] = {}
     for exposure_s in sorted({f.exposure_time_s for f in frames}, reverse=True):
@@ -52,8 +55,26 @@ def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.S
     outlines = {}
     for i, f in chosen.items():
         light = hull.light(f.dn, sensor, f.background, f.exposure_time_s)
-        outlines[i] = hull.silhouette(light, sensor, f.world_to_camera, f.K, _pose_error_px(f))
-    return outlines
+        outlines[i] = hull.silhouette(light, sensor, f.world_to_camera, f.K)
+    errors_px = {i: _pose_error_px(f) for i, f in chosen.items()}
+    return _grown(outlines, errors_px)
+
+
+def _grown(outlines: dict[int, hull.Silhouette], errors_px: dict[int, int]) -> dict[int, hull.Silhouette]:
+    """Return silhouettes grown by the least reach that makes them coherent, each by its own limit at most."""
+    most, radius = max(errors_px.values()), hull.radius_m(list(outlines.values()))
+    if most == 0 or radius == 0:
+        return outlines
+    for reach_px in [r for r in (0, 1, 2, 4) if r < most]:
+        grown = {i: s.dilated(min(reach_px, errors_px[i])) for i, s in outlines.items()}
+        points, voxel_m = hull.hull_points(list(grown.values()), radius)
+        coherence = hull.coherence(list(outlines.values()), points, voxel_m)
+        log.info(
+            "silhouettes grown by %d px of %d allowed by the tags: coherence %.3f", reach_px, most, coherence
+        )
+        if coherence >= hull.AGREEMENT:
+            return grown
+    return {i: s.dilated(errors_px[i]) for i, s in outlines.items()}
 
 
 def _pose_error_px(frame: TrainingFrame) -> int:

@@ -66,10 +66,15 @@ def test_the_hull_of_a_ball_is_its_surface():
         pose[2, 3] = 5.0
         silhouettes.append(hull.Silhouette(mask, mask, ~mask, pose, K))
     assert hull.radius_m(silhouettes) == pytest.approx(1.05 * radius_px / 100 * 5, rel=0.05)
-    points, _voxel_m = hull.hull_points(silhouettes, hull.radius_m(silhouettes))
+    points, voxel_m = hull.hull_points(silhouettes, hull.radius_m(silhouettes))
     distance = points.norm(dim=1)
     # 40 outlines bound the ball from outside; a pixel is 5 cm, a voxel 0.8 cm; the vote lets corners stand out
     assert len(points) > 1000 and distance.min() > 0.9 and distance.median() < 1.08
+    assert hull.coherence(silhouettes, points, voxel_m) > 0.99
+    lost = points[
+        points[:, 0] < 0
+    ]  # half a hull covers less of what the views show, but more than half of it
+    assert 0.5 < hull.coherence(silhouettes, lost, voxel_m) < 0.95
 
 
 def test_light_does_not_leak_into_the_dark_and_a_faint_face_is_found():

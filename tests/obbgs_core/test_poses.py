@@ -17,7 +17,7 @@ from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.pose_covariance import flaw, whitening
 from obbgs_core.render import render
-from obbgs_core.start.initialisation import MOST_DILATION_PX, _pose_error_px
+from obbgs_core.start.initialisation import MOST_DILATION_PX, _pose_error_px, silhouettes
 from obbgs_core.train.batches import Batches
 from obbgs_core.train.poses import PoseCorrections, rigid_motions
 from obbgs_core.train.presets import preset
@@ -375,6 +375,17 @@ def test_silhouettes_grow_by_a_turn_or_a_shift_alone_as_their_deviations_say():
     undone = correlated(torch.tensor([0, 0.03, 0, 0.24, 0, 0]).double(), 1, 3, -1.0)
     assert _pose_error_px(tagged_at(pose, undone)) == 0
     assert _pose_error_px(tagged_at(pose, undone.abs())) == 6
+
+
+def test_silhouettes_grow_where_poses_err_and_not_where_a_tag_only_allows_it():
+    shown = scenes.photographed(model(), 36, 0, SIZE, FOCAL_PX, (1e-4,))
+    ungrown = silhouettes(shown, SENSOR)
+    exact, wrong = (silhouettes(scenes.tagged(shown, wrong, 0.03), SENSOR) for wrong in (False, True))
+    sky = [
+        sum(float(s.sky.float().mean()) for s in outlines.values()) for outlines in (ungrown, exact, wrong)
+    ]
+    assert all(torch.equal(ungrown[i].likely, exact[i].likely) for i in ungrown)
+    assert sky[0] == sky[1] > 1.1 * sky[2]  # 0.03 rad of 100 px move a picture by 3 px
 
 
 def test_pose_refinement_takes_tilt_out_of_the_poses():

@@ -1,0 +1,121 @@
+"""The commands of `ground` that show what is there: list, compare-runs."""
+
+import dataclasses
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from ground.cli_options import AsJson
+
+if TYPE_CHECKING:  # torch takes seconds to import, and --help must not wait for it
+    from ground.listing import RunEntry, SessionEntry
+
+
+def list_command(
+    folders: Annotated[
+        list[Path] | None, typer.Argument(help="Where to look, three levels deep; default: here.")
+    ] = None,
+    json_: AsJson = False,
+) -> None:
+    """Show the sessions in some folders, and their runs: frames, losses, method, PSNR, Gaussians, age.
+
+    Example: ground list passes demo --json
+    """
+    from ground.listing import find_sessions
+
+    sessions = find_sessions(folders or [Path()])
+    if json_:
+        print(json.dumps([dataclasses.asdict(session) for session in sessions]))
+        return
+    if not sessions:
+        print("no session here; `ground listen` and `ground import` make one")
+        return
+    Console().print(_sessions_table(sessions))
+
+
+def compare_runs_command(
+    first: Annotated[Path, typer.Argument(help="A run's folder, such as pass-12/runs/first.")],
+    second: Annotated[Path, typer.Argument(help="Another run's folder, of any session.")],
+    json_: AsJson = False,
+) -> None:
+    """Show which settings differ between two runs, and the figures of both.
+
+    Example: ground compare-runs pass-12/runs/first pass-12/runs/second
+    """
+    from ground.listing import compare_runs
+
+    found = compare_runs(first, second)
+    if json_:
+        print(json.dumps(found))
+        return
+    for title, values in found.items():
+        table = Table(title=title.capitalize())
+        for heading in ("", str(first), str(second)):
+            table.add_column(heading, overflow="fold")
+        for name, pair in values.items():
+            table.add_row(*(Text(cell) for cell in (name, *map(_cell, pair))))
+        Console().print(table if values else f"{title}: no difference")
+
+
+def _sessions_table(sessions: "list[SessionEntry]") -> Table:
+    table = Table()
+    for heading in (
+        "session / run",
+        "made",
+        "frames / method",
+        "lost / clean PSNR",
+        "size / Gaussians",
+        "remarks",
+    ):
+        table.add_column(heading, overflow="fold")
+    for s in sessions:
+        captured = "" if s.frames_captured is None else f" of {s.frames_captured}"
+        lost = (
+            ", ".join(f"{count:,} {kind.replace('_', ' ')}" for kind, count in s.losses.items()) or "nothing"
+        )
+        frames = f"{s.frames}{captured} in {s.brackets} brackets"
+        cells = [s.folder, _age(s.created_utc), frames, lost, s.size, s.imported_from or ""]
+        if s.problem:
+            cells = [s.folder, "", "", "", "", s.problem]
+        table.add_row(*map(Text, cells), style="bold")
+        for run in s.runs:
+            table.add_row(*map(Text, _run_cells(run)))
+        table.add_section()
+    return table
+
+
+def _run_cells(run: "RunEntry") -> list[str]:
+    psnr_db = run.psnr_clean_db if run.psnr_clean_db is not None else run.psnr_noisy_db
+    psnr = "" if psnr_db is None else f"{psnr_db:.2f} dB"
+    if psnr and run.psnr_clean_db is None:
+        psnr += " (noisy frames)"
+    gaussians = "" if run.gaussians is None else f"{run.gaussians:,}"
+    remark = run.problem or f"trained in {run.seconds:.0f} s"
+    return [f"  {run.name}", _age(run.made_utc), run.method or "", psnr, gaussians, remark]
+
+
+def _age(utc: str) -> str:
+    """Return how long ago a time was, in its largest whole unit; the text itself where it is no time."""
+    try:
+        then = datetime.fromisoformat(utc)
+    except ValueError:
+        return utc
+    seconds = (datetime.now(UTC) - then.replace(tzinfo=then.tzinfo or UTC)).total_seconds()
+    for unit, length_s in (("day", 86_400), ("hour", 3600), ("minute", 60)):
+        if (count := int(seconds // length_s)) >= 1:
+            return f"{count} {unit}{'s' if count > 1 else ''} ago"
+    return "just now"
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    return (
+        f"{value:.5g}" if isinstance(value, float) else f"{value:,}" if isinstance(value, int) else str(value)
+    )

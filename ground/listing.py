@@ -1,0 +1,199 @@
+"""What lies in some folders: sessions with their runs, and what differs between two runs; read, never changed."""
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ground.runs import read_metrics
+from ground.session import SessionError, flight_counts, read_header, read_records
+
+DEEPEST = 3  # levels of folders below the given ones in which sessions are looked for
+FIGURES = (  # of metrics.json, in the order of a comparison
+    *(
+        "psnr_clean_db",
+        "psnr_clean_foreground_db",
+        "psnr_noisy_db",
+        "psnr_srgb_db",
+        "ssim_clean",
+        "lpips_clean",
+    ),
+    *("chi2", "chamfer", "hausdorff", "completeness_surface", "accuracy_surface", "gaussians", "ply_bytes"),
+    *("train_seconds", "train_steps", "frames_trained", "frames_held_out"),
+)
+
+
+@dataclass(frozen=True)
+class RunEntry:
+    """One run of a session; figures that it does not have are None.
+
+    problem: why its metrics cannot be read, or that it is unfinished; empty for a whole run.
+    """
+
+    name: str
+    method: str | None
+    psnr_clean_db: float | None
+    psnr_noisy_db: float | None
+    gaussians: int | None
+    seconds: float | None
+    made_utc: str
+    problem: str
+
+
+@dataclass(frozen=True)
+class SessionEntry:
+    """One session; frames_captured is None where the spacecraft did not say how many it took.
+
+    problem: why the session cannot be read; its other values are then 0, None or empty.
+    """
+
+    folder: str
+    created_utc: str
+    imported_from: str | None
+    frames: int
+    frames_captured: int | None
+    brackets: int
+    losses: dict[str, int]  # by kind, without the kinds that are 0
+    size: str  # of the pictures, such as 256x256
+    runs: list[RunEntry]
+    problem: str
+
+
+def find_sessions(folders: Sequence[Path]) -> list[SessionEntry]:
+    """Return the sessions in some folders and below them, in the order of their paths.
+
+    Raises:
+        SessionError: a folder is not there.
+    """
+    found: dict[Path, SessionEntry] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise SessionError(f"{folder} is not a folder")
+        for session in sorted(_sessions_below(folder, DEEPEST)):
+            found.setdefault(session.resolve(), _session_entry(session))
+    return list(found.values())
+
+
+def _sessions_below(folder: Path, levels: int) -> Iterator[Path]:
+    if (folder / "session.json").is_file():
+        yield folder
+    elif levels:
+        with os.scandir(folder) as entries:
+            below = [
+                e.name for e in entries if e.is_dir(follow_symlinks=False) and not e.name.startswith(".")
+            ]
+        for name in below:
+            try:
+                yield from _sessions_below(folder / name, levels - 1)
+            except PermissionError:  # somebody else's folder is no session of ours
+                continue
+
+
+def _session_entry(folder: Path) -> SessionEntry:
+    try:
+        header, records = read_header(folder), read_records(folder)
+        flight = flight_counts(header)
+        captured = flight.captured(max(r.id for r in records)) if flight and records else None
+        camera = header["camera"]
+        return SessionEntry(
+            str(folder),
+            str(header["created_utc"]),
+            header.get("imported_from"),
+            len(records),
+            captured,
+            len({record.bracket for record in records}),
+            {name: count for name, count in header["losses"].items() if count},
+            f"{camera['width']}x{camera['height']}",
+            _runs(folder),
+            "",
+        )
+    except (SessionError, KeyError, TypeError, ValueError, AttributeError) as error:
+        return SessionEntry(str(folder), "", None, 0, None, 0, {}, "", [], str(error))
+
+
+def _runs(session: Path) -> list[RunEntry]:
+    folder = session / "runs"
+    if not folder.is_dir():
+        return []
+    paths = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.endswith(".replaced"))
+    return sorted(map(_run_entry, paths), key=lambda run: run.made_utc)
+
+
+def _run_entry(folder: Path) -> RunEntry:
+    name, made = folder.name, folder.stat().st_mtime
+    metrics: dict[str, Any] = {}
+    problem = ""
+    if name.startswith(".") and name.endswith(".part"):
+        name, problem = (
+            name[1 : -len(".part")],
+            "unfinished: `ground reconstruct` with this name goes on with it",
+        )
+    else:
+        try:
+            metrics = read_metrics(folder / "metrics.json")
+            made = (folder / "metrics.json").stat().st_mtime
+        except SessionError as error:
+            problem = str(error)
+    return RunEntry(
+        name,
+        metrics.get("method"),
+        metrics.get("psnr_clean_db"),
+        metrics.get("psnr_noisy_db"),
+        metrics.get("gaussians"),
+        metrics.get("train_seconds"),
+        datetime.fromtimestamp(made, UTC).isoformat(timespec="seconds"),
+        problem,
+    )
+
+
+def compare_runs(first: Path, second: Path) -> dict[str, dict[str, list]]:
+    """Return what differs between two run folders: {"settings": {name: [first, second]}, "figures": the same}.
+
+    Settings are those of config.yaml by their dotted names, without digests and versions that are equal; figures those
+    of metrics.json that either has, also where they are equal.
+
+    Raises:
+        SessionError: a folder is not a finished run, or its files are damaged.
+    """
+    settings = [_flat(_config(folder)) for folder in (first, second)]
+    metrics = [read_metrics(folder / "metrics.json") for folder in (first, second)]
+    names = sorted(settings[0].keys() | settings[1].keys())
+    return {
+        "settings": {
+            name: [tree.get(name) for tree in settings]
+            for name in names
+            if settings[0].get(name) != settings[1].get(name)
+        },
+        "figures": {
+            key: [m.get(key) for m in metrics]
+            for key in FIGURES
+            if any(m.get(key) is not None for m in metrics)
+        },
+    }
+
+
+def _config(folder: Path) -> dict:
+    path = folder / "config.yaml"
+    try:
+        tree = yaml.safe_load(path.read_text())
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise SessionError(f"{folder} is not a finished run: {path} cannot be read: {error}") from error
+    if not isinstance(tree, dict):
+        raise SessionError(f"{path} should hold the settings of a run; make the run again")
+    return tree
+
+
+def _flat(tree: dict, above: str = "") -> dict[str, Any]:
+    """Return the leaves of nested settings by their dotted names."""
+    leaves: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            leaves |= _flat(value, f"{above}{name}.")
+        else:
+            leaves[f"{above}{name}"] = value if isinstance(value, int | float | str) else json.dumps(value)
+    return leaves

@@ -1,0 +1,91 @@
+"""`ground list` and `ground compare-runs`: what lies in folders is shown as it is, whatever its state."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from ground import cli
+from ground.reconstruct import reconstruct
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "session"
+TINY = {"steps": 8, "start.count": 300, "growth.max_gaussians": 300}
+
+
+@pytest.fixture(scope="module")
+def passes(tmp_path_factory) -> Path:
+    """A folder with a session of two real runs, one unfinished and one damaged run, and a damaged session."""
+    folder = tmp_path_factory.mktemp("passes")
+    session = folder / "2026" / "pass-12"
+    shutil.copytree(GOLDEN, session)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ground.model_files.SURFACE_POINTS", 500)
+        reconstruct(session, "first", "obbgs", TINY)
+        reconstruct(session, "second", "3dgs", TINY | {"growth.interval": 10})
+    (session / "runs" / ".third.part").mkdir()
+    (session / "runs" / "fourth").mkdir()
+    (session / "runs" / "fourth" / "metrics.json").write_text("{")
+    (folder / "damaged").mkdir()
+    (folder / "damaged" / "session.json").write_text("not JSON")
+    return folder
+
+
+def called(*arguments: str) -> str:
+    result = CliRunner().invoke(cli.app, arguments, env={"COLUMNS": "200"}, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_sessions_are_found_below_a_folder_and_damaged_ones_are_shown_with_the_reason(passes):
+    session, damaged = json.loads(called("list", str(passes), "--json"))
+    lines = (GOLDEN / "frames.jsonl").read_text().splitlines()
+    assert session["folder"].endswith("2026/pass-12") and session["problem"] == ""
+    assert session["frames"] == len(lines)
+    assert session["brackets"] == len({json.loads(line)["bracket"] for line in lines})
+    assert damaged["folder"].endswith("damaged") and "session.json" in damaged["problem"]
+
+
+def test_every_run_is_listed_finished_or_not(passes):
+    session = json.loads(called("list", str(passes / "2026"), "--json"))[0]
+    runs = {run["name"]: run for run in session["runs"]}
+    assert set(runs) == {"first", "second", "third", "fourth"}
+    for name, method in (("first", "obbgs"), ("second", "3dgs")):
+        metrics = json.loads((passes / "2026/pass-12/runs" / name / "metrics.json").read_text())
+        assert (runs[name]["method"], runs[name]["gaussians"]) == (method, metrics["gaussians"])
+        assert runs[name]["seconds"] == metrics["train_seconds"] and runs[name]["problem"] == ""
+    assert runs["third"]["problem"].startswith("unfinished")
+    assert "metrics.json" in runs["fourth"]["problem"]
+
+
+def test_a_session_given_twice_is_listed_once_and_the_screen_shows_it(passes):
+    text = called("list", str(passes), str(passes / "2026" / "pass-12"))
+    assert text.count("48 in 16 brackets") == 1
+    assert "unfinished" in text and "first" in text
+
+
+def test_comparing_runs_names_exactly_the_settings_that_differ(passes, tmp_path):
+    runs = passes / "2026" / "pass-12" / "runs"
+    found = json.loads(called("compare-runs", str(runs / "first"), str(runs / "second"), "--json"))
+    assert found["settings"]["method.name"] == ["obbgs", "3dgs"]
+    assert found["settings"]["method.growth.interval"] == [60, 10]
+    assert "method.steps" not in found["settings"] and "seed" not in found["settings"]
+    assert found["figures"]["train_steps"] == [8, 8]
+    same = json.loads(called("compare-runs", str(runs / "first"), str(runs / "first"), "--json"))
+    assert same["settings"] == {}
+    assert "no difference" in called("compare-runs", str(runs / "first"), str(runs / "first"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("list", "{missing}"), "not a folder"),
+        (("compare-runs", "{runs}/first", "{runs}/third"), "not a finished run"),
+        (("compare-runs", "{runs}/fourth", "{runs}/first"), "config.yaml"),
+    ],
+)
+def test_what_is_not_there_is_said(passes, tmp_path, arguments, told):
+    names = {"missing": tmp_path / "nowhere", "runs": passes / "2026" / "pass-12" / "runs"}
+    result = CliRunner().invoke(cli.app, [a.format(**names) for a in arguments])
+    assert result.exit_code != 0 and told in str(result.exception)
