@@ -98,6 +98,11 @@ def _appearance(metrics: dict) -> list[str]:
             "direction; model.spz, and what other viewers show of model.ply, are lit from "
             f"({x:.3f}, {y:.3f}, {z:.3f}), target body frame."
         )
+    if metrics.get("background"):
+        lines.append(
+            f"- Trained in front of a background of radiance {metrics['background']:g}, which model.onnx draws. "
+            "model.ply and model.spz do not hold it: set it in the viewer."
+        )
     return lines
 
 

@@ -279,7 +279,8 @@ def test_a_run_on_white_is_scored_in_display_values_and_in_light(tmp_path, rende
     assert metrics["psnr_noisy_db"] > blank + 5
     assert metrics["onnx_parity_db"] > 50
     assert "display values (sRGB)" in write_report(tmp_path / "s", "run").read_text()
-    assert "display values (sRGB)" in (run.folder / "model_card.md").read_text()
+    card = (run.folder / "model_card.md").read_text()
+    assert "display values (sRGB)" in card and "a background of radiance 1" in card
 
 
 # --- intrinsics ---
