@@ -17,7 +17,7 @@ from obbgs_base.errors import Interrupted
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from tests import raycast
 
-FEW = SweepSettings(tilts_deg=(0.0,), sources=4, window_px=5)
+FEW = SweepSettings(sources=4, window_px=5, fusion=depth_maps.FusionSettings(0.5))
 BOXES = raycast.spacecraft(3)
 
 
