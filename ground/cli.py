@@ -1,4 +1,4 @@
-"""The command line `ground`: listen, key, uplink, reconstruct, evaluate, report, import, export."""
+"""The command line `ground`: all commands; those that need little are here, others in cli_runs and cli_systems."""
 
 import dataclasses
 import json
@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from flightsw.icd.mission import load_mission
 from ground.cli_options import AsJson, ExportFormat, ImportFormat, SessionDir, UplinkCommand
 from ground.cli_runs import evaluate_command, reconstruct_command, report_command
+from ground.cli_systems import dictionary_command, yamcs_command
 from obbgs_base.command_line import new_app, run
 
 app = new_app("The ground station: frames in, a 3D model out.")
@@ -161,6 +162,8 @@ def uplink(
 app.command("reconstruct")(reconstruct_command)
 app.command("evaluate")(evaluate_command)
 app.command("report")(report_command)
+app.command("dictionary")(dictionary_command)
+app.command("yamcs")(yamcs_command)
 
 
 @app.command("import")
