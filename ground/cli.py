@@ -1,5 +1,6 @@
 """The command line `ground`: all commands; those that need little are here, others in cli_runs and cli_systems."""
 
+import contextlib
 import dataclasses
 import json
 import signal
@@ -35,6 +36,12 @@ def listen_command(
     idle_timeout: Annotated[
         float | None, typer.Option(help="Stop after this many seconds without a packet.")
     ] = None,
+    forward: Annotated[
+        str | None,
+        typer.Option(
+            help="Pass every packet of the spacecraft on by UDP, to udp://HOST:PORT; default: to nobody."
+        ),
+    ] = None,
     json_: AsJson = False,
 ) -> None:
     """Receive frames and telemetry into a session folder until stopped, send commands, show the state of the pass.
@@ -45,12 +52,16 @@ def listen_command(
     Example: ground listen --link 'serial:///dev/ttyUSB0?baud=921600' --session pass-12
     """
     from ground.console import statuses_shown
+    from ground.forward import Forwarder
     from ground.ingest import listen
 
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    with statuses_shown(stderr, json_) as (on_status, on_event):
+    with (
+        Forwarder(forward) if forward is not None else contextlib.nullcontext() as forwarder,
+        statuses_shown(stderr, json_) as (on_status, on_event),
+    ):
         summary = listen(
             link,
             session,
@@ -60,6 +71,7 @@ def listen_command(
             should_stop=stop.is_set,
             on_status=on_status,
             on_event=on_event,
+            forward=forwarder,
         )
     if json_:
         print(json.dumps({"type": "summary"} | dataclasses.asdict(summary)))

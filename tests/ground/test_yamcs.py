@@ -13,6 +13,7 @@ from flightsw.icd.command import Command, Report
 from flightsw.icd.config import ConfigError
 from flightsw.icd.packet import APID_HOUSEKEEPING, APID_REPORTS, TELEMETRY, pack_packet
 from flightsw.icd.telemetry import DICTIONARY, NUMBERS
+from ground.forward import Forwarder
 from ground.yamcs import write_yamcs
 from tests.dictionary_packets import exactly, packets, some_value
 from tests.yamcs import Yamcs, running_yamcs, wait_for
@@ -133,6 +134,15 @@ def test_a_command_s_verifiers_follow_our_reports(yamcs: Yamcs, stages, ending):
     wait_for(has_ended, "the command ends")
     statuses = {name.removeprefix("Verifier_"): value for name, value in history().items()}
     assert {name: statuses[f"{name}_Status"] for name in ending} == ending
+
+
+def test_what_is_forwarded_reaches_yamcs(yamcs: Yamcs):
+    before = yamcs.packets_received()
+    with Forwarder(f"udp://127.0.0.1:{yamcs.telemetry_port}") as forward:
+        for packet, *_ in packets(40, seed=9):
+            forward.send(packet)
+        wait_for(lambda: yamcs.packets_received() == before + 40, "Yamcs receives what is forwarded")
+        assert (forward.sent, forward.dropped) == (40, 0)
 
 
 def test_a_folder_that_is_not_empty_is_left_as_it_is(tmp_path):
