@@ -181,8 +181,10 @@ class _Ingest:
         if forward is not None:
             self._stream.on_packet = forward.send
         interval_s, max_pdu_bytes = timer_s(link.baud_rate), self._stream.max_data_bytes
-        self._receiver = Receiver(max_pdu_bytes, interval_s, self._accept)
-        self._uplinker = Uplinker(writer.folder, max_pdu_bytes, interval_s, self._note_end)
+        self._receiver = Receiver(max_pdu_bytes, interval_s, self._accept, checksum=mission.link.checksum)
+        self._uplinker = Uplinker(
+            writer.folder, max_pdu_bytes, interval_s, self._note_end, checksum=mission.link.checksum
+        )
         self._telemetry = TelemetryLog(
             writer.folder,
             on_event,
