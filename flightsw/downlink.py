@@ -162,7 +162,12 @@ class _Downlink:
         self._started_s = self._clock_s()
         self._ranking = Ranking(store, self._mission.camera, self._clock_s)
         self._frames = FrameSender(
-            store, self._ranking, self._counts, self._stream.max_data_bytes, self.interval_s
+            store,
+            self._ranking,
+            self._counts,
+            self._stream.max_data_bytes,
+            self.interval_s,
+            self._mission.link.checksum,
         )
         self._uploads: Receiver | None = None  # of the model file that was announced last
         self._upload_counter = 0
@@ -323,6 +328,7 @@ class _Downlink:
                 max_file_bytes=upload.sealed_bytes,
                 max_open=2,
                 route=UPLINK,
+                checksum=self._mission.link.checksum,
             )
         if self._uploads is not None:
             self._uploads.receive(pdu, now_s)

@@ -1,5 +1,6 @@
-"""The command line `ground`: listen, key, uplink, reconstruct, evaluate, report, list, compare, import, export."""
+"""The command line `ground`: all commands; those of runs, lists, comparisons and other systems are in `cli_*`."""
 
+import contextlib
 import dataclasses
 import json
 import signal
@@ -26,6 +27,7 @@ from ground.cli_options import (
     ValuesGiven,
 )
 from ground.cli_runs import evaluate_command, reconstruct_command, report_command
+from ground.cli_systems import dictionary_command, yamcs_command
 from obbgs_base.command_line import new_app, run
 
 app = new_app("The ground station: frames in, a 3D model out.")
@@ -45,6 +47,12 @@ def listen_command(
     idle_timeout: Annotated[
         float | None, typer.Option(help="Stop after this many seconds without a packet.")
     ] = None,
+    forward: Annotated[
+        str | None,
+        typer.Option(
+            help="Pass every packet of the spacecraft on by UDP, to udp://HOST:PORT; default: to nobody."
+        ),
+    ] = None,
     json_: AsJson = False,
 ) -> None:
     """Receive frames and telemetry into a session folder until stopped, send commands, show the state of the pass.
@@ -55,12 +63,16 @@ def listen_command(
     Example: ground listen --link 'serial:///dev/ttyUSB0?baud=921600' --session pass-12
     """
     from ground.console import statuses_shown
+    from ground.forward import Forwarder
     from ground.ingest import listen
 
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    with statuses_shown(stderr, json_) as (on_status, on_event):
+    with (
+        Forwarder(forward) if forward is not None else contextlib.nullcontext() as forwarder,
+        statuses_shown(stderr, json_) as (on_status, on_event),
+    ):
         summary = listen(
             link,
             session,
@@ -70,6 +82,7 @@ def listen_command(
             should_stop=stop.is_set,
             on_status=on_status,
             on_event=on_event,
+            forward=forwarder,
         )
     if json_:
         print(json.dumps({"type": "summary"} | dataclasses.asdict(summary)))
@@ -175,6 +188,8 @@ app.command("report")(report_command)
 app.command("compare")(compare_command)
 app.command("list")(list_command)
 app.command("compare-runs")(compare_runs_command)
+app.command("dictionary")(dictionary_command)
+app.command("yamcs")(yamcs_command)
 
 
 @app.command("import")

@@ -36,7 +36,7 @@ commands_refused
 """
 COUNTS = """
 crc_errors packets_missing skipped_bytes segments_resent duplicates frames_rejected telemetry_refused store_failures
-hang_ups
+hang_ups packets_not_forwarded
 """
 
 

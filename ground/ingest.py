@@ -24,6 +24,7 @@ from flightsw.icd.packet import (
 )
 from flightsw.icd.transfer import Incoming, Receiver, timer_s
 from flightsw.ports import Link, open_link
+from ground.forward import Forwarder
 from ground.session import SessionError
 from ground.session_writer import SessionWriter
 from ground.telemetry import TelemetryLog
@@ -54,6 +55,7 @@ class ListenSummary:
     bytes_received: int = 0  # from the port
     bytes_sent: int = 0
     packets_received: int = 0
+    packets_forwarded: int = 0  # to another ground system
     payload_bytes: int = 0  # containers of frames_received
     open_transfers: int = 0
     commands_ended: int = 0
@@ -68,6 +70,7 @@ class ListenSummary:
     duplicates: int = 0  # frames that came again
     store_failures: int = 0  # the disk refused them; the spacecraft keeps the frames
     hang_ups: int = 0
+    packets_not_forwarded: int = 0  # that this machine dropped, or the other host refused
     link_losses: dict[str, int] = field(default_factory=dict)  # counts of the link itself, by name
 
     @property
@@ -75,7 +78,7 @@ class ListenSummary:
         """The counts that go to session.json."""
         names = (
             "skipped_bytes crc_errors packets_missing packets_foreign telemetry_refused segments_resent "
-            "pdus_refused frames_rejected duplicates store_failures hang_ups"
+            "pdus_refused frames_rejected duplicates store_failures hang_ups packets_not_forwarded"
         )
         return {name: getattr(self, name) for name in names.split()} | self.link_losses
 
@@ -107,12 +110,14 @@ def listen(
     clock_s: Callable[[], float] = time.monotonic,
     on_status: Callable[[Status], None] = lambda status: None,
     on_event: Callable[[dict[str, Any]], None] = lambda event: None,
+    forward: Forwarder | None = None,
 ) -> ListenSummary:
     """Write what arrives over the link into a new or existing session and return the counts.
 
     Commands that `ground uplink` leaves in the session are sent. Ends when `should_stop` returns True, when the session
     holds `exit_after` frames, or when no packet has come for `idle_timeout_s`. `on_progress` is called after each frame
-    and about once a second, `on_status` four times a second, `on_event` for each event as it comes.
+    and about once a second, `on_status` four times a second, `on_event` for each event as it comes. `forward` is
+    given every packet of the spacecraft.
 
     Raises:
         ConfigError: the URL is not valid.
@@ -122,7 +127,7 @@ def listen(
     with open_link(link_url, GROUND_SIDE) as link:
         writer = SessionWriter(session_dir, mission)
         with listening(writer.folder):
-            ingest = _Ingest(link, writer, mission, on_event)
+            ingest = _Ingest(link, writer, mission, on_event, forward)
             interval_s = timer_s(link.baud_rate)
             now_s = clock_s()
             ingest.last_packet_s = last_save_s = last_status_s = now_s
@@ -159,18 +164,27 @@ class _Ingest:
     """Receives packets, hands each to its receiver, and sends what they have to answer."""
 
     def __init__(
-        self, link: Link, writer: SessionWriter, mission: Mission, on_event: Callable[[dict[str, Any]], None]
+        self,
+        link: Link,
+        writer: SessionWriter,
+        mission: Mission,
+        on_event: Callable[[dict[str, Any]], None],
+        forward: Forwarder | None,
     ):
         self.frames_received = 0
         self.last_packet_s = float("-inf")
         self.flight_outbox: int | None = (
             None  # frames still to come, as housekeeping said after the last frame
         )
-        self._link, self._writer, self._on_event = link, writer, on_event
+        self._link, self._writer, self._on_event, self._forward = link, writer, on_event, forward
         self._stream = PacketStream(TELECOMMAND, mission.link.max_packet_bytes)
+        if forward is not None:
+            self._stream.on_packet = forward.send
         interval_s, max_pdu_bytes = timer_s(link.baud_rate), self._stream.max_data_bytes
-        self._receiver = Receiver(max_pdu_bytes, interval_s, self._accept)
-        self._uplinker = Uplinker(writer.folder, max_pdu_bytes, interval_s, self._note_end)
+        self._receiver = Receiver(max_pdu_bytes, interval_s, self._accept, checksum=mission.link.checksum)
+        self._uplinker = Uplinker(
+            writer.folder, max_pdu_bytes, interval_s, self._note_end, checksum=mission.link.checksum
+        )
         self._telemetry = TelemetryLog(
             writer.folder,
             on_event,
@@ -297,5 +311,7 @@ class _Ingest:
             duplicates=self._duplicates,
             store_failures=self._store_failures + self._telemetry.write_failures,
             hang_ups=self._link.hang_ups,
+            packets_forwarded=self._forward.sent if self._forward else 0,
+            packets_not_forwarded=self._forward.dropped if self._forward else 0,
             link_losses=self._link.losses,
         )

@@ -22,7 +22,7 @@ from typing import Any
 
 from flightsw.icd.auth import Key, seal, seal_file
 from flightsw.icd.command import ENDED, Command, Report, model_file_name
-from flightsw.icd.mission import ConfigError
+from flightsw.icd.mission import Checksum, ConfigError
 from flightsw.icd.transfer import UPLINK, Sender
 from ground.session import SessionError
 from obbgs_base.files import write_whole
@@ -240,9 +240,10 @@ class Uplinker:
         interval_s: float,
         on_end: Callable[[int, str, str, str], None] = lambda counter, command, stage, text: None,
         utc_ns: Callable[[], int] = time.time_ns,
+        checksum: Checksum = "crc-32",
     ):
         self.jobs: dict[int, Job] = {}
-        self.files = Sender(max_pdu_bytes, interval_s, route=UPLINK)
+        self.files = Sender(max_pdu_bytes, interval_s, route=UPLINK, checksum=checksum)
         self._folder, self._on_end, self._utc_ns = session / "uplink", on_end, utc_ns
         self._interval_s = interval_s
         self._next_poll_s = float("-inf")

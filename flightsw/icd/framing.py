@@ -5,6 +5,8 @@ CRC is CCITT's with the final inversion (CRC-16/GENIBUS): without it a packet fo
 too, and COBS makes such a zero of a delimiter with its lowest bit flipped.
 """
 
+from collections.abc import Callable
+
 from cobs import cobs
 from fastcrc import crc16
 
@@ -108,6 +110,9 @@ class PacketStream:
         self.packets_received = 0
         self.packets_missing = 0  # by gaps in the sequence count of each APID
         self.packets_foreign = 0  # whole, but no packet of the other side's
+        self.on_packet: Callable[[bytes], None] = lambda packet: (
+            None
+        )  # given each of the other side's, with its header
         self._packet_type = packet_type
         self._next_count = dict.fromkeys(APIDS, 0)
         self._expected_count: dict[int, int] = {}
@@ -133,6 +138,7 @@ class PacketStream:
                 self.packets_foreign += 1
                 continue
             self._count(header.apid, header.seq_count)
+            self.on_packet(packet)
             data.append((header.apid, content))
         return data
 

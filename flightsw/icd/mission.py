@@ -11,6 +11,8 @@ from typing import Any, Literal
 from flightsw.icd.config import ConfigError, build, in_file, parse_yaml, require
 from flightsw.icd.tle import check_tle
 
+Checksum = Literal["crc-32", "crc-32c", "modular"]  # of CFDP
+
 
 @dataclass(frozen=True)
 class OrbitSection:
@@ -255,6 +257,7 @@ class LinkSection:
         "thumbnail-first"  # of the outbox, until commanded
     )
     housekeeping_s: float = 1.0  # from one housekeeping packet to the next
+    checksum: Checksum = "crc-32"  # of each transferred file
 
     def __post_init__(self):
         path = "mission.link"

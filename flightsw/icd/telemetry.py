@@ -12,6 +12,8 @@ from flightsw.icd.config import ConfigError, build, in_file, keys_below, parse_y
 from flightsw.icd.packet import PacketError, PacketTooShort
 
 NUMBERS = {"uint8": "B", "uint16": "H", "uint32": "I", "uint64": "Q", "int64": "q", "float64": "d"}
+WHOLE = tuple(kind for kind in NUMBERS if "int" in kind)
+NAME = re.compile(r"[a-z][a-z0-9_]*", re.ASCII)  # of packets and items: also a name in XTCE, JSON and Python
 ARRAY = re.compile(r"(float64|text|bytes)\[(\d{1,3})\]", re.ASCII)
 Severity = Literal["info", "warning", "error"]
 Limit = Literal["green", "yellow", "red"]
@@ -39,6 +41,12 @@ class Item:
             if bounds and not (len(bounds) == 2 and bounds[0] <= bounds[1]):
                 raise ConfigError(f"{self.name}.{key}", f"expected [low, high], got {list(bounds)}")
         names = [name for _, name in self.states]
+        if self.states and not (
+            self.type in WHOLE and all(_fits(n, NUMBERS[self.type]) for n, _ in self.states)
+        ):
+            raise ConfigError(
+                f"{self.name}.states", f"expected numbers that a whole-number type holds, got {self.type}"
+            )
         if len(set(names)) != len(names) or not set(self.red_states) <= set(names):
             raise ConfigError(
                 f"{self.name}.states", f"expected different names, red ones among them: {names}"
@@ -235,6 +243,7 @@ def _layouts(tree: Any, section: str, version: int) -> Iterator[tuple[str, Layou
     seen = set()
     for name, packet in tree.items():
         path = f"{section}.{name}"
+        _require_name(name, path)
         if not isinstance(packet, dict) or not isinstance(packet.get("items", {}), dict):
             raise ConfigError(path, "expected a mapping with an id and items")
         items = tuple(_item(key, item, f"{path}.{key}") for key, item in packet.get("items", {}).items())
@@ -249,7 +258,8 @@ def _layouts(tree: Any, section: str, version: int) -> Iterator[tuple[str, Layou
         yield name, layout
 
 
-def _item(name: str, tree: Any, path: str) -> Item:
+def _item(name: Any, tree: Any, path: str) -> Item:
+    _require_name(name, path)
     if not isinstance(tree, dict) or not isinstance(tree.get("states", {}), dict):
         raise ConfigError(path, "expected a mapping with a type")
     states = tuple(tree.get("states", {}).items())
@@ -258,6 +268,21 @@ def _item(name: str, tree: Any, path: str) -> Item:
     rest = {key: value for key, value in tree.items() if key != "states"}
     with keys_below(path, name):
         return build(Item, rest, path, name=name, states=states)
+
+
+def _require_name(name: Any, path: str) -> None:
+    if not (isinstance(name, str) and NAME.fullmatch(name)):
+        raise ConfigError(
+            path, "expected a name of lower-case letters, digits and _ that begins with a letter"
+        )
+
+
+def _fits(number: int, code: str) -> bool:
+    try:
+        struct.pack(f">{code}", number)
+    except struct.error:
+        return False
+    return True
 
 
 def _taken(data: bytes, at: int, size: int) -> bytes:

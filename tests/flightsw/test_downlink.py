@@ -1,5 +1,6 @@
 """What the flight side puts on the wire, in which order, without a port: a link of lists and a clock of ours."""
 
+import dataclasses
 import logging
 import os
 import shutil
@@ -27,6 +28,7 @@ from flightsw.icd.packet import (
 )
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import UPLINK, Sender, parse_pdu
+from flightsw.icd.transfer.checksum import TYPES
 from flightsw.settings import Settings, save_settings
 from flightsw.store import FrameStore
 from ground.uplink import make_key
@@ -103,6 +105,17 @@ def test_headers_go_at_once_then_thumbnails_then_pictures(store, small_mission):
     headers = [data for apid, data in link.packets() if apid == APID_FRAME_HEADERS]
     assert headers == [store.read(number)[: HEADER.size] for number in range(3)]
     assert [read_header(data)["frame_id"] for data in headers] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("checksum", ["crc-32", "crc-32c", "modular"])
+def test_files_carry_the_checksum_that_the_mission_file_asks_for(store, small_mission, checksum):
+    link = ListLink()
+    mission = dataclasses.replace(
+        small_mission, link=dataclasses.replace(small_mission.link, checksum=checksum)
+    )
+    fly(link, store, mission, 0.3)
+    pdus = [parse_pdu(data) for apid, data in link.packets() if apid == APID_FILES]
+    assert {pdu.checksum_type for pdu in pdus if isinstance(pdu, MetadataPdu)} == {TYPES[checksum]}
 
 
 def test_in_the_order_oldest_there_are_no_thumbnails(store, small_mission):

@@ -4,7 +4,6 @@ Each fix overrides a private method, so the version is pinned, and each has a te
 needed any more or no longer enough.
 """
 
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,8 @@ from spacepackets.cfdp.pdu import EofPdu, FileDataPdu, FinishedPdu, MetadataPdu
 from spacepackets.cfdp.pdu.finished import DeliveryCode, FileStatus, FinishedParams
 from spacepackets.cfdp.tlv import FilestoreResponseStatusCode
 from spacepackets.countdown import Countdown
+
+from flightsw.icd.transfer.checksum import file_checksum
 
 
 def delivered(finished: FinishedParams) -> bool:
@@ -81,7 +82,7 @@ class OneFile(VirtualFilestore):
     def calculate_checksum(
         self, checksum_type: Any, file_path: Path, size_to_verify: int, segment_len: int = 4096
     ) -> bytes:
-        return zlib.crc32(self.content[:size_to_verify]).to_bytes(4, "big")
+        return file_checksum(checksum_type, self.content[:size_to_verify])
 
     def file_size(self, file: Path) -> int:
         return len(self.content)
@@ -233,8 +234,7 @@ class FixedDestHandler(DestHandler):
         params = self._params
         if params.completion_disposition == CompletionDisposition.COMPLETED:
             whole = len(self.user.file.content) == params.fp.file_size
-            crc = zlib.crc32(self.user.file.content).to_bytes(4, "big")
-            if not whole or crc != params.fp.crc32:
+            if not whole or file_checksum(params.checksum_type, self.user.file.content) != params.fp.crc32:
                 params.finished_params.delivery_code = DeliveryCode.DATA_INCOMPLETE
                 params.finished_params.condition_code = ConditionCode.FILE_CHECKSUM_FAILURE
         super()._handle_transfer_completion()

@@ -6,15 +6,17 @@ from typing import Any
 
 from cfdppy import exceptions as cfdp_errors
 from cfdppy.mib import IndicationConfig, LocalEntityConfig, RemoteEntityConfig, RemoteEntityConfigTable
-from spacepackets.cfdp import ChecksumType, ConditionCode, Direction, DirectiveType, TransmissionMode
+from spacepackets.cfdp import ConditionCode, Direction, DirectiveType, TransmissionMode
 from spacepackets.cfdp.defs import InvalidCrcError, UnsupportedCfdpVersionError
 from spacepackets.cfdp.pdu import AckPdu, EofPdu, FinishedPdu, MetadataPdu
 from spacepackets.cfdp.pdu.ack import TransactionStatus
 from spacepackets.cfdp.pdu.helper import PduFactory
 from spacepackets.util import ByteFieldU8
 
+from flightsw.icd.mission import Checksum
 from flightsw.icd.packet import PacketError
 from flightsw.icd.transfer.cfdp_fixes import Faults
+from flightsw.icd.transfer.checksum import TYPES
 
 FLIGHT, GROUND = ByteFieldU8(1), ByteFieldU8(2)  # entity IDs
 Route = tuple[ByteFieldU8, ByteFieldU8]  # the entities that send and receive a file
@@ -84,6 +86,7 @@ def configuration(
     remote: ByteFieldU8,
     max_pdu_bytes: int,
     interval_s: float,
+    checksum: Checksum,
     max_segment_bytes: int | None = None,
 ) -> tuple[LocalEntityConfig, RemoteEntityConfigTable]:
     """Return the library's configuration of this end and of the other one."""
@@ -95,7 +98,7 @@ def configuration(
         closure_requested=True,
         crc_on_transmission=False,
         default_transmission_mode=TransmissionMode.ACKNOWLEDGED,
-        crc_type=ChecksumType.CRC_32,
+        crc_type=TYPES[checksum],
         positive_ack_timer_interval_seconds=interval_s,
         positive_ack_timer_expiration_limit=TIMER_LIMIT,
         immediate_nak_mode=False,  # measured: immediate mode resends far more after a restart

@@ -5,11 +5,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from spacepackets.cfdp import ChecksumType, Direction, DirectiveType
+from spacepackets.cfdp import Direction, DirectiveType
 from spacepackets.cfdp.pdu import AckPdu, EofPdu, FileDataPdu, FinishedPdu, MetadataPdu
 
+from flightsw.icd.mission import Checksum
 from flightsw.icd.packet import PacketError
 from flightsw.icd.transfer.cfdp_fixes import Clock, FixedDestHandler, Indications, NoCheckTimer, OneFile
+from flightsw.icd.transfer.checksum import TYPES
 from flightsw.icd.transfer.pdu import (
     DOWNLINK,
     REFUSALS,
@@ -60,6 +62,7 @@ class Receiver:
         max_file_bytes: int = 64 << 20,
         max_open: int = 32,
         route: Route = DOWNLINK,
+        checksum: Checksum = "crc-32",
     ):
         self.segments_received = 0
         self.segments_resent = 0  # came at or below what was there already: resent, late or twice
@@ -67,6 +70,7 @@ class Receiver:
         self.pdus_refused = 0
         self._max_pdu_bytes, self._interval_s, self._accept = max_pdu_bytes, interval_s, accept
         self._max_file_bytes, self._max_open, self._route = max_file_bytes, max_open, route
+        self._checksum: Checksum = checksum
         self._clock = Clock()
         self._receiving: OrderedDict[int, _Receiving] = OrderedDict()
         self._closed: OrderedDict[int, bytes] = OrderedDict()  # transaction to its Finished PDU
@@ -149,8 +153,8 @@ class Receiver:
         elif isinstance(pdu, EofPdu | MetadataPdu):
             if pdu.file_size > self._max_file_bytes:
                 raise PacketError(f"a file of {pdu.file_size} bytes, allowed are {self._max_file_bytes}")
-            if isinstance(pdu, MetadataPdu) and pdu.checksum_type != ChecksumType.CRC_32:
-                raise PacketError(f"checksum type {pdu.checksum_type}, this link uses CRC-32")
+            if isinstance(pdu, MetadataPdu) and pdu.checksum_type != TYPES[self._checksum]:
+                raise PacketError(f"checksum type {pdu.checksum_type}, this link uses {self._checksum}")
         elif not acknowledges(pdu, DirectiveType.FINISHED_PDU):
             raise PacketError(f"{type(pdu).__name__} is not for a receiver")
 
@@ -160,7 +164,7 @@ class Receiver:
             del self._receiving[oldest]
         source, destination = self._route
         nak_bytes = min(self._max_pdu_bytes, MAX_NAK_BYTES)
-        config, remotes = configuration(destination, source, nak_bytes, self._interval_s)
+        config, remotes = configuration(destination, source, nak_bytes, self._interval_s, self._checksum)
         user = Indications(OneFile(b"", self._max_file_bytes), self._accept)
         handler = FixedDestHandler(config, user, remotes, NoCheckTimer())
         handler.clock = self._clock

@@ -10,6 +10,7 @@ from spacepackets.cfdp import Direction, DirectiveType, TransmissionMode
 from spacepackets.cfdp.pdu import FileDataPdu, FinishedPdu, NakPdu
 from spacepackets.seqcount import ProvidesSeqCount
 
+from flightsw.icd.mission import Checksum
 from flightsw.icd.packet import PacketError
 from flightsw.icd.transfer.cfdp_fixes import (
     Clock,
@@ -75,7 +76,12 @@ class Sender:
     """The sending entity: several files in flight, the first put first on the wire."""
 
     def __init__(
-        self, max_pdu_bytes: int, interval_s: float, max_in_flight: int = 8, route: Route = DOWNLINK
+        self,
+        max_pdu_bytes: int,
+        interval_s: float,
+        max_in_flight: int = 8,
+        route: Route = DOWNLINK,
+        checksum: Checksum = "crc-32",
     ):
         self.segments_sent = 0
         self.segments_resent = 0
@@ -83,6 +89,7 @@ class Sender:
         self.pdus_refused = 0
         self._max_pdu_bytes, self._interval_s, self._max_in_flight = max_pdu_bytes, interval_s, max_in_flight
         self._route = route
+        self._checksum: Checksum = checksum
         self._segments = SegmentLength(max_pdu_bytes, interval_s)
         self._clock = Clock()
         self._sending: OrderedDict[int, _Sending] = OrderedDict()
@@ -111,7 +118,12 @@ class Sender:
         self._clock.now_s = now_s
         source, destination = self._route
         config, remotes = configuration(
-            source, destination, self._max_pdu_bytes, self._interval_s, self._segments.length_bytes
+            source,
+            destination,
+            self._max_pdu_bytes,
+            self._interval_s,
+            self._checksum,
+            self._segments.length_bytes,
         )
         user = Indications(OneFile(content, len(content)))
         handler = FixedSourceHandler(config, user, remotes, NoCheckTimer(), _OneNumber(transaction))
