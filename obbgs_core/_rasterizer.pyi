@@ -102,6 +102,7 @@ def published(
     sensor: SensorModel,
     ssim_weight: float,
     edge_weight: float,
+    clamped: bool,
     residual: Array,
     gradient: Array | None,
     threads: int,
