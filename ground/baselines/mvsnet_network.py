@@ -120,7 +120,7 @@ def _reduced(view: View, feature: Tensor) -> View:
     K[:2] /= STRIDE
     K[:2, 2] += 0.5 - 0.5 / STRIDE  # centres are at .5 in both
     lit = torch.zeros(feature.shape[1:], dtype=torch.bool)
-    return View(feature, lit, lit, view.world_to_camera, K)
+    return View(feature, view.full_scale, lit, view.world_to_camera, K)
 
 
 def _mass_near(probability: Tensor) -> Tensor:

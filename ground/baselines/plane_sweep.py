@@ -52,7 +52,7 @@ def reconstruct_mvs(
     """Return the fused point cloud of depth maps by correlation.
 
     Args:
-        one_exposure: frames are divided by their exposure times, and windows with saturated pixels are left out; if
+        one_exposure: frames are divided by their exposure times, and a pair is clipped where one of it saturates; if
             false, the readings are matched as they are.
 
     Raises:
@@ -120,15 +120,18 @@ def _scores(
     rows, columns = (torch.arange(int(g.min()) - half, int(g.max()) + half + 1) for g in grid)
     rows, columns = torch.meshgrid(rows, columns, indexing="ij")
     rays = pixel_rays(rows, columns, view.K)
-    image = F.pad(comparable(view), (half,) * 4, value=torch.nan)[rows + half, columns + half]
-    sources = [(comparable(other), homography_terms(rays, view, other)) for other in others]
+    pairs = []
+    for other in others:
+        most = min(view.full_scale, other.full_scale)
+        image = F.pad(comparable(view, most), (half,) * 4, value=torch.nan)[rows + half, columns + half]
+        pairs.append((image, comparable(other, most), *homography_terms(rays, view, other)))
     scores = torch.empty(len(planes), *grid[0].shape)
     at_once = max(1, PIXELS_AT_ONCE // rays[..., 0].numel())
     for first in range(0, len(planes), at_once):
         chosen = slice(first, first + at_once)
         layers = planes[chosen, None, None].expand(-1, *rows.shape)
         kept = [torch.full_like(scores[chosen], NOTHING) for _ in range(min(settings.kept, len(others)))]
-        for source, (turned, moved) in sources:
+        for image, source, turned, moved in pairs:
             warped = warp(source[None], turned, moved, layers)[0]
             score = correlation(image, warped, settings.window_px).nan_to_num_(NOTHING)
             for k, other_score in enumerate(kept):  # the best first
@@ -137,9 +140,9 @@ def _scores(
     return scores
 
 
-def comparable(view: View) -> Tensor:
-    """Return the mean of a view's channels [H, W], not a number at saturated pixels and on the border."""
-    image = torch.where(view.saturated, torch.nan, view.image.mean(dim=0))
+def comparable(view: View, most: float) -> Tensor:
+    """Return the mean of a view's channels [H, W], clipped where either of two views saturates; NaN on the border."""
+    image = view.image.clamp(max=most).mean(dim=0)
     return F.pad(image[1:-1, 1:-1], (1, 1, 1, 1), value=torch.nan)
 
 

@@ -77,7 +77,7 @@ def _cropped(view: View, truth_m: np.ndarray, crop_px: int, rng: np.random.Gener
     K = view.K.clone()
     K[:2, 2] -= torch.tensor([left, top])
     square = np.s_[..., top : top + size, left : left + size]
-    crop = View(view.image[square], view.saturated[square], view.lit[square], view.world_to_camera, K)
+    crop = View(view.image[square], view.full_scale, view.lit[square], view.world_to_camera, K)
     at = (
         torch.arange(size * ENLARGED // STRIDE) * STRIDE // ENLARGED
     )  # where the features' pixels are centred

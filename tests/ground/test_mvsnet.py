@@ -42,7 +42,7 @@ def test_features_of_a_plane_are_warped_to_where_the_plane_projects_and_carry_a_
     lit = torch.ones(32, 32, dtype=torch.bool)
     values, views = [], []
     for pose in map(torch.from_numpy, poses):
-        view = View(torch.zeros(1, 32, 32), ~lit, lit, pose, K)
+        view = View(torch.zeros(1, 32, 32), 1.0, lit, pose, K)
         body_rays = rays @ pose[:3, :3]
         at = view.centre - body_rays * (view.centre[2] / body_rays[..., 2])[..., None]  # on the plane z = 0
         values.append((torch.sin(3 * at[..., 0]) + at[..., 1]).float())
