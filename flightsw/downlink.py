@@ -167,7 +167,7 @@ class _Downlink:
             self._counts,
             self._stream.max_data_bytes,
             self.interval_s,
-            self._mission.link.checksum,
+            self._mission.link,
         )
         self._uploads: Receiver | None = None  # of the model file that was announced last
         self._upload_counter = 0

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from flightsw.errors import StoreError
 from flightsw.icd.frame import HEADER, decode_frame, encode_thumbnail
-from flightsw.icd.mission import Checksum
+from flightsw.icd.mission import LinkSection
 from flightsw.icd.packet import PacketError
 from flightsw.icd.transfer import Outcome, Sender
 from flightsw.ranking import Ranking
@@ -39,10 +39,10 @@ class FrameSender:
         counts: SendingCounts,
         max_pdu_bytes: int,
         interval_s: float,
-        checksum: Checksum,
+        link: LinkSection,
     ):
         self.waiting: list[int] = []  # frames still to be delivered, those in flight included
-        self.transfers = Sender(max_pdu_bytes, interval_s, checksum=checksum)
+        self.transfers = Sender(max_pdu_bytes, interval_s, link.files_in_flight, checksum=link.checksum)
         self._store, self._ranking, self._counts = store, ranking, counts
         self._queue: deque[int] = deque()  # frames to be put, in order
         self._thumbnails: deque[int] = deque()  # frames whose thumbnail is to be put

@@ -65,6 +65,16 @@ class Yamcs:
             while at < len(text) and text[at].isspace():
                 at += 1
 
+    def download(self, path: str) -> bytes:
+        with urllib.request.urlopen(self._url + path, timeout=ANSWER_S) as answer:
+            return answer.read()
+
+    def upload(self, path: str, content: bytes) -> None:
+        request = urllib.request.Request(
+            self._url + path, content, {"Content-Type": "application/octet-stream"}
+        )
+        urllib.request.urlopen(request, timeout=ANSWER_S).close()
+
     def packets_received(self) -> int:
         return int(self.ask("/links/obbgs/telemetry")["dataInCount"])
 

@@ -258,6 +258,7 @@ class LinkSection:
     )
     housekeeping_s: float = 1.0  # from one housekeeping packet to the next
     checksum: Checksum = "crc-32"  # of each transferred file
+    files_in_flight: int = 8  # at most, to the ground
 
     def __post_init__(self):
         path = "mission.link"
@@ -275,6 +276,11 @@ class LinkSection:
             512 <= self.max_packet_bytes <= 4096,  # the longest telemetry packets have some 400 bytes
             f"{path}.max_packet_bytes",
             f"expected 512 to 4096, got {self.max_packet_bytes}",
+        )
+        require(
+            1 <= self.files_in_flight <= 32,  # as many as the ground keeps open
+            f"{path}.files_in_flight",
+            f"expected 1 to 32, got {self.files_in_flight}",
         )
         require(self.roi_sigma > 0, f"{path}.roi_sigma", f"must be positive, got {self.roi_sigma}")
         require(

@@ -107,6 +107,17 @@ def test_headers_go_at_once_then_thumbnails_then_pictures(store, small_mission):
     assert [read_header(data)["frame_id"] for data in headers] == [0, 1, 2]
 
 
+@pytest.mark.parametrize("files", [1, 2])
+def test_no_more_files_are_under_way_than_the_mission_file_allows(store, small_mission, files):
+    save_settings(store.folder, Settings("oldest"))
+    link = ListLink()
+    mission = dataclasses.replace(
+        small_mission, link=dataclasses.replace(small_mission.link, files_in_flight=files)
+    )
+    fly(link, store, mission, 0.5)
+    assert len(set(link.files())) == files  # nobody answers, so that none ends
+
+
 @pytest.mark.parametrize("checksum", ["crc-32", "crc-32c", "modular"])
 def test_files_carry_the_checksum_that_the_mission_file_asks_for(store, small_mission, checksum):
     link = ListLink()
