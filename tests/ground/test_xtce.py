@@ -13,6 +13,8 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from space_packet_parser.xtce.definitions import XtcePacketDefinition
+from space_packet_parser.xtce.validation import validate_xtce
 from typer.testing import CliRunner
 
 from flightsw.icd import telemetry
@@ -24,23 +26,18 @@ from ground.cli import app
 from ground.xtce import FRAME_HEADER, NAMESPACE, xtce_document
 from tests.dictionary_packets import exactly, frame_header, packets
 
-spp = pytest.importorskip("space_packet_parser", reason="pip install space_packet_parser")
 PACKETS = 10_000
 
 
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory):
     """space_packet_parser, with our document."""
-    from space_packet_parser.xtce.definitions import XtcePacketDefinition
-
     file = tmp_path_factory.mktemp("xtce") / "obbgs.xml"
     file.write_bytes(xtce_document())
     return XtcePacketDefinition.from_xtce(file)
 
 
 def assert_valid(document: bytes, tmp_path) -> None:
-    from space_packet_parser.xtce.validation import validate_xtce
-
     file = tmp_path / "document.xml"
     file.write_bytes(document)
     result = validate_xtce(file, raise_on_error=False)  # the schema comes with the library
@@ -174,8 +171,6 @@ def test_huge_limits_and_those_between_whole_numbers_are_valid(tmp_path):
 @settings(max_examples=100, deadline=None)
 @given(data=st.data())
 def test_a_damaged_dictionary_gives_a_document_that_others_read_or_an_error_that_says_why(data):
-    from space_packet_parser.xtce.definitions import XtcePacketDefinition
-
     content = telemetry._FILE.read_bytes()
     lines = content.splitlines(keepends=True)
     match data.draw(st.sampled_from(["cut", "line", "byte"])):
