@@ -189,7 +189,8 @@ class _Telemetry:
     def _stages(self, dictionary: Dictionary) -> None:
         """Add the containers of the reports that the commands' verifiers wait for."""
         report = dictionary.reports.get("report")
-        stages = {name: number for number, name in report.item("stage").states} if report else {}
+        items = [item for item in report.items if item.name == "stage"] if report else []
+        stages = {name: number for item in items for number, name in item.states}
         for name, wanted in STAGES.items():
             numbers = [stages[stage] for stage in wanted if stage in stages]
             if len(numbers) != len(wanted):
