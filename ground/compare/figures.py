@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ground.compare.charts import COLOURS, VERDICT_COLOURS
 from ground.compare.page import error_of, shown_view
@@ -82,6 +83,7 @@ def _speed(results: Results, target: str) -> Figure:
         front = pareto(ends)
         axis.step([x for x, _ in front], [sign * y for _, y in front], "k:", where="post", lw=1)
         axis.set(xscale="log", xlabel="seconds of training")
+        _ticks_1_2_5(axis)
         axis.grid(alpha=0.3)
     left.set_title(f"{target}: {score.title}")
     right.set(title="Chamfer distance of the centres", yscale="log")
@@ -94,6 +96,13 @@ def _speed(results: Results, target: str) -> Figure:
             left.annotate(label, place, xycoords=("axes fraction", "data"), va="bottom", fontsize=7)
     left.legend(fontsize=8)
     return figure
+
+
+def _ticks_1_2_5(axis: Axes) -> None:
+    """Label a logarithmic x axis at 1, 2 and 5 times powers of ten only; Matplotlib's own labels overlap."""
+    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _size(results: Results) -> Figure:
@@ -114,6 +123,7 @@ def _size(results: Results) -> Figure:
             ]
             axis.plot([x for x, _ in points], [y for _, y in points], "o", color=colour(label), label=label)
         axis.set(xscale="log", xlabel=title, ylabel=results.score.title)
+        _ticks_1_2_5(axis)
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8)
     return figure

@@ -16,7 +16,7 @@ from obbgs_base.files import write_whole
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.score.metrics import psnr_db
 
-MARKS = (0.02, *(0.05 * i for i in range(1, 20)))  # shares of the work at which the curve is measured
+MARKS = (0.02, *(i / 20 for i in range(1, 20)))  # shares of the work at which the curve is measured
 FEW_MARKS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)  # of methods whose images take long
 CURVE_VIEWS = 16  # held-out frames, evenly spaced; final scores use all
 SETTLED_DB, SETTLED_OVER = (

@@ -61,7 +61,7 @@ def _tables(results: Results) -> str:
         else "No truth is known of these sessions: methods are compared with received held-out frames."
     )
     notes = (
-        f"{truth} Complete: within 0.01 of a point. The best of each column is bold, without regard to size and time. "
+        f"{truth} Complete: within 0.01 of a point. Bold: the best of those that reconstruct something. "
         "The ceiling is a perfect model that ignores exposure: true radiance at the geometric mean of the exposure "
         "times; at that exposure it is exact (120 dB), so that only its pooled figure tells. Noise is the noisy frame "
         "itself, which of course equals itself (120 dB). ± is the deviation over seeds."
@@ -140,16 +140,20 @@ def _failures(results: Results, out: Path) -> str:
         f"less than {MARGIN_DB:g} dB above the best image without training (black, mean, untrained); refused: ended in "
         "an error that says why. Point at a cell for its figures."
     )
-    worst = []
+    worst: dict[tuple[str, str], tuple[str, KeptView]] = {}  # of each method and target
     for row in results.rows:
         view = read_views(out / VIEWS / f"{row['digest']}.npz").get(WORST)
-        if view is not None and row["method"] not in reference_names():
-            worst.append((view.psnr_db, f"{row['method']}, {row['target']}, {row['condition']}", view))
-    worst.sort(key=lambda entry: entry[0])
+        if view is None or row["method"] in reference_names():
+            continue
+        key = (row["method"], row["target"])
+        if key not in worst or view.psnr_db < worst[key][1].psnr_db:
+            worst[key] = (f"{row['method']}, {row['target']}, {row['condition']}", view)
+    shown = sorted(worst.values(), key=lambda entry: entry[1].psnr_db)[:WORST_SHOWN]
     cells = [label(""), label("expected"), label("render"), label("error")]
-    for _, words, view in worst[:WORST_SHOWN]:
+    for words, view in shown:
         cells += [label(f"{html.escape(words)}, frame {view.frame}"), *_compared(view)]
-    pictures = f"<h3>Worst views</h3>{grid('180px repeat(3, 1fr)', cells)}" if worst else ""
+    title = "<h3>Worst views, one of each method and target</h3>"
+    pictures = title + grid("220px repeat(3, 200px)", cells) if shown else ""
     return section(
         "Where methods fail", note, (plot(failure_figure(results)) if results.trained else "") + pictures
     )

@@ -1,0 +1,115 @@
+"""Trainings as compared methods: interrupted and resumed, ended early, and followed on the way."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from ground.baselines.reconstruction import Reconstruction, Work
+from ground.compare import trainings
+from ground.compare.case import Case, load_case
+from ground.compare.energy import EnergyMeter
+from ground.compare.follow import MARKS, Follower, image_of
+from ground.compare.trainings import reconstruct_gaussians
+from obbgs_base.errors import Interrupted
+from obbgs_core.train.presets import preset
+from tests.small_sessions import small_session
+
+STEPS = 24
+PUBLISHED = preset("3dgs+exposure", {"steps": STEPS, "start.count": 150, "growth.max_gaussians": 200})
+OURS = preset("obbgs", {"steps": STEPS, "start.count": 150, "chi2_end": 1e-9})
+
+
+@pytest.fixture(autouse=True)
+def few_surface_points(monkeypatch) -> None:
+    monkeypatch.setattr(trainings, "SURFACE_POINTS", 300)
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory) -> Case:
+    return load_case(small_session(tmp_path_factory.mktemp("sessions") / "target"))
+
+
+def trained(case: Case, config, work: Work, **options) -> Reconstruction:
+    return reconstruct_gaussians(case.training, case.sensor, config, 0, work, **options)
+
+
+def test_an_interrupted_training_goes_on_to_the_same_model(case, tmp_path):
+    asked = iter(range(1000))
+    with pytest.raises(Interrupted, match=f"interrupted at step 10 of {STEPS}"):
+        trained(case, PUBLISHED, Work(tmp_path, should_stop=lambda: next(asked) == 9))
+    resumed, whole = trained(case, PUBLISHED, Work(tmp_path)), trained(case, PUBLISHED, Work())
+    assert resumed.figures["resumed_at"] == 10 and "resumed_at" not in whole.figures
+    assert torch.equal(resumed.points, whole.points) and torch.equal(resumed.surface, whole.surface)
+    assert (tmp_path / "model.ply").is_file()
+    assert whole.size_bytes == 4 * (whole.figures["gaussians"] * (3 + 4 + 3 + 1 + 16) + 1)  # mono, degree 3
+
+
+def test_a_training_ends_early_only_after_half_of_its_steps_and_not_against_its_own_rule(case):
+    early = trained(case, PUBLISHED, Work(), settled=lambda: True)
+    assert early.figures["converged"] and early.figures["steps"] == STEPS // 2
+    whole = trained(case, OURS, Work(), settled=lambda: True)
+    assert not whole.figures["converged"] and whole.figures["steps"] == STEPS
+
+
+def test_a_time_limit_of_nothing_is_the_untrained_start(case):
+    start = trained(case, OURS, Work(), time_limit_s=0.0)
+    assert start.figures["steps"] == 0 and not start.figures["converged"]
+
+
+def test_the_curve_is_measured_on_the_way_and_goes_on_after_an_interruption(case, tmp_path):
+    followed = Follower(case, tmp_path, tmp_path / "stop")
+    result = trained(case, PUBLISHED, Work(None, followed.on_step))
+    curve = followed.finish(result)
+    due = {math.ceil(mark * STEPS - 1e-9) for mark in MARKS}  # the first step that reaches each mark
+    assert [round(point["share"] * STEPS) for point in curve] == [*sorted(due - {STEPS}), STEPS]
+    assert all({"seconds", "psnr_clean_db", "chamfer"} <= set(point) for point in curve)
+    assert curve[-1]["share"] == 1
+    assert curve[-1]["psnr_clean_db"] == pytest.approx(
+        case.image_scores([image_of(result, f) for f in case.held_out])["psnr_clean_db"],
+        abs=1e-3,
+    )
+    again = Follower(case, tmp_path, tmp_path / "stop")
+    again.on_step(0.5, 1.0, lambda: result)  # resumed from a checkpoint in the middle
+    assert max(point["share"] for point in again.points) <= 0.5 and len(again.points) >= 9
+
+
+@pytest.mark.parametrize(
+    ("values", "settled"),
+    [
+        ([30.0, 31.0, 31.01, 31.02, 31.03], True),
+        ([30.0, 31.0, 31.01, 31.03, 31.06], False),
+        ([30.0, 31.0, 31.01, 31.06, 31.01], False),  # it ended where it was, but it moved
+        ([31.0, 31.0], False),  # too few to tell
+    ],
+)
+def test_a_curve_has_settled_when_it_moved_little_over_its_last_fifth(case, tmp_path, values, settled):
+    followed = Follower(case, tmp_path, tmp_path / "stop")
+    shares = (0.2, 0.4, 0.44, 0.48, 0.5)
+    followed.points = [{"share": s, "psnr_clean_db": v} for s, v in zip(shares, values, strict=False)]
+    assert followed.settled() == settled
+
+
+def test_work_stops_when_the_file_appears(case, tmp_path):
+    followed = Follower(case, tmp_path, tmp_path / "stop")
+    assert not followed.should_stop()
+    (tmp_path / "stop").touch()
+    assert Follower(case, tmp_path, tmp_path / "stop").should_stop()
+
+
+def test_energy_is_summed_over_packages_and_through_a_wrap_of_the_counter(tmp_path):
+    def tell(package: int, uj: int) -> None:
+        folder = tmp_path / f"intel-rapl:{package}"
+        folder.mkdir(exist_ok=True)
+        (folder / "energy_uj").write_text(f"{uj}\n")
+        (folder / "max_energy_range_uj").write_text("10000000\n")
+
+    tell(0, 9_000_000)
+    tell(1, 1_000_000)
+    (tmp_path / "intel-rapl:0:0").mkdir()  # a core's share of package 0, which must not count twice
+    meter = EnergyMeter(tmp_path)
+    tell(0, 500_000)
+    tell(1, 3_000_000)
+    assert meter.sample() == pytest.approx(1.5 + 2.0)
+    assert EnergyMeter(Path(tmp_path / "none")).sample() is None
