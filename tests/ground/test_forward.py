@@ -18,7 +18,7 @@ from flightsw.icd.framing import frame_packet
 from flightsw.icd.packet import APID_EVENTS, TELECOMMAND, pack_packet
 from flightsw.ports import LinkError
 from ground.forward import Forwarder, parse_target
-from ground.ingest import ListenSummary, listen
+from ground.ingest import ListenSummary, Status, listen
 from tests.dictionary_packets import packets
 from tests.yamcs import free_ports
 
@@ -38,12 +38,17 @@ def url_of(udp: socket.socket) -> str:
 def passed(wire: bytes, packets: int, folder, mission, forward: Forwarder) -> ListenSummary:
     """Let `listen` receive these bytes over a pseudo-terminal, until it has so many packets."""
     received: list[int] = []
+    is_open = threading.Event()  # opening a port throws away what it holds
     end_s = time.monotonic() + 30
     ours, theirs = os.openpty()
     tty.setraw(theirs)
 
+    def on_status(status: Status) -> None:
+        received.append(status.summary.packets_received)
+        is_open.set()
+
     def write() -> None:
-        left = wire
+        left = wire if is_open.wait(30) else b""
         while left:
             left = left[os.write(ours, left[:1000]) :]
 
@@ -56,7 +61,7 @@ def passed(wire: bytes, packets: int, folder, mission, forward: Forwarder) -> Li
             folder,
             mission,
             should_stop=lambda: packets in received or time.monotonic() > end_s,
-            on_status=lambda status: received.append(status.summary.packets_received),
+            on_status=on_status,
             forward=forward,
         )
     finally:
@@ -71,8 +76,8 @@ def test_every_packet_of_the_spacecraft_is_passed_on_as_it_came(receiver, tmp_pa
     wire = b"\0noise\0" + b"".join(frame_packet(packet) for packet in [echo, *sent])
     with Forwarder(url_of(receiver)) as forward:
         summary = passed(wire, len(sent), tmp_path / "session", small_mission, forward)
-    assert [receiver.recv(65_536) for _ in sent] == sent
     assert (summary.packets_forwarded, summary.packets_not_forwarded) == (len(sent), 0)
+    assert [receiver.recv(65_536) for _ in sent] == sent
     receiver.setblocking(False)
     with pytest.raises(BlockingIOError):
         receiver.recv(65_536)  # neither the echo nor the noise
