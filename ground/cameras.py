@@ -38,6 +38,7 @@ def cameras_of(session: Session, records: list[FrameRecord]) -> Cameras:
         camera.width,
         camera.height,
         sun_dir=stacked_suns([sun_direction(record) for record in records]),
+        psf_sigma_px=camera.psf_sigma_px,
     )
 
 

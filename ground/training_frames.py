@@ -58,6 +58,7 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
             motion_covariance(record.covariance, record.world_to_camera[:3, :3])
         ),
         sun_dir=sun_direction(record),
+        psf_sigma_px=session.camera.psf_sigma_px,
     )
 
 

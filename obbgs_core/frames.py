@@ -21,6 +21,8 @@ class TrainingFrame:
     pose_covariance: [6, 6] float64, of the motion that in front of world_to_camera makes the tagged pose the true one:
         rotation vector about the camera's axes (rad), then shift along them (m); None or zeros: the pose is exact.
     sun_dir: [3] towards the Sun, unit, body frame; None: not known.
+    psf_sigma_px: of the optics, as in `Cameras`, the same in all frames; None: not calibrated, a method whose footprint
+        is the camera's learns it.
     """
 
     dn: Tensor
@@ -31,6 +33,7 @@ class TrainingFrame:
     bracket: int | None = None  # frames of one trigger share a pose correction
     pose_covariance: Tensor | None = None
     sun_dir: Tensor | None = None
+    psf_sigma_px: float | None = None
 
 
 def sun_span_deg(frames: list[TrainingFrame]) -> float:
@@ -58,7 +61,8 @@ def cameras_of(frames: list[TrainingFrame]) -> Cameras:
     """Return the cameras of some frames of one size, with their Sun where it is known in all."""
     height, width = frames[0].dn.shape[:2]
     poses, K = torch.stack([f.world_to_camera for f in frames]), torch.stack([f.K for f in frames])
-    return Cameras(poses, K, width, height, sun_dir=stacked_suns([f.sun_dir for f in frames]))
+    suns, psf_sigma_px = stacked_suns([f.sun_dir for f in frames]), frames[0].psf_sigma_px
+    return Cameras(poses, K, width, height, sun_dir=suns, psf_sigma_px=psf_sigma_px)
 
 
 def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[TrainingFrame], float | None]:
@@ -73,6 +77,11 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
     shapes = {tuple(f.dn.shape) for f in frames}
     if len(shapes) > 1:
         raise ReconstructionError(f"all frames must have one size and channel count, got {sorted(shapes)}")
+    spreads = {f.psf_sigma_px for f in frames}
+    if len(spreads) > 1:
+        raise ReconstructionError(
+            f"all frames must have one psf_sigma_px, that of their camera, got {sorted(map(str, spreads))}"
+        )
     for f in frames:
         finite = torch.isfinite(f.dn).all() and torch.isfinite(f.world_to_camera).all()
         if f.sun_dir is not None and not abs(float(f.sun_dir.norm()) - 1) < 1e-3:

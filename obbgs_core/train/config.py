@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from obbgs_core.model.footprint import Footprint
+from obbgs_core.model.gaussians import Footprint
 from obbgs_core.settings import at_least_one, check
 from obbgs_core.start.initialisation import StartSettings
 from obbgs_core.train.adam import RateSettings
@@ -33,7 +33,7 @@ class MethodConfig:
     bracket_steps: bool = False  # the frames of a step are one of each exposure time
     steps: int = at_least_one(30_000)
     pyramid: tuple[tuple[float, float], ...] = ((0.0, 1.0),)  # (from this share of the steps on, image scale)
-    footprint: Footprint = "kerbl"  # what a pixel averages over, see obbgs_core/model/footprint.py
+    footprint: Footprint = "kerbl"  # what a pixel averages over, see `Gaussians`
     outlier_filter: bool = False  # remove Gaussians far from the centre from the finished model
     chi2_end: float = 0.0  # above 0: stop after growth when the running chi² falls to this; 1 is pure noise
     start: StartSettings = field(default_factory=StartSettings)

@@ -23,7 +23,7 @@ from obbgs_core.train.poses import PoseCorrections
 from obbgs_core.train.result import StepInfo
 
 log = logging.getLogger(__name__)
-FORMAT = 1  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 2  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass
