@@ -7,10 +7,14 @@ from typing import get_args
 import pytest
 import torch
 
+from obbgs_core.errors import ReconstructionError
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.footprint import PIXEL_PX2, footprint_px2
-from obbgs_core.model.gaussians import Footprint, Gaussians
+from obbgs_core.model.gaussians import DEFAULT_PSF_SIGMA_PX, Footprint, Gaussians
 from obbgs_core.render import native_kernels, project, render
+from obbgs_core.train.presets import preset
+from obbgs_core.train.trainer import Trainer
+from tests import scenes
 from tests.obbgs_core.test_render import looking_at_origin, random_gaussians
 
 needs_native = pytest.mark.skipif(not native_kernels(), reason="the compiled rasterizer is not installed")
@@ -146,3 +150,36 @@ def test_a_gaussian_without_width_is_not_drawn_and_has_no_gradient(backend):
 def test_an_unknown_footprint_is_refused():
     with pytest.raises(ValueError, match="footprint must be one of kerbl, mip-splatting, camera"):
         dataclasses.replace(random_gaussians(2), footprint="gauss")  # pyright: ignore[reportArgumentType]
+
+
+def test_the_point_spread_is_found_from_pictures_alone():
+    gaussians = dataclasses.replace(random_gaussians(60, 1, sh_count=1), footprint="camera")
+    cameras = looking_at_origin(3, 48)
+    seen = render(gaussians, dataclasses.replace(cameras, psf_sigma_px=0.8)).radiance
+    estimate = torch.tensor(0.26, requires_grad=True)
+    optimiser = torch.optim.Adam([estimate], lr=0.05)
+    model = dataclasses.replace(gaussians, psf_sigma_px=estimate)
+    for _ in range(120):
+        optimiser.zero_grad()
+        (render(model, cameras).radiance - seen).square().sum().backward()
+        optimiser.step()
+    assert abs(estimate.item() - 0.8) < 0.01
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_training_learns_the_point_spread_only_where_it_is_not_calibrated(calibrated):
+    frames = scenes.photographed(scenes.target(), count=6, size_px=32)
+    if calibrated:
+        frames = [dataclasses.replace(frame, psf_sigma_px=0.5) for frame in frames]
+    trainer = Trainer(frames, scenes.SENSOR, preset("obbgs", {"steps": 20, "start.count": 100}))
+    for _ in range(5):
+        trainer.step()
+    moved = trainer.state.gaussians.psf_sigma_px.item() != pytest.approx(DEFAULT_PSF_SIGMA_PX)
+    assert moved == (not calibrated)
+
+
+def test_frames_of_different_optics_are_refused():
+    frames = scenes.photographed(scenes.target(), count=4, size_px=32)
+    frames[2] = dataclasses.replace(frames[2], psf_sigma_px=0.5)
+    with pytest.raises(ReconstructionError, match="one psf_sigma_px"):
+        Trainer(frames, scenes.SENSOR, preset("obbgs"))
