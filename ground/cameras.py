@@ -39,6 +39,7 @@ def cameras_of(session: Session, records: list[FrameRecord]) -> Cameras:
         camera.height,
         sun_dir=stacked_suns([sun_direction(record) for record in records]),
         background=session.background,
+        psf_sigma_px=camera.psf_sigma_px,
     )
 
 

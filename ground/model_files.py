@@ -87,15 +87,23 @@ def write_models(
     exposures_s = exposure_times_s(training)
     white_radiance = (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * exposures_s[0])
     sun_dir = median_sun_direction(training)
-    outputs.make("model.ply", lambda path: save_ply(gaussians, path, white_radiance, sun_dir))
+    cameras = cameras_of(session, training)
+    outputs.make("model.ply", lambda path: save_ply(gaussians, path, white_radiance, sun_dir, cameras))
     if blind is not None:
-        outputs.make("blind.ply", lambda path: save_ply(blind, path, white_radiance, sun_dir))
+        outputs.make("blind.ply", lambda path: save_ply(blind, path, white_radiance, sun_dir, cameras))
     outputs.make("model.spz", lambda path: save_spz(gaussians, path, white_radiance, sun_dir))
     outputs.make("surface.ply", lambda path: _write_surface(gaussians, session, training, path))
     exported = outputs.make(
         "model.onnx",
         lambda path: export_onnx(
-            gaussians, sensor, path, camera.width, camera.height, exposures_s, session.background
+            gaussians,
+            sensor,
+            path,
+            camera.width,
+            camera.height,
+            exposures_s,
+            camera.psf_sigma_px,
+            session.background,
         ),
     )
     if exported is None:

@@ -68,6 +68,7 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
         ),
         sun_dir=sun_direction(record),
         background=session.background,
+        psf_sigma_px=session.camera.psf_sigma_px,
     )
 
 

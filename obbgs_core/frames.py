@@ -22,6 +22,8 @@ class TrainingFrame:
         rotation vector about the camera's axes (rad), then shift along them (m); None or zeros: the pose is exact.
     sun_dir: [3] towards the Sun, unit, body frame; None: not known.
     background: radiance of what is seen where the target is not, the same in all frames of a training; space is black.
+    psf_sigma_px: of the optics, as in `Cameras`, the same in all frames; None: not calibrated, a method whose footprint
+        is the camera's learns it.
     """
 
     dn: Tensor
@@ -33,6 +35,7 @@ class TrainingFrame:
     pose_covariance: Tensor | None = None
     sun_dir: Tensor | None = None
     background: float = 0.0
+    psf_sigma_px: float | None = None
 
 
 def sun_span_deg(frames: list[TrainingFrame]) -> float:
@@ -60,8 +63,9 @@ def cameras_of(frames: list[TrainingFrame]) -> Cameras:
     """Return the cameras of some frames of one size and background, with their Sun where it is known in all."""
     height, width = frames[0].dn.shape[:2]
     poses, K = torch.stack([f.world_to_camera for f in frames]), torch.stack([f.K for f in frames])
-    suns = stacked_suns([f.sun_dir for f in frames])
-    return Cameras(poses, K, width, height, sun_dir=suns, background=frames[0].background)
+    suns, psf_sigma_px = stacked_suns([f.sun_dir for f in frames]), frames[0].psf_sigma_px
+    background = frames[0].background
+    return Cameras(poses, K, width, height, sun_dir=suns, psf_sigma_px=psf_sigma_px, background=background)
 
 
 def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[TrainingFrame], float | None]:
@@ -81,6 +85,11 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
     if len(backgrounds) > 1 or not 0 <= backgrounds[0] < math.inf:
         raise ReconstructionError(
             f"all frames must have one background radiance of at least 0, got {', '.join(map(str, backgrounds))}"
+        )
+    spreads = {f.psf_sigma_px for f in frames}
+    if len(spreads) > 1:
+        raise ReconstructionError(
+            f"all frames must have one psf_sigma_px, that of their camera, got {sorted(map(str, spreads))}"
         )
     for f in frames:
         finite = torch.isfinite(f.dn).all() and torch.isfinite(f.world_to_camera).all()

@@ -169,6 +169,8 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
     if origin in (typing.Union, types.UnionType):
         wanted_list = isinstance(value, list)
         branches = typing.get_args(hint)
+        if value is None and type(None) in branches:
+            return None
         return _convert(value, branches[-1] if wanted_list else branches[0], path)
     if origin is tuple:
         require(isinstance(value, list), path, f"expected a list, got {_describe(value)}")

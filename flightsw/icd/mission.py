@@ -70,6 +70,8 @@ class CameraSection:
     """A pinhole camera (OpenCV axes, pixel centres at .5) and its sensor.
 
     dn = clip(black_dn + dn_per_radiance_s * exposure_time_s * radiance + noise, 0, white_dn).
+    psf_sigma_px: standard deviation of the optics' point spread, without the pixel's own width; None: not calibrated,
+        the ground estimates it. The default is that of the simulator's renderer.
     """
 
     width: int
@@ -84,6 +86,7 @@ class CameraSection:
     dn_per_radiance_s: float = 4.0e7
     electrons_per_dn: float = 4.0
     read_noise_dn: float = 8.0
+    psf_sigma_px: float | None = 0.26
 
     def __post_init__(self):
         path = "mission.camera"
@@ -99,6 +102,11 @@ class CameraSection:
             self.read_noise_dn >= 0,
             f"{path}.read_noise_dn",
             f"must not be negative, got {self.read_noise_dn}",
+        )
+        require(
+            self.psf_sigma_px is None or 0 <= self.psf_sigma_px <= 10,
+            f"{path}.psf_sigma_px",
+            f"expected 0 to 10, or null where it is not known, got {self.psf_sigma_px}",
         )
         require(self.channels in (1, 3), f"{path}.channels", f"expected 1 or 3, got {self.channels}")
         require(8 <= self.bit_depth <= 16, f"{path}.bit_depth", f"expected 8 to 16, got {self.bit_depth}")

@@ -357,6 +357,7 @@ def _foreign_camera(intrinsics: Intrinsics, channels: int, bit_depth: int, longe
         dn_per_radiance_s=white_dn / longest_s,
         electrons_per_dn=FOREIGN_ELECTRONS_PER_DN,
         read_noise_dn=FOREIGN_READ_NOISE * white_dn,
+        psf_sigma_px=None,  # not known: it is learnt
     )
 
 

@@ -14,6 +14,8 @@ from scipy.ndimage import convolve, gaussian_filter
 from flightsw.icd.mission import CameraSection
 
 HOT_RATE_E_S = 2e5  # mean dark current of a hot pixel, electrons per second
+# The renderer's pixel filter blurs the radiance before any lens does; the mission's default is the same.
+RENDERED_PSF_SIGMA_PX = 0.26
 LARGEST_POISSON_E = 1e15  # far above any pixel; NumPy's Poisson refuses about 9e18
 
 
@@ -69,7 +71,7 @@ class SensorModel:
         return replace(self, photons_per_radiance_s=photons)
 
     def camera_section(self, width: int, height: int, focal_px: float) -> CameraSection:
-        """Return what a calibration of this camera tells flight and ground: its linear response and noise only."""
+        """Return what a calibration of this camera tells flight and ground: linear response, noise and blur."""
         return CameraSection(
             width=width,
             height=height,
@@ -83,6 +85,7 @@ class SensorModel:
             dn_per_radiance_s=self.dn_per_radiance_s,
             electrons_per_dn=self.electrons_per_dn,
             read_noise_dn=self.read_noise_e / self.electrons_per_dn,
+            psf_sigma_px=math.hypot(self.psf_sigma_px, RENDERED_PSF_SIGMA_PX),
         )
 
 
@@ -114,12 +117,14 @@ PRESETS = {
 
 def ideal(camera: CameraSection) -> SensorModel:
     """Return the sensor that a camera's calibration describes, free of the faults that a calibration leaves out."""
+    psf_px = RENDERED_PSF_SIGMA_PX if camera.psf_sigma_px is None else camera.psf_sigma_px
     return SensorModel(
         photons_per_radiance_s=camera.dn_per_radiance_s * camera.electrons_per_dn,
         electrons_per_dn=camera.electrons_per_dn,
         bit_depth=camera.bit_depth,
         black_dn=camera.black_dn,
         read_noise_e=camera.read_noise_dn * camera.electrons_per_dn,
+        psf_sigma_px=math.sqrt(max(0.0, psf_px**2 - RENDERED_PSF_SIGMA_PX**2)),
         colour="mono" if camera.channels == 1 else "rgb",
     )
 

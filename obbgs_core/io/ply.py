@@ -7,8 +7,14 @@ ignore. Everything else means the same there and here: metres, logarithms of sig
 
 If our radiance depends on the Sun's direction instead of the viewing direction, a comment of the header says so, and
 f_dc and f_rest hold the colours with the Sun in the direction that the comment names.
+
+Most viewers widen every Gaussian by 0.3 px² of their screen and keep its peak, the footprint `kerbl`. Another footprint
+stands in a comment, and `opacity` is then made for such viewers: the model's own, which follows as fitted_opacity,
+times the root of the share by which 0.3 px² would lower the peak at the distance of the cameras. All of the share would
+match there and let a viewer see through the surface from nearer.
 """
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +24,14 @@ from torch import Tensor
 from obbgs_base.files import write_whole
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.model import sh
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.footprint import KERBL_PX2, PIXEL_PX2, lowers_peak
 from obbgs_core.model.gaussians import Gaussians, Shading
-from obbgs_core.render import lit_from
+from obbgs_core.render import lit_from, project
 
 DISPLAY_GAMMA = 2.2
 TURNS_WITH_SUN = "comment radiance_sh turn with the Sun"
+FOOTPRINT = "comment footprint "
 LAMBERT = "comment radiance_sh are albedos in units of the Sun's light, ambient light "
 
 
@@ -47,18 +56,26 @@ def radiance_sh(display: Tensor, white_radiance: float, channels: int) -> Tensor
 
 
 def save_ply(
-    gaussians: Gaussians, path: Path, white_radiance: float = 1.0, sun_dir: Tensor | None = None
+    gaussians: Gaussians,
+    path: Path,
+    white_radiance: float = 1.0,
+    sun_dir: Tensor | None = None,
+    cameras: Cameras | None = None,
 ) -> None:
     """Write the model; the file appears whole or not at all.
 
     Args:
         white_radiance: the radiance that viewers show as white.
         sun_dir: [3] unit, body frame, towards the Sun: what viewers show, if the radiance depends on it.
+        cameras: from which opacities are made for viewers that keep peaks; None: viewers get the model's own.
 
     Raises:
         ValueError: the radiance depends on the Sun's direction, and sun_dir is not given.
     """
     gaussians = gaussians.detach()
+    for_viewers = (
+        viewer_logits(gaussians, cameras) if cameras is not None and lowers_peak(gaussians) else None
+    )
     count, coefficients, channels = gaussians.sh.shape
     shown = display_sh(lit_from(gaussians, sun_dir), white_radiance)
     rest = shown[:, 1:].transpose(1, 2).flatten(1)  # all of red, then of green, then of blue
@@ -69,11 +86,13 @@ def save_ply(
         table[axis] = torch.zeros(count)
     table |= {f"f_dc_{i}": shown[:, 0, i] for i in range(3)}
     table |= {f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])}
-    table["opacity"] = gaussians.opacity_logits
+    table["opacity"] = gaussians.opacity_logits if for_viewers is None else for_viewers
     table |= {f"scale_{i}": gaussians.log_scales[:, i] for i in range(3)}
     table |= {f"rot_{i}": gaussians.quats[:, i] for i in range(4)}
     for k in range(coefficients):
         table |= {f"radiance_sh_{k}_{c}": gaussians.sh[:, k, c] for c in range(channels)}
+    if for_viewers is not None:
+        table["fitted_opacity"] = gaussians.opacity_logits
     comments = [
         f"comment f_dc and f_rest: (radiance / {white_radiance:.9g})^(1/{DISPLAY_GAMMA}); radiance_sh: scene-linear"
     ]
@@ -81,7 +100,19 @@ def save_ply(
         x, y, z = sun_dir.tolist()
         kind = f"{LAMBERT}{gaussians.ambient:.9g}" if gaussians.shading == "lambert" else TURNS_WITH_SUN
         comments.append(f"{kind}; f_dc: with the Sun towards {x:.6f} {y:.6f} {z:.6f}, body frame")
+    if gaussians.footprint != "kerbl":
+        comments.append(f"{FOOTPRINT}{gaussians.footprint}, psf_sigma_px {gaussians.psf_sigma_px.item():.9g}")
     write_whole(path, _ply(table, *comments))
+
+
+def viewer_logits(gaussians: Gaussians, cameras: Cameras) -> Tensor:
+    """Return opacity logits [N] for viewers that widen by 0.3 px² and keep the peak, seen from about these cameras."""
+    psf_sigma_px = torch.tensor(KERBL_PX2 - PIXEL_PX2).sqrt()
+    widened = dataclasses.replace(gaussians, footprint="camera", psf_sigma_px=psf_sigma_px)
+    projected = project(widened, dataclasses.replace(cameras, psf_sigma_px=None, scale=1.0))
+    seen = projected.depths > 0
+    share = (projected.peak_shares * seen).sum(dim=0) / seen.sum(dim=0).clamp(min=1)
+    return torch.logit(gaussians.opacities * share.sqrt(), eps=1e-6)
 
 
 def save_surface_ply(points: Tensor, normals: Tensor, path: Path) -> None:
@@ -122,7 +153,11 @@ def load_ply(path: Path) -> Gaussians:
     channels = 1 + max(int(name.split("_")[3]) for name in radiance)
     shading: Shading = "view"
     ambient = torch.zeros(())
+    fitted = {}
     for line in lines:
+        if line.startswith(FOOTPRINT):
+            footprint, _, psf_sigma_px = line.removeprefix(FOOTPRINT).partition(", psf_sigma_px ")
+            fitted = {"footprint": footprint, "psf_sigma_px": torch.tensor(float(psf_sigma_px))}
         if line.startswith(TURNS_WITH_SUN):
             shading = "sun"
         elif line.startswith(LAMBERT):
@@ -131,8 +166,9 @@ def load_ply(path: Path) -> Gaussians:
         means=torch.stack([table[a] for a in "xyz"], 1),
         quats=torch.stack([table[f"rot_{i}"] for i in range(4)], 1),
         log_scales=torch.stack([table[f"scale_{i}"] for i in range(3)], 1),
-        opacity_logits=table["opacity"],
+        opacity_logits=table.get("fitted_opacity", table["opacity"]),
         sh=torch.stack([table[name] for name in radiance], 1).reshape(counts[0], -1, channels),
         shading=shading,
         ambient=ambient,
+        **fitted,
     )

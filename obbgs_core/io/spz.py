@@ -4,13 +4,15 @@ gsply quantises and packs; this file converts our radiance to display colours (s
 axis points up and its z axis backwards, those of 3DGS PLYs down and forwards, so y and z change sign, as in Niantic's
 own converter: both files then look alike in a viewer. The comment of the gzip header holds what is needed to turn the
 display colours back into radiance: the white radiance and the number of channels. A model whose radiance depends on the
-Sun's direction is written as it looks with the Sun in one direction.
+Sun's direction is written as it looks with the Sun in one direction. A model whose footprint lowers the peak of thin
+Gaussians sets SPZ's flag `antialiased`: viewers that know it do the same, with 0.3 px² on their own screen.
 
 Rounding errors: means half of 2^-bits m with as many bits as the model's extent allows, sigmas 3 %, opacities 1/510,
 display colours 1/270. Sigmas are clamped to 45 um .. 380 m, display colours to 1.44, which is 2.2 times the white
 radiance.
 """
 
+import gzip
 import math
 import re
 import tempfile
@@ -31,7 +33,13 @@ LARGEST_FIXED_POINT = 2**23 - 1
 MAX_FRACTIONAL_BITS = 16  # 15 um: finer than any sigma that SPZ can hold
 GZIP_HEADER_BYTES = 10
 GZIP_HAS_COMMENT = 0x10
-COMMENT = re.compile(rb"obbgs white_radiance=(\S+) channels=([13])")
+FLAGS_BYTE, FLAG_ANTIALIASED = (
+    14,
+    0x01,
+)  # of the content: "rendered with the peak lowered" (Niantic, load-spz.cc)
+COMMENT = re.compile(
+    rb"obbgs white_radiance=(\S+) channels=([13])(?: footprint=(camera|mip-splatting) psf_sigma_px=([^\s\0]+))?"
+)
 
 
 def save_spz(
@@ -72,11 +80,14 @@ def save_spz(
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "model.spz"
         gsply.write_spz(file, packed, fractional_bits=bits)
-        content = file.read_bytes()
-    comment = f"obbgs white_radiance={white_radiance!r} channels={gaussians.sh.shape[2]}".encode("ascii")
-    # magic and method; flags; no time of writing; compression level and system (RFC 1952)
-    header = content[:3] + bytes([content[3] | GZIP_HAS_COMMENT]) + bytes(4) + content[8:GZIP_HEADER_BYTES]
-    write_whole(path, header + comment + b"\0" + content[GZIP_HEADER_BYTES:])
+        payload = bytearray(gzip.decompress(file.read_bytes()))
+    payload[FLAGS_BYTE] |= FLAG_ANTIALIASED if gaussians.footprint != "kerbl" else 0
+    content = gzip.compress(payload, mtime=0)
+    comment = f"obbgs white_radiance={white_radiance!r} channels={gaussians.sh.shape[2]}"
+    if gaussians.footprint != "kerbl":
+        comment += f" footprint={gaussians.footprint} psf_sigma_px={gaussians.psf_sigma_px.item():.6g}"
+    header = content[:3] + bytes([content[3] | GZIP_HAS_COMMENT]) + content[4:GZIP_HEADER_BYTES]  # RFC 1952
+    write_whole(path, header + comment.encode("ascii") + b"\0" + content[GZIP_HEADER_BYTES:])
 
 
 def load_spz(path: Path) -> Gaussians:
@@ -86,7 +97,7 @@ def load_spz(path: Path) -> Gaussians:
         ReconstructionError: the file is something else, or damaged.
     """
     with open(path, "rb") as file:
-        start = file.read(GZIP_HEADER_BYTES + 100)
+        start = file.read(GZIP_HEADER_BYTES + 200)
     note = COMMENT.match(start, GZIP_HEADER_BYTES)
     if not start.startswith(b"\x1f\x8b") or not note:
         raise ReconstructionError(f"{path} is not an SPZ written by this software: no radiance scale in it")
@@ -102,12 +113,18 @@ def load_spz(path: Path) -> Gaussians:
     if packed.shN is not None:  # None if colours do not depend on the direction
         shown = torch.cat([shown, torch.from_numpy(packed.shN.copy())], dim=1)
     shown = shown * _sh_signs(shown.shape[1])
+    fitted = (
+        {}
+        if note[3] is None
+        else {"footprint": note[3].decode(), "psf_sigma_px": torch.tensor(float(note[4]))}
+    )
     return Gaussians(
         means=means * FLIP,
         quats=torch.cat([quats[:, :1], quats[:, 1:] * FLIP], dim=1),
         log_scales=log_scales,
         opacity_logits=opacity_logits,
         sh=radiance_sh(shown, float(note[1]), int(note[2])),
+        **fitted,
     )
 
 

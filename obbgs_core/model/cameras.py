@@ -8,9 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# Without calibration; with the pixel's own 1/12 px² it makes 0.15 px², the best of several on rendered pictures.
-DEFAULT_PSF_SIGMA_PX = 0.26
-
 
 @dataclass(frozen=True)
 class Cameras:
@@ -18,8 +15,9 @@ class Cameras:
 
     sun_dir [C, 3] (no gradient): towards the Sun when each picture is taken, unit, body frame; only models whose
     radiance turns with the Sun need it.
-    psf_sigma_px: standard deviation of the optics' point spread, in pixels of these images (may be a tensor [] with a
-    gradient); only models whose footprint is the camera's need it, see `footprint`.
+    psf_sigma_px: standard deviation of the optics' point spread, in pixels of the sensor; None: not calibrated, the
+    model's own estimate is used. Only models whose footprint is the camera's need it.
+    scale: pixels of these images for one of the sensor, along a side; below 1 where pixels were averaged.
     background: radiance, the same in all channels, of what is seen where no Gaussian is; space is black.
     """
 
@@ -29,7 +27,8 @@ class Cameras:
     height: int
     near_m: float = 0.01
     sun_dir: Tensor | None = None
-    psf_sigma_px: float | Tensor = DEFAULT_PSF_SIGMA_PX
+    psf_sigma_px: float | None = None
+    scale: float = 1.0
     background: float = 0.0
 
     def __post_init__(self):
@@ -80,8 +79,7 @@ class Cameras:
         """Return the cameras of images resized by `factor` (0.5: half as wide and high, rounded up)."""
         K = self.K * torch.tensor([[factor], [factor], [1.0]], dtype=self.K.dtype, device=self.K.device)
         width, height = -int(-self.width * factor // 1), -int(-self.height * factor // 1)
-        psf_sigma_px = self.psf_sigma_px * factor
-        return dataclasses.replace(self, K=K, width=width, height=height, psf_sigma_px=psf_sigma_px)
+        return dataclasses.replace(self, K=K, width=width, height=height, scale=self.scale * factor)
 
 
 def stacked_suns(directions: Sequence[Tensor | None]) -> Tensor | None:

@@ -33,9 +33,9 @@ def render_native(
     sunlit: Tensor | None,
 ) -> Rendered:
     """Render with one of `native_kernels()`, in float32 on the CPU; other arguments as of `backends.rasterize`."""
-    peak_lowered = lowers_peak(gaussians.footprint)
+    peak_lowered = lowers_peak(gaussians)
     request = _Request(kernel, cameras, suns, sunlit, peak_lowered, ScreenGradients())
-    footprint = footprint_px2(gaussians.footprint, cameras)
+    footprint = footprint_px2(gaussians, cameras)
     tensors = (*gaussians.tensors().values(), cameras.world_to_camera, gaussians.ambient, footprint)
     images: Any = _Rasterize.apply(request, *tensors)
     return Rendered(*images, screen=request.screen)

@@ -53,7 +53,7 @@ def project(gaussians: Gaussians, cameras: Cameras) -> Projected:
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * x / z, zero, fy / z, -fy * y / z], dim=-1).unflatten(-1, (2, 3))
     M = J @ (R[:, None] @ gaussians.axes[None])  # [C, N, 2, 3]; Sigma' = M M^T
-    footprint = footprint_px2(gaussians.footprint, cameras)[:, None]
+    footprint = footprint_px2(gaussians, cameras)[:, None]
     xx = (M[..., 0, :] ** 2).sum(-1) + footprint
     xy = (M[..., 0, :] * M[..., 1, :]).sum(-1)
     yy = (M[..., 1, :] ** 2).sum(-1) + footprint
@@ -63,7 +63,7 @@ def project(gaussians: Gaussians, cameras: Cameras) -> Projected:
     conics = torch.stack([yy, -xy, xx], dim=-1) / determinant[..., None]
     conics = torch.where(drawn[..., None], conics, torch.zeros_like(conics))
     shares = torch.ones_like(z)
-    if lowers_peak(gaussians.footprint):
+    if lowers_peak(gaussians):
         # the determinant of M Mᵀ as a square, in which nothing cancels; the root has no derivative at 0
         narrow = torch.linalg.cross(M[..., 0, :], M[..., 1, :]).square().sum(-1)
         shares = (torch.where(narrow > 0, narrow, 1) / determinant).sqrt()

@@ -11,6 +11,7 @@ from obbgs_core.model.gaussians import TENSORS, Gaussians
 from obbgs_core.settings import check
 
 OPACITY_RATE = 0.05  # of opacity logits a step (Kerbl et al. 2023)
+PSF_RATE = 0.002  # of the point spread a step, in pixels of the sensor
 AMBIENT_RATE = 0.001  # of the ambient light a step, in units of the Sun's
 
 
@@ -54,6 +55,7 @@ def learning_rates(
         "opacity_logits": OPACITY_RATE * decay,
         "sh": sh,
         "ambient": AMBIENT_RATE * decay,
+        "psf_sigma_px": PSF_RATE * decay,
     }
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from obbgs_core.model.footprint import Footprint
+from obbgs_core.model.gaussians import Footprint
 from obbgs_core.settings import at_least_one, check
 from obbgs_core.start.initialisation import StartSettings
 from obbgs_core.train.adam import RateSettings
@@ -46,7 +46,7 @@ class MethodConfig:
     bracket_steps: bool = False  # the frames of a step are one of each exposure time
     steps: int = at_least_one(30_000)
     pyramid: tuple[tuple[float, float], ...] = ((0.0, 1.0),)  # (from this share of the steps on, image scale)
-    footprint: Footprint = "kerbl"  # what a pixel averages over, see obbgs_core/model/footprint.py
+    footprint: Footprint = "kerbl"  # what a pixel averages over, see `Gaussians`
     # (image scale, frames of a step, share of the steps) of trainings that come first and hand over their model; each
     # counts its steps from 0, so that the rate of the means and growth begin again (MVGS)
     coarse: tuple[tuple[float, int, float], ...] = ()

@@ -64,6 +64,7 @@ PRESETS: dict[str, MethodConfig] = {
             bracket_steps=True,
             steps=1500,
             pyramid=((0.0, 0.25), (0.15, 0.5), (0.4, 1.0)),
+            footprint="camera",
             outlier_filter=False,  # few Gaussians stray from the hull; with it the demo lost 0.4 dB
             chi2_end=1.0,
             start=StartSettings(kind="hull", count=6000),
@@ -90,7 +91,7 @@ PRESETS: dict[str, MethodConfig] = {
             rates=RateSettings(
                 means=4e-3, means_end=2e-5, quats=0.01, log_scales=0.02, sh=0.04, final_share=0.2
             ),
-            parsimony=ParsimonySettings(prune_at=(0.3, 0.5, 0.7, 0.85), keep_above_opacity=0.5),
+            parsimony=ParsimonySettings(prune_at=(0.3, 0.5, 0.7, 0.85), keep_above_opacity=0.65),
             light=LightSettings(sh_degree=0, max_sh_degree=1, sun_span_deg=5.0),
             poses=PoseSettings(refine="auto"),
         ),

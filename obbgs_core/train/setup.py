@@ -69,7 +69,7 @@ class TrainingSetup:
                 f.dn.numpy().tobytes() + f.world_to_camera.numpy().tobytes() + f.K.numpy().tobytes()
             )
             known = [None if tag is None else tag.tolist() for tag in (f.sun_dir, f.pose_covariance)]
-            digest.update(repr((f.exposure_time_s, f.bracket, known)).encode())
+            digest.update(repr((f.exposure_time_s, f.bracket, known, f.psf_sigma_px)).encode())
         return Identity(digest.hexdigest(), flat(self.config), flat(MethodConfig(self.config.name)))
 
 

@@ -31,6 +31,7 @@ from obbgs_core.train.state import TrainingState
 log = logging.getLogger(__name__)
 CHI2_MEMORY = 0.98  # share of the running chi² that a step keeps; the rest is the step's own
 CHECKPOINT_EVERY_S = 20.0
+LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
 FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
 PACE_STEPS = 50  # the time left is estimated from the pace of so many steps
 
@@ -153,6 +154,7 @@ class Trainer:
         rates = learning_rates(config.rates, share, self.setup.unit_m, coefficients, self.setup.radiance_unit)
         state.adam.step(state.gaussians, rates)
         state.gaussians.ambient.detach().clamp_(min=0)
+        state.gaussians.psf_sigma_px.detach().clamp_(min=LEAST_PSF_SIGMA_PX)
         if state.poses is not None:
             state.poses.step(pose_rate(share, config.poses))
         if state.compensation is not None:

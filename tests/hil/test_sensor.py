@@ -163,6 +163,7 @@ def test_a_sensor_and_its_calibration_agree():
         again = ideal(camera)
         assert again.dn_per_radiance_s == pytest.approx(sensor.dn_per_radiance_s)
         assert again.read_noise_e == pytest.approx(sensor.read_noise_e)
+        assert again.psf_sigma_px == pytest.approx(sensor.psf_sigma_px, abs=1e-6)
         assert sensor.with_gain(123.0).dn_per_radiance_s == pytest.approx(123.0)
 
 

@@ -1,5 +1,6 @@
 """The exported renderer on onnxruntime against our own renderer."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -58,6 +59,28 @@ def test_onnxruntime_agrees_with_our_renderer(tmp_path, sh_count, channels, widt
         torch.testing.assert_close(torch.tensor(alpha), ours.alpha[0], rtol=0, atol=5e-3)  # cutoff pixels
         covered = ours.alpha[0] > 0.1
         torch.testing.assert_close(torch.tensor(depth)[covered], ours.depth[0][covered], rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize("footprint", ["camera", "mip-splatting"])
+def test_onnxruntime_lowers_peaks_as_our_renderer_does(tmp_path, footprint):
+    gaussians = dataclasses.replace(scene(400, 1, 1), footprint=footprint, psf_sigma_px=torch.tensor(0.4))
+    path = tmp_path / "model.onnx"
+    K = np.array([[80, 0, 32], [0, 78, 31], [0, 0, 1]], dtype=np.float32)
+    rng = np.random.default_rng(1)
+    for psf_sigma_px in (None, 0.8):  # the model's estimate, and a calibrated camera
+        export_onnx(gaussians, SENSOR, path, 64, 64, [1e-4], psf_sigma_px)
+        session = onnxruntime.InferenceSession(str(path))
+        for distance in (5.0, 15.0):
+            pose = random_view(rng, distance)
+            feed = {"world_to_camera": pose, "K": K, "exposure_time_s": np.array(1e-4, dtype=np.float32)}
+            image, alpha = session.run(["image", "alpha"], feed)
+            cameras = Cameras(
+                torch.tensor(pose)[None], torch.tensor(K)[None], 64, 64, psf_sigma_px=psf_sigma_px
+            )
+            ours = render(gaussians, cameras)
+            expected = (SENSOR.expected_dn(ours.radiance[0], 1e-4) / SENSOR.white_dn).clamp(0, 1)
+            assert -10 * math.log10(((torch.tensor(image) - expected) ** 2).mean()) >= 60  # dB
+            torch.testing.assert_close(torch.tensor(alpha), ours.alpha[0], rtol=0, atol=5e-3)  # cutoff pixels
 
 
 def needles() -> Gaussians:

@@ -2,14 +2,19 @@
 
 import dataclasses
 import math
+from typing import get_args
 
 import pytest
 import torch
 
+from obbgs_core.errors import ReconstructionError
 from obbgs_core.model.cameras import Cameras
-from obbgs_core.model.footprint import FOOTPRINTS, PIXEL_PX2, footprint_px2
-from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.footprint import PIXEL_PX2, footprint_px2
+from obbgs_core.model.gaussians import DEFAULT_PSF_SIGMA_PX, Footprint, Gaussians
 from obbgs_core.render import native_kernels, project, render
+from obbgs_core.train.presets import preset
+from obbgs_core.train.trainer import Trainer
+from tests import scenes
 from tests.obbgs_core.test_render import looking_at_origin, random_gaussians
 
 needs_native = pytest.mark.skipif(not native_kernels(), reason="the compiled rasterizer is not installed")
@@ -19,19 +24,19 @@ def gradients(gaussians: Gaussians, cameras: Cameras, backend: str) -> dict[str,
     """Return the gradients of a loss of all images by the model, the poses and the optics' point spread."""
     leaves = {name: value.clone().requires_grad_() for name, value in gaussians.tensors().items()}
     pose = cameras.world_to_camera.clone().requires_grad_()
-    psf_sigma_px = torch.tensor(0.4, dtype=pose.dtype, requires_grad=True)
-    moved = dataclasses.replace(cameras, world_to_camera=pose, psf_sigma_px=psf_sigma_px)
+    leaves["psf_sigma_px"] = torch.tensor(0.4, dtype=pose.dtype, requires_grad=True)
+    moved = dataclasses.replace(cameras, world_to_camera=pose)
     out = render(dataclasses.replace(gaussians, **leaves), moved, backend)
     generator = torch.Generator().manual_seed(5)
     images = [out.radiance, out.alpha, out.depth]
     sum((i * torch.rand(i.shape, generator=generator).to(i)).sum() for i in images).backward()
     found = {name: leaf.grad for name, leaf in leaves.items()}
-    return found | {"world_to_camera": pose.grad, "psf_sigma_px": psf_sigma_px.grad}
+    return found | {"world_to_camera": pose.grad}
 
 
 @needs_native
 @pytest.mark.parametrize("kernel", native_kernels())
-@pytest.mark.parametrize("footprint", FOOTPRINTS)
+@pytest.mark.parametrize("footprint", get_args(Footprint))
 def test_native_gradients_match_autograd_on_the_reference(kernel, footprint):
     # flat tops: hardly a pixel lies within float32 rounding of the 1/255 cutoff
     double = random_gaussians(60, seed=4, dtype=torch.float64)
@@ -105,12 +110,19 @@ def test_images_at_a_smaller_scale_are_those_of_averaged_pixels(factor):
 
 
 def test_the_footprint_is_that_of_pixel_and_optics_at_every_scale():
-    cameras = dataclasses.replace(looking_at_origin(3, 64), psf_sigma_px=0.8)
-    torch.testing.assert_close(footprint_px2("camera", cameras), torch.full((3,), PIXEL_PX2 + 0.64))
-    quarter = footprint_px2("camera", cameras.scaled(0.25))
-    torch.testing.assert_close(quarter, torch.full((3,), PIXEL_PX2 + 0.04))
-    torch.testing.assert_close(footprint_px2("kerbl", cameras.scaled(0.25)), torch.full((3,), 0.3))
-    torch.testing.assert_close(footprint_px2("mip-splatting", cameras), torch.full((3,), 0.1))
+    gaussians = dataclasses.replace(random_gaussians(2), footprint="camera", psf_sigma_px=torch.tensor(0.4))
+    unknown = looking_at_origin(3, 64)
+    calibrated = dataclasses.replace(unknown, psf_sigma_px=0.8)
+    for footprint, cameras, variance_px2 in (
+        ("camera", calibrated, PIXEL_PX2 + 0.64),
+        ("camera", calibrated.scaled(0.25), PIXEL_PX2 + 0.04),
+        ("camera", unknown, PIXEL_PX2 + 0.16),
+        ("camera", unknown.scaled(0.5).scaled(0.5), PIXEL_PX2 + 0.01),
+        ("kerbl", calibrated.scaled(0.25), 0.3),
+        ("mip-splatting", calibrated, 0.1),
+    ):
+        found = footprint_px2(dataclasses.replace(gaussians, footprint=footprint), cameras)
+        torch.testing.assert_close(found, torch.full((3,), variance_px2))
 
 
 def test_widening_keeps_a_gaussians_integral():
@@ -138,3 +150,36 @@ def test_a_gaussian_without_width_is_not_drawn_and_has_no_gradient(backend):
 def test_an_unknown_footprint_is_refused():
     with pytest.raises(ValueError, match="footprint must be one of kerbl, mip-splatting, camera"):
         dataclasses.replace(random_gaussians(2), footprint="gauss")  # pyright: ignore[reportArgumentType]
+
+
+def test_the_point_spread_is_found_from_pictures_alone():
+    gaussians = dataclasses.replace(random_gaussians(60, 1, sh_count=1), footprint="camera")
+    cameras = looking_at_origin(3, 48)
+    seen = render(gaussians, dataclasses.replace(cameras, psf_sigma_px=0.8)).radiance
+    estimate = torch.tensor(0.26, requires_grad=True)
+    optimiser = torch.optim.Adam([estimate], lr=0.05)
+    model = dataclasses.replace(gaussians, psf_sigma_px=estimate)
+    for _ in range(120):
+        optimiser.zero_grad()
+        (render(model, cameras).radiance - seen).square().sum().backward()
+        optimiser.step()
+    assert abs(estimate.item() - 0.8) < 0.01
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_training_learns_the_point_spread_only_where_it_is_not_calibrated(calibrated):
+    frames = scenes.photographed(scenes.target(), count=6, size_px=32)
+    if calibrated:
+        frames = [dataclasses.replace(frame, psf_sigma_px=0.5) for frame in frames]
+    trainer = Trainer(frames, scenes.SENSOR, preset("obbgs", {"steps": 20, "start.count": 100}))
+    for _ in range(5):
+        trainer.step()
+    moved = trainer.state.gaussians.psf_sigma_px.item() != pytest.approx(DEFAULT_PSF_SIGMA_PX)
+    assert moved == (not calibrated)
+
+
+def test_frames_of_different_optics_are_refused():
+    frames = scenes.photographed(scenes.target(), count=4, size_px=32)
+    frames[2] = dataclasses.replace(frames[2], psf_sigma_px=0.5)
+    with pytest.raises(ReconstructionError, match="one psf_sigma_px"):
+        Trainer(frames, scenes.SENSOR, preset("obbgs"))

@@ -1,5 +1,7 @@
 """PLY files against plyfile and the formulas of the 3DGS viewers."""
 
+import dataclasses
+
 import numpy as np
 import plyfile
 import pytest
@@ -10,7 +12,10 @@ from scipy.special import expit, sph_harm_y
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.io.ply import display_sh, load_ply, radiance_sh, save_ply, save_surface_ply
 from obbgs_core.model import sh
+from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.render import render
+from obbgs_core.score.metrics import psnr_db
 
 WHITE = 2.0
 
@@ -108,3 +113,55 @@ def test_a_surface_is_read_by_others(tmp_path):
     vertex = plyfile.PlyData.read(str(tmp_path / "surface.ply"))["vertex"]
     np.testing.assert_array_equal(np.stack([vertex[a] for a in "xyz"], 1), points.numpy())
     np.testing.assert_array_equal(np.stack([vertex[a] for a in ("nx", "ny", "nz")], 1), normals.numpy())
+
+
+def sparse_ball(count: int = 3000) -> tuple[Gaussians, Cameras]:
+    """Return a hollow ball of small thin Gaussians, as a trained model has them, and cameras at 4 m around it."""
+    g = torch.Generator().manual_seed(4)
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=g), dim=1)
+    gaussians = Gaussians(
+        directions,
+        torch.randn(count, 4, generator=g),
+        (torch.tensor([0.06, 0.03, 0.006]) * (0.5 + torch.rand(count, 1, generator=g))).log(),
+        torch.full((count,), 2.0),
+        sh.from_radiance(0.2 + torch.rand(count, 1, 1, generator=g)),
+        footprint="camera",
+        psf_sigma_px=torch.tensor(0.3),
+    )
+    turns = Rotation.random(6, rng=np.random.default_rng(2)).as_matrix()
+    poses = torch.eye(4).repeat(6, 1, 1)
+    poses[:, :3, :3] = torch.from_numpy(turns).float()
+    poses[:, 2, 3] = 4.0
+    K = torch.tensor([[140.0, 0, 50], [0, 140, 50], [0, 0, 1]]).expand(6, 3, 3)
+    return gaussians, Cameras(poses, K, 100, 100)
+
+
+def test_the_footprint_comes_back_and_viewers_get_opacities_of_their_own(tmp_path):
+    gaussians, cameras = sparse_ball(50)
+    save_ply(gaussians, tmp_path / "m.ply", WHITE, cameras=cameras)
+    again = load_ply(tmp_path / "m.ply")
+    assert again.footprint == "camera" and again.psf_sigma_px == gaussians.psf_sigma_px
+    assert torch.equal(again.opacity_logits, gaussians.opacity_logits)
+    vertex = plyfile.PlyData.read(str(tmp_path / "m.ply"))["vertex"]
+    assert (vertex["opacity"] < vertex["fitted_opacity"]).all()
+    save_ply(dataclasses.replace(gaussians, footprint="kerbl"), tmp_path / "k.ply", WHITE, cameras=cameras)
+    assert load_ply(tmp_path / "k.ply").footprint == "kerbl"
+    assert b"fitted_opacity" not in (tmp_path / "k.ply").read_bytes()
+
+
+@pytest.mark.parametrize("times_nearer", [1, 2, 4])
+def test_a_viewer_that_keeps_peaks_shows_nearly_our_picture(tmp_path, times_nearer):
+    gaussians, cameras = sparse_ball()
+    save_ply(gaussians, tmp_path / "m.ply", WHITE, cameras=cameras)
+    vertex = plyfile.PlyData.read(str(tmp_path / "m.ply"))["vertex"]
+    shown = dataclasses.replace(
+        gaussians, footprint="kerbl", opacity_logits=torch.from_numpy(np.array(vertex["opacity"]))
+    )
+    poses = cameras.world_to_camera.clone()
+    poses[:, 2, 3] = 1.0 + 3.0 / times_nearer  # of the surface
+    there = dataclasses.replace(cameras, world_to_camera=poses)
+    ours, theirs = (render(each, there).radiance / WHITE for each in (gaussians, shown))
+    unchanged = render(dataclasses.replace(gaussians, footprint="kerbl"), cameras).radiance / WHITE
+    assert psnr_db(theirs, ours) >= 35  # dB
+    if times_nearer == 1:
+        assert psnr_db(theirs, ours) > psnr_db(unchanged, ours) + 3

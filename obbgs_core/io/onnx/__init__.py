@@ -20,7 +20,6 @@ from obbgs_core.io.onnx.composite import composite
 from obbgs_core.io.onnx.graph import Graph
 from obbgs_core.io.onnx.projection import camera_view, project
 from obbgs_core.io.onnx.radiance import radiance_towards
-from obbgs_core.model.cameras import DEFAULT_PSF_SIGMA_PX
 from obbgs_core.model.footprint import variance_px2
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.reference import MIN_DEPTH_ALPHA
@@ -46,7 +45,7 @@ def export_onnx(
     width: int,
     height: int,
     exposures_s: Sequence[float],
-    psf_sigma_px: float = DEFAULT_PSF_SIGMA_PX,
+    psf_sigma_px: float | None = None,
     background: float = 0.0,
 ) -> Exported:
     """Write the renderer; the file appears whole or not at all.
@@ -60,15 +59,15 @@ def export_onnx(
         width: of the rendered image, px.
         height: the same.
         exposures_s: the exposure times of the training frames; their range goes into the metadata.
-        psf_sigma_px: the point spread of the optics that are rendered, as in `Cameras`.
+        psf_sigma_px: the point spread of the camera that is rendered, px; None: the model's estimate.
         background: radiance of what is seen where no Gaussian is.
 
     Raises:
         ExportError: the model is empty, not finite or too large for an ONNX file, or there is no exposure time.
     """
     _check(gaussians, exposures_s)
-    footprint = float(variance_px2(gaussians.footprint, psf_sigma_px))
-    graph = _graph(gaussians, sensor, width, height, footprint, background)
+    footprint_px2 = float(variance_px2(gaussians, psf_sigma_px))
+    graph = _graph(gaussians, sensor, width, height, footprint_px2, background)
     size_bytes = sum(len(constant.raw_data) for constant in graph.constants)
     if size_bytes > MAX_PROTOBUF_BYTES:
         raise ExportError(
@@ -83,7 +82,7 @@ def export_onnx(
         "height": height,
         "gaussians": len(gaussians),
         "footprint": gaussians.footprint,
-        "psf_sigma_px": psf_sigma_px,
+        "footprint_px2": footprint_px2,
         "exposure_min_s": min(exposures_s),
         "exposure_max_s": max(exposures_s),
         "format": FORMAT_VERSION,

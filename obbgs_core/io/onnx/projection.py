@@ -79,7 +79,7 @@ def project(g: Graph, gaussians: Gaussians, view: View) -> Projected:
         slope = g.op("Unsqueeze", tangent, g.ints(1))
         M.append(g.op("Mul", scale, g.op("Sub", row, g.op("Mul", slope, rows[2]))))
     extents, splats = _ellipses(g, gaussians, M, in_front, mean_x, mean_y, view.footprint_px2)
-    peak_lowered = lowers_peak(gaussians.footprint)
+    peak_lowered = lowers_peak(gaussians)
     return Projected(pz, [mean_x, mean_y], extents, splats, peak_lowered, depth_axes=rows[2])
 
 
@@ -119,7 +119,7 @@ def _ellipses(
     # a Gaussian too large for float32 is not drawn, as in `render`
     drawn = g.op("And", drawn, g.op("LessOrEqual", determinant, float(np.finfo(np.float32).max)))
     share = None
-    if lowers_peak(gaussians.footprint):
+    if lowers_peak(gaussians):
         share = g.op("Sqrt", g.op("Div", squared_cross, determinant))
         drawn = g.op("And", drawn, g.op("GreaterOrEqual", share, MIN_PEAK_SHARE))
     squared_radius = g.op("Where", drawn, squared_radius, 0.0)

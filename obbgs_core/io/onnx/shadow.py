@@ -64,7 +64,7 @@ def _sun_view(g: Graph, gaussians: Gaussians) -> View:
     t = g.op("Reshape", g.op("Neg", g.op("MatMul", R, place)), g.ints(1, 3))
     half_px = SHADOW_MAP_PX / 2
     focal, middle = (g.value(np.array([v], dtype=np.float32)) for v in (half_px * SUN_DISTANCE, half_px))
-    footprint = float(variance_px2(gaussians.footprint, SHADOW_PSF_SIGMA_PX))
+    footprint = float(variance_px2(gaussians, SHADOW_PSF_SIGMA_PX))
     return View(R, t, focal, focal, middle, middle, SHADOW_MAP_PX, SHADOW_MAP_PX, footprint)
 
 
