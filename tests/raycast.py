@@ -12,8 +12,7 @@ from obbgs_core.sensor import Sensor
 
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=2.0, read_noise_dn=3.0)
 EXPOSURES_S = (5e-5, 1e-4, 2e-4)
-OCTAVES = 3  # of the texture, each half as large and half as strong
-GRID = 4  # random values along each side of a face's coarsest octave
+OCTAVES = 3  # of a texture, each half as large and half as strong
 
 
 @dataclass(frozen=True)
@@ -24,14 +23,14 @@ class Box:
     half_m: np.ndarray
     rotation: np.ndarray
     seed: int
-    albedo: float = 1.0
+    cells: int = 4  # random values along each side of a face in the texture's coarsest octave
 
     def texture(self, face: int, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return values 0.15 to 1 at places 0..1 on a face: smooth noise in several octaves, the same every time."""
         rng = np.random.default_rng([self.seed, face])
         total, weights = np.zeros_like(u), 0.0
         for octave in range(OCTAVES):
-            size = GRID * 2**octave
+            size = self.cells * 2**octave
             values = rng.random((size + 1, size + 1))
             x, y = np.clip(u, 0, 1) * size, np.clip(v, 0, 1) * size
             i, j = np.minimum(x.astype(int), size - 1), np.minimum(y.astype(int), size - 1)
@@ -78,9 +77,8 @@ def _hit(
             for side in (-1, 1):
                 on = hit & (axis == k) & (np.sign(d[..., k]) == -side)
                 u, v = (0.5 + 0.5 * at[..., other][on] for other in range(3) if other != k)
-                light = box.albedo * (
-                    0.5 + 0.15 * (k + (side > 0))
-                )  # each face has its own, as under a fixed Sun
+                # each face has its own light, as under a fixed Sun
+                light = 0.5 + 0.15 * (k + (side > 0))
                 radiance[on] = light * box.texture(2 * k + (side > 0), u, v)
         depth_m[hit] = enter[hit]
     return radiance, np.where(np.isfinite(depth_m), depth_m, 0)

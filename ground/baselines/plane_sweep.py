@@ -1,7 +1,6 @@
 """Plane-sweep multi-view stereo with known poses: depths at which neighbouring pictures correlate.
 
-Source: Collins, A space-sweep approach to true multi-image matching, 1996; several directions of planes as in Gallup
-et al., Real-time plane-sweeping stereo with multiple sweeping directions, 2007; the fusion is in `depth_maps.py`.
+Source: Collins, A space-sweep approach to true multi-image matching, 1996; the fusion is in `depth_maps.py`.
 """
 
 import math
@@ -35,13 +34,12 @@ class SweepSettings:
     """How depths are found."""
 
     window_px: int = 7  # odd; windows of this width are correlated
-    sources: int = 8  # views with which each is matched
+    sources: int = 6  # views with which each is matched
     kept: int = (
         3  # the best correlations of each pixel and plane are averaged: in the others it may be hidden
     )
     plane_px: float = 1.0  # from plane to plane a point moves so far in the picture of the widest baseline
-    tilts_deg: tuple[float, ...] = (0.0, 45.0)  # of the planes; each but 0 in four directions
-    fusion: FusionSettings = field(default_factory=lambda: FusionSettings(least_confidence=0.5))
+    fusion: FusionSettings = field(default_factory=lambda: FusionSettings(least_confidence=0.2))
 
 
 def reconstruct_mvs(
@@ -54,7 +52,7 @@ def reconstruct_mvs(
     """Return the fused point cloud of depth maps by correlation.
 
     Args:
-        one_exposure: frames are divided by their exposure times, and windows with saturated pixels are left out; if
+        one_exposure: frames are divided by their exposure times, and a pair is clipped where one of it saturates; if
             false, the readings are matched as they are.
 
     Raises:
@@ -84,18 +82,12 @@ def sweep(views: Views, reference: int, sources: list[int], settings: SweepSetti
     rows, columns = _bounds(view.lit)
     crop = (slice(*rows), slice(*columns))
     grid = torch.meshgrid(torch.arange(*rows), torch.arange(*columns), indexing="ij")
-    near_m, far_m = depth_range_m(view, views.radius_m)
     others = [views.views[j] for j in sources]
-    for normal in _normals(settings.tilts_deg):
-        planes = _planes(view, others, normal, views.radius_m, settings.plane_px)
-        score = _scores(view, grid, others, normal, planes, settings)
-        value, inverse_offset = _peak(score, planes)
-        along = (pixel_rays(grid[0], grid[1], view.K) @ normal).float()
-        depth = 1 / (inverse_offset * along).clamp(min=1e-9)
-        # a tilted plane also meets rays outside the range
-        better = (depth >= near_m) & (depth <= far_m) & (value > best[crop]) & view.lit[crop]
-        depth_m[crop] = torch.where(better, depth, depth_m[crop])
-        best[crop] = torch.where(better, value, best[crop])
+    planes = inverse_depths(view, others, views.radius_m, settings.plane_px)
+    value, inverse_depth = _peak(_scores(view, grid, others, planes, settings), planes)
+    found = view.lit[crop] & (value > 0)
+    depth_m[crop] = torch.where(found, 1 / inverse_depth, 0.0)
+    best[crop] = torch.where(found, value, 0.0)
     return DepthMap(depth_m, best)
 
 
@@ -105,28 +97,14 @@ def _bounds(lit: Tensor) -> tuple[tuple[int, int], tuple[int, int]]:
     return (int(rows.min()), int(rows.max()) + 1), (int(columns.min()), int(columns.max()) + 1)
 
 
-def _normals(tilts_deg: tuple[float, ...]) -> list[Tensor]:
-    """Return the unit normals [3] of the planes, in the camera's frame."""
-    normals = []
-    for tilt in map(math.radians, tilts_deg):
-        for quarter in range(4 if tilt else 1):
-            around = quarter * math.pi / 2 + math.pi / 4
-            x, y = math.sin(tilt) * math.cos(around), math.sin(tilt) * math.sin(around)
-            normals.append(torch.tensor([x, y, math.cos(tilt)], dtype=torch.float64))
-    return normals
+def inverse_depths(view: View, others: list[View], radius_m: float, plane_px: float) -> Tensor:
+    """Return the inverse depths [D] 1/m of planes through the sphere that the target can fill.
 
-
-def _planes(view: View, others: list[View], normal: Tensor, radius_m: float, plane_px: float) -> Tensor:
-    """Return the inverse offsets [D] 1/m of planes normal·X = offset through the sphere that the target can fill.
-
-    They are even in the inverse offset, in which the image of a point moves nearly evenly.
+    Disparity is focal length times baseline over depth, so that planes even in it move a point evenly.
     """
-    middle_m = float(normal @ view.world_to_camera[:3, 3])
-    near_m, far_m = max(middle_m - radius_m, 0.02 * abs(middle_m)), middle_m + radius_m
-    # disparity is focal length times baseline over depth, and a depth on the axis is the offset over normal[2]
+    near_m, far_m = depth_range_m(view, radius_m)
     widest = max(float(other.K[0, 0] * (view.centre - other.centre).norm()) for other in others)
-    shift_px = widest * float(normal[2]) * (1 / near_m - 1 / far_m)
-    count = max(3, math.ceil(shift_px / plane_px) + 1)
+    count = max(3, math.ceil(widest * (1 / near_m - 1 / far_m) / plane_px) + 1)
     return torch.linspace(1 / far_m, 1 / near_m, count)
 
 
@@ -134,7 +112,6 @@ def _scores(
     view: View,
     grid: tuple[Tensor, ...],
     others: list[View],
-    normal: Tensor,
     planes: Tensor,
     settings: SweepSettings,
 ) -> Tensor:
@@ -143,17 +120,19 @@ def _scores(
     rows, columns = (torch.arange(int(g.min()) - half, int(g.max()) + half + 1) for g in grid)
     rows, columns = torch.meshgrid(rows, columns, indexing="ij")
     rays = pixel_rays(rows, columns, view.K)
-    image = F.pad(comparable(view), (half,) * 4, value=torch.nan)[rows + half, columns + half]
-    along = (rays @ normal).float()
-    sources = [(comparable(other), homography_terms(rays, view, other)) for other in others]
+    pairs = []
+    for other in others:
+        most = min(view.full_scale, other.full_scale)
+        image = F.pad(comparable(view, most), (half,) * 4, value=torch.nan)[rows + half, columns + half]
+        pairs.append((image, comparable(other, most), *homography_terms(rays, view, other)))
     scores = torch.empty(len(planes), *grid[0].shape)
     at_once = max(1, PIXELS_AT_ONCE // rays[..., 0].numel())
     for first in range(0, len(planes), at_once):
         chosen = slice(first, first + at_once)
-        inverse_depths = planes[chosen, None, None] * along
+        layers = planes[chosen, None, None].expand(-1, *rows.shape)
         kept = [torch.full_like(scores[chosen], NOTHING) for _ in range(min(settings.kept, len(others)))]
-        for source, (turned, moved) in sources:
-            warped = warp(source[None], turned, moved, inverse_depths)[:, 0]
+        for image, source, turned, moved in pairs:
+            warped = warp(source[None], turned, moved, layers)[0]
             score = correlation(image, warped, settings.window_px).nan_to_num_(NOTHING)
             for k, other_score in enumerate(kept):  # the best first
                 kept[k], score = torch.maximum(other_score, score), torch.minimum(other_score, score)
@@ -161,9 +140,9 @@ def _scores(
     return scores
 
 
-def comparable(view: View) -> Tensor:
-    """Return the mean of a view's channels [H, W], not a number at saturated pixels and on the border."""
-    image = torch.where(view.saturated, torch.nan, view.image.mean(dim=0))
+def comparable(view: View, most: float) -> Tensor:
+    """Return the mean of a view's channels [H, W], clipped where either of two views saturates; NaN on the border."""
+    image = view.image.clamp(max=most).mean(dim=0)
     return F.pad(image[1:-1, 1:-1], (1, 1, 1, 1), value=torch.nan)
 
 
@@ -180,7 +159,7 @@ def homography_terms(rays: Tensor, reference: View, source: View) -> tuple[Tenso
 
 
 def warp(image: Tensor, turned: Tensor, moved: Tensor, inverse_depths: Tensor) -> Tensor:
-    """Return an image [C, H, W] as seen along another camera's rays at inverse depths [D, h, w], 1/m: [D, C, h, w].
+    """Return an image [C, H, W] as seen along another camera's rays at inverse depths [D, h, w], 1/m: [C, D, h, w].
 
     Values are bilinear, and those of the border outside the image. The gradient flows to the image.
 
@@ -191,8 +170,10 @@ def warp(image: Tensor, turned: Tensor, moved: Tensor, inverse_depths: Tensor) -
     place = torch.empty(*inverse_depths.shape, 2)
     for axis in range(2):
         place[..., axis] = (turned[..., axis] + moved[axis] * inverse_depths) / z
-    stack = image.expand(len(place), *image.shape)
-    return F.grid_sample(stack, place, "bilinear", "border", align_corners=False)
+    # all planes as one tall grid: the image need not be repeated for each
+    rows = place.flatten(0, 1)[None]
+    warped = F.grid_sample(image[None], rows, "bilinear", "border", align_corners=False)[0]
+    return warped.unflatten(1, inverse_depths.shape[:2])
 
 
 def correlation(a: Tensor, b: Tensor, window_px: int) -> Tensor:
@@ -223,7 +204,7 @@ def _sums(images: Tensor, window_px: int) -> Tensor:
 
 
 def _peak(score: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the best score [h, w] and its inverse offset, 1/m, at the top of a parabola through three planes."""
+    """Return the best score [h, w] and its inverse depth, 1/m, at the top of a parabola through three planes."""
     value, index = score.max(dim=0)
     inner = index.clamp(1, len(planes) - 2)
     before, at, after = (score.gather(0, (inner + k)[None])[0] for k in (-1, 0, 1))

@@ -26,12 +26,12 @@ class View:
     """One frame for matching.
 
     image: [C, H, W], 1 is full scale, of the one exposure to which all frames were brought, or of each frame's own.
-    saturated: [H, W] pixels that read full scale in any channel, where the exposures are known; else none.
+    full_scale: at this value the view's own exposure saturates.
     lit: [H, W] pixels that are probably light; only these get a depth.
     """
 
     image: Tensor
-    saturated: Tensor
+    full_scale: float
     lit: Tensor
     world_to_camera: Tensor  # [4, 4] float64
     K: Tensor  # [3, 3] float64, px
@@ -55,8 +55,8 @@ def prepare(frames: list[TrainingFrame], sensor: Sensor, one_exposure: bool) -> 
     """Return the frames that show light, brought to the geometric mean of their exposures or as they are.
 
     Args:
-        one_exposure: readings are divided by the exposure time, and saturated ones are marked. If false, readings are
-            taken as they are, as by somebody who does not know that the exposures differ.
+        one_exposure: readings are divided by the exposure time. If false, they are taken as they are, as by somebody
+            who does not know that the exposures differ.
 
     Raises:
         TooFewFrames, ReconstructionError: the frames do not fit together, or are black.
@@ -77,11 +77,10 @@ def prepare(frames: list[TrainingFrame], sensor: Sensor, one_exposure: bool) -> 
         if outline.certain.sum() < FEWEST_LIT_PX:
             continue
         gain = reference_s / f.exposure_time_s if one_exposure else 1.0
-        saturated = (f.dn >= sensor.white_dn).any(dim=-1) & one_exposure
         image = (f.dn - sensor.black_dn).movedim(-1, 0) * (gain / full_dn)
         # probable light far from any certain light is mostly noise
         lit = outline.likely & _near(outline.certain)
-        views.append(View(image.float(), saturated, lit, f.world_to_camera.double(), f.K.double()))
+        views.append(View(image.float(), gain, lit, f.world_to_camera.double(), f.K.double()))
     return Views(views, radius_m, digest.hexdigest())
 
 

@@ -17,7 +17,7 @@ from obbgs_base.errors import Interrupted
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from tests import raycast
 
-FEW = SweepSettings(tilts_deg=(0.0,), sources=4, window_px=5)
+FEW = SweepSettings(sources=4, window_px=5, fusion=depth_maps.FusionSettings(0.5))
 BOXES = raycast.spacecraft(3)
 
 
@@ -66,9 +66,9 @@ def test_the_image_of_a_plane_is_warped_as_by_opencv(tilt_deg):
     image = cv2.GaussianBlur(rng.random((48, 48)).astype(np.float32), (0, 0), 2)
     K = np.array([[80.0, 0, 24], [0, 80, 24], [0, 0, 1]])
     poses = raycast.looking_at_origin(np.array([[0, 0, 1.0], [0.3, 0.1, 1]]), 4.0)
-    black = torch.zeros(48, 48, dtype=torch.bool)
+    lit = torch.ones(48, 48, dtype=torch.bool)
     reference, source = (
-        stereo_views.View(torch.from_numpy(image)[None], black, ~black, torch.tensor(p), torch.tensor(K))
+        stereo_views.View(torch.from_numpy(image)[None], 1.0, lit, torch.tensor(p), torch.tensor(K))
         for p in poses
     )
     normal = np.array([np.sin(np.radians(tilt_deg)), 0, np.cos(np.radians(tilt_deg))])
@@ -129,19 +129,21 @@ def test_a_textured_spacecraft_becomes_a_cloud_on_its_surface(scene):
     assert shares == sorted(shares) and len(shares) == 20 and shares[-1] < 1
 
 
-def test_saturated_frames_are_left_out_where_the_exposures_are_known(scene):
-    frames, _ = scene
+def test_two_exposures_of_one_view_are_clipped_alike():
+    """Once both are clipped where the longer saturates they differ by noise; as they are, by its saturated part."""
+    pose = raycast.looking_at_origin(np.array([[0, 0.3, 1.0]]), 4.5)
+    frames, _ = raycast.photographed(BOXES, np.repeat(pose, 3, axis=0), 64, 120.0)
     known = stereo_views.prepare(frames, raycast.SENSOR, one_exposure=True)
     raw = stereo_views.prepare(frames, raycast.SENSOR, one_exposure=False)
-    assert sum(int(v.saturated.sum()) for v in known.views) > 100
-    assert not any(v.saturated.any() for v in raw.views) and known.digest != raw.digest
-    # one view's radiance twice: the frames of three exposures agree once they are divided by their times
-    levels = [v.image[:, v.lit].mean().item() for v in raw.views]
-    assert levels[2] > 2 * levels[0]
-    assert (
-        torch.isnan(plane_sweep.comparable(known.views[2])).sum()
-        > torch.isnan(plane_sweep.comparable(raw.views[2])).sum()
-    )
+    assert known.digest != raw.digest and [v.full_scale for v in raw.views] == [1, 1, 1]
+    middle, long = known.views[1:]
+    assert long.full_scale == pytest.approx(middle.full_scale / 2)
+    brightest = middle.image[0] > 1.1 * long.full_scale  # of the mean exposure, beyond the noise
+    alike = [plane_sweep.comparable(v, long.full_scale)[brightest].nanmean() for v in (middle, long)]
+    assert brightest.sum() > 50 and alike[0].item() == pytest.approx(alike[1].item(), rel=0.01)
+    assert middle.image[0][brightest].mean() > 1.1 * long.image[0][brightest].mean()
+    lit = raw.views[0].lit & raw.views[2].lit
+    assert raw.views[2].image[0][lit].mean() > 2 * raw.views[0].image[0][lit].mean()
 
 
 def test_an_interrupted_sweep_goes_on_and_ends_alike(scene, tmp_path):
@@ -200,7 +202,7 @@ def test_points_that_only_two_views_see_alike_are_rejected():
     lit = torch.ones(32, 32, dtype=torch.bool)
     views, maps = [], []
     for k, pose in enumerate(poses):
-        view = stereo_views.View(torch.zeros(1, 32, 32), ~lit, lit, torch.tensor(pose), K)
+        view = stereo_views.View(torch.zeros(1, 32, 32), 1.0, lit, torch.tensor(pose), K)
         rows, columns = torch.meshgrid(torch.arange(32), torch.arange(32), indexing="ij")
         rays = stereo_views.pixel_rays(rows, columns, K) @ view.world_to_camera[:3, :3]
         depth_m = (-view.centre[2] / rays[..., 2]) * (1.2 if k == 2 else 1)  # the plane z = 0 of the body
