@@ -96,8 +96,8 @@ def corners(positions: Tensor, cells: int, rows: int) -> tuple[Tensor, Tensor]:
         # the lowest bits of a product do not depend on the higher ones, and XOR treats each bit by itself
         vertex = (vertex & (rows - 1) if hashed else vertex).int()[:, None]
         share = torch.stack([1 - scaled + low, scaled - low])[:, None]
-        row = (vertex ^ row if hashed else vertex + row).view(-1, len(positions))
-        weight = (share * weight).view(-1, len(positions))
+        row = (vertex ^ row if hashed else vertex + row).flatten(0, 1)
+        weight = (share * weight).flatten(0, 1)
     return row, weight
 
 

@@ -223,3 +223,13 @@ def test_colours_are_bounded_only_where_exposures_are_ignored():
             colours = field.colour(field.geometry(positions)[1] + 5.0, directions)
         assert (colours.max() > 1) == (not bounded)
         assert float(colours.min()) >= 0
+
+
+@pytest.mark.parametrize("exposure_aware", [True, False])
+def test_rays_through_empty_space_only_are_black(small, exposure_aware):
+    frames = scenes.photographed(scenes.target(), 4, size_px=24, focal_px=45.0)
+    training = nerf.Training(frames, scenes.SENSOR, 0, 10, exposure_aware)
+    training.model.occupancy.occupied[:] = False
+    image = training.model.image(cameras_of(frames[:1]), 1e-4)
+    assert torch.equal(image, torch.full_like(image, scenes.SENSOR.black_dn / scenes.SENSOR.white_dn))
+    assert training.model.depth_map(cameras_of(frames[:1]))[0].isinf().all()
