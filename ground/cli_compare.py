@@ -42,6 +42,7 @@ def compare_command(
         Path | None,
         typer.Option(help="A YAML file of stability conditions; default: frames as they were taken."),
     ] = None,
+    weights: Annotated[Path | None, typer.Option(help="The file of weights that mvsnet needs.")] = None,
     scheduler: Annotated[
         str | None,
         typer.Option(help="A dask scheduler, such as tcp://10.0.0.1:8786; default: processes of its own."),
@@ -74,7 +75,7 @@ def compare_command(
         facts = [session_facts(folder) for folder in (sessions, *(more_sessions or []))]
         chosen = load_conditions(conditions) if conditions else {AS_TAKEN: Condition()}
         names = [name.strip() for name in methods.split(",") if name.strip()]
-        cells = cells_of(facts, names, seeds, parse_budgets(budgets), chosen)
+        cells = cells_of(facts, names, seeds, parse_budgets(budgets), chosen, weights)
         with _shown(stderr) as on_state:
             command = this_command("ground")
             summary = run_grid(cells, out, command, scheduler, workers, on_state, lambda: stop.requested)

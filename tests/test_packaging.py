@@ -85,6 +85,13 @@ def test_a_command_without_its_extra_says_what_to_install(missing, tool, argumen
     assert any(f"needs {module}," in line for module in missing)
 
 
+@pytest.mark.parametrize("missing", [ALL, {"distributed"}, {"matplotlib"}])
+def test_a_comparison_without_its_extra_names_that_extra(missing):
+    done = run_without(missing, "ground", "compare", "--sessions", GOLDEN, "--out", "never")
+    assert done.returncode == 2, done.stderr
+    assert "pip install 'obbgs[compare]'" in done.stderr and not (ROOT / "never").exists()
+
+
 @pytest.mark.parametrize(
     ("tool", "arguments"),
     [

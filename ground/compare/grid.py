@@ -1,5 +1,6 @@
 """The cells of a grid: every session with every method, seed, budget and condition, and the digest of each."""
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Sequence
@@ -84,7 +85,7 @@ def session_facts(folder: Path) -> SessionFacts:
 
 @dataclass(frozen=True)
 class Cell:
-    """One row to be made. `memory_mb` is what its process is estimated to need."""
+    """One row to be made. `memory_mb` is what its process is estimated to need; `weights` are a learned method's."""
 
     session: SessionFacts
     method: str
@@ -94,6 +95,7 @@ class Cell:
     condition: Condition
     digest: str
     memory_mb: float
+    weights: Path | None = None
 
     @property
     def label(self) -> str:
@@ -107,14 +109,18 @@ def cells_of(
     seeds: int,
     budgets: Sequence[Budget],
     conditions: dict[str, Condition],
+    weights: Path | None = None,
 ) -> list[Cell]:
     """Return the cells of a grid in the order in which they are worth having: first seeds and first conditions first.
 
     A cell stands once where axes mean nothing to its method: a black image has no seed, no steps and no size.
     Conditions with settings of a training hold only for methods that are trainings.
 
+    Args:
+        weights: the file of a learned method's weights.
+
     Raises:
-        ValueError: no such method, or no seed.
+        ValueError: no such method, no seed, or no weights where they are needed.
         CompareError: two sessions have one name or the same content.
     """
     if seeds < 1:
@@ -128,7 +134,7 @@ def cells_of(
                     "leave one out, or rename its folder"
                 )
             known[key] = facts.path
-    registered = [method(name) for name in dict.fromkeys(methods)]
+    registered = [method(name, weights) for name in dict.fromkeys(methods)]
     cells: dict[str, Cell] = {}
     for budget in budgets:
         for seed in range(seeds):
@@ -139,7 +145,8 @@ def cells_of(
                             continue
                         cell = _cell(facts, wanted, seed, budget, name, condition)
                         cells.setdefault(cell.digest, cell)
-    return list(cells.values())
+    weights = None if weights is None else weights.resolve()
+    return [dataclasses.replace(cell, weights=weights) for cell in cells.values()]
 
 
 def _cell(

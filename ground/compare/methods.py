@@ -1,16 +1,20 @@
 """The registry of compared methods: how each is run, and which axes of a grid change what it does."""
 
 import dataclasses
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from ground.baselines.mvsnet import reconstruct_mvsnet
 from ground.baselines.nerf import reconstruct_nerf
 from ground.baselines.plane_sweep import reconstruct_mvs
 from ground.baselines.reconstruction import Reconstruction, Work
+from ground.baselines.sfm import Pictures, reconstruct_sfm
 from ground.compare import references
 from ground.compare.case import Case
 from ground.compare.trainings import reconstruct_gaussians
@@ -70,12 +74,20 @@ class Method:
     gaussians: int = 0
 
 
-def method(name: str) -> Method:
+def method(name: str, weights: Path | None = None) -> Method:
     """Return a method by its name: a reference, a baseline, or a training as `preset` names it, `3dgs+exposure`.
 
+    Args:
+        weights: the file of a learned method's weights, which decides its rows by its content.
+
     Raises:
-        ValueError: there is no such method; the message names the known ones.
+        ValueError: there is no such method; the message names the known ones. Or it needs weights, and there are none.
     """
+    if name == MVSNET:
+        if weights is None or not weights.is_file():
+            raise ValueError(f"{MVSNET} needs the file of its weights: --weights FILE, got {weights}")
+        digest = hashlib.sha256(weights.read_bytes()).hexdigest()
+        return Method(name, lambda task: _learned(task, weights), {"weights": digest})
     if name in _REFERENCES:
         return Method(name, lambda task: _reference(task, _REFERENCES[name]))
     if name in _BASELINES:
@@ -85,7 +97,7 @@ def method(name: str) -> Method:
     try:
         return _training(preset(name), name)
     except ValueError as error:
-        others = ", ".join([*reference_names(), *_BASELINES])
+        others = ", ".join([*reference_names(), *_BASELINES, MVSNET])
         raise ValueError(f"{error}; or {others}, which are no trainings of Gaussians") from error
 
 
@@ -100,7 +112,7 @@ _REFERENCES: dict[str, Callable[[Case, list[TrainingFrame]], list[Tensor]]] = {
     "ceiling": references.ceiling,
     "noise": references.noise,
 }
-UNTRAINED = "untrained"  # the Gaussians that `obbgs` starts from
+MVSNET, UNTRAINED = "mvsnet", "untrained"  # the Gaussians that `obbgs` starts from
 _BASELINES: dict[str, Method] = {
     method.name: method
     for method in (
@@ -108,6 +120,9 @@ _BASELINES: dict[str, Method] = {
         Method("nerf+exposure", lambda task: _nerf(task, exposure_aware=True), seeded=True, stepped=True),
         Method("mvs", lambda task: _stereo(task, one_exposure=True)),
         Method("mvs+raw", lambda task: _stereo(task, one_exposure=False)),
+        Method("sfm", lambda task: _motion(task, "raw")),
+        Method("sfm+fused", lambda task: _motion(task, "fused")),
+        Method("sfm+one-exposure", lambda task: _motion(task, "one-exposure")),
     )
 }
 
@@ -124,6 +139,14 @@ def _nerf(task: Task, exposure_aware: bool) -> Outcome:
 
 def _stereo(task: Task, one_exposure: bool) -> Outcome:
     return Outcome(reconstruct_mvs(task.frames, task.sensor, task.work, one_exposure))
+
+
+def _learned(task: Task, weights: Path) -> Outcome:
+    return Outcome(reconstruct_mvsnet(task.frames, task.sensor, weights, task.work))
+
+
+def _motion(task: Task, pictures: Pictures) -> Outcome:
+    return Outcome(reconstruct_sfm(task.frames, task.sensor, task.work, pictures))
 
 
 def _training(config: MethodConfig, name: str, time_limit_s: float = float("inf")) -> Method:

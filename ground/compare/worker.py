@@ -47,7 +47,7 @@ def run_cell(cell: Cell, out: Path, stop: Path, command: str) -> dict[str, Any]:
 
 def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict[str, Any]:
     case = load_case(cell.session.path)
-    wanted = method(cell.method)
+    wanted = method(cell.method, cell.weights)
     follower = Follower(case, folder, stop, MARKS if wanted.settable else FEW_MARKS)
     row: dict[str, Any] = {
         "digest": cell.digest,
