@@ -270,7 +270,7 @@ def test_a_session_without_frames_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("change", "arguments", "code", "message"),
     [
-        (lambda s: None, ["--method", "nerf"], 2, "'nerf' is not one of 'obbgs', 'jiang2025'"),
+        (lambda s: None, ["--method", "nerf"], 2, "no method 'nerf'; expected one of 3dgs"),
         (lambda s: None, ["--name", "../x"], 1, "plain folder name"),
         (lambda s: shutil.rmtree(s), [], 1, "is not a session"),
         (lambda s: (s / "session.json").write_text('{"schema_version": 99}'), [], 1, "schema version 99"),

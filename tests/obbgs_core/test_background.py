@@ -148,12 +148,12 @@ def test_outlines_on_white_are_those_on_black():
         assert not (outline.certain & (near < 0.01)).any()
 
 
-def test_a_background_belongs_to_the_fingerprint_and_black_leaves_it_as_it_was():
+def test_a_background_belongs_to_the_identity_of_a_training():
     frames = photographed(target(), 6, size_px=32, focal_px=65.0)
     config = preset("3dgs", QUICK)
-    black = Trainer(frames, SENSOR, config).setup.fingerprint
+    black = Trainer(frames, SENSOR, config).setup.identity
     grey = [dataclasses.replace(f, background=1e-3) for f in frames]
-    assert Trainer(grey, SENSOR, config).setup.fingerprint != black
+    assert Trainer(grey, SENSOR, config).setup.identity != black
 
 
 @pytest.mark.parametrize("wrong", [-1.0, float("nan"), float("inf")])

@@ -62,7 +62,10 @@ def outputs_and_gradients(gaussians: Gaussians, cameras: Cameras, backend: str, 
     images = [out.radiance, out.alpha[..., None], out.depth[..., None]]
     loss = sum((i * torch.rand(i.shape, generator=g).to(i.dtype)).sum() for i in images)
     loss.backward()
-    return out, {**{n: t.grad for n, t in leaves.items()}, "world_to_camera": pose.grad}
+    gradients = {
+        n: t.grad for n, t in leaves.items() if t.grad is not None
+    }  # not every footprint has a point spread
+    return out, gradients | {"world_to_camera": pose.grad}
 
 
 @needs_native
