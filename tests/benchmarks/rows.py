@@ -23,6 +23,7 @@ NAMES = (
 FIGURES = {  # key of a row: column title and format
     "psnr_clean_db": ("clean PSNR", "{:.2f} dB"),
     "psnr_foreground_db": ("foreground", "{:.2f} dB"),
+    "psnr_clean_pooled_db": ("pooled", "{:.2f} dB"),
     "chamfer": ("Chamfer", "{:.4f}"),
     "hausdorff": ("Hausdorff", "{:.3f}"),
     "completeness_surface": ("surface complete", "{:.1f} %"),
