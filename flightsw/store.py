@@ -18,7 +18,7 @@ from flightsw.errors import StoreError, StoreFull
 from flightsw.icd.frame import Frame, decode_frame, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.icd.packet import PacketError
-from obbgs_base.files import sync_folder, write_whole
+from obbgs_base.files import append_line, sync_folder, write_whole
 
 log = logging.getLogger(__name__)
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -312,16 +312,7 @@ class FrameStore:
         return stored
 
     def _append(self, entry: dict) -> None:
-        before_bytes = self._index_bytes
-        try:
-            with open(self._index, "ab") as index:
-                index.write(json.dumps(entry).encode() + b"\n")
-                index.flush()
-                os.fsync(index.fileno())
-        except OSError:
-            if self._index.exists():  # a full disk: half a line would damage the index for good
-                os.truncate(self._index, before_bytes)
-            raise
+        append_line(self._index, json.dumps(entry).encode())
 
 
 def open_store(folder: Path, mission: Mission) -> FrameStore:

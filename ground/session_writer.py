@@ -22,7 +22,7 @@ from ground.session import (
     read_records,
 )
 from ground.telemetry import FlightCounts
-from obbgs_base.files import write_whole
+from obbgs_base.files import append_line, write_whole
 
 
 class SessionWriter:
@@ -84,17 +84,8 @@ class SessionWriter:
             )
         name = f"frames/{frame.frame_id:06d}.png"
         write_whole(self.folder / name, bytes(imagecodecs.png_encode(frame.dn, level=1)))
-        line = json.dumps(frame_line(frame, name, sha256), allow_nan=False).encode() + b"\n"
-        before_bytes = self._frames_file.stat().st_size if self._frames_file.exists() else 0
-        try:
-            with open(self._frames_file, "ab") as file:
-                file.write(line)
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError:
-            if self._frames_file.exists():  # after half a line, the next one would be damaged too
-                os.truncate(self._frames_file, before_bytes)
-            raise
+        line = json.dumps(frame_line(frame, name, sha256), allow_nan=False).encode()
+        append_line(self._frames_file, line)
         self._sha256_of[frame.frame_id] = sha256
         return True
 

@@ -23,6 +23,26 @@ def write_whole(path: Path, content: bytes) -> None:
     sync_folder(path.parent)
 
 
+def append_line(path: Path, line: bytes) -> None:
+    """Append a line, which lacks its line feed, and sync the file; sync the folder as well if the file is new.
+
+    Raises:
+        OSError: the disk does not take it; then `path` is as it was before, without half a line.
+    """
+    before_bytes = path.stat().st_size if path.exists() else None
+    try:
+        with open(path, "ab") as file:
+            file.write(line + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError:
+        if path.exists():  # after half a line, the next one would be damaged too
+            os.truncate(path, before_bytes or 0)
+        raise
+    if before_bytes is None:
+        sync_folder(path.parent)
+
+
 def sync_folder(folder: Path) -> None:
     """Force a folder's entries (created, renamed and removed files) to the disk."""
     descriptor = os.open(folder, os.O_RDONLY)

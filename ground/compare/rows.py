@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ground.compare.errors import CompareError
-from obbgs_base.files import sync_folder
+from obbgs_base.files import append_line
 
 ROWS, LOCK = "rows.jsonl", "lock"
 
@@ -43,18 +43,7 @@ class Rows:
         Raises:
             OSError: the disk does not take it.
         """
-        line = json.dumps(row, allow_nan=False).encode() + b"\n"
-        before_bytes = self.path.stat().st_size if self.path.exists() else 0
-        try:
-            with open(self.path, "ab") as file:
-                file.write(line)
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError:
-            if self.path.exists():
-                os.truncate(self.path, before_bytes)
-            raise
-        sync_folder(self.path.parent)
+        append_line(self.path, json.dumps(row, allow_nan=False).encode())
         self.rows[row["digest"]] = row
 
 
