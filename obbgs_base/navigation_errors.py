@@ -154,7 +154,26 @@ def displaced(motion: NominalMotion, parameters: SharedParameters | np.ndarray) 
         parameters.vector() if isinstance(parameters, SharedParameters) else np.asarray(parameters, float)
     )
     lead = vectors.shape[:-1]
-    rows = vectors.reshape(-1, SIZE)
+    changed = _changed(motion, vectors.reshape(-1, SIZE))
+    return _poses(*changed).reshape(*lead, len(motion.times_s), 4, 4)
+
+
+def displaced_motion(motion: NominalMotion, parameters: SharedParameters) -> NominalMotion:
+    """Return the motion with changed parameters; its poses are those of `displaced`."""
+    to_camera, to_body, position_m = (part[0] for part in _changed(motion, parameters.vector()[None]))
+    ratios = np.append(1 + parameters.inertia_ratios, 1.0)
+    return dataclasses.replace(
+        motion,
+        position_m=position_m,
+        inertial_to_camera=to_camera,
+        inertial_to_body=to_body,
+        rate_rad_s=motion.rate_rad_s + parameters.rate_rad_s,
+        inertia=motion.inertia * ratios,
+    )
+
+
+def _changed(motion: NominalMotion, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return inertial_to_camera, inertial_to_body [P, N, 3, 3] and position_m [P, N, 3] with parameters [P, 19]."""
     names = np.split(rows, np.cumsum(list(LENGTHS.values()))[:-1], axis=1)
     position, velocity, attitude, rate, ratios, boresight, clock, _ = names
     inertial_to_rtn = _turning(motion)
@@ -173,8 +192,7 @@ def displaced(motion: NominalMotion, parameters: SharedParameters | np.ndarray) 
         np.cross(motion.position_m, path_velocity) / distance2
     )  # [N, 3] rad/s of the line of sight, inertial
     to_camera = motion.inertial_to_camera @ rotations(-sight_turn * clock[:, None])
-    to_camera = rotations(boresight)[:, None] @ to_camera
-    return _poses(to_camera, to_body, moved).reshape(*lead, len(motion.times_s), 4, 4)
+    return rotations(boresight)[:, None] @ to_camera, to_body, moved
 
 
 def jacobian(motion: NominalMotion, at: SharedParameters) -> np.ndarray:

@@ -7,7 +7,13 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displaced, jacobian
+from obbgs_base.navigation_errors import (
+    NominalMotion,
+    SharedParameters,
+    displaced,
+    displaced_motion,
+    jacobian,
+)
 
 GM = 3.986004418e14  # m³/s²
 RADIUS_M = 6.9e6
@@ -106,6 +112,7 @@ def test_a_tumbling_target_turns_as_eulers_equations_say():
         motion.times_s, RATE + change.rate_rad_s, inertia, start
     ).swapaxes(1, 2)
     poses = displaced(motion, change)
+    np.testing.assert_allclose(displaced_motion(motion, change).world_to_camera, poses, atol=1e-9)
     error = Rotation.from_matrix(poses[:, :3, :3] @ true.swapaxes(1, 2)).magnitude()
     before = Rotation.from_matrix(motion.world_to_camera[:, :3, :3] @ true.swapaxes(1, 2)).magnitude()
     assert before.max() > 0.2

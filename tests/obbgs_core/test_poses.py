@@ -15,11 +15,12 @@ from obbgs_core.frames import TrainingFrame, usable
 from obbgs_core.losses import likelihood_loss
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.motions import rigid_motions
 from obbgs_core.model.pose_covariance import flaw, whitening
+from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.render import render
 from obbgs_core.start.initialisation import MOST_DILATION_PX, _pose_error_px, silhouettes
 from obbgs_core.train.batches import Batches
-from obbgs_core.train.poses import PoseCorrections, rigid_motions
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
 from obbgs_core.train.validation import correction_gain
