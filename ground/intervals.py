@@ -30,8 +30,11 @@ class View:
     on_target: Tensor
 
     def of_target(self, sensor: Sensor) -> Readings:
-        chosen = [value[self.on_target] for value in (self.radiance, self.deviation, self.frame.dn)]
-        return Readings.of(sensor, *chosen, self.frame.exposure_time_s)
+        """Return the readings on the target that are expected clear of both clips."""
+        radiance, deviation, dn = (
+            value[self.on_target] for value in (self.radiance, self.deviation, self.frame.dn)
+        )
+        return Readings.of(sensor, radiance, deviation, dn, self.frame.exposure_time_s)
 
 
 def interval_views(
