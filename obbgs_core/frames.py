@@ -50,7 +50,7 @@ class TrainingFrame:
     background: radiance of what is seen where the target is not, the same in all frames of a training; space is black.
     psf_sigma_px: of the optics, as in `Cameras`, the same in all frames; None: not calibrated, a method whose footprint
         is the camera's learns it.
-    navigation: errors that all frames of the pass share, the same object in all of them; None: there are none.
+    navigation: errors that all frames of the pass share, the same in all of them; None: there are none.
     time_s: since the navigation's epoch; inertial_to_body: [3, 3] float64, the attitude that the pose assumes; None:
         the body's axes are inertial. Only the navigation needs them.
     """
@@ -123,8 +123,11 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
         raise ReconstructionError(
             f"all frames must have one psf_sigma_px, that of their camera, got {sorted(map(str, spreads))}"
         )
-    if any(f.navigation is not frames[0].navigation for f in frames):
-        raise ValueError("all frames must have one and the same navigation object, got several")
+    stated = {repr(f.navigation and f.navigation.tree()) for f in frames}
+    if len(stated) > 1:
+        raise ReconstructionError(
+            f"all frames must state the same navigation, that of one pass, got {len(stated)}"
+        )
     for f in frames:
         finite = torch.isfinite(f.dn).all() and torch.isfinite(f.world_to_camera).all()
         if f.sun_dir is not None and not abs(float(f.sun_dir.norm()) - 1) < 1e-3:

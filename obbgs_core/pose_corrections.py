@@ -17,6 +17,7 @@ from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.registration import PoseInformation
 
 NULL = 1e-9  # a singular value of rows of unit length that is zero up to rounding
+LINEAR = 0.1  # prior deviations by which shared parameters move before their effect is linearised anew
 GAUGE_ROUNDS = 3  # of the linear problem that fixes the gauge; its error is of second order in the motion
 
 
@@ -50,6 +51,7 @@ class PoseCorrections:
         sigmas = SharedParameters() if navigation is None else navigation.sigmas
         self.sigmas = torch.from_numpy(dataclasses.replace(sigmas, focal=np.zeros(1)).vector())  # [19]
         self.shared = torch.zeros(SIZE, dtype=torch.float64)
+        self.linear_at = torch.full_like(self.shared, torch.nan)  # [19] where `by_shared` was taken
         self.moved = self.tags  # [F, 4, 4] the tags with the shared parameters
         self.by_shared = torch.zeros(
             len(frames), 6, 0, dtype=torch.float64
@@ -183,11 +185,12 @@ class PoseCorrections:
 
     def _move_shared(self, frames: list[TrainingFrame], shared: Tensor) -> None:
         """Set the shared parameters, and what they make of the tags."""
-        motion = motion_of(frames)
-        at = SharedParameters.of(shared.numpy())
+        motion, at = motion_of(frames), SharedParameters.of(shared.numpy())
         self.shared, self.moved = shared, torch.from_numpy(displaced(motion, at))
-        columns = torch.from_numpy(jacobian(motion, at))
-        self.by_shared = columns[:, :, self.free] * self.sigmas[self.free]
+        further = ((shared - self.linear_at) / self.sigmas)[self.free].abs().max()
+        if not further <= LINEAR:  # also the first time, when it is NaN
+            columns = torch.from_numpy(jacobian(motion, at))
+            self.by_shared, self.linear_at = columns[:, :, self.free] * self.sigmas[self.free], shared
 
     def _clear(self) -> None:
         self.gradient = torch.zeros(len(self.of_frame), 6, dtype=torch.float64)

@@ -63,3 +63,33 @@ class PoseEstimate:
                 )
             ],
         }
+
+    @staticmethod
+    def of(tree: dict) -> "PoseEstimate":
+        """Return the estimate that a `tree` holds.
+
+        Raises:
+            LookupError, TypeError, ValueError: it is no such tree.
+        """
+        value, prior, posterior = (
+            SharedParameters(**{name: np.array(tree["shared"][name][key]) for name in LENGTHS})
+            for key in ("value", "prior_sigma", "posterior_sigma")
+        )
+        own, own_prior, own_posterior = (
+            np.array([bracket[key] for bracket in tree["brackets"]])
+            for key in ("motion", "prior_sigma", "posterior_sigma")
+        )
+        frames = tree["frames"]
+        return PoseEstimate(
+            frame_ids=[frame["id"] for frame in frames],
+            brackets=[frame["bracket"] for frame in frames],
+            tagged=np.array([frame["tagged"] for frame in frames]),
+            estimated=np.array([frame["estimated"] for frame in frames]),
+            shared=value,
+            shared_prior=prior,
+            shared_posterior=posterior,
+            shared_covariance=np.array(tree["shared_covariance"]),
+            own=own,
+            own_prior=own_prior,
+            own_posterior=own_posterior,
+        )

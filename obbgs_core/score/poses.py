@@ -21,7 +21,7 @@ from obbgs_core.registration import point_flow, pose_information
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 
-ROUNDS = 20  # of aligning; the motion is small, so that a few would do
+ROUNDS = 8  # of aligning, Gauss-Newton
 SCALES = (
     4,
     2,
@@ -75,7 +75,7 @@ def pose_errors(
     estimated: Tensor, true: Tensor, motion: Tensor, radius_m: float, focal_px: float
 ) -> PoseErrors:
     """Return how far estimated poses [N, 4, 4] are from true ones after the body's motion [4, 4]."""
-    estimated, moved = estimated.double(), true.double() @ motion
+    estimated, moved = estimated.double(), true.double() @ motion.double()
     errors = motion_vectors(estimated @ torch.linalg.inv(moved))
     centres = [-(p[:, :3, :3].mT @ p[:, :3, 3:])[..., 0] for p in (estimated, moved)]
     ranges = moved[:, :3, 3].norm(dim=1)

@@ -6,7 +6,9 @@ true poses of a scenario, with sensor noise, and the tags err as each condition 
     python -m tests.benchmarks.poses --quick --json
 """
 
+import argparse
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,24 +16,31 @@ import numpy as np
 import torch
 
 from flightsw.icd.quaternion import quat_to_matrix
+from ground.cameras import exposed
+from ground.scores import ScoredView, clean_scores, cloud_scores
 from hil.sky.sensor import converted
 from hil.world.scenario import Scene, load_scenario
 from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displaced_motion
 from obbgs_core.frames import Navigation, TrainingFrame, cameras_of
 from obbgs_core.io.ply import load_ply, save_ply
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.model.motions import rigid_motions
+from obbgs_core.model.motions import adjoints, rigid_motions
+from obbgs_core.pose_corrections import with_estimate
 from obbgs_core.render import render
+from obbgs_core.score.poses import best_motion, pose_errors, settled_poses
 from obbgs_core.sensor import Sensor
 from obbgs_core.train import train
+from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.presets import preset
 from tests.benchmarks import targets
+from tests.benchmarks.rows import shown
 
 SCENARIOS = ("fly-around", "tumbling", "v-bar")
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=4.0, read_noise_dn=2.0)
 EXPOSURES_S = (5e-5, 1e-4, 2e-4)
 FRAME_SPACING_S = 0.5
 FILLS = 0.7  # of the field of view by the target's largest dimension at the mean range
+HELD_OUT = 8  # every eighth bracket
 CACHE = Path(__file__).parents[2] / "build" / "benchmarks"
 
 
@@ -177,3 +186,116 @@ def with_tags(
         )
         for i, f in enumerate(seen.frames)
     ]
+
+
+def stated(seen: Pass, degrees: float) -> list[TrainingFrame]:
+    """Return the frames with exact poses whose tags state an error: degrees, and 1.67 % of the size a degree."""
+    sigma = torch.tensor([np.radians(degrees)] * 3 + [degrees / 60 * seen.size_m] * 3, dtype=torch.float64)
+    return [dataclasses.replace(f, pose_covariance=torch.diag(sigma**2)) for f in seen.frames]
+
+
+def independent(seen: Pass, degrees: float, seed: int) -> list[TrainingFrame]:
+    """Return the frames with each bracket's target turned at random about its origin, and tags that state it."""
+    rng, frames = np.random.default_rng([seed, 18]), []
+    turns = torch.from_numpy(np.radians(degrees) * rng.standard_normal((len(seen.frames), 3)))
+    for f in seen.frames:
+        by_turn = adjoints(f.world_to_camera[None].double())[0][:, :3]  # of the body about its origin
+        motion = rigid_motions((by_turn @ turns[f.bracket or 0])[None])[0].float()
+        covariance = np.radians(degrees) ** 2 * by_turn @ by_turn.T
+        pose = motion @ f.world_to_camera
+        frames.append(dataclasses.replace(f, world_to_camera=pose, pose_covariance=covariance))
+    return frames
+
+
+CONDITIONS: dict[str, Callable[[Pass, int], list[TrainingFrame]]] = {
+    "exact": lambda seen, seed: seen.frames,
+    "stated_0.1": lambda seen, seed: stated(seen, 0.1),
+    "stated_0.3": lambda seen, seed: stated(seen, 0.3),
+    "stated_1": lambda seen, seed: stated(seen, 1.0),
+    "stated_3": lambda seen, seed: stated(seen, 3.0),
+    "correlated_1": lambda seen, seed: correlated(seen, 1.0, seed),
+    "correlated_3": lambda seen, seed: correlated(seen, 3.0, seed),
+    "correlated_10": lambda seen, seed: correlated(seen, 10.0, seed),
+    "independent_0.1": lambda seen, seed: independent(seen, 0.1, seed),
+    "independent_0.3": lambda seen, seed: independent(seen, 0.3, seed),
+    "independent_1": lambda seen, seed: independent(seen, 1.0, seed),
+}
+
+
+def scored(
+    seen: Pass, frames: list[TrainingFrame], config: MethodConfig, seed: int
+) -> dict[str, float | str]:
+    """Return the scores of a training on all brackets but every eighth, on which it is scored."""
+    held_out = [i for i, f in enumerate(seen.frames) if (f.bracket or 0) % HELD_OUT == HELD_OUT - 1]
+    trained = [i for i in range(len(frames)) if i not in set(held_out)]
+    result = train([frames[i] for i in trained], SENSOR, config, seed)
+    true, radius_m = torch.stack([f.world_to_camera for f in seen.frames]), seen.size_m / 2
+    found, tags = result.pose_estimate, [frames[i] for i in held_out]
+    estimated = torch.stack([frames[i].world_to_camera for i in trained])
+    if found is not None:
+        estimated, tags = torch.from_numpy(found.estimated), with_estimate(tags, found)
+    motion = best_motion(estimated, true[trained], radius_m)
+    errors = pose_errors(estimated, true[trained], motion, radius_m, seen.frames[0].K[0, 0].item())
+    settled = settled_poses(result.gaussians, tags, SENSOR) if found is not None else true[held_out]
+    in_model = (true[held_out].double() @ motion).float()  # true poses as the model's frame has them
+
+    def clean_db(poses: torch.Tensor) -> float:
+        views = []
+        for i, pose in zip(held_out, poses, strict=True):
+            frame = dataclasses.replace(seen.frames[i], world_to_camera=pose)
+            with torch.no_grad():
+                radiance = render(result.gaussians, cameras_of([frame])).radiance[0]
+            pair = (exposed(r, SENSOR, frame.exposure_time_s) for r in (radiance, seen.radiance[i]))
+            views.append(ScoredView(*pair, seen.alpha[i], frame.exposure_time_s))
+        return clean_scores(views)["psnr_clean_db"]
+
+    means = result.gaussians.means.double().numpy() @ motion[:3, :3].numpy().T + motion[:3, 3].numpy()
+    cloud = cloud_scores(means, np.zeros((0, 3)), seen.cloud_m, targets.LARGEST_DIMENSION / seen.size_m)
+    return {
+        "psnr_clean_db": clean_db(in_model),
+        "psnr_settled_db": clean_db(settled),
+        "chamfer": cloud["chamfer"],
+        "pose_error_deg": errors.rotation_deg,
+        "pose_error_range": errors.range_share,
+        "pose_error_px": errors.pixels,
+        "chi2": result.history[-1].chi2,
+        "gaussians": len(result.gaussians),
+        "seconds": result.seconds,
+        "poses": result.poses,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="one seed, 100x100 pixels, 49 brackets, 600 steps"
+    )
+    parser.add_argument("--target", default="TDRS", choices=targets.names(), help="default: %(default)s")
+    parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, help="default: all, one with --quick")
+    parser.add_argument("--conditions", nargs="+", choices=list(CONDITIONS), help="default: all")
+    parser.add_argument("--json", action="store_true", help="print rows as JSON lines")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    size_px, brackets, steps, seeds = (100, 49, 600, 1) if arguments.quick else (200, 121, 1500, 5)
+    model = target_model(arguments.target, size_px, 600)
+    cloud = targets.expose(arguments.target, size_px).cloud
+    config = preset("obbgs", {"steps": steps, "light.max_sh_degree": 0})
+    for scenario in arguments.scenarios or SCENARIOS:
+        for seed in range(seeds):
+            seen = photographed(model, cloud, scenario, brackets, size_px, seed)
+            chosen = arguments.conditions or list(CONDITIONS)
+            if arguments.quick and not arguments.conditions and scenario != SCENARIOS[0]:
+                chosen = ["exact", "correlated_1"]
+            exact_db = float("nan")
+            for name in dict.fromkeys(["exact", *chosen]):
+                figures = scored(seen, CONDITIONS[name](seen, seed), config, seed)
+                if name == "exact":
+                    exact_db = figures["psnr_clean_db"]
+                row = {"condition": name, "scenario": scenario, "target": arguments.target, "seed": seed}
+                print(shown(row | figures | {"psnr_exact_db": exact_db}, "poses", arguments.json), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -166,6 +166,21 @@ def test_the_jacobian_predicts_small_changes(draw, tumbling):
     np.testing.assert_allclose(motions[:, :3, 3], predicted[:, 3:], atol=1e-5)
 
 
+def test_a_spin_whose_rate_is_not_known_errs_as_one_whose_rate_is_known():
+    """A body with equal moments: the changes of both agree to first order, and so does what a late clock shows."""
+    rate = np.array([0.003, -0.002, 0.02])
+    times = np.sort(np.concatenate([np.arange(0, 600, 60.0), np.arange(0, 600, 60.0) + 0.5]))
+    bodies = Rotation.from_rotvec(-rate * times[:, None]).as_matrix()
+    cameras = np.broadcast_to(np.eye(3), bodies.shape)
+    known = NominalMotion(times, np.tile([0.0, 0, -50], (len(times), 1)), cameras, bodies, rate_rad_s=rate)
+    unknown = NominalMotion(times, known.position_m, cameras, bodies)
+    change = SharedParameters(attitude_rad=[1e-3, -2e-3, 1e-3], rate_rad_s=[2e-6, 1e-6, -3e-6], clock_s=0.02)
+    a, b = displaced(known, change), displaced(unknown, change)
+    moved = Rotation.from_matrix(a[:, :3, :3] @ known.world_to_camera[:, :3, :3].swapaxes(1, 2)).magnitude()
+    left = Rotation.from_matrix(a[:, :3, :3] @ b[:, :3, :3].swapaxes(1, 2)).magnitude()
+    assert moved.min() > 1e-3 and left.max() < 2e-5  # second order in 3e-3
+
+
 def test_parameters_survive_lists_and_vectors():
     parameters = SharedParameters.of(np.arange(19.0))
     assert SharedParameters(**parameters.lists()).lists() == parameters.lists()
