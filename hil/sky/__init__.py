@@ -3,3 +3,6 @@
 from pathlib import Path
 
 SHIPPED = Path(__file__).parents[1] / "assets" / "spacecraft.glb"  # the target that comes with the project
+SHIPPED_FOIL = SHIPPED.with_name(
+    "spacecraft-foil.glb"
+)  # the same in crinkled foil, cell glass and polished metal
