@@ -6,4 +6,3 @@ CameraKind = Literal["hil", "gige"]  # a socket of our own protocol, or GigE Vis
 LinkKind = Literal["serial", "slcan", "slcan-fd"]  # a serial line, or a CAN or CAN FD bus with slcan adapters
 FaultKind = Literal["none", "standard"]  # standard: hil.links.faults.STANDARD_FAULTS and a cut in the middle
 SensorKind = Literal["paper", "spacecam"]  # hil.sky.sensor.PRESETS
-Materials = Literal["own", "foil"]  # those of the mesh, or crinkled foil and cell glass in their place

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import TaskID
 
 from flightsw.icd.mission import load_mission
-from hil.choices import CameraKind, FaultKind, LinkKind, Materials, SensorKind
-from hil.sky import SHIPPED, SHIPPED_FOIL
+from hil.choices import CameraKind, FaultKind, LinkKind, SensorKind
+from hil.sky import SHIPPED, SHIPPED_FOIL, Materials
 from obbgs_base.command_line import new_app, run
 
 app = new_app("The simulated world: sky, target, camera and link, so that a pass runs on a desk.")

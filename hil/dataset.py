@@ -21,8 +21,8 @@ from ground.session import open_session
 from ground.session_writer import SessionWriter
 from ground.telemetry import FlightCounts
 from hil import truth
-from hil.choices import Materials, SensorKind
-from hil.sky import blender, motion, sensor, stars
+from hil.choices import SensorKind
+from hil.sky import Materials, blender, motion, sensor, stars
 from hil.sky.blender import mesh_sha256
 from hil.sky.motion import image_velocity, smear
 from hil.sky.render_farm import RenderFarm

@@ -10,8 +10,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from hil.choices import Materials
-from hil.sky import SHIPPED, SHIPPED_FOIL
+from hil.sky import SHIPPED, SHIPPED_FOIL, Materials
 from obbgs_base.errors import ObbgsError
 
 log = logging.getLogger(__name__)

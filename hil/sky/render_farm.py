@@ -14,7 +14,7 @@ import numpy as np
 
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission
-from hil.choices import Materials
+from hil.sky import Materials
 from hil.sky.blender import SAMPLES, SOURCES, Worker, check_mesh, mesh_sha256
 
 Op = Literal["render", "geometry"]  # radiance and coverage, or depth and normals

@@ -13,8 +13,7 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from hil.choices import Materials
-from hil.sky import crinkles
+from hil.sky import Materials, crinkles
 
 # base colour (linear), metallic, roughness
 MATT = {
