@@ -1,7 +1,7 @@
 """Stability conditions: what is changed about a session's training frames before a method sees them.
 
-Held-out frames stay as they are. Whatever is drawn at random is drawn from the frame's number, so that every method and
-seed sees the same frames.
+Held-out frames stay as they are, but for a held-out sector. Whatever is drawn at random is drawn from the frame's
+number, so that every method and seed sees the same frames.
 """
 
 import dataclasses
@@ -45,6 +45,7 @@ class Condition:
     - missing_exposure: the frames of this exposure time are lost, 1 is the shortest; 0: none.
     - eclipse: the frames between these two shares of the session show only noise.
     - pose_error_deg: every pose is turned at random by this standard deviation about each axis, and tagged with it.
+    - held_out_sector_deg: the frames of a sector of viewing directions so wide are held out, and they alone are scored.
     - set: settings of a training, such as `growth.interval: 60`; only methods that train Gaussians run under them.
     """
 
@@ -59,6 +60,7 @@ class Condition:
     missing_exposure: int = 0
     eclipse: tuple[float, ...] = ()
     pose_error_deg: float = 0.0
+    held_out_sector_deg: float = 0.0
     set: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -70,6 +72,11 @@ class Condition:
             0 <= self.lost_percent < 100,
             "lost_percent",
             f"expected 0 to less than 100, got {self.lost_percent:g}",
+        )
+        require(
+            0 <= self.held_out_sector_deg < 360,
+            "held_out_sector_deg",
+            f"expected 0 to less than 360, got {self.held_out_sector_deg:g}",
         )
         require(
             all(ratio > 0 for ratio in self.exposure_ratios),
