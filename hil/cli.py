@@ -16,7 +16,7 @@ from rich.progress import TaskID
 
 from flightsw.icd.mission import load_mission
 from hil.choices import CameraKind, FaultKind, LinkKind, SensorKind
-from hil.sky import SHIPPED
+from hil.sky import SHIPPED, SHIPPED_FOIL, Materials
 from obbgs_base.command_line import new_app, run
 
 app = new_app("The simulated world: sky, target, camera and link, so that a pass runs on a desk.")
@@ -264,6 +264,10 @@ def dataset(
         typer.Option(help="paper: 8 bits with the noise of Jiang et al. 2025; spacecam: a scientific CMOS."),
     ] = "paper",
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 1,
+    materials: Annotated[
+        Materials,
+        typer.Option(help="own: those of the mesh; foil: crinkled foil, and cell glass where it is dark."),
+    ] = "own",
     cache: Annotated[Path, typer.Option(help="Folder in which rendered frames are kept.")] = Path("renders"),
     workers: Annotated[int, typer.Option(min=1, help="Number of Blender processes.")] = 2,
     json_: AsJson = False,
@@ -284,8 +288,10 @@ def dataset(
     else:
         times_ms = [float(text) for text in bracket.split(",")]
         settings = {"scenario": scenario, "frames": frames, "size_px": size, "bracket_ms": times_ms}
-        config = build(DatasetConfig, {**settings, "sensor": sensor, "seed": seed}, "dataset")
-        jobs = [(mesh or SHIPPED, out)]
+        config = build(
+            DatasetConfig, {**settings, "sensor": sensor, "seed": seed, "materials": materials}, "dataset"
+        )
+        jobs = [(mesh or (SHIPPED_FOIL if materials == "foil" else SHIPPED), out)]
     with progress_bar(Console(stderr=True), label_width=20) as bars:
         tasks: dict[str, TaskID] = {}
 
@@ -304,12 +310,21 @@ def dataset(
 
 
 @app.command()
-def target(out: Annotated[Path, typer.Option(help="The GLB to write.")] = Path("spacecraft.glb")) -> None:
+def target(
+    out: Annotated[Path, typer.Option(help="The GLB to write.")] = Path("spacecraft.glb"),
+    materials: Annotated[
+        Materials,
+        typer.Option(
+            help="own: nearly matt; foil: crinkled gold foil, glossy cell glass and a polished dish."
+        ),
+    ] = "own",
+) -> None:
     """Write the shipped target, a parametric spacecraft, as binary glTF; the bytes are the same on every machine.
 
-    Example: hil target --out spacecraft.glb
+    Example: hil target --materials foil --out spacecraft.glb
     """
-    out.write_bytes(SHIPPED.read_bytes())  # not built again: rounding differs between processors
+    shipped = SHIPPED_FOIL if materials == "foil" else SHIPPED
+    out.write_bytes(shipped.read_bytes())  # not built again: rounding differs between processors
     print(out)
 
 
