@@ -12,7 +12,7 @@ from flightsw.commands import Commander, ReplayCounter
 from flightsw.errors import DownlinkError, FlightError
 from flightsw.frame_sender import FrameSender, SendingCounts
 from flightsw.housekeeping import EventLog, ProcessMeter, disk_values
-from flightsw.icd.frame import HEADER
+from flightsw.icd.frame import HEADER, header_of
 from flightsw.icd.framing import PacketStream
 from flightsw.icd.mission import Mission
 from flightsw.icd.packet import (
@@ -175,7 +175,7 @@ class _Downlink:
         self._frames.look()
         for frame_id in {frame.frame_id for frame in store.frames}.difference(self.waiting):
             with contextlib.suppress(OSError), open(store.path(frame_id), "rb") as container:
-                self._ranking.note_sent(frame_id, container.read(HEADER.size))
+                self._ranking.note_sent(frame_id, header_of(container.read(HEADER.size)))
 
     def start_again(self, error: Exception) -> None:
         """Begin anew after a failure and a pause; the log's error is an event to the ground.
@@ -312,7 +312,7 @@ class _Downlink:
         for frame_id in new[:HEADERS_A_LOOK]:
             self._announced.add(frame_id)
             with contextlib.suppress(OSError), open(self._store.path(frame_id), "rb") as container:
-                self._telemetry.append((APID_FRAME_HEADERS, container.read(HEADER.size)))
+                self._telemetry.append((APID_FRAME_HEADERS, header_of(container.read(HEADER.size))))
             if self.settings.priority == "thumbnail-first":
                 self._frames.queue_thumbnail(frame_id)
 

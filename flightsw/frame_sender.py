@@ -5,7 +5,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from flightsw.errors import StoreError
-from flightsw.icd.frame import HEADER, decode_frame, encode_thumbnail
+from flightsw.icd.frame import decode_frame, encode_thumbnail, header_of
 from flightsw.icd.mission import LinkSection
 from flightsw.icd.packet import PacketError
 from flightsw.icd.transfer import Outcome, Sender
@@ -81,7 +81,7 @@ class FrameSender:
             if container is not None:
                 self._sizes_bytes[frame_id] = len(container)
                 transfers.put(frame_file_name(frame_id), container, self._store.next_transaction(), now_s)
-                self._ranking.note_sent(frame_id, container[: HEADER.size])
+                self._ranking.note_sent(frame_id, header_of(container))
 
     def outcomes(self) -> tuple[int, list[Outcome]]:
         """Take account of the transfers that ended; return how many did, and the frames' that failed."""

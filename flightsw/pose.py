@@ -88,22 +88,33 @@ def navigation_tag(mission: Mission, state: SatelliteStates | RelativePose) -> P
 
     Raises:
         OrbitError: as `pose_tag`.
+        NavigationError: a pose in body axes of a target whose attitude the mission calls unknown.
     """
     if isinstance(state, SatelliteStates):
         return _tag_of_states(mission, state, True, "navigation")
+    if mission.target_attitude.knowledge == "unknown":
+        raise NavigationError(
+            "navigation gives poses in the target's body axes, but mission.target_attitude.knowledge is unknown: "
+            "send the states of both satellites, or say what is known of the attitude"
+        )
+    gcrs_to_body = target_attitude(mission, state.utc_ns)
     return PoseTag(
         quat_body_to_camera=state.quat_body_to_camera,
         position_body_m=state.position_body_m,
         covariance=state.covariance,
-        sun_dir_body=target_attitude(mission, state.utc_ns) @ sun_direction_gcrs(state.utc_ns),
+        sun_dir_body=gcrs_to_body @ sun_direction_gcrs(state.utc_ns),
         in_eclipse=in_eclipse(propagate(mission.orbit.target_tle, state.utc_ns).position_m, state.utc_ns),
         valid=True,
         source="navigation",
+        attitude=mission.target_attitude.knowledge,
+        quat_inertial_to_body=matrix_to_quat(gcrs_to_body),
+        correlation_time_s=mission.pose.correlation_time_s,
     )
 
 
 def _tag_of_states(mission: Mission, states: SatelliteStates, valid: bool, source: str) -> PoseTag:
-    if states.quat_gcrs_to_body is None:
+    knowledge = mission.target_attitude.knowledge
+    if states.quat_gcrs_to_body is None or knowledge == "unknown":
         gcrs_to_body = target_attitude(mission, states.utc_ns)
     else:
         gcrs_to_body = quat_to_matrix(states.quat_gcrs_to_body)
@@ -127,6 +138,9 @@ def _tag_of_states(mission: Mission, states: SatelliteStates, valid: bool, sourc
         in_eclipse=in_eclipse(states.target_position_m, states.utc_ns),
         valid=valid,
         source=source,
+        attitude=knowledge,
+        quat_inertial_to_body=matrix_to_quat(gcrs_to_body),
+        correlation_time_s=mission.pose.correlation_time_s,
     )
 
 
@@ -141,7 +155,12 @@ def _pointing(states: SatelliteStates) -> np.ndarray:
 
 
 def target_attitude(mission: Mission, utc_ns: int) -> np.ndarray:
-    """Return gcrs_to_body [3, 3]: body +z on the mission's axis, turned about it in `spin` mode."""
+    """Return gcrs_to_body [3, 3]: body +z on the mission's axis, turned about it in `spin` mode.
+
+    Where the mission calls the attitude unknown it is the identity: inertial axes stand for the body's.
+    """
+    if mission.target_attitude.knowledge == "unknown":
+        return np.eye(3)
     gcrs_to_start = _attitude_at_start(mission)
     if mission.target_attitude.mode == "inertial":
         return gcrs_to_start

@@ -122,6 +122,12 @@ def _quality(metrics: dict) -> list[str]:
     ):
         if key in metrics:
             lines.append("- " + text.format(metrics[key]))
+    for key, of in (("interval_90_noisy", "readings"), ("interval_90_clean", "noiseless exposures")):
+        if key in metrics:
+            lines.append(
+                f"- Stated uncertainty: intervals that should hold 90 % hold {100 * metrics[key]:.0f} % of the {of} "
+                "on the target in held-out frames."
+            )
     if metrics.get("onnx_fits_uplink") is False:
         lines.append("- model.onnx is too large for the uplink: train with a smaller --budget.")
     return lines

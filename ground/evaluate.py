@@ -9,9 +9,11 @@ import torch
 
 from ground.cameras import camera_of, exposed, predicted_image
 from ground.card import model_card
+from ground.intervals import interval_scores
 from ground.runs import Run, open_run, written_to
 from ground.scores import ScoredView, clean_scores, cloud_scores, display_scores, noisy_psnr_db
 from ground.session import FrameRecord
+from ground.training_frames import split, training_frame
 from ground.truth import Truth, read_points
 from obbgs_base.files import write_whole
 from obbgs_core.render import render
@@ -27,6 +29,9 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     - psnr_noisy_db: against the frames as received.
     - psnr_srgb_db, psnr_linear_db: of imported pictures in colour, the same of display values (sRGB-coded, black 0,
       full scale 1), as most publications measure it, and of values that are linear in light.
+
+    - interval_90_noisy, and with truth interval_90_clean and interval_90_half_width: how often the model's intervals
+      hold, as in `interval_scores`; only where frames are held out and exposure times are known.
 
     With a simulator's truth also, from true poses, so that errors of the scored frames' pose tags do not count as
     errors of the model:
@@ -58,11 +63,26 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
             surface = read_points(run.folder / "surface.ply")
         centres = run.gaussians.means.double().numpy()
         figures |= cloud_scores(centres, surface, truth.cloud_m, 2 / truth.largest_dimension_m)
+    if run.metrics["scored_frames"] == "held_out" and not run.metrics.get("reference_exposure_s"):
+        figures |= _interval_figures(run)
     metrics = {**run.metrics, **{key: round(value, 5) for key, value in figures.items()}}
     with written_to(run.folder):
         write_whole(run.folder / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
         write_whole(run.folder / "model_card.md", model_card(run.session.created_utc, metrics).encode())
     return metrics
+
+
+def _interval_figures(run: Run) -> dict[str, float]:
+    """Return how often the intervals hold that the model states of the held-out frames."""
+    records, radiance = run.scored, []
+    if Truth.exists(run.session):
+        truth = Truth(run.session)
+        records = list(map(truth.posed, run.scored))
+        radiance = [torch.from_numpy(truth.radiance(record)[0]) for record in records]
+    training, scored = (
+        [training_frame(run.session, record) for record in part] for part in (split(run.session)[0], records)
+    )
+    return interval_scores(run.gaussians, training, run.sensor, scored, radiance)
 
 
 def _image(run: Run, record: FrameRecord) -> torch.Tensor:

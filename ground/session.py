@@ -2,7 +2,8 @@
 
     session.json        schema version, digest of the mission file, camera calibration, TLEs, losses, bytes received,
                         what the spacecraft's telemetry said of its frames, time of creation; of imported pictures
-                        also the background's radiance and whether values are linear in light or sRGB-coded
+                        also the background's radiance and whether values are linear in light or sRGB-coded; how the
+                        pose tags can err (`Navigation`)
     frames.jsonl        one line per frame, a `FrameRecord`, in the order of arrival
     frames/000123.png   the frame's digital numbers, 16-bit linear, mono or RGB
     truth/              only from a simulator: true poses, radiance and surface; never read in training
@@ -18,17 +19,19 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import imagecodecs
 import numpy as np
 
-from flightsw.icd.config import ConfigError, build, keys_below, parse_json
+from flightsw.icd.config import ConfigError, build, keys_below, parse_json, require
+from flightsw.icd.frame import Attitude
 from flightsw.icd.mission import CameraSection
 from ground.telemetry import FlightCounts
 from obbgs_base.errors import ObbgsError
+from obbgs_base.navigation_errors import SharedParameters
 
 SCHEMA_VERSION = 1
 SPLITS = ("train", "val", "test")
@@ -78,6 +81,7 @@ class FrameRecord:
         None  # train, val or test, where an imported data set states it: for all frames or for none
     )
     K: np.ndarray | None = None  # [3, 3] px, where it is not the session's camera's
+    quat_inertial_to_body: np.ndarray | None = None  # [4] attitude of the target that the pose assumes, GCRS
 
 
 ARRAY_SHAPES = {
@@ -87,7 +91,37 @@ ARRAY_SHAPES = {
     "covariance": (6, 6),
     "sun_dir_body": (3,),
     "K": (3, 3),
+    "quat_inertial_to_body": (4,),
 }
+
+
+@dataclass(frozen=True)
+class Navigation:
+    """What flight says of its pose tags beside their covariances, which are of what differs from bracket to bracket.
+
+    attitude: of the target: known, rate_only (the body axes at the start were chosen freely) or unknown (`body` stands
+        for inertial axes centred on the target); the least that any tag says.
+    correlation_time_s: of the errors in the covariances; 0: independent from bracket to bracket.
+    epoch_utc_ns: the time at which the shared parameters are those of the start.
+    mean_motion_rad_s: of the target's orbit; 0: not known.
+    quat_inertial_to_rtn: [4] to radial, transverse and normal axes at the epoch.
+    sigmas: standard deviations of the parameters that all frames share.
+    """
+
+    attitude: Attitude = "known"
+    correlation_time_s: float = 0.0
+    epoch_utc_ns: int = 0
+    mean_motion_rad_s: float = 0.0
+    quat_inertial_to_rtn: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+    sigmas: SharedParameters = field(default_factory=SharedParameters)
+
+    def __post_init__(self):
+        for name in ("correlation_time_s", "mean_motion_rad_s"):
+            value = getattr(self, name)
+            require(value >= 0, f"session.navigation.{name}", f"must not be negative, got {value}")
+        quat = self.quat_inertial_to_rtn
+        unit = len(quat) == 4 and abs(math.hypot(*quat) - 1) < 1e-6
+        require(unit, "session.navigation.quat_inertial_to_rtn", f"expected a unit quaternion, got {quat}")
 
 
 @dataclass(frozen=True)
@@ -106,6 +140,7 @@ class Session:
     frames_imported: int | None  # pictures that were imported; None: the frames came over a link
     background: float  # radiance of what is seen where the target is not
     encoding: str  # of the digital numbers: linear in light, or srgb (display values)
+    navigation: Navigation
 
     @property
     def frames_captured(self) -> int | None:
@@ -167,6 +202,7 @@ def open_session(folder: str | Path) -> Session:
             int(header["frames_received"]) if "imported_from" in header else None,
             _background(header),
             _encoding(header),
+            _navigation(header),
         )
     except (ConfigError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise SessionCorrupt(f"{folder / 'session.json'}: {error}") from error
@@ -234,6 +270,15 @@ def _encoding(header: dict[str, Any]) -> str:
     return encoding
 
 
+def _navigation(header: dict[str, Any]) -> Navigation:
+    """Return the section `navigation`; the default one, of exact shared parameters, in sessions without it."""
+    tree = dict(header.get("navigation", {}))
+    sigmas = SharedParameters(**tree.pop("sigmas", {}))
+    if (sigmas.vector() < 0).any():
+        raise ValueError(f"navigation.sigmas must not be negative, got {sigmas.lists()}")
+    return build(Navigation, tree, "session.navigation", sigmas=sigmas)
+
+
 def read_records(folder: Path) -> list[FrameRecord]:
     """Return the whole lines of frames.jsonl in their order; [] where there is no such file.
 
@@ -260,24 +305,24 @@ def _record(tree: Any) -> FrameRecord:
     if not isinstance(tree, dict):
         raise ValueError("expected an object")
     values: dict[str, Any] = {}
-    for field in dataclasses.fields(FrameRecord):
-        if field.default is None and tree.get(field.name) is None:
+    for column in dataclasses.fields(FrameRecord):
+        if column.default is None and tree.get(column.name) is None:
             continue
-        if field.name not in tree:
-            raise ValueError(f"{field.name} is missing")
-        value = tree[field.name]
-        if field.name in ARRAY_SHAPES:
+        if column.name not in tree:
+            raise ValueError(f"{column.name} is missing")
+        value = tree[column.name]
+        if column.name in ARRAY_SHAPES:
             value = np.array(value, dtype=np.float64)
-            if value.shape != ARRAY_SHAPES[field.name] or not np.isfinite(value).all():
-                raise ValueError(f"{field.name} must be {ARRAY_SHAPES[field.name]} finite numbers")
-        elif field.name == "split":
+            if value.shape != ARRAY_SHAPES[column.name] or not np.isfinite(value).all():
+                raise ValueError(f"{column.name} must be {ARRAY_SHAPES[column.name]} finite numbers")
+        elif column.name == "split":
             if value not in SPLITS:
                 raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {value!r}")
-        elif field.type is float and type(value) is int:
+        elif column.type is float and type(value) is int:
             value = float(value)
-        elif type(value) is not field.type or (field.type is float and not math.isfinite(value)):
-            raise ValueError(f"{field.name} is {value!r}")
-        values[field.name] = value
+        elif type(value) is not column.type or (column.type is float and not math.isfinite(value)):
+            raise ValueError(f"{column.name} is {value!r}")
+        values[column.name] = value
     if "K" in values and not is_pinhole(values["K"]):
         raise ValueError(
             f"K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive, got {tree['K']}"

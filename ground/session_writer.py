@@ -11,8 +11,10 @@ from typing import Any
 
 import imagecodecs
 
-from flightsw.icd.frame import Frame
+from flightsw.icd.frame import ATTITUDES, Attitude, Frame
 from flightsw.icd.mission import Mission
+from flightsw.icd.quaternion import matrix_to_quat
+from flightsw.icd.tle import orbit_axes
 from ground.session import (
     SCHEMA_VERSION,
     SessionCorrupt,
@@ -36,6 +38,7 @@ class SessionWriter:
     def __init__(self, folder: str | Path, mission: Mission):
         self.folder = Path(folder)
         self._mission = mission
+        self._navigation = navigation_of(mission)
         self._frames_file = self.folder / "frames.jsonl"
         self._losses_before: dict[str, int] = {}
         self._bytes_before = 0
@@ -86,6 +89,7 @@ class SessionWriter:
         write_whole(self.folder / name, bytes(imagecodecs.png_encode(frame.dn, level=1)))
         line = json.dumps(frame_line(frame, name, sha256), allow_nan=False).encode()
         append_line(self._frames_file, line)
+        self._note_attitude(frame.pose.attitude)
         self._sha256_of[frame.frame_id] = sha256
         return True
 
@@ -109,6 +113,7 @@ class SessionWriter:
                 "target": list(self._mission.orbit.target_tle),
                 "chaser": list(self._mission.orbit.chaser_tle),
             },
+            "navigation": self._navigation,
             "losses": total,
             "flight": dataclasses.asdict(self.flight) if self.flight else None,
             "frames_received": self.frame_count,
@@ -128,8 +133,13 @@ class SessionWriter:
             self._bytes_before = int(header["bytes_received"])
             self._created_utc = str(header["created_utc"])
             self.flight = flight_counts(header)
+            self._note_attitude(header.get("navigation", {}).get("attitude", "known"))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise SessionCorrupt(f"{self.folder / 'session.json'}: {error}") from error
+
+    def _note_attitude(self, attitude: Attitude) -> None:
+        """Keep the least that the mission file or any tag knows of the target's attitude."""
+        self._navigation["attitude"] = max(self._navigation["attitude"], attitude, key=ATTITUDES.index)
 
     def _cut_unfinished_line(self) -> None:
         if self._frames_file.exists():
@@ -139,9 +149,28 @@ class SessionWriter:
                 os.truncate(self._frames_file, whole_bytes)
 
 
+def navigation_of(mission: Mission) -> dict[str, Any]:
+    """Return the section `navigation` of session.json (`ground.session.Navigation`).
+
+    Raises:
+        ConfigError: the target's orbit cannot be propagated to the mission's start.
+    """
+    epoch_utc_ns = mission.orbit.start_utc_ns
+    mean_motion_rad_s, inertial_to_rtn = orbit_axes(mission.orbit.target_tle, epoch_utc_ns)
+    return {
+        "attitude": mission.target_attitude.knowledge,
+        "correlation_time_s": mission.pose.correlation_time_s,
+        "epoch_utc_ns": epoch_utc_ns,
+        "mean_motion_rad_s": mean_motion_rad_s,
+        "quat_inertial_to_rtn": matrix_to_quat(inertial_to_rtn).tolist(),
+        "sigmas": mission.navigation_errors.sigmas.lists(),
+    }
+
+
 def frame_line(frame: Frame, file: str, sha256: str) -> dict[str, Any]:
     """Return a frame's line of frames.jsonl."""
     pose = frame.pose
+    assumed = pose.quat_inertial_to_body
     return {
         "id": frame.frame_id,
         "bracket": frame.bracket_id,
@@ -160,4 +189,5 @@ def frame_line(frame: Frame, file: str, sha256: str) -> dict[str, Any]:
         "sha256": sha256,
         "bit_depth": frame.bit_depth,
         "black_dn": frame.black_dn,
+        **({} if assumed is None else {"quat_inertial_to_body": assumed.tolist()}),
     }

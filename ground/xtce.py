@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from flightsw.icd.config import ConfigError
-from flightsw.icd.frame import SOURCES
+from flightsw.icd.frame import ATTITUDES, SOURCES
 from flightsw.icd.packet import (
     APID_EVENTS,
     APID_FILES,
@@ -65,13 +65,15 @@ FRAME_HEADER: tuple[tuple[str, str, str, tuple[tuple[int, str], ...]], ...] = (
     ("codec", "B", "", ()),
     ("near", "B", "DN", ()),
     ("pose_source", "B", "", tuple(enumerate(SOURCES))),
-    ("spare", "B", "", ()),
+    ("attitude", "B", "", tuple(enumerate(ATTITUDES))),
     ("black_dn", "f", "DN", ()),
     ("saturated_count", "I", "", ()),
     *((f"quat_body_to_camera_{axis}", "d", "", ()) for axis in "wxyz"),
     *((f"position_body_m_{axis}", "d", "m", ()) for axis in "xyz"),
     *((f"sun_dir_body_{axis}", "d", "", ()) for axis in "xyz"),
     *((f"covariance_{row}_{column}", "d", "", ()) for row in range(6) for column in range(row + 1)),
+    *((f"quat_inertial_to_body_{axis}", "d", "", ()) for axis in "wxyz"),
+    ("correlation_time_s", "d", "s", ()),
     ("codestream_bytes", "I", "B", ()),
     ("pixel_crc", "I", "", ()),
 )

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from flightsw.icd.frame import HEADER, MAGIC, SOURCES, VERSION
+from flightsw.icd.frame import ATTITUDES, HEADER, MAGIC, SOURCES, VERSION
 from flightsw.icd.packet import (
     APID_EVENTS,
     APID_FILES,
@@ -91,16 +91,17 @@ def found(prefix: str, item: Item, value: Any) -> dict[str, Any]:
 
 
 def frame_header(rng: random.Random) -> tuple[bytes, dict[str, Any]]:
-    fixed = {"version": VERSION, "header_bytes": HEADER.size, "spare": 0}
+    fixed = {"version": VERSION, "header_bytes": HEADER.size}
     values = {
         name: fixed.get(name, some_number(rng, code[-1]))
         for name, code, *_ in FRAME_HEADER
         if name != "magic"
     }
     values = {"magic": MAGIC} | values
-    values["pose_source"] = rng.randrange(len(SOURCES))
-    data = HEADER.pack(*(value for name, value in values.items() if name != "spare"))
+    values["pose_source"], values["attitude"] = rng.randrange(len(SOURCES)), rng.randrange(len(ATTITUDES))
+    data = HEADER.pack(*values.values())
     values["pose_source"] = SOURCES[values["pose_source"]]
+    values["attitude"] = ATTITUDES[values["attitude"]]
     return data, {f"frame_header_{name}": value for name, value in values.items()}
 
 

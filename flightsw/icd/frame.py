@@ -1,9 +1,10 @@
 """One frame on the wire: exposure, time, pose tag and pixels in a container with checksums."""
 
+import math
 import struct
 import zlib
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal, get_args
 
 import imagecodecs
 import numpy as np
@@ -12,12 +13,19 @@ from flightsw.icd.packet import CrcMismatch, PacketError, PacketTooShort
 from flightsw.icd.quaternion import quat_to_matrix
 
 MAGIC = b"OBGF"
-VERSION = 1
+VERSION = 2
 SOURCES = ("none", "sgp4", "navigation", "truth")
+Attitude = Literal["known", "rate_only", "unknown"]  # what is known of the target's
+ATTITUDES = get_args(Attitude)
 # magic, version, header bytes | frame, bracket, index, count, flags | exposure s, mid-exposure UTC ns
-# | height, width, channels, bit depth, codec, NEAR, pose source | black, saturated | quaternion, position,
-# Sun, covariance (lower triangle) | codestream bytes, CRC-32 of the decoded pixels. Byte table: README.md.
-HEADER = struct.Struct(">4sHHIIBBHdqHHBBBBBxfI4d3d3d21dII")
+# | height, width, channels, bit depth, codec, NEAR, pose source, attitude | black, saturated | quaternion, position,
+# Sun, covariance (lower triangle) | assumed attitude, correlation time s | codestream bytes, CRC-32 of the decoded
+# pixels. Byte table: README.md.
+HEADER = struct.Struct(">4sHHIIBBHdqHHBBBBBBfI4d3d3d21d4ddII")
+# of version 1: without the assumed attitude and the correlation time, and a zero in the place of `attitude`
+HEADER_1 = struct.Struct(">4sHHIIBBHdqHHBBBBBBfI4d3d3d21dII")
+HEADERS = {1: HEADER_1, VERSION: HEADER}
+NOT_STATED = (0.0, 0.0, 0.0, 0.0, 0.0)  # assumed attitude and correlation time, of a header of version 1
 CRC = struct.Struct(">I")
 FLAG_ECLIPSE, FLAG_POSE_VALID, FLAG_MASKED = 1, 2, 4
 CODEC_JPEG_LS = 1
@@ -30,7 +38,12 @@ TRIANGLE = np.tril_indices(6)
 
 @dataclass(frozen=True)
 class PoseTag:
-    """The camera's pose in the target's body frame, and the light that fell on the target."""
+    """The camera's pose in the target's body frame, and the light that fell on the target.
+
+    `attitude` says what is known of the target's attitude. known: the pose is in its body frame. rate_only: so it is,
+    but the body's axes at the start were chosen freely. unknown: `body` stands for inertial (GCRS) axes centred on the
+    target, for the Sun's direction too.
+    """
 
     quat_body_to_camera: np.ndarray  # [4] w, x, y, z, unit
     position_body_m: np.ndarray  # [3] camera centre
@@ -39,6 +52,11 @@ class PoseTag:
     in_eclipse: bool
     valid: bool
     source: str = "sgp4"
+    attitude: Attitude = "known"
+    quat_inertial_to_body: np.ndarray | None = (
+        None  # [4] the target's attitude that the pose assumes; None: not stated
+    )
+    correlation_time_s: float = 0.0  # of the tag's errors; 0: independent from bracket to bracket
 
     def __post_init__(self):
         for name, shape in (
@@ -46,16 +64,29 @@ class PoseTag:
             ("position_body_m", (3,)),
             ("covariance", (6, 6)),
             ("sun_dir_body", (3,)),
+            ("quat_inertial_to_body", (4,)),
         ):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
+            given = getattr(self, name)
+            if given is None:
+                continue
+            value = np.asarray(given, dtype=np.float64)
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"{name} must be {shape} finite numbers, got shape {value.shape}")
+            if name.startswith("quat"):
+                _require_unit(name, value)
             object.__setattr__(self, name, value)
-        quat = self.quat_body_to_camera
-        if np.abs(quat).max() > 2 or abs(np.linalg.norm(quat) - 1) > 1e-6:  # 2: before the norm overflows
-            raise ValueError(f"quat_body_to_camera must be a unit quaternion, got {self.quat_body_to_camera}")
         if self.source not in SOURCES:
             raise ValueError(f"source must be one of {', '.join(SOURCES)}, got {self.source!r}")
+        if self.attitude not in ATTITUDES:
+            raise ValueError(f"attitude must be one of {', '.join(ATTITUDES)}, got {self.attitude!r}")
+        assumed = self.quat_inertial_to_body
+        if self.attitude == "unknown" and (assumed is None or not abs(assumed[0]) > 1 - 1e-9):
+            raise ValueError(
+                "with attitude unknown a pose is in inertial axes: quat_inertial_to_body must be the identity, got "
+                f"{assumed}"
+            )
+        if not 0 <= self.correlation_time_s < math.inf:
+            raise ValueError(f"correlation_time_s must be at least 0, got {self.correlation_time_s}")
 
     @property
     def world_to_camera(self) -> np.ndarray:
@@ -64,6 +95,11 @@ class PoseTag:
         matrix[:3, :3] = quat_to_matrix(self.quat_body_to_camera)
         matrix[:3, 3] = -matrix[:3, :3] @ self.position_body_m
         return matrix
+
+
+def _require_unit(name: str, quat: np.ndarray) -> None:
+    if np.abs(quat).max() > 2 or abs(np.linalg.norm(quat) - 1) > 1e-6:  # 2: before the norm overflows
+        raise ValueError(f"{name} must be a unit quaternion, got {quat}")
 
 
 @dataclass(frozen=True)
@@ -129,6 +165,7 @@ def encode_frame(frame: Frame, *, max_error_dn: int = 0, roi_mask: np.ndarray | 
     codestream = bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(dn), level=max_error_dn))
     decoded = dn if max_error_dn == 0 else imagecodecs.jpegls_decode(codestream)
     pose = frame.pose
+    assumed = np.zeros(4) if pose.quat_inertial_to_body is None else pose.quat_inertial_to_body
     header = HEADER.pack(
         MAGIC,
         VERSION,
@@ -147,12 +184,15 @@ def encode_frame(frame: Frame, *, max_error_dn: int = 0, roi_mask: np.ndarray | 
         CODEC_JPEG_LS,
         max_error_dn,
         SOURCES.index(pose.source),
+        ATTITUDES.index(pose.attitude),
         frame.black_dn,
         frame.saturated_count,
         *pose.quat_body_to_camera,
         *pose.position_body_m,
         *pose.sun_dir_body,
         *pose.covariance[TRIANGLE],
+        *assumed,
+        pose.correlation_time_s,
         len(codestream),
         _pixel_crc(decoded),
     )
@@ -168,24 +208,42 @@ def decode_frame(data: bytes) -> Frame:
         CrcMismatch: the container or the decoded pixels do not fit their CRC-32.
         PacketError: not a container, another version, or values out of range.
     """
-    if len(data) < HEADER.size + CRC.size:
-        raise PacketTooShort(f"a frame has at least {HEADER.size + CRC.size} bytes, got {len(data)}")
-    fields = HEADER.unpack_from(data)
-    magic, version, header_bytes = fields[:3]
-    if magic != MAGIC:
-        raise PacketError(f"expected a frame starting with {MAGIC!r}, got {magic!r}")
-    if version != VERSION or header_bytes != HEADER.size:
-        raise PacketError(
-            f"frame version {version} with {header_bytes} header bytes; this software reads {VERSION}"
-        )
+    if len(data) < HEADER_1.size + CRC.size:
+        raise PacketTooShort(f"a frame has at least {HEADER_1.size + CRC.size} bytes, got {len(data)}")
+    fields, header_bytes = _header_fields(data)
     codestream_bytes, pixel_crc = fields[-2:]
-    if len(data) != HEADER.size + codestream_bytes + CRC.size:
+    if len(data) != header_bytes + codestream_bytes + CRC.size:
         raise PacketTooShort(
             f"the header promises {codestream_bytes} codestream bytes, {len(data)} came in all"
         )
     if CRC.unpack_from(data, len(data) - CRC.size)[0] != zlib.crc32(data[: -CRC.size]):
         raise CrcMismatch("the container's CRC-32 does not fit its bytes")
-    return _frame_from(fields, data[HEADER.size : -CRC.size], pixel_crc)
+    return _frame_from(fields, data[header_bytes : -CRC.size], pixel_crc)
+
+
+def header_of(container: bytes) -> bytes:
+    """Return the header at the beginning of a container, whatever its version; nothing is checked."""
+    return container[: int.from_bytes(container[6:8], "big")]
+
+
+def _header_fields(data: bytes) -> tuple[tuple, int]:
+    """Return the fields of a header, of any version as those of the newest, and its number of bytes.
+
+    Raises:
+        PacketError: not a container, a version that is not known, or the end comes too early.
+    """
+    magic, version, header_bytes = data[:4], *struct.unpack_from(">HH", data, 4)
+    if magic != MAGIC:
+        raise PacketError(f"expected a frame starting with {MAGIC!r}, got {magic!r}")
+    layout = HEADERS.get(version)
+    if layout is None or header_bytes != layout.size:
+        raise PacketError(
+            f"frame version {version} with {header_bytes} header bytes; this software reads up to {VERSION}"
+        )
+    if len(data) < header_bytes:
+        raise PacketTooShort(f"a frame header of version {version} has {header_bytes} bytes, got {len(data)}")
+    fields = layout.unpack_from(data)
+    return (fields if version > 1 else (*fields[:-2], *NOT_STATED, *fields[-2:])), header_bytes
 
 
 def read_header(data: bytes) -> dict[str, Any]:
@@ -194,12 +252,15 @@ def read_header(data: bytes) -> dict[str, Any]:
     Raises:
         PacketError: not one whole header of this version, or a value that is not finite.
     """
-    if len(data) != HEADER.size or data[:4] != MAGIC:
-        raise PacketError(f"expected a header of {HEADER.size} bytes starting with {MAGIC!r}")
-    fields = HEADER.unpack(data)
-    if fields[1:3] != (VERSION, HEADER.size) or fields[16] >= len(SOURCES):
-        raise PacketError(f"frame version {fields[1]}; this software reads {VERSION}")
-    numbers = (fields[8], fields[17], *fields[19:50])
+    if len(data) < HEADER_1.size:
+        raise PacketTooShort(f"a frame header has at least {HEADER_1.size} bytes, got {len(data)}")
+    fields, header_bytes = _header_fields(data)
+    if len(data) != header_bytes or fields[16] >= len(SOURCES) or fields[17] >= len(ATTITUDES):
+        raise PacketError(
+            f"expected one header of {header_bytes} bytes, a pose source below {len(SOURCES)} and an attitude below "
+            f"{len(ATTITUDES)}; got {len(data)} bytes, {fields[16]} and {fields[17]}"
+        )
+    numbers = (fields[8], fields[18], *fields[20:56])
     if not np.isfinite(numbers).all():
         raise PacketError("a frame header with values that are not finite")
     names = "frame_id bracket_id bracket_index bracket_count flags exposure_time_s mid_exposure_utc_ns height width"
@@ -207,11 +268,12 @@ def read_header(data: bytes) -> dict[str, Any]:
     return values | {
         "near": fields[15],
         "pose_source": SOURCES[fields[16]],
-        "saturated_count": fields[18],
-        "quat_body_to_camera": list(fields[19:23]),
-        "position_body_m": list(fields[23:26]),
-        "sun_dir_body": list(fields[26:29]),
-        "codestream_bytes": fields[50],
+        "attitude": ATTITUDES[fields[17]],
+        "saturated_count": fields[19],
+        "quat_body_to_camera": list(fields[20:24]),
+        "position_body_m": list(fields[24:27]),
+        "sun_dir_body": list(fields[27:30]),
+        "codestream_bytes": fields[56],
     }
 
 
@@ -231,16 +293,18 @@ def encode_thumbnail(frame: Frame) -> bytes | None:
 
 def _frame_from(fields: tuple, codestream: bytes, pixel_crc: int) -> Frame:
     (frame_id, bracket_id, index, count, flags, exposure_s, mid_ns) = fields[3:10]
-    (height, width, channels, bit_depth, codec, _near, source, black_dn, saturated) = fields[10:19]
-    numbers = np.array(fields[19:50])
+    (height, width, channels, bit_depth, codec, _near, source, attitude, black_dn, saturated) = fields[10:20]
+    numbers = np.array(fields[20:56])
     if (
         codec != CODEC_JPEG_LS
         or channels not in (1, 3)
         or source >= len(SOURCES)
+        or attitude >= len(ATTITUDES)
         or height * width > MAX_PIXELS
     ):
         raise PacketError(
-            f"codec {codec}, {channels} channels, pose source {source}, {height}x{width}: out of range"
+            f"codec {codec}, {channels} channels, pose source {source}, attitude {attitude}, {height}x{width}: "
+            "out of range"
         )
     expected_size = (height, width, channels)
     if _codestream_size(codestream) != expected_size:  # before decoding: hostile sizes must not take memory
@@ -269,6 +333,9 @@ def _frame_from(fields: tuple, codestream: bytes, pixel_crc: int) -> Frame:
             in_eclipse=bool(flags & FLAG_ECLIPSE),
             valid=bool(flags & FLAG_POSE_VALID),
             source=SOURCES[source],
+            attitude=ATTITUDES[attitude],
+            quat_inertial_to_body=numbers[31:35] if numbers[31:35].any() else None,
+            correlation_time_s=float(numbers[35]),
         )
         return Frame(
             frame_id, bracket_id, index, count, exposure_s, mid_ns, pose, dn, bit_depth, black_dn, saturated

@@ -1,14 +1,18 @@
 """The mission file: one YAML read by every part, checked key by key."""
 
 import hashlib
-import math
-import re
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
 from flightsw.icd.config import ConfigError, build, in_file, parse_yaml, require
+from flightsw.icd.pose_sections import (
+    NavigationErrorsSection,
+    NavigationSection,
+    PoseSection,
+    TargetAttitudeSection,
+)
 from flightsw.icd.tle import check_tle
 
 Checksum = Literal["crc-32", "crc-32c", "modular"]  # of CFDP
@@ -41,28 +45,6 @@ class OrbitSection:
         )
         whole = moment.astimezone(UTC).replace(microsecond=0)
         return int(whole.timestamp()) * 1_000_000_000 + moment.microsecond * 1000
-
-
-@dataclass(frozen=True)
-class TargetAttitudeSection:
-    """How the target turns: body +z stays on `axis` (GCRS), body x, y turn about it in `spin` mode."""
-
-    mode: Literal["inertial", "spin"] = "inertial"
-    axis: Literal["sun"] | tuple[float, ...] = "sun"
-    period_s: float = 600.0
-
-    def __post_init__(self):
-        path = "mission.target_attitude"
-        if not isinstance(self.axis, str):
-            require(len(self.axis) == 3, f"{path}.axis", f"expected 3 numbers, got {len(self.axis)}")
-            require(
-                abs(math.hypot(*self.axis) - 1) < 1e-3,
-                f"{path}.axis",
-                f"expected a unit vector, got length {math.hypot(*self.axis):.4f}",
-            )
-        require(
-            0.1 <= self.period_s <= 1e9, f"{path}.period_s", f"expected 0.1 to 1e9 s, got {self.period_s}"
-        )
 
 
 @dataclass(frozen=True)
@@ -187,56 +169,6 @@ class BracketSection:
 
 
 @dataclass(frozen=True)
-class PoseSection:
-    """Uncertainty of the tags, and how the camera is mounted on the chaser."""
-
-    sigma_position_m: float = 0.02
-    sigma_attitude_deg: float = 0.01
-    quat_chaser_to_camera: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)  # w, x, y, z
-    camera_position_m: tuple[float, ...] = (0.0, 0.0, 0.0)  # in the chaser's frame, from its centre of mass
-
-    def __post_init__(self):
-        path = "mission.pose"
-        for name, count in (("quat_chaser_to_camera", 4), ("camera_position_m", 3)):
-            got = len(getattr(self, name))
-            require(got == count, f"{path}.{name}", f"expected {count} numbers, got {got}")
-        length = math.hypot(*self.quat_chaser_to_camera)
-        require(
-            abs(length - 1) < 1e-6,
-            f"{path}.quat_chaser_to_camera",
-            f"expected a unit quaternion, got length {length:.6f}",
-        )
-        for name in ("sigma_position_m", "sigma_attitude_deg"):
-            require(
-                getattr(self, name) >= 0,
-                f"mission.pose.{name}",
-                f"must not be negative, got {getattr(self, name)}",
-            )
-
-
-@dataclass(frozen=True)
-class NavigationSection:
-    """Where the pose comes from: the two-line elements, or states as JSON lines (flightsw/navigation.py)."""
-
-    source: str = "sgp4"  # or file:///path, tcp://host:port
-    max_gap_s: float = 2.0  # no pose is interpolated between states further apart
-    wait_s: float = 2.0  # for a state that has not arrived yet
-
-    def __post_init__(self):
-        path = "mission.navigation"
-        require(
-            self.source == "sgp4"
-            or re.fullmatch(r"file:///.+|tcp://[^:/]+:\d{1,5}", self.source) is not None,
-            f"{path}.source",
-            f"expected sgp4, file:///path or tcp://host:port, got {self.source!r}",
-        )
-        require(
-            0 < self.max_gap_s <= 3600, f"{path}.max_gap_s", f"expected 0 to 3600 s, got {self.max_gap_s}"
-        )
-        require(0 <= self.wait_s <= 60, f"{path}.wait_s", f"expected 0 to 60 s, got {self.wait_s}")
-
-
-@dataclass(frozen=True)
 class StoreSection:
     """How much the frame store may take, and what happens when it is full.
 
@@ -334,6 +266,7 @@ class Mission:
     bracket: BracketSection = field(default_factory=BracketSection)
     pose: PoseSection = field(default_factory=PoseSection)
     navigation: NavigationSection = field(default_factory=NavigationSection)
+    navigation_errors: NavigationErrorsSection = field(default_factory=NavigationErrorsSection)
     store: StoreSection = field(default_factory=StoreSection)
     link: LinkSection = field(default_factory=LinkSection)
     reconstruct: ReconstructSection = field(default_factory=ReconstructSection)

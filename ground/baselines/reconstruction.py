@@ -1,6 +1,6 @@
 """What every compared method returns, and how the comparison follows and interrupts its work."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.cameras import Cameras
 
 
@@ -22,6 +23,8 @@ class Reconstruction:
     size_bytes: of the file or the parameters that one would keep.
     seconds: of the method's own work, without scoring, over all interrupted parts.
     figures: further columns of its row, such as the number of registered frames.
+    intervals: from held-out frames, their true radiance (or none) and the frames that calibrate to how often stated
+        intervals hold, as `ground.intervals.interval_scores` has it; None where the method states no uncertainty.
     """
 
     points: Tensor
@@ -30,6 +33,9 @@ class Reconstruction:
     size_bytes: int
     seconds: float
     figures: dict[str, Any] = field(default_factory=dict)
+    intervals: (
+        Callable[[list[TrainingFrame], list[Tensor], Sequence[TrainingFrame]], dict[str, float]] | None
+    ) = None
 
     @staticmethod
     def nothing(seconds: float, reason: str) -> "Reconstruction":

@@ -14,7 +14,7 @@ from torch import Tensor
 from ground.cameras import exposed, sensor_of
 from ground.compare.errors import CompareError
 from ground.scores import ScoredView, clean_scores, cloud_scores, display_scores, noisy_psnr_db
-from ground.session import Session, open_session, read_header
+from ground.session import FrameRecord, Session, open_session, read_header
 from ground.training_frames import split, training_frame
 from ground.truth import Truth
 from obbgs_core.frames import TrainingFrame
@@ -33,6 +33,7 @@ class Case:
     cloud_m: [N, 3], points of the true surface, body frame; None without truth.
     units_per_m: 2 over the target's largest dimension.
     session: where the frames came from; None for frames that are in no session.
+    calibration: frames that are neither trained on nor scored, by which stated uncertainties are calibrated.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Case:
     cloud_m: np.ndarray | None
     units_per_m: float = 1.0
     session: Session | None = None
+    calibration: Sequence[TrainingFrame] = ()
 
     @property
     def clean(self) -> list[Tensor]:
@@ -91,24 +93,40 @@ class Case:
         return lambda frame: torch.from_numpy(truth.radiance(records[frame.id])[0])
 
 
-def load_case(folder: Path) -> Case:
+def load_case(folder: Path, sector_deg: float = 0.0) -> Case:
     """Return the case of a session folder, named after the folder, or after the one above where it is `session`.
+
+    Args:
+        sector_deg: the width of a sector of viewing directions, about the orbit's normal and around the middle frame.
+            If it is above 0, all frames of the sector are held out and scored, and no others.
 
     Raises:
         SessionError: the session or its truth cannot be used.
-        CompareError: no frame is held out.
+        CompareError: no frame is held out, or none is left.
     """
     session = open_session(folder)
     training, held_out = split(session)
+    calibrating: list[FrameRecord] = []
+    if sector_deg:
+        inside = _sector(training, sector_deg)
+        calibrating = [record for record in held_out if not inside(record)]
+        held_out = [record for record in training + held_out if inside(record)]
+        training = [record for record in training if not inside(record)]
+        if not training:
+            raise CompareError(f"a sector of {sector_deg:g} degrees leaves no frame of {folder} for training")
     if not held_out:
         raise CompareError(
             f"{folder} holds out no frames, so nothing can be scored: it needs two brackets or more"
         )
     sensor, truth = sensor_of(session.camera), Truth(session) if Truth.exists(session) else None
-    given = [training_frame(session, record) for record in training]
+    given, calibration = (
+        [training_frame(session, r) for r in records] for records in (training, calibrating)
+    )
     if truth is None:
         scored = [training_frame(session, record) for record in held_out]
-        return Case(case_name(folder), sensor, given, scored, [], [], None, session=session)
+        return Case(
+            case_name(folder), sensor, given, scored, [], [], None, session=session, calibration=calibration
+        )
     records = list(map(truth.posed, held_out))
     scored = [
         dataclasses.replace(training_frame(session, record), pose_covariance=None) for record in records
@@ -124,7 +142,28 @@ def load_case(folder: Path) -> Case:
         truth.cloud_m,
         2 / truth.largest_dimension_m,
         session,
+        calibration,
     )
+
+
+def _sector(training: list[FrameRecord], width_deg: float) -> Callable[[FrameRecord], bool]:
+    """Return whether a frame was taken from the sector around the middle one of the training frames.
+
+    Its azimuth is measured about the direction in which the cameras' directions from the target vary least.
+    """
+
+    def direction(record: FrameRecord) -> np.ndarray:
+        return record.position_body_m / np.linalg.norm(record.position_body_m)
+
+    directions = np.array([direction(record) for record in training])
+    _, _, axes = np.linalg.svd(directions)
+
+    def azimuth_deg(record: FrameRecord) -> float:
+        along, across = axes[:2] @ direction(record)
+        return float(np.degrees(np.arctan2(across, along)))
+
+    middle_deg = azimuth_deg(training[len(training) // 2])
+    return lambda record: abs((azimuth_deg(record) - middle_deg + 180) % 360 - 180) <= width_deg / 2
 
 
 def case_name(folder: Path) -> str:

@@ -38,6 +38,7 @@ METRICS = (
     Metric("completeness_centres", "centres complete, %", "{:.1f}", True),
     Metric("completeness_surface", "surface complete, %", "{:.1f}", True),
     Metric("accuracy_surface", "accuracy", "{:.4f}", False),
+    Metric("interval_90_clean", "90 % intervals hold, share", "{:.2f}", None),
     Metric("gaussians", "Gaussians", "{:,.0f}", None),
     Metric("bytes", "kB", "{:,.0f}", None),
     Metric("seconds", "seconds", "{:,.0f}", None),

@@ -1,5 +1,6 @@
 """Trainings of Gaussians as compared methods: resumable, followed on the way, ended early where they have converged."""
 
+import functools
 import time
 from collections.abc import Callable
 
@@ -8,6 +9,7 @@ from torch import Tensor
 
 from ground.baselines.reconstruction import Reconstruction, Work
 from ground.compare.follow import MARKS
+from ground.intervals import interval_scores
 from ground.model_files import SURFACE_POINTS
 from obbgs_base.errors import Interrupted
 from obbgs_core.frames import TrainingFrame, cameras_of
@@ -95,6 +97,10 @@ def reconstruct_gaussians(
             "growth": result.growth,
             "poses": result.poses,
         },
+        # the images of other methods need more than a radiance and an exposure time
+        intervals=functools.partial(interval_scores, result.gaussians, frames, sensor)
+        if config.exposure_aware and not config.compensation
+        else None,
     )
 
 

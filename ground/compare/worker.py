@@ -46,7 +46,7 @@ def run_cell(cell: Cell, out: Path, stop: Path, command: str) -> dict[str, Any]:
 
 
 def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict[str, Any]:
-    case = load_case(cell.session.path)
+    case = load_case(cell.session.path, cell.condition.held_out_sector_deg)
     wanted = method(cell.method, cell.weights)
     follower = Follower(case, folder, stop, MARKS if wanted.settable else FEW_MARKS)
     row: dict[str, Any] = {
@@ -77,6 +77,10 @@ def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict
         )
         outcome = wanted.run(task)
         row |= scores(case, outcome, out / VIEWS / f"{cell.digest}.npz")
+        if outcome.reconstruction.intervals is not None:
+            row |= _rounded_all(
+                outcome.reconstruction.intervals(case.held_out, case.radiance, case.calibration)
+            )
         if curve := follower.finish(outcome.reconstruction):
             row["curve"] = curve
         if outcome.reconstruction.seconds and (joules := follower.joules) is not None:
@@ -100,11 +104,9 @@ def scores(case: Case, outcome: Outcome, views: Path) -> dict[str, Any]:
     figures |= case.cloud_scores(result.points, result.surface)
     if result.seconds:
         figures |= {"bytes": result.size_bytes, "seconds": result.seconds}
-    return {
-        ROW_NAMES.get(key, key): _rounded(value)
-        for key, value in figures.items()
-        if key not in ROW_LEAVES_OUT
-    }
+    return _rounded_all(
+        {ROW_NAMES.get(key, key): value for key, value in figures.items() if key not in ROW_LEAVES_OUT}
+    )
 
 
 def clear_work(out: Path, digest: str) -> None:
@@ -117,5 +119,5 @@ def clear_work(out: Path, digest: str) -> None:
         folder.rmdir()
 
 
-def _rounded(value: Any) -> Any:
-    return round(value, 5) if isinstance(value, float) else value
+def _rounded_all(figures: dict[str, Any]) -> dict[str, Any]:
+    return {key: round(value, 5) if isinstance(value, float) else value for key, value in figures.items()}

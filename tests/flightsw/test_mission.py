@@ -1,7 +1,9 @@
 """The mission file: what is wrong is named by its path."""
 
+import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given
@@ -10,7 +12,8 @@ from sgp4.io import compute_checksum
 
 from flightsw.icd.config import ConfigError, build
 from flightsw.icd.mission import Mission, load_mission
-from flightsw.icd.tle import tle_checksum
+from flightsw.icd.tle import orbit_axes, tle_checksum
+from flightsw.orbit import propagate
 
 TEXT = (Path(__file__).parents[2] / "mission.yaml").read_text()
 TREE = yaml.safe_load(TEXT)
@@ -52,12 +55,71 @@ def test_the_shipped_mission_loads(tmp_path):
         ("2 31698", "2 31699", r"mission\.orbit\.target_tle"),
         ("10:52:30Z", "10:52:30", r"mission\.orbit\.start_utc: say the time zone"),
         ("10:52:30Z", "25:52:30Z", r"mission\.orbit\.start_utc: expected ISO 8601"),
+        (
+            "mode: spin",
+            "knowledge: some",
+            r"target_attitude\.knowledge: expected one of known, rate_only, unknown",
+        ),
+        (
+            "pose:",
+            "pose:\n  correlation_time_s: -1",
+            r"mission\.pose\.correlation_time_s: must not be negative",
+        ),
+        (
+            "pose:",
+            "navigation_errors: {clock_ms: 1}\npose:",
+            r"navigation_errors\.clock_ms: unknown key.*clock_s",
+        ),
+        (
+            "pose:",
+            "navigation_errors: {position_m: [1, 2]}\npose:",
+            r"position_m: expected 1 or 3 numbers, got 2",
+        ),
+        (
+            "pose:",
+            "navigation_errors: {inertia_ratios: []}\npose:",
+            r"inertia_ratios: expected 1 or 2 numbers, got 0",
+        ),
+        (
+            "pose:",
+            "navigation_errors: {rate_deg_s: [0, -1, 0]}\npose:",
+            r"rate_deg_s: must not be negative, got -1",
+        ),
+        (
+            "pose:",
+            "navigation_errors: {focal: two}\npose:",
+            r"navigation_errors\.focal: expected a number, got 'two'",
+        ),
     ],
 )
 def test_a_wrong_value_is_named_by_its_path(tmp_path, old, new, path):
     assert old in TEXT
     with pytest.raises(ConfigError, match=path):
         load(tmp_path, TEXT.replace(old, new))
+
+
+def test_sigmas_of_shared_errors_are_in_radians_one_an_axis(tmp_path):
+    assert not load(tmp_path, TEXT).navigation_errors.sigmas.vector().any()  # missions without the section
+    section = "navigation_errors: {position_m: [1, 8, 2], boresight_deg: 0.1, inertia_ratios: [0.1, 0.2], clock_s: 0.5}"
+    sigmas = load(tmp_path, f"{TEXT}\n{section}\n").navigation_errors.sigmas
+    assert sigmas.position_m.tolist() == [1, 8, 2]
+    assert sigmas.boresight_rad.tolist() == pytest.approx([0.1 * math.pi / 180] * 3)
+    assert sigmas.inertia_ratios.tolist() == [0.1, 0.2] and sigmas.clock_s.tolist() == [0.5]
+
+
+def test_the_orbit_s_axes_are_those_of_its_states():
+    utc_ns = 1_784_631_150_000_000_000
+    rate_rad_s, axes = orbit_axes(tuple(TREE["orbit"]["target_tle"]), utc_ns)
+    assert 2 * math.pi / rate_rad_s == pytest.approx(
+        86_400 / 15.19, rel=1e-3
+    )  # revolutions a day in the elements
+    state = propagate(tuple(TREE["orbit"]["target_tle"]), utc_ns)
+    along = state.velocity_m_s / np.linalg.norm(state.velocity_m_s)
+    np.testing.assert_allclose(
+        axes @ state.position_m / np.linalg.norm(state.position_m), [1, 0, 0], atol=7e-3
+    )
+    np.testing.assert_allclose(axes @ along, [0, 1, 0], atol=7e-3)  # 0.4 degrees of precession
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
 
 
 @pytest.mark.parametrize("text", ["", "- a list", "orbit: [", "\x00", "orbit: 3"])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from flightsw.icd.frame import encode_frame
+from flightsw.icd.pose_sections import NavigationErrorsSection
 from ground.session import MissingFrames, SessionCorrupt, SessionError, open_session
 from ground.session_writer import SessionWriter
 
@@ -45,6 +46,54 @@ def test_a_session_gives_back_what_was_written(session, small_mission, make_fram
         assert (record.bracket, record.bracket_index) == (frame.bracket_id, frame.bracket_index)
         assert record.saturated == frame.saturated_count
         assert record.file == f"frames/{record.id:06d}.png"
+
+
+def test_a_session_keeps_what_flight_says_of_its_poses(tmp_path, small_mission, make_frame):
+    mission = dataclasses.replace(
+        small_mission,
+        pose=dataclasses.replace(small_mission.pose, correlation_time_s=30.0),
+        navigation_errors=NavigationErrorsSection(position_m=(1.0, 8.0, 1.0), boresight_deg=0.1),
+    )
+    writer = SessionWriter(tmp_path / "session", mission)
+    stated = dataclasses.replace(
+        make_frame(0).pose, attitude="rate_only", quat_inertial_to_body=[0, 0.6, 0, 0.8]
+    )
+    for frame in (dataclasses.replace(make_frame(0), pose=stated), make_frame(1)):
+        writer.add(frame, encode_frame(frame))
+    writer.save({}, 0)
+    SessionWriter(tmp_path / "session", mission)  # one that continues forgets nothing
+    session = open_session(tmp_path / "session")
+    navigation = session.navigation
+    assert (navigation.attitude, navigation.correlation_time_s) == ("rate_only", 30.0)
+    assert navigation.epoch_utc_ns == mission.orbit.start_utc_ns
+    assert navigation.mean_motion_rad_s == pytest.approx(2 * np.pi * 15.19 / 86_400, rel=1e-3)
+    np.testing.assert_array_equal(navigation.sigmas.vector(), mission.navigation_errors.sigmas.vector())
+    np.testing.assert_array_equal(session.frames[0].quat_inertial_to_body, [0, 0.6, 0, 0.8])
+    assert session.frames[1].quat_inertial_to_body is None
+
+
+def test_a_session_from_before_navigation_was_kept_opens_as_one_of_known_attitude(session):
+    header = json.loads((session / "session.json").read_text())
+    del header["navigation"]
+    (session / "session.json").write_text(json.dumps(header))
+    navigation = open_session(session).navigation
+    assert navigation.attitude == "known" and not navigation.sigmas.vector().any()
+
+
+@pytest.mark.parametrize(
+    ("section", "problem"),
+    [
+        ({"attitude": "guessed"}, "session.navigation.attitude: expected one of known, rate_only, unknown"),
+        ({"sigmas": {"clock_s": [-1.0]}}, "sigmas must not be negative"),
+        ({"sigmas": {"position_m": [1.0]}}, "expected 3 finite numbers"),
+        ({"quat_inertial_to_rtn": [1.0, 1.0, 0.0, 0.0]}, "expected a unit quaternion"),
+    ],
+)
+def test_a_wrong_section_of_navigation_is_named(session, section, problem):
+    header = json.loads((session / "session.json").read_text())
+    (session / "session.json").write_text(json.dumps(header | {"navigation": section}))
+    with pytest.raises(SessionCorrupt, match=problem):
+        open_session(session)
 
 
 def test_colour_frames_keep_their_channels(tmp_path, small_mission, make_frame):

@@ -68,7 +68,7 @@ def test_a_packet_of_another_version_or_number_is_none_of_ours_for_others_too(re
 
 
 def test_the_frame_header_is_that_of_the_container():
-    letters = "".join("x" if name == "spare" else code for name, code, *_ in FRAME_HEADER)
+    letters = "".join(code for _, code, *_ in FRAME_HEADER)
     assert struct.calcsize(f">{letters}") == HEADER.size
     unrolled = "".join(
         letter * int(count or 1) for count, letter in re.findall(r"(\d*)([a-zA-Z])", HEADER.format)

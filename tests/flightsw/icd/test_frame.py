@@ -4,6 +4,7 @@ import dataclasses
 import struct
 import zlib
 
+import imagecodecs
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -19,6 +20,7 @@ from flightsw.icd.frame import (
     decode_frame,
     encode_frame,
     encode_thumbnail,
+    header_of,
     read_header,
 )
 
@@ -31,7 +33,7 @@ def assert_equal(a: Frame, b: Frame) -> None:
         if field.name not in ("pose", "dn"):
             assert getattr(a, field.name) == getattr(b, field.name), field.name
     for field in dataclasses.fields(PoseTag):
-        np.testing.assert_array_equal(getattr(a.pose, field.name), getattr(b.pose, field.name))
+        assert np.array_equal(getattr(a.pose, field.name), getattr(b.pose, field.name)), field.name
     np.testing.assert_array_equal(a.dn, b.dn)
 
 
@@ -47,15 +49,19 @@ def sealed(body: bytes) -> bytes:
     position=st.tuples(finite, finite, finite),
     shape=st.tuples(st.integers(1, 20), st.integers(1, 20)),
     channels=st.sampled_from([1, 3]),
+    attitude=st.sampled_from(["known", "rate_only", "unknown"]),
+    correlation_s=st.floats(0, 1e6),
     seed=st.integers(0, 99),
 )
-def test_decode_of_encode_is_the_frame(frame_id, mid_ns, exposure_s, position, shape, channels, seed):
+def test_decode_of_encode_is_the_frame(
+    frame_id, mid_ns, exposure_s, position, shape, channels, attitude, correlation_s, seed
+):
     rng = np.random.default_rng(seed)
     quat, root = rng.normal(size=4), rng.normal(size=(6, 6))
-    covariance = root + root.T
-    pose = PoseTag(
-        quat / np.linalg.norm(quat), np.array(position), covariance, np.array([0.0, 0, 1]), True, False
-    )
+    quat /= np.linalg.norm(quat)
+    assumed = {"known": None, "rate_only": quat, "unknown": np.array([1.0, 0, 0, 0])}[attitude]
+    light = (np.array([0.0, 0, 1]), True, False, "navigation")
+    pose = PoseTag(quat, np.array(position), root + root.T, *light, attitude, assumed, correlation_s)
     dn = rng.integers(0, 65536, shape if channels == 1 else (*shape, 3), dtype=np.uint16)
     frame = Frame(frame_id, seed, 1, 3, exposure_s, mid_ns, pose, dn, 16, 64.0, 5)
     assert_equal(decode_frame(encode_frame(frame)), frame)
@@ -129,6 +135,37 @@ def test_a_codestream_without_its_end_is_refused_before_it_is_decoded(make_frame
     body[-1] ^= 1  # charls would search for the end for seconds
     with pytest.raises(PacketError, match="codestream does not end"):
         decode_frame(sealed(bytes(body)))
+
+
+def version_1(frame: Frame) -> bytes:
+    """Return a container as version 1 of the interface document lays it out."""
+    pose = frame.pose
+    stream = bytes(imagecodecs.jpegls_encode(frame.dn))
+    numbers = (*pose.quat_body_to_camera, *pose.position_body_m, *pose.sun_dir_body)
+    triangle = [pose.covariance[row, column] for row in range(6) for column in range(row + 1)]
+    body = struct.pack(">4sHHIIBBH", b"OBGF", 1, 310, frame.frame_id, frame.bracket_id, 0, 3, 2)
+    body += struct.pack(">dqHH", frame.exposure_time_s, frame.mid_exposure_utc_ns, *frame.dn.shape)
+    body += struct.pack(">BBBBBxfI", 1, 12, 1, 0, 1, frame.black_dn, frame.saturated_count)
+    body += struct.pack(">10d21d", *numbers, *triangle)
+    body += struct.pack(">II", len(stream), zlib.crc32(frame.dn.astype(">u2").tobytes()))
+    assert len(body) == 310
+    return sealed(body + stream)
+
+
+def test_a_container_of_version_1_is_still_read(make_frame):
+    frame = make_frame(6)  # its tag does not state an attitude, like those of version 1
+    container = version_1(frame)
+    assert_equal(decode_frame(container), frame)
+    header = header_of(container)
+    assert (len(header), len(header_of(encode_frame(frame)))) == (310, HEADER.size)
+    values, newest = read_header(header), read_header(header_of(encode_frame(frame)))
+    assert values == newest and values["attitude"] == "known"
+
+
+def test_a_tag_of_unknown_attitude_is_in_inertial_axes(make_frame):
+    for assumed in (None, [0.0, 1, 0, 0]):
+        with pytest.raises(ValueError, match="must be the identity"):
+            dataclasses.replace(make_frame(1).pose, attitude="unknown", quat_inertial_to_body=assumed)
 
 
 def test_a_quaternion_too_long_to_measure_is_refused(make_frame):
@@ -211,7 +248,7 @@ def test_a_damaged_header_is_read_or_refused_never_a_crash(make_frame, data):
     try:
         assert set(read_header(bytes(header))) >= {"frame_id", "position_body_m"}
     except PacketError:
-        assert bit < 64 or bit // 8 in (20, 21, 44, 46, 47) or bit // 8 >= 54
+        assert bit < 64 or bit // 8 in (20, 21, 44, 45, 46, 47) or bit // 8 >= 54
 
 
 @pytest.mark.parametrize(("size_px", "channels"), [(200, 1), (331, 3)])

@@ -1,5 +1,6 @@
 """The byte tables of the interface document, read and held against the code."""
 
+import dataclasses
 import re
 import struct
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 import flightsw.icd
 from flightsw.icd import packet
 from flightsw.icd.auth import SECURITY_HEADER, TAG_BYTES, Key, seal
-from flightsw.icd.frame import CODEC_JPEG_LS, CRC, HEADER, SOURCES, encode_frame
+from flightsw.icd.frame import ATTITUDES, CODEC_JPEG_LS, CRC, HEADER, SOURCES, encode_frame
 from flightsw.icd.packet import PacketHeader
 
 README = (Path(flightsw.icd.__path__[0]) / "README.md").read_text()
@@ -25,11 +26,12 @@ def table(first_column: str) -> list[list[str]]:
 
 def test_frame_table_is_what_encode_frame_writes(make_frame):
     frame = make_frame(7)
-    container = encode_frame(frame)
-    pose = frame.pose
+    stated = {"attitude": "rate_only", "quat_inertial_to_body": [0, 0.6, 0, 0.8], "correlation_time_s": 12.5}
+    pose = dataclasses.replace(frame.pose, **stated)
+    container = encode_frame(dataclasses.replace(frame, pose=pose))
     expected = {
         "magic": b"OBGF",
-        "version": 1,
+        "version": 2,
         "header_bytes": HEADER.size,
         "frame_id": frame.frame_id,
         "bracket_id": frame.bracket_id,
@@ -45,12 +47,15 @@ def test_frame_table_is_what_encode_frame_writes(make_frame):
         "codec": CODEC_JPEG_LS,
         "near": 0,
         "pose_source": SOURCES.index("sgp4"),
+        "attitude": ATTITUDES.index("rate_only"),
         "black_dn": 64.0,
         "saturated_count": frame.saturated_count,
         "quat_body_to_camera": tuple(pose.quat_body_to_camera),
         "position_body_m": tuple(pose.position_body_m),
         "sun_dir_body": tuple(pose.sun_dir_body),
         "covariance": tuple(pose.covariance[np.tril_indices(6)]),
+        "quat_inertial_to_body": (0.0, 0.6, 0.0, 0.8),
+        "correlation_time_s": 12.5,
         "codestream_bytes": len(container) - HEADER.size - CRC.size,
         "pixel_crc": struct.unpack_from(">I", container, HEADER.size - 4)[0],
     }
@@ -58,8 +63,6 @@ def test_frame_table_is_what_encode_frame_writes(make_frame):
     for offset, kind, name, _ in table("offset"):
         assert int(offset) == position, name
         position += struct.calcsize(">" + kind)
-        if kind == "x":
-            continue
         values = struct.unpack_from(">" + kind, container, int(offset))
         value = values[0] if len(values) == 1 else values
         assert value == expected.pop(name), name
@@ -71,6 +74,7 @@ def test_flags_and_pose_sources_are_those_of_the_code():
     text = {name: value for _, _, name, value in table("offset")}
     assert text["flags"].startswith("1 in eclipse, 2 pose valid, 4 pixels outside")
     assert text["pose_source"] == ", ".join(f"{number} {name}" for number, name in enumerate(SOURCES))
+    assert text["attitude"] == ", ".join(f"{number} {name}" for number, name in enumerate(ATTITUDES))
 
 
 @pytest.mark.parametrize("field", ["packet_type", "apid", "seq_flags", "seq_count", "data_length"])

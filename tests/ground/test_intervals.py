@@ -1,0 +1,81 @@
+"""How often stated intervals hold in views that a model never saw, and the sector that a comparison holds out."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from ground.compare.case import load_case
+from ground.compare.errors import CompareError
+from ground.intervals import interval_scores
+from obbgs_core.frames import cameras_of
+from obbgs_core.render import render
+from obbgs_core.score.uncertainty import parameter_deviations
+from tests import scenes
+from tests.small_sessions import small_session
+
+
+def test_intervals_hold_as_often_as_they_say_where_the_posterior_has_the_right_form():
+    """The model is off by a draw of its posterior, three times as far: the calibration has to find the factor."""
+    truth = scenes.target()
+    training, scored = scenes.photographed(truth, 12), scenes.photographed(truth, 8, seed=1)
+    draws = torch.Generator().manual_seed(0)
+    deviations = parameter_deviations(truth, training, scenes.SENSOR)
+    off = dataclasses.replace(
+        truth,
+        **{
+            name: value + 3 * deviations[name] * torch.randn(value.shape, generator=draws)
+            for name, value in truth.tensors().items()
+        },
+    )
+    radiance = [render(truth, cameras_of([frame])).radiance[0] for frame in scored]
+    found = interval_scores(off, training, scenes.SENSOR, scored, radiance)
+    assert 0.85 < found["interval_90_noisy"] < 0.95
+    assert 0.80 < found["interval_90_clean"] < 0.99
+    assert 0 < found["interval_90_half_width"] < 0.2
+    without_truth = interval_scores(off, training, scenes.SENSOR, scored, [])
+    assert without_truth == {"interval_90_noisy": found["interval_90_noisy"]}
+
+
+def test_nothing_is_stated_where_no_reading_can_calibrate():
+    truth = scenes.target()
+    frames = scenes.photographed(truth, 4)
+    dark = [dataclasses.replace(frame, exposure_time_s=1e-12) for frame in frames]
+    assert interval_scores(truth, frames, scenes.SENSOR, dark, []) == {}
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    return small_session(tmp_path_factory.mktemp("sessions") / "target")
+
+
+def test_a_sector_is_held_out_as_a_whole_and_alone_is_scored(session):
+    whole, without = load_case(session), load_case(session, 90.0)
+    ids = [{f.id for f in frames} for frames in (without.training, without.held_out, without.calibration)]
+    assert set.union(*ids) == {f.id for f in whole.training + whole.held_out}
+    assert sum(map(len, ids)) == len(set.union(*ids)) and all(ids)
+    assert ids[2] < {f.id for f in whole.held_out}
+    assert len(without.radiance) == len(without.coverage) == len(without.held_out)
+
+    def directions(frames) -> np.ndarray:
+        poses = torch.stack([f.world_to_camera for f in frames]).double().numpy()
+        centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+        return centres / np.linalg.norm(centres, axis=1, keepdims=True)
+
+    # seen along the axis of least variation, the sector is an interval of azimuth that no training frame enters
+    every = directions(whole.training)
+    _, axes = np.linalg.eigh(every.T @ every)
+    azimuths = [
+        np.degrees(np.arctan2(*(directions(frames) @ axes[:, 1:]).T))
+        for frames in (without.held_out, without.training)
+    ]
+    middle = np.degrees(np.angle(np.exp(1j * np.radians(azimuths[0])).mean()))
+    inside, outside = (np.abs((azimuth - middle + 180) % 360 - 180) for azimuth in azimuths)
+    assert inside.max() - inside.min() <= 90 and np.ptp((azimuths[0] - middle + 180) % 360 - 180) <= 90.001
+    assert outside.min() > inside.min()
+
+
+def test_a_sector_that_holds_everything_out_is_refused(session):
+    with pytest.raises(CompareError, match="leaves no frame"):
+        load_case(session, 359.9999)
