@@ -61,6 +61,15 @@ class PoseCorrections:
         self.gathered = 0  # pictures since the last step
         self._clear()
 
+    def extended(self, frames: list[TrainingFrame]) -> "PoseCorrections":
+        """Return the corrections of more frames, which begin with those of this one; new brackets have no own yet."""
+        more, known = PoseCorrections(frames), len(self.of_frame)
+        if more.sigmas.any():
+            more._move_shared(frames, self.shared)
+        more.value[: len(self.value)] = self.value
+        more.gradient[:known], more.curvature[:known] = self.gradient, self.curvature
+        return more
+
     @property
     def rank(self) -> Tensor:
         """The number of directions [P] in which each bracket may be corrected by itself."""

@@ -7,6 +7,7 @@ import logging
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import (
@@ -21,7 +22,7 @@ from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import flat
 from obbgs_core.start.alignment import settled
-from obbgs_core.start.hull import light, shows_light
+from obbgs_core.start.hull import Silhouette, light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.batches import Batches, FrameOrder
@@ -33,6 +34,9 @@ from obbgs_core.train.state import Identity, TrainingState
 from obbgs_core.train.validation import validation_brackets
 
 log = logging.getLogger(__name__)
+EXACT_TAGS = "as tagged (the tags are exact)"
+TOO_FEW_BRACKETS = "as tagged (too few brackets for validation)"
+UNTESTED = ("", EXACT_TAGS, TOO_FEW_BRACKETS)  # of poses whose refinement no validation brackets have decided
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,8 @@ class TrainingSetup:
     reference_exposure_s: float | None  # what every exposure was taken for when exposure is ignored
     dark_frames: int  # left out: nothing in them rises above the noise
     tagged_exposures_s: list[float]  # of the frames, also where the method ignores them
+    outlines: dict[int, Silhouette]  # of the long exposures, by the frame's index
+    start_means: Tensor  # [N, 3] m, of the first Gaussians
 
     @property
     def sun_moves(self) -> bool:
@@ -121,6 +127,8 @@ def prepare(
         reference_exposure_s=reference_exposure_s,
         dark_frames=dark,
         tagged_exposures_s=[f.exposure_time_s for f, shows in zip(frames, shown, strict=True) if shows],
+        outlines=outlines,
+        start_means=gaussians.means.detach(),
     )
     brackets = validation_brackets(lit)
     poses_decided = _decided_at_once(config, lit, brackets) if poses is None else f"refined ({why})"
@@ -164,5 +172,5 @@ def _decided_at_once(config: MethodConfig, frames: list[TrainingFrame], brackets
     if config.poses.refine != "auto":
         return {"never": "as tagged", "always": "refined"}[config.poses.refine]
     if not PoseCorrections(frames).covariances.any():
-        return "as tagged (the tags are exact)"
-    return "" if brackets else "as tagged (too few brackets for validation)"
+        return EXACT_TAGS
+    return "" if brackets else TOO_FEW_BRACKETS
