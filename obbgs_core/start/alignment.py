@@ -15,10 +15,11 @@ from obbgs_core.start import hull
 log = logging.getLogger(__name__)
 MOST_DILATION_PX = 8  # of a silhouette, for pose errors
 CENTRE_SIGMA = 0.1  # of a silhouette's centre about the projection of one point of the body, over its radius
-ROUNDS = 10  # of aligning the silhouettes' centres; the problem is nearly linear
+ROUNDS = 12  # of aligning the silhouettes' centres; the problem is nearly linear
 # the aligned poses are taken if they leave at most this share of the light that is not covered as tagged
 BETTER = 0.7
 OFFSET = 0.3  # of the silhouettes' radius: deviation of their common point from the body's origin
+HOLD = 0.3  # of the median distance of the centres from the point, which is added to their deviation
 FAR = 3.0  # times the median distance of the centres from the point, beyond which they count less
 
 
@@ -105,7 +106,9 @@ def _aligned(
         flow = point_flow(at, K)  # [L, 2, 6]
         # a centre far off counts less, as one of a picture that shows something else
         distance = away_px.norm(dim=1)
-        weight = 1 / (sigma_px**2 * (distance / (FAR * distance.median()).clamp(min=1e-9)).clamp(min=1))
+        far = (distance / (FAR * distance.median()).clamp(min=1e-9)).clamp(min=1)
+        # far from the solution the priors hold the step, so that it is not taken beyond where flow is linear
+        weight = 1 / (far * (sigma_px**2 + (HOLD * distance.median()) ** 2))
         gradient = -(flow.mT @ (weight[:, None] * away_px)[..., None])[..., 0]
         poses.gather(lit, PoseInformation(gradient, weight[:, None, None] * (flow.mT @ flow)))
         by_offset[lit, 3:] = offset_m * turn

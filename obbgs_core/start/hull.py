@@ -185,9 +185,8 @@ def coherence(silhouettes: list[Silhouette], points: Tensor, voxel_m: float) -> 
         inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
         image = torch.zeros(height, width, dtype=torch.bool)
         image[v[inside].long(), u[inside].long()] = True
-        reach_px = max(
-            1, math.ceil(float(s.K[0, 0]) * voxel_m / 2 / max(float(s.world_to_camera[2, 3]), 1e-6))
-        )
+        voxel_px = float(s.K[0, 0]) * voxel_m / max(float(s.world_to_camera[2, 3]), 1e-6)
+        reach_px = math.ceil(min(max(voxel_px / 2, 1.0), min(height, width) / 4))  # as in `agreement`
         image = _dilated(image[None, None], reach_px)[0, 0]
         covered += int((s.certain & image).sum())
         total += int(s.certain.sum())

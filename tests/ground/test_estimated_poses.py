@@ -1,0 +1,70 @@
+"""The estimated poses of a run: written and read, and the model's place in the true body frame."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ground.estimated_poses import FILE, Alignment, read_estimate, write_estimate
+from ground.session import SessionError, open_session
+from ground.truth import Truth
+from obbgs_base.navigation_errors import SharedParameters
+from obbgs_core.model.motions import rigid_motions
+from obbgs_core.pose_estimate import PoseEstimate
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "session"
+MOTION = rigid_motions(torch.tensor([[0.02, -0.03, 0.01, 0.2, -0.1, 0.3]]).double())[0]
+
+
+@pytest.fixture(scope="module")
+def estimate() -> PoseEstimate:
+    """An estimate whose poses are the true ones, seen from a body frame that is moved; the tags are turned by 0.1."""
+    session = open_session(GOLDEN)
+    truth, records = Truth(session), session.frames
+    true = torch.from_numpy(np.stack([truth.posed(r).world_to_camera for r in records]))
+    turns = torch.zeros(len(records), 6).double()
+    turns[::2, 2] = 0.1
+    rng = np.random.default_rng(0)
+    sigmas = SharedParameters(boresight_rad=np.full(3, 0.01), clock_s=np.full(1, 0.1))
+    return PoseEstimate(
+        frame_ids=[r.id for r in records],
+        brackets=[r.bracket for r in records],
+        tagged=(rigid_motions(turns) @ true).numpy(),
+        estimated=(true @ MOTION).numpy(),
+        shared=SharedParameters(boresight_rad=rng.normal(size=3)),
+        shared_prior=sigmas,
+        shared_posterior=dataclasses.replace(sigmas, boresight_rad=np.array([1e-4, 1e-3, 9e-3])),
+        shared_covariance=rng.normal(size=(19, 19)),
+        own=rng.normal(size=(3, 6)),
+        own_prior=rng.random((3, 6)),
+        own_posterior=rng.random((3, 6)),
+    )
+
+
+def test_an_estimate_is_read_as_it_was_written(estimate, tmp_path):
+    write_estimate(tmp_path, None)
+    assert read_estimate(tmp_path) is None
+    write_estimate(tmp_path, estimate)
+    found = read_estimate(tmp_path)
+    assert found is not None and found.tree() == estimate.tree()
+    assert found.unobservable() == ["boresight_rad[2]", "clock_s"]
+
+
+@pytest.mark.parametrize("damage", ["{", "[]", json.dumps({"shared": {}})])
+def test_a_damaged_estimate_is_refused(tmp_path, damage):
+    (tmp_path / FILE).write_text(damage)
+    with pytest.raises(SessionError, match=r"poses_estimated.json cannot be read.*make the run again"):
+        read_estimate(tmp_path)
+
+
+def test_a_model_that_moved_with_its_poses_is_found_again(estimate):
+    session = open_session(GOLDEN)
+    found = Alignment.of(estimate, session, Truth(session))
+    torch.testing.assert_close(found.motion, MOTION, rtol=0, atol=1e-6)
+    figures = found.figures()
+    assert figures["pose_error_deg"] < 1e-4 and figures["pose_error_px"] < 1e-3
+    # half of the tags are turned by 0.1 rad about the line of sight, and no motion of the body undoes that
+    assert 1 < figures["pose_error_tagged_deg"] < np.degrees(0.1)
