@@ -28,6 +28,7 @@ from ground.cli_options import (
 )
 from ground.cli_runs import evaluate_command, reconstruct_command, report_command
 from ground.cli_systems import dictionary_command, yamcs_command
+from ground.cli_view import view_command
 from obbgs_base.command_line import new_app, run
 
 app = new_app("The ground station: frames in, a 3D model out.")
@@ -185,6 +186,7 @@ def uplink(
 app.command("reconstruct")(reconstruct_command)
 app.command("evaluate")(evaluate_command)
 app.command("report")(report_command)
+app.command("view")(view_command)
 app.command("compare")(compare_command)
 app.command("list")(list_command)
 app.command("compare-runs")(compare_runs_command)
