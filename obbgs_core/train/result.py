@@ -61,6 +61,7 @@ class TrainResult:
     growth: str  # the step until which Gaussians were added
     poses: str  # whether the poses were refined, and why
     exposing: Exposing  # what its pictures are made with
+    misfit: float | None  # the model's own error as a share of the light; None: it was not learnt
     sun_span_deg: float  # largest angle between two frames' Suns, body frame
     dark_frames: int  # left out: nothing in them rises above the noise
     removed_outliers: int

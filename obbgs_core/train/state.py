@@ -28,7 +28,7 @@ from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 2  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 3  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,7 @@ class TrainingState:
     boxes: list[Obb] = field(default_factory=list)  # behind the worst tiles since the last growth inside them
     shadows: Shadows = field(default_factory=Shadows)
     chi2: float = math.nan  # running mean
+    misfit: float | None = None  # running mean of the model's own error; None: not learnt, or not yet
     psnr_db: float = math.nan  # of the last step's frames
     steps_done: int = 0
     seconds: float = 0.0

@@ -12,7 +12,7 @@ import torch
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.losses import fit_figures
+from obbgs_core.losses import fit_figures, relative_misfit
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
@@ -119,7 +119,7 @@ class Trainer:
         cameras = batch.cameras if state.poses is None else state.poses.cameras(batch)
         sunlit = state.shadows.sunlit(state.gaussians, cameras, state.steps_done)
         rendered = self._compensated(render(state.model, cameras, sunlit=sunlit), batch)
-        loss, residual = image_loss(rendered, batch, setup.sensor, config.loss)
+        loss, residual = image_loss(rendered, batch, setup.sensor, config.loss, state.misfit)
         if not torch.isfinite(loss):
             raise Diverged(state.steps_done, loss.item())
         prior = priors(state.gaussians, rendered, batch, setup.radius_m, config.loss)
@@ -161,13 +161,18 @@ class Trainer:
             state.compensation.step(share)
 
     def _measure(self, rendered: Rendered, batch: Batch) -> None:
-        """Keep the running chi² on the target, and the PSNR of this step's frames."""
+        """Keep the running chi² on the target, the model's own error, and the PSNR of this step's frames."""
         state = self.state
         images = (rendered.radiance, rendered.alpha, batch.exposure_time_s, batch.dn)
         chi2, state.psnr_db = fit_figures(*images, self.setup.sensor, batch.averaged_pixels)
         if not math.isnan(chi2):
             known = not math.isnan(state.chi2)
             state.chi2 = CHI2_MEMORY * state.chi2 + (1 - CHI2_MEMORY) * chi2 if known else chi2
+        if self.setup.config.loss.misfit:
+            misfit = relative_misfit(images[0], *images[2:], self.setup.sensor, batch.averaged_pixels)
+            if not math.isnan(misfit):
+                last = misfit if state.misfit is None else state.misfit
+                state.misfit = CHI2_MEMORY * last + (1 - CHI2_MEMORY) * misfit
 
     def _recorded(self, loss: float) -> StepInfo:
         """Return how the training stands, and keep it in the history."""
@@ -243,6 +248,7 @@ class Trainer:
             growth=f"until step {min(state.steps_done, round(setup.config.steps_until(setup.config.growth.end)))}",
             poses=state.poses_decided or "as tagged (training ended before this was decided)",
             exposing=self.exposing,
+            misfit=state.misfit,
             sun_span_deg=setup.sun_span_deg,
             dark_frames=setup.dark_frames,
             removed_outliers=removed,
