@@ -17,7 +17,7 @@ from obbgs_core.sensor import Sensor
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Wang et al. 2004
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
-MISFIT_ROWS = 100  # of an image that the model's own error is measured on, about
+MISFIT_ROWS = 50  # of an image that the model's own error is measured on, about
 ON_TARGET_ALPHA = 0.05  # pixels with more alpha than this count as target in the figures of a fit
 
 
