@@ -18,13 +18,13 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
 
     Where the frames state their splits, those of `test` are held out, or those of `val` where there is no test frame;
     otherwise the frames of `val` are in neither list. Where nothing but `train` is stated, and where no split is, every
-    eighth bracket is held out as a whole; of 2 to 7 brackets the last one; a single bracket is all for training. Frames
-    in eclipse and frames whose pose is not valid are in neither list.
+    eighth bracket is held out as a whole (`is_held_out`); where that is none, the last one; a single bracket is all for
+    training. Frames in eclipse and frames whose pose is not valid are in neither list.
 
     Raises:
         SessionError: no frame is left, or none that is for training.
     """
-    usable = [r for r in session.frames if r.pose_valid and not r.in_eclipse]
+    usable = [r for r in session.frames if is_usable(r)]
     if not usable:
         eclipsed = sum(r.in_eclipse for r in session.frames)
         raise SessionError(
@@ -43,10 +43,20 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
     if held_out := stated["test"] or stated["val"]:
         return stated["train"], held_out
     brackets = sorted({r.bracket for r in usable})
-    chosen = set(brackets[TEST_INTERVAL - 1 :: TEST_INTERVAL])
+    chosen = {r.bracket for r in usable if is_held_out(r)}
     if not chosen and len(brackets) > 1:
         chosen = {brackets[-1]}
     return [r for r in usable if r.bracket not in chosen], [r for r in usable if r.bracket in chosen]
+
+
+def is_usable(record: FrameRecord) -> bool:
+    """Return whether a frame's pose is valid and it was not taken in eclipse."""
+    return record.pose_valid and not record.in_eclipse
+
+
+def is_held_out(record: FrameRecord) -> bool:
+    """Return whether a frame is of every eighth bracket, by the bracket's number: it does not matter what else came."""
+    return record.bracket % TEST_INTERVAL == TEST_INTERVAL - 1
 
 
 def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:

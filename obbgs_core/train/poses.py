@@ -63,6 +63,14 @@ class PoseCorrections:
                 covariances[i] = frame.pose_covariance
         self.whitening = whitening(self._bracket_means(covariances))
 
+    @torch.no_grad()
+    def extended(self, frames: list[TrainingFrame]) -> "PoseCorrections":
+        """Return the corrections of more frames, which begin with those of this one; new brackets have none yet."""
+        more, known = PoseCorrections(frames), len(self.value)
+        for name in ("value", "second", "visits"):
+            getattr(more, name)[:known] = getattr(self, name)
+        return more
+
     @property
     def rank(self) -> Tensor:
         """The number of directions [P] in which each bracket may be corrected."""

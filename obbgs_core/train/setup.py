@@ -7,6 +7,7 @@ import logging
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import (
@@ -19,7 +20,7 @@ from obbgs_core.frames import (
 )
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import flat
-from obbgs_core.start.hull import light, shows_light
+from obbgs_core.start.hull import Silhouette, light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.batches import Batches, FrameOrder
@@ -32,6 +33,9 @@ from obbgs_core.train.state import Identity, TrainingState
 from obbgs_core.train.validation import validation_brackets
 
 log = logging.getLogger(__name__)
+EXACT_TAGS = "as tagged (the tags are exact)"
+TOO_FEW_BRACKETS = "as tagged (too few brackets for validation)"
+UNTESTED = ("", EXACT_TAGS, TOO_FEW_BRACKETS)  # of poses whose refinement no validation brackets have decided
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,8 @@ class TrainingSetup:
     reference_exposure_s: float | None  # what every exposure was taken for when exposure is ignored
     dark_frames: int  # left out: nothing in them rises above the noise
     tagged_exposures_s: list[float]  # of the frames, also where the method ignores them
+    outlines: dict[int, Silhouette]  # of the long exposures, by the frame's index
+    start_means: Tensor  # [N, 3] m, of the first Gaussians
 
     @property
     def sun_moves(self) -> bool:
@@ -116,6 +122,8 @@ def prepare(
         reference_exposure_s=reference_exposure_s,
         dark_frames=dark,
         tagged_exposures_s=[f.exposure_time_s for f, shows in zip(frames, shown, strict=True) if shows],
+        outlines=outlines,
+        start_means=gaussians.means.detach(),
     )
     brackets = validation_brackets(lit)
     poses_decided = _decided_at_once(config, lit, brackets)
@@ -156,5 +164,5 @@ def _decided_at_once(config: MethodConfig, frames: list[TrainingFrame], brackets
     if config.poses.refine != "auto":
         return {"never": "as tagged", "always": "refined"}[config.poses.refine]
     if not any(f.pose_covariance is not None and f.pose_covariance.any() for f in frames):
-        return "as tagged (the tags are exact)"
-    return "" if brackets else "as tagged (too few brackets for validation)"
+        return EXACT_TAGS
+    return "" if brackets else TOO_FEW_BRACKETS

@@ -22,6 +22,7 @@ from obbgs_core.train.appearance import described, freeze_later_degrees
 from obbgs_core.train.batches import Batch
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import outliers
+from obbgs_core.train.joining import check_joinable, join, release, withhold
 from obbgs_core.train.objective import image_loss, priors
 from obbgs_core.train.poses import pose_rate
 from obbgs_core.train.result import Exposing, StepInfo, TrainResult
@@ -33,6 +34,7 @@ CHI2_MEMORY = 0.98  # share of the running chi² that a step keeps; the rest is 
 CHECKPOINT_EVERY_S = 20.0
 LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
 FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
+HOLD = 0.4  # share of the steps that the schedule is set back to when frames join: from there pictures have full size
 PACE_STEPS = 50  # the time left is estimated from the pace of so many steps
 
 
@@ -101,6 +103,7 @@ class Trainer:
 
     def __init__(self, frames: list[TrainingFrame], sensor: Sensor, config: MethodConfig, seed: int = 0):
         began = time.monotonic()
+        self._given, self._asked = frames, config
         self.setup, self.state = prepare(frames, sensor, config, seed)
         self.state.seconds = time.monotonic() - began
 
@@ -202,6 +205,35 @@ class Trainer:
         if state.steps_done >= config.steps:
             return f"all {config.steps} steps done (residual chi² {state.chi2:.2f})"
         return ""
+
+    def join(self, frames: list[TrainingFrame], hold: float = HOLD) -> None:
+        """Go on with more frames: the model is kept, and the start is carved again of all frames.
+
+        The schedule is set back to the share `hold` of the steps, so that it ends only when no frames come any more.
+
+        Raises:
+            ValueError: the method's training cannot take in frames, see `check_joinable`.
+            ReconstructionError: as in `train`.
+        """
+        check_joinable(self.setup.config)
+        began = time.monotonic()
+        joined, fresh = prepare(self._given + frames, self.setup.sensor, self._asked, self.setup.seed)
+        join(self.setup, self.state, joined, fresh, hold)
+        self.setup, self._given = joined, self._given + frames
+        self.state.seconds += time.monotonic() - began
+
+    def withhold(self) -> None:
+        """Keep back the brackets that will decide on the poses, however few there are yet, because frames will join."""
+        withhold(self.setup, self.state)
+
+    def release(self, hold: float = HOLD) -> None:
+        """Train on the brackets that were kept back too if they are too few to decide, because no more frames join."""
+        release(self.setup, self.state, hold)
+
+    @property
+    def share(self) -> float:
+        """The share of the schedule that is done; it falls where frames join."""
+        return self.setup.config.moment(self.state.steps_done).share
 
     @property
     def is_past_growth(self) -> bool:

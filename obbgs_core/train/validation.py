@@ -20,10 +20,14 @@ FIT_STEPS = 20  # of a validation bracket's correction
 
 def validation_brackets(frames: list[TrainingFrame]) -> list[list[int]]:
     """Return the frames, by index, of every seventh bracket; none where frames or brackets are few."""
+    chosen = every_seventh_bracket(frames)
+    return [] if len(frames) < FEWEST_FRAMES_IN_ALL or len(chosen) < FEWEST else chosen
+
+
+def every_seventh_bracket(frames: list[TrainingFrame]) -> list[list[int]]:
+    """Return the frames, by index, of every seventh bracket, the fourth first; further frames change no earlier one."""
     numbers = bracket_numbers(frames)
     chosen = range(INTERVAL // 2, max(numbers) + 1, INTERVAL)
-    if len(frames) < FEWEST_FRAMES_IN_ALL or len(chosen) < FEWEST:
-        return []
     return [[i for i, number in enumerate(numbers) if number == wanted] for wanted in chosen]
 
 
