@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ground.cameras import sensor_of
+from ground.estimated_poses import write_estimate
 from ground.model_files import Outputs, model_sizes, write_models
 from ground.run_record import training_metrics, write_config, write_history
 from ground.runs import check_replaceable, publish, run_folder, unfinished_run, written_to
@@ -129,6 +130,7 @@ def finish_run(
     with written_to(folder.parent):
         (part / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
         write_history(results, part / "metrics.jsonl")
+        write_estimate(part, result.pose_estimate)
         write_config(session, result.config, seed, part / "config.yaml")
         publish(part, folder)
 

@@ -63,6 +63,9 @@ def training_metrics(
         "session_created_utc": session.created_utc,
         "reference_exposure_s": result.reference_exposure_s,
     }
+    if result.pose_estimate is not None:
+        tree = result.pose_estimate.tree()
+        metrics["pose_estimate"] = {key: tree[key] for key in ("shared", "unobservable")}
     if blind is not None:
         metrics |= {
             "blind_gaussians": len(blind.gaussians),

@@ -17,13 +17,13 @@ from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.pose_covariance import Whitening
 from obbgs_core.obb import Obb
+from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.render.shadows import ShadowMap
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.appearance import Shadows
 from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.growth import Growth
-from obbgs_core.train.poses import PoseCorrections
 from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
@@ -75,6 +75,7 @@ class TrainingState:
     growth: Growth
     order: FrameOrder
     poses: PoseCorrections | None  # None: as tagged
+    poses_aligned: bool  # whether they were moved before the first step
     poses_decided: str  # whether the poses are refined, and why; empty: the validation brackets will decide
     appearance_reason: str  # why the radiance depends on what it does
     smoothing_m: Tensor | None = None  # [N] deviations of the 3D filter; None: the method has none
