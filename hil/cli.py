@@ -14,8 +14,9 @@ import typer
 from rich.console import Console
 from rich.progress import TaskID
 
+from flightsw.icd.frame import Attitude
 from flightsw.icd.mission import load_mission
-from hil.choices import CameraKind, FaultKind, LinkKind, SensorKind
+from hil.choices import NAVIGATION, CameraKind, FaultKind, LinkKind, NavigationKind, SensorKind
 from hil.sky import SHIPPED, SHIPPED_FOIL, Materials
 from obbgs_base.command_line import new_app, run
 
@@ -32,6 +33,21 @@ ScenarioName = Annotated[
     str,
     typer.Option(
         "--scenario", help="A ready-made scenario or a YAML file; default: the mission's own orbits."
+    ),
+]
+Navigation = Annotated[
+    NavigationKind,
+    typer.Option(
+        help="realistic: poses err by 0.1 degrees of boresight, 2 % of the range along the track, 0.2 % of the spin "
+        "rate, 20 ms and 0.02 degrees of noise, and the tags say so; perfect: tags are exact."
+    ),
+]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the navigation errors.")]
+KnownAttitude = Annotated[
+    Attitude | None,
+    typer.Option(
+        help="What flight knows of the target's attitude; default: what the mission says. With unknown, its tags are "
+        "in inertial axes."
     ),
 ]
 RealTime = Annotated[
@@ -65,10 +81,9 @@ def demo(
     ] = "none",
     scenario: ScenarioName = "",
     real_time: RealTime = 0.0,
-    navigation_noise: Annotated[
-        int | None,
-        typer.Option(help="Seed of random navigation errors with the mission's sigmas; default: no errors."),
-    ] = None,
+    navigation: Navigation = NAVIGATION,
+    seed: Seed = 1,
+    attitude: KnownAttitude = None,
     json_: AsJson = False,
 ) -> None:
     """Simulate a whole pass, from rendered frames over flight, link and ground to a model and its report.
@@ -80,7 +95,7 @@ def demo(
     from hil.simulated_pass import PassConfig
 
     unwind_on_sigterm()
-    config = PassConfig(camera, link, faults, scenario, navigation_noise, real_time)
+    config = PassConfig(camera, link, faults, scenario, navigation, real_time, seed, attitude)
     figures = run_demo(out, mission, mesh, config, Console(stderr=json_))
     if json_:
         print(json.dumps(figures))
@@ -101,9 +116,13 @@ def camera(
     inputs: Annotated[
         Path,
         typer.Option(
-            help="With --scenario: where the mission.yaml and navigation states for flight and ground are written."
+            help="With --scenario: where the mission.yaml and navigation states for flight and ground are written; the "
+            "three options below are of these."
         ),
     ] = Path("scenario"),
+    navigation: Navigation = NAVIGATION,
+    seed: Seed = 1,
+    attitude: KnownAttitude = None,
     real_time: RealTime = 0.0,
 ) -> None:
     """Serve the simulated camera until stopped; prints its URL. Frames are rendered when a client requests them.
@@ -116,11 +135,12 @@ def camera(
     from hil.cameras.virtual import CameraServer
     from hil.sky.render_farm import RenderFarm
     from hil.world.navigation import write_flight_inputs
-    from hil.world.world import load_world
+    from hil.world.world import load_world, told
 
-    world = load_world(load_mission(mission), scenario)
+    world = load_world(told(load_mission(mission), attitude), scenario)
     if scenario:
-        print(f"start flight with --mission {write_flight_inputs(world, inputs)}", file=sys.stderr)
+        written = write_flight_inputs(world, inputs, seed if navigation == "realistic" else None)
+        print(f"start flight with --mission {written.mission_path}", file=sys.stderr)
     stop = _stop_event()
     with RenderFarm(world.mission, mesh, cache, workers=1) as farm:
         more = {"pose_at": world.pose_at, "real_time": real_time}
