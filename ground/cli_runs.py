@@ -10,6 +10,8 @@ from rich.console import Console
 from flightsw.icd.mission import ReconstructSection, load_mission
 from ground.cli_options import (
     AsJson,
+    AttitudeChoice,
+    AttitudeGiven,
     BlindReference,
     Budget,
     MethodName,
@@ -25,7 +27,7 @@ from ground.cli_options import (
     Threads,
     TimeLimit,
 )
-from ground.progress import Stop, say, steps_shown
+from ground.progress import Stop, say, shares_shown, steps_shown
 from ground.summary import frames_row, model_rows, table
 from obbgs_base.errors import Interrupted
 
@@ -45,6 +47,7 @@ def reconstruct_command(
     time_limit: TimeLimit = math.inf,
     seed: Seed = None,
     blind_reference: BlindReference = False,
+    attitude: AttitudeGiven = AttitudeChoice.AUTO,
     overwrite: Overwrite = False,
     threads: Threads = None,
     json_: AsJson = False,
@@ -90,6 +93,8 @@ def reconstruct_command(
                 out,
                 overwrite,
                 lambda: stop.requested,
+                attitude.value,
+                shares_shown(stderr),
             )
             stop.raise_at_once()
             say(stderr, "scoring the model and writing its report")

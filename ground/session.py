@@ -141,6 +141,9 @@ class Session:
     background: float  # radiance of what is seen where the target is not
     encoding: str  # of the digital numbers: linear in light, or srgb (display values)
     navigation: Navigation
+    attitude_estimated: bool = (
+        False  # poses are in axes of the target that were found, not in those of the tags
+    )
 
     @property
     def frames_captured(self) -> int | None:
