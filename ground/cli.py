@@ -16,6 +16,7 @@ from flightsw.icd.mission import load_mission
 from ground.cli_compare import compare_command
 from ground.cli_formats import export_command, import_command
 from ground.cli_list import compare_runs_command, list_command
+from ground.cli_live import live_command
 from ground.cli_options import (
     AsJson,
     SessionDir,
@@ -23,6 +24,7 @@ from ground.cli_options import (
 )
 from ground.cli_runs import evaluate_command, reconstruct_command, report_command
 from ground.cli_systems import dictionary_command, yamcs_command
+from ground.cli_view import view_command
 from obbgs_base.command_line import new_app, run
 
 app = new_app("The ground station: frames in, a 3D model out.")
@@ -177,9 +179,11 @@ def uplink(
         raise typer.Exit(1)
 
 
+app.command("live")(live_command)
 app.command("reconstruct")(reconstruct_command)
 app.command("evaluate")(evaluate_command)
 app.command("report")(report_command)
+app.command("view")(view_command)
 app.command("compare")(compare_command)
 app.command("list")(list_command)
 app.command("compare-runs")(compare_runs_command)

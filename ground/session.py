@@ -153,6 +153,11 @@ class Session:
             return self.frames_imported
         return self.flight.captured(self.frames[-1].id)
 
+    @property
+    def nominal_exposures(self) -> bool:
+        """Whether the exposure times are made up: pictures were imported that state none."""
+        return self.frames_imported is not None and {r.exposure_time_s for r in self.frames} == {1.0}
+
     def K(self, record: FrameRecord) -> np.ndarray:
         """Return the pinhole matrix [3, 3] of a frame, float32, px."""
         return np.array(self.camera.K if record.K is None else record.K, dtype=np.float32)

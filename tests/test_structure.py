@@ -23,6 +23,7 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     },  # the flat modules: errors, sensor, losses, obb, frames, ...
     "obbgs_core.render": CORE,
     "obbgs_core.start": CORE,
+    "obbgs_core.attitude": CORE | {"obbgs_core.start"},
     "obbgs_core.train": CORE | {"obbgs_core.render", "obbgs_core.start"},
     "obbgs_core.io": CORE | {"obbgs_core.render"},
     "obbgs_core.score": CORE | {"obbgs_core.render"},
@@ -39,7 +40,12 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     "ground.baselines": CORE | {"obbgs_core.start", "obbgs_core.score"},
     "ground.compare": {"obbgs_base", "flightsw.icd", "ground", "ground.baselines", "ground.session"}
     | LIBRARY,
-    "ground": CONTRACT | {"flightsw.ports", "ground.formats", "ground.compare"} | SESSIONS | LIBRARY,
+    "ground.viewer": {"obbgs_base", "flightsw.icd", "ground", "ground.session"}
+    | LIBRARY - {"obbgs_core.train"},
+    "ground": CONTRACT
+    | {"flightsw.ports", "ground.formats", "ground.compare", "ground.viewer"}
+    | SESSIONS
+    | LIBRARY,
     "hil.watched": {"obbgs_base"},
     "hil.sky": {"obbgs_base", "flightsw.icd"},
     "hil.world": {"obbgs_base", "flightsw.icd", "flightsw", "flightsw.cameras"},
