@@ -40,8 +40,10 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     "ground.baselines": CORE | {"obbgs_core.start", "obbgs_core.score"},
     "ground.compare": {"obbgs_base", "flightsw.icd", "ground", "ground.baselines", "ground.session"}
     | LIBRARY,
+    "ground.viewer": {"obbgs_base", "flightsw.icd", "ground", "ground.session"}
+    | LIBRARY - {"obbgs_core.train"},
     "ground": CONTRACT
-    | {"flightsw.ports", "ground.formats", "ground.compare", "obbgs_core.attitude"}
+    | {"flightsw.ports", "ground.formats", "ground.compare", "ground.viewer", "obbgs_core.attitude"}
     | SESSIONS
     | LIBRARY,
     "hil.watched": {"obbgs_base"},
