@@ -26,7 +26,7 @@ from ground.cli_options import (
     UplinkCommand,
     ValuesGiven,
 )
-from ground.cli_runs import evaluate_command, reconstruct_command, report_command
+from ground.cli_runs import evaluate_command, mesh_command, reconstruct_command, report_command
 from ground.cli_systems import dictionary_command, yamcs_command
 from obbgs_base.command_line import new_app, run
 
@@ -185,6 +185,7 @@ def uplink(
 app.command("reconstruct")(reconstruct_command)
 app.command("evaluate")(evaluate_command)
 app.command("report")(report_command)
+app.command("mesh")(mesh_command)
 app.command("compare")(compare_command)
 app.command("list")(list_command)
 app.command("compare-runs")(compare_runs_command)

@@ -55,6 +55,15 @@ class ExportFormat(StrEnum):
     NERFSTUDIO = "nerfstudio"
 
 
+class MeshFormatName(StrEnum):
+    """Formats of meshes."""
+
+    GLB = "glb"
+    OBJ = "obj"
+    STL = "stl"
+    PLY = "ply"
+
+
 class UplinkCommand(StrEnum):
     """The commands that the spacecraft obeys."""
 

@@ -97,10 +97,10 @@ def reconstruct(
             except ReconstructionError as error:
                 outputs.miss("blind.ply", str(error))
         blind_gaussians = blind.gaussians if blind else None
-        parity_db = write_models(outputs, result.gaussians, blind_gaussians, session, training, held_out)
+        files = write_models(outputs, result.gaussians, blind_gaussians, session, training, held_out)
         outputs.require("model.ply")
         metrics = training_metrics(result, blind, session, training, held_out)
-        metrics |= {"onnx_parity_db": parity_db} | model_sizes(part) | {"missing_outputs": outputs.missing}
+        metrics |= files | model_sizes(part) | {"missing_outputs": outputs.missing}
         log.info("%d Gaussians in %.1f s: %s", len(result.gaussians), result.seconds, result.stop_reason)
         with written_to(folder.parent):
             (part / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
