@@ -116,6 +116,8 @@ def _quality(metrics: dict) -> list[str]:
     lines = []
     if isinstance(chi2 := metrics.get("chi2"), int | float) and math.isfinite(chi2):
         lines.append(f"- Residual chi² {chi2:.2f}: {chi2_explained(chi2)}")
+    if isinstance(misfit := metrics.get("misfit"), float):
+        lines.append(f"- The model's own error, beside the noise: {100 * misfit:.0f} % of the light.")
     scored = scored_frames(metrics)
     for key, text in (
         ("psnr_noisy_db", f"PSNR of {scored} against their noisy readings: {{:.2f}} dB."),

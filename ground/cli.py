@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from flightsw.icd.mission import load_mission
 from ground.cli_compare import compare_command
 from ground.cli_list import compare_runs_command, list_command
+from ground.cli_live import live_command
 from ground.cli_options import (
     AsJson,
     Background,
@@ -182,6 +183,7 @@ def uplink(
         raise typer.Exit(1)
 
 
+app.command("live")(live_command)
 app.command("reconstruct")(reconstruct_command)
 app.command("evaluate")(evaluate_command)
 app.command("report")(report_command)

@@ -21,6 +21,7 @@ def dictionary_command(
     from ground.xtce import xtce_document
     from obbgs_base.files import write_whole
 
+    xtce.parent.mkdir(parents=True, exist_ok=True)
     write_whole(xtce, xtce_document())
     counts = {name: len(getattr(DICTIONARY, name)) for name in ("telemetry", "events", "reports", "commands")}
     text = ", ".join(f"{count} {name}" for name, count in counts.items())

@@ -18,6 +18,7 @@ from rich.text import Text
 
 from flightsw.icd.telemetry import DICTIONARY, printable
 from ground.ingest import Status
+from ground.live_status import line as model_line
 from ground.telemetry import plain
 
 PLAIN_S, JSON_S = 10.0, 1.0  # between lines where there is no screen
@@ -103,9 +104,11 @@ class ConsoleView:
         top.add_column(ratio=1)
         top.add_column(ratio=1)
         top.add_row(Panel(_link(status, down, up), title="link"), Panel(_flight(status), title="spacecraft"))
+        model = [Panel(Text(model_line(status.model)), title="model")] if status.model else []
         return Group(
             top,
             Panel(_files(status, down), title="files"),
+            *model,
             Panel(_commands_and_events(status), title="events"),
         )
 
@@ -118,6 +121,7 @@ class ConsoleView:
             f"{link_state(status)[0]}, frames {s.frames_in_session} received / {captured(status)} captured, {speed}"
             f"{s.crc_errors} CRC errors, {s.packets_missing} missing, {s.segments_resent} resent, "
             f"outbox {status.housekeeping.get('outbox_frames', '?')}"
+            + (f"; model: {model_line(status.model)}" if status.model else "")
         )
 
 

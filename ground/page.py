@@ -28,18 +28,24 @@ p.note { color: var(--soft); margin: 4px 0 14px; font-size: 13.5px; }
 .card span { color: var(--soft); font-size: 13px; }
 table { border-collapse: collapse; width: 100%; font-size: 14px; }
 td, th { text-align: left; padding: 5px 10px; border-bottom: 1px solid var(--line); vertical-align: top; }
-td.n { text-align: right; font-variant-numeric: tabular-nums; }
+td.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
 .grid { display: grid; gap: 6px; }
 .grid img { width: 100%; display: block; background: #000; border-radius: 3px; image-rendering: pixelated; }
 .grid .label { color: var(--soft); font-size: 13px; align-self: center; }
 .grid figure { margin: 0; } .grid figcaption { color: var(--soft); font-size: 12px; text-align: center; }
 h3 { font-size: 15px; margin: 18px 0 8px; }
-.two { display: grid; grid-template-columns: 1fr 1fr; gap: 8px 32px; align-items: start; }
+.two { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 8px 32px; align-items: start; }
 .ramp { display: inline-block; width: 90px; height: 10px; border-radius: 3px; margin: 0 6px;
   border: 1px solid var(--line); background: linear-gradient(90deg, #000, #f00, #ff0, #fff); }
 ul.notes { background: #fff7e6; border: 1px solid #f0d9a8; border-radius: 8px; margin: 0 0 14px;
   padding: 10px 14px 10px 30px; }
 pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px; overflow-x: auto; margin: 0 0 12px; }
+@media (max-width: 760px) {
+  main { padding: 16px 8px 40px; } section { padding: 14px 12px; } h1 { font-size: 21px; overflow-wrap: anywhere; }
+  .cards, .two { grid-template-columns: minmax(0, 1fr); } .two > * { min-width: 0; }
+  .card b { font-size: 20px; } td { padding: 5px 4px; overflow-wrap: anywhere; } .grid { gap: 3px; }
+  .grid .label, .grid figcaption { font-size: 10px; overflow-wrap: anywhere; }
+}
 """
 
 
@@ -48,7 +54,7 @@ def page(title: str, subtitle: str, sections: Iterable[str]) -> str:
     title = html.escape(title)
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style>'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style>'
         f"<script>{get_plotlyjs()}</script></head><body><main><h1>{title}</h1>"
         f'<p class="note">{html.escape(subtitle)}</p>{"".join(sections)}</main></body></html>'
     )
@@ -102,7 +108,7 @@ def plot(figure: go.Figure) -> str:
         figure,
         full_html=False,
         include_plotlyjs=False,
-        config={"displaylogo": False, "displayModeBar": False},
+        config={"displaylogo": False, "displayModeBar": False, "responsive": True},
     )
 
 

@@ -1,17 +1,13 @@
-"""The report's interactive figures: the model in 3D, training over time, the exposure histogram."""
+"""The report's interactive figures: training over time, the exposure histogram."""
 
 import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 import plotly.graph_objects as go
-import torch
 from plotly.subplots import make_subplots
 
-from ground.cameras import cameras_of, sun_direction
 from ground.session import Session
-from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.render.lighting import mean_radiance
 from obbgs_core.sensor import Sensor
 
 POINTS_SHOWN = 15_000  # more make the page larger and the view no clearer
@@ -23,68 +19,6 @@ INK, SPACE, SUN = "#1c2733", "#10161e", "#f0b429"
 KNOWN_COLOUR, BLIND_COLOUR = "#1f6feb", "#d1652a"
 EXPOSURE_COLOURS = ("#1f6feb", "#2a9d8f", "#d1652a", "#8e44ad", "#c0392b")
 RADIANCE_SCALE = [[0.0, "#33465c"], [0.5, "#93a8bd"], [1.0, "#fff4d9"]]
-
-
-def model_figure(gaussians: Gaussians, session: Session) -> tuple[go.Figure, int]:
-    """Return the model in 3D (centres coloured by mean radiance, camera track, Sun), and how many centres it shows."""
-    frames = session.frames
-    solid = torch.nonzero(gaussians.opacities > LEAST_OPACITY)[:, 0]
-    if len(solid) > POINTS_SHOWN:
-        solid = solid[torch.randperm(len(solid), generator=torch.Generator().manual_seed(0))[:POINTS_SHOWN]]
-    points = gaussians.means[solid].numpy()
-    lit = [record for record in frames if sun_direction(record) is not None] or list(frames)
-    radiance = mean_radiance(gaussians.select(solid), cameras_of(session, lit)).mean(dim=1).numpy()
-    brightness = np.sqrt(radiance)
-    reach_m = float(np.quantile(np.linalg.norm(points, axis=1), 0.995)) if len(points) else 1.0
-    figure = go.Figure()
-    figure.add_scatter3d(
-        **_xyz(points),
-        mode="markers",
-        name="Gaussian centres",
-        marker={
-            "size": 2,
-            "color": brightness,
-            "cmin": 0,
-            "cmax": float(np.quantile(brightness, 0.99)) if len(points) else 1.0,
-            "colorscale": RADIANCE_SCALE,
-            "colorbar": {"title": {"text": "√radiance"}, "thickness": 12, "len": 0.6},
-        },
-        customdata=radiance,
-        hovertemplate="%{x:.2f}, %{y:.2f}, %{z:.2f} m<br>radiance %{customdata:.3f}<extra></extra>",
-    )
-    in_time = sorted(frames, key=lambda record: record.mid_exposure_utc_ns)
-    centres = np.array([record.position_body_m for record in in_time])
-    ranges_m = np.linalg.norm(centres, axis=1)
-    figure.add_scatter3d(
-        **_xyz(centres / np.maximum(ranges_m, 1e-9)[:, None] * reach_m * TRACK_RADIUS),
-        mode="lines+markers",
-        name="camera track",
-        marker={"size": 3, "color": BLIND_COLOUR},
-        line={"width": 1, "color": BLIND_COLOUR},
-        text=[f"frame {r.id}, {d:.0f} m" for r, d in zip(in_time, ranges_m, strict=True)],
-        hovertemplate="%{text}<extra></extra>",
-    )
-    sun = np.mean([record.sun_dir_body for record in in_time], axis=0) * reach_m * TRACK_RADIUS
-    figure.add_scatter3d(
-        **_xyz(np.array([np.zeros(3), sun])),
-        mode="lines",
-        name="to the Sun",
-        line={"color": SUN, "width": 5},
-        hoverinfo="skip",
-    )
-    axis = {"color": "#8795a5", "gridcolor": "#263140", "zeroline": False, "showbackground": False}
-    figure.update_layout(
-        scene={
-            "aspectmode": "data",
-            "bgcolor": SPACE,
-            "camera": {"eye": {"x": 0.75, "y": 0.75, "z": 0.5}},
-            **{f"{name}axis": {**axis, "title": {"text": f"{name}, m"}} for name in "xyz"},
-        },
-        height=580,
-        margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        legend={"x": 0.01, "y": 0.99, "bgcolor": "rgba(255,255,255,0.85)", "itemsizing": "constant"},
-    )
-    return figure, len(points)
 
 
 def training_figure(history: Sequence[dict]) -> go.Figure:
@@ -123,8 +57,12 @@ def training_figure(history: Sequence[dict]) -> go.Figure:
     return figure
 
 
-def histogram_figure(session: Session, sensor: Sensor) -> go.Figure:
-    """Return the histogram of the readings in all frames, one line for each exposure time."""
+def histogram_figure(session: Session, sensor: Sensor, nominal: bool) -> go.Figure:
+    """Return the histogram of the readings in all frames, one line for each exposure time.
+
+    Args:
+        nominal: exposure times are made up and not named.
+    """
     figure = go.Figure()
     edges = np.linspace(0, sensor.white_dn + 1, BINS + 1)
     for index, exposure_s in enumerate(sorted({r.exposure_time_s for r in session.frames})):
@@ -135,7 +73,7 @@ def histogram_figure(session: Session, sensor: Sensor) -> go.Figure:
         figure.add_scatter(
             x=(edges[:-1] + edges[1:]) / 2,
             y=np.where(counts > 0, counts, np.nan),
-            name=f"{exposure_s * 1e3:g} ms",
+            name="" if nominal else f"{exposure_s * 1e3:g} ms",
             mode="lines",
             line={"shape": "hvh", "width": 2, "color": EXPOSURE_COLOURS[index % len(EXPOSURE_COLOURS)]},
             hovertemplate="%{y:,} pixels near %{x:.0f} DN",

@@ -80,6 +80,20 @@ class _Events(logging.Handler):
             say(self._console, record.getMessage())
 
 
+class Lines:
+    """Prints what a long work says every ten seconds, and at once where its first word changes."""
+
+    def __init__(self, console: Console):
+        self._console, self._first_word, self._next_s = console, "", 0.0
+
+    def __call__(self, label: str, text: str) -> None:
+        now_s, first_word = time.monotonic(), text.partition(" ")[0]
+        if first_word == self._first_word and now_s < self._next_s:
+            return
+        self._first_word, self._next_s = first_word, now_s + PLAIN_S
+        say(self._console, f"{label}: {text}")
+
+
 def say(console: Console, text: str) -> None:
     """Print a line of plain text, without markup."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ground.cameras import sensor_of
+from ground.estimated_poses import write_estimate
 from ground.model_files import Outputs, model_sizes, write_models
 from ground.run_record import training_metrics, write_config, write_history
 from ground.runs import check_replaceable, publish, run_folder, unfinished_run, written_to
-from ground.session import open_session
+from ground.session import FrameRecord, Session, open_session
 from ground.training_frames import split, training_frame
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.train.config import MethodConfig
@@ -70,7 +71,7 @@ def reconstruct(
         raise ValueError(f"the time limit must be longer than 0 s, got {time_limit_s:g}")
     config = preset(method, changes)
     session = open_session(session_dir)
-    folder = run_folder(session, name, out)
+    folder = run_folder(session.path, name, out)
     check_replaceable(folder, overwrite)
     training, held_out = split(session)
     sensor = sensor_of(session.camera)
@@ -96,18 +97,42 @@ def reconstruct(
                 blind = trained(BLIND, configs[BLIND])
             except ReconstructionError as error:
                 outputs.miss("blind.ply", str(error))
-        blind_gaussians = blind.gaussians if blind else None
-        files = write_models(outputs, result.gaussians, blind_gaussians, session, training, held_out)
-        outputs.require("model.ply")
-        metrics = training_metrics(result, blind, session, training, held_out)
-        metrics |= files | model_sizes(part) | {"missing_outputs": outputs.missing}
-        log.info("%d Gaussians in %.1f s: %s", len(result.gaussians), result.seconds, result.stop_reason)
-        with written_to(folder.parent):
-            (part / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
-            write_history({KNOWN: result, BLIND: blind}, part / "metrics.jsonl")
-            write_config(session, result.config, seed, part / "config.yaml")
-            publish(part, folder)
+        finish_run(outputs, folder, {KNOWN: result, BLIND: blind}, session, training, held_out, seed)
     return folder
+
+
+def finish_run(
+    outputs: Outputs,
+    folder: Path,
+    results: dict[str, TrainResult | None],
+    session: Session,
+    training: list[FrameRecord],
+    held_out: list[FrameRecord],
+    seed: int,
+) -> None:
+    """Write the files of finished trainings into the folder of `outputs`, and make that the run's folder.
+
+    Args:
+        results: those of KNOWN and, or None, of BLIND.
+
+    Raises:
+        SessionError: model.ply or the folder cannot be written.
+        Interrupted: as in `Outputs.make`.
+    """
+    part, result, blind = outputs.folder, results[KNOWN], results.get(BLIND)
+    assert result is not None
+    blind_gaussians = blind.gaussians if blind else None
+    files = write_models(outputs, result.gaussians, blind_gaussians, session, training, held_out)
+    outputs.require("model.ply")
+    metrics = training_metrics(result, blind, session, training, held_out)
+    metrics |= files | model_sizes(part) | {"missing_outputs": outputs.missing}
+    log.info("%d Gaussians in %.1f s: %s", len(result.gaussians), result.seconds, result.stop_reason)
+    with written_to(folder.parent):
+        (part / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+        write_history(results, part / "metrics.jsonl")
+        write_estimate(part, result.pose_estimate)
+        write_config(session, result.config, seed, part / "config.yaml")
+        publish(part, folder)
 
 
 def _checkpoint(label: str) -> str:

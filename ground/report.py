@@ -5,28 +5,20 @@ import json
 import math
 from pathlib import Path
 
-import numpy as np
-import torch
 import yaml
 
-from ground.cameras import exposed, predicted_image
+from ground.cameras import median_sun_direction
 from ground.card import chi2_explained, frames_captured, scored_frames
-from ground.evaluate import clean_image
-from ground.page import as_yaml, cards, grid, label, page, picture, plot, section, two_tables
-from ground.pictures import ERROR_FULL_SCALE, bounding_box, heat, tone
-from ground.plots import histogram_figure, model_figure, training_figure
+from ground.page import as_yaml, cards, page, plot, section, two_tables
+from ground.plots import histogram_figure, training_figure
+from ground.report_frames import frames_section, is_nominal, scored_section
 from ground.runs import Run, open_run, written_to
-from ground.session import FrameRecord, SessionError
+from ground.session import SessionError
+from ground.splat_view import splat_view
+from ground.telemetry_plots import broken_limits, housekeeping_series, telemetry_figure
 from ground.truth import Truth
 from obbgs_base.files import write_whole
-from obbgs_core.score.metrics import COMPLETENESS_RADIUS, psnr_db
-
-COLUMNS = 6  # brackets shown for each exposure
-VIEWS_SHOWN = 3
-MARGIN_PX = 10
-ABOVE_EMPTY = (
-    0.01  # of full scale: pixels that differ more from the background are target when pictures are cropped
-)
+from obbgs_core.score.metrics import COMPLETENESS_RADIUS
 
 
 def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
@@ -42,13 +34,14 @@ def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
         f"Method {run.metrics['method']}, {run.metrics['frames_received']} frames received, session of "
         f"{run.session.created_utc}.",
         [
-            _result(run, truth),
-            _frames(run),
-            _scored_views(run, truth),
             _model(run),
+            _result(run, truth),
+            frames_section(run),
+            scored_section(run, truth),
             _training(run),
             _histogram(run),
             _losses(run),
+            _telemetry(run),
             _simulation(truth),
             _configuration(run),
         ],
@@ -77,10 +70,12 @@ def _result(run: Run, truth: Truth | None) -> str:
     notes = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
     callout = f'<ul class="notes">{notes}</ul>' if notes else ""
     details = f'<div style="margin-top:16px">{two_tables(_details(m))}</div>'
-    return section("Result", note, callout + cards(_main_figures(m)) + details)
+    return section(
+        "Result", note, callout + cards(_main_figures(m, run.session.frames_imported is not None)) + details
+    )
 
 
-def _main_figures(m: dict) -> list[tuple[str, str]]:
+def _main_figures(m: dict, imported: bool) -> list[tuple[str, str]]:
     """Return the most important figures, each with a sentence of what it means, as HTML."""
     scored = scored_frames(m)
     figures: list[tuple[str, str]] = []
@@ -90,13 +85,13 @@ def _main_figures(m: dict) -> list[tuple[str, str]]:
         )
     elif "psnr_noisy_db" in m:
         figures.append((f"{m['psnr_noisy_db']:.2f} dB", f"PSNR of {scored} against their noisy readings"))
+    if "psnr_clean_foreground_db" in m:
+        text = "clean PSNR of the foreground: only pixels that the target covers, without the easy black sky"
+        figures.append((f"{m['psnr_clean_foreground_db']:.2f} dB", text))
     if "psnr_clean_blind_db" in m:
         gain_db = m["psnr_clean_db"] - m["psnr_clean_blind_db"]
         text = f"the same, trained without exposure times: knowing them brings {gain_db:+.2f} dB"
         figures.append((f"{m['psnr_clean_blind_db']:.2f} dB", text))
-    if "psnr_clean_foreground_db" in m:
-        text = "clean PSNR of the foreground: only pixels that the target covers, without the easy black sky"
-        figures.append((f"{m['psnr_clean_foreground_db']:.2f} dB", text))
     if "chamfer" in m:
         text = (
             "Chamfer distance: mean distance between the Gaussians' centres and the true surface, both ways"
@@ -109,9 +104,12 @@ def _main_figures(m: dict) -> list[tuple[str, str]]:
     figures.append(
         (f"{m['train_seconds']:.0f} s", f"of training; it ended with: {html.escape(m['stop_reason'])}")
     )
-    figures.append(
-        (f"{m['frames_received']:,} / {frames_captured(m)}", "frames received / captured on board")
-    )
+    if imported:
+        figures.append((f"{m['frames_received']:,}", "pictures imported"))
+    else:
+        figures.append(
+            (f"{m['frames_received']:,} / {frames_captured(m)}", "frames received / captured on board")
+        )
     if m.get("onnx_bytes") is not None and m.get("onnx_parity_db") is not None:
         text = f"agreement of the on-board ONNX renderer ({m['onnx_bytes'] / 1e6:.2f} MB) with ours, in its worst view"
         figures.append((f"{m['onnx_parity_db']:.0f} dB", text))
@@ -155,97 +153,16 @@ def _exposure_ms(key: str) -> str:
     return key.removeprefix("psnr_clean_").removesuffix("ms_db")
 
 
-def _frames(run: Run) -> str:
-    exposures = sorted({r.exposure_time_s for r in run.session.frames})
-    by_key = {(r.bracket, r.exposure_time_s): r for r in run.session.frames}
-    picked = _spread(sorted({r.bracket for r in run.session.frames}), COLUMNS)
-    cells = []
-    for exposure_s in exposures:
-        cells.append(label(f"{exposure_s * 1e3:g} ms"))
-        for bracket in picked:
-            record = by_key.get((bracket, exposure_s))
-            if record is None:
-                cells.append(label("missing"))
-                continue
-            caption = f"frame {record.id}, {_range_m(record):.0f} m"
-            if record.saturated:
-                caption += f"<br>{record.saturated:,} px saturated"
-            cells.append(picture(_tone(run, _noisy_image(run, record)), f"frame {record.id}", caption))
-    return section(
-        "Frames by exposure",
-        "Frames as received: each column is a bracket, each row an exposure time; below each frame stand its number "
-        "and the range to the target. Brightness is the square root of the signal above black, full scale is white.",
-        grid(f"60px repeat({len(picked)}, 1fr)", cells),
-    )
-
-
-def _scored_views(run: Run, truth: Truth | None) -> str:
-    records = [truth.posed(r) for r in run.scored] if truth else run.scored
-    by_key = {(r.bracket, r.exposure_time_s): r for r in records}
-    brackets = sorted({r.bracket for r in run.scored})
-    shown = _spread(brackets, VIEWS_SHOWN)
-    body = []
-    for bracket in shown:
-        of_view = [by_key[key] for key in sorted(by_key) if key[0] == bracket]
-        body.append(f"<h3>Bracket {bracket}, {_range_m(of_view[0]):.0f} m</h3>")
-        body.append(_compared(run, truth, of_view))
-    training = run.metrics["scored_frames"] == "training"
-    seen = "trained on: the session has too few brackets to hold one out" if training else "never trained on"
-    note = (
-        f"{len(shown)} of {len(brackets)} brackets, {seen}; cropped to the target, brightness as above. Error is the "
-        f"absolute difference: 0<span class='ramp'></span>{ERROR_FULL_SCALE:.0%} of full scale or more. PSNR is of the "
-        f"whole frame against the {'noiseless exposure' if truth else 'noisy frame'}."
-    )
-    if run.blind:
-        note += " Blind: the same training with every exposure time replaced by their mean."
-    title = "Training views (nothing was held out)" if training else "Held-out views"
-    return section(f"{title}: {'truth' if truth else 'frame'}, render, error", note, "".join(body))
-
-
-def _compared(run: Run, truth: Truth | None, of_view: list[FrameRecord]) -> str:
-    """Return the frames of a bracket, shortest exposure first, beside the renders of each model and their errors."""
-    reference = "truth" if truth else "frame"
-    names = [reference, "render", "error"] + (["blind render", "blind error"] if run.blind else [])
-    expected = [
-        clean_image(run, truth, r) if truth else torch.from_numpy(_noisy_image(run, r)) for r in of_view
-    ]
-    background = torch.tensor(run.session.background)
-    empty = exposed(background, run.sensor, of_view[-1].exposure_time_s)
-    signal = expected[-1] - empty  # of the longest exposure
-    if run.session.background:
-        signal = signal.abs()
-    box = bounding_box(signal.mean(-1) > ABOVE_EMPTY, MARGIN_PX)
-    cells = [label(""), *(label(name) for name in names)]
-    models = [(run.gaussians, run.metrics.get("reference_exposure_s"))]
-    if run.blind:
-        models.append((run.blind, run.metrics["blind_reference_exposure_s"]))
-    for record, image in zip(of_view, expected, strict=True):
-        cells.append(label(f"{record.exposure_time_s * 1e3:g} ms"))
-        cells.append(picture(_tone(run, image[box].numpy()), reference, f"frame {record.id}"))
-        for gaussians, reference_exposure_s in models:
-            exposure_s = reference_exposure_s or record.exposure_time_s
-            render = predicted_image(gaussians, run.session, record, run.sensor, exposure_s)
-            error = ((render - image).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
-            caption = f"{psnr_db(render, image):.1f} dB"
-            cells.append(picture(_tone(run, render[box].numpy()), "render", caption))
-            cells.append(picture(heat(error[box].numpy()), "error", "&nbsp;"))
-    return grid(f"60px repeat({len(names)}, 1fr)", cells)
-
-
 def _model(run: Run) -> str:
-    figure, shown = model_figure(run.gaussians, run.session)
-    ranges_m = [_range_m(record) for record in run.session.frames]
     note = (
-        f"Centres of {shown:,} of the {len(run.gaussians):,} Gaussians without the faint ones, coloured by brightness, "
-        "in the target's body frame. The camera track has true directions but is drawn at one distance; ranges were "
-        f"{min(ranges_m):.0f} to {max(ranges_m):.0f} m. Drag to turn, scroll to zoom."
+        f"The {len(run.gaussians):,} Gaussians of the model as the sensor would see them at the chosen exposure; "
+        "brightness is shown as in the frames below. Drag to turn, wheel or pinch to zoom, shift and drag to move."
     )
     if "appearance" in run.metrics:
-        note += (
-            f" Radiance: {html.escape(run.metrics['appearance'])}; the Sun's direction spans "
-            f"{run.metrics['sun_span_deg']:.1f} degrees, and each point shows its mean over the frames."
-        )
-    return section("Model and camera track", note, plot(figure))
+        note += f" Radiance: {html.escape(run.metrics['appearance'])}."
+        if median_sun_direction(list(run.session.frames)) is not None:
+            note += f" The Sun's direction spans {run.metrics['sun_span_deg']:.1f} degrees."
+    return section("Model", note, splat_view(run, is_nominal(run)))
 
 
 def _training(run: Run) -> str:
@@ -270,15 +187,19 @@ def _training(run: Run) -> str:
 
 def _histogram(run: Run) -> str:
     saturated = sum(r.saturated for r in run.session.frames)
+    nominal = is_nominal(run)
+    title, by_time = ("Histogram", "") if nominal else ("Exposure histogram", ", by exposure time")
     note = (
-        "How many pixels of all received frames have which reading, by exposure time; both the peak at the black level "
+        f"How many pixels of all frames have which reading{by_time}; both the peak at the black level "
         f"and a pile at full scale carry little information. {saturated:,} pixels are saturated: training takes such a "
         "reading as a lower bound of the light."
     )
-    return section("Exposure histogram", note, plot(histogram_figure(run.session, run.sensor)))
+    return section(title, note, plot(histogram_figure(run.session, run.sensor, nominal)))
 
 
 def _losses(run: Run) -> str:
+    if run.session.frames_imported is not None:
+        return ""  # nothing came over a link
     captured, received = run.metrics.get("frames_captured"), run.metrics["frames_received"]
     flight = run.session.flight
     if captured is None:  # frames are numbered from 0 without gaps, so a gap is a frame that never came
@@ -304,6 +225,20 @@ def _losses(run: Run) -> str:
         "requested again and counted as resent."
     )
     return section("Losses on the link", note, two_tables(rows))
+
+
+def _telemetry(run: Run) -> str:
+    """Return the spacecraft's housekeeping over time; nothing where none was received."""
+    series = housekeeping_series(run.session.path)
+    if not series:
+        return ""
+    broken = ", ".join(f"{name.replace('_', ' ')} ({limit})" for name, limit in broken_limits(series))
+    note = (
+        f"Housekeeping over {series[0].seconds[-1]:.0f} s, {len(series[0].seconds):,} packets. Values beyond a limit "
+        f"of the telemetry dictionary are yellow or red, dotted lines are the limits. Limits were broken by: "
+        f"{broken or 'none'}."
+    )
+    return section("Telemetry", note, plot(telemetry_figure(series)))
 
 
 def _simulation(truth: Truth | None) -> str:
@@ -339,22 +274,3 @@ def _configuration(run: Run) -> str:
     columns = f"<div>{as_yaml(method)}</div><div>{as_yaml(config)}{as_yaml(camera)}</div>"
     body = f'<div class="two">{columns}</div>{as_yaml(tles)}'
     return section("Configuration and versions", "Everything needed to repeat this run.", body)
-
-
-def _spread(values: list[int], count: int) -> list[int]:
-    """Return at most `count` of the values, evenly spread, first and last included."""
-    return [values[i] for i in np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))]
-
-
-def _range_m(record: FrameRecord) -> float:
-    return float(np.linalg.norm(record.position_body_m))
-
-
-def _tone(run: Run, image: np.ndarray) -> np.ndarray:
-    return tone(image, run.sensor, run.session.encoding)
-
-
-def _noisy_image(run: Run, record: FrameRecord) -> np.ndarray:
-    """Return a frame as received [H, W, C], as a fraction of full scale."""
-    dn = run.session.dn(record).astype(np.float32)
-    return dn.reshape(*dn.shape[:2], -1) / run.sensor.white_dn

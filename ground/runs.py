@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ground.cameras import sensor_of
+from ground.live_status import LIVE_STATUS
 from ground.session import FrameRecord, Session, SessionError, open_session
 from ground.training_frames import split
 from obbgs_core.errors import ReconstructionError
@@ -50,7 +51,7 @@ class Run:
     metrics: dict
 
 
-def run_folder(session: Session, name: str, out: Path | None = None) -> Path:
+def run_folder(session_dir: Path, name: str, out: Path | None = None) -> Path:
     """Return where a run is or will be: in `out` if given, otherwise in runs/ of the session.
 
     Raises:
@@ -58,7 +59,7 @@ def run_folder(session: Session, name: str, out: Path | None = None) -> Path:
     """
     if not name or Path(name).name != name or name.startswith("."):
         raise SessionError(f"a run's name must be a plain folder name, got {name!r}")
-    return (session.path / "runs" if out is None else out) / name
+    return (session_dir / "runs" if out is None else out) / name
 
 
 def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
@@ -68,13 +69,17 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
         SessionError: there is no such session or run, it is a run of another session, or its metrics.json is damaged.
     """
     session = open_session(session_dir)
-    folder = run_folder(session, name, out)
+    folder = run_folder(session.path, name, out)
     if not (folder / "metrics.json").is_file():
         raise SessionError(
             f"{folder} is not a finished run; make one with `ground reconstruct --name {name}`"
         )
     training, held_out = split(session)
     metrics = read_metrics(folder / "metrics.json")
+    if not metrics[
+        "frames_held_out"
+    ]:  # of a few brackets that came one by one, none was kept from the training
+        training, held_out = [*training, *held_out], []
     metrics["scored_frames"] = "held_out" if held_out else "training"
     if metrics.get("session_created_utc", session.created_utc) != session.created_utc:
         raise SessionError(
@@ -136,7 +141,7 @@ def check_replaceable(folder: Path, overwrite: bool) -> None:
     Raises:
         SessionError: there is a finished run and `overwrite` is False, or something that is not a finished run.
     """
-    if not folder.exists():
+    if not folder.exists() or is_live(folder):
         return
     if not (folder / "metrics.json").is_file():
         raise SessionError(
@@ -144,6 +149,11 @@ def check_replaceable(folder: Path, overwrite: bool) -> None:
         )
     if not overwrite:
         raise SessionError(f"{folder} is a finished run: --overwrite replaces it, --name makes another")
+
+
+def is_live(folder: Path) -> bool:
+    """Return whether a folder holds only what `ground live` shows of a run that is not finished."""
+    return (folder / LIVE_STATUS).is_file() and not (folder / "metrics.json").is_file()
 
 
 @contextlib.contextmanager
@@ -157,7 +167,7 @@ def unfinished_run(folder: Path, overwrite: bool, kept: Sequence[str]) -> Iterat
     Raises:
         SessionError: another process makes this run, there is a finished one, or the folder cannot be written.
     """
-    part = folder.with_name(f".{folder.name}.part")
+    part = unfinished_folder(folder)
     with written_to(folder.parent):
         lock = _locked(part)
     try:
@@ -173,6 +183,11 @@ def unfinished_run(folder: Path, overwrite: bool, kept: Sequence[str]) -> Iterat
         raise
     finally:
         _unlock(lock, part)
+
+
+def unfinished_folder(folder: Path) -> Path:
+    """Return the hidden folder in which a run is made."""
+    return folder.with_name(f".{folder.name}.part")
 
 
 def publish(part: Path, folder: Path) -> None:

@@ -5,9 +5,10 @@ import logging
 import numpy as np
 import torch
 
+from flightsw.icd.quaternion import quat_to_matrix
 from ground.cameras import sun_direction
 from ground.session import SPLITS, FrameRecord, Session, SessionError
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import Navigation, TrainingFrame
 
 log = logging.getLogger(__name__)
 TEST_INTERVAL = 8  # every eighth bracket is held out
@@ -18,13 +19,13 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
 
     Where the frames state their splits, those of `test` are held out, or those of `val` where there is no test frame;
     otherwise the frames of `val` are in neither list. Where nothing but `train` is stated, and where no split is, every
-    eighth bracket is held out as a whole; of 2 to 7 brackets the last one; a single bracket is all for training. Frames
-    in eclipse and frames whose pose is not valid are in neither list.
+    eighth bracket is held out as a whole (`is_held_out`); where that is none, the last one; a single bracket is all for
+    training. Frames in eclipse and frames whose pose is not valid are in neither list.
 
     Raises:
         SessionError: no frame is left, or none that is for training.
     """
-    usable = [r for r in session.frames if r.pose_valid and not r.in_eclipse]
+    usable = [r for r in session.frames if is_usable(r)]
     if not usable:
         eclipsed = sum(r.in_eclipse for r in session.frames)
         raise SessionError(
@@ -43,10 +44,20 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
     if held_out := stated["test"] or stated["val"]:
         return stated["train"], held_out
     brackets = sorted({r.bracket for r in usable})
-    chosen = set(brackets[TEST_INTERVAL - 1 :: TEST_INTERVAL])
+    chosen = {r.bracket for r in usable if is_held_out(r)}
     if not chosen and len(brackets) > 1:
         chosen = {brackets[-1]}
     return [r for r in usable if r.bracket not in chosen], [r for r in usable if r.bracket in chosen]
+
+
+def is_usable(record: FrameRecord) -> bool:
+    """Return whether a frame's pose is valid and it was not taken in eclipse."""
+    return record.pose_valid and not record.in_eclipse
+
+
+def is_held_out(record: FrameRecord) -> bool:
+    """Return whether a frame is of every eighth bracket, by the bracket's number: it does not matter what else came."""
+    return record.bracket % TEST_INTERVAL == TEST_INTERVAL - 1
 
 
 def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
@@ -55,7 +66,7 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
     Raises:
         MissingFrames, SessionCorrupt: its picture cannot be read.
     """
-    dn = session.dn(record).astype(np.float32)
+    dn, assumed = session.dn(record).astype(np.float32), record.quat_inertial_to_body
     return TrainingFrame(
         dn=torch.from_numpy(dn.reshape(*dn.shape[:2], session.camera.channels)),
         exposure_time_s=record.exposure_time_s,
@@ -69,7 +80,19 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
         sun_dir=sun_direction(record),
         background=session.background,
         psf_sigma_px=session.camera.psf_sigma_px,
+        navigation=navigation_of(session),
+        time_s=(record.mid_exposure_utc_ns - session.navigation.epoch_utc_ns) / 1e9,
+        inertial_to_body=None if assumed is None else torch.from_numpy(quat_to_matrix(assumed)),
     )
+
+
+def navigation_of(session: Session) -> Navigation | None:
+    """Return what the pose tags of a session share of their errors; None where they share none."""
+    stated = session.navigation
+    if not stated.sigmas.vector().any():
+        return None
+    to_rtn = quat_to_matrix(np.array(stated.quat_inertial_to_rtn))
+    return Navigation(stated.sigmas, stated.mean_motion_rad_s, to_rtn)
 
 
 def motion_covariance(tag_covariance: np.ndarray, body_to_camera: np.ndarray) -> np.ndarray:

@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 JOB_NAME = re.compile(r"(\d{20})\.json", re.ASCII)
 MAX_MODEL_BYTES = 64 * 1024 * 1024  # as the dictionary's `model.size_bytes`
 POLL_S = 0.2  # between looks at the folder
+LOCK_TRIES = 5  # to become the session's listener
 RESEND_INTERVALS = 2  # timer intervals before an unanswered command is sent again
 UNREADABLE = (
     OSError,
@@ -193,10 +194,14 @@ def listening(session: Path) -> Iterator[None]:
         SessionError: another process listens.
     """
     with open(session / "listener.lock", "wb") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise SessionError(f"another process listens into {session}") from error
+        for tried in range(LOCK_TRIES):
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if tried == LOCK_TRIES - 1:
+                    raise SessionError(f"another process listens into {session}") from error
+                time.sleep(0.02)  # `is_listening` of another process holds the lock for a moment
         yield
 
 

@@ -14,9 +14,10 @@ import typer
 from rich.console import Console
 from rich.progress import TaskID
 
+from flightsw.icd.frame import Attitude
 from flightsw.icd.mission import load_mission
-from hil.choices import CameraKind, FaultKind, LinkKind, SensorKind
-from hil.sky import SHIPPED
+from hil.choices import NAVIGATION, CameraKind, FaultKind, LinkKind, NavigationKind, SensorKind
+from hil.sky import SHIPPED, SHIPPED_FOIL, Materials
 from obbgs_base.command_line import new_app, run
 
 app = new_app("The simulated world: sky, target, camera and link, so that a pass runs on a desk.")
@@ -32,6 +33,21 @@ ScenarioName = Annotated[
     str,
     typer.Option(
         "--scenario", help="A ready-made scenario or a YAML file; default: the mission's own orbits."
+    ),
+]
+Navigation = Annotated[
+    NavigationKind,
+    typer.Option(
+        help="realistic: poses err by 0.1 degrees of boresight, 2 % of the range along the track, 0.2 % of the spin "
+        "rate, 20 ms and 0.02 degrees of noise, and the tags say so; perfect: tags are exact."
+    ),
+]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the navigation errors.")]
+KnownAttitude = Annotated[
+    Attitude | None,
+    typer.Option(
+        help="What flight knows of the target's attitude; default: what the mission says. With unknown, its tags are "
+        "in inertial axes."
     ),
 ]
 RealTime = Annotated[
@@ -65,10 +81,9 @@ def demo(
     ] = "none",
     scenario: ScenarioName = "",
     real_time: RealTime = 0.0,
-    navigation_noise: Annotated[
-        int | None,
-        typer.Option(help="Seed of random navigation errors with the mission's sigmas; default: no errors."),
-    ] = None,
+    navigation: Navigation = NAVIGATION,
+    seed: Seed = 1,
+    attitude: KnownAttitude = None,
     json_: AsJson = False,
 ) -> None:
     """Simulate a whole pass, from rendered frames over flight, link and ground to a model and its report.
@@ -80,7 +95,7 @@ def demo(
     from hil.simulated_pass import PassConfig
 
     unwind_on_sigterm()
-    config = PassConfig(camera, link, faults, scenario, navigation_noise, real_time)
+    config = PassConfig(camera, link, faults, scenario, navigation, real_time, seed, attitude)
     figures = run_demo(out, mission, mesh, config, Console(stderr=json_))
     if json_:
         print(json.dumps(figures))
@@ -101,9 +116,13 @@ def camera(
     inputs: Annotated[
         Path,
         typer.Option(
-            help="With --scenario: where the mission.yaml and navigation states for flight and ground are written."
+            help="With --scenario: where the mission.yaml and navigation states for flight and ground are written; the "
+            "three options below are of these."
         ),
     ] = Path("scenario"),
+    navigation: Navigation = NAVIGATION,
+    seed: Seed = 1,
+    attitude: KnownAttitude = None,
     real_time: RealTime = 0.0,
 ) -> None:
     """Serve the simulated camera until stopped; prints its URL. Frames are rendered when a client requests them.
@@ -116,11 +135,12 @@ def camera(
     from hil.cameras.virtual import CameraServer
     from hil.sky.render_farm import RenderFarm
     from hil.world.navigation import write_flight_inputs
-    from hil.world.world import load_world
+    from hil.world.world import load_world, told
 
-    world = load_world(load_mission(mission), scenario)
+    world = load_world(told(load_mission(mission), attitude), scenario)
     if scenario:
-        print(f"start flight with --mission {write_flight_inputs(world, inputs)}", file=sys.stderr)
+        written = write_flight_inputs(world, inputs, seed if navigation == "realistic" else None)
+        print(f"start flight with --mission {written.mission_path}", file=sys.stderr)
     stop = _stop_event()
     with RenderFarm(world.mission, mesh, cache, workers=1) as farm:
         more = {"pose_at": world.pose_at, "real_time": real_time}
@@ -264,6 +284,10 @@ def dataset(
         typer.Option(help="paper: 8 bits with the noise of Jiang et al. 2025; spacecam: a scientific CMOS."),
     ] = "paper",
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 1,
+    materials: Annotated[
+        Materials,
+        typer.Option(help="own: those of the mesh; foil: crinkled foil, and cell glass where it is dark."),
+    ] = "own",
     cache: Annotated[Path, typer.Option(help="Folder in which rendered frames are kept.")] = Path("renders"),
     workers: Annotated[int, typer.Option(min=1, help="Number of Blender processes.")] = 2,
     json_: AsJson = False,
@@ -284,8 +308,10 @@ def dataset(
     else:
         times_ms = [float(text) for text in bracket.split(",")]
         settings = {"scenario": scenario, "frames": frames, "size_px": size, "bracket_ms": times_ms}
-        config = build(DatasetConfig, {**settings, "sensor": sensor, "seed": seed}, "dataset")
-        jobs = [(mesh or SHIPPED, out)]
+        config = build(
+            DatasetConfig, {**settings, "sensor": sensor, "seed": seed, "materials": materials}, "dataset"
+        )
+        jobs = [(mesh or (SHIPPED_FOIL if materials == "foil" else SHIPPED), out)]
     with progress_bar(Console(stderr=True), label_width=20) as bars:
         tasks: dict[str, TaskID] = {}
 
@@ -304,12 +330,21 @@ def dataset(
 
 
 @app.command()
-def target(out: Annotated[Path, typer.Option(help="The GLB to write.")] = Path("spacecraft.glb")) -> None:
+def target(
+    out: Annotated[Path, typer.Option(help="The GLB to write.")] = Path("spacecraft.glb"),
+    materials: Annotated[
+        Materials,
+        typer.Option(
+            help="own: nearly matt; foil: crinkled gold foil, glossy cell glass and a polished dish."
+        ),
+    ] = "own",
+) -> None:
     """Write the shipped target, a parametric spacecraft, as binary glTF; the bytes are the same on every machine.
 
-    Example: hil target --out spacecraft.glb
+    Example: hil target --materials foil --out spacecraft.glb
     """
-    out.write_bytes(SHIPPED.read_bytes())  # not built again: rounding differs between processors
+    shipped = SHIPPED_FOIL if materials == "foil" else SHIPPED
+    out.write_bytes(shipped.read_bytes())  # not built again: rounding differs between processors
     print(out)
 
 

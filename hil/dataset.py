@@ -22,7 +22,7 @@ from ground.session_writer import SessionWriter
 from ground.telemetry import FlightCounts
 from hil import truth
 from hil.choices import SensorKind
-from hil.sky import blender, motion, sensor, stars
+from hil.sky import Materials, blender, motion, sensor, stars
 from hil.sky.blender import mesh_sha256
 from hil.sky.motion import image_velocity, smear
 from hil.sky.render_farm import RenderFarm
@@ -55,6 +55,7 @@ class DatasetConfig:
     sensor: SensorKind = "paper"
     seed: int = 1
     targets: tuple[str, ...] = ()
+    materials: Materials = "own"
 
     def __post_init__(self):
         if not self.bracket_ms or self.frames < 1 or self.frames % len(self.bracket_ms):
@@ -140,7 +141,7 @@ def make_dataset(
     scene = Scene(scenario)
     shots = list(plan(mission))
     states = [scene.state(shot.mid_exposure_utc_ns) for shot in shots]
-    with RenderFarm(mission, mesh, cache, workers) as farm:
+    with RenderFarm(mission, mesh, cache, workers, config.materials) as farm:
         rendered = iter(range(1, len(states) + 1))  # a counter that the workers' threads share
         farm.prerender(
             [state.pose for state in states],
@@ -264,7 +265,7 @@ def _digest(config: DatasetConfig, scenario_sha256: str, mesh: Path) -> str:
     blender.check_mesh(mesh)
     settings = {**dataclasses.asdict(config), "targets": None, "scenario": scenario_sha256}
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode() + mesh_sha256(mesh).encode())
-    for source in (blender.WORKER, Path(__file__)):
+    for source in (*blender.SOURCES, Path(__file__)):
         digest.update(source.read_bytes())
     for module in (sensor, motion, stars, truth, ground.truth):
         digest.update(inspect.getsource(module).encode())

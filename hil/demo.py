@@ -23,7 +23,7 @@ from hil.truth import write_truth
 from hil.world.clock import SimulatedClock
 from hil.world.navigation import write_flight_inputs
 from hil.world.scenario import true_exposures
-from hil.world.world import load_world
+from hil.world.world import load_world, told
 from obbgs_base.errors import ObbgsError
 
 MARKER = "demo.json"  # a folder with it was made by a demo and may be overwritten
@@ -73,7 +73,7 @@ def simulate_pass(
         ValueError: flight cannot follow the real-time factor.
         CaptureError, OSError: the GigE camera cannot be served: Aravis is missing, or its port is taken.
     """
-    world = load_world(load_mission(mission_path), config.scenario)
+    world = load_world(told(load_mission(mission_path), config.attitude), config.scenario)
     SimulatedClock(world.mission, config.real_time)  # refuses an impossible factor before anything is removed
     check_mesh(mesh)
     _require_own(out)
@@ -89,14 +89,20 @@ def simulate_pass(
             task = progress.add_task("render", total=len(exposures))
             farm.prerender([e.pose for e in exposures], lambda: progress.advance(task))
         _clear(out)  # not earlier: a mesh that cannot be rendered must not remove an earlier pass
-        if config.scenario or config.navigation_noise is not None:
-            mission_path = write_flight_inputs(world, out / "scenario", config.navigation_noise)
+        errors = None
+        known = mission.target_attitude.knowledge == "known"
+        if config.scenario or config.navigation == "realistic" or not known:
+            seed = config.seed if config.navigation == "realistic" else None
+            inputs = write_flight_inputs(world, out / "scenario", seed)
+            mission_path, errors = inputs.mission_path, inputs.errors
             world = replace(world, mission=load_mission(mission_path))
         console.print(
             f"[bold]2/4 Pass[/]  flight and ground, {config.camera} camera, {config.link} link between, "
             f"faults: {config.faults}"
         )
         simulation = fly(out, world, mission_path, farm.radiance, config, console)
+        if errors is not None:
+            simulation["navigation"] |= errors.described()
         console.print("[bold]3/4 Truth[/] the simulator's own record, for the evaluation only")
         write_truth(out / "session", world.mission, farm, pose_at=world.pose_at, simulation=simulation)
     return simulation
@@ -157,7 +163,7 @@ def _summary(f: dict) -> Table:
         (
             "tags against truth",
             f"{navigation['position_error_m']:.3f} m, {navigation['rotation_error_deg']:.4f} deg "
-            f"(injected noise: {navigation['noise']})",
+            f"(injected errors: {navigation['errors']})",
         ),
         *model_rows(f),
         ("everything", f"{f['seconds']:.0f} s"),

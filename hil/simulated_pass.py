@@ -14,12 +14,14 @@ from typing import IO
 
 import numpy as np
 from rich.console import Console
+from scipy.spatial.transform import Rotation
 
-from flightsw.icd.frame import PoseTag
+from flightsw.icd.frame import Attitude, PoseTag
 from flightsw.icd.mission import Mission
+from flightsw.icd.quaternion import quat_to_matrix
 from hil.cameras.gige import GigeCameraServer
 from hil.cameras.virtual import CameraServer
-from hil.choices import CameraKind, FaultKind, LinkKind
+from hil.choices import NAVIGATION, CameraKind, FaultKind, LinkKind, NavigationKind
 from hil.links.faults import STANDARD_CUT_S, STANDARD_FAULTS, Faults
 from hil.links.virtual_can import VirtualCan
 from hil.links.virtual_link import VirtualLink
@@ -55,8 +57,10 @@ class PassConfig:
     link: LinkKind = "serial"  # serial: at the mission's baud rate; CAN at 1 Mbit/s
     faults: FaultKind = "none"
     scenario: str = ""  # a ready-made one or a YAML file; empty: the mission's own orbits and attitude
-    navigation_noise: int | None = None  # seed of errors with the mission's sigmas; None: exact tags
+    navigation: NavigationKind = NAVIGATION
     real_time: float = 0.0  # how many times as fast as real time the simulated clock runs; 0: lock step
+    seed: int = 1  # of the navigation errors
+    attitude: Attitude | None = None  # what flight knows of the target's; None: what the mission says
 
     def open_link(self, mission: Mission) -> VirtualLink:
         """Return the link, not yet running."""
@@ -289,17 +293,25 @@ def is_fault_count(name: str) -> bool:
 
 
 def _navigation_figures(world: World, config: PassConfig, records: list[dict]) -> dict:
-    """Return the root mean square errors of the received tags, in position and in rotation."""
-    noise = "none" if config.navigation_noise is None else f"seed {config.navigation_noise}"
+    """Return the root mean square errors of the received tags, in position and in rotation.
+
+    Tags of another attitude than the known one are compared in the axes that they were free to choose.
+    """
     position_m, turn_rad = [], []
+    knowledge, start_ns = world.mission.target_attitude.knowledge, world.mission.orbit.start_utc_ns
     for record in records:
-        true = world.pose_at(record["mid_exposure_utc_ns"])
-        position_m.append(np.linalg.norm(true.position_body_m - record["position_body_m"]))
-        half_turn = min(1.0, abs(true.quat_body_to_camera @ record["quat_body_to_camera"]))
-        turn_rad.append(2 * np.arccos(half_turn))
+        utc_ns = record["mid_exposure_utc_ns"]
+        true = world.pose_at(utc_ns)
+        tag_to_body = np.eye(3)
+        if knowledge != "known":
+            tag_to_body = world.gcrs_to_body(start_ns if knowledge == "rate_only" else utc_ns)
+        tagged = quat_to_matrix(np.array(record["quat_body_to_camera"])) @ tag_to_body.T
+        position_m.append(np.linalg.norm(true.position_body_m - tag_to_body @ record["position_body_m"]))
+        turn_rad.append(Rotation.from_matrix(tagged @ quat_to_matrix(true.quat_body_to_camera).T).magnitude())
     return {
         "source": world.mission.navigation.source.partition(":")[0],
-        "noise": noise,
+        "errors": f"realistic, seed {config.seed}" if config.navigation == "realistic" else "none",
+        "attitude": knowledge,
         "position_error_m": round(float(np.sqrt(np.mean(np.square(position_m)))), 4),
         "rotation_error_deg": round(float(np.degrees(np.sqrt(np.mean(np.square(turn_rad))))), 5),
     }

@@ -13,6 +13,7 @@ from flightsw.pose import pose_tag
 from ground import truth
 from ground.session import Session, open_session
 from hil.sky.render_farm import RenderFarm
+from hil.sky.sensor import through_lens
 
 CLOUD_POINTS = 100_000
 MAX_SAMPLES_PER_POINT = 10  # where less than a tenth of the surface is seen, the cloud stays smaller
@@ -59,7 +60,7 @@ def _frames(
         yield truth.TrueFrame(
             record.id,
             pose.world_to_camera,
-            farm.radiance(pose),
+            through_lens(farm.radiance(pose), session.camera),
             farm.alpha(pose),
             *(farm.geometry(pose) if geometry else ()),
         )

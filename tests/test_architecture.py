@@ -16,7 +16,7 @@ FORBIDDEN = {
     "ground": {"hil", "cv2", "trimesh"},
     "hil": {"obbgs_core", "bpy"},
 }
-BLENDER_ONLY = {"hil.sky.blender_worker"}  # runs in Blender's own Python
+BLENDER_ONLY = {"hil.sky.blender_worker", "hil.sky.blender_materials"}  # run in Blender's own Python
 
 
 def modules_of(part: str) -> list[str]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from hil.sky.sensor import SensorModel
 from obbgs_core.losses import fit_figures
 from tests.benchmarks import targets
 
@@ -56,3 +57,32 @@ def test_half_of_the_readings_of_a_signal_at_full_scale_are_below_it(folder):
             shares.append((frame.dn[:, column] < 255).float().mean().item())
     assert len(shares) >= 2  # the longest exposures reach full scale
     assert 0.25 < np.mean(shares) < 0.75
+
+
+def test_another_sensor_reads_what_its_lens_leaves_and_a_method_that_knows_it_sees_noise_alone(folder):
+    """A bright column is blurred; against the blurred truth chi² is 1, against the sharp one it is not."""
+    with np.load(folder / "RAMP_400.npz") as arrays:
+        content = dict(arrays)
+    content["radiance"] = np.where(np.arange(SIZE_PX) == SIZE_PX // 2, 1, 0.3)[None, None, :, None] * np.ones(
+        (VIEWS, SIZE_PX, SIZE_PX, 3), np.float16
+    )
+    np.savez(folder / "RAMP_400.npz", **content)
+    sharp = targets.expose("RAMP", SIZE_PX)
+    model = SensorModel(read_noise_e=12.0, psf_sigma_px=0.6)
+    target = targets.exposed_by(sharp, model)
+    assert target.sensor.white_dn == 4095 and target.views[0].frame.dn.shape == (SIZE_PX, SIZE_PX, 1)
+    assert target.views[0].frame.psf_sigma_px == pytest.approx(np.hypot(0.6, 0.26))
+    inner = (
+        slice(8, -8),
+        slice(8, -8),
+    )  # the lens takes light from beyond the edges, where nothing was rendered
+
+    def chi2(view: targets.View, radiance: torch.Tensor) -> float:
+        exposure_s = torch.full((1, 1, 1, 1), view.frame.exposure_time_s)
+        pair = (radiance[inner][None].contiguous(), torch.ones(1, SIZE_PX - 16, SIZE_PX - 16))
+        return fit_figures(*pair, exposure_s, view.frame.dn[inner][None].contiguous(), target.sensor)[0]
+
+    views = target.views[::3]  # the shortest exposure: nothing is clipped
+    assert np.mean([chi2(view, view.radiance) for view in views]) == pytest.approx(1, abs=0.05)
+    grey = [view.radiance.mean(dim=2, keepdim=True) for view in sharp.views[::3]]
+    assert np.mean([chi2(view, light) for view, light in zip(views, grey, strict=True)]) > 2

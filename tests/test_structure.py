@@ -23,6 +23,7 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     },  # the flat modules: errors, sensor, losses, obb, frames, ...
     "obbgs_core.render": CORE,
     "obbgs_core.start": CORE,
+    "obbgs_core.attitude": CORE | {"obbgs_core.start"},
     "obbgs_core.train": CORE | {"obbgs_core.render", "obbgs_core.start"},
     "obbgs_core.io": CORE | {"obbgs_core.render"},
     "obbgs_core.score": CORE | {"obbgs_core.render"},

@@ -20,10 +20,10 @@ class TargetAttitudeSection:
     a guess. unknown: neither this section nor navigation says anything of the attitude, and poses are in GCRS axes.
     """
 
-    knowledge: Attitude = "known"
     mode: Literal["inertial", "spin"] = "inertial"
     axis: Literal["sun"] | tuple[float, ...] = "sun"
     period_s: float = 600.0
+    knowledge: Attitude = "known"
 
     def __post_init__(self):
         path = "mission.target_attitude"

@@ -18,8 +18,8 @@ from ground.compare.case import Case
 from ground.compare.errors import CompareError
 from ground.settings import checked_settings
 from obbgs_core.frames import TrainingFrame
+from obbgs_core.model.motions import rigid_motions
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.poses import rigid_motions
 
 NOISE, SHUTTER, DARK, POSE, LOSS = range(5)  # streams of random numbers, one a purpose
 MOST_ELECTRONS = 1e15  # NumPy's Poisson refuses about 9e18
@@ -40,6 +40,8 @@ class Condition:
     These need no truth:
 
     - believed_noise, believed_gain: factors on the noise, and on the signal per light, that the method is told.
+    - synthetic_bracket: the frames in turn are exposed for these multiples of their own exposure time, their readings
+      taken for the light without noise, as where photographs of one exposure are to stand for a bracket.
     - frames: how many of the training frames are left, evenly spaced; 0: all.
     - lost_percent: so many of the frames are lost at random.
     - missing_exposure: the frames of this exposure time are lost, 1 is the shortest; 0: none.
@@ -53,6 +55,7 @@ class Condition:
     noise: float = 1.0
     exposure_error: float = 0.0
     response_gamma: float = 1.0
+    synthetic_bracket: tuple[float, ...] = ()
     believed_noise: float = 1.0
     believed_gain: float = 1.0
     frames: int = 0
@@ -78,10 +81,13 @@ class Condition:
             "held_out_sector_deg",
             f"expected 0 to less than 360, got {self.held_out_sector_deg:g}",
         )
+        for name in ("exposure_ratios", "synthetic_bracket"):
+            ratios = getattr(self, name)
+            require(all(ratio > 0 for ratio in ratios), name, f"expected numbers above 0, got {list(ratios)}")
         require(
-            all(ratio > 0 for ratio in self.exposure_ratios),
-            "exposure_ratios",
-            f"expected numbers above 0, got {list(self.exposure_ratios)}",
+            not (self.synthetic_bracket and self.exposes_anew),
+            "synthetic_bracket",
+            "takes the readings for the light, the other conditions of exposure and noise the truth: leave one out",
         )
         whole = not self.eclipse or (len(self.eclipse) == 2 and 0 <= self.eclipse[0] < self.eclipse[1] <= 1)
         require(whole, "eclipse", f"expected two shares of the session in order, got {list(self.eclipse)}")
@@ -152,6 +158,8 @@ def given(case: Case, condition: Condition) -> tuple[list[TrainingFrame], Sensor
     frames = case.training
     if condition.exposes_anew:
         frames = _exposed_anew(case, condition)
+    if condition.synthetic_bracket:
+        frames = _bracketed(case, condition)
     if condition.eclipse:
         first, last = condition.eclipse
         frames = [
@@ -188,6 +196,24 @@ def _exposed_anew(case: Case, condition: Condition) -> list[TrainingFrame]:
         dn = read_out(light, exposure_s * longer, case.sensor, condition, _random(NOISE, frame))
         dn = torch.from_numpy(dn.astype(np.float32))
         frames.append(dataclasses.replace(frame, dn=dn, exposure_time_s=exposure_s))
+    return frames
+
+
+def _bracketed(case: Case, condition: Condition) -> list[TrainingFrame]:
+    """Return the training frames with the exposure times of a synthetic bracket, one a frame in turn, and new noise."""
+    if case.session is not None and case.session.encoding != "linear":
+        raise CompareError(
+            f"the values of {case.name} are {case.session.encoding}-coded, and a synthetic bracket needs values that "
+            "are linear in light: import the pictures with --values decode"
+        )
+    sensor, ratios, frames = case.sensor, condition.synthetic_bracket, []
+    for i, frame in enumerate(case.training):
+        light = (frame.dn.double() - sensor.black_dn) / (sensor.dn_per_radiance_s * frame.exposure_time_s)
+        exposure_s = frame.exposure_time_s * ratios[i % len(ratios)]
+        dn = read_out(light.numpy(), exposure_s, sensor, condition, _random(NOISE, frame))
+        frames.append(
+            dataclasses.replace(frame, dn=torch.from_numpy(dn.astype(np.float32)), exposure_time_s=exposure_s)
+        )
     return frames
 
 

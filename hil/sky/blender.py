@@ -10,11 +10,14 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from hil.sky import SHIPPED
+from hil.sky import SHIPPED, SHIPPED_FOIL, Materials
 from obbgs_base.errors import ObbgsError
 
 log = logging.getLogger(__name__)
 WORKER = Path(__file__).with_name("blender_worker.py")
+SOURCES = tuple(
+    WORKER.with_name(f"{name}.py") for name in ("blender_worker", "blender_materials", "crinkles")
+)
 SAMPLES = 16  # a pixel, before denoising (OIDN); rendering time grows in proportion, quality hardly
 BPY_VERSION = "4.5.15"
 RETRIES = 2  # of a request on which Blender crashed
@@ -64,14 +67,17 @@ class Worker:
     Args:
         samples: light paths a pixel.
         ambient: radiance of the uniform light from all around; default the worker's own (blender_worker.py).
+        materials: those of the mesh, or foil and cell glass in their place; the shipped target in foil keeps its own.
 
     Raises:
         MeshError: the mesh cannot be loaded.
         BlenderError: Blender cannot be started.
     """
 
-    def __init__(self, mesh: Path, samples: int = SAMPLES, ambient: float | None = None):
-        self.mesh, self.samples, self.ambient = mesh, samples, ambient
+    def __init__(
+        self, mesh: Path, samples: int = SAMPLES, ambient: float | None = None, materials: Materials = "own"
+    ):
+        self.mesh, self.samples, self.ambient, self.materials = mesh, samples, ambient, materials
         self.restarts = -1
         self.facts: dict = {}
         self._start()
@@ -98,7 +104,10 @@ class Worker:
             raise BlenderError(f"Blender did not start: {reason}; {_remedy(reason)}")
         self.version = greeting["ready"]
         load = {"op": "load", "mesh": str(self.mesh.resolve()), "samples": self.samples}
-        load["keep_scale"] = mesh_sha256(self.mesh) == mesh_sha256(SHIPPED)
+        digest = mesh_sha256(self.mesh)
+        foil = digest == mesh_sha256(SHIPPED_FOIL)
+        load["shipped"] = foil or digest == mesh_sha256(SHIPPED)
+        load["materials"] = "own" if foil else self.materials
         if self.ambient is not None:
             load["ambient"] = self.ambient
         reply = self._exchange(load)

@@ -1,4 +1,5 @@
-"""Renders one mesh with Blender, in whose own Python it runs: only bpy, NumPy and the standard library are imported.
+"""Renders one mesh with Blender, in whose own Python it runs: it imports bpy, NumPy, the standard library, and its
+neighbours `blender_materials` and `crinkles`, which do the same.
 
 Requests come on stdin and replies go to stdout, each one JSON object in a line; arrays go to the .npz file that the
 request names. `render` gives scene-linear radiance, and `geometry` depth and normals: these need a render of their own
@@ -16,20 +17,24 @@ import numpy as np
 from mathutils import Matrix, Vector
 from mathutils.bvhtree import BVHTree
 
+sys.path.insert(0, str(Path(__file__).parent))  # an installed Blender does not search beside its script
+from blender_materials import dress, limit_material
+
 FOREIGN_SIZE_M = 6.0  # a mesh of unknown units is scaled to this largest dimension
 SUN_IRRADIANCE = np.pi  # a white Lambert plate facing the Sun has radiance 1
 SUN_ANGLE_RAD = 0.00925  # angular diameter of the Sun at 1 au
 EARTHSHINE_RADIANCE = 0.06  # uniform light from all directions, relative to that plate's radiance
-MAX_METALLIC = 0.3  # a metal reflects its surroundings, which are black here except for the Sun
-MIN_ROUGHNESS = 0.15  # a smoother surface shows nothing but a point-like reflection of the Sun
 LARGEST_FLOAT16 = 65504.0
 BACKGROUND_DEPTH_M = 1e9  # larger depths are background: Cycles writes 1e10 there
 
 
-def load(path, keep_scale):
+def load(path, shipped, materials):
     """Load a mesh file into an empty scene and return its facts.
 
-    Without `keep_scale` the mesh is centred and scaled to 6 m.
+    A mesh that is not `shipped` with the project is centred and scaled to 6 m, and its materials are limited.
+
+    Args:
+        materials: `own`, those of the file, or `foil`, crinkled foil and cell glass in their place.
     """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     to_file_axes = import_mesh(path)
@@ -49,15 +54,18 @@ def load(path, keep_scale):
     extent = float((high - low).max())
     if not (np.isfinite(extent) and extent > 0):
         raise ValueError("the mesh has no extent: is its compression supported?")
-    if not keep_scale:
+    if not shipped:
         middle = (low + high) / 2
         fit = Matrix.Scale(FOREIGN_SIZE_M / extent, 4) @ Matrix.Translation(Vector(-middle))
         for o in meshes:
             o.data.transform(fit)
         extent = FOREIGN_SIZE_M
     recomputed = sum(recompute_normals(o) for o in meshes)
-    for material in bpy.data.materials:
-        limit_material(material)
+    if materials == "foil":
+        dress(meshes)
+    elif not shipped:
+        for material in bpy.data.materials:
+            limit_material(material)
     bpy.context.view_layer.update()
     triangles = sum(len(p.vertices) - 2 for o in meshes for p in o.data.polygons)
     return {"largest_dimension_m": extent, "triangles": triangles, "normals_recomputed": recomputed}
@@ -114,53 +122,6 @@ def recompute_normals(o):
     mesh.attributes.remove(attribute)
     mesh.set_sharp_from_angle(angle=np.pi / 6)
     return True
-
-
-def limit_material(material):
-    """Keep a material visible under one Sun: limit how metallic and how smooth it is, and remove emission."""
-    if not material.use_nodes:
-        return
-    nodes = list(material.node_tree.nodes)
-    shaders = [node for node in nodes if node.type == "BSDF_PRINCIPLED"]
-    if not shaders:
-        for node in nodes:
-            if node.type == "EMISSION":
-                replace_emission(material, node)
-    links = material.node_tree.links
-    for shader in shaders:
-        limit_input(material, shader.inputs["Metallic"], "MINIMUM", MAX_METALLIC)
-        limit_input(material, shader.inputs["Roughness"], "MAXIMUM", MIN_ROUGHNESS)
-        emission = [shader.inputs["Emission Strength"], shader.inputs["Emission Color"]]
-        for link in [link for socket in emission for link in socket.links]:
-            links.remove(link)
-        shader.inputs["Emission Strength"].default_value = 0.0
-
-
-def limit_input(material, socket, operation, bound):
-    """Replace a shader's input, a value or a texture, by its minimum or maximum with a bound."""
-    links = material.node_tree.links
-    for link in list(socket.links):
-        clamp = material.node_tree.nodes.new("ShaderNodeMath")
-        clamp.operation = operation
-        clamp.inputs[1].default_value = bound
-        source = link.from_socket
-        links.remove(link)
-        links.new(source, clamp.inputs[0])
-        links.new(clamp.outputs[0], socket)
-    limit = min if operation == "MINIMUM" else max
-    socket.default_value = limit(socket.default_value, bound)
-
-
-def replace_emission(material, emission):
-    """Make an unlit material (KHR_materials_unlit, imported as emission) a matt one of the same colour."""
-    links = material.node_tree.links
-    matt = material.node_tree.nodes.new("ShaderNodeBsdfDiffuse")
-    matt.inputs["Color"].default_value = emission.inputs["Color"].default_value
-    for link in list(emission.inputs["Color"].links):
-        links.new(link.from_socket, matt.inputs["Color"])
-    for node in material.node_tree.nodes:
-        if node.type == "OUTPUT_MATERIAL":
-            links.new(matt.outputs["BSDF"], node.inputs["Surface"])
 
 
 def set_up(samples, ambient):
@@ -327,7 +288,7 @@ def answer(request):
     """Carry out a request and return the facts for its reply."""
     op = request["op"]
     if op == "load":
-        facts = load(request["mesh"], request["keep_scale"])
+        facts = load(request["mesh"], request["shipped"], request["materials"])
         set_up(request["samples"], request.get("ambient", EARTHSHINE_RADIANCE))
         return facts
     if op == "render":

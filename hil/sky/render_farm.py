@@ -14,7 +14,8 @@ import numpy as np
 
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission
-from hil.sky.blender import SAMPLES, WORKER, Worker, check_mesh, mesh_sha256
+from hil.sky import Materials
+from hil.sky.blender import SAMPLES, SOURCES, Worker, check_mesh, mesh_sha256
 
 Op = Literal["render", "geometry"]  # radiance and coverage, or depth and normals
 
@@ -27,16 +28,19 @@ class RenderFarm:
         BlenderError: Blender is missing or cannot be started.
     """
 
-    def __init__(self, mission: Mission, mesh: Path, cache: Path, workers: int = 2):
+    def __init__(
+        self, mission: Mission, mesh: Path, cache: Path, workers: int = 2, materials: Materials = "own"
+    ):
         check_mesh(mesh)
         self.mission, self.mesh, self.cache = mission, mesh, cache
+        self.materials: Materials = materials
         cache.mkdir(parents=True, exist_ok=True)
         self._count = workers
         self._workers: list[Worker] = []
         self._lock = threading.Lock()
         self._first = self._worker(0)  # at once, so that a bad mesh is reported here
-        settings = f"{mesh_sha256(mesh)} {SAMPLES} {self._first.version} ".encode()
-        self._identity = hashlib.sha256(settings + WORKER.read_bytes()).hexdigest()
+        settings = f"{mesh_sha256(mesh)} {SAMPLES} {self._first.version} {materials} ".encode()
+        self._identity = hashlib.sha256(settings + b"".join(s.read_bytes() for s in SOURCES)).hexdigest()
 
     def __enter__(self) -> "RenderFarm":
         return self
@@ -134,7 +138,7 @@ class RenderFarm:
 
     def _worker(self, index: int) -> Worker:
         while len(self._workers) <= index:
-            self._workers.append(Worker(self.mesh))
+            self._workers.append(Worker(self.mesh, materials=self.materials))
         return self._workers[index]
 
     def _request(self, pose: PoseTag, op: Op) -> dict:

@@ -129,6 +129,15 @@ def ideal(camera: CameraSection) -> SensorModel:
     )
 
 
+def through_lens(radiance: np.ndarray, camera: CameraSection) -> np.ndarray:
+    """Return a rendered radiance [H, W, C] as the camera's calibrated point spread leaves it, float32.
+
+    It is what a noiseless sensor behind that lens would measure, and what a model that knows the lens should predict.
+    """
+    sigma_px = ideal(camera).psf_sigma_px
+    return gaussian_filter(radiance.astype(np.float32), sigma_px, axes=(0, 1), mode="constant")
+
+
 def clean_dn(radiance: np.ndarray, exposure_time_s: float, camera: CameraSection) -> np.ndarray:
     """Return the reading of a noiseless sensor, DN as float64, clipped at full scale but not rounded."""
     signal_dn = camera.dn_per_radiance_s * exposure_time_s * radiance.astype(np.float64)

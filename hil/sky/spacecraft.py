@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from PIL import Image
 from trimesh.transformations import rotation_matrix, translation_matrix
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from hil.sky import Materials, crinkles
+
 # base colour (linear), metallic, roughness
-MATERIALS = {
+MATT = {
     "gold_foil": ((0.75, 0.48, 0.12), 0.3, 0.35),
     "white_paint": ((0.80, 0.80, 0.78), 0.0, 0.6),
     "solar_cell": ((0.05, 0.07, 0.18), 0.1, 0.25),
@@ -21,32 +24,57 @@ MATERIALS = {
     "black_radiator": ((0.12, 0.12, 0.13), 0.0, 0.7),
     "aluminium": ((0.62, 0.64, 0.66), 0.3, 0.4),
 }
+FOIL = MATT | {  # what reflects the Sun like a mirror that is more or less rough
+    "gold_foil": ((0.83, 0.54, 0.16), 1.0, 0.3),
+    "solar_cell": ((0.012, 0.015, 0.03), 0.0, 0.15),
+    "aluminium": ((0.62, 0.64, 0.66), 1.0, 0.35),
+    "dish": ((0.75, 0.75, 0.73), 1.0, 0.3),
+}
+MATERIALS = {"own": MATT, "foil": FOIL}
 
 
-def build() -> trimesh.Scene:
-    """Return the spacecraft as a scene with one mesh for each material; it is 6.0 m from panel tip to panel tip."""
-    parts: dict[str, list[trimesh.Trimesh]] = {name: [] for name in MATERIALS}
+def build(materials: Materials = "own") -> trimesh.Scene:
+    """Return the spacecraft as a scene with one mesh for each material; it is 6.0 m from panel tip to panel tip.
+
+    With materials `foil`, gold foil is crinkled by a normal map, along texture coordinates that are lengths on each of
+    the body's six sides.
+    """
+    outfit = MATERIALS[materials]
+    parts: dict[str, list[trimesh.Trimesh]] = {name: [] for name in FOIL}
     _bus(parts)
     for side in (-1, 1):
         _solar_panel(parts, side)
     _dish(parts)
     _boom_and_antennas(parts)
+    if "dish" not in outfit:
+        parts["white_paint"] += parts.pop("dish")
     scene = trimesh.Scene()
     for name, meshes in parts.items():
         mesh: Any = trimesh.util.concatenate(meshes)
-        colour, metallic, roughness = MATERIALS[name]
+        colour, metallic, roughness = outfit[name]
         material = PBRMaterial(
             name=name, baseColorFactor=[*colour, 1.0], metallicFactor=metallic, roughnessFactor=roughness
         )
-        mesh.visual = TextureVisuals(material=material)
+        uv = None
+        if name == "gold_foil" and materials == "foil":
+            material.normalTexture = Image.fromarray(crinkles.normal_map())
+            uv = _lengths_on_sides(mesh) / crinkles.TILE_M
+        mesh.visual = TextureVisuals(uv=uv, material=material)
         scene.add_geometry(mesh, node_name=name, geom_name=name)
     return scene
 
 
-def write(path: Path) -> None:
+def write(path: Path, materials: Materials = "own") -> None:
     """Write the spacecraft as binary glTF."""
-    content: Any = build().export(file_type="glb", include_normals=True)
+    content: Any = build(materials).export(file_type="glb", include_normals=True)
     path.write_bytes(content)
+
+
+def _lengths_on_sides(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Return each vertex's coordinates [V, 2] m in the plane of its side, for boxes along the axes."""
+    across = np.abs(mesh.vertex_normals).argmax(axis=1)
+    in_plane = np.array([[1, 2], [0, 2], [0, 1]])[across]
+    return np.take_along_axis(mesh.vertices, in_plane, axis=1)
 
 
 def _box(size: tuple[float, float, float], centre: tuple[float, float, float]) -> trimesh.Trimesh:
@@ -111,7 +139,7 @@ def _dish(parts: dict[str, list[trimesh.Trimesh]]) -> None:
     trimesh.repair.fix_normals(reflector)
     place = translation_matrix((0.75, 0.0, 0.25)) @ rotation_matrix(np.radians(70), (0, 1, 0))
     reflector.apply_transform(place)
-    parts["white_paint"].append(reflector)
+    parts["dish"].append(reflector)
     feed = (place @ (0, 0, 0.42, 1))[:3]
     for angle in np.radians((30, 150, 270)):
         rim = (place @ (0.45 * np.cos(angle), 0.45 * np.sin(angle), 0.12, 1))[:3]

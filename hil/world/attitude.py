@@ -55,8 +55,8 @@ def attitude(
 ) -> Attitude:
     """Return the target's attitude as a function of time.
 
-    A tumble is integrated from the start to `horizon_s` later; outside, the function raises ValueError. The other modes
-    are known at any time.
+    A tumble is integrated from the start to `horizon_s` later, and known from a tenth of a second before; outside, the
+    function raises ValueError. The other modes are known at any time.
     """
     if section.mode == "lvlh":
         return lambda utc_ns: _gcrs_to_lvlh(target_tle, utc_ns)
@@ -77,7 +77,8 @@ def attitude(
 
     def tumbling(utc_ns: int) -> np.ndarray:
         elapsed_s = (utc_ns - start_utc_ns) / 1e9
-        if not 0 <= elapsed_s <= horizon_s:
+        # before the start the polynomial of the integrator's first step goes on; a test checks how good that is
+        if not -0.1 <= elapsed_s <= horizon_s:
             raise ValueError(
                 f"the tumble is known from 0 to {horizon_s:g} s after the start, not {elapsed_s:g} s"
             )

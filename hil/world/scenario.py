@@ -16,7 +16,7 @@ from flightsw.icd.quaternion import matrix_to_quat
 from flightsw.orbit import OrbitState, propagate, sun_direction_gcrs, sunlit_fraction
 from flightsw.pose import look_along, pose_tag
 from flightsw.sequencer import plan
-from hil.world.attitude import AttitudeSection, attitude
+from hil.world.attitude import Attitude, AttitudeSection, attitude
 from hil.world.fly_around import Design, FlyAround, RelativeElements, design
 
 SCENARIOS = Path(__file__).parent / "scenarios"
@@ -139,15 +139,15 @@ class Scene:
     def __init__(self, scenario: Scenario):
         self.scenario = scenario
         self.orbit = scenario.orbit
-        self.gcrs_to_body = attitude(
-            scenario.attitude,
-            self.orbit.target_tle,
-            self.orbit.start_utc_ns,
-            scenario.duration_s + HORIZON_MARGIN_S,
-        )
+        self.gcrs_to_body = self.attitude_of(scenario.attitude)
         sigma = PoseSection()  # the tag's stated uncertainty; the pose itself is exact
         variances = [sigma.sigma_position_m**2, np.radians(sigma.sigma_attitude_deg) ** 2]
         self._covariance = np.diag(np.repeat(variances, 3))
+
+    def attitude_of(self, section: AttitudeSection) -> Attitude:
+        """Return the attitude as a function of time that a target of this orbit and start would have."""
+        orbit, horizon_s = self.orbit, self.scenario.duration_s + HORIZON_MARGIN_S
+        return attitude(section, orbit.target_tle, orbit.start_utc_ns, horizon_s)
 
     def state(self, utc_ns: int) -> SceneState:
         """Return the geometry and the light at a time.
@@ -175,6 +175,7 @@ class Scene:
             in_eclipse=sunlit < 0.5,
             valid=True,
             source="truth",
+            quat_inertial_to_body=matrix_to_quat(gcrs_to_body),
         )
         return SceneState(
             utc_ns=utc_ns,

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flightsw.icd.frame import Attitude as Knowledge
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, PoseSection, TargetAttitudeSection
 from flightsw.pose import pose_tag, target_attitude
+from hil.world.attitude import Attitude
 from hil.world.scenario import Scenario, Scene, load_scenario
 
 
@@ -17,9 +19,16 @@ from hil.world.scenario import Scenario, Scene, load_scenario
 class World:
     """The truth of a pass, as functions of the time in UTC ns."""
 
-    mission: Mission
+    mission: Mission  # what flight is given: it may know less of the target's attitude than this world does
     pose_at: Callable[[int], PoseTag]  # of the camera
-    gcrs_to_body: Callable[[int], np.ndarray]  # [3, 3] attitude of the target
+    attitude_if: Callable[
+        [float], Attitude
+    ]  # of the target, if its rate at the start were larger by this share
+
+    @functools.cached_property
+    def gcrs_to_body(self) -> Attitude:
+        """The target's attitude [3, 3] as a function of UTC ns."""
+        return self.attitude_if(0.0)
 
 
 def load_world(mission: Mission, scenario: str = "") -> World:
@@ -29,19 +38,40 @@ def load_world(mission: Mission, scenario: str = "") -> World:
         ConfigError: no such scenario, or it is wrong.
     """
     if not scenario:
-        return World(
-            mission, functools.partial(pose_tag, mission), functools.partial(target_attitude, mission)
-        )
+        known = dataclasses.replace(mission.target_attitude, knowledge="known")
+        true_mission = dataclasses.replace(mission, target_attitude=known)
+
+        def spinning(share: float) -> Attitude:
+            section = dataclasses.replace(known, period_s=known.period_s / (1 + share))
+            return functools.partial(
+                target_attitude, dataclasses.replace(true_mission, target_attitude=section)
+            )
+
+        return World(mission, functools.partial(pose_tag, true_mission), spinning)
     loaded = load_scenario(scenario)
-    scene = Scene(loaded)
-    return World(scenario_mission(mission, loaded), lambda ns: scene.state(ns).pose, scene.gcrs_to_body)
+    scene, section = Scene(loaded), loaded.attitude
+
+    def turning(share: float) -> Attitude:
+        rates = tuple(rate * (1 + share) for rate in section.rates_deg_s)
+        faster = dataclasses.replace(section, rates_deg_s=rates, period_s=section.period_s / (1 + share))
+        return scene.attitude_of(faster)
+
+    return World(scenario_mission(mission, loaded), lambda ns: scene.state(ns).pose, turning)
+
+
+def told(mission: Mission, knowledge: Knowledge | None) -> Mission:
+    """Return the mission of a flight that knows so much of the target's attitude; None: what the mission says."""
+    if knowledge is None:
+        return mission
+    section = dataclasses.replace(mission.target_attitude, knowledge=knowledge)
+    return dataclasses.replace(mission, target_attitude=section)
 
 
 def scenario_mission(mission: Mission, scenario: Scenario) -> Mission:
     """Return the mission with a scenario's orbits, start, field of view and bracket times.
 
     It has no more brackets than the scenario, and its camera is in the chaser's centre of mass. The target's attitude
-    is left out: flight receives it in the navigation states.
+    is left out: flight receives it in the navigation states, if at all.
     """
     count = min(mission.bracket.count, scenario.brackets)
     spread = scenario.bracket_section(mission.bracket.exposure_times_ms, count)
@@ -50,7 +80,7 @@ def scenario_mission(mission: Mission, scenario: Scenario) -> Mission:
     return dataclasses.replace(
         mission,
         orbit=dataclasses.replace(scenario.orbit, max_element_age_days=mission.orbit.max_element_age_days),
-        target_attitude=TargetAttitudeSection(),
+        target_attitude=TargetAttitudeSection(knowledge=mission.target_attitude.knowledge),
         camera=dataclasses.replace(mission.camera, fx_px=float(focal_px), fy_px=float(focal_px)),
         bracket=dataclasses.replace(
             mission.bracket,

@@ -60,7 +60,7 @@ class Silhouette:
 
 def silhouette(dn: Tensor, sensor: Sensor, world_to_camera: Tensor, K: Tensor) -> Silhouette:
     """Return the pixels of dn [H, W, C] that are brighter than noise."""
-    sky_dn, sigma_dn = _dark_reading(sensor)
+    sky_dn, sigma_dn = dark_reading(sensor)
     sigma_dn /= math.sqrt(dn.shape[2])
     signal = ((dn.mean(dim=-1) - sky_dn) / sigma_dn)[None, None]  # in sigmas
     bright = signal > BRIGHT_SIGMA
@@ -110,13 +110,13 @@ def _dilated(mask: Tensor, reach_px: int) -> Tensor:
 
 def shows_light(dn: Tensor, sensor: Sensor) -> bool:
     """Return whether anything in dn [H, W, C] certainly rises above the noise; in eclipse nothing does."""
-    sky_dn, sigma_dn = _dark_reading(sensor)
+    sky_dn, sigma_dn = dark_reading(sensor)
     signal = F.avg_pool2d((dn.mean(dim=-1) - sky_dn)[None], 3, 1)
     bright = signal > CERTAIN_SIGMA * sigma_dn / math.sqrt(dn.shape[2]) / 3
     return int(bright.sum()) >= FEWEST_BRIGHT_PX
 
 
-def _dark_reading(sensor: Sensor) -> tuple[float, float]:
+def dark_reading(sensor: Sensor) -> tuple[float, float]:
     """Return mean and deviation, DN, of a pixel without light: normal noise on the black level, clipped at zero."""
     mean, sigma = sensor.black_dn, math.hypot(sensor.read_noise_dn, math.sqrt(1 / 12))
     share = 0.5 * (1 + math.erf(mean / sigma / math.sqrt(2)))

@@ -147,6 +147,10 @@ def _views(
 
 def padded(gaussians: Gaussians, degree: int) -> Gaussians:
     """Return the same Gaussians with room for spherical harmonics up to `degree`, the new ones zero."""
-    count = (degree + 1) ** 2
-    room = torch.zeros(len(gaussians), count - gaussians.sh.shape[1], gaussians.sh.shape[2])
-    return dataclasses.replace(gaussians, sh=torch.cat([gaussians.sh, room], dim=1))
+    return dataclasses.replace(gaussians, sh=padded_to(gaussians.sh, (degree + 1) ** 2))
+
+
+def padded_to(coefficients: Tensor, count: int) -> Tensor:
+    """Return coefficients [N, count, C] that begin with the given ones [N, K, C]; the others are zero."""
+    room = coefficients.new_zeros(len(coefficients), count - coefficients.shape[1], coefficients.shape[2])
+    return torch.cat([coefficients, room], dim=1)

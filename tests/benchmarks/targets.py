@@ -14,7 +14,7 @@ import math
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import imagecodecs
@@ -30,7 +30,8 @@ from ground.compare.case import Case
 from ground.session import SCHEMA_VERSION
 from ground.session_writer import frame_line
 from ground.truth import TrueFrame, write_truth
-from hil.sky.sensor import converted
+from hil.sky.sensor import PRESETS, RENDERED_PSF_SIGMA_PX, SensorModel, converted, read_out, through_lens
+from hil.sky.stars import star_radiance
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
 
@@ -100,6 +101,41 @@ def expose(name: str, size: int = 400, sigma: float = PAPER_SIGMA, seed: int = 0
         frame = TrainingFrame(torch.from_numpy(dn.astype(np.float32)), exposure_s, poses[i], K, i)
         views.append(View(frame, radiance[i], alpha[i]))
     return Target(name, sensor, views, cloud)
+
+
+def exposed_by(target: Target, model: SensorModel, seed: int = 0) -> Target:
+    """Return the same views as another sensor reads them, with its optics, its faults and the stars behind the target.
+
+    The gain is such that the same radiance fills the same share of its range. Colours become grey for a mono sensor.
+    The truth is what its lens leaves of the radiance; vignetting and the pixels' faults are no part of it, since no
+    calibration tells them to a method.
+    """
+    model = model.with_gain(
+        target.sensor.dn_per_radiance_s * (model.white_dn - model.black_dn) / target.sensor.white_dn
+    )
+    height, width = target.views[0].frame.dn.shape[:2]
+    camera = model.camera_section(width, height, target.views[0].frame.K[0, 0].item())
+    noise, views = np.random.default_rng(seed), []
+    for view in target.views:
+        frame, light = view.frame, view.radiance.double().numpy()
+        if model.colour == "mono":
+            light = light.mean(axis=2, keepdims=True)
+        seen = light
+        if model.stars:
+            gcrs_to_camera = frame.world_to_camera[:3, :3].double().numpy()
+            sky = star_radiance(gcrs_to_camera, frame.K.double().numpy(), width, height)
+            seen = light + (sky * (1 - view.alpha.double().numpy()))[..., None]
+        dn = torch.from_numpy(read_out(model, seen, frame.exposure_time_s, noise).astype(np.float32))
+        exposed = replace(frame, dn=dn, psf_sigma_px=camera.psf_sigma_px)
+        views.append(View(exposed, torch.from_numpy(through_lens(light, camera)), view.alpha))
+    sensor = Sensor(
+        camera.black_dn,
+        camera.white_dn,
+        camera.dn_per_radiance_s,
+        camera.electrons_per_dn,
+        camera.read_noise_dn,
+    )
+    return replace(target, sensor=sensor, views=views)
 
 
 def load(name: str, size: int = 400, sigma: float = PAPER_SIGMA, seed: int = 0) -> Case:
@@ -178,6 +214,7 @@ def _camera(target: Target) -> CameraSection:
         dn_per_radiance_s=sensor.dn_per_radiance_s,
         electrons_per_dn=sensor.electrons_per_dn,
         read_noise_dn=sensor.read_noise_dn,
+        psf_sigma_px=frame.psf_sigma_px or RENDERED_PSF_SIGMA_PX,
     )
 
 
@@ -220,14 +257,25 @@ def main() -> None:
     )
     parser.add_argument("targets", nargs="*", help="names; default: all")
     parser.add_argument("--size", type=int, default=400, choices=(400, 200, 100), help="pixels along a side")
+    parser.add_argument(
+        "--sensor",
+        choices=PRESETS,
+        default="paper",
+        help="spacecam: with its lens, its faults, blooming and stars",
+    )
     parser.add_argument("--out", type=Path, required=True, help="where to write NAME-SIZE")
     arguments = parser.parse_args()
     if wrong := set(arguments.targets).difference(names()):
         parser.error(f"no target {', '.join(sorted(wrong))} in {FOLDER}; there are {', '.join(names())}")
     for name in arguments.targets or names():
-        session = arguments.out / f"{name}-{arguments.size}"
+        other = arguments.sensor != "paper"
+        session = arguments.out / (f"{name}-{arguments.size}" + f"-{arguments.sensor}" * other)
         if not session.exists():
-            write(expose(name, arguments.size), session)
+            target = expose(name, arguments.size)
+            write(
+                exposed_by(target, replace(PRESETS[arguments.sensor], blooming=True)) if other else target,
+                session,
+            )
         print(session)
 
 

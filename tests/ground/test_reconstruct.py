@@ -117,9 +117,9 @@ def test_the_report_is_one_file_that_needs_no_network(trained):
     session, _ = trained
     page = write_report(session, "run").read_text()
     body = page[page.index("</head>") :]
-    for expected in ("Frames by exposure", "Held-out views", "Model and camera track", "Exposure histogram"):
+    for expected in ("Frames by exposure", "Held-out views", "Model", "Exposure histogram"):
         assert expected in body
-    assert "data:image/png;base64," in body and "scatter3d" in body
+    assert "data:image/png;base64," in body and "splatViews" in body
     assert 'src="http' not in page and "<link" not in page
 
 

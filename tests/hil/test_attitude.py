@@ -93,9 +93,17 @@ def test_a_tumble_is_refused_outside_its_time():
     section = AttitudeSection("tumble", rates_deg_s=(0.1, 1.0, 0.0), inertia=(1.0, 2.0, 2.5))
     at = attitude(section, MISSION.orbit.target_tle, START_NS, 60.0)
     np.testing.assert_allclose(at(START_NS + 60 * 10**9) @ at(START_NS + 60 * 10**9).T, np.eye(3), atol=1e-12)
-    for outside_ns in (START_NS - 1, START_NS + 61 * 10**9):
+    for outside_ns in (START_NS - 2 * 10**8, START_NS + 61 * 10**9):
         with pytest.raises(ValueError, match="the tumble is known from 0 to 60 s"):
             at(outside_ns)
+
+
+def test_a_tumble_is_known_a_little_before_its_start():
+    """Torque-free rotation runs backwards with the rates negated."""
+    inertia, rates = np.array([1.0, 2.0, 2.6]), np.array([0.4, 1.2, -0.3])
+    forwards = tumble(inertia, rates, np.array([1.0, 0, 0, 0]), 100.0)
+    backwards = tumble(inertia, -rates, np.array([1.0, 0, 0, 0]), 100.0)
+    np.testing.assert_allclose(forwards(-0.03)[:4], backwards(0.03)[:4], atol=1e-10)
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,8 @@ def hil(*arguments: str) -> subprocess.CompletedProcess:
 
 def test_demo_ends_in_a_report_with_every_frame_across(mission, tmp_path):
     out = tmp_path / "demo"
-    done = hil("demo", "--out", str(out), "--mission", str(mission), "--json")
+    options = ("--mission", str(mission), "--navigation", "perfect", "--json")
+    done = hil("demo", "--out", str(out), *options)
     assert done.returncode == 0, done.stderr
     figures = json.loads(done.stdout)
     assert figures["frames_captured"] == figures["frames_received"] == 15
@@ -53,7 +54,8 @@ def test_demo_ends_in_a_report_with_every_frame_across(mission, tmp_path):
     assert figures["onnx_parity_db"] >= max(45, black_db + 10)  # 45 dB says little of dark pictures
     assert figures["navigation"] == {
         "source": "sgp4",
-        "noise": "none",
+        "errors": "none",
+        "attitude": "known",
         "position_error_m": 0.0,
         "rotation_error_deg": 0.0,
     }
@@ -126,14 +128,18 @@ def test_a_pass_that_stalls_is_an_error(quick, tmp_path, monkeypatch):
 
 def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_path):
     out = tmp_path / "demo"
-    config = PassConfig(link="slcan-fd", scenario="tumbling", real_time=3000.0, navigation_noise=3)
+    config = PassConfig(
+        link="slcan-fd", scenario="tumbling", navigation="realistic", real_time=3000.0, seed=3
+    )
     simulation = simulate_pass(out, quick, SHIPPED, config, Console(stderr=True))
     assert simulation["frames"] == {"captured": 4, "received": 4, "without_valid_pose": 0}
     link = simulation["link"]  # without faults, a CAN bus
     assert link["can_frames_lost"] == link["can_frames_overrun"] == link["segments_resent"] == 0
     # frames of a bracket are a sixth of a millisecond apart, less than storing one takes
     assert 2 <= simulation["camera"]["late_frames"] <= 3
-    assert 0.005 < simulation["navigation"]["position_error_m"] < 0.1
+    # 2 % of 400 m, and in body axes what 4700 degrees of tumbling make of 0.2 %
+    assert 0.01 * 400 < simulation["navigation"]["position_error_m"] < 0.3 * 400
+    assert simulation["navigation"]["clock_error_s"] != 0
     scene = Scene(load_scenario("tumbling"))
     truth = json.loads((out / "session" / "truth" / "truth.json").read_text())
     assert truth["simulation"] == simulation
@@ -144,7 +150,7 @@ def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_pat
         tag = tags[entry["id"]]
         true = scene.state(tag["mid_exposure_utc_ns"]).pose.world_to_camera
         np.testing.assert_allclose(entry["world_to_camera"], true, atol=1e-9)
-        assert 1e-4 < np.abs(np.array(tag["world_to_camera"]) - true).max() < 0.5  # m: navigation errs
+        assert 1 < np.abs(np.array(tag["world_to_camera"]) - true).max() < 20  # m: navigation errs
 
 
 def test_impossible_options_are_refused_before_anything_is_written(mission, tmp_path, monkeypatch, capsys):

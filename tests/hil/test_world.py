@@ -16,13 +16,17 @@ from scipy.spatial.transform import Rotation
 from flightsw.cameras import open_camera
 from flightsw.icd.mission import ConfigError, Mission, load_mission
 from flightsw.icd.quaternion import quat_to_matrix
+from flightsw.icd.tle import orbit_axes
+from flightsw.orbit import propagate
 from flightsw.pose import PoseTagger
 from flightsw.sequencer import plan
 from hil.cameras.virtual import CameraServer
 from hil.world.clock import LONGEST_WAIT_S, SimulatedClock
 from hil.world.navigation import write_flight_inputs
+from hil.world.navigation_errors import draw, stated_sigmas
 from hil.world.scenario import SCENARIOS, load_scenario
-from hil.world.world import World, load_world
+from hil.world.world import World, load_world, told
+from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displaced
 
 NS = 1_000_000_000
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")
@@ -46,7 +50,7 @@ def test_a_scenario_s_mission_has_its_orbits_and_brackets_and_survives_the_file(
     half_width = mission.camera.width / 2 / mission.camera.fx_px
     assert 2 * math.degrees(math.atan(half_width)) == pytest.approx(scenario.fov_deg)
     short = few_brackets(world, 1, 2.0)
-    read = load_mission(write_flight_inputs(short, tmp_path))
+    read = load_mission(write_flight_inputs(short, tmp_path, None).mission_path)
     assert read.navigation.source == f"file://{tmp_path / 'navigation.jsonl'}"
     assert read == dataclasses.replace(short.mission, navigation=read.navigation, sha256=read.sha256)
 
@@ -62,7 +66,7 @@ def lvlh_scenario(folder: Path) -> str:
 def test_flight_tags_frames_of_any_target_with_the_truth(tmp_path, name):
     world = load_world(MISSION, lvlh_scenario(tmp_path) if name == "lvlh" else name)
     world = few_brackets(world, 20, 23.0)
-    mission = load_mission(write_flight_inputs(world, tmp_path))
+    mission = load_mission(write_flight_inputs(world, tmp_path, None).mission_path)
     tagger = PoseTagger(mission)
     for shot in plan(mission):
         tag, true = tagger(shot.mid_exposure_utc_ns), world.pose_at(shot.mid_exposure_utc_ns)
@@ -78,22 +82,118 @@ def test_flight_tags_frames_of_any_target_with_the_truth(tmp_path, name):
     assert tagger.navigation_gaps == 0
 
 
-def test_navigation_errors_are_as_large_as_the_tags_say(tmp_path):
-    """The normalised squared error of a consistent filter has the mean of chi² (Bar-Shalom 2001, 5.4): 6 here."""
-    world = few_brackets(load_world(MISSION, "v-bar"), 1, 2.0)
-    utc_ns = world.mission.orbit.start_utc_ns + NS // 2
-    true = world.pose_at(utc_ns)
-    errors = []
-    for seed in range(100):
-        tagger = PoseTagger(load_mission(write_flight_inputs(world, tmp_path, seed)))
-        tag = tagger(utc_ns)
-        tagger.close()
-        turn = quat_to_matrix(tag.quat_body_to_camera) @ quat_to_matrix(true.quat_body_to_camera).T
-        rotation = Rotation.from_matrix(turn).as_rotvec()
-        error = np.concatenate([tag.position_body_m - true.position_body_m, rotation])
-        errors.append(error @ np.linalg.solve(tag.covariance, error))
-    four_sigma = 4 * math.sqrt(2 * 6 / len(errors))
-    assert np.mean(errors) == pytest.approx(6, abs=four_sigma)
+def errors_at_start(seed: int, latitude_rad: float, rate_rad_s: float) -> np.ndarray:
+    """Return drawn errors in the order of the stated sigmas: position, velocity (RTN), boresight, clock, spin rate."""
+    drawn = draw(400.0, seed)
+
+    def position_m(elapsed_s: float) -> np.ndarray:
+        return drawn.position_rtn_m(latitude_rad + rate_rad_s * elapsed_s, elapsed_s, rate_rad_s)
+
+    velocity_m_s = (position_m(1.0) - position_m(-1.0)) / 2
+    boresight_deg = np.degrees(drawn.boresight_rad)
+    return np.array([*position_m(0.0), *velocity_m_s, *boresight_deg, drawn.clock_s, drawn.spin_rate * 1.5])
+
+
+def test_errors_are_as_large_as_what_is_stated_says():
+    """The mean of squares in units of the stated variances is 1 (consistency of a filter, Bar-Shalom 2001, 5.4)."""
+    rate_rad_s = 1.1e-3
+    stated = stated_sigmas(400.0, np.array([0.0, 1.5, 0.0]), rate_rad_s)
+    sigmas = [
+        *stated.position_m,
+        *stated.velocity_m_s,
+        *[stated.boresight_deg] * 3,
+        stated.clock_s,
+        stated.rate_deg_s[1],
+    ]
+    latitudes = np.random.default_rng(5).uniform(0, 2 * np.pi, 600)
+    squares = np.array([(errors_at_start(i, u, rate_rad_s) / sigmas) ** 2 for i, u in enumerate(latitudes)])
+    four_deviations = 4 * squares.std(axis=0) / math.sqrt(len(squares))
+    assert (np.abs(squares.mean(axis=0) - 1) < four_deviations).all()
+    assert stated.rate_deg_s[0] == stated.focal == stated.attitude_deg == 0
+
+
+def geometry(world: World, times_ns: list[int]) -> dict[str, np.ndarray]:
+    to_body = np.array([world.gcrs_to_body(ns) for ns in times_ns])
+    poses = [world.pose_at(ns) for ns in times_ns]
+    return {
+        "position_m": np.array([b.T @ p.position_body_m for b, p in zip(to_body, poses, strict=True)]),
+        "inertial_to_camera": np.array(
+            [quat_to_matrix(p.quat_body_to_camera) @ b for b, p in zip(to_body, poses, strict=True)]
+        ),
+        "inertial_to_body": to_body,
+    }
+
+
+@pytest.mark.parametrize("name", ["", "v-bar", "tumbling"])
+def test_tags_err_as_the_model_of_shared_errors_says(tmp_path, name):
+    """From the truth, the model that the ground estimates with leads to flight's tags, but for their noise."""
+    world = load_world(MISSION, name)
+    count = 12
+    world = few_brackets(world, count, 60.0)
+    inputs = write_flight_inputs(world, tmp_path, seed=4)
+    mission, errors = load_mission(inputs.mission_path), inputs.errors
+    assert errors is not None
+    start_ns = mission.orbit.start_utc_ns
+    times_ns = [start_ns + i * 60 * NS + NS // 2 for i in range(count)]
+    rate, axes = orbit_axes(mission.orbit.target_tle, start_ns)
+    spin = world.gcrs_to_body(start_ns + NS // 100) @ world.gcrs_to_body(start_ns).T
+    spin_rad_s = -100 * Rotation.from_matrix(spin).as_rotvec()
+    inertia = np.array([1.0, 2.0, 2.6]) if name == "tumbling" else np.ones(3)
+    motion = NominalMotion(
+        (np.array(times_ns) - start_ns) / NS,
+        **geometry(world, times_ns),
+        mean_motion_rad_s=rate,
+        inertial_to_rtn=axes,
+        rate_rad_s=spin_rad_s,
+        inertia=inertia,
+    )
+    state = propagate(mission.orbit.target_tle, start_ns)
+    normal = np.cross(state.position_m, state.velocity_m_s)
+    node = np.cross([0, 0, 1], normal)
+    cosine = node @ state.position_m / np.linalg.norm(node) / np.linalg.norm(state.position_m)
+    latitude = math.acos(cosine) if state.position_m[2] > 0 else 2 * math.pi - math.acos(cosine)
+    at_start = errors.position_rtn_m(latitude, 0.0, rate)
+    before, after = (errors.position_rtn_m(latitude + t * rate, t, rate) for t in (-1.0, 1.0))
+    parameters = SharedParameters(
+        position_m=at_start,
+        velocity_m_s=(after - before) / 2,
+        rate_rad_s=errors.spin_rate * spin_rad_s,
+        boresight_rad=errors.boresight_rad,
+        clock_s=[-errors.clock_s],
+    )
+    expected = displaced(motion, parameters)
+    tagger = PoseTagger(mission)
+    tags = [tagger(ns) for ns in times_ns]
+    tagger.close()
+    turns = []
+    for tag, pose in zip(tags, expected, strict=True):
+        turns.append(Rotation.from_matrix(tag.world_to_camera[:3, :3] @ pose[:3, :3].T).as_rotvec())
+        centre_m = -pose[:3, :3].T @ pose[:3, 3]
+        error_m = np.linalg.norm(tag.position_body_m - centre_m)
+        assert error_m < 0.01 * np.linalg.norm(at_start)
+    noise = math.degrees(np.std(turns))
+    assert 0.012 < noise < 0.03  # 0.02 degrees, of 36 numbers
+    assert np.linalg.norm(tags[0].position_body_m - world.pose_at(times_ns[0]).position_body_m) > 0.01 * 60
+
+
+@pytest.mark.parametrize("knowledge", ["rate_only", "unknown"])
+def test_flight_is_told_no_more_of_the_attitude_than_the_mission_says(tmp_path, knowledge):
+    world = few_brackets(load_world(told(MISSION, knowledge), "tumbling"), 3, 60.0)
+    mission = load_mission(write_flight_inputs(world, tmp_path, None).mission_path)
+    tagger = PoseTagger(mission)
+    start_ns = mission.orbit.start_utc_ns
+    for shot in plan(mission):
+        tag, true = tagger(shot.mid_exposure_utc_ns), world.pose_at(shot.mid_exposure_utc_ns)
+        assert tag.attitude == knowledge
+        free_ns = start_ns if knowledge == "rate_only" else shot.mid_exposure_utc_ns
+        to_body = world.gcrs_to_body(free_ns)
+        np.testing.assert_allclose(to_body @ tag.position_body_m, true.position_body_m, atol=0.05)
+        turn = (
+            quat_to_matrix(tag.quat_body_to_camera) @ to_body.T @ quat_to_matrix(true.quat_body_to_camera).T
+        )
+        assert Rotation.from_matrix(turn).magnitude() < 1e-4
+        np.testing.assert_allclose(to_body @ tag.sun_dir_body, true.sun_dir_body, atol=1e-4)
+    tagger.close()
 
 
 def test_the_same_seed_gives_the_same_errors_and_no_seed_none(tmp_path):
@@ -101,10 +201,11 @@ def test_the_same_seed_gives_the_same_errors_and_no_seed_none(tmp_path):
     world = few_brackets(load_world(MISSION), 2, 5.0)
 
     def states(seed: int | None) -> bytes:
-        return (write_flight_inputs(world, tmp_path, seed).parent / "navigation.jsonl").read_bytes()
+        write_flight_inputs(world, tmp_path, seed)
+        return (tmp_path / "navigation.jsonl").read_bytes()
 
     assert states(1) == states(1) != states(2)
-    mission = load_mission(write_flight_inputs(world, tmp_path))
+    mission = load_mission(write_flight_inputs(world, tmp_path, None).mission_path)
     tagger = PoseTagger(mission)
     for shot in plan(mission):
         tag, true = tagger(shot.mid_exposure_utc_ns), world.pose_at(shot.mid_exposure_utc_ns)

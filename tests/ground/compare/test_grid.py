@@ -203,6 +203,21 @@ def test_a_session_without_truth_cannot_be_exposed_anew(session, tmp_path):
     assert len(given(case, Condition(lost_percent=50))[0]) == 11
 
 
+def test_photographs_become_a_bracket_without_any_truth(session, tmp_path):
+    shutil.copytree(session, tmp_path / "imported", ignore=shutil.ignore_patterns("truth"))
+    case = load_case(tmp_path / "imported")
+    frames = frames_under(case, synthetic_bracket=(0.25, 1.0, 4.0))
+    ratios = [f.exposure_time_s / old.exposure_time_s for f, old in zip(frames, case.training, strict=True)]
+    assert ratios == pytest.approx([0.25, 1.0, 4.0] * 7)
+    for frame, old in list(zip(frames, case.training, strict=True))[::3]:  # those of the shortest exposure
+        expected = (old.dn - case.sensor.black_dn) / 4 + case.sensor.black_dn
+        off = (frame.dn - expected) / case.sensor.variance_dn2(expected).sqrt()
+        assert off.square().mean().sqrt() == pytest.approx(1, abs=0.3)  # noise of its own
+    coded = dataclasses.replace(case, session=dataclasses.replace(case.session, encoding="srgb"))
+    with pytest.raises(CompareError, match="imported are srgb-coded"):
+        given(coded, Condition(synthetic_bracket=(0.25, 1.0)))
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
@@ -224,6 +239,9 @@ def test_conditions_that_do_not_fit_a_session_are_refused(case, changes, told):
         ("a: {noise: 0}", "conditions.a.noise: expected more than 0"),
         ("a: {noise: loud}", "conditions.a.noise: expected a number"),
         ("a: {eclipse: [0.7, 0.4]}", "conditions.a.eclipse: expected two shares"),
+        ("a: {synthetic_bracket: [1, 0]}", "conditions.a.synthetic_bracket: expected numbers above 0"),
+        ("a: {synthetic_bracket: [1, 4], noise: 2}", "leave one out"),
+        ("a: {held_out_sector_deg: 360}", "conditions.a.held_out_sector_deg: expected 0 to less than 360"),
         ("a: {lost_percent: 100}", "expected 0 to less than 100"),
         ("a: {set: {growth.intervall: 60}}", "growth.intervall: unknown key"),
         ("a: {set: {growth.interval: 0}}", "growth.interval must be at least 1"),

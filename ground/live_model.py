@@ -1,0 +1,75 @@
+"""The model that a live reconstruction shows: the best so far by the held-out frames that have come."""
+
+import logging
+import math
+import shutil
+from pathlib import Path
+
+import torch
+
+from ground.arrivals import Arrivals
+from ground.cameras import cameras_of, median_sun_direction, predicted_image, sensor_of
+from ground.model_files import exposure_times_s
+from ground.runs import is_live
+from obbgs_core.io.ply import save_ply
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.score.metrics import psnr_db
+
+log = logging.getLogger(__name__)
+SCORED = 16  # held-out frames at most, spread evenly over those that have come
+
+
+class ShownModel:
+    """Renews model.ply in a run's folder when a model is better than the one that is there.
+
+    held_out_db: mean PSNR of that one against held-out frames; NaN before the first of them.
+    """
+
+    def __init__(self, folder: Path, arrivals: Arrivals):
+        self.gaussians: Gaussians | None = None
+        self.step: int | None = None  # of the training, that the shown model is of
+        self.offered_step: int | None = None  # of the last model that was offered
+        self.held_out_db = math.nan
+        self._folder, self._arrivals = folder, arrivals
+        self._images: dict[int, torch.Tensor] = {}  # held-out frames [H, W, C] as fractions of full scale
+
+    def offer(self, gaussians: Gaussians, step: int) -> bool:
+        """Show a model, unless the shown one is better by the same held-out frames; return whether it was shown."""
+        self.offered_step, offered_db = step, self.score_db(gaussians)
+        if self.gaussians is not None:
+            self.held_out_db = self.score_db(self.gaussians)
+            if self.held_out_db > offered_db:
+                return False
+        gaussians = gaussians.trainable().detach()  # a copy: training goes on in place
+        try:
+            self._write(gaussians)
+        except OSError as error:  # a full disk must not end the training
+            log.warning("step %d: %s cannot be renewed: %s", step, self._folder / "model.ply", error)
+            return False
+        self.gaussians, self.step, self.held_out_db = gaussians, step, offered_db
+        return True
+
+    def score_db(self, gaussians: Gaussians) -> float:
+        """Return the mean PSNR of a model against held-out frames, noisy as they came; NaN without such frames."""
+        session, held_out = self._arrivals.session, self._arrivals.held_out
+        if session is None or not held_out:
+            return math.nan
+        sensor, values = sensor_of(session.camera), []
+        for record in held_out[:: math.ceil(len(held_out) / SCORED)]:
+            if record.id not in self._images:
+                dn = torch.from_numpy(session.dn(record).astype("float32"))
+                self._images[record.id] = dn.reshape(*dn.shape[:2], -1) / sensor.white_dn
+            predicted = predicted_image(gaussians, session, record, sensor, record.exposure_time_s)
+            values.append(psnr_db(predicted, self._images[record.id]))
+        return math.fsum(values) / len(values)
+
+    def _write(self, gaussians: Gaussians) -> None:
+        session, training = self._arrivals.session, self._arrivals.training
+        assert session is not None
+        if self._folder.exists() and not is_live(self._folder):
+            shutil.rmtree(self._folder)  # a finished run that may be replaced
+        self._folder.mkdir(parents=True, exist_ok=True)
+        sensor = sensor_of(session.camera)
+        white_radiance = sensor.full_scale_radiance(exposure_times_s(training)[0])
+        sun_dir, cameras = median_sun_direction(training), cameras_of(session, training)
+        save_ply(gaussians, self._folder / "model.ply", white_radiance, sun_dir, cameras)

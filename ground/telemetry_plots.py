@@ -1,0 +1,117 @@
+"""The spacecraft's housekeeping over time, as figures with the limits of the telemetry dictionary in colour."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+
+from flightsw.icd.telemetry import DICTIONARY, Item
+
+LIMIT_COLOURS = {"green": "#1f6feb", "yellow": "#d99a00", "red": "#c0392b"}
+SHOWN = (  # the items that say how a pass went; telemetry.jsonl holds all of them
+    *("frames_stored", "outbox_frames", "delivered", "frames_failed", "frames_refused", "frames_dropped"),
+    *("segments_resent", "crc_errors", "hang_ups", "disk_free_bytes", "cpu_percent", "rss_bytes"),
+)
+COLUMNS = 3
+ROW_PX = 170
+BYTES_PER_MB = 1e6
+
+
+@dataclass(frozen=True)
+class Series:
+    """One number of the housekeeping packets over time."""
+
+    item: Item
+    seconds: np.ndarray  # [N] since the first packet, by the spacecraft's clock
+    values: np.ndarray  # [N]
+
+    @property
+    def limits(self) -> list[str]:
+        """The limit that each value keeps or breaks: green, yellow or red."""
+        return [self.item.limit(value) for value in self.values.tolist()]
+
+
+def housekeeping_series(session: Path) -> list[Series]:
+    """Return the numbers of a session's housekeeping that are shown, in order of time; none without telemetry.
+
+    Lines that are damaged or lack an item are left out: telemetry is shown as far as it can be read.
+    """
+    lines = _housekeeping(session / "telemetry.jsonl")
+    if not lines:
+        return []
+    utc_ns = np.array([line["utc_ns"] for line in lines])
+    order = np.argsort(utc_ns, kind="stable")
+    seconds = (utc_ns[order] - utc_ns.min()) / 1e9
+    layout = DICTIONARY.telemetry["housekeeping"]
+    values = {name: np.array([float(line[name]) for line in lines])[order] for name in SHOWN}
+    return [Series(layout.item(name), seconds, values[name]) for name in SHOWN]
+
+
+def telemetry_figure(series: list[Series]) -> go.Figure:
+    """Return one small plot for each series; values beyond a limit are yellow or red, the limits are lines."""
+    rows = -(-len(series) // COLUMNS)
+    titles = [f"{each.item.name.replace('_', ' ')}{_unit(each.item)}" for each in series]
+    figure = make_subplots(
+        rows=rows, cols=COLUMNS, subplot_titles=titles, vertical_spacing=0.35 / rows, horizontal_spacing=0.07
+    )
+    for i, each in enumerate(series):
+        place: dict[str, Any] = {"row": i // COLUMNS + 1, "col": i % COLUMNS + 1}
+        factor = BYTES_PER_MB if each.item.unit == "B" else 1.0
+        figure.add_scatter(
+            x=each.seconds,
+            y=each.values / factor,
+            mode="lines+markers",
+            line={"color": "#b9c4d0", "width": 1, "shape": "hv"},
+            marker={"size": 4, "color": [LIMIT_COLOURS[limit] for limit in each.limits]},
+            hovertemplate="%{y:,} after %{x:.0f} s<extra></extra>",
+            showlegend=False,
+            **place,
+        )
+        for limit, bounds in (("yellow", each.item.yellow), ("red", each.item.red)):
+            for bound in bounds:
+                if _is_near(bound, each.values):
+                    line = {"color": LIMIT_COLOURS[limit], "width": 1, "dash": "dot"}
+                    figure.add_hline(y=bound / factor, line=line, **place)
+        if each.values.min() == each.values.max():  # a scale of thousandths around a constant says nothing
+            value = each.values[0] / factor
+            figure.update_yaxes(range=[value - max(1.0, abs(value)), value + max(1.0, abs(value))], **place)
+    figure.update_annotations(font_size=12)
+    figure.update_layout(height=ROW_PX * rows + 30, margin={"l": 40, "r": 15, "t": 30, "b": 25})
+    return figure
+
+
+def broken_limits(series: list[Series]) -> list[tuple[str, str]]:
+    """Return the name of each item that broke a limit, and the worst limit it broke."""
+    worst = {each.item.name: max(each.limits, key=("green", "yellow", "red").index) for each in series}
+    return [(name, limit) for name, limit in worst.items() if limit != "green"]
+
+
+def _housekeeping(path: Path) -> list[dict]:
+    if not path.exists():
+        return []
+    kept = []
+    for line in path.read_bytes().split(b"\n"):
+        try:
+            values = json.loads(line)
+        except ValueError:
+            continue
+        if not isinstance(values, dict) or values.get("packet") != "housekeeping":
+            continue
+        if all(type(values.get(name)) in (int, float) for name in ("utc_ns", *SHOWN)):
+            kept.append(values)
+    return kept
+
+
+def _unit(item: Item) -> str:
+    return f", {'MB' if item.unit == 'B' else item.unit}" if item.unit else ""
+
+
+def _is_near(bound: float, values: np.ndarray) -> bool:
+    """Return whether a limit is near enough to the values to be drawn without hiding how they change."""
+    low, high = float(values.min()), float(values.max())
+    reach = max(high - low, 0.5 * abs(high), 1.0)
+    return low - reach <= bound <= high + reach

@@ -1,0 +1,242 @@
+"""The motion of a target whose attitude nobody knows, from the frames of a pass alone."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from obbgs_base.errors import Interrupted
+from obbgs_core.attitude import search
+from obbgs_core.attitude.motion import SPIN, TUMBLE, attitudes, inertia, principal
+from obbgs_core.attitude.outlines import outlines
+from obbgs_core.attitude.refine import difference_steps, refined, spread
+from obbgs_core.attitude.views import Views, views
+from obbgs_core.errors import ReconstructionError
+from obbgs_core.frames import TrainingFrame
+from obbgs_core.sensor import Sensor
+
+log = logging.getLogger(__name__)
+COARSE, FINE = 16, 32  # cells across the pictures of the grid search, and of the refinement
+FEWEST_VIEWS = 2 * search.ARC
+ARCS = (
+    (0.5, 1),
+    (0.25, 1),
+    (0.75, 1),
+    (0.5, 3),
+)  # middle of the first arc as a share of the pass, views skipped
+UNRELATED = 12  # random motions whose disagreement shows what no relation looks like
+EXPLAINED = 0.15  # a motion explains the outlines when it leaves less than this share of that disagreement
+TUMBLES = 0.9  # a tumble is believed when it leaves less than this share of what a steady spin leaves
+LARGEST_SIGMA_DEG = 5.0  # of the attitude in the mean of the pass; with more it counts as not determined
+POLISHING = 8  # steps
+
+
+class AttitudeUndetermined(ReconstructionError):
+    """The frames do not determine the target's attitude; the message says why."""
+
+
+@dataclass(frozen=True)
+class TargetMotion:
+    """How a target rotates, in its own axes.
+
+    parameters: [3] of a steady spin or [8] of a tumble at time 0, in the inertial axes (`obbgs_core.attitude.motion`).
+    covariance: of the parameters.
+    epoch_to_body: [3, 3] rotation from the inertial axes at time 0 to the target's axes: of a spin, z is along the
+        angular velocity; of a tumble they are the principal axes by rising moment.
+    disagreement: of the outlines, as a share of what unrelated motions leave.
+    views: number of outlines that were compared.
+    """
+
+    parameters: np.ndarray
+    covariance: np.ndarray
+    epoch_to_body: np.ndarray
+    disagreement: float
+    views: int
+
+    @property
+    def tumbles(self) -> bool:
+        """Whether the angular velocity changes, as that of a torque-free body of unequal moments does."""
+        return len(self.parameters) == TUMBLE
+
+    def inertial_to_body(self, times_s: np.ndarray) -> np.ndarray:
+        """Return the attitudes [N, 3, 3] at times from the epoch."""
+        return self.epoch_to_body @ attitudes(self.parameters[None], times_s)[0]
+
+    def facts(self) -> dict:
+        """Return spin axis, rate and inertia ratios with standard deviations, in degrees, for a report.
+
+        The axis is that of the angular momentum, which stands still in inertial axes; of a spin it is the axis of
+        rotation. The rate is that at time 0.
+        """
+
+        def derived(parameters: np.ndarray) -> np.ndarray:
+            momentum = inertia(parameters) @ parameters[:SPIN]
+            rate = np.degrees(parameters[:SPIN])
+            ratios = principal(parameters).moments[:2] if self.tumbles else np.zeros(0)
+            return np.concatenate([momentum / np.linalg.norm(momentum), [np.linalg.norm(rate)], rate, ratios])
+
+        sigmas = np.sqrt(np.diag(self.covariance))
+        small = 1e-4 * np.maximum(sigmas, 1e-12)
+        value = derived(self.parameters)
+        J = np.stack([(derived(self.parameters + d) - value) / d.sum() for d in np.diag(small)], axis=1)
+        sigma = np.sqrt(np.diag(J @ self.covariance @ J.T))
+        return {
+            "kind": "tumble" if self.tumbles else "spin",
+            "axis_inertial": value[:3].round(6).tolist(),
+            "axis_sigma_deg": float(np.degrees(np.linalg.norm(sigma[:3]))),
+            "rate_deg_s": float(value[3]),
+            "rate_sigma_deg_s": float(sigma[3]),
+            "period_s": float(360 / value[3]),
+            "rate_inertial_deg_s": value[4:7].tolist(),
+            "rate_inertial_sigma_deg_s": sigma[4:7].tolist(),
+            "inertia_ratios": value[7:].tolist(),
+            "inertia_ratios_sigma": sigma[7:].tolist(),
+            "outlines_compared": self.views,
+            "disagreement": self.disagreement,
+        }
+
+
+def estimate_motion(
+    frames: list[TrainingFrame],
+    times_s: np.ndarray,
+    sensor: Sensor,
+    on_progress: Callable[[str, float], None] = lambda what, share: None,
+    should_stop: Callable[[], bool] = lambda: False,
+    seed: int = 0,
+) -> TargetMotion:
+    """Return the motion that makes the outlines of a pass agree on one body.
+
+    Args:
+        frames: with poses and Sun relative to inertial axes through the target's centre of mass.
+        times_s: [N] of the frames; time 0 is the reference epoch.
+        on_progress: called with what is being done and the share of it that is done.
+
+    Raises:
+        AttitudeUndetermined: too few frames show light, no motion explains them, or several do.
+        Interrupted: should_stop returned true.
+    """
+    found, radius_m = outlines(frames, sensor, FINE)
+    if len(found) < FEWEST_VIEWS:
+        raise AttitudeUndetermined(
+            f"the target's attitude is not known and cannot be found: {len(found)} brackets show light (eclipse, or "
+            f"exposures too short), at least {FEWEST_VIEWS} are needed"
+        )
+    order = sorted(found, key=lambda i: times_s[i])
+    silhouettes, at_s = [found[i] for i in order], times_s[order]
+    coarse, fine = (views(silhouettes, at_s, radius_m, cells) for cells in (COARSE, FINE))
+    unrelated = _unrelated_cost(fine, seed)
+    best: list[search.Candidate] = []
+    for middle, stride in ARCS:
+        arc = _arc(len(fine), middle, stride)
+        if arc is None:
+            continue
+
+        def report(what: str, share: float) -> None:
+            if should_stop():
+                raise Interrupted(
+                    "interrupted while the target's attitude was searched; nothing of it is kept"
+                )
+            on_progress(what, share)
+
+        candidates = search.searched(coarse, fine, arc, report)
+        best = _ranked([*best, *candidates], fine)
+        log.info(
+            "from view %d: %s of the unrelated disagreement", arc[len(arc) // 2], best[0].cost / unrelated
+        )
+        if best[0].cost < EXPLAINED * unrelated:
+            break
+    return _judged(best, fine, unrelated, seed)
+
+
+def _arc(count: int, middle: float, stride: int) -> np.ndarray | None:
+    """Return the indices of the views of a first arc; None where the pass is too short for it."""
+    half = search.ARC // 2 * stride
+    if 2 * half + 1 > count:
+        return None
+    centre = int(np.clip(round(middle * (count - 1)), half, count - 1 - half))
+    return centre + stride * np.arange(-(search.ARC // 2), search.ARC // 2 + 1)
+
+
+def _unrelated_cost(fine: Views, seed: int) -> float:
+    """Return the median cost of random spins of up to half a turn from view to view."""
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(UNRELATED, 3))
+    turns = rng.uniform(0.1, np.pi, UNRELATED) / np.median(np.diff(fine.times_s))
+    rates = directions / np.linalg.norm(directions, axis=1, keepdims=True) * turns[:, None]
+    return float(np.median(refined(fine, rates, 0)[1]))
+
+
+def _ranked(candidates: list[search.Candidate], fine: Views) -> list[search.Candidate]:
+    """Return the different candidates, best first, their costs taken on the same rays of all views."""
+    scored = [
+        search.Candidate(c.parameters, float(refined(fine, c.parameters[None], 0)[1][0])) for c in candidates
+    ]
+    return search.distinct(scored, fine)
+
+
+def _judged(best: list[search.Candidate], fine: Views, unrelated: float, seed: int) -> TargetMotion:
+    """Return the best candidate, polished, as a spin if that explains the outlines as well as a tumble.
+
+    Raises:
+        AttitudeUndetermined: nothing explains the outlines, or different motions do.
+    """
+    polished = []
+    for candidate in best[:2]:
+        for size in (SPIN, TUMBLE):
+            moved, cost = refined(fine, candidate.parameters[None, :size], POLISHING, seed)
+            polished.append(search.Candidate(moved[0], float(cost[0])))
+    ranked = search.distinct(polished, fine)
+    first = ranked[0]
+    spins = [c for c in polished if len(c.parameters) == SPIN]
+    steady = min(spins, key=lambda c: c.cost)
+    if first.cost > TUMBLES * steady.cost:
+        first = steady
+    share = first.cost / unrelated
+    if share >= EXPLAINED:
+        raise AttitudeUndetermined(
+            "the target's attitude is not known and cannot be found: no spin and no torque-free tumble with at least "
+            f"eight brackets a turn makes the outlines of {len(fine)} brackets agree (the best leaves {share:.0%} of "
+            "the disagreement of unrelated motions). The target may look alike from all sides, turn faster than the "
+            "brackets follow, or not turn freely; take brackets more often, or give its attitude"
+        )
+    others = [
+        c
+        for c in ranked
+        if c.cost < first.cost / TUMBLES and search.apart_rad(c, first, fine) > search.APART_RAD
+    ]
+    if others:
+        apart = np.degrees(search.apart_rad(others[0], first, fine))
+        raise AttitudeUndetermined(
+            f"the target's attitude is not known and cannot be found: two motions, {apart:.0f} degrees apart, explain "
+            f"the outlines of {len(fine)} brackets equally well. The target may be too symmetric, or seen from one "
+            "side only; take brackets from more directions, or give its attitude"
+        )
+    covariance = spread(fine, first.parameters, seed)
+    sigma_deg = float(np.degrees(_attitude_sigma_rad(first.parameters, covariance, fine.times_s)))
+    if sigma_deg > LARGEST_SIGMA_DEG:
+        raise AttitudeUndetermined(
+            "the target's attitude is not known and cannot be found: the outlines leave it open by "
+            f"{sigma_deg:.0f} degrees in the mean of the pass, as those of a body that is round about its axis do; "
+            "give its attitude"
+        )
+    return TargetMotion(first.parameters, covariance, _own_axes(first.parameters), share, len(fine))
+
+
+def _attitude_sigma_rad(parameters: np.ndarray, covariance: np.ndarray, times_s: np.ndarray) -> float:
+    """Return the standard deviation of the attitude, rad, root mean square over the times."""
+    small = difference_steps(parameters, times_s, 1e-4)
+    body = attitudes(np.concatenate([parameters[None], parameters + np.diag(small)]), times_s)
+    slopes = ((body[1:] - body[0]) / small[:, None, None, None]).reshape(len(parameters), -1)
+    # a small turn changes the nine entries of a rotation by the square root of two times its angle
+    return float(np.sqrt(np.einsum("kn,kl,ln->", slopes, covariance, slopes) / 2 / len(times_s)))
+
+
+def _own_axes(parameters: np.ndarray) -> np.ndarray:
+    """Return the rotation [3, 3] from the inertial axes at the epoch to the target's own."""
+    if len(parameters) == TUMBLE:
+        return principal(parameters).axes.T
+    z = parameters / max(np.linalg.norm(parameters), 1e-12)
+    helper = np.eye(3)[int(np.argmin(np.abs(z)))]
+    x = np.cross(helper, z) / np.linalg.norm(np.cross(helper, z))
+    return np.stack([x, np.cross(z, x), z])

@@ -1,0 +1,115 @@
+"""The free rotation of a rigid body, with few parameters: from an angular velocity and an inertia to attitudes.
+
+The body axes are defined as the inertial axes at the reference epoch, time 0, so that the attitude at that epoch is
+the identity and no parameter. A steady spin has three parameters, the angular velocity at the epoch (rad/s). A
+torque-free tumble has five more: the logarithm of the second moments of the body's mass, a symmetric matrix without
+trace, as only ratios of moments show in the motion. Any such matrix belongs to a body that can exist.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+SPIN, TUMBLE = 3, 8  # numbers of parameters
+TOLERANCE = 1e-7  # of the integrated attitude, rad for each step
+# an orthonormal basis [5, 3, 3] of the symmetric matrices without trace
+_SHAPES = np.zeros((5, 3, 3))
+_SHAPES[0] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2)
+_SHAPES[1] = np.diag([1.0, 1.0, -2.0]) / np.sqrt(6)
+for _index, (_i, _j) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
+    _SHAPES[_index, _i, _j] = _SHAPES[_index, _j, _i] = 1 / np.sqrt(2)
+
+
+@dataclass(frozen=True)
+class Principal:
+    """Principal moments [3], the largest 1, in rising order, and their axes, the columns of [3, 3], body frame."""
+
+    moments: np.ndarray
+    axes: np.ndarray
+
+
+def inertia(parameters: np.ndarray) -> np.ndarray:
+    """Return inertia matrices [..., 3, 3], of trace 1, of parameters [..., 8]; of a spin [..., 3] that of a ball."""
+    if parameters.shape[-1] == SPIN:
+        return np.broadcast_to(np.eye(3) / 3, (*parameters.shape[:-1], 3, 3)).copy()
+    values, axes = np.linalg.eigh(np.einsum("...k,kij->...ij", parameters[..., SPIN:], _SHAPES))
+    mass = np.exp(values - values.max(axis=-1, keepdims=True))
+    mass /= 2 * mass.sum(axis=-1, keepdims=True)
+    moments = mass.sum(axis=-1, keepdims=True) - mass
+    return np.einsum("...ik,...k,...jk->...ij", axes, moments, axes)
+
+
+def principal(parameters: np.ndarray) -> Principal:
+    """Return the principal moments and axes of parameters [8]."""
+    moments, axes = np.linalg.eigh(inertia(parameters))
+    return Principal(moments / moments[2], axes * np.sign(np.linalg.det(axes)))
+
+
+def attitudes(parameters: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    """Return the rotations from inertial to body axes [B, N, 3, 3] of motions [B, 3 or 8] at times [N] from the epoch.
+
+    Source: Euler's equations I dω/dt = Iω x ω in body axes, and dq/dt = q (0, ω) / 2 (Markley and Crassidis,
+    Fundamentals of Spacecraft Attitude Determination and Control, 2014).
+    """
+    if parameters.shape[-1] == SPIN:
+        turns = parameters[:, None, :] * times_s[None, :, None]
+        return Rotation.from_rotvec(-turns.reshape(-1, 3)).as_matrix().reshape(*turns.shape, 3)
+    count = len(parameters)
+    moments = inertia(parameters)
+    inverse = np.linalg.inv(moments)
+
+    def derivative(_: float, flat: np.ndarray) -> np.ndarray:
+        state = flat.reshape(count, 7)
+        q, rate = state[:, :4], state[:, 4:]
+        w, v = q[:, :1], q[:, 1:]
+        momentum = np.einsum("bij,bj->bi", moments, rate)
+        return np.concatenate(
+            [
+                -0.5 * (v * rate).sum(axis=1, keepdims=True),
+                0.5 * (w * rate + np.cross(v, rate)),
+                np.einsum("bij,bj->bi", inverse, np.cross(momentum, rate)),
+            ],
+            axis=1,
+        ).ravel()
+
+    start = np.concatenate([np.tile([1.0, 0, 0, 0], (count, 1)), parameters[:, :SPIN]], axis=1).ravel()
+    quats = np.zeros((count, len(times_s), 4))
+    quats[:, :, 0] = 1
+    for sign in (1, -1):
+        ahead = np.flatnonzero(sign * times_s > 0)
+        if len(ahead) == 0:
+            continue
+        ahead = ahead[np.argsort(sign * times_s[ahead], kind="stable")]
+        asked, place = np.unique(sign * times_s[ahead], return_inverse=True)
+        solved = solve_ivp(
+            derivative,
+            (0.0, sign * asked[-1]),
+            start,
+            method="DOP853",
+            t_eval=sign * asked,
+            rtol=TOLERANCE,
+            atol=TOLERANCE * np.tile([1.0] * 4 + [1e-2] * 3, count),
+        )
+        if not solved.success:
+            raise ValueError(
+                f"the motion cannot be integrated: {solved.message}; parameters {parameters.tolist()}"
+            )
+        quats[:, ahead] = solved.y.reshape(count, 7, -1)[:, :4].transpose(0, 2, 1)[:, place]
+    body_to_inertial = Rotation.from_quat(quats.reshape(-1, 4)[:, [1, 2, 3, 0]]).as_matrix()
+    return body_to_inertial.reshape(count, len(times_s), 3, 3).swapaxes(-1, -2)
+
+
+def at_epoch(parameters: np.ndarray, epoch_s: float) -> np.ndarray:
+    """Return the parameters [3 or 8] of the same motion for a reference epoch `epoch_s` later, or earlier if negative.
+
+    The body axes become the inertial axes at the new epoch; the angular momentum stands still in inertial axes.
+    """
+    if len(parameters) == SPIN:
+        return parameters.copy()
+    body = attitudes(parameters[None], np.array([epoch_s]))[0, 0]
+    moments = inertia(parameters)
+    rate = np.linalg.solve(body.T @ moments @ body, moments @ parameters[:SPIN])
+    shape = body.T @ np.einsum("k,kij->ij", parameters[SPIN:], _SHAPES) @ body
+    return np.concatenate([rate, np.einsum("kij,ij->k", _SHAPES, shape)])

@@ -1,0 +1,116 @@
+"""More frames for a training that is under way: what was learnt is kept, and the start is carved again."""
+
+import dataclasses
+import logging
+
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.start import hull
+from obbgs_core.train.adam import Adam
+from obbgs_core.train.appearance import SUN_FROM
+from obbgs_core.train.batches import FrameOrder
+from obbgs_core.train.config import MethodConfig
+from obbgs_core.train.decisions import smooth
+from obbgs_core.train.growth import Growth
+from obbgs_core.train.parsimony import padded_to
+from obbgs_core.train.setup import TOO_FEW_BRACKETS, UNTESTED, TrainingSetup
+from obbgs_core.train.state import TrainingState
+from obbgs_core.train.validation import every_seventh_bracket
+
+log = logging.getLogger(__name__)
+# A Gaussian stays while so many of the silhouettes see light near its centre: fewer than carve the hull, because
+# training has moved it to where it explains the pictures.
+STAYING_AGREEMENT = 0.7
+NEW_SPACINGS = 2.0  # a new point of the hull becomes a Gaussian where none is within so many of its spacings
+
+
+def check_joinable(config: MethodConfig) -> None:
+    """Refuse a method whose training cannot take in frames on its way.
+
+    Raises:
+        ValueError: such a method.
+    """
+    if not config.exposure_aware or config.compensation or config.coarse:
+        raise ValueError(
+            f"no frames can join a training of {config.name}: it must know exposure times, learn no colours of single "
+            "frames and have no coarse stages, as obbgs"
+        )
+
+
+def join(
+    setup: TrainingSetup, state: TrainingState, joined: TrainingSetup, fresh: TrainingState, hold: float
+) -> None:
+    """Change the state of a training so that it goes on with more frames.
+
+    Gaussians stay where the silhouettes of all frames still see light. Of the start that was carved of all frames those
+    are added that are on no surface of the earlier start and where the model has nothing. The schedule is set back to
+    the share `hold` of the steps, or to where the Sun is tested if only now it is known to move.
+
+    Args:
+        setup: of the training so far.
+        joined: of all frames; it begins with those of `setup`, in their order.
+        fresh: the state in which a training of `joined` would start.
+    """
+    config, gaussians = joined.config, state.gaussians.detach()
+    position = min(state.steps_done, round(config.steps_until(hold)))
+    if joined.sun_moves and not setup.sun_moves and config.light.sh_degree == 0:
+        position = min(position, max(0, round(config.steps_until(SUN_FROM)) - 1))
+        # a direction that was chosen while the Sun stood still is chosen again
+        gaussians = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1].contiguous(), shading="view")
+        state.adam = Adam(gaussians)
+    kept = torch.nonzero(_stays(gaussians, joined))[:, 0]
+    old, start = gaussians.select(kept), fresh.gaussians.detach()
+    added = torch.nonzero(_is_new(start, setup.start_means, old.means))[:, 0]
+    added = added[: max(0, config.growth.max_gaussians - len(kept))]
+    new = dataclasses.replace(start.select(added), sh=padded_to(start.sh[added], gaussians.sh.shape[1]))
+    log.info(
+        "%d frames: %d of %d Gaussians stay on the hull, %d join them",
+        *(len(joined.frames), len(kept), len(gaussians), len(new)),
+    )
+    state.gaussians = Gaussians.concatenate([old, new]).trainable()
+    state.adam.follow(kept, len(new))
+    state.growth, state.boxes, state.shadows = Growth.of(len(state.gaussians)), [], fresh.shadows
+    if state.poses is not None:
+        state.poses = state.poses.extended(joined.frames)
+    elif state.poses_decided in UNTESTED or fresh.poses is not None:
+        state.poses, state.poses_aligned, state.poses_decided = (
+            fresh.poses,
+            fresh.poses_aligned,
+            fresh.poses_decided,
+        )
+    withhold(joined, state)
+    smooth(joined, state)
+    state.steps_done = position
+
+
+def withhold(setup: TrainingSetup, state: TrainingState) -> None:
+    """Draw from all frames, but for every seventh bracket until it is decided whether poses are refined.
+
+    Brackets keep their numbers when others follow, so those that decide have never been trained on.
+    """
+    withheld = every_seventh_bracket(setup.frames) if state.poses_decided in ("", TOO_FEW_BRACKETS) else []
+    state.order = FrameOrder.of(setup.frames, setup.config.bracket_steps, withheld, state.order.turn)
+
+
+def release(setup: TrainingSetup, state: TrainingState, hold: float) -> None:
+    """Train on the withheld brackets too where they stayed too few for a decision, because no frames follow."""
+    if state.poses_decided == TOO_FEW_BRACKETS and state.order.validation_brackets:
+        state.order = FrameOrder.of(setup.frames, setup.config.bracket_steps, [], state.order.turn)
+        state.steps_done = min(state.steps_done, round(setup.config.steps_until(hold)))
+
+
+def _stays(gaussians: Gaussians, setup: TrainingSetup) -> Tensor:
+    """Return which Gaussians [N] lie where enough silhouettes see light near their centres; all if none do."""
+    reach_m = setup.radius_m / hull.COARSE_VOXELS
+    stays = hull.agreement(list(setup.outlines.values()), gaussians.means, reach_m) >= STAYING_AGREEMENT
+    return stays if stays.any() else torch.ones_like(stays)
+
+
+def _is_new(start: Gaussians, earlier_means: Tensor, means: Tensor) -> Tensor:
+    """Return which of the first Gaussians [N] are far from the centres of an earlier start and from a model's."""
+    distances = [KDTree(m.numpy()).query(start.means.numpy())[0] for m in (earlier_means, means)]
+    nearest_m = torch.from_numpy(distances[0]).minimum(torch.from_numpy(distances[1]))
+    return nearest_m > NEW_SPACINGS * start.scales[:, 0]
