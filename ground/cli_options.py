@@ -31,6 +31,7 @@ class ImportFormat(StrEnum):
     NERFSTUDIO = "nerfstudio"
     COLMAP = "colmap"
     SHIRT = "shirt"
+    IMAGES = "images"
 
 
 class PixelValues(StrEnum):
@@ -53,6 +54,15 @@ class ExportFormat(StrEnum):
 
     NERF = "nerf"
     NERFSTUDIO = "nerfstudio"
+
+
+class MeshFormatName(StrEnum):
+    """Formats of meshes."""
+
+    GLB = "glb"
+    OBJ = "obj"
+    STL = "stl"
+    PLY = "ply"
 
 
 class UplinkCommand(StrEnum):
@@ -84,6 +94,15 @@ BackgroundGiven = Annotated[
         "--background",
         help="What is seen where the target is not; transparent pictures are put on it. Default: white for transparent "
         "pictures of the format nerf, otherwise black.",
+    ),
+]
+PoseSigmaGiven = Annotated[
+    str | None,
+    typer.Option(
+        "--pose-sigma",
+        metavar="DEG,M",
+        help="How far the poses can err, as standard deviations in degrees and metres; the training "
+        "corrects them within it. Default: exact poses; for the format images what its features say.",
     ),
 ]
 # of `ground reconstruct`

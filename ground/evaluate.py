@@ -1,5 +1,6 @@
 """The scores of a finished run: against its held-out frames and, where a simulator left it, against the truth."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -9,6 +10,7 @@ import torch
 
 from ground.cameras import camera_of, exposed, predicted_image
 from ground.card import model_card
+from ground.estimated_poses import Alignment, read_estimate, settled_records
 from ground.intervals import interval_scores
 from ground.runs import Run, open_run, written_to
 from ground.scores import ScoredView, clean_scores, cloud_scores, display_scores, noisy_psnr_db
@@ -16,6 +18,7 @@ from ground.session import FrameRecord
 from ground.training_frames import split, training_frame
 from ground.truth import Truth, read_points
 from obbgs_base.files import write_whole
+from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
 
@@ -33,8 +36,12 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     - interval_90_noisy, and with truth interval_90_clean and interval_90_half_width: how often the model's intervals
       hold, as in `interval_scores`; only where frames are held out and exposure times are known.
 
+    Where the training refined its poses, the scored frames are compared from poses that are settled on each of them,
+    with the model fixed, and not from their tags; `scored_poses` is then "settled".
+
     With a simulator's truth also, from true poses, so that errors of the scored frames' pose tags do not count as
-    errors of the model:
+    errors of the model. Where the training refined its poses, the model is moved rigidly first, so that the estimated
+    poses of the training are nearest to the true ones:
 
     - psnr_clean_db, ssim_clean, lpips_clean (AlexNet; where its weights were fetched): against noiseless exposures.
     - psnr_clean_<exposure>_db, psnr_clean_pooled_db, psnr_clean_foreground_db: as in `clean_scores`.
@@ -42,47 +49,65 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     - psnr_radiance_db: of scene-linear radiance, the brightest true pixel of a frame as 1.
     - chamfer, hausdorff, accuracy, completeness: of the Gaussians' centres, in units where the target's largest
       dimension is 2; the same with _surface: of the points in surface.ply.
+    - psnr_clean_settled_db: from the settled poses; pose_error_deg, pose_error_range (of the range), pose_error_px: of
+      the training's estimated poses, root mean squares, and pose_error_tagged_... of its tags; only of refined poses.
 
     Raises:
         SessionError: no such session or run, damaged metrics or truth, or a run folder that cannot be written.
     """
     run = open_run(session_dir, name, out)
-    figures = {
-        "psnr_noisy_db": noisy_psnr_db((_image(run, record), _noisy(run, record)) for record in run.scored)
+    estimate, shown = read_estimate(run.folder), run.scored
+    if estimate is not None:
+        shown = settled_records(run.gaussians, run.session, run.scored, run.sensor, estimate)
+    figures: dict[str, float] = {
+        "psnr_noisy_db": noisy_psnr_db((_image(run, record), _noisy(run, record)) for record in shown)
     }
     if run.session.frames_imported is not None and run.session.camera.channels == 3:
-        pairs = ((_image(run, record), _noisy(run, record)) for record in run.scored)
+        pairs = ((_image(run, record), _noisy(run, record)) for record in shown)
         figures |= display_scores(pairs, run.sensor, run.session.encoding)
-    if Truth.exists(run.session):
-        truth = Truth(run.session)
-        records = list(map(truth.posed, run.scored))
-        figures |= clean_scores([_scored(run, truth, record) for record in records])
-        figures |= _radiance_figures(run, truth, records)
-        surface = np.zeros((0, 3))
-        if (run.folder / "surface.ply").exists():
-            surface = read_points(run.folder / "surface.ply")
-        centres = run.gaussians.means.double().numpy()
-        figures |= cloud_scores(centres, surface, truth.cloud_m, 2 / truth.largest_dimension_m)
+    truth = Truth(run.session) if Truth.exists(run.session) else None
+    if truth is not None:
+        motion = None
+        if estimate is not None:
+            alignment = Alignment.of(estimate, run.session, truth)
+            motion = alignment.motion.numpy()
+            settled = clean_scores([_scored(run, truth, record) for record in shown])
+            figures |= alignment.figures() | {"psnr_clean_settled_db": settled["psnr_clean_db"]}
+        shown = [truth.posed(record, motion) for record in run.scored]
+        figures |= clean_scores([_scored(run, truth, record) for record in shown])
+        figures |= _radiance_figures(run, truth, shown) | _cloud_figures(run, truth, motion)
     if run.metrics["scored_frames"] == "held_out" and not run.metrics.get("reference_exposure_s"):
-        figures |= _interval_figures(run)
+        figures |= _interval_figures(run, truth, shown, estimate)
     metrics = {**run.metrics, **{key: round(value, 5) for key, value in figures.items()}}
+    if estimate is not None:
+        metrics["scored_poses"] = "settled"
     with written_to(run.folder):
         write_whole(run.folder / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
         write_whole(run.folder / "model_card.md", model_card(run.session.created_utc, metrics).encode())
     return metrics
 
 
-def _interval_figures(run: Run) -> dict[str, float]:
+def _cloud_figures(run: Run, truth: Truth, motion: np.ndarray | None) -> dict[str, float]:
+    """Return the scores of the model's geometry, after a motion [4, 4] to the true body frame."""
+    surface, motion = np.zeros((0, 3)), np.eye(4) if motion is None else motion
+    if (run.folder / "surface.ply").exists():
+        surface = read_points(run.folder / "surface.ply")
+    centres = run.gaussians.means.double().numpy()
+    centres, surface = (points @ motion[:3, :3].T + motion[:3, 3] for points in (centres, surface))
+    return cloud_scores(centres, surface, truth.cloud_m, 2 / truth.largest_dimension_m)
+
+
+def _interval_figures(
+    run: Run, truth: Truth | None, shown: list[FrameRecord], estimate: PoseEstimate | None
+) -> dict[str, float]:
     """Return how often the intervals hold that the model states of the held-out frames."""
-    records, radiance = run.scored, []
-    if Truth.exists(run.session):
-        truth = Truth(run.session)
-        records = list(map(truth.posed, run.scored))
-        radiance = [torch.from_numpy(truth.radiance(record)[0]) for record in records]
-    training, scored = (
-        [training_frame(run.session, record) for record in part] for part in (split(run.session)[0], records)
-    )
-    return interval_scores(run.gaussians, training, run.sensor, scored, radiance)
+    radiance = [] if truth is None else [torch.from_numpy(truth.radiance(record)[0]) for record in shown]
+    training = split(run.session)[0]
+    if estimate is not None:
+        poses = dict(zip(estimate.frame_ids, estimate.estimated, strict=True))
+        training = [dataclasses.replace(r, world_to_camera=poses[r.id]) for r in training if r.id in poses]
+    known, scored = ([training_frame(run.session, r) for r in records] for records in (training, shown))
+    return interval_scores(run.gaussians, known, run.sensor, scored, radiance)
 
 
 def _image(run: Run, record: FrameRecord) -> torch.Tensor:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ground.cameras import sensor_of
+from ground.estimated_poses import write_estimate
 from ground.model_files import Outputs, model_sizes, write_models
 from ground.run_record import training_metrics, write_config, write_history
 from ground.runs import check_replaceable, publish, run_folder, unfinished_run, written_to
@@ -121,14 +122,15 @@ def finish_run(
     part, result, blind = outputs.folder, results[KNOWN], results.get(BLIND)
     assert result is not None
     blind_gaussians = blind.gaussians if blind else None
-    parity_db = write_models(outputs, result.gaussians, blind_gaussians, session, training, held_out)
+    files = write_models(outputs, result.gaussians, blind_gaussians, session, training, held_out)
     outputs.require("model.ply")
     metrics = training_metrics(result, blind, session, training, held_out)
-    metrics |= {"onnx_parity_db": parity_db} | model_sizes(part) | {"missing_outputs": outputs.missing}
+    metrics |= files | model_sizes(part) | {"missing_outputs": outputs.missing}
     log.info("%d Gaussians in %.1f s: %s", len(result.gaussians), result.seconds, result.stop_reason)
     with written_to(folder.parent):
         (part / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
         write_history(results, part / "metrics.jsonl")
+        write_estimate(part, result.pose_estimate)
         write_config(session, result.config, seed, part / "config.yaml")
         publish(part, folder)
 

@@ -53,6 +53,7 @@ def training_metrics(
         "removed_not_finite": result.removed_not_finite,
         "dark_frames": result.dark_frames,
         "chi2": None if math.isnan(chi2) else chi2,
+        "misfit": result.misfit,  # null: not learnt
         "frames_received": len(session.frames),
         "frames_captured": session.frames_captured,  # null: flight did not say
         "frames_trained": len(training),
@@ -62,6 +63,9 @@ def training_metrics(
         "session_created_utc": session.created_utc,
         "reference_exposure_s": result.reference_exposure_s,
     }
+    if result.pose_estimate is not None:
+        tree = result.pose_estimate.tree()
+        metrics["pose_estimate"] = {key: tree[key] for key in ("shared", "unobservable")}
     if blind is not None:
         metrics |= {
             "blind_gaussians": len(blind.gaussians),

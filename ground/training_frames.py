@@ -5,9 +5,10 @@ import logging
 import numpy as np
 import torch
 
+from flightsw.icd.quaternion import quat_to_matrix
 from ground.cameras import sun_direction
 from ground.session import SPLITS, FrameRecord, Session, SessionError
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import Navigation, TrainingFrame
 
 log = logging.getLogger(__name__)
 TEST_INTERVAL = 8  # every eighth bracket is held out
@@ -65,7 +66,7 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
     Raises:
         MissingFrames, SessionCorrupt: its picture cannot be read.
     """
-    dn = session.dn(record).astype(np.float32)
+    dn, assumed = session.dn(record).astype(np.float32), record.quat_inertial_to_body
     return TrainingFrame(
         dn=torch.from_numpy(dn.reshape(*dn.shape[:2], session.camera.channels)),
         exposure_time_s=record.exposure_time_s,
@@ -79,7 +80,19 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
         sun_dir=sun_direction(record),
         background=session.background,
         psf_sigma_px=session.camera.psf_sigma_px,
+        navigation=navigation_of(session),
+        time_s=(record.mid_exposure_utc_ns - session.navigation.epoch_utc_ns) / 1e9,
+        inertial_to_body=None if assumed is None else torch.from_numpy(quat_to_matrix(assumed)),
     )
+
+
+def navigation_of(session: Session) -> Navigation | None:
+    """Return what the pose tags of a session share of their errors; None where they share none."""
+    stated = session.navigation
+    if not stated.sigmas.vector().any():
+        return None
+    to_rtn = quat_to_matrix(np.array(stated.quat_inertial_to_rtn))
+    return Navigation(stated.sigmas, stated.mean_motion_rad_s, to_rtn)
 
 
 def motion_covariance(tag_covariance: np.ndarray, body_to_camera: np.ndarray) -> np.ndarray:

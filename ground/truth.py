@@ -138,14 +138,18 @@ class Truth:
         """Return whether a simulator left a truth folder beside the session."""
         return (session.path / "truth" / "truth.json").is_file()
 
-    def posed(self, record: FrameRecord) -> FrameRecord:
+    def posed(self, record: FrameRecord, motion: np.ndarray | None = None) -> FrameRecord:
         """Return a frame's record with its true pose in place of the received one.
+
+        Args:
+            motion: [4, 4] rigid, from the frame of the model to the true body frame; None: they are the same.
 
         Raises:
             SessionError: the truth has no such frame.
         """
         self._require(record)
-        return dataclasses.replace(record, world_to_camera=self._poses[record.id])
+        pose = self._poses[record.id]
+        return dataclasses.replace(record, world_to_camera=pose if motion is None else pose @ motion)
 
     def radiance(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray]:
         """Return a frame's scene-linear radiance [H, W, C] and coverage [H, W] in 0..1, both float32.

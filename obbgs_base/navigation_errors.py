@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-LARGEST_TURN_RAD = 0.03  # of a Runge-Kutta step of a tumbling target: its error stays below 1e-9 rad a step
+from obbgs_base.free_rotation import free_rotation, rotations, turning_of
+
 # steps of central differences: m, m/s, rad, rad/s, ratio, rad, s, ratio; of an error of third order in them
 DIFFERENCES = {
     "position_m": 1e-2,
@@ -81,8 +82,9 @@ class NominalMotion:
     """The geometry of a pass before its parameters change, one row for each frame.
 
     Where the orbit is not known, the defaults let the relative position err by a constant and a constant velocity along
-    the inertial axes; where rate or inertia are not known, the target's attitude by a rotation about its own axes that
-    grows with time.
+    the inertial axes. Where the rate is not known (0), the attitudes of the frames say how the target turns, and its
+    rate errs by a constant vector in inertial axes, as that of a body with equal moments of inertia does; ratios of
+    inertia then change nothing.
     """
 
     times_s: np.ndarray  # [N] of the frames, since the epoch
@@ -154,7 +156,26 @@ def displaced(motion: NominalMotion, parameters: SharedParameters | np.ndarray) 
         parameters.vector() if isinstance(parameters, SharedParameters) else np.asarray(parameters, float)
     )
     lead = vectors.shape[:-1]
-    rows = vectors.reshape(-1, SIZE)
+    changed = _changed(motion, vectors.reshape(-1, SIZE))
+    return _poses(*changed).reshape(*lead, len(motion.times_s), 4, 4)
+
+
+def displaced_motion(motion: NominalMotion, parameters: SharedParameters) -> NominalMotion:
+    """Return the motion with changed parameters; its poses are those of `displaced`."""
+    to_camera, to_body, position_m = (part[0] for part in _changed(motion, parameters.vector()[None]))
+    ratios = np.append(1 + parameters.inertia_ratios, 1.0)
+    return dataclasses.replace(
+        motion,
+        position_m=position_m,
+        inertial_to_camera=to_camera,
+        inertial_to_body=to_body,
+        rate_rad_s=motion.rate_rad_s + parameters.rate_rad_s,
+        inertia=motion.inertia * ratios,
+    )
+
+
+def _changed(motion: NominalMotion, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return inertial_to_camera, inertial_to_body [P, N, 3, 3] and position_m [P, N, 3] with parameters [P, 19]."""
     names = np.split(rows, np.cumsum(list(LENGTHS.values()))[:-1], axis=1)
     position, velocity, attitude, rate, ratios, boresight, clock, _ = names
     inertial_to_rtn = _turning(motion)
@@ -164,17 +185,13 @@ def displaced(motion: NominalMotion, parameters: SharedParameters | np.ndarray) 
     path_velocity = _velocity(motion, inertial_to_rtn)
     moved = motion.position_m + np.einsum("nji,pnj->pni", inertial_to_rtn, offset_rtn)
     moved = moved + clock[:, None] * path_velocity
-    turned, rates = _rotation(motion, rate, ratios)
-    before = _rotation(motion, np.zeros((1, 3)), np.zeros((1, 2)))[0]
-    to_body = turned @ rotations(attitude)[:, None] @ before.swapaxes(-1, -2) @ motion.inertial_to_body
-    to_body = rotations(-rates * clock[:, None]) @ to_body
+    to_body = _attitudes(motion, attitude, rate, ratios, clock)
     distance2 = np.maximum((motion.position_m**2).sum(axis=1, keepdims=True), 1e-300)
     sight_turn = (
         np.cross(motion.position_m, path_velocity) / distance2
     )  # [N, 3] rad/s of the line of sight, inertial
     to_camera = motion.inertial_to_camera @ rotations(-sight_turn * clock[:, None])
-    to_camera = rotations(boresight)[:, None] @ to_camera
-    return _poses(to_camera, to_body, moved).reshape(*lead, len(motion.times_s), 4, 4)
+    return rotations(boresight)[:, None] @ to_camera, to_body, moved
 
 
 def jacobian(motion: NominalMotion, at: SharedParameters) -> np.ndarray:
@@ -211,16 +228,6 @@ def relative_motion(motion: NominalMotion) -> np.ndarray:
     return matrices
 
 
-def rotations(vectors: np.ndarray) -> np.ndarray:
-    """Return the rotation matrices [..., 3, 3] of rotation vectors [..., 3], rad, at any angle (Rodrigues)."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
-    versine = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # (1 - cos a) / a²
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + versine * cross @ cross
-
-
 def _poses(to_camera: np.ndarray, to_body: np.ndarray, position_m: np.ndarray) -> np.ndarray:
     """Return world_to_camera [..., 4, 4]: from the body's axes about the target's centre to the camera's."""
     turn = to_camera @ to_body.swapaxes(-1, -2)
@@ -251,72 +258,18 @@ def _velocity(motion: NominalMotion, inertial_to_rtn: np.ndarray) -> np.ndarray:
     return (after - before) / (2 * step_s)
 
 
-def _rotation(motion: NominalMotion, rate: np.ndarray, ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far the body has turned since the epoch [P, N, 3, 3] and its rates [P, N, 3], body axes, rad/s.
-
-    Args:
-        rate: [P, 3] change of the rate at the epoch.
-        ratios: [P, 2] changes of the inertia ratios.
-    """
-    rate = motion.rate_rad_s + rate
-    inertia = motion.inertia * np.concatenate([1 + ratios, np.ones((len(ratios), 1))], axis=1)
-    if not (inertia > 0).all():
-        raise ValueError(f"inertia_ratios: expected changes above -1, got {ratios.min():g}")
-    if np.allclose(inertia, inertia[:, :1], rtol=1e-14, atol=0):  # no torque acts on the rates
-        turned = rotations(-rate[:, None] * motion.times_s[:, None])
-        return turned, np.broadcast_to(rate[:, None], (*turned.shape[:2], 3))
-    turned = np.empty((len(rate), len(motion.times_s), 3, 3))
-    rates = np.empty((len(rate), len(motion.times_s), 3))
-    order = np.argsort(motion.times_s, kind="stable")
-    later = motion.times_s[order] >= 0
-    for indices in (order[later], order[~later][::-1]):
-        quats, now, at_s = np.tile([1.0, 0, 0, 0], (len(rate), 1)), rate, 0.0
-        for index in indices:
-            span_s = float(motion.times_s[index] - at_s)
-            fastest = np.linalg.norm(now, axis=1).max()
-            steps = int(np.ceil(abs(span_s) * fastest / LARGEST_TURN_RAD))
-            for _ in range(steps):
-                quats, now = _runge_kutta(quats, now, inertia, span_s / steps)
-            at_s = float(motion.times_s[index])
-            turned[:, index], rates[:, index] = _from_quats(quats), now
-    return turned, rates
-
-
-def _runge_kutta(
-    quats: np.ndarray, rates: np.ndarray, inertia: np.ndarray, step_s: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return body-to-start quaternions [P, 4] and rates [P, 3] a step later, by the fourth-order method."""
-
-    def slopes(state: np.ndarray) -> np.ndarray:
-        w, x, y, z, p, q, r = state.T
-        a, b, c = inertia.T
-        return np.stack(
-            [
-                0.5 * (-x * p - y * q - z * r),
-                0.5 * (w * p + y * r - z * q),
-                0.5 * (w * q + z * p - x * r),
-                0.5 * (w * r + x * q - y * p),
-                (b - c) / a * q * r,
-                (c - a) / b * r * p,
-                (a - b) / c * p * q,
-            ],
-            axis=1,
-        )
-
-    state = np.concatenate([quats, rates], axis=1)
-    k1 = slopes(state)
-    k2 = slopes(state + step_s / 2 * k1)
-    k3 = slopes(state + step_s / 2 * k2)
-    k4 = slopes(state + step_s * k3)
-    state = state + step_s / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    quats = state[:, :4] / np.linalg.norm(state[:, :4], axis=1, keepdims=True)
-    return quats, state[:, 4:]
-
-
-def _from_quats(quats: np.ndarray) -> np.ndarray:
-    """Return start-to-body rotations [P, 3, 3] of body-to-start quaternions [P, 4]."""
-    w, v = quats[:, :1, None], quats[:, 1:]
-    x, y, z = v.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
-    return (np.eye(3) + 2 * w * cross + 2 * cross @ cross).swapaxes(-1, -2)
+def _attitudes(
+    motion: NominalMotion, attitude: np.ndarray, rate: np.ndarray, ratios: np.ndarray, clock: np.ndarray
+) -> np.ndarray:
+    """Return inertial_to_body [P, N, 3, 3] with changes of P values each, as in `SharedParameters`."""
+    times_s, nominal = motion.times_s, motion.inertial_to_body
+    if motion.rate_rad_s.any():
+        inertia = motion.inertia * np.concatenate([1 + ratios, np.ones((len(ratios), 1))], axis=1)
+        turned, rates = free_rotation(times_s, motion.rate_rad_s + rate, inertia)
+        before, _ = free_rotation(times_s, motion.rate_rad_s[None], motion.inertia[None])
+        to_body = turned @ rotations(attitude)[:, None] @ before.swapaxes(-1, -2) @ nominal
+        return rotations(-rates * clock[:, None]) @ to_body
+    turning = turning_of(times_s, nominal)
+    grown = np.einsum("nij,pj->pni", turning.integral_s, rate @ turning.at_epoch)
+    to_body = rotations(-grown) @ nominal @ rotations(attitude @ turning.at_epoch)[:, None]
+    return rotations(-turning.rates_rad_s * clock[:, None]) @ to_body

@@ -2,11 +2,14 @@
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
+from obbgs_base.navigation_errors import SharedParameters
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.model.cameras import Cameras, stacked_suns
 from obbgs_core.model.pose_covariance import flaw
@@ -14,16 +17,42 @@ from obbgs_core.model.pose_covariance import flaw
 FEWEST_FRAMES = 3
 
 
+@dataclass(frozen=True, eq=False)
+class Navigation:
+    """What the pose tags of one pass share: how far its common parameters may err, and the motion that they assume.
+
+    The fields but the first are those of `obbgs_base.navigation_errors.NominalMotion`.
+    """
+
+    sigmas: SharedParameters  # deviations; 0: exact
+    mean_motion_rad_s: float = 0.0
+    inertial_to_rtn: np.ndarray = field(default_factory=lambda: np.eye(3))
+    rate_rad_s: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    inertia: np.ndarray = field(default_factory=lambda: np.ones(3))
+
+    def tree(self) -> dict:
+        """Return everything as numbers and lists."""
+        motion = (self.inertial_to_rtn, self.rate_rad_s, self.inertia)
+        return {
+            "sigmas": self.sigmas.lists(),
+            "orbit": [self.mean_motion_rad_s, *(m.tolist() for m in motion)],
+        }
+
+
 @dataclass(frozen=True)
 class TrainingFrame:
     """One exposure: dn [H, W, C] float, known exposure time, pose [4, 4] body to camera, K [3, 3] px.
 
     pose_covariance: [6, 6] float64, of the motion that in front of world_to_camera makes the tagged pose the true one:
-        rotation vector about the camera's axes (rad), then shift along them (m); None or zeros: the pose is exact.
+        rotation vector about the camera's axes (rad), then shift along them (m); None or zeros: the pose is exact but
+        for what the navigation's parameters change.
     sun_dir: [3] towards the Sun, unit, body frame; None: not known.
     background: radiance of what is seen where the target is not, the same in all frames of a training; space is black.
     psf_sigma_px: of the optics, as in `Cameras`, the same in all frames; None: not calibrated, a method whose footprint
         is the camera's learns it.
+    navigation: errors that all frames of the pass share, the same in all of them; None: there are none.
+    time_s: since the navigation's epoch; inertial_to_body: [3, 3] float64, the attitude that the pose assumes; None:
+        the body's axes are inertial. Only the navigation needs them.
     """
 
     dn: Tensor
@@ -36,6 +65,9 @@ class TrainingFrame:
     sun_dir: Tensor | None = None
     background: float = 0.0
     psf_sigma_px: float | None = None
+    navigation: Navigation | None = None
+    time_s: float = 0.0
+    inertial_to_body: Tensor | None = None
 
 
 def sun_span_deg(frames: list[TrainingFrame]) -> float:
@@ -91,6 +123,11 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
         raise ReconstructionError(
             f"all frames must have one psf_sigma_px, that of their camera, got {sorted(map(str, spreads))}"
         )
+    stated = {repr(f.navigation and f.navigation.tree()) for f in frames}
+    if len(stated) > 1:
+        raise ReconstructionError(
+            f"all frames must state the same navigation, that of one pass, got {len(stated)}"
+        )
     for f in frames:
         finite = torch.isfinite(f.dn).all() and torch.isfinite(f.world_to_camera).all()
         if f.sun_dir is not None and not abs(float(f.sun_dir.norm()) - 1) < 1e-3:
@@ -117,3 +154,16 @@ def bracket_numbers(frames: list[TrainingFrame]) -> list[int]:
     numbers: dict[int, int] = {}
     keys = [f.id if f.bracket is None else -1 - f.bracket for f in frames]
     return [numbers.setdefault(key, len(numbers)) for key in keys]
+
+
+def averaged(dn: Tensor, factor: int, white_dn: float) -> Tensor:
+    """Return dn [H, W, C] averaged over blocks of factor x factor pixels, those at the right and bottom edge smaller.
+
+    A block with a pixel at full scale is at full scale, because the mean of its true signals is not known.
+    """
+    if factor == 1:
+        return dn
+    image = dn.movedim(-1, 0)[None]
+    mean = F.avg_pool2d(image, factor, ceil_mode=True)
+    largest = F.max_pool2d(image, factor, ceil_mode=True)
+    return torch.where(largest >= white_dn, largest, mean)[0].movedim(0, -1)

@@ -12,10 +12,10 @@ from hil.sky.sensor import converted
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.motions import rigid_motions
 from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.poses import rigid_motions
 
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=2.0, read_noise_dn=3.0)
 SIZE_PX, FOCAL_PX, RANGE_M = 64, 130.0, 8.0

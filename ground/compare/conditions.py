@@ -18,8 +18,8 @@ from ground.compare.case import Case
 from ground.compare.errors import CompareError
 from ground.settings import checked_settings
 from obbgs_core.frames import TrainingFrame
+from obbgs_core.model.motions import rigid_motions
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.poses import rigid_motions
 
 NOISE, SHUTTER, DARK, POSE, LOSS = range(5)  # streams of random numbers, one a purpose
 MOST_ELECTRONS = 1e15  # NumPy's Poisson refuses about 9e18

@@ -21,7 +21,6 @@ log = logging.getLogger(__name__)
 FEWEST_HULL_POINTS = 200  # with fewer the start is random
 FEWEST_VIEWS = 12  # that carve the hull
 VIEWS_FOR_COLOUR = 24  # about so many frames, spread evenly, are averaged for the first radiance
-MOST_DILATION_PX = 8  # of a silhouette, for pose errors
 HULL_OPACITY, RANDOM_OPACITY = 0.5, 0.1  # of the first Gaussians
 
 
@@ -40,13 +39,10 @@ class StartSettings:
 
 
 def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.Silhouette]:
-    """Return silhouettes of the longest exposures by the frame's index, grown by as much as the poses err.
+    """Return silhouettes of the longest exposures by the frame's index, as tagged.
 
     Shadowed faces are brightest there. Where these frames are few those of the next longest exposure join them: a view
     that misses a shadowed face does less harm than no view.
-
-    The pose tags state how much the poses may err. They are grown by no more than that, and by no more than what their
-    coherence asks for: a tag may be honest and its pose still exact, and silhouettes grown for nothing carve nothing.
     """
     chosen: dict[int, TrainingFrame] = {}
     for exposure_s in sorted({f.exposure_time_s for f in frames}, reverse=True):
@@ -56,42 +52,7 @@ def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.S
     for i, f in chosen.items():
         light = hull.light(f.dn, sensor, f.background, f.exposure_time_s)
         outlines[i] = hull.silhouette(light, sensor, f.world_to_camera, f.K)
-    errors_px = {i: _pose_error_px(f) for i, f in chosen.items()}
-    return _grown(outlines, errors_px)
-
-
-def _grown(outlines: dict[int, hull.Silhouette], errors_px: dict[int, int]) -> dict[int, hull.Silhouette]:
-    """Return silhouettes grown by the least reach that makes them coherent, each by its own limit at most."""
-    most, radius = max(errors_px.values()), hull.radius_m(list(outlines.values()))
-    if most == 0 or radius == 0:
-        return outlines
-    for reach_px in [r for r in (0, 1, 2, 4) if r < most]:
-        grown = {i: s.dilated(min(reach_px, errors_px[i])) for i, s in outlines.items()}
-        points, voxel_m = hull.hull_points(list(grown.values()), radius)
-        coherence = hull.coherence(list(outlines.values()), points, voxel_m)
-        log.info(
-            "silhouettes grown by %d px of %d allowed by the tags: coherence %.3f", reach_px, most, coherence
-        )
-        if coherence >= hull.AGREEMENT:
-            return grown
-    return {i: s.dilated(errors_px[i]) for i, s in outlines.items()}
-
-
-def _pose_error_px(frame: TrainingFrame) -> int:
-    """Return the largest standard deviation, px, that the pose tag gives the image of the body's origin."""
-    if frame.pose_covariance is None:
-        return 0
-    x, y, z = frame.world_to_camera[:3, 3].tolist()
-    z = max(z, 1e-6)
-    u, v = x / z, y / z
-    image_by_motion = [  # the interaction matrix of a point (Chaumette and Hutchinson 2006)
-        [-u * v, 1 + u * u, -v, 1 / z, 0, -u / z],
-        [-1 - v * v, u * v, u, 0, 1 / z, -v / z],
-    ]
-    pixel_by_motion = frame.K[:2, :2].double() @ torch.tensor(image_by_motion, dtype=torch.float64)
-    covariance_px2 = pixel_by_motion @ frame.pose_covariance.double() @ pixel_by_motion.T
-    worst_px2 = float(torch.linalg.eigvalsh(covariance_px2)[-1].clamp(min=0))
-    return min(MOST_DILATION_PX, round(math.sqrt(worst_px2)))
+    return outlines
 
 
 def first_gaussians(

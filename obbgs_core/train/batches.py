@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_core.frames import TrainingFrame, cameras_of
+from obbgs_core.frames import TrainingFrame, averaged, cameras_of
 from obbgs_core.model.cameras import Cameras
 
 
@@ -59,19 +59,6 @@ class Batches:
             i: F.avg_pool2d(sky[None].float(), factor, ceil_mode=True)[0] for i, sky in self.sky.items()
         }
         return [shares.get(i, unknown) for i in range(len(self.frames))]
-
-
-def averaged(dn: Tensor, factor: int, white_dn: float) -> Tensor:
-    """Return dn [H, W, C] averaged over blocks of factor x factor pixels, those at the right and bottom edge smaller.
-
-    A block with a pixel at full scale is at full scale, because the mean of its true signals is not known.
-    """
-    if factor == 1:
-        return dn
-    image = dn.movedim(-1, 0)[None]
-    mean = F.avg_pool2d(image, factor, ceil_mode=True)
-    largest = F.max_pool2d(image, factor, ceil_mode=True)
-    return torch.where(largest >= white_dn, largest, mean)[0].movedim(0, -1)
 
 
 @dataclass

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from obbgs_core.errors import Diverged
+from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.render import Rendered
 from obbgs_core.train.appearance import SUN_FROM, described, raised_degree
 from obbgs_core.train.batches import Batch, FrameOrder
@@ -25,7 +26,6 @@ from obbgs_core.train.growth import (
 )
 from obbgs_core.train.multi_view import crossing_boxes, inside, threshold_factor
 from obbgs_core.train.parsimony import justified
-from obbgs_core.train.poses import PoseCorrections
 from obbgs_core.train.setup import TrainingSetup
 from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import TrainingState

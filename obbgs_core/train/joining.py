@@ -75,8 +75,12 @@ def join(
     state.growth, state.boxes, state.shadows = Growth.of(len(state.gaussians)), [], fresh.shadows
     if state.poses is not None:
         state.poses = state.poses.extended(joined.frames)
-    elif state.poses_decided in UNTESTED:
-        state.poses_decided = fresh.poses_decided
+    elif state.poses_decided in UNTESTED or fresh.poses is not None:
+        state.poses, state.poses_aligned, state.poses_decided = (
+            fresh.poses,
+            fresh.poses_aligned,
+            fresh.poses_decided,
+        )
     withhold(joined, state)
     smooth(joined, state)
     state.steps_done = position

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.compensation import mapped, nearest
 from obbgs_core.train.config import MethodConfig
@@ -60,7 +61,9 @@ class TrainResult:
     appearance: str  # what the radiance depends on, and why
     growth: str  # the step until which Gaussians were added
     poses: str  # whether the poses were refined, and why
+    pose_estimate: PoseEstimate | None  # the refined poses; None: as tagged
     exposing: Exposing  # what its pictures are made with
+    misfit: float | None  # the model's own error as a share of the light; None: it was not learnt
     sun_span_deg: float  # largest angle between two frames' Suns, body frame
     dark_frames: int  # left out: nothing in them rises above the noise
     removed_outliers: int

@@ -18,8 +18,10 @@ from obbgs_core.frames import (
     sun_span_deg,
     usable,
 )
+from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import flat
+from obbgs_core.start.alignment import settled
 from obbgs_core.start.hull import Silhouette, light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
 from obbgs_core.train.adam import Adam
@@ -27,7 +29,6 @@ from obbgs_core.train.batches import Batches, FrameOrder
 from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import Growth
-from obbgs_core.train.poses import PoseCorrections
 from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import Identity, TrainingState
 from obbgs_core.train.validation import validation_brackets
@@ -75,6 +76,9 @@ class TrainingSetup:
                 f.dn.numpy().tobytes() + f.world_to_camera.numpy().tobytes() + f.K.numpy().tobytes()
             )
             known = [None if tag is None else tag.tolist() for tag in (f.sun_dir, f.pose_covariance)]
+            if f.navigation is not None:
+                attitude = None if f.inertial_to_body is None else f.inertial_to_body.tolist()
+                digest.update(repr((f.time_s, attitude, f.navigation.tree())).encode())
             digest.update(repr((f.exposure_time_s, f.bracket, known, f.psf_sigma_px)).encode())
         return Identity(digest.hexdigest(), flat(self.config), flat(MethodConfig(self.config.name)))
 
@@ -97,11 +101,12 @@ def prepare(
             f"the noise, {FEWEST_FRAMES} are needed"
         )
     rng = torch.Generator().manual_seed(seed)
-    outlines = silhouettes(lit, sensor)
+    outlines, poses, why = settled(lit, silhouettes(lit, sensor), config.poses.refine != "never")
+    posed = lit if poses is None else poses.frames(lit)
     config, budget = _limited(config, sum(int(outline.certain.sum()) for outline in outlines.values()))
     log.info("budget: %s", budget)
     gaussians, radius_m, start = first_gaussians(
-        lit, list(outlines.values()), sensor, config.start, config.light.sh_degree, rng
+        posed, list(outlines.values()), sensor, config.start, config.light.sh_degree, rng
     )
     gaussians = dataclasses.replace(gaussians, footprint=config.footprint)
     sky = {i: outline.sky for i, outline in outlines.items()} if config.loss.sky_weight else None
@@ -126,14 +131,17 @@ def prepare(
         start_means=gaussians.means.detach(),
     )
     brackets = validation_brackets(lit)
-    poses_decided = _decided_at_once(config, lit, brackets)
+    poses_decided = _decided_at_once(config, lit, brackets) if poses is None else f"refined ({why})"
+    if poses is None and config.poses.refine == "always":
+        poses = PoseCorrections(lit)
     state = TrainingState(
         rng=rng,
         gaussians=gaussians,
         adam=Adam(gaussians),
         growth=Growth.of(len(gaussians)),
         order=FrameOrder.of(lit, config.bracket_steps, [] if poses_decided else brackets),
-        poses=PoseCorrections(lit) if config.poses.refine == "always" else None,
+        poses=poses,
+        poses_aligned=bool(why),
         poses_decided=poses_decided,
         appearance_reason="as configured" if config.light.sh_degree else "",
     )
@@ -163,6 +171,6 @@ def _decided_at_once(config: MethodConfig, frames: list[TrainingFrame], brackets
     """Return whether the poses are refined, and why, where no training is needed to know; else nothing."""
     if config.poses.refine != "auto":
         return {"never": "as tagged", "always": "refined"}[config.poses.refine]
-    if not any(f.pose_covariance is not None and f.pose_covariance.any() for f in frames):
+    if not PoseCorrections(frames).covariances.any():
         return EXACT_TAGS
     return "" if brackets else TOO_FEW_BRACKETS

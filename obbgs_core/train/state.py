@@ -17,18 +17,18 @@ from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.pose_covariance import Whitening
 from obbgs_core.obb import Obb
+from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.render.shadows import ShadowMap
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.appearance import Shadows
 from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.growth import Growth
-from obbgs_core.train.poses import PoseCorrections
 from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 2  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 3  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,7 @@ class TrainingState:
     growth: Growth
     order: FrameOrder
     poses: PoseCorrections | None  # None: as tagged
+    poses_aligned: bool  # whether they were moved before the first step
     poses_decided: str  # whether the poses are refined, and why; empty: the validation brackets will decide
     appearance_reason: str  # why the radiance depends on what it does
     smoothing_m: Tensor | None = None  # [N] deviations of the 3D filter; None: the method has none
@@ -82,6 +83,7 @@ class TrainingState:
     boxes: list[Obb] = field(default_factory=list)  # behind the worst tiles since the last growth inside them
     shadows: Shadows = field(default_factory=Shadows)
     chi2: float = math.nan  # running mean
+    misfit: float | None = None  # running mean of the model's own error; None: not learnt, or not yet
     psnr_db: float = math.nan  # of the last step's frames
     steps_done: int = 0
     seconds: float = 0.0

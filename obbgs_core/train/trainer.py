@@ -12,8 +12,9 @@ import torch
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.losses import fit_figures
+from obbgs_core.losses import fit_figures, relative_misfit
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.registration import pose_information
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train import decisions
@@ -24,7 +25,7 @@ from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import outliers
 from obbgs_core.train.joining import check_joinable, join, release, withhold
 from obbgs_core.train.objective import image_loss, priors
-from obbgs_core.train.poses import pose_rate
+from obbgs_core.train.poses import ALIGNED_FROM
 from obbgs_core.train.result import Exposing, StepInfo, TrainResult
 from obbgs_core.train.setup import prepare
 from obbgs_core.train.state import TrainingState
@@ -119,19 +120,18 @@ class Trainer:
         share, scale = moment.share, moment.image_scale
         drawn = state.order.draw(min(moment.frames, len(setup.frames)), state.rng)
         batch = setup.batches.batch(drawn, scale)
-        cameras = batch.cameras if state.poses is None else state.poses.cameras(batch)
+        cameras = batch.cameras if state.poses is None else state.poses.cameras(drawn, batch.cameras)
         sunlit = state.shadows.sunlit(state.gaussians, cameras, state.steps_done)
         rendered = self._compensated(render(state.model, cameras, sunlit=sunlit), batch)
-        loss, residual = image_loss(rendered, batch, setup.sensor, config.loss)
+        loss, residual = image_loss(rendered, batch, setup.sensor, config.loss, state.misfit)
         if not torch.isfinite(loss):
             raise Diverged(state.steps_done, loss.item())
         prior = priors(state.gaussians, rendered, batch, setup.radius_m, config.loss)
-        if state.poses is not None:
-            prior = prior + state.poses.prior(batch.indices, batch.dn.numel())
         (loss + prior).backward()
         if decisions.is_recorded(setup, share):
             decisions.observe(setup, state, rendered, batch, residual, share)
         self._descend(share)
+        self._move_poses(rendered, batch, share)
         decisions.decide_poses(setup, state, share)
         decisions.change_number(setup, state, batch, residual, moment)
         decisions.select_model(setup, state, scale)
@@ -158,19 +158,35 @@ class Trainer:
         state.adam.step(state.gaussians, rates)
         state.gaussians.ambient.detach().clamp_(min=0)
         state.gaussians.psf_sigma_px.detach().clamp_(min=LEAST_PSF_SIGMA_PX)
-        if state.poses is not None:
-            state.poses.step(pose_rate(share, config.poses))
         if state.compensation is not None:
             state.compensation.step(share)
 
+    def _move_poses(self, rendered: Rendered, batch: Batch, share: float) -> None:
+        """Gather what the step's frames say of their poses; once every frame has spoken, move the poses."""
+        state, poses = self.state, self.state.poses
+        begin = ALIGNED_FROM if state.poses_aligned else self.setup.config.poses.refine_from
+        if poses is None or share < begin:
+            return
+        images = (rendered.radiance.detach(), rendered.alpha.detach(), rendered.depth.detach())
+        cameras = poses.cameras(batch.indices, batch.cameras)
+        readings = (batch.exposure_time_s, batch.dn, self.setup.sensor, batch.averaged_pixels)
+        poses.gather(batch.indices, pose_information(*images, cameras, *readings))
+        if poses.is_due:
+            poses.step(self.setup.frames)
+
     def _measure(self, rendered: Rendered, batch: Batch) -> None:
-        """Keep the running chi² on the target, and the PSNR of this step's frames."""
+        """Keep the running chi² on the target, the model's own error, and the PSNR of this step's frames."""
         state = self.state
         images = (rendered.radiance, rendered.alpha, batch.exposure_time_s, batch.dn)
         chi2, state.psnr_db = fit_figures(*images, self.setup.sensor, batch.averaged_pixels)
         if not math.isnan(chi2):
             known = not math.isnan(state.chi2)
             state.chi2 = CHI2_MEMORY * state.chi2 + (1 - CHI2_MEMORY) * chi2 if known else chi2
+        if self.setup.config.loss.misfit:
+            misfit = relative_misfit(images[0], *images[2:], self.setup.sensor, batch.averaged_pixels)
+            if not math.isnan(misfit):
+                last = misfit if state.misfit is None else state.misfit
+                state.misfit = CHI2_MEMORY * last + (1 - CHI2_MEMORY) * misfit
 
     def _recorded(self, loss: float) -> StepInfo:
         """Return how the training stands, and keep it in the history."""
@@ -274,7 +290,9 @@ class Trainer:
             appearance=described(state.gaussians, state.appearance_reason),
             growth=f"until step {min(state.steps_done, round(setup.config.steps_until(setup.config.growth.end)))}",
             poses=state.poses_decided or "as tagged (training ended before this was decided)",
+            pose_estimate=None if state.poses is None else state.poses.estimate(setup.frames),
             exposing=self.exposing,
+            misfit=state.misfit,
             sun_span_deg=setup.sun_span_deg,
             dark_frames=setup.dark_frames,
             removed_outliers=removed,

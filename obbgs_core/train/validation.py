@@ -1,5 +1,6 @@
 """Validation brackets: held out of the first part of the training, they decide whether poses are refined."""
 
+import dataclasses
 import math
 
 import torch
@@ -7,15 +8,16 @@ import torch
 from obbgs_core.frames import TrainingFrame, bracket_numbers
 from obbgs_core.losses import ON_TARGET_ALPHA, fit_figures, likelihood_loss
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.pose_corrections import PoseCorrections
+from obbgs_core.registration import pose_information
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.batches import Batch
-from obbgs_core.train.poses import POSE_RATE, PoseCorrections
 
 # One bracket in seven, at least three in all; a prime number, so that no cycle of the capture repeats with it.
 INTERVAL, FEWEST = 7, 3
 FEWEST_FRAMES_IN_ALL = 24  # with fewer, every frame is needed for training
-FIT_STEPS = 20  # of a validation bracket's correction
+FIT_STEPS = 5  # of Gauss and Newton, of a validation bracket's correction
 
 
 def validation_brackets(frames: list[TrainingFrame]) -> list[list[int]]:
@@ -41,12 +43,17 @@ def correction_gain(
     1992), because a coarse model errs by more than noise, and alike in neighbouring pixels. The penalty is half the
     number of corrected directions times ln(values on the target) (Schwarz 1978).
     """
-    poses, ratios = PoseCorrections(frames), []
+    poses = PoseCorrections(frames)
+    # a bracket is corrected by itself, so its own errors are those that all frames share as well
+    alone = [
+        dataclasses.replace(f, navigation=None, pose_covariance=c)
+        for f, c in zip(frames, poses.covariances, strict=True)
+    ]
+    poses, ratios = PoseCorrections(alone), []
     for batch in brackets:
         directions = int(poses.rank[poses.of_frame[batch.indices[0]]])
         if directions:
-            tagged, _, _ = _fitted(model, poses, batch, sensor, 0)
-            corrected, chi2, values = _fitted(model, poses, batch, sensor, FIT_STEPS)
+            (tagged, _, _), (corrected, chi2, values) = _fitted(model, alone, poses, batch, sensor)
             gain = (tagged - corrected) * batch.dn.numel() / chi2
             ratios.append(gain / (0.5 * directions * math.log(values)))
     ratios = torch.tensor(ratios)
@@ -54,19 +61,21 @@ def correction_gain(
 
 
 def _fitted(
-    model: Gaussians, poses: PoseCorrections, batch: Batch, sensor: Sensor, steps: int
-) -> tuple[float, float, int]:
-    """Fit a bracket's correction to the model; return the loss with prior, the chi², and the values on the target."""
-    images = (batch.exposure_time_s, batch.dn, sensor, batch.averaged_pixels)
-    for k in range(steps):
-        loss, _ = likelihood_loss(render(model, poses.cameras(batch)).radiance, *images)
-        (loss + poses.prior(batch.indices, batch.dn.numel())).backward()
-        poses.step(POSE_RATE * (1 - k / steps))
-    with torch.no_grad():
-        rendered = render(model, poses.cameras(batch))
-        loss = likelihood_loss(rendered.radiance, *images)[0]
-        if steps:
-            loss = loss + poses.prior(batch.indices, batch.dn.numel())
-    chi2, _ = fit_figures(rendered.radiance, rendered.alpha, *images)
-    on_target = int((rendered.alpha > ON_TARGET_ALPHA).sum()) * batch.averaged_pixels * batch.dn.shape[-1]
-    return loss.item(), chi2, max(2, on_target)
+    model: Gaussians, frames: list[TrainingFrame], poses: PoseCorrections, batch: Batch, sensor: Sensor
+) -> tuple[tuple[float, float, int], tuple[float, float, int]]:
+    """Fit a bracket's correction; return loss with prior, chi² and values on the target, as tagged and as corrected."""
+    images, found = (batch.exposure_time_s, batch.dn, sensor, batch.averaged_pixels), []
+    row = poses.of_frame[batch.indices[0]]
+    for _ in range(FIT_STEPS + 1):
+        cameras = poses.cameras(batch.indices, batch.cameras)
+        with torch.no_grad():
+            rendered = render(model, cameras)
+        loss = likelihood_loss(rendered.radiance, *images)[0].item()
+        loss += 0.5 * poses.value[row].square().sum().item() / batch.dn.numel()
+        chi2, _ = fit_figures(rendered.radiance, rendered.alpha, *images)
+        on_target = int((rendered.alpha > ON_TARGET_ALPHA).sum()) * batch.averaged_pixels * batch.dn.shape[-1]
+        found.append((loss, chi2, max(2, on_target)))
+        views = (rendered.radiance, rendered.alpha, rendered.depth, cameras)
+        poses.gather(batch.indices, pose_information(*views, *images))
+        poses.step(frames)
+    return found[0], min(found)

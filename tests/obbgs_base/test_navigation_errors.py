@@ -7,7 +7,13 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displaced, jacobian
+from obbgs_base.navigation_errors import (
+    NominalMotion,
+    SharedParameters,
+    displaced,
+    displaced_motion,
+    jacobian,
+)
 
 GM = 3.986004418e14  # m³/s²
 RADIUS_M = 6.9e6
@@ -106,6 +112,7 @@ def test_a_tumbling_target_turns_as_eulers_equations_say():
         motion.times_s, RATE + change.rate_rad_s, inertia, start
     ).swapaxes(1, 2)
     poses = displaced(motion, change)
+    np.testing.assert_allclose(displaced_motion(motion, change).world_to_camera, poses, atol=1e-9)
     error = Rotation.from_matrix(poses[:, :3, :3] @ true.swapaxes(1, 2)).magnitude()
     before = Rotation.from_matrix(motion.world_to_camera[:, :3, :3] @ true.swapaxes(1, 2)).magnitude()
     assert before.max() > 0.2
@@ -157,6 +164,21 @@ def test_the_jacobian_predicts_small_changes(draw, tumbling):
         Rotation.from_matrix(motions[:, :3, :3]).as_rotvec(), predicted[:, :3], atol=1e-8
     )
     np.testing.assert_allclose(motions[:, :3, 3], predicted[:, 3:], atol=1e-5)
+
+
+def test_a_spin_whose_rate_is_not_known_errs_as_one_whose_rate_is_known():
+    """A body with equal moments: the changes of both agree to first order, and so does what a late clock shows."""
+    rate = np.array([0.003, -0.002, 0.02])
+    times = np.sort(np.concatenate([np.arange(0, 600, 60.0), np.arange(0, 600, 60.0) + 0.5]))
+    bodies = Rotation.from_rotvec(-rate * times[:, None]).as_matrix()
+    cameras = np.broadcast_to(np.eye(3), bodies.shape)
+    known = NominalMotion(times, np.tile([0.0, 0, -50], (len(times), 1)), cameras, bodies, rate_rad_s=rate)
+    unknown = NominalMotion(times, known.position_m, cameras, bodies)
+    change = SharedParameters(attitude_rad=[1e-3, -2e-3, 1e-3], rate_rad_s=[2e-6, 1e-6, -3e-6], clock_s=0.02)
+    a, b = displaced(known, change), displaced(unknown, change)
+    moved = Rotation.from_matrix(a[:, :3, :3] @ known.world_to_camera[:, :3, :3].swapaxes(1, 2)).magnitude()
+    left = Rotation.from_matrix(a[:, :3, :3] @ b[:, :3, :3].swapaxes(1, 2)).magnitude()
+    assert moved.min() > 1e-3 and left.max() < 2e-5  # second order in 3e-3
 
 
 def test_parameters_survive_lists_and_vectors():

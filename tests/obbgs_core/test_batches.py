@@ -8,7 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from obbgs_core.train.batches import Batches, FrameOrder, averaged
+from obbgs_core.frames import averaged
+from obbgs_core.train.batches import Batches, FrameOrder
 from obbgs_core.train.validation import validation_brackets
 from tests.scenes import SENSOR, photographed, target
 

@@ -1,0 +1,100 @@
+"""The estimated poses of a run: their file, and what evaluation needs of them to be fair to a model that moved."""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ground.session import FrameRecord, Session, SessionError
+from ground.training_frames import training_frame
+from ground.truth import Truth
+from obbgs_base.files import write_whole
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.pose_corrections import with_estimate
+from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.score.poses import PoseErrors, best_motion, pose_errors, settled_poses
+from obbgs_core.sensor import Sensor
+
+FILE = "poses_estimated.json"
+
+
+def write_estimate(folder: Path, estimate: PoseEstimate | None) -> None:
+    """Write what a training found of its poses into a run folder; nothing where they are as tagged."""
+    if estimate is not None:
+        write_whole(folder / FILE, (json.dumps(estimate.tree()) + "\n").encode())
+
+
+def read_estimate(folder: Path) -> PoseEstimate | None:
+    """Return what the training of a run found of its poses; None where they are as tagged.
+
+    Raises:
+        SessionError: the file is damaged.
+    """
+    path = folder / FILE
+    if not path.exists():
+        return None
+    try:
+        return PoseEstimate.of(json.loads(path.read_bytes()))
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise SessionError(f"{path} cannot be read: {error}; make the run again") from error
+
+
+def settled_records(
+    gaussians: Gaussians, session: Session, records: list[FrameRecord], sensor: Sensor, estimate: PoseEstimate
+) -> list[FrameRecord]:
+    """Return held-out frames with the poses that are settled on their pictures, the model fixed."""
+    frames = with_estimate([training_frame(session, record) for record in records], estimate)
+    poses = settled_poses(gaussians, frames, sensor)
+    return [
+        dataclasses.replace(r, world_to_camera=p.double().numpy())
+        for r, p in zip(records, poses, strict=True)
+    ]
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How a model whose poses were estimated lies in the true body frame.
+
+    motion: [4, 4] rigid, from the model's frame to the true one; before, after: errors of the training's poses as
+    tagged and as estimated, each after the motion that suits it best.
+    """
+
+    motion: Tensor
+    before: PoseErrors
+    after: PoseErrors
+
+    @staticmethod
+    def of(estimate: PoseEstimate, session: Session, truth: Truth) -> "Alignment":
+        """Return the alignment of an estimate with a simulator's truth.
+
+        Raises:
+            SessionError: the truth lacks a frame of the training.
+        """
+        records = {record.id: record for record in session.frames}
+        true = torch.from_numpy(
+            np.stack([truth.posed(records[number]).world_to_camera for number in estimate.frame_ids])
+        )
+        radius_m, focal_px = truth.largest_dimension_m / 2, session.camera.fx_px
+        tagged, estimated = torch.from_numpy(estimate.tagged), torch.from_numpy(estimate.estimated)
+        motion = best_motion(estimated, true, radius_m)
+        as_tagged = best_motion(tagged, true, radius_m)
+        return Alignment(
+            motion,
+            pose_errors(tagged, true, as_tagged, radius_m, focal_px),
+            pose_errors(estimated, true, motion, radius_m, focal_px),
+        )
+
+    def figures(self) -> dict[str, float]:
+        """Return the errors for metrics.json."""
+        return {
+            "pose_error_tagged_deg": self.before.rotation_deg,
+            "pose_error_tagged_range": self.before.range_share,
+            "pose_error_tagged_px": self.before.pixels,
+            "pose_error_deg": self.after.rotation_deg,
+            "pose_error_range": self.after.range_share,
+            "pose_error_px": self.after.pixels,
+        }

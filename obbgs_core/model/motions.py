@@ -1,0 +1,48 @@
+"""Small rigid motions: a rotation vector (rad), then a shift (m), in front of a pose [4, 4]."""
+
+import torch
+from torch import Tensor
+
+SMALLEST_TURN_RAD = 1e-9  # a rotation vector below has the skew part of its matrix for it
+
+
+def rigid_motions(xi: Tensor) -> Tensor:
+    """Return [B, 4, 4] of rotation vectors (rad) and shifts (m) [B, 6]; exact rotations for any angle."""
+    generator = torch.zeros(len(xi), 4, 4, dtype=xi.dtype)
+    generator[:, :3, :3] = cross_matrices(xi[:, :3])
+    motion = torch.matrix_exp(generator)
+    shift = torch.zeros_like(motion)
+    shift[:, :3, 3] = xi[:, 3:]
+    return motion + shift
+
+
+def motion_vectors(motions: Tensor) -> Tensor:
+    """Return the rotation vectors and shifts [B, 6] of rigid motions [B, 4, 4] that turn by less than half a turn."""
+    R = motions[:, :3, :3]
+    skew = (R - R.mT) / 2
+    axis = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], dim=1)  # sin a times the unit axis
+    sine = axis.norm(dim=1, keepdim=True)
+    cosine = (R.diagonal(dim1=1, dim2=2).sum(1, keepdim=True) - 1) / 2
+    angle = torch.atan2(sine, cosine)
+    turn = torch.where(sine > SMALLEST_TURN_RAD, axis * angle / sine.clamp(min=SMALLEST_TURN_RAD), axis)
+    return torch.cat([turn, motions[:, :3, 3]], dim=1)
+
+
+def adjoints(poses: Tensor) -> Tensor:
+    """Return [B, 6, 6] that take a small motion of the body to the same one in front of poses [B, 4, 4].
+
+    A rotation w and a shift v, body axes, are the rotation R w and the shift R v + t x (R w) in the camera's.
+    """
+    R, t = poses[:, :3, :3], poses[:, :3, 3]
+    found = torch.zeros(len(poses), 6, 6, dtype=poses.dtype)
+    found[:, :3, :3] = R
+    found[:, 3:, 3:] = R
+    found[:, 3:, :3] = cross_matrices(t) @ R
+    return found
+
+
+def cross_matrices(v: Tensor) -> Tensor:
+    """Return [..., 3, 3] with cross(v) @ x = v x x."""
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))

@@ -1,0 +1,331 @@
+"""Corrections of the poses of a pass: few parameters that all frames share, and six small numbers for each bracket."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from obbgs_base.navigation_errors import SIZE, NominalMotion, SharedParameters, displaced, jacobian
+from obbgs_core.frames import TrainingFrame, bracket_numbers
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
+from obbgs_core.model.pose_covariance import whitening
+from obbgs_core.model.rotations import from_rotation_vectors, multiply
+from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.registration import PoseInformation
+
+NULL = 1e-9  # a singular value of rows of unit length that is zero up to rounding
+LINEAR = 0.1  # prior deviations by which shared parameters move before their effect is linearised anew
+GAUGE_ROUNDS = 3  # of the linear problem that fixes the gauge; its error is of second order in the motion
+
+
+class PoseCorrections:
+    """The poses of all frames with their corrections: shared parameters `shared` [19], then `value` [P, 6] a bracket.
+
+    The shared parameters (`obbgs_base.navigation_errors`) move the tagged poses, each bracket's own correction follows.
+    The own corrections have unit variance: times the root of the tags' covariance they are rigid motions in front of
+    world_to_camera, a rotation about the camera's axes (rad), then a shift along them (m). Directions in which the tags
+    are exact, and shared parameters whose prior deviation is 0, are not corrected. The focal length is not estimated:
+    from a distance it shows as the range does.
+
+    Frames of one bracket share their motion: the error of a navigation solution hardly changes within it. Its
+    covariance is the mean of those that the frames' tags give, each in its own camera's axes; an exact tag counts with
+    zeros. The tags of a bracket share one error instead of being independent draws, so several tags do not reduce it
+    (weighting by inverse covariances would claim so). However they are correlated, the covariance of their mean is
+    never larger than the mean of their covariances, and it is equal where the tags agree.
+    """
+
+    def __init__(self, frames: list[TrainingFrame]):
+        self.of_frame = bracket_numbers(frames)  # the row of each frame
+        count = max(self.of_frame) + 1
+        self.value = torch.zeros(count, 6)
+        covariances = torch.zeros(len(frames), 6, 6, dtype=torch.float64)
+        for i, frame in enumerate(frames):
+            if frame.pose_covariance is not None:
+                covariances[i] = frame.pose_covariance
+        self.whitening = whitening(self._bracket_means(covariances))
+        self.tags = torch.stack([frame.world_to_camera for frame in frames]).double()  # [F, 4, 4]
+        navigation = frames[0].navigation
+        sigmas = SharedParameters() if navigation is None else navigation.sigmas
+        self.sigmas = torch.from_numpy(dataclasses.replace(sigmas, focal=np.zeros(1)).vector())  # [19]
+        self.shared = torch.zeros(SIZE, dtype=torch.float64)
+        self.linear_at = torch.full_like(self.shared, torch.nan)  # [19] where `by_shared` was taken
+        self.moved = self.tags  # [F, 4, 4] the tags with the shared parameters
+        self.by_shared = torch.zeros(
+            len(frames), 6, 0, dtype=torch.float64
+        )  # [F, 6, S] motion by whitened parameter
+        if self.sigmas.any():
+            self._move_shared(frames, self.shared)
+        self.gathered = 0  # pictures since the last step
+        self._clear()
+
+    def extended(self, frames: list[TrainingFrame]) -> "PoseCorrections":
+        """Return the corrections of more frames, which begin with those of this one; new brackets have no own yet."""
+        more, known = PoseCorrections(frames), len(self.of_frame)
+        if more.sigmas.any():
+            more._move_shared(frames, self.shared)
+        more.value[: len(self.value)] = self.value
+        more.gradient[:known], more.curvature[:known] = self.gradient, self.curvature
+        return more
+
+    @property
+    def rank(self) -> Tensor:
+        """The number of directions [P] in which each bracket may be corrected by itself."""
+        return self.whitening.rank
+
+    @property
+    def covariances(self) -> Tensor:
+        """The covariances [F, 6, 6] of the poses' errors as tagged: shared and own together."""
+        root = self.whitening.root.double()[self.of_frame]
+        return root @ root.mT + self.by_shared @ self.by_shared.mT
+
+    @property
+    def free(self) -> Tensor:
+        """Which of the shared parameters [19] are estimated."""
+        return self.sigmas > 0
+
+    def rows(self, indices: list[int]) -> Tensor:
+        """Return the rows [B] of frames."""
+        return torch.tensor([self.of_frame[i] for i in indices])
+
+    def corrected(self, indices: list[int]) -> Tensor:
+        """Return the poses [B, 4, 4] of frames with their corrections."""
+        rows = self.rows(indices)
+        own = rigid_motions(_times(self.whitening.root[rows], self.value[rows]).double())
+        return (own @ self.moved[indices]).float()
+
+    def cameras(self, indices: list[int], cameras: Cameras) -> Cameras:
+        """Return the cameras of frames with their corrections."""
+        return dataclasses.replace(cameras, world_to_camera=self.corrected(indices))
+
+    def frames(self, frames: list[TrainingFrame]) -> list[TrainingFrame]:
+        """Return the frames with corrected poses."""
+        poses = self.corrected(list(range(len(frames))))
+        return [dataclasses.replace(f, world_to_camera=p) for f, p in zip(frames, poses, strict=True)]
+
+    def gather(self, indices: list[int], information: PoseInformation) -> None:
+        """Keep what pictures say of their poses until the next step; a frame's newest picture counts."""
+        self.gradient[indices], self.curvature[indices] = information.gradient, information.curvature
+        self.gathered += len(indices)
+
+    @property
+    def is_due(self) -> bool:
+        """Whether as many pictures were gathered as there are frames."""
+        return self.gathered >= len(self.of_frame)
+
+    def step(self, frames: list[TrainingFrame], extra: Tensor | None = None) -> Tensor:
+        """Move all corrections to the minimum of what was gathered plus their priors.
+
+        One step of Gauss and Newton in all parameters together: the brackets' own are eliminated first (Schur
+        complement, as in bundle adjustment; Triggs et al. 2000), so that its cost grows with the number of frames only.
+        The prior of a bracket counts once.
+
+        Args:
+            extra: [F, 6, E] motions by further parameters of unit variance that are to be estimated along.
+
+        Returns:
+            The change of the further parameters [E] from zero.
+        """
+        normal = self._normal_equations(extra)
+        all_shared, own = normal.solution()
+        shared, others = all_shared.split([self.by_shared.shape[2], 0 if extra is None else extra.shape[2]])
+        rows = torch.tensor(self.of_frame)
+        motion = _times(self.by_shared, shared) + _times(self.whitening.root.double(), own)[rows]
+        self.gradient += _times(self.curvature, motion)  # until the frames speak again
+        if shared.numel():
+            change = torch.zeros(SIZE, dtype=torch.float64)
+            change[self.free] = self.sigmas[self.free] * shared
+            self._move_shared(frames, self.shared + change)
+        self.value = _times(self.whitening.support, self.value + own.float())
+        self.gathered = 0
+        return others
+
+    def _normal_equations(self, extra: Tensor | None = None) -> "NormalEquations":
+        rows, count = torch.tensor(self.of_frame), len(self.value)
+        root = self.whitening.root.double()[rows]
+        curvature, gradient = self.curvature, self.gradient
+        by_shared, now = self.by_shared, (self.shared / self.sigmas)[self.free]
+        if extra is not None:
+            by_shared, now = torch.cat([by_shared, extra], 2), torch.cat([now, now.new_zeros(extra.shape[2])])
+        own = root.mT @ curvature
+
+        def summed(of_frames: Tensor) -> Tensor:
+            return torch.zeros(count, *of_frames.shape[1:], dtype=torch.float64).index_add(0, rows, of_frames)
+
+        return NormalEquations(
+            summed(own @ root) + torch.eye(6, dtype=torch.float64),
+            summed(own @ by_shared),
+            (by_shared.mT @ curvature @ by_shared).sum(0) + torch.eye(len(now), dtype=torch.float64),
+            -summed(_times(root.mT, gradient)) - self.value.double(),
+            -_times(by_shared.mT, gradient).sum(0) - now,
+        )
+
+    def estimate(self, frames: list[TrainingFrame]) -> PoseEstimate:
+        """Return the corrected poses and their corrections, with prior and posterior deviations.
+
+        The posterior deviations are those of the likelihood that was gathered last, with the model as it is: what moves
+        poses and model together is not counted in them.
+        """
+        normal = self._normal_equations()
+        shared, own = normal.covariances()
+        root, spread = self.whitening.root.double(), torch.zeros(SIZE, SIZE, dtype=torch.float64)
+        sigmas = self.sigmas[self.free]
+        chosen = torch.nonzero(self.free)[:, 0]
+        spread[chosen[:, None], chosen] = sigmas[:, None] * shared * sigmas
+        posterior = spread.diagonal().clamp(min=0).sqrt()
+        navigation = frames[0].navigation
+        prior = SharedParameters() if navigation is None else navigation.sigmas
+        last = torch.from_numpy(prior.vector())[-1:]
+        return PoseEstimate(
+            frame_ids=[f.id for f in frames],
+            brackets=self.of_frame,
+            tagged=self.tags.numpy(),
+            estimated=self.corrected(list(range(len(frames)))).double().numpy(),
+            shared=SharedParameters.of(self.shared.numpy()),
+            shared_prior=prior,
+            shared_posterior=SharedParameters.of(torch.cat([posterior[:-1], last]).numpy()),
+            shared_covariance=spread.numpy(),
+            own=_times(root, self.value.double()).numpy(),
+            own_prior=(root @ root.mT).diagonal(dim1=1, dim2=2).sqrt().numpy(),
+            own_posterior=(root @ own @ root.mT).diagonal(dim1=1, dim2=2).clamp(min=0).sqrt().numpy(),
+        )
+
+    def _move_shared(self, frames: list[TrainingFrame], shared: Tensor) -> None:
+        """Set the shared parameters, and what they make of the tags."""
+        motion, at = motion_of(frames), SharedParameters.of(shared.numpy())
+        self.shared, self.moved = shared, torch.from_numpy(displaced(motion, at))
+        further = ((shared - self.linear_at) / self.sigmas)[self.free].abs().max()
+        if not further <= LINEAR:  # also the first time, when it is NaN
+            columns = torch.from_numpy(jacobian(motion, at))
+            self.by_shared, self.linear_at = columns[:, :, self.free] * self.sigmas[self.free], shared
+
+    def _clear(self) -> None:
+        self.gradient = torch.zeros(len(self.of_frame), 6, dtype=torch.float64)
+        self.curvature = torch.zeros(len(self.of_frame), 6, 6, dtype=torch.float64)
+
+    def fix_gauge(self, gaussians: Gaussians, frames: list[TrainingFrame]) -> Gaussians:
+        """Return the model moved rigidly to where the corrections, moved with it, are smallest in their deviations.
+
+        Moving the model rigidly by d and every pose by its inverse changes no image, so training leaves d open. Motions
+        that would change a direction in which a tag is exact are excluded, unless a shared parameter takes them up.
+        """
+        whole, target = torch.eye(4, dtype=torch.float64), self.corrected(list(range(len(frames)))).double()
+        for _ in range(GAUGE_ROUNDS if self.sigmas.any() else 1):
+            motion, shared = self._gauge(target)
+            rigid = rigid_motions(motion[None])[0]
+            whole, target = rigid @ whole, target @ torch.linalg.inv(rigid)
+            if shared.numel():
+                change = torch.zeros(SIZE, dtype=torch.float64)
+                change[self.free] = self.sigmas[self.free] * shared
+                self._move_shared(frames, self.shared + change)
+            left = motion_vectors(target @ torch.linalg.inv(self.moved))
+            self.value = _times(self.whitening.inverse, self._bracket_means(left)).float()
+        turn = motion_vectors(whole[None])[0, :3].float()
+        rigid = whole.float()
+        return dataclasses.replace(  # a turn this small does not show in the radiance
+            gaussians,
+            means=gaussians.means @ rigid[:3, :3].T + rigid[:3, 3],
+            quats=multiply(from_rotation_vectors(turn).expand(len(gaussians), 4), gaussians.quats),
+        )
+
+    def _gauge(self, poses: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the motion [6] of the body that makes the corrections smallest, and the change [S] of the shared ones.
+
+        The motion adds adjoint · d to each correction, which the shared parameters may take up instead.
+        """
+        size = self.by_shared.shape[2]
+        adjoint = self._bracket_means(torch.cat([-adjoints(poses), -self.by_shared], dim=2))  # [P, 6, 6 + S]
+        free = _null_space((self.whitening.exact @ adjoint).flatten(0, 1))
+        own_rows = (self.whitening.inverse @ adjoint).flatten(0, 1)
+        shared_rows = torch.cat([torch.zeros(size, 6, dtype=torch.float64), torch.eye(size).double()], dim=1)
+        rows = torch.cat([own_rows, shared_rows]) @ free
+        now = torch.cat([self.value.flatten().double(), (self.shared / self.sigmas)[self.free]])
+        change = free @ (torch.linalg.pinv(rows) @ -now)
+        return change[:6], change[6:]
+
+    def _bracket_means(self, of_frames: Tensor) -> Tensor:
+        """Return the mean over each bracket's frames [P, ...] of what each frame has [F, ...]."""
+        of_frame = torch.tensor(self.of_frame)
+        sums = torch.zeros(len(self.value), *of_frames.shape[1:], dtype=of_frames.dtype)
+        frames = torch.bincount(of_frame).view(-1, *[1] * (of_frames.dim() - 1))
+        return sums.index_add(0, of_frame, of_frames) / frames
+
+
+def with_estimate(frames: list[TrainingFrame], estimate: PoseEstimate) -> list[TrainingFrame]:
+    """Return frames with the tags that an estimate of the shared parameters makes of theirs, and what is left to doubt.
+
+    Their covariance is that of the tag's own errors plus that of the estimated parameters.
+    """
+    if frames[0].navigation is None:
+        return frames
+    poses = PoseCorrections(frames)
+    motion = motion_of(frames)
+    columns = torch.from_numpy(jacobian(motion, estimate.shared))
+    spread = columns @ torch.from_numpy(estimate.shared_covariance) @ columns.mT
+    root = poses.whitening.root.double()[poses.of_frame]
+    places = torch.from_numpy(displaced(motion, estimate.shared)).float()
+    return [
+        dataclasses.replace(f, world_to_camera=place, pose_covariance=own + shared, navigation=None)
+        for f, place, own, shared in zip(frames, places, root @ root.mT, spread, strict=True)
+    ]
+
+
+@dataclasses.dataclass(frozen=True)
+class NormalEquations:
+    """Normal equations with a block for each bracket and one for what all share; float64, priors included."""
+
+    own: Tensor  # [P, 6, 6]
+    mixed: Tensor  # [P, 6, S]
+    shared: Tensor  # [S, S]
+    own_right: Tensor  # [P, 6]
+    shared_right: Tensor  # [S]
+
+    def _reduced(self) -> tuple[Tensor, Tensor]:
+        """Return the shared block with the brackets eliminated, and own⁻¹ mixed [P, 6, S]."""
+        eliminated = torch.linalg.solve(self.own, self.mixed)
+        return self.shared - (self.mixed.mT @ eliminated).sum(0), eliminated
+
+    def solution(self) -> tuple[Tensor, Tensor]:
+        """Return the shared parameters [S] and those of the brackets [P, 6]."""
+        reduced, eliminated = self._reduced()
+        shared = torch.linalg.solve(reduced, self.shared_right - _times(eliminated.mT, self.own_right).sum(0))
+        return shared, torch.linalg.solve(self.own, self.own_right) - eliminated @ shared
+
+    def covariances(self) -> tuple[Tensor, Tensor]:
+        """Return the covariance of the shared parameters [S, S] and those of the brackets [P, 6, 6]."""
+        reduced, eliminated = self._reduced()
+        shared = torch.linalg.inv(reduced)
+        return shared, torch.linalg.inv(self.own) + eliminated @ shared @ eliminated.mT
+
+
+def motion_of(frames: list[TrainingFrame]) -> NominalMotion:
+    """Return the nominal motion of frames that state their navigation."""
+    navigation = frames[0].navigation
+    assert navigation is not None
+    poses = torch.stack([f.world_to_camera for f in frames]).double().numpy()
+    attitudes = np.stack(
+        [np.eye(3) if f.inertial_to_body is None else f.inertial_to_body.numpy() for f in frames]
+    )
+    times_s = np.array([f.time_s for f in frames])
+    return NominalMotion.of_poses(
+        times_s,
+        poses,
+        attitudes,
+        mean_motion_rad_s=navigation.mean_motion_rad_s,
+        inertial_to_rtn=navigation.inertial_to_rtn,
+        rate_rad_s=navigation.rate_rad_s,
+        inertia=navigation.inertia,
+    )
+
+
+def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
+    return (matrices @ vectors[..., None])[..., 0]
+
+
+def _null_space(rows: Tensor) -> Tensor:
+    """Return an orthonormal basis [n, k] of what all rows [M, n] map to zero, whatever their lengths."""
+    lengths = rows.norm(dim=1, keepdim=True)
+    _, singular, basis = torch.linalg.svd(torch.where(lengths > 0, rows / lengths, 0.0), full_matrices=False)
+    return basis[singular < NULL].T

@@ -1,0 +1,152 @@
+"""Fair scores of models whose poses were refined: the model may have moved as a whole, and its tags err.
+
+Pictures are compared from poses that are settled on each held-out frame with the model fixed, and from true poses
+after the rigid motion of the model that brings its estimated poses nearest to the true ones. Geometry is compared after
+that motion.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from obbgs_core.frames import TrainingFrame, averaged, cameras_of
+from obbgs_core.losses import likelihood_loss
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
+from obbgs_core.model.rotations import from_rotation_vectors, multiply
+from obbgs_core.pose_corrections import PoseCorrections
+from obbgs_core.registration import point_flow, pose_information
+from obbgs_core.render import render
+from obbgs_core.sensor import Sensor
+
+ROUNDS = 8  # of aligning, Gauss-Newton
+SCALES = (
+    4,
+    2,
+    1,
+)  # sensor pixels along a side of a pixel of the pictures that a pose is settled on, coarse to fine
+STEPS = 4  # of Gauss and Newton on each
+SMALLEST_PX = 24  # no picture is averaged to fewer pixels along a side
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """How far poses are from the true ones, root mean squares over them.
+
+    rotation_deg: of the turn from true to estimated camera axes; range_share: of the camera's distance from its true
+    place over its range; pixels: of the projections of points of the target.
+    """
+
+    rotation_deg: float
+    range_share: float
+    pixels: float
+
+
+def best_motion(estimated: Tensor, true: Tensor, radius_m: float) -> Tensor:
+    """Return the rigid motion [4, 4] of the body after which estimated poses see it most nearly as the true ones do.
+
+    The sum of the squared angles between the projections of seven points, the body's origin and six at `radius_m` from
+    it, is least: what pictures show counts, and an error along the line of sight counts as little as it shows.
+
+    Args:
+        estimated, true: [N, 4, 4] world_to_camera; a point x of the model is at motion · x in the true body frame.
+    """
+    estimated, true = estimated.double(), true.double()
+    motion = torch.eye(4, dtype=torch.float64)
+    for _ in range(ROUNDS):
+        now = true @ motion
+        flow, left = _views(now, estimated, radius_m)
+        rows = (flow @ adjoints(now)[:, None]).flatten(0, 2)
+        motion = motion @ rigid_motions((torch.linalg.pinv(rows) @ left.flatten())[None])[0]
+    return motion
+
+
+def _views(now: Tensor, wanted: Tensor, radius_m: float) -> tuple[Tensor, Tensor]:
+    """Return how seven points' projections (focal length 1) move with poses [N, 7, 2, 6], and how far they should."""
+    points = torch.cat([torch.zeros(1, 3), torch.eye(3), -torch.eye(3)]).double() * radius_m
+    at, goal = (points @ poses[:, :3, :3].mT + poses[:, None, :3, 3] for poses in (now, wanted))
+    flow = point_flow(at.flatten(0, 1), torch.eye(3).double().expand(at.shape[0] * at.shape[1], 3, 3))
+    return flow.unflatten(0, at.shape[:2]), goal[..., :2] / goal[..., 2:] - at[..., :2] / at[..., 2:]
+
+
+def pose_errors(
+    estimated: Tensor, true: Tensor, motion: Tensor, radius_m: float, focal_px: float
+) -> PoseErrors:
+    """Return how far estimated poses [N, 4, 4] are from true ones after the body's motion [4, 4]."""
+    estimated, moved = estimated.double(), true.double() @ motion.double()
+    errors = motion_vectors(estimated @ torch.linalg.inv(moved))
+    centres = [-(p[:, :3, :3].mT @ p[:, :3, 3:])[..., 0] for p in (estimated, moved)]
+    ranges = moved[:, :3, 3].norm(dim=1)
+    _, away = _views(moved, estimated, radius_m)
+
+    def root_mean_square(values: Tensor) -> float:
+        return values.square().mean().sqrt().item()
+
+    return PoseErrors(
+        rotation_deg=root_mean_square(torch.rad2deg(errors[:, :3].norm(dim=1))),
+        range_share=root_mean_square((centres[0] - centres[1]).norm(dim=1) / ranges),
+        pixels=focal_px * root_mean_square(away.norm(dim=-1)),
+    )
+
+
+def moved(gaussians: Gaussians, motion: Tensor) -> Gaussians:
+    """Return a model after a rigid motion [4, 4]; radiance that turns with the view or the Sun does not turn along."""
+    turn = quat_of(motion[:3, :3]).to(gaussians.quats)
+    rigid = motion.to(gaussians.means)
+    return dataclasses.replace(
+        gaussians,
+        means=gaussians.means @ rigid[:3, :3].T + rigid[:3, 3],
+        quats=multiply(turn.expand(len(gaussians), 4), gaussians.quats),
+    )
+
+
+def quat_of(rotation: Tensor) -> Tensor:
+    """Return the quaternion [4] w, x, y, z of a rotation [3, 3] by less than half a turn."""
+    pose = torch.eye(4, dtype=rotation.dtype)
+    pose[:3, :3] = rotation
+    return from_rotation_vectors(motion_vectors(pose[None])[0, :3])
+
+
+def settled_poses(model: Gaussians, frames: list[TrainingFrame], sensor: Sensor) -> Tensor:
+    """Return the poses [F, 4, 4] of frames, each settled on its own picture with the model fixed.
+
+    Gauss-Newton steps on the likelihood of the picture and the prior of its tag, coarse pictures first. The best pose
+    on the whole picture is kept, so that no pose becomes worse.
+
+    Args:
+        frames: with tags and their whole covariances; one without covariance keeps its pose.
+    """
+    return torch.stack([_settled(model, frame, sensor) for frame in frames])
+
+
+@torch.no_grad()
+def _settled(model: Gaussians, frame: TrainingFrame, sensor: Sensor) -> Tensor:
+    alone = [dataclasses.replace(frame, navigation=None)]
+    poses, whole, best = PoseCorrections(alone), cameras_of(alone), (float("inf"), frame.world_to_camera)
+    if not int(poses.rank[0]):
+        return frame.world_to_camera
+    exposure_s = torch.tensor(frame.exposure_time_s).view(1, 1, 1, 1)
+    for factor in (f for f in SCALES if f == 1 or min(frame.dn.shape[:2]) >= f * SMALLEST_PX):
+        dn, cameras = averaged(frame.dn, factor, sensor.white_dn)[None], whole.scaled(1 / factor)
+        for _ in range(STEPS):
+            at = poses.cameras([0], cameras)
+            rendered = render(model, at)
+            images = (exposure_s, dn, sensor, factor * factor)
+            if factor == 1:
+                loss = likelihood_loss(rendered.radiance, *images)[0].item() * dn.numel()
+                best = min(
+                    best,
+                    (loss + 0.5 * poses.value.square().sum().item(), poses.corrected([0])[0]),
+                    key=_first,
+                )
+            poses.gather(
+                [0], pose_information(rendered.radiance, rendered.alpha, rendered.depth, at, *images)
+            )
+            poses.step(alone)
+    return best[1]
+
+
+def _first(pair: tuple[float, Tensor]) -> float:
+    return pair[0]

@@ -1,0 +1,141 @@
+"""The first poses: as tagged where the silhouettes agree with the tags, else moved to where the silhouettes agree."""
+
+import dataclasses
+import logging
+import math
+
+import torch
+from torch import Tensor
+
+from obbgs_core.frames import TrainingFrame
+from obbgs_core.pose_corrections import PoseCorrections
+from obbgs_core.registration import PoseInformation, point_flow
+from obbgs_core.start import hull
+
+log = logging.getLogger(__name__)
+MOST_DILATION_PX = 8  # of a silhouette, for pose errors
+CENTRE_SIGMA = 0.1  # of a silhouette's centre about the projection of one point of the body, over its radius
+ROUNDS = 10  # of aligning the silhouettes' centres; the problem is nearly linear
+# the aligned poses are taken if they leave at most this share of the light that is not covered as tagged
+BETTER = 0.7
+OFFSET = 0.3  # of the silhouettes' radius: deviation of their common point from the body's origin
+FAR = 3.0  # times the median distance of the centres from the point, beyond which they count less
+
+
+def settled(
+    frames: list[TrainingFrame], outlines: dict[int, hull.Silhouette], may_move: bool
+) -> tuple[dict[int, hull.Silhouette], PoseCorrections | None, str]:
+    """Return silhouettes grown by as much as the poses err, the poses if they were moved, and why they were or not.
+
+    The pose tags state how much the poses may err. Silhouettes are grown by no more than that, and by no more than what
+    their coherence asks for: a tag may be honest and its pose still exact, and silhouettes grown for nothing carve
+    nothing. Where the hull of the tagged poses is not coherent, the poses are moved, within what the tags allow, to
+    where the centres of the silhouettes meet; they are kept if the hull is more coherent there.
+
+    Args:
+        outlines: silhouettes of some of the frames, by index, with tagged poses.
+        may_move: whether the poses may be moved at all.
+    """
+    poses = PoseCorrections(frames)
+    errors_px = {i: _error_px(frames[i], poses.covariances[i]) for i in outlines}
+    if max(errors_px.values()) == 0 or not any(o.certain.any() for o in outlines.values()):
+        return outlines, None, ""
+    tagged = _coherence(outlines)
+    if tagged >= hull.AGREEMENT:
+        return outlines, None, ""
+    if may_move:
+        moved, left_px = _aligned(frames, outlines)
+        at = moved.corrected(list(outlines))
+        aligned = {
+            i: dataclasses.replace(o, world_to_camera=p)
+            for (i, o), p in zip(outlines.items(), at, strict=True)
+        }
+        coherence = _coherence(aligned)
+        why = f"the hull covers {tagged:.3f} of the light as tagged, {coherence:.3f} with aligned silhouettes"
+        log.info(why)
+        if 1 - coherence < BETTER * (1 - tagged):
+            most = min(MOST_DILATION_PX, max(1, round(left_px)))
+            return grown(aligned, dict.fromkeys(aligned, most)), moved, why
+    return grown(outlines, errors_px), None, ""
+
+
+def grown(outlines: dict[int, hull.Silhouette], errors_px: dict[int, int]) -> dict[int, hull.Silhouette]:
+    """Return silhouettes grown by the least reach that makes them coherent, each by its own limit at most."""
+    most = max(errors_px.values())
+    for reach_px in [r for r in (0, 1, 2, 4) if r < most]:
+        reached = {i: s.dilated(min(reach_px, errors_px[i])) for i, s in outlines.items()}
+        coherence = _coherence(outlines, reached)
+        log.info("silhouettes grown by %d px of at most %d: coherence %.3f", reach_px, most, coherence)
+        if coherence >= hull.AGREEMENT:
+            return reached
+    return {i: s.dilated(errors_px[i]) for i, s in outlines.items()}
+
+
+def _coherence(
+    outlines: dict[int, hull.Silhouette], reached: dict[int, hull.Silhouette] | None = None
+) -> float:
+    """Return the coherence of the hull of silhouettes, grown or as they are, with the silhouettes as they are."""
+    carving = list((reached or outlines).values())
+    radius = hull.radius_m(list(outlines.values()))
+    if radius == 0:
+        return 0.0
+    points, voxel_m = hull.hull_points(carving, radius)
+    return hull.coherence(list(outlines.values()), points, voxel_m)
+
+
+def _aligned(
+    frames: list[TrainingFrame], outlines: dict[int, hull.Silhouette]
+) -> tuple[PoseCorrections, float]:
+    """Return poses at which one point of the body projects to the silhouettes' centres, and what is left, px.
+
+    The point is the body's origin plus an offset that is estimated as well. The lit part's centre is not quite that of
+    one point: it is taken to err by a tenth of the silhouette's radius.
+    """
+    poses, point = PoseCorrections(frames), torch.zeros(3, dtype=torch.float64)
+    lit = [i for i, outline in outlines.items() if outline.certain.any()]
+    centres, radii = zip(*(_centre(outlines[i].certain) for i in lit), strict=True)
+    centres_px, sigma_px = torch.stack(centres), CENTRE_SIGMA * torch.tensor(radii, dtype=torch.float64)
+    K = torch.stack([frames[i].K for i in lit]).double()
+    ranges_m = torch.stack([frames[i].world_to_camera[2, 3] for i in lit]).clamp(min=1e-6)
+    # the prior deviation of the point from the origin
+    offset_m = OFFSET * float((sigma_px / CENTRE_SIGMA * ranges_m / K[:, 0, 0]).median())
+    by_offset = torch.zeros(len(frames), 6, 3, dtype=torch.float64)
+    for _ in range(ROUNDS):
+        at, turn, away_px = _seen(poses, lit, point, K, centres_px)
+        flow = point_flow(at, K)  # [L, 2, 6]
+        # a centre far off counts less, as one of a picture that shows something else
+        distance = away_px.norm(dim=1)
+        weight = 1 / (sigma_px**2 * (distance / (FAR * distance.median()).clamp(min=1e-9)).clamp(min=1))
+        gradient = -(flow.mT @ (weight[:, None] * away_px)[..., None])[..., 0]
+        poses.gather(lit, PoseInformation(gradient, weight[:, None, None] * (flow.mT @ flow)))
+        by_offset[lit, 3:] = offset_m * turn
+        point = point + offset_m * poses.step(frames, extra=by_offset)
+    return poses, float(_seen(poses, lit, point, K, centres_px)[2].norm(dim=1).median())
+
+
+def _seen(
+    poses: PoseCorrections, lit: list[int], point: Tensor, K: Tensor, centres_px: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a point of the body in camera axes [L, 3], the poses' rotations, and how far the centres are off, px."""
+    world_to_camera = poses.corrected(lit).double()
+    at = world_to_camera[:, :3, :3] @ point + world_to_camera[:, :3, 3]
+    at[:, 2] = at[:, 2].clamp(min=1e-6)
+    projected = at[:, :2] / at[:, 2:] * K[:, [0, 1], [0, 1]] + K[:, :2, 2]
+    return at, world_to_camera[:, :3, :3], centres_px - projected
+
+
+def _centre(mask: Tensor) -> tuple[Tensor, float]:
+    """Return the centre [2] (x, y) px of a mask [H, W], and the radius of a disc as large."""
+    rows, columns = torch.nonzero(mask, as_tuple=True)
+    centre = torch.stack([columns.double().mean(), rows.double().mean()]) + 0.5
+    return centre, math.sqrt(len(rows) / math.pi)
+
+
+def _error_px(frame: TrainingFrame, covariance: Tensor) -> int:
+    """Return the largest standard deviation, px, that a pose's covariance gives the image of the body's origin."""
+    at = frame.world_to_camera[:3, 3].double().clone()
+    at[2] = at[2].clamp(min=1e-6)
+    pixel_by_motion = point_flow(at[None], frame.K.double()[None])[0]
+    covariance_px2 = pixel_by_motion @ covariance.double() @ pixel_by_motion.T
+    worst_px2 = float(torch.linalg.eigvalsh(covariance_px2)[-1].clamp(min=0))
+    return min(MOST_DILATION_PX, round(math.sqrt(worst_px2)))

@@ -1,0 +1,271 @@
+"""What the frames of a pass say of its poses together: the shared parameters, their certainty, and fair scores."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displaced_motion
+from obbgs_core.errors import ReconstructionError
+from obbgs_core.frames import Navigation, TrainingFrame, cameras_of, usable
+from obbgs_core.losses import likelihood_loss
+from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
+from obbgs_core.pose_corrections import NormalEquations, PoseCorrections, with_estimate
+from obbgs_core.registration import pose_information
+from obbgs_core.render import render
+from obbgs_core.score.poses import best_motion, moved, pose_errors, settled_poses
+from obbgs_core.start.alignment import settled
+from obbgs_core.start.initialisation import silhouettes
+from obbgs_core.train.presets import preset
+from obbgs_core.train.trainer import Trainer
+from tests import scenes
+from tests.scenes import QUICK, SENSOR, target
+
+SIZE, RANGE_M = 48, 60.0
+FOCAL_PX = 100.0 * RANGE_M / scenes.RANGE_M
+MODEL = target(40, seed=5)
+ERRORS = SharedParameters(
+    position_m=[0.5, -0.8, 0.3], boresight_rad=[0.012, -0.008, 0.004], rate_rad_s=[0, 0, 3e-5]
+)
+SIGMAS = SharedParameters(
+    position_m=[1, 1, 1], velocity_m_s=[1e-3] * 3, boresight_rad=[0.01] * 3, rate_rad_s=[3e-5] * 3
+)
+OWN = torch.diag(torch.tensor([1e-5] * 3 + [1e-4] * 3).double() ** 2)
+
+
+def a_pass(count: int = 24) -> tuple[list[TrainingFrame], NominalMotion]:
+    """Return true frames of a camera that flies around a spinning body, and its motion."""
+    times, rate = np.linspace(0, 1500, count), np.array([0.0, 0.0, 0.02])
+    bodies = Rotation.from_rotvec(-rate * times[:, None]).as_matrix()
+    angle = 1e-3 * times
+    places = RANGE_M * np.stack([np.cos(angle), np.sin(angle) * 0.6, np.sin(angle) * 0.8], 1)
+    cameras = []
+    for place in places:
+        z = -place / RANGE_M
+        x = np.cross([0.0, 0.6, 0.8], z) / np.linalg.norm(np.cross([0.0, 0.6, 0.8], z))
+        cameras.append(np.stack([x, np.cross(z, x), z]))
+    motion = NominalMotion(times, places, np.array(cameras), bodies, 1e-3, rate_rad_s=rate)
+    K, frames = scenes.intrinsics(SIZE, FOCAL_PX), []
+    for i, pose in enumerate(motion.world_to_camera):
+        frame = TrainingFrame(torch.zeros(SIZE, SIZE, 1), 1e-4, torch.from_numpy(pose).float(), K, i, i)
+        with torch.no_grad():
+            expected = SENSOR.expected_dn(render(MODEL, cameras_of([frame])).radiance[0], 1e-4)
+        noise = torch.randn(expected.shape, generator=torch.Generator().manual_seed(i))
+        dn = (expected + noise * SENSOR.variance_dn2(expected).sqrt()).round().clamp(0, SENSOR.white_dn)
+        frames.append(dataclasses.replace(frame, dn=dn))
+    return frames, motion
+
+
+def tagged(frames: list[TrainingFrame], motion: NominalMotion) -> list[TrainingFrame]:
+    """Return frames with the poses of a motion, and the deviations of what they share stated."""
+    navigation = Navigation(SIGMAS, motion.mean_motion_rad_s, motion.inertial_to_rtn, motion.rate_rad_s)
+    return [
+        dataclasses.replace(
+            f,
+            world_to_camera=torch.from_numpy(motion.world_to_camera[i]).float(),
+            pose_covariance=OWN,
+            navigation=navigation,
+            time_s=float(motion.times_s[i]),
+            inertial_to_body=torch.from_numpy(motion.inertial_to_body[i]),
+        )
+        for i, f in enumerate(frames)
+    ]
+
+
+@pytest.fixture(scope="module")
+def erring() -> tuple[list[TrainingFrame], list[TrainingFrame]]:
+    """Frames with true poses, and with tags that err by what they share."""
+    true, motion = a_pass()
+    return true, tagged(true, displaced_motion(motion, ERRORS))
+
+
+def gathered(poses: PoseCorrections, frames: list[TrainingFrame]) -> None:
+    """Let the true model's pictures say what they say of the poses."""
+    indices = list(range(len(frames)))
+    cameras = poses.cameras(indices, cameras_of(frames))
+    with torch.no_grad():
+        r = render(MODEL, cameras)
+    dn, exposure_s = torch.stack([f.dn for f in frames]), torch.full((len(frames), 1, 1, 1), 1e-4)
+    poses.gather(indices, pose_information(r.radiance, r.alpha, r.depth, cameras, exposure_s, dn, SENSOR))
+
+
+def errors(poses: torch.Tensor, true: list[TrainingFrame]):
+    truth = torch.stack([f.world_to_camera for f in true])
+    return pose_errors(poses, truth, best_motion(poses, truth, 1.0), 1.0, FOCAL_PX)
+
+
+def test_the_gradient_by_a_pose_is_that_of_autograd(erring):
+    """For errors below a pixel the image flow stands for rendering anew; what edges uncover is a part of it."""
+    true, _ = erring
+    frame, xi = true[3], torch.tensor([[1e-3, -5e-4, 2e-3, 0.01, 0.02, -0.02]])
+    cameras = cameras_of([frame])
+    away = rigid_motions(xi) @ frame.world_to_camera
+
+    def loss(motion: torch.Tensor) -> torch.Tensor:
+        at = dataclasses.replace(cameras, world_to_camera=rigid_motions(motion) @ away)
+        radiance = render(MODEL, at).radiance
+        value, _ = likelihood_loss(radiance, torch.tensor(1e-4).view(1, 1, 1, 1), frame.dn[None], SENSOR)
+        return value * frame.dn.numel()
+
+    leaf = torch.zeros(1, 6, requires_grad=True)
+    loss(leaf).backward()
+    at = dataclasses.replace(cameras, world_to_camera=away)
+    with torch.no_grad():
+        r = render(MODEL, at)
+    images = (r.radiance, r.alpha, r.depth, at, torch.tensor(1e-4).view(1, 1, 1, 1), frame.dn[None])
+    ours = pose_information(*images, SENSOR).gradient[0]
+    true_gradient = leaf.grad[0].double()
+    scale = torch.tensor([1.0, 1, 0.1, 1 / RANGE_M, 1 / RANGE_M, 1 / RANGE_M]).double()
+    a, b = ours * scale, true_gradient * scale
+    assert float(a @ b / a.norm() / b.norm()) > 0.97
+
+
+def test_eliminating_the_brackets_solves_the_whole_system():
+    rng = np.random.default_rng(0)
+    P, S = 4, 5
+    root = rng.normal(size=(6 * P + S, 6 * P + S))
+    full = root @ root.T + 10 * np.eye(6 * P + S)
+    for p in range(P):
+        for q in range(P):
+            if p != q:
+                full[6 * p : 6 * p + 6, 6 * q : 6 * q + 6] = 0
+    right = rng.normal(size=6 * P + S)
+    blocks = [slice(6 * p, 6 * p + 6) for p in range(P)]
+    tensors = (
+        np.stack([full[b, b] for b in blocks]),
+        np.stack([full[b, 6 * P :] for b in blocks]),
+        full[6 * P :, 6 * P :],
+        right[: 6 * P].reshape(P, 6),
+        right[6 * P :],
+    )
+    normal = NormalEquations(*map(torch.from_numpy, tensors))
+    expected, inverse = np.linalg.solve(full, right), np.linalg.inv(full)
+    shared, own = normal.solution()
+    np.testing.assert_allclose(shared, expected[6 * P :], rtol=1e-9)
+    np.testing.assert_allclose(own.ravel(), expected[: 6 * P], rtol=1e-9)
+    shared_covariance, own_covariances = normal.covariances()
+    np.testing.assert_allclose(shared_covariance, inverse[6 * P :, 6 * P :], rtol=1e-9, atol=1e-12)
+    for b, found in zip(blocks, own_covariances, strict=True):
+        np.testing.assert_allclose(found, inverse[b, b], rtol=1e-9, atol=1e-12)
+
+
+def test_shared_errors_are_found_with_a_known_model_and_what_does_not_show_is_said(erring):
+    true, wrong = erring
+    outlines, poses, why = settled(wrong, silhouettes(wrong, SENSOR), may_move=True)
+    assert poses is not None and "light as tagged" in why and len(outlines) == len(wrong)
+    before = errors(poses.tags, true)
+    aligned = errors(poses.corrected(list(range(len(true)))), true)
+    assert before.pixels > 5 and aligned.pixels < 0.2 * before.pixels
+    for _ in range(4):
+        gathered(poses, wrong)
+        poses.step(wrong)
+    gathered(poses, wrong)
+    after = errors(poses.corrected(list(range(len(true)))), true)
+    assert after.pixels < 0.1 and after.rotation_deg < 0.1
+    estimate = poses.estimate(wrong)
+    prior, posterior = estimate.shared_prior.vector(), estimate.shared_posterior.vector()
+    assert np.all(posterior <= prior * (1 + 1e-9))
+    # a rotation about the camera's axis and a shift across the line of sight show; the whole orbit's scale does not
+    assert estimate.shared_posterior.boresight_rad[2] < 0.2 * estimate.shared_prior.boresight_rad[2]
+    tree = estimate.tree()
+    assert tree["unobservable"] == estimate.unobservable() and len(tree["frames"]) == len(true)
+
+
+def test_frames_that_were_not_trained_on_follow_the_estimate(erring):
+    true, wrong = erring
+    poses = settled(wrong, silhouettes(wrong, SENSOR), may_move=True)[1]
+    assert poses is not None
+    for _ in range(2):
+        gathered(poses, wrong)
+        poses.step(wrong)
+    estimate = poses.estimate(wrong)
+    followed = with_estimate(wrong[::4], estimate)
+    found = torch.stack([f.world_to_camera for f in followed])
+    own = poses.corrected(list(range(0, len(true), 4)))
+    # what is left in between are the brackets' own corrections
+    left = motion_vectors((found @ torch.linalg.inv(own)).double())
+    np.testing.assert_allclose(left[:, :3], 0, atol=1e-4)
+    np.testing.assert_allclose(left[:, 3:], 0, atol=2e-3)
+    assert all(f.navigation is None and f.pose_covariance is not None for f in followed)
+
+
+def test_a_pose_is_settled_on_its_picture_and_an_exact_one_stays(erring):
+    true, _ = erring
+    sigma = torch.tensor([0.004] * 3 + [0.05] * 3).double()
+    away = rigid_motions(torch.tensor([[0.006, -0.004, 0.01, 0.02, 0.03, 0.05]]))[0]
+    wrong = [
+        dataclasses.replace(f, world_to_camera=away @ f.world_to_camera, pose_covariance=torch.diag(sigma**2))
+        for f in true[:3]
+    ]
+    found = settled_poses(MODEL, wrong, SENSOR)
+    identity = torch.eye(4)
+    before = pose_errors(
+        torch.stack([f.world_to_camera for f in wrong]), _poses(true[:3]), identity, 1.0, FOCAL_PX
+    )
+    after = pose_errors(found, _poses(true[:3]), identity, 1.0, FOCAL_PX)
+    assert before.pixels > 3 and after.pixels < 0.2
+    exact = [dataclasses.replace(f, pose_covariance=None) for f in true[:2]]
+    assert torch.equal(settled_poses(MODEL, exact, SENSOR), _poses(exact))
+
+
+def _poses(frames: list[TrainingFrame]) -> torch.Tensor:
+    return torch.stack([f.world_to_camera for f in frames])
+
+
+@settings(max_examples=8)
+@given(st.lists(st.floats(-0.2, 0.2), min_size=6, max_size=6))
+def test_the_best_motion_is_the_one_that_moved_all_poses(draw):
+    true = _poses(a_pass(6)[0]).double()
+    motion = rigid_motions(torch.tensor([draw]).double())[0]
+    estimated = true @ motion
+    found = best_motion(estimated, true, 1.0)
+    torch.testing.assert_close(found, motion, rtol=0, atol=1e-6)
+    left = pose_errors(estimated, true, found, 1.0, FOCAL_PX)
+    assert left.rotation_deg < 1e-4 and left.range_share < 1e-6 and left.pixels < 1e-3
+
+
+def test_moving_model_and_poses_changes_no_picture(erring):
+    true, _ = erring
+    motion = rigid_motions(torch.tensor([[0.2, -0.3, 0.1, 0.3, -0.1, 0.2]]))[0]
+    cameras = cameras_of(true[:4])
+    back = cameras.world_to_camera @ torch.linalg.inv(motion)
+    with torch.no_grad():
+        before = render(MODEL, cameras).radiance
+        after = render(
+            moved(MODEL, motion.double()), dataclasses.replace(cameras, world_to_camera=back)
+        ).radiance
+    assert (before - after).abs().mean() < 1e-4 * before.mean()  # float32 at 60 m
+
+
+@given(st.integers(0, 10_000))
+def test_motion_vectors_and_adjoints_match_their_definitions(seed):
+    rng = np.random.default_rng(seed)
+    xi = torch.from_numpy(rng.normal(size=(3, 6)) * 0.5)
+    torch.testing.assert_close(motion_vectors(rigid_motions(xi)), xi, rtol=1e-9, atol=1e-9)
+    poses, small = rigid_motions(torch.from_numpy(rng.normal(size=(3, 6)))), 1e-6 * xi[:1]
+    around = poses @ rigid_motions(small) @ torch.linalg.inv(poses)
+    torch.testing.assert_close(motion_vectors(around), (adjoints(poses) @ small[0]), rtol=0, atol=1e-11)
+
+
+def test_a_training_finds_what_the_pass_shares(erring):
+    true, wrong = erring
+    changes = {"steps": 120, "start.count": 800, "growth.max_gaussians": 1200, "poses.refine": "auto"}
+    trainer = Trainer(wrong, SENSOR, preset("obbgs", QUICK | changes))
+    while not trainer.stop_reason():
+        trainer.step()
+    result = trainer.result("")
+    assert result.pose_estimate is not None and result.poses.startswith("refined (the hull")
+    before = errors(torch.from_numpy(result.pose_estimate.tagged), true)
+    after = errors(torch.from_numpy(result.pose_estimate.estimated), true)
+    assert after.pixels < 0.3 * before.pixels
+
+
+def test_frames_of_two_passes_are_refused(erring):
+    _, wrong = erring
+    other = Navigation(dataclasses.replace(SIGMAS, clock_s=np.ones(1)))
+    with pytest.raises(ReconstructionError, match="the same navigation"):
+        usable([*wrong[:5], dataclasses.replace(wrong[5], navigation=other)], True)
