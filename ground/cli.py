@@ -22,7 +22,7 @@ from ground.cli_options import (
     SessionDir,
     UplinkCommand,
 )
-from ground.cli_runs import evaluate_command, reconstruct_command, report_command
+from ground.cli_runs import evaluate_command, mesh_command, reconstruct_command, report_command
 from ground.cli_systems import dictionary_command, yamcs_command
 from ground.cli_view import view_command
 from obbgs_base.command_line import new_app, run
@@ -183,6 +183,7 @@ app.command("live")(live_command)
 app.command("reconstruct")(reconstruct_command)
 app.command("evaluate")(evaluate_command)
 app.command("report")(report_command)
+app.command("mesh")(mesh_command)
 app.command("view")(view_command)
 app.command("compare")(compare_command)
 app.command("list")(list_command)

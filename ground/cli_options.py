@@ -64,6 +64,15 @@ class ExportFormat(StrEnum):
     NERFSTUDIO = "nerfstudio"
 
 
+class MeshFormatName(StrEnum):
+    """Formats of meshes."""
+
+    GLB = "glb"
+    OBJ = "obj"
+    STL = "stl"
+    PLY = "ply"
+
+
 class UplinkCommand(StrEnum):
     """The commands that the spacecraft obeys."""
 

@@ -136,12 +136,12 @@ def finish_run(
     part, result, blind = outputs.folder, results[KNOWN], results.get(BLIND)
     assert result is not None
     blind_gaussians = blind.gaussians if blind else None
-    parity_db = write_models(outputs, result.gaussians, blind_gaussians, session, training, held_out)
+    files = write_models(outputs, result.gaussians, blind_gaussians, session, training, held_out)
     outputs.require("model.ply")
     metrics = training_metrics(result, blind, session, training, held_out)
     if (found := FoundAttitude.read(part / ATTITUDE_FILE)) is not None:
         metrics["attitude"] = found.motion.facts()
-    metrics |= {"onnx_parity_db": parity_db} | model_sizes(part) | {"missing_outputs": outputs.missing}
+    metrics |= files | model_sizes(part) | {"missing_outputs": outputs.missing}
     log.info("%d Gaussians in %.1f s: %s", len(result.gaussians), result.seconds, result.stop_reason)
     with written_to(folder.parent):
         (part / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
