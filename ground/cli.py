@@ -11,24 +11,20 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from flightsw.icd.mission import load_mission
 from ground.cli_compare import compare_command
+from ground.cli_formats import export_command, import_command
 from ground.cli_list import compare_runs_command, list_command
 from ground.cli_live import live_command
 from ground.cli_options import (
     AsJson,
-    Background,
-    BackgroundGiven,
-    ExportFormat,
-    ImportFormat,
     SessionDir,
     UplinkCommand,
-    ValuesGiven,
 )
-from ground.cli_runs import evaluate_command, reconstruct_command, report_command
+from ground.cli_runs import evaluate_command, mesh_command, reconstruct_command, report_command
 from ground.cli_systems import dictionary_command, yamcs_command
+from ground.cli_view import view_command
 from obbgs_base.command_line import new_app, run
 
 app = new_app("The ground station: frames in, a 3D model out.")
@@ -72,7 +68,7 @@ def listen_command(
         signal.signal(number, lambda *_: stop.set())
     with (
         Forwarder(forward) if forward is not None else contextlib.nullcontext() as forwarder,
-        statuses_shown(stderr, json_) as (on_status, on_event),
+        statuses_shown(stderr, json_, link, session) as (on_status, on_event),
     ):
         summary = listen(
             link,
@@ -187,82 +183,15 @@ app.command("live")(live_command)
 app.command("reconstruct")(reconstruct_command)
 app.command("evaluate")(evaluate_command)
 app.command("report")(report_command)
+app.command("mesh")(mesh_command)
+app.command("view")(view_command)
 app.command("compare")(compare_command)
 app.command("list")(list_command)
 app.command("compare-runs")(compare_runs_command)
 app.command("dictionary")(dictionary_command)
 app.command("yamcs")(yamcs_command)
-
-
-@app.command("import")
-def import_command(
-    folder: Annotated[Path, typer.Option("--from", help="The data set's folder.")],
-    session: Annotated[Path, typer.Option(help="The session folder to make.")],
-    format_: Annotated[ImportFormat, typer.Option("--format", help="The data set's format.")],
-    values: ValuesGiven = None,
-    background: BackgroundGiven = None,
-    frames: Annotated[
-        int | None,
-        typer.Option(min=1, help="Import only the first so many pictures (of each split); default: all."),
-    ] = None,
-    json_: AsJson = False,
-) -> None:
-    """Make a session of pictures with known cameras: NeRF-synthetic, nerfstudio, COLMAP or SHIRT.
-
-    Splits that the data set states are kept: `ground reconstruct` trains on train and holds out test, or val if there
-    is no test.
-
-    Example: ground import --format shirt --from shirtv1/roe1/lightbox --frames 363 --session roe1
-    """
-    from ground.formats.colmap import read_colmap
-    from ground.formats.nerf import read_nerf
-    from ground.formats.nerfstudio import read_nerfstudio
-    from ground.formats.shirt import read_shirt
-    from ground.formats.views import Values, first_of_each_split, is_transparent, write_session
-
-    exported = None
-    white = None if background is None else background is Background.WHITE
-    match format_:
-        case ImportFormat.NERF:
-            views, exported = read_nerf(folder)
-            if exported is None and white is None:
-                white = is_transparent(views[0].image)
-        case ImportFormat.NERFSTUDIO:
-            views, exported = read_nerfstudio(folder)
-        case ImportFormat.COLMAP:
-            views = read_colmap(folder)
-        case ImportFormat.SHIRT:
-            views = read_shirt(folder)
-    views = first_of_each_split(views, frames)
-    given = None if values is None else Values(values.value)
-    with Progress(TextColumn("importing"), BarColumn(), TimeRemainingColumn(), console=stderr) as progress:
-        task = progress.add_task("import", total=len(views))
-        source = f"{format_.value}: {folder}"
-        count = write_session(views, session, source, given, white, exported, lambda: progress.advance(task))
-    print(json.dumps({"frames": count, "session": str(session)}) if json_ else f"{count} frames in {session}")
-
-
-@app.command("export")
-def export_command(
-    session: SessionDir,
-    out: Annotated[Path, typer.Option(help="The folder to write.")],
-    format_: Annotated[
-        ExportFormat, typer.Option("--format", help="The format to write.")
-    ] = ExportFormat.NERF,
-    json_: AsJson = False,
-) -> None:
-    """Write a session's frames for other software, whole brackets split into train, val and test (6:2:3).
-
-    Example: ground export --session pass-12 --format nerfstudio --out pass-12-nerfstudio
-    """
-    from ground.formats.nerf import export_nerf
-    from ground.formats.nerfstudio import export_nerfstudio
-    from ground.session import open_session
-
-    exporters = {ExportFormat.NERF: export_nerf, ExportFormat.NERFSTUDIO: export_nerfstudio}
-    counts = exporters[format_](open_session(session), out)
-    text = ", ".join(f"{count} {split}" for split, count in counts.items())
-    print(json.dumps(counts) if json_ else f"{text} in {out}")
+app.command("import")(import_command)
+app.command("export")(export_command)
 
 
 def main() -> None:

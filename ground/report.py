@@ -11,7 +11,7 @@ from ground.cameras import median_sun_direction
 from ground.card import chi2_explained, frames_captured, scored_frames
 from ground.page import as_yaml, cards, page, plot, section, two_tables
 from ground.plots import histogram_figure, training_figure
-from ground.report_frames import frames_section, is_nominal, scored_section
+from ground.report_frames import frames_section, scored_section
 from ground.runs import Run, open_run, written_to
 from ground.session import SessionError
 from ground.splat_view import splat_view
@@ -162,7 +162,7 @@ def _model(run: Run) -> str:
         note += f" Radiance: {html.escape(run.metrics['appearance'])}."
         if median_sun_direction(list(run.session.frames)) is not None:
             note += f" The Sun's direction spans {run.metrics['sun_span_deg']:.1f} degrees."
-    return section("Model", note, splat_view(run, is_nominal(run)))
+    return section("Model", note, splat_view(run))
 
 
 def _training(run: Run) -> str:
@@ -187,7 +187,7 @@ def _training(run: Run) -> str:
 
 def _histogram(run: Run) -> str:
     saturated = sum(r.saturated for r in run.session.frames)
-    nominal = is_nominal(run)
+    nominal = run.session.nominal_exposures
     title, by_time = ("Histogram", "") if nominal else ("Exposure histogram", ", by exposure time")
     note = (
         f"How many pixels of all frames have which reading{by_time}; both the peak at the black level "

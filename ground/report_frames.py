@@ -22,7 +22,7 @@ ABOVE_EMPTY = (
 
 
 def frames_section(run: Run) -> str:
-    nominal = is_nominal(run)
+    nominal = run.session.nominal_exposures
     exposures = sorted({r.exposure_time_s for r in run.session.frames})
     by_key = {(r.bracket, r.exposure_time_s): r for r in run.session.frames}
     picked = _spread(sorted({r.bracket for r in run.session.frames}), COLUMNS)
@@ -51,7 +51,7 @@ def frames_section(run: Run) -> str:
 def scored_section(run: Run, truth: Truth | None) -> str:
     records = [truth.posed(r) for r in run.scored] if truth else run.scored
     by_key = {(r.bracket, r.exposure_time_s): r for r in records}
-    nominal, brackets = is_nominal(run), sorted({r.bracket for r in run.scored})
+    nominal, brackets = run.session.nominal_exposures, sorted({r.bracket for r in run.scored})
     shown = _spread(brackets, VIEWS_SHOWN)
     body = []
     for bracket in shown:
@@ -102,16 +102,9 @@ def _compared(run: Run, truth: Truth | None, of_view: list[FrameRecord]) -> str:
     return grid(f"{LABEL_WIDTH} repeat({len(names)}, minmax(0, 1fr))", cells)
 
 
-def is_nominal(run: Run) -> bool:
-    """Return whether the exposure times are made up: pictures were imported that state none."""
-    return run.session.frames_imported is not None and {r.exposure_time_s for r in run.session.frames} == {
-        1.0
-    }
-
-
 def _exposure(run: Run, record: FrameRecord) -> str:
     """Return a frame's exposure time in words; nothing where it is made up."""
-    return "" if is_nominal(run) else f"{record.exposure_time_s * 1e3:g} ms"
+    return "" if run.session.nominal_exposures else f"{record.exposure_time_s * 1e3:g} ms"
 
 
 def _spread(values: list[int], count: int) -> list[int]:

@@ -53,6 +53,7 @@ def training_metrics(
         "removed_not_finite": result.removed_not_finite,
         "dark_frames": result.dark_frames,
         "chi2": None if math.isnan(chi2) else chi2,
+        "misfit": result.misfit,  # null: not learnt
         "frames_received": len(session.frames),
         "frames_captured": session.frames_captured,  # null: flight did not say
         "frames_trained": len(training),

@@ -141,6 +141,8 @@ class Session:
     background: float  # radiance of what is seen where the target is not
     encoding: str  # of the digital numbers: linear in light, or srgb (display values)
     navigation: Navigation
+    registration: Mapping[str, Any] | None  # of photographs: what structure from motion made of them
+    attitude_estimated: bool = False  # poses are in axes of the target that were found
 
     @property
     def frames_captured(self) -> int | None:
@@ -151,6 +153,11 @@ class Session:
         if self.flight is None:
             return self.frames_imported
         return self.flight.captured(self.frames[-1].id)
+
+    @property
+    def nominal_exposures(self) -> bool:
+        """Whether the exposure times are made up: pictures were imported that state none."""
+        return self.frames_imported is not None and {r.exposure_time_s for r in self.frames} == {1.0}
 
     def K(self, record: FrameRecord) -> np.ndarray:
         """Return the pinhole matrix [3, 3] of a frame, float32, px."""
@@ -203,6 +210,7 @@ def open_session(folder: str | Path) -> Session:
             _background(header),
             _encoding(header),
             _navigation(header),
+            _registration(header),
         )
     except (ConfigError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise SessionCorrupt(f"{folder / 'session.json'}: {error}") from error
@@ -268,6 +276,15 @@ def _encoding(header: dict[str, Any]) -> str:
     if encoding not in ENCODINGS:
         raise ValueError(f"encoding must be one of {', '.join(ENCODINGS)}, got {encoding!r}")
     return encoding
+
+
+def _registration(header: dict[str, Any]) -> dict[str, Any] | None:
+    found = header.get("registration")
+    if found is None:
+        return None
+    if not (isinstance(found, dict) and isinstance(found.get("left_out"), list)):
+        raise ValueError(f"registration must be an object with a list left_out, got {found!r}")
+    return found
 
 
 def _navigation(header: dict[str, Any]) -> Navigation:

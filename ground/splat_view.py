@@ -24,14 +24,10 @@ PICTURE_PX = (360, 240)  # width and height of the turntable
 EXPOSURE_REACH = 4.0  # the slider reaches from a quarter of the shortest exposure to four times the longest
 
 
-def splat_view(run: Run, nominal: bool) -> str:
-    """Return the view as HTML: the model, its controls, and a turntable for browsers that cannot draw it.
-
-    Args:
-        nominal: whether exposure times are made up, so that only their ratios mean something.
-    """
+def splat_view(run: Run) -> str:
+    """Return the view as HTML: the model, its controls, and a turntable for browsers that cannot draw it."""
     gaussians = _strongest(run.gaussians.detach())
-    facts, arrays = packed(run, gaussians, nominal)
+    facts, arrays = packed(run, gaussians)
     data = "".join(
         f'<script type="text/plain" data-part="{name}">{base64.b64encode(values.tobytes()).decode()}</script>'
         for name, values in arrays.items()
@@ -53,7 +49,7 @@ def splat_view(run: Run, nominal: bool) -> str:
     )
 
 
-def packed(run: Run, gaussians: Gaussians, nominal: bool) -> tuple[dict, dict[str, np.ndarray]]:
+def packed(run: Run, gaussians: Gaussians) -> tuple[dict, dict[str, np.ndarray]]:
     """Return what the page needs to draw the Gaussians: facts for JSON, and arrays.
 
     means: [N, 3] float32, m. params: [N, texels, 4] float16: quaternion, log scales and opacity, coefficients of
@@ -89,7 +85,7 @@ def packed(run: Run, gaussians: Gaussians, nominal: bool) -> tuple[dict, dict[st
         "sensor": {key: getattr(sensor, key) for key in ("black_dn", "white_dn", "dn_per_radiance_s")},
         "encoding": session.encoding,
         "background": session.background,
-        "nominal": nominal,
+        "nominal": session.nominal_exposures,
         "exposures_s": sorted({record.exposure_time_s for record in session.frames}),
         "suns": [[round(v, 6) for v in sun.tolist()] for sun in suns],
         "cameras": _directions(session.frames),

@@ -83,6 +83,7 @@ class SensorModel:
         electrons_per_dn: float,
         read_noise_dn: float,
         averaged_pixels: float,
+        misfit: float | None,
     ) -> None: ...
 
 def likelihood(

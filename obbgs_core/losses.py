@@ -17,6 +17,7 @@ from obbgs_core.sensor import Sensor
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Wang et al. 2004
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+MISFIT_ROWS = 50  # of an image that the model's own error is measured on, about
 ON_TARGET_ALPHA = 0.05  # pixels with more alpha than this count as target in the figures of a fit
 
 
@@ -27,8 +28,9 @@ def likelihood_loss(
     sensor: Sensor,
     averaged_pixels: int = 1,
     edge_weight: float = 0.0,
+    misfit: float | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Return the robust negative log likelihood of readings plus weighted edges, and the noise-normalised residual.
+    """Return the robust negative log likelihood of readings plus weighted edges, and the normalised residual.
 
     Edges are compared after `Sensor.stabilised`, where noise is the same everywhere, with the prediction clamped at
     full scale.
@@ -38,9 +40,12 @@ def likelihood_loss(
         exposure_time_s: [B, 1, 1, 1].
         dn: read [B, H, W, C].
         averaged_pixels: sensor pixels averaged into each pixel of dn; the noise is smaller by its root.
+        misfit: the model's own error as a share of the light (`relative_misfit`), which no averaging makes smaller. The
+            residual is then over both errors together, and the penalty Cauchy's: what the model cannot explain, such as
+            the glint of a mirror, loses its pull. None: only the noise is known, and the penalty is `charbonnier`.
 
     Returns:
-        loss: scalar; residual: [B, H, W, C], `Sensor.deviance_residual`, without gradient.
+        loss: scalar; residual: [B, H, W, C], `Sensor.deviance_residual` over its deviation, without gradient.
 
     Raises:
         ValueError: shapes disagree, or images are smaller than the 3x3 of an edge.
@@ -48,8 +53,9 @@ def likelihood_loss(
     _check(radiance, exposure_time_s, dn)
     native = compiled.module_for(radiance, exposure_time_s, dn)
     if native is None:
-        return likelihood_loss_reference(radiance, exposure_time_s, dn, sensor, averaged_pixels, edge_weight)
-    model = _sensor_model(native, sensor, averaged_pixels)
+        settings = (averaged_pixels, edge_weight, misfit)
+        return likelihood_loss_reference(radiance, exposure_time_s, dn, sensor, *settings)
+    model = _sensor_model(native, sensor, averaged_pixels, misfit)
     return _swept(native.likelihood, radiance, exposure_time_s, dn, sensor, model, edge_weight)
 
 
@@ -60,10 +66,18 @@ def likelihood_loss_reference(
     sensor: Sensor,
     averaged_pixels: int = 1,
     edge_weight: float = 0.0,
+    misfit: float | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return what `likelihood_loss` does, in readable PyTorch."""
     residual = sensor.deviance_residual(radiance, exposure_time_s, dn, averaged_pixels)
-    loss = charbonnier(residual)
+    if misfit is None:
+        loss = charbonnier(residual)
+    else:
+        prediction = sensor.predicted(radiance.detach(), exposure_time_s)
+        light_dn = (prediction.expected_dn - sensor.black_dn).clamp(0, sensor.white_dn - sensor.black_dn)
+        both = 1 + averaged_pixels * (misfit * light_dn).square() / prediction.variance_dn2
+        residual = residual / both.sqrt()
+        loss = cauchy(residual)
     if edge_weight:
         visible = sensor.expected_dn(radiance, exposure_time_s).clamp(max=sensor.white_dn)
         loss = loss + edge_weight * sobel_edge_loss(sensor.stabilised(visible), sensor.stabilised(dn))
@@ -169,6 +183,30 @@ def charbonnier(normalised_residual: Tensor, knee: float = 2.0) -> Tensor:
     return (knee * knee * ((1 + (normalised_residual / knee) ** 2).sqrt() - 1)).mean()
 
 
+def cauchy(normalised_residual: Tensor, tail: float = 3.0) -> Tensor:
+    """Return the mean robust penalty: half the square well below `tail` sigma, growing as a logarithm well above."""
+    return (0.5 * tail * tail * torch.log1p((normalised_residual / tail) ** 2)).mean()
+
+
+@torch.no_grad()
+def relative_misfit(
+    radiance: Tensor, exposure_time_s: Tensor, dn: Tensor, sensor: Sensor, averaged_pixels: int = 1
+) -> float:
+    """Return the model's own error as a share of the light, by the method of moments; NaN where nothing is seen.
+
+    Its square is the mean square by which readings differ from their expectation, less the noise, over the mean square
+    of the light; 0 where noise explains the difference. Values that are lit above twice the noise count, saturated ones
+    do not. The arguments are as for `likelihood_loss`; of large images, every so many pixels are taken.
+    """
+    step = max(1, radiance.shape[1] // MISFIT_ROWS)
+    radiance, dn = radiance[:, ::step, ::step], dn[:, ::step, ::step]
+    prediction = sensor.predicted(radiance, exposure_time_s)
+    light_dn, variance = prediction.expected_dn - sensor.black_dn, prediction.variance_dn2 / averaged_pixels
+    seen = (light_dn > 2 * variance.sqrt()) & (dn < sensor.white_dn)
+    excess = ((prediction.expected_dn - dn).square() - variance)[seen].sum()
+    return (excess / light_dn.square()[seen].sum()).clamp(min=0).sqrt().item()
+
+
 def ssim(a: Tensor, b: Tensor) -> Tensor:
     """Return the mean structural similarity of images in 0..1, Gaussian window, zero padding as in 3DGS."""
     return ssim_map(a, b).mean()
@@ -219,10 +257,15 @@ def _check(radiance: Tensor, exposure_time_s: Tensor, dn: Tensor) -> None:
         )
 
 
-def _sensor_model(native, sensor: Sensor, averaged_pixels: int = 1):
+def _sensor_model(native, sensor: Sensor, averaged_pixels: int = 1, misfit: float | None = None):
     """Return the sensor as the compiled module takes it."""
     return native.SensorModel(
-        sensor.black_dn, sensor.white_dn, sensor.electrons_per_dn, sensor.read_noise_dn, averaged_pixels
+        sensor.black_dn,
+        sensor.white_dn,
+        sensor.electrons_per_dn,
+        sensor.read_noise_dn,
+        averaged_pixels,
+        misfit,
     )
 
 

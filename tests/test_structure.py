@@ -40,7 +40,12 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     "ground.baselines": CORE | {"obbgs_core.start", "obbgs_core.score"},
     "ground.compare": {"obbgs_base", "flightsw.icd", "ground", "ground.baselines", "ground.session"}
     | LIBRARY,
-    "ground": CONTRACT | {"flightsw.ports", "ground.formats", "ground.compare"} | SESSIONS | LIBRARY,
+    "ground.viewer": {"obbgs_base", "flightsw.icd", "ground", "ground.session"}
+    | LIBRARY - {"obbgs_core.train"},
+    "ground": CONTRACT
+    | {"flightsw.ports", "ground.formats", "ground.compare", "ground.viewer", "obbgs_core.attitude"}
+    | SESSIONS
+    | LIBRARY,
     "hil.watched": {"obbgs_base"},
     "hil.sky": {"obbgs_base", "flightsw.icd"},
     "hil.world": {"obbgs_base", "flightsw.icd", "flightsw", "flightsw.cameras"},

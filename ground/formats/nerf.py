@@ -15,14 +15,13 @@ import numpy as np
 
 from flightsw.icd.config import ConfigError, build, keys_below, parse_json
 from flightsw.icd.mission import CameraSection
+from ground.formats.axes import opengl_to_world_to_camera, world_to_camera_to_opengl
 from ground.formats.views import (
     Exported,
     FormatError,
     Intrinsics,
     View,
     image_size,
-    opengl_to_world_to_camera,
-    world_to_camera_to_opengl,
 )
 from ground.session import SPLITS, FrameRecord, Session
 from obbgs_base.files import write_whole

@@ -26,8 +26,6 @@ from obbgs_base.files import write_whole
 FOREIGN_READ_NOISE = 2 / 255  # of full scale
 FOREIGN_ELECTRONS_PER_DN = 1e3
 FRAME_SPACING_NS = 1_000_000_000  # between pictures without a time
-# x right, y up, z backwards (OpenGL, Blender) to x right, y down, z forward (OpenCV), and back
-FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class FormatError(SessionError):
@@ -73,6 +71,21 @@ class View:
     split: str | None = None  # train, val or test; stated for all views or for none
 
 
+@dataclass(frozen=True)
+class PoseSigmas:
+    """Standard deviations of imported poses, the same about every axis and for every picture."""
+
+    rotation_rad: float
+    position_m: float
+
+    def __post_init__(self):
+        if not all(0 <= value < math.inf for value in (self.rotation_rad, self.position_m)):
+            raise ValueError(f"expected deviations of at least 0, got {self}")
+
+
+EXACT = PoseSigmas(0.0, 0.0)
+
+
 class Values(StrEnum):
     """What the values of imported pictures stand for, and whether a session keeps them."""
 
@@ -104,6 +117,8 @@ def write_session(
     white_background: bool | None = None,
     exported: Exported | None = None,
     on_view: Callable[[], None] = lambda: None,
+    sigmas: PoseSigmas = EXACT,
+    registration: dict | None = None,
 ) -> int:
     """Write a new session from pictures and return the number of its frames.
 
@@ -118,6 +133,8 @@ def write_session(
             black; None: as the export says, otherwise black.
         exported: what our own export says of the pictures; their 8 bits span its camera's range from black level to
             full scale.
+        sigmas: how far the poses can err; the training corrects what is not exact.
+        registration: what structure from motion says of the pictures, for the session to keep.
 
     Raises:
         FormatError: there are no views, their sizes differ, or a picture cannot be read or has another size.
@@ -136,7 +153,7 @@ def write_session(
         dn = _digital_numbers(view, target)
         write_whole(folder / name, bytes(imagecodecs.png_encode(dn, level=1)))
         sha256 = hashlib.sha256(view.image.read_bytes()).hexdigest()
-        line = frame_line(_frame(view, number, dn, camera), name, sha256)
+        line = frame_line(_frame(view, number, dn, camera, sigmas), name, sha256)
         if view.split is not None:
             line["split"] = view.split
         if view.intrinsics.K != camera.K:
@@ -151,6 +168,7 @@ def write_session(
         "camera": dataclasses.asdict(camera),
         "background": target.background,
         "encoding": target.encoding,
+        **({} if registration is None else {"registration": registration}),
         "tles": {},
         "losses": {},
         "frames_received": len(views),
@@ -251,41 +269,6 @@ def undistort(image: np.ndarray, intrinsics: Intrinsics, empty: float = 0.0) -> 
     return np.stack(channels, axis=2)
 
 
-def opengl_to_world_to_camera(camera_to_world: object, where: str) -> np.ndarray:
-    """Return world_to_camera [4, 4], OpenCV axes, of a camera-to-world matrix in OpenGL axes.
-
-    Raises:
-        FormatError: it is not a rotation with a translation.
-    """
-    try:
-        matrix = np.array(camera_to_world, dtype=np.float64)
-    except (ValueError, TypeError) as error:
-        raise FormatError(f"{where}: transform_matrix is not a matrix of numbers") from error
-    if matrix.shape == (3, 4):
-        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise FormatError(
-            f"{where}: transform_matrix must be 4x4 finite numbers, got shape {list(matrix.shape)}"
-        )
-    R = matrix[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-        raise FormatError(f"{where}: transform_matrix holds no rotation")
-    return rigid_inverse(matrix @ FLIP_YZ)
-
-
-def world_to_camera_to_opengl(world_to_camera: np.ndarray) -> np.ndarray:
-    """Return the camera-to-world matrix [4, 4] in OpenGL axes."""
-    return rigid_inverse(world_to_camera) @ FLIP_YZ
-
-
-def rigid_inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse [4, 4] of a rotation with a translation."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = matrix[:3, :3].T
-    inverse[:3, 3] = -matrix[:3, :3].T @ matrix[:3, 3]
-    return inverse
-
-
 def image_size(path: Path) -> tuple[int, int]:
     """Return width and height of a picture.
 
@@ -361,12 +344,12 @@ def _foreign_camera(intrinsics: Intrinsics, channels: int, bit_depth: int, longe
     )
 
 
-def _frame(view: View, number: int, dn: np.ndarray, camera: CameraSection) -> Frame:
+def _frame(view: View, number: int, dn: np.ndarray, camera: CameraSection, sigmas: PoseSigmas) -> Frame:
     w2c = view.world_to_camera
     pose = PoseTag(
         quat_body_to_camera=matrix_to_quat(w2c[:3, :3]),
         position_body_m=-w2c[:3, :3].T @ w2c[:3, 3],
-        covariance=np.zeros((6, 6)),
+        covariance=np.diag(np.repeat([sigmas.position_m**2, sigmas.rotation_rad**2], 3)),
         sun_dir_body=view.sun_dir_body,
         in_eclipse=view.in_eclipse,
         valid=True,

@@ -24,6 +24,8 @@ class LossSettings:
     edge_weight: float = 0.0  # of the difference of Sobel derivatives
     # of l1_ssim: the prediction is clamped at full scale as the sensor clips, so that a saturated pixel does not pull
     clamped: bool = True
+    # of the likelihood: the model's own error is learnt beside the noise, and what it cannot explain loses its pull
+    misfit: bool = False
     # of the mean square of the coefficients that turn with the view: a prior for matt surface
     sh_weight: float = 0.0
     # of the mean shortest scale over the target's radius: flat Gaussians are surface
@@ -35,12 +37,15 @@ class LossSettings:
 
 
 def image_loss(
-    rendered: Rendered, batch: Batch, sensor: Sensor, settings: LossSettings
+    rendered: Rendered, batch: Batch, sensor: Sensor, settings: LossSettings, misfit: float | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return the loss of a step's images and the residual [B, H, W, C], in sigmas or in full scales."""
+    """Return the loss of a step's images and the residual [B, H, W, C], in sigmas or in full scales.
+
+    misfit: the model's own error as far as it is known, see `likelihood_loss`.
+    """
     images = (rendered.radiance, batch.exposure_time_s, batch.dn, sensor)
     if settings.kind == "likelihood":
-        return likelihood_loss(*images, batch.averaged_pixels, settings.edge_weight)
+        return likelihood_loss(*images, batch.averaged_pixels, settings.edge_weight, misfit)
     loss, residual = published_loss(*images, settings.ssim_weight, settings.edge_weight, settings.clamped)
     return loss * len(batch.cameras), residual  # a sum over the step's frames, as published
 

@@ -63,6 +63,7 @@ class TrainResult:
     poses: str  # whether the poses were refined, and why
     pose_estimate: PoseEstimate | None  # the refined poses; None: as tagged
     exposing: Exposing  # what its pictures are made with
+    misfit: float | None  # the model's own error as a share of the light; None: it was not learnt
     sun_span_deg: float  # largest angle between two frames' Suns, body frame
     dark_frames: int  # left out: nothing in them rises above the noise
     removed_outliers: int

@@ -83,6 +83,7 @@ class TrainingState:
     boxes: list[Obb] = field(default_factory=list)  # behind the worst tiles since the last growth inside them
     shadows: Shadows = field(default_factory=Shadows)
     chi2: float = math.nan  # running mean
+    misfit: float | None = None  # running mean of the model's own error; None: not learnt, or not yet
     psnr_db: float = math.nan  # of the last step's frames
     steps_done: int = 0
     seconds: float = 0.0

@@ -12,7 +12,7 @@ import torch
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.losses import fit_figures
+from obbgs_core.losses import fit_figures, relative_misfit
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.registration import pose_information
 from obbgs_core.render import Rendered, render
@@ -32,6 +32,9 @@ from obbgs_core.train.state import TrainingState
 
 log = logging.getLogger(__name__)
 CHI2_MEMORY = 0.98  # share of the running chi² that a step keeps; the rest is the step's own
+MISFIT_FROM = (
+    0.5  # share of the steps from which the model's own error counts: before, most of it is yet to be learnt
+)
 CHECKPOINT_EVERY_S = 20.0
 LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
 FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
@@ -123,7 +126,8 @@ class Trainer:
         cameras = batch.cameras if state.poses is None else state.poses.cameras(drawn, batch.cameras)
         sunlit = state.shadows.sunlit(state.gaussians, cameras, state.steps_done)
         rendered = self._compensated(render(state.model, cameras, sunlit=sunlit), batch)
-        loss, residual = image_loss(rendered, batch, setup.sensor, config.loss)
+        misfit = state.misfit if share >= MISFIT_FROM else None
+        loss, residual = image_loss(rendered, batch, setup.sensor, config.loss, misfit)
         if not torch.isfinite(loss):
             raise Diverged(state.steps_done, loss.item())
         prior = priors(state.gaussians, rendered, batch, setup.radius_m, config.loss)
@@ -175,13 +179,18 @@ class Trainer:
             poses.step(self.setup.frames)
 
     def _measure(self, rendered: Rendered, batch: Batch) -> None:
-        """Keep the running chi² on the target, and the PSNR of this step's frames."""
+        """Keep the running chi² on the target, the model's own error, and the PSNR of this step's frames."""
         state = self.state
         images = (rendered.radiance, rendered.alpha, batch.exposure_time_s, batch.dn)
         chi2, state.psnr_db = fit_figures(*images, self.setup.sensor, batch.averaged_pixels)
         if not math.isnan(chi2):
             known = not math.isnan(state.chi2)
             state.chi2 = CHI2_MEMORY * state.chi2 + (1 - CHI2_MEMORY) * chi2 if known else chi2
+        if self.setup.config.loss.misfit:
+            misfit = relative_misfit(images[0], *images[2:], self.setup.sensor, batch.averaged_pixels)
+            if not math.isnan(misfit):
+                last = misfit if state.misfit is None else state.misfit
+                state.misfit = CHI2_MEMORY * last + (1 - CHI2_MEMORY) * misfit
 
     def _recorded(self, loss: float) -> StepInfo:
         """Return how the training stands, and keep it in the history."""
@@ -287,6 +296,7 @@ class Trainer:
             poses=state.poses_decided or "as tagged (training ended before this was decided)",
             pose_estimate=None if state.poses is None else state.poses.estimate(setup.frames),
             exposing=self.exposing,
+            misfit=state.misfit,
             sun_span_deg=setup.sun_span_deg,
             dark_frames=setup.dark_frames,
             removed_outliers=removed,

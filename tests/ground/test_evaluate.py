@@ -98,6 +98,13 @@ def test_chi2_far_above_one_is_told_as_the_size_of_the_models_error(chi2, told):
     assert told in chi2_explained(chi2)
 
 
+@pytest.mark.parametrize(("misfit", "told"), [(0.213, True), (None, False)])
+def test_the_card_tells_the_models_own_error_where_it_was_learnt(session, misfit, told):
+    metrics = json.loads((session / "runs" / "run" / "metrics.json").read_text()) | {"misfit": misfit}
+    card = model_card("2026-07-21T00:00:00+00:00", metrics)
+    assert ("own error, beside the noise: 21 % of the light" in card) == told
+
+
 @pytest.mark.parametrize("chi2", [None, math.nan])
 def test_a_run_without_chi2_or_onnx_has_its_card_and_report(session, tmp_path, chi2):
     shutil.copytree(session, tmp_path / "session")

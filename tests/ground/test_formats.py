@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from flightsw.icd.frame import encode_frame
 from flightsw.icd.quaternion import quat_to_matrix
+from ground.formats.axes import opengl_to_world_to_camera, world_to_camera_to_opengl
 from ground.formats.colmap import read_colmap
 from ground.formats.nerf import export_nerf, read_nerf, split_frames
 from ground.formats.nerfstudio import export_nerfstudio, read_nerfstudio
@@ -24,9 +25,7 @@ from ground.formats.views import (
     FormatError,
     Intrinsics,
     Values,
-    opengl_to_world_to_camera,
     undistort,
-    world_to_camera_to_opengl,
     write_session,
 )
 from ground.session import SessionError, open_session

@@ -16,6 +16,7 @@ from skimage.metrics import peak_signal_noise_ratio
 from ground.cameras import cameras_of, predicted_image
 from ground.cli_options import PixelValues
 from ground.evaluate import evaluate
+from ground.formats.axes import world_to_camera_to_opengl
 from ground.formats.colmap import read_colmap
 from ground.formats.nerf import export_nerf, read_nerf
 from ground.formats.nerfstudio import export_nerfstudio, read_nerfstudio
@@ -25,7 +26,6 @@ from ground.formats.views import (
     Values,
     first_of_each_split,
     is_transparent,
-    world_to_camera_to_opengl,
     write_session,
 )
 from ground.reconstruct import reconstruct

@@ -104,7 +104,7 @@ def test_the_page_draws_what_our_renderer_draws(
 ):
     gaussians = model(shading, footprint, sh_count, channels)
     run = dataclasses.replace(open_run(session, "run"), gaussians=gaussians)
-    (tmp_path / "page.html").write_text(f"<!doctype html>{splat_view(run, False)}")
+    (tmp_path / "page.html").write_text(f"<!doctype html>{splat_view(run)}")
     with opened(browser, as_url(tmp_path / "page.html"), 420, 300) as page:
         still(page)
         for changed in (
@@ -129,7 +129,7 @@ def test_a_moving_sun_can_be_moved_and_shadows_follow(session, browser, tmp_path
     run = dataclasses.replace(
         run, session=dataclasses.replace(run.session, frames=frames), gaussians=gaussians
     )
-    (tmp_path / "page.html").write_text(f"<!doctype html>{splat_view(run, False)}")
+    (tmp_path / "page.html").write_text(f"<!doctype html>{splat_view(run)}")
     with opened(browser, as_url(tmp_path / "page.html"), 420, 300) as page:
         still(page)
         seen = []
@@ -144,7 +144,7 @@ def test_a_moving_sun_can_be_moved_and_shadows_follow(session, browser, tmp_path
 
 
 def test_the_controls_work_and_no_wheel_flies_into_the_model(session, browser, tmp_path):
-    (tmp_path / "page.html").write_text(f"<!doctype html>{splat_view(open_run(session, 'run'), False)}")
+    (tmp_path / "page.html").write_text(f"<!doctype html>{splat_view(open_run(session, 'run'))}")
     with opened(browser, as_url(tmp_path / "page.html"), 240, 460) as page:
         still(page)
         first = pixels(page, CANVAS)
@@ -212,7 +212,7 @@ def test_the_turntable_is_an_animation_of_our_renders(session):
 def test_a_large_model_keeps_its_strongest_gaussians(session, monkeypatch):
     monkeypatch.setattr("ground.splat_view.MOST_SPLATS", 100)
     run = open_run(session, "run")
-    facts = splat_view(run, False).partition('data-part="model">')[2].partition("</script>")[0]
+    facts = splat_view(run).partition('data-part="model">')[2].partition("</script>")[0]
     assert json.loads(facts)["count"] == 100 < len(run.gaussians)
 
 
@@ -220,7 +220,7 @@ def test_gaussians_that_are_not_finite_are_left_out(session):
     run = open_run(session, "run")
     gaussians = run.gaussians
     gaussians.means[3, 1] = torch.nan
-    facts = splat_view(run, False).partition('data-part="model">')[2].partition("</script>")[0]
+    facts = splat_view(run).partition('data-part="model">')[2].partition("</script>")[0]
     assert json.loads(facts)["count"] == len(gaussians) - 1
 
 

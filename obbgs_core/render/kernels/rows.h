@@ -14,6 +14,7 @@ namespace obbgs {
 constexpr int kReach = 5, kTaps = 2 * kReach + 1;  // SSIM window of Wang et al. 2004: 11 pixels, sigma 1.5
 constexpr float kSsimC1 = 1e-4f, kSsimC2 = 9e-4f;  // (0.01)^2, (0.03)^2
 constexpr float kKnee = 2;                         // sigma, where the Charbonnier penalty turns from square to linear
+constexpr float kTail = 3;                         // sigma, where the Cauchy penalty turns from square to logarithm
 constexpr float kHalfDn = 0.5f;                    // rounding: a reading of 0 means a signal below this
 
 struct SensorModel {
@@ -21,6 +22,7 @@ struct SensorModel {
   float read_variance;   // DN^2, quantisation included
   float anscombe_floor;  // electrons^2
   float root_averaged;   // sqrt of the sensor pixels in one pixel: averaging shrinks the noise
+  float misfit;          // squared relative error of the model times the sensor pixels in one; negative: not known
 };
 
 struct Window {
@@ -94,10 +96,19 @@ inline float expected_dn(float signal, const SensorModel& s, float& inverse_sigm
   return s.black + signal;
 }
 
-// Robust penalty of a squared residual: knee^2 (q - 1) without the cancellation, q = sqrt(1 + (r / knee)^2).
-inline float charbonnier(float squared, float& q) {
-  q = std::sqrt(1.0f + squared * (1.0f / (kKnee * kKnee)));
-  return squared / (q + 1.0f);
+// Robust penalty of a squared residual; its slope is residual / q. Where the model's own error is not known: Charbonnier,
+// knee^2 (q - 1) without the cancellation, q = sqrt(1 + (r / knee)^2). Otherwise Cauchy, tail^2 / 2 log(q),
+// q = 1 + (r / tail)^2, of residuals over both errors: `share` is the noise's share of their deviation.
+inline float robust(float& squared, float signal, float inverse_sigma, const SensorModel& s, float& share, float& q) {
+  const float seen = signal < 0 ? 0.0f : (signal > s.white - s.black ? s.white - s.black : signal);
+  const float error = seen * inverse_sigma;
+  const bool known = s.misfit >= 0;
+  share = known ? 1.0f / std::sqrt(1.0f + s.misfit * error * error) : 1.0f;
+  squared *= share * share;
+  const float w = squared * (1.0f / (kTail * kTail)), bounded = w < 1e29f ? w : 1e29f + 0 * w;
+  const float smooth = std::sqrt(1.0f + squared * (1.0f / (kKnee * kKnee)));
+  q = known ? 1.0f + w : smooth;
+  return known ? 0.5f * kTail * kTail * log_positive(1.0f + bounded, bounded) : squared / (smooth + 1.0f);
 }
 
 // Deviance residual of one row of sensor pixels, its robust penalty (added to `penalty`), and d penalty / d radiance.
@@ -122,12 +133,12 @@ void likelihood_row(int n, const float* __restrict radiance, const float* __rest
     const float deviance = (b < 0 ? b * b : 0.0f) - 2.0f * log_positive(phi, phi_minus_1);
     const float hazard = 0.39894228f * (b < 0 ? 1.0f : bell) / phi;
     const float z = (expected - dn[x]) * inverse_sigma;
-    const float squared = clipped ? (deviance > 0 ? deviance : 0.0f) + 0 * z : z * z;  // NaN stays NaN
-    float q;
-    penalty[x] += charbonnier(squared, q);
+    float squared = clipped ? (deviance > 0 ? deviance : 0.0f) + 0 * z : z * z;  // NaN stays NaN
+    float q, share;
+    penalty[x] += robust(squared, expected - s.black, inverse_sigma, s, share, q);
     const float root = std::sqrt(squared);
-    residual[x] = clipped ? (saturated ? -root : root) : z;
-    slope[x] = (clipped ? (saturated ? -hazard : hazard) : z) / q * inverse_sigma * gain;
+    residual[x] = clipped ? (saturated ? -root : root) : z * share;
+    slope[x] = (clipped ? (saturated ? -hazard : hazard) : z) / q * inverse_sigma * gain * share * share;
   }
 }
 
@@ -136,11 +147,13 @@ void unclipped_likelihood_row(int n, const float* __restrict radiance, const flo
                               const SensorModel s, float* __restrict residual, float* __restrict penalty,
                               float* __restrict slope) {
   for (int x = 0; x < n; ++x) {
-    float inverse_sigma, q;
-    const float z = (expected_dn(gain * radiance[x], s, inverse_sigma) - dn[x]) * inverse_sigma;
-    penalty[x] += charbonnier(z * z, q);
-    residual[x] = z;
-    slope[x] = z / q * inverse_sigma * gain;
+    float inverse_sigma, q, share;
+    const float expected = expected_dn(gain * radiance[x], s, inverse_sigma);
+    const float z = (expected - dn[x]) * inverse_sigma;
+    float squared = z * z;
+    penalty[x] += robust(squared, expected - s.black, inverse_sigma, s, share, q);
+    residual[x] = z * share;
+    slope[x] = z / q * inverse_sigma * gain * share * share;
   }
 }
 
@@ -158,10 +171,10 @@ void averaged_likelihood_row(int n, const float* __restrict radiance, const floa
     float r = (expected * below - dn[x]) * inverse_sigma + at_zero.density;
     const bool censored = dn[x] >= s.white && r > 0;
     r = censored ? 0.0f : r * s.root_averaged;
-    float q;
-    penalty[x] += charbonnier(r * r, q);
-    residual[x] = r;
-    slope[x] = censored ? 0.0f : r / q * below * inverse_sigma * gain * s.root_averaged;
+    float q, share, squared = r * r;
+    penalty[x] += robust(squared, expected - s.black, inverse_sigma, s, share, q);
+    residual[x] = r * share;
+    slope[x] = censored ? 0.0f : r / q * below * inverse_sigma * gain * s.root_averaged * share * share;
   }
 }
 

@@ -154,7 +154,7 @@ void expect(const Array& array, const char* name, size_t count) {
                                 std::to_string(array.size()));
 }
 
-// Mean Charbonnier penalty of the deviance residual + edge_weight * mean Sobel difference, stabilised scale.
+// Mean robust penalty of the deviance residual + edge_weight * mean Sobel difference, stabilised scale.
 double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, double edge_weight, Array residual,
                   std::optional<Array> gradient, int threads) {
   const Shape shape = shape_of(radiance, "radiance");
@@ -303,7 +303,7 @@ void bind_training(nb::module_& m) {
   using obbgs::SensorModel;
   nb::class_<SensorModel>(m, "SensorModel")
       .def("__init__", [](SensorModel* self, double black_dn, double white_dn, double electrons_per_dn,
-                          double read_noise_dn, double averaged_pixels) {
+                          double read_noise_dn, double averaged_pixels, std::optional<double> misfit) {
         const double read_noise_e = read_noise_dn * electrons_per_dn;
         new (self) SensorModel{float(black_dn),
                                float(white_dn),
@@ -311,7 +311,8 @@ void bind_training(nb::module_& m) {
                                float(electrons_per_dn),
                                float(read_noise_dn * read_noise_dn + 1.0 / 12),
                                float(3.0 / 8 + read_noise_e * read_noise_e),
-                               float(std::sqrt(averaged_pixels))};
+                               float(std::sqrt(averaged_pixels)),
+                               misfit ? float(*misfit * *misfit * averaged_pixels) : -1.0f};
       });
   // arrays that are filled in place must not be converted: the result would go into a copy
   m.def("likelihood", &obbgs::likelihood, "radiance"_a, "dn"_a, "gains"_a, "sensor"_a, "edge_weight"_a,

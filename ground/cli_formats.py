@@ -1,0 +1,159 @@
+"""Commands of `ground` that turn other formats into sessions and back: import and export."""
+
+import json
+import math
+import signal
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from ground.cli_options import (
+    AsJson,
+    Background,
+    BackgroundGiven,
+    ExportFormat,
+    ImportFormat,
+    PoseSigmaGiven,
+    SessionDir,
+    ValuesGiven,
+)
+
+if TYPE_CHECKING:
+    from ground.formats.photographs import Registered
+    from ground.formats.views import PoseSigmas
+
+stderr = Console(stderr=True)
+
+
+def import_command(
+    folder: Annotated[Path, typer.Option("--from", help="The data set's folder.")],
+    session: Annotated[Path, typer.Option(help="The session folder to make.")],
+    format_: Annotated[ImportFormat, typer.Option("--format", help="The data set's format.")],
+    values: ValuesGiven = None,
+    background: BackgroundGiven = None,
+    pose_sigma: PoseSigmaGiven = None,
+    frames: Annotated[
+        int | None,
+        typer.Option(min=1, help="Import only the first so many pictures (of each split); default: all."),
+    ] = None,
+    json_: AsJson = False,
+) -> None:
+    """Make a session of pictures with known cameras (NeRF-synthetic, nerfstudio, COLMAP, SHIRT), or of photographs.
+
+    Splits that the data set states are kept: `ground reconstruct` trains on train and holds out test, or val if there
+    is no test. Of images, a folder of photographs by one camera, structure from motion finds the cameras; it takes
+    minutes, and goes on where it was interrupted.
+
+    Example: ground import --format shirt --from shirtv1/roe1/lightbox --frames 363 --session roe1
+    """
+    from ground.formats.colmap import read_colmap
+    from ground.formats.nerf import read_nerf
+    from ground.formats.nerfstudio import read_nerfstudio
+    from ground.formats.shirt import read_shirt
+    from ground.formats.views import EXACT, Values, first_of_each_split, is_transparent, write_session
+
+    exported = registration = None
+    sigmas = EXACT
+    given_sigmas = None if pose_sigma is None else _pose_sigmas(pose_sigma)
+    white = None if background is None else background is Background.WHITE
+    match format_:
+        case ImportFormat.NERF:
+            views, exported = read_nerf(folder)
+            if exported is None and white is None:
+                white = is_transparent(views[0].image)
+        case ImportFormat.NERFSTUDIO:
+            views, exported = read_nerfstudio(folder)
+        case ImportFormat.COLMAP:
+            views = read_colmap(folder)
+        case ImportFormat.SHIRT:
+            views = read_shirt(folder)
+        case ImportFormat.IMAGES:
+            found = _photographs(folder, session, frames)
+            views, sigmas, registration = found.views, found.sigmas, found.described()
+    views = first_of_each_split(views, frames)
+    given = None if values is None else Values(values.value)
+    with Progress(TextColumn("importing"), BarColumn(), TimeRemainingColumn(), console=stderr) as progress:
+        task = progress.add_task("import", total=len(views))
+        count = write_session(
+            views,
+            session,
+            f"{format_.value}: {folder}",
+            given,
+            white,
+            exported,
+            lambda: progress.advance(task),
+            given_sigmas or sigmas,
+            registration,
+        )
+    if json_:
+        print(json.dumps({"frames": count, "session": str(session), **(registration or {})}))
+        return
+    print(f"{count} frames in {session}")
+    if registration and registration["left_out"]:
+        print(f"left out, because they could not be registered: {', '.join(registration['left_out'])}")
+
+
+def _pose_sigmas(text: str) -> "PoseSigmas":
+    from ground.formats.views import PoseSigmas
+
+    try:
+        degrees, metres = map(float, text.split(","))
+        return PoseSigmas(math.radians(degrees), metres)
+    except ValueError as error:
+        raise ValueError(
+            f"--pose-sigma: expected degrees and metres, both at least 0, such as 0.2,0.01, got {text!r}"
+        ) from error
+
+
+def _photographs(folder: Path, session: Path, count: int | None) -> "Registered":
+    """Return what structure from motion makes of a folder, with a bar; SIGINT and SIGTERM stop it at its next step."""
+    from ground.formats.photographs import read_photographs
+    from ground.session import SessionError
+
+    if (session / "session.json").exists():
+        raise SessionError(f"{session} holds a session already; choose a new folder")
+    stop = threading.Event()
+    before = {
+        number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        with Progress(
+            TextColumn("finding cameras"), BarColumn(), TimeRemainingColumn(), console=stderr
+        ) as progress:
+            task = progress.add_task("register", total=1.0)
+            return read_photographs(
+                folder,
+                session / "registration",
+                lambda share: progress.update(task, completed=share),
+                stop.is_set,
+                count,
+            )
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def export_command(
+    session: SessionDir,
+    out: Annotated[Path, typer.Option(help="The folder to write.")],
+    format_: Annotated[
+        ExportFormat, typer.Option("--format", help="The format to write.")
+    ] = ExportFormat.NERF,
+    json_: AsJson = False,
+) -> None:
+    """Write a session's frames for other software, whole brackets split into train, val and test (6:2:3).
+
+    Example: ground export --session pass-12 --format nerfstudio --out pass-12-nerfstudio
+    """
+    from ground.formats.nerf import export_nerf
+    from ground.formats.nerfstudio import export_nerfstudio
+    from ground.session import open_session
+
+    exporters = {ExportFormat.NERF: export_nerf, ExportFormat.NERFSTUDIO: export_nerfstudio}
+    counts = exporters[format_](open_session(session), out)
+    text = ", ".join(f"{count} {split}" for split, count in counts.items())
+    print(json.dumps(counts) if json_ else f"{text} in {out}")

@@ -1,0 +1,199 @@
+"""Photographs without poses: their cameras by structure from motion (COLMAP), in a frame of the object's own.
+
+Source: Schönberger and Frahm, Structure-from-Motion Revisited, 2016, through its Python package pycolmap.
+"""
+
+import contextlib
+import math
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ground.formats.views import FormatError, Intrinsics, PoseSigmas, View, image_size
+from obbgs_base.errors import Interrupted
+
+if TYPE_CHECKING:
+    import pycolmap
+
+SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
+SEED = 0
+FEWEST = 3  # pictures that a model must register
+PICTURES_AT_ONCE = 8  # between looks at whether to stop
+RADIUS_SHARE = 0.9  # of the points lie within one metre of the origin
+
+
+@dataclass(frozen=True)
+class Registered:
+    """What structure from motion made of a folder of photographs.
+
+    views: the registered pictures. Origin: the points' median; one metre: the radius that holds nine tenths of them, as
+        the true scale cannot be known.
+    left_out: names of the pictures that were not registered.
+    reprojection_px: mean distance of the features from where their points are projected to.
+    sigmas: how far the poses can err: that distance as an angle, and at the median range.
+    """
+
+    views: list[View]
+    left_out: tuple[str, ...]
+    reprojection_px: float
+    sigmas: PoseSigmas
+
+    def described(self) -> dict:
+        """Return what the session keeps of it."""
+        return {
+            "registered": len(self.views),
+            "left_out": list(self.left_out),
+            "reprojection_px": self.reprojection_px,
+            "scale": "unknown: one metre is the radius that holds nine tenths of the points",
+        }
+
+
+def read_photographs(
+    folder: Path,
+    work: Path,
+    on_share: Callable[[float], None] = lambda share: None,
+    should_stop: Callable[[], bool] = lambda: False,
+    count: int | None = None,
+) -> Registered:
+    """Return the photographs of a folder, in the order of their names, with the cameras that took them.
+
+    One camera with one focal length is assumed to have taken them all; its focal length and a radial distortion are
+    estimated. Its line of sight is taken to meet the pictures' middle: from a distance that cannot be told from a turn
+    of all cameras, and estimating it made them worse.
+
+    Args:
+        work: keeps features and matches, so that the same call goes on after an interruption; removed at the end.
+        on_share: is told how much is done, from 0 to 1.
+        count: take only the first so many; None: all.
+
+    Raises:
+        FormatError: fewer than three pictures, different sizes, or no model is found that registers three of them.
+        Interrupted: `should_stop` returned true; what was found is kept in `work`.
+    """
+    import pycolmap
+
+    names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)[:count]
+    if len(names) < FEWEST:
+        raise FormatError(f"{folder}: expected at least {FEWEST} photographs, found {len(names)}")
+    if len(sizes := {image_size(folder / name) for name in names}) > 1:
+        raise FormatError(f"{folder}: the pictures of a session have one size, found {sorted(sizes)}")
+    work.mkdir(parents=True, exist_ok=True)
+    database = work / "database.db"
+
+    def step(share: float) -> None:
+        on_share(share)
+        if should_stop():
+            raise Interrupted(
+                f"stopped after {100 * share:.0f} % of structure from motion; what was found is kept in {work}"
+            )
+
+    with _silence():
+        pycolmap.set_random_seed(SEED)
+        extraction = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
+        with pycolmap.Database.open(database) as opened:
+            cameras = opened.read_all_cameras()
+        for start in range(0, len(names), PICTURES_AT_ONCE):
+            # the first pictures make the camera, the others share it
+            reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+            if cameras:
+                reader.existing_camera_id = cameras[0].camera_id
+            pycolmap.extract_features(
+                database,
+                folder,
+                names[start : start + PICTURES_AT_ONCE],
+                pycolmap.CameraMode.SINGLE,
+                reader,
+                extraction,
+                pycolmap.Device.cpu,
+            )
+            with pycolmap.Database.open(database) as opened:
+                cameras = opened.read_all_cameras()
+            step(0.3 * min(1.0, (start + PICTURES_AT_ONCE) / len(names)))
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = SEED
+        matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
+        pycolmap.match_exhaustive(
+            database, matching, verification_options=verification, device=pycolmap.Device.cpu
+        )
+        step(0.7)
+        model = _mapped(database, folder, work / "models", len(names), step)
+    if model is None:
+        raise FormatError(
+            f"{folder}: no {FEWEST} of {len(names)} photographs have enough features in common to find their cameras; "
+            "take more of them, with more overlap, of a textured object"
+        )
+    registered = _registered(model, folder, names)
+    shutil.rmtree(work)
+    return registered
+
+
+def _mapped(
+    database: Path, folder: Path, models: Path, count: int, step: Callable[[float], None]
+) -> "pycolmap.Reconstruction | None":
+    """Return the model with the most pictures of all that incremental mapping finds."""
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=1, random_seed=SEED, extract_colors=False, min_model_size=FEWEST
+    )
+    shutil.rmtree(models, ignore_errors=True)
+    models.mkdir()
+    stop, done, asked = pycolmap.CancellationToken(), 0, None
+
+    def next_picture() -> None:
+        nonlocal done, asked
+        done += 1
+        try:
+            step(min(0.99, 0.7 + 0.3 * done / count))
+        except Interrupted as error:  # it must not pass through the library
+            asked = error
+            stop.cancel()
+
+    found = pycolmap.incremental_mapping(
+        database, folder, models, options, next_image_callback=next_picture, cancellation_token=stop
+    )
+    if asked is not None:
+        raise asked
+    return max(found.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
+
+
+def _registered(model: "pycolmap.Reconstruction", folder: Path, names: list[str]) -> Registered:
+    points = np.array([point.xyz for point in model.points3D.values()])
+    centre = np.median(points, axis=0)
+    metre = float(np.quantile(np.linalg.norm(points - centre, axis=1), RADIUS_SHARE))
+    views, ranges_m = {}, []
+    for image in model.images.values():
+        if image.has_pose:
+            pose = np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
+            pose[:3, 3] = (pose[:3, 3] + pose[:3, :3] @ centre) / metre
+            views[image.name] = View(folder / image.name, pose, _intrinsics(model.cameras[image.camera_id]))
+            ranges_m.append(np.linalg.norm(pose[:3, 3]))
+    reprojection_px = model.compute_mean_reprojection_error()
+    focal_px = next(iter(views.values())).intrinsics.fx_px
+    sigma_rad = math.atan(reprojection_px / focal_px)
+    left_out = tuple(name for name in names if name not in views)
+    in_order = [views[name] for name in names if name in views]
+    sigmas = PoseSigmas(sigma_rad, sigma_rad * float(np.median(ranges_m)))
+    return Registered(in_order, left_out, reprojection_px, sigmas)
+
+
+def _intrinsics(camera: "pycolmap.Camera") -> Intrinsics:
+    focal_px, cx_px, cy_px, k1 = camera.params  # SIMPLE_RADIAL; COLMAP's pixel centres are at .5 like ours
+    return Intrinsics(camera.width, camera.height, focal_px, focal_px, cx_px, cy_px, (k1, 0.0, 0.0, 0.0, 0.0))
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep COLMAP's log to its fatal errors while it works."""
+    import pycolmap
+
+    before = pycolmap.logging.minloglevel, pycolmap.logging.logtostderr
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel, pycolmap.logging.logtostderr = before

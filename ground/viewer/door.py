@@ -1,0 +1,91 @@
+"""The viewer's port: a server that binds exactly what was asked for and answers only the page that it served itself."""
+
+import contextlib
+import functools
+import http
+import io
+import ipaddress
+import socket
+from collections.abc import Iterator
+from urllib.parse import urlsplit
+
+import viser
+import websockets.asyncio.server
+from websockets.http11 import Request, Response
+
+from obbgs_base.errors import ObbgsError
+
+
+class ViewError(ObbgsError):
+    """The viewer cannot be shown; the message says why."""
+
+
+def opened(host: str, port: int) -> viser.ViserServer:
+    """Return a running server without a scene.
+
+    Raises:
+        ViewError: host or port cannot be bound; viser itself would silently take another port.
+    """
+    _check_free(host, port)
+    with _guarded(host), contextlib.redirect_stdout(io.StringIO()):  # it prints its address, and we ours
+        server = viser.ViserServer(host=host, port=port, label="obbgs", verbose=False)
+    if port and server.get_port() != port:
+        server.stop()
+        raise ViewError(_taken(host, port, "it was taken meanwhile"))
+    return server
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host name or address means this machine only."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def refused(request: Request, host: str) -> str | None:
+    """Return why a connection is refused, None if it is not.
+
+    A page of another site, open in the same browser, may connect to any port of this machine: its Origin tells. A site
+    whose name was made to point here (DNS rebinding) has an Origin that fits, but not one of this machine's names.
+    """
+    asked, origin = request.headers.get("Host", ""), urlsplit(request.headers.get("Origin", ""))
+    if is_loopback(host) and not is_loopback(urlsplit(f"//{asked}").hostname or ""):
+        return "this server is for this machine only"
+    if request.headers.get("Upgrade", "").lower() == "websocket" and origin.netloc != asked:
+        return "only the page that this server sent may connect"
+    return None
+
+
+@contextlib.contextmanager
+def _guarded(host: str) -> Iterator[None]:
+    """Let a server that is made in the block ask `refused` first; viser has no setting for that."""
+    serve = websockets.asyncio.server.serve
+
+    def guarded_serve(*args, process_request, **options):
+        def first(connection, request: Request) -> Response | None:
+            if (reason := refused(request, host)) is not None:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
+            return process_request(connection, request)
+
+        return serve(*args, process_request=first, **options)
+
+    websockets.asyncio.server.serve = functools.wraps(serve)(guarded_serve)  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _check_free(host: str, port: int) -> None:
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        raise ViewError(_taken(host, port, error.strerror or str(error))) from error
+
+
+def _taken(host: str, port: int, reason: str) -> str:
+    return f"cannot listen on {host} port {port}: {reason}; give another with --port, 0 for any that is free"

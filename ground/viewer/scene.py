@@ -1,0 +1,152 @@
+"""One model in the viewer's scene: its splats, the mesh, cameras with their frames, and the Sun."""
+
+import math
+from typing import Any
+
+import numpy as np
+import viser
+
+from flightsw.icd.quaternion import matrix_to_quat
+from ground.cameras import sun_direction
+from ground.pictures import tone
+from ground.session import FrameRecord, SessionError
+from ground.turntable import extent
+from ground.viewer.source import Shown
+from ground.viewer.splats import colours, error_colours, shapes, uncertainty_colours
+
+RADIUS = 10.0  # of the first model in the scene: large enough for the half-precision covariances of viser
+CAMERAS_AT = 2.0  # radii: true directions, but nearer, or the model could not be seen beside them
+MOST_CAMERAS = 60
+THUMBNAIL_PX = 64
+SENSOR, ERROR, UNCERTAINTY = "as the sensor sees it", "misfit (chi²)", "uncertainty of radiance"
+COLOURS = (SENSOR, ERROR, UNCERTAINTY)
+
+
+class Placed:
+    """A model that was put into the scene below a name, and can be replaced there.
+
+    Args:
+        offset: [3] of its centre, in units of the scene.
+        per_metre: units of the scene; None: such that the model's radius is RADIUS.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        name: str,
+        shown: Shown,
+        offset: np.ndarray,
+        per_metre: float | None = None,
+    ):
+        self.shown, self.offset = shown, offset
+        self._server, self._name = server, name
+        centre, radius_m = extent(shown.gaussians)
+        self.centre_m = centre.double().numpy()
+        self.per_metre = RADIUS / radius_m if per_metre is None else per_metre
+        self._shapes = shapes(shown)
+        self._overlays: dict[str, np.ndarray] = {}
+        self.handles: dict[str, list[Any]] = {"cameras": [], "sun": [], "mesh": []}
+
+    def place(self, point_m: np.ndarray) -> np.ndarray:
+        """Return where a point [..., 3] of the body frame, m, lies in the scene."""
+        return (point_m - self.centre_m) * self.per_metre + self.offset
+
+    def draw(self, record: FrameRecord, exposure_time_s: float, colour: str, visible: bool = True) -> None:
+        """Put the splats into the scene, or give those there other colours."""
+        rgb = colours(self.shown, record, exposure_time_s) if colour == SENSOR else self._overlay(colour)
+        if "splats" in self.handles:  # drawn anew they would fade in again
+            self.handles["splats"][0].rgbs = rgb.astype(np.float32) / 255
+            return
+        self.handles["splats"] = [
+            self._server.scene.add_gaussian_splats(
+                f"/{self._name}/splats",
+                self.place(self._shapes.means).astype(np.float32),
+                (self._shapes.covariances * self.per_metre**2).astype(np.float32),
+                rgb.astype(np.float32) / 255,
+                self._shapes.opacities[:, None].astype(np.float32),
+                visible=visible,
+            )
+        ]
+
+    def _overlay(self, colour: str) -> np.ndarray:
+        if colour not in self._overlays:
+            self._overlays[colour] = {ERROR: error_colours, UNCERTAINTY: uncertainty_colours}[colour](
+                self.shown
+            )
+        return self._overlays[colour]
+
+    def draw_mesh(self, visible: bool) -> None:
+        """Put model.glb into the scene, if the run has one."""
+        if self.shown.mesh is not None:
+            self.handles["mesh"] = [
+                self._server.scene.add_glb(
+                    f"/{self._name}/mesh",
+                    self.shown.mesh,
+                    scale=self.per_metre,
+                    position=tuple(self.place(np.zeros(3))),
+                    visible=visible,
+                )
+            ]
+
+    def draw_sun(self, record: FrameRecord, visible: bool) -> None:
+        """Put an arrow towards the Sun of a frame into the scene, if the frame's tag knows it."""
+        sun = sun_direction(record)
+        if sun is None:
+            return
+        ends = np.stack([1.0 * RADIUS * sun.numpy(), 1.25 * RADIUS * sun.numpy()]) + self.offset
+        arrow = self._server.scene.add_arrows(
+            f"/{self._name}/sun",
+            ends[None].astype(np.float32),
+            (240, 180, 41),
+            shaft_radius=0.1,
+            head_radius=0.3,
+            head_length=0.8,
+            visible=visible,
+        )
+        label = self._server.scene.add_label(
+            f"/{self._name}/sun label", "Sun", position=tuple(ends[1]), visible=visible
+        )
+        self.handles["sun"] = [arrow, label]
+
+    def draw_cameras(self, records: list[FrameRecord], chosen: Any, visible: bool) -> None:
+        """Put one camera for each bracket into the scene, with a small picture; `chosen` is called with its frame."""
+        for handle in self.handles["cameras"]:
+            handle.remove()
+        one_per_bracket = list({record.bracket: record for record in records}.values())
+        kept = np.unique(np.linspace(0, len(one_per_bracket) - 1, MOST_CAMERAS).round().astype(int))
+        self.handles["cameras"] = [self._camera(one_per_bracket[i], chosen, visible) for i in kept]
+
+    def _camera(self, record: FrameRecord, chosen: Any, visible: bool) -> Any:
+        session = self.shown.session
+        away = record.position_body_m - self.centre_m
+        position = self.offset + CAMERAS_AT * RADIUS * away / max(float(np.linalg.norm(away)), 1e-9)
+        handle = self._server.scene.add_camera_frustum(
+            f"/{self._name}/cameras/{record.id}",
+            fov=0.5,
+            aspect=session.camera.width / session.camera.height,
+            scale=1.2,
+            thickness=0.04,
+            color=(209, 101, 42),
+            image=self.thumbnail(record),
+            wxyz=tuple(matrix_to_quat(record.world_to_camera[:3, :3].T)),
+            position=tuple(position),
+            visible=visible,
+        )
+        handle.on_click(lambda _: chosen(record))
+        return handle
+
+    def thumbnail(self, record: FrameRecord) -> np.ndarray | None:
+        """Return a frame in screen brightness, bytes [H, W, 3], every so many pixels; None if it cannot be read."""
+        try:
+            dn = self.shown.session.dn(record)
+        except SessionError:
+            return None
+        step = math.ceil(max(dn.shape[:2]) / THUMBNAIL_PX)
+        image = dn[::step, ::step].astype(np.float32) / self.shown.sensor.white_dn
+        image = image.reshape(*image.shape[:2], -1)
+        return tone(image, self.shown.sensor, self.shown.session.encoding)
+
+    def show(self, part: str, visible: bool) -> None:
+        """Show or hide a part: splats, mesh, cameras, sun."""
+        for handle in self.handles.get(part, ()):
+            handle.visible = visible

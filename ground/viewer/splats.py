@@ -1,0 +1,133 @@
+"""A model as the viewer's program draws it: covariances, opacities and one display colour for each Gaussian.
+
+The program (viser) blends display colours and widens Gaussians by 0.3 px² of its own screen. The footprint of the
+session's pixels is therefore part of the covariances, as in Mip-Splatting's 3D filter, and the share by which it lowers
+a peak, in the mean over the session's cameras, part of the opacities.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ground.cameras import cameras_of, exposed, sun_direction
+from ground.pictures import tone
+from ground.session import FrameRecord, Session
+from ground.training_frames import split, training_frame
+from ground.turntable import metres_per_pixel
+from ground.viewer.source import Shown
+from obbgs_core.frames import cameras_of as cameras_of_frames
+from obbgs_core.model.footprint import variance_px2
+from obbgs_core.model.sh import C0
+from obbgs_core.render import project, render, sunlit_shares
+from obbgs_core.render.lighting import radiance_along
+from obbgs_core.score.uncertainty import parameter_deviations
+
+VIEWS = 12  # of the session's cameras over which the lowered peaks are averaged
+FRAMES = 24  # at most, that overlays are made of
+CHI2_SHOWN = (1.0, 100.0)  # from the darkest to the brightest colour
+DEVIATION_SHOWN = (0.003, 0.3)  # of full scale
+NOT_SEEN = (90, 90, 110)  # colour of Gaussians that no frame shows
+RAMP = np.array(
+    [[13, 8, 135], [126, 3, 168], [204, 71, 120], [248, 149, 64], [240, 249, 33]], dtype=float
+)  # plasma
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Where Gaussians are and how they cover, without colours: covariances [N, 3, 3] m², opacities [N]."""
+
+    means: np.ndarray
+    covariances: np.ndarray
+    opacities: np.ndarray
+
+
+@torch.no_grad()
+def shapes(shown: Shown) -> Shapes:
+    """Return the shapes of a model's Gaussians for a program with another footprint."""
+    gaussians, session = shown.gaussians, shown.session
+    variance = float(variance_px2(gaussians, session.camera.psf_sigma_px))
+    widened = gaussians.covariances() + variance * metres_per_pixel(session) ** 2 * torch.eye(3)
+    projected = project(gaussians, cameras_of(session, _spread(list(session.frames), VIEWS)))
+    seen = projected.depths > 0
+    share = (projected.peak_shares * seen).sum(dim=0) / seen.sum(dim=0).clamp(min=1)
+    return Shapes(gaussians.means.numpy(), widened.numpy(), (gaussians.opacities * share).numpy())
+
+
+@torch.no_grad()
+def colours(shown: Shown, record: FrameRecord, exposure_time_s: float) -> np.ndarray:
+    """Return the display colours [N, 3], bytes, seen from a frame's camera under its Sun, at an exposure time."""
+    gaussians, session = shown.gaussians, shown.session
+    directions = torch.nn.functional.normalize(
+        gaussians.means - cameras_of(session, [record]).centres[0], dim=1
+    )
+    sun = sun_direction(record)
+    sunlit = None
+    if gaussians.shading == "lambert" and sun is not None:
+        sunlit = sunlit_shares(gaussians, sun[None])[0]
+    radiance = radiance_along(gaussians, directions, sun, sunlit)
+    image = exposed(radiance[None], shown.sensor, exposure_time_s).numpy()
+    return tone(image, shown.sensor, session.encoding)[0]
+
+
+def error_colours(shown: Shown) -> np.ndarray:
+    """Return colours [N, 3], bytes, of the misfit: each Gaussian's mean squared residual over the noise, its chi².
+
+    The mean is over the pixels of the frames, weighted by how much of each the Gaussian is. It is the derivative of the
+    weighted image by the Gaussian's radiance.
+    """
+    probe = dataclasses.replace(
+        shown.gaussians.detach(),
+        sh=torch.full(
+            (len(shown.gaussians), 1, 1), 10 / C0
+        ).requires_grad_(),  # radiance 10: softplus is linear
+        shading="view",
+    )
+    total, weight = torch.zeros(len(probe)), torch.zeros(len(probe))
+    for frame in _frames(shown.session):
+        cameras = cameras_of_frames([frame])
+        with torch.no_grad():
+            radiance = render(shown.gaussians, cameras).radiance[0]
+            residual = shown.sensor.normalised_residual(radiance, frame.exposure_time_s, frame.dn)
+            squared = residual.square().mean(dim=-1, keepdim=True)
+        image = render(probe, cameras).radiance[0]
+        total += _gradient(image, squared, probe.sh, keep=True)
+        weight += _gradient(image, torch.ones_like(squared), probe.sh, keep=False)
+    return _ramp(total / weight.clamp(min=1e-9), weight > 0, CHI2_SHOWN)
+
+
+def uncertainty_colours(shown: Shown) -> np.ndarray:
+    """Return colours [N, 3], bytes, of how unsure each Gaussian's radiance is: its standard deviation over full scale.
+
+    The deviation is that of the parameters' posterior (`parameter_deviations`), full scale that of the middle exposure.
+    """
+    exposures_s = sorted({record.exposure_time_s for record in shown.session.frames})
+    deviations = parameter_deviations(shown.gaussians, _frames(shown.session), shown.sensor)["sh"]
+    radiance = C0 * deviations[:, 0].mean(dim=1)
+    share = radiance / shown.sensor.full_scale_radiance(exposures_s[len(exposures_s) // 2])
+    return _ramp(share, torch.ones(len(share), dtype=torch.bool), DEVIATION_SHOWN)
+
+
+def _frames(session: Session) -> list:
+    training, _ = split(session)
+    return [training_frame(session, record) for record in _spread(training, FRAMES)]
+
+
+def _spread(records: list[FrameRecord], count: int) -> list[FrameRecord]:
+    return [records[i] for i in np.unique(np.linspace(0, len(records) - 1, count).round().astype(int))]
+
+
+def _gradient(image: Tensor, weights: Tensor, sh: Tensor, keep: bool) -> Tensor:
+    (gradient,) = torch.autograd.grad((image * weights).sum(), sh, retain_graph=keep)
+    return gradient[:, 0, 0] / C0
+
+
+def _ramp(values: Tensor, known: Tensor, limits: tuple[float, float]) -> np.ndarray:
+    """Return values on a logarithmic scale of colours, bytes [N, 3]."""
+    low, high = np.log(limits)
+    at = (np.log(values.clamp(min=1e-12).detach().numpy()) - low) / (high - low)
+    places = np.linspace(0, 1, len(RAMP))
+    shown = np.stack([np.interp(at, places, RAMP[:, c]) for c in range(3)], axis=1)
+    return np.where(known.numpy()[:, None], shown, NOT_SEEN).round().astype(np.uint8)

@@ -1,0 +1,300 @@
+"""The viewer's controls and what they do; it draws again whenever a run's model is renewed."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+import imagecodecs
+import numpy as np
+import torch
+import viser
+
+from ground.cameras import predicted_image
+from ground.pictures import ERROR_FULL_SCALE, heat, tone
+from ground.session import FrameRecord, SessionError
+from ground.turntable import VIEWS, circle, moving_png, pictures
+from ground.viewer.door import opened
+from ground.viewer.scene import COLOURS, RADIUS, SENSOR, Placed
+from ground.viewer.source import Source
+from obbgs_core.errors import ReconstructionError
+
+log = logging.getLogger(__name__)
+POLL_S = 1.0  # between looks for a renewed model
+APART = 2.4  # radii between the centres of two models side by side
+FIELD_RAD = 0.4  # vertical field of view, about that of a telescope's picture of the model
+NEAREST, FARTHEST = (
+    1.4,
+    40.0,
+)  # radii from the model that the camera may come to: the wheel never flies into it
+REACH = (
+    4.0  # the exposure slider reaches from a quarter of the shortest exposure to so many times the longest
+)
+PICTURE_PX = (1200, 800)
+TURNTABLE_PX = (480, 320)
+PARTS = ("splats", "cameras", "sun", "mesh")
+
+
+def view(
+    sources: list[Source],
+    host: str,
+    port: int,
+    on_ready: Callable[[int], None],
+    should_stop: Callable[[], bool],
+) -> None:
+    """Show one run, or two side by side, until told to stop; `on_ready` receives the port.
+
+    Raises:
+        SessionError, ReconstructionError: a run cannot be read at the start. Later ones are logged, and the model that
+            was read last stays.
+        ViewError: the port cannot be bound.
+    """
+    shown = [source.load() for source in sources]
+    server = opened(host, port)
+    try:
+        first = Placed(server, "a", shown[0], np.zeros(3))
+        placed = [first]
+        for other in shown[1:]:
+            placed.append(Placed(server, "b", other, np.array([APART * RADIUS, 0.0, 0.0]), first.per_metre))
+        viewer = Viewer(server, placed)
+        on_ready(server.get_port())
+        while not should_stop():
+            for i, source in enumerate(sources):
+                if source.renewed():
+                    try:
+                        viewer.renew(i, source)
+                    except (SessionError, ReconstructionError, OSError, ValueError) as error:
+                        log.warning("%s is not shown anew: %s", source.name, error)
+            time.sleep(POLL_S)
+    finally:
+        server.stop()
+
+
+class Viewer:
+    """The page: all viewers of it share exposure, frame and colours, each has a camera of its own."""
+
+    def __init__(self, server: viser.ViserServer, placed: list[Placed]):
+        self.server, self.placed = server, placed
+        self.lock = threading.RLock()  # viser calls from threads of its own
+        self.frames = _in_time(placed[0])
+        server.scene.set_up_direction("+z")
+        server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
+        self._controls()
+        self._start_camera()
+        server.on_client_connect(self._limit_zoom)
+        self.draw_all()
+
+    @property
+    def record(self) -> FrameRecord:
+        """The frame that the timeline stands at."""
+        return self.frames[min(max(int(self.timeline.value), 0), len(self.frames) - 1)]
+
+    @property
+    def exposure_s(self) -> float:
+        low_ms, high_ms = self.exposure_limits_ms
+        value_ms = float(self.exposure.value)
+        return float(np.clip(value_ms if np.isfinite(value_ms) else low_ms, low_ms, high_ms)) / 1e3
+
+    @property
+    def colour(self) -> str:
+        return self.colouring.value if self.colouring.value in COLOURS else SENSOR
+
+    def _controls(self) -> None:
+        gui, session = self.server.gui, self.placed[0].shown.session
+        self.status = gui.add_markdown("")
+        exposures_s = sorted({record.exposure_time_s for record in session.frames})
+        low_ms, high_ms = 1e3 * exposures_s[0] / REACH, 1e3 * exposures_s[-1] * REACH
+        self.exposure_limits_ms = low_ms, high_ms
+        nominal = session.nominal_exposures
+        name = "Brightness, per mille" if nominal else "Exposure, ms"
+        middle_ms = 1e3 * exposures_s[len(exposures_s) // 2]
+        self.exposure = gui.add_slider(
+            name, min=low_ms, max=high_ms, step=low_ms / 10, initial_value=middle_ms
+        )
+        self.exposure.on_update(lambda _: self.draw_splats())
+        if not nominal:
+            self.brackets = gui.add_button_group("Brackets, ms", [f"{1e3 * s:g}" for s in exposures_s])
+            self.brackets.on_click(lambda _: self._expose(self.brackets.value))
+        self.colouring = gui.add_dropdown("Colours", COLOURS, initial_value=SENSOR)
+        self.colouring.on_update(lambda _: self.draw_splats())
+        self.checks = {}
+        for part in PARTS:
+            if part == "mesh" and not any(each.shown.mesh for each in self.placed):
+                continue
+            self.checks[part] = gui.add_checkbox(part.capitalize(), initial_value=part in ("splats", "sun"))
+            self.checks[part].on_update(lambda _: self._show())
+        with gui.add_folder("Timeline of the pass"):
+            self.timeline = gui.add_slider(
+                "Frame", min=0, max=max(1, len(self.frames) - 1), step=1, initial_value=0
+            )
+            self.timeline.on_update(lambda _: self.draw_frame())
+            self.facts = gui.add_markdown("")
+            self.comparison = gui.add_image(
+                np.zeros((2, 6, 3), np.uint8), label="frame, model, error", format="png"
+            )
+            through = gui.add_button("Look through its camera")
+            through.on_click(lambda event: self._look_through(event.client))
+        reset = gui.add_button("Reset view")
+        reset.on_click(lambda event: self._reset(event.client))
+        picture = gui.add_button("Save picture")
+        picture.on_click(lambda event: self._save_picture(event.client))
+        turntable = gui.add_button("Save turntable")
+        turntable.on_click(lambda event: self._save_turntable(event.client))
+
+    def draw_all(self) -> None:
+        """Draw everything anew, after a model was put in place."""
+        with self.lock:
+            for each in self.placed:
+                each.draw_mesh(self._is_checked("mesh"))
+            self.placed[0].draw_cameras(self.frames, self._choose, self._is_checked("cameras"))
+            self.draw_frame()
+            names = " | ".join(
+                f"{each.shown.name}, {len(each.shown.gaussians):,} Gaussians" for each in self.placed
+            )
+            self.status.content = f"**{names}**, read at {datetime.now(UTC):%H:%M:%SZ}"
+
+    def draw_splats(self) -> None:
+        """Draw the splats at the chosen exposure, from the direction of the chosen frame, under its Sun."""
+        with self.lock:
+            for each in self.placed:
+                record = self.record if each is self.placed[0] else _nearest(each, self.record)
+                each.draw(record, self.exposure_s, self.colour, self._is_checked("splats"))
+
+    def draw_frame(self) -> None:
+        """Draw what depends on the chosen frame: facts, pictures, the Sun and the splats' colours."""
+        with self.lock:
+            record, first = self.record, self.placed[0]
+            self.facts.content = _facts(record)
+            self.comparison.image = _compared(first, record)
+            for each in self.placed:
+                each.draw_sun(record, self._is_checked("sun"))
+            self.draw_splats()
+
+    def renew(self, index: int, source: Source) -> None:
+        """Read a run again and draw it in place of the one that was there, in the same scale."""
+        shown, old = source.load(), self.placed[index]
+        with self.lock:
+            for handle in old.handles["cameras"]:
+                handle.remove()
+            self.placed[index] = Placed(self.server, "ab"[index], shown, old.offset, old.per_metre)
+            if index == 0:
+                self.frames = _in_time(self.placed[0])
+                self.timeline.max = max(1, len(self.frames) - 1)
+            self.draw_all()
+
+    def _is_checked(self, part: str) -> bool:
+        return part in self.checks and bool(self.checks[part].value)
+
+    def _show(self) -> None:
+        with self.lock:
+            for each in self.placed:
+                for part in PARTS:
+                    each.show(part, self._is_checked(part))
+
+    def _expose(self, text: str) -> None:
+        self.exposure.value = float(text)
+
+    def _choose(self, record: FrameRecord) -> None:
+        self.timeline.value = self.frames.index(record)
+
+    def _start_camera(self) -> None:
+        camera = self.server.initial_camera
+        away = self.record.position_body_m / max(float(np.linalg.norm(self.record.position_body_m)), 1e-9)
+        middle = np.mean([each.offset for each in self.placed], axis=0)
+        self.start = middle + away * _fitting_distance(len(self.placed)), middle
+        camera.fov = FIELD_RAD
+        camera.position, camera.look_at = self.start
+        camera.near, camera.far = RADIUS / 10, 100 * RADIUS
+
+    def _limit_zoom(self, client: viser.ClientHandle) -> None:
+        client.camera.max_orbit_distance = FARTHEST * RADIUS
+        client.camera.min_orbit_distance = NEAREST * RADIUS
+
+    def _reset(self, client: viser.ClientHandle | None) -> None:
+        if client is not None:
+            client.camera.up_direction = (0.0, 0.0, 1.0)
+            client.camera.position, client.camera.look_at = self.start
+            client.camera.fov = FIELD_RAD
+            self._limit_zoom(client)
+
+    def _look_through(self, client: viser.ClientHandle | None) -> None:
+        """Put a viewer's camera where the chosen frame's was, as far away, with its direction of up and field."""
+        if client is None:
+            return
+        record, first = self.record, self.placed[0]
+        session = first.shown.session
+        pose, K = record.world_to_camera, session.K(record)
+        client.camera.max_orbit_distance = 1e6 * RADIUS
+        position = first.place(-pose[:3, :3].T @ pose[:3, 3])
+        distance = float(np.linalg.norm(position))
+        client.camera.far, client.camera.near = distance + 100 * RADIUS, max(0.01, distance - 50 * RADIUS)
+        client.camera.fov = float(2 * np.arctan(session.camera.height / 2 / K[1, 1]))
+        _, down, forward = pose[:3, :3]
+        client.camera.up_direction = -down
+        client.camera.position = position
+        client.camera.look_at = position + distance * forward
+
+    def _save_picture(self, client: viser.ClientHandle | None) -> None:
+        if client is not None:
+            width, height = PICTURE_PX
+            image = client.get_render(height, width, transport_format="png", timeout=60)
+            png = imagecodecs.png_encode(np.ascontiguousarray(on_black(image)))
+            client.send_file_download("view.png", bytes(png))
+
+    def _save_turntable(self, client: viser.ClientHandle | None) -> None:
+        """Send the first model's turntable, drawn by our own renderer at the chosen exposure."""
+        if client is not None:
+            shown = self.placed[0].shown
+            cameras = circle(shown.gaussians, shown.session, VIEWS, *TURNTABLE_PX)
+            images = pictures(shown.gaussians, shown.session, shown.sensor, self.exposure_s, cameras)
+            client.send_file_download("turntable.png", moving_png(images))
+
+
+def _in_time(placed: Placed) -> list[FrameRecord]:
+    return sorted(placed.shown.session.frames, key=lambda record: (record.mid_exposure_utc_ns, record.id))
+
+
+def _nearest(placed: Placed, record: FrameRecord) -> FrameRecord:
+    """Return the frame of another session that was taken from the direction nearest to a frame's."""
+    wanted = record.position_body_m / max(float(np.linalg.norm(record.position_body_m)), 1e-9)
+    frames = placed.shown.session.frames
+    return max(
+        frames,
+        key=lambda r: float(r.position_body_m @ wanted) / max(float(np.linalg.norm(r.position_body_m)), 1e-9),
+    )
+
+
+def _fitting_distance(models: int) -> float:
+    width = RADIUS * (1 + APART / 2 * (models - 1))
+    return 1.35 * width / np.tan(FIELD_RAD / 2)
+
+
+def _facts(record: FrameRecord) -> str:
+    taken = datetime.fromtimestamp(record.mid_exposure_utc_ns / 1e9, UTC)
+    range_m = float(np.linalg.norm(record.position_body_m))
+    return (
+        f"frame {record.id} of bracket {record.bracket}, {1e3 * record.exposure_time_s:g} ms, {taken:%H:%M:%S}, "
+        f"{range_m:.4g} m, {record.saturated:,} pixels saturated"
+    )
+
+
+def _compared(placed: Placed, record: FrameRecord) -> np.ndarray:
+    """Return a frame, the model's picture and the error side by side, bytes [H, 3 W, 3]."""
+    shown = placed.shown
+    try:
+        dn = shown.session.dn(record).astype(np.float32)
+    except SessionError as error:
+        log.warning("%s", error)
+        return np.zeros((2, 6, 3), np.uint8)
+    frame = torch.from_numpy(dn.reshape(*dn.shape[:2], -1) / shown.sensor.white_dn)
+    image = predicted_image(shown.gaussians, shown.session, record, shown.sensor, record.exposure_time_s)
+    error = ((image - frame).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
+    encoding = shown.session.encoding
+    toned = [tone(each.numpy(), shown.sensor, encoding) for each in (frame, image)]
+    return np.concatenate([*toned, heat(error.numpy())], axis=1)
+
+
+def on_black(image: np.ndarray) -> np.ndarray:
+    """Return a picture [H, W, 4] with transparency on black, bytes [H, W, 3]."""
+    return (image[..., :3].astype(np.float32) * (image[..., 3:] / 255)).round().astype(np.uint8)

@@ -1,0 +1,243 @@
+"""`ground view`: which run it shows, who may connect, what colours mean, and its page in a browser."""
+
+import dataclasses
+import shutil
+import socket
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+from websockets.datastructures import Headers
+from websockets.http11 import Request
+from websockets.sync.client import connect
+
+from ground import cli
+from ground.cameras import predicted_image
+from ground.pictures import tone
+from ground.session import SessionError
+from ground.viewer import splats, viewer
+from ground.viewer.door import ViewError, opened, refused
+from ground.viewer.scene import Placed
+from ground.viewer.source import Shown, Source
+from obbgs_core.io.ply import save_ply
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.render import render
+from tests import scenes
+from tests.browser import chromium
+from tests.browser import opened as page_of
+from tests.small_sessions import small_session
+
+# viser 1.1.1 prints it for any splats, at times: the empty bounding sphere of a geometry that it has not filled yet
+VISERS = "computeBoundingSphere(): Computed radius is NaN"
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory) -> Path:
+    """A session of 40x40 pixels, and a run whose model is the one that was photographed."""
+    folder = small_session(tmp_path_factory.mktemp("viewed") / "A")
+    run = folder / "runs" / "run"
+    run.mkdir(parents=True)
+    save_ply(scenes.target(), run / "model.ply")
+    return folder
+
+
+def test_a_run_is_found_by_its_folder_or_its_session_and_read_again_when_renewed(session, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(session, folder)
+    shutil.copytree(folder / "runs" / "run", folder / "runs" / "newer")
+    save_ply(scenes.target(seed=1), folder / "runs" / "newer" / "model.ply")
+    assert Source(folder / "runs" / "run").name == "copy/run"
+    source = Source(folder)
+    assert source.folder.name == "newer" and source.renewed()
+    assert len(source.load().gaussians) == 60 and not source.renewed()
+    save_ply(scenes.target(count=70), source.folder / "model.ply")
+    assert source.renewed() and len(source.load().gaussians) == 70
+    (source.folder / "model.ply").unlink()
+    assert not source.renewed()  # between two models
+    with pytest.raises(SessionError, match=r"has no model\.ply yet"):
+        source.load()
+
+
+def test_what_is_no_run_is_told_so(session, tmp_path):
+    with pytest.raises(SessionError, match=r"neither a session \(session\.json\) nor a run"):
+        Source(tmp_path)
+    shutil.copytree(session, tmp_path / "s", ignore=shutil.ignore_patterns("runs"))
+    with pytest.raises(SessionError, match="has no run with a"):
+        Source(tmp_path / "s")
+    shutil.copytree(session / "runs" / "run", tmp_path / "alone")
+    with pytest.raises(SessionError, match=r"does not lie in runs/ of a session"):
+        Source(tmp_path / "alone")
+
+
+@pytest.mark.parametrize(
+    ("host", "headers", "told"),
+    [
+        ("127.0.0.1", {"Host": "127.0.0.1:80", "Origin": "http://127.0.0.1:80"}, None),
+        ("127.0.0.1", {"Host": "localhost:80", "Origin": "http://localhost:80"}, None),
+        ("127.0.0.1", {"Host": "127.0.0.1:80", "Origin": "http://evil.example"}, "only the page"),
+        ("127.0.0.1", {"Host": "127.0.0.1:80", "Origin": "http://127.0.0.1:81"}, "only the page"),
+        ("127.0.0.1", {"Host": "127.0.0.1:80"}, "only the page"),
+        ("127.0.0.1", {"Host": "evil.example:80", "Origin": "http://evil.example:80"}, "this machine only"),
+        ("127.0.0.1", {}, "this machine only"),
+        ("0.0.0.0", {"Host": "station:80", "Origin": "http://station:80"}, None),
+        ("0.0.0.0", {"Host": "station:80", "Origin": "http://evil.example"}, "only the page"),
+    ],
+)
+def test_only_the_page_of_the_server_may_connect(host, headers, told):
+    reason = refused(Request("/", Headers(headers | {"Upgrade": "websocket"})), host)
+    assert (reason is None) if told is None else (told in str(reason))
+
+
+def test_a_page_of_another_site_gets_nothing_from_the_port():
+    server = opened("127.0.0.1", 0)
+    try:
+        url = f"ws://127.0.0.1:{server.get_port()}"
+        with pytest.raises(Exception, match="403"):
+            connect(url, origin="http://evil.example")  # pyright: ignore[reportArgumentType]
+    finally:
+        server.stop()
+
+
+def test_a_port_that_is_taken_is_not_replaced_by_another(session):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(ViewError, match=f"cannot listen on 127.0.0.1 port {port}: .*--port"):
+            opened("127.0.0.1", port)
+    result = CliRunner().invoke(cli.app, ["view", str(session / "nothing")])
+    assert result.exit_code == 1 and "neither a session" in str(result.exception)
+
+
+def solid(footprint: str) -> Gaussians:
+    """Return the opaque surface of a sphere of 0.9 m, as trained models have surfaces, with light and dark places."""
+    rng = torch.Generator().manual_seed(0)
+    means = torch.nn.functional.normalize(torch.randn(1500, 3, generator=rng), dim=1)
+    light = 0.25 + 0.2 * torch.sin(4 * means[:, 0]) * torch.sin(3 * means[:, 2])
+    return Gaussians(
+        0.9 * means,
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(1500, 1),
+        torch.full((1500, 3), 0.05).log(),
+        torch.full((1500,), 3.0),
+        scenes.from_radiance(light[:, None, None]),
+        footprint=footprint,  # pyright: ignore[reportArgumentType]
+    )
+
+
+def as_drawn(shown: Shown, record, exposure_time_s: float) -> np.ndarray:
+    """Return what a program draws that blends the viewer's colours, here our own renderer, as bytes [H, W, 3]."""
+    shape = splats.shapes(shown)
+    values, vectors = np.linalg.eigh(shape.covariances)
+    vectors[np.linalg.det(vectors) < 0, :, 0] *= -1
+    from scipy.spatial.transform import Rotation
+
+    rgb = splats.colours(shown, record, exposure_time_s) / 255
+    blended = Gaussians(
+        torch.from_numpy(shape.means),
+        torch.from_numpy(Rotation.from_matrix(vectors).as_quat(scalar_first=True)).float(),
+        torch.from_numpy(np.log(values) / 2).float(),
+        torch.logit(torch.from_numpy(shape.opacities), eps=1e-6),
+        scenes.from_radiance(torch.from_numpy(rgb).float()[:, None]),
+        footprint="mip-splatting",
+    )
+    cameras = splats.cameras_of(shown.session, [record])
+    K = cameras.K * torch.tensor([[8.0], [8.0], [1.0]])  # a screen is finer than the sensor
+    fine = dataclasses.replace(cameras, K=K, width=8 * cameras.width, height=8 * cameras.height)
+    image = render(blended, fine).radiance[0].numpy()
+    return image.reshape(cameras.height, 8, cameras.width, 8, 3).mean(axis=(1, 3)) * 255
+
+
+@pytest.mark.parametrize("footprint", ["kerbl", "camera"])
+def test_shapes_and_colours_give_the_picture_of_the_sensor(session, footprint):
+    """Display colours are blended in place of light, which is the larger part of the difference."""
+    shown = dataclasses.replace(Source(session).load(), gaussians=solid(footprint))
+    record = shown.session.frames[3]
+    image = predicted_image(shown.gaussians, shown.session, record, shown.sensor, record.exposure_time_s)
+    ours = tone(image.numpy(), shown.sensor, "linear").astype(float)
+    theirs = as_drawn(shown, record, record.exposure_time_s)
+    assert ours.max() > 100
+    assert -10 * np.log10(np.mean((ours - theirs) ** 2) / 255**2) > 30
+
+
+def test_the_misfit_is_seen_where_the_model_is_wrong(session):
+    """One Gaussian is made four times as bright: it gets the brightest colour, those of the others stay dark."""
+    shown = Source(session).load()
+    before = splats.error_colours(shown).astype(int).sum(axis=1)
+    wrong = shown.gaussians.detach()
+    sh = wrong.sh.clone()
+    index = int(wrong.means.norm(dim=1).argmax())  # stands alone
+    sh[index] *= 4
+    shown = dataclasses.replace(shown, gaussians=dataclasses.replace(wrong, sh=sh))
+    after = splats.error_colours(shown).astype(int)
+    np.testing.assert_allclose(after[index], splats.RAMP[-1], atol=60)
+    assert np.median(before) < splats.RAMP[2].sum() < after[index].sum()
+
+
+def test_uncertainty_is_larger_for_what_frames_show_less(session):
+    shown = Source(session).load()
+    hidden = shown.gaussians.detach()
+    logits = hidden.opacity_logits.clone()
+    logits[7] = -9.0  # nearly transparent: the frames say nothing of its radiance
+    shown = dataclasses.replace(shown, gaussians=dataclasses.replace(hidden, opacity_logits=logits))
+    colour = splats.uncertainty_colours(shown).astype(int)
+    np.testing.assert_allclose(colour[7], splats.RAMP[-1], atol=1)
+    assert colour[:7].sum(axis=1).max() < colour[7].sum()
+
+
+def test_the_page_draws_the_splats_and_its_controls_work(session):
+    """What the browser draws through a frame's camera against our renderer: on black, at two exposures."""
+    shown = dataclasses.replace(Source(session).load(), gaussians=solid("camera"))
+    server = opened("127.0.0.1", 0)
+    try:
+        first = Placed(server, "a", shown, np.zeros(3))
+        second = Placed(server, "b", shown, np.array([24.0, 0, 0]), first.per_metre)
+        page_viewer = viewer.Viewer(server, [first, second])
+        second.show("splats", False)  # it stands in the picture that is compared
+        with (
+            chromium() as browser,
+            page_of(browser, f"http://127.0.0.1:{server.get_port()}", 700, 700, known=VISERS) as page,
+        ):
+            page.wait_for_selector("text=Timeline of the pass")
+            client = waited_for(lambda: next(iter(server.get_clients().values()), None))
+            page.get_by_text("0.2", exact=True).click()
+            waited_for(lambda: page_viewer.exposure_s == pytest.approx(2e-4))
+            page.get_by_text("Look through its camera").click()
+            waited_for(lambda: abs(client.camera.fov - 2 * np.arctan(20 / 80)) < 1e-3)
+            waited_for(lambda: abs(np.linalg.norm(client.camera.position) - 8 * first.per_metre) < 1)
+            page.wait_for_timeout(3000)  # the splats fade in
+            for exposure_s in (2e-4, 5e-5):
+                page_viewer.exposure.value = 1e3 * exposure_s
+                page_viewer.draw_splats()
+                theirs, ours = through_camera(client, first, page_viewer.record, exposure_s)
+                assert ours.max() > 50
+                assert -10 * np.log10(np.mean((ours - theirs) ** 2) / 255**2) > 30
+            page.get_by_text("Cameras", exact=True).click()
+            waited_for(lambda: all(handle.visible for handle in first.handles["cameras"]))
+            page.get_by_text("Save turntable").click()
+            page.wait_for_selector("text=turntable.png")
+    finally:
+        server.stop()
+
+
+def through_camera(client, placed: Placed, record, exposure_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a client draws through a frame's camera, and what our renderer does, bytes [H, W, 3], on black."""
+    shown = placed.shown
+    camera, times = shown.session.camera, 8  # a screen is finer than the sensor
+    height, width = times * camera.height, times * camera.width
+    drawn = client.get_render(height, width, transport_format="png", timeout=200)
+    on_black = viewer.on_black(drawn).astype(float)
+    theirs = on_black.reshape(camera.height, times, camera.width, times, 3).mean(axis=(1, 3))
+    image = predicted_image(shown.gaussians, shown.session, record, shown.sensor, exposure_s)
+    return theirs, tone(image.numpy(), shown.sensor, shown.session.encoding).astype(float)
+
+
+def waited_for(what, seconds: float = 100):
+    """Return what a function returns, as soon as it is true; fail after some time."""
+    end_s = time.monotonic() + seconds
+    while not (value := what()):
+        assert time.monotonic() < end_s
+        time.sleep(0.1)
+    return value

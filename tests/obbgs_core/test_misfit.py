@@ -1,0 +1,100 @@
+"""The model's own error beside the noise: measured on simulated errors, its penalty as SciPy has it, its gradients."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.optimize
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from obbgs_core.losses import cauchy, likelihood_loss, likelihood_loss_reference, relative_misfit
+from obbgs_core.sensor import Sensor
+from tests.obbgs_core.test_losses import (
+    SENSORS,
+    assert_gradients_agree,
+    bracket,
+    needs_native,
+    value_and_gradient,
+)
+
+SENSOR = Sensor(black_dn=10, white_dn=4095, dn_per_radiance_s=1e7, electrons_per_dn=4, read_noise_dn=5)
+EXPOSURES_S = torch.full((1, 1, 1, 1), 1e-4)
+
+
+def erring(share: float, seed: int, noise: bool = True) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return a prediction [1, 120, 90, 1] that errs by a share of the light, and readings."""
+    g = torch.Generator().manual_seed(seed)
+    radiance = 0.2 + 1.5 * torch.rand(1, 120, 90, 1, generator=g)
+    expected = SENSOR.expected_dn(radiance, EXPOSURES_S)
+    light_dn = expected - SENSOR.black_dn
+    dn = expected + share * light_dn * torch.randn(expected.shape, generator=g)
+    if noise:
+        dn = dn + SENSOR.variance_dn2(expected).sqrt() * torch.randn(expected.shape, generator=g)
+    return radiance, dn
+
+
+@given(st.floats(0.05, 0.3), st.integers(0, 1000))
+def test_the_share_by_which_a_model_errs_is_found_beside_the_noise(share, seed):
+    radiance, dn = erring(share, seed)
+    assert relative_misfit(radiance, EXPOSURES_S, dn, SENSOR) == pytest.approx(share, rel=0.1)
+
+
+def test_noise_alone_is_no_misfit_and_darkness_tells_nothing():
+    radiance, dn = erring(0.0, 1)
+    assert relative_misfit(radiance, EXPOSURES_S, dn, SENSOR) < 0.01
+    assert math.isnan(relative_misfit(0 * radiance, EXPOSURES_S, 0 * dn, SENSOR))
+
+
+def test_the_mean_of_several_pixels_has_less_noise_and_the_same_misfit():
+    radiance, dn = erring(0.02, 1, noise=False)
+    alone = relative_misfit(radiance, EXPOSURES_S, dn, SENSOR, averaged_pixels=1)
+    assert alone < relative_misfit(radiance, EXPOSURES_S, dn, SENSOR, averaged_pixels=16) < 0.021
+
+
+def test_the_penalty_is_that_of_scipy():
+    residuals = np.random.default_rng(0).normal(size=50) * 10
+    solved = scipy.optimize.least_squares(lambda x: residuals + 0 * x, [0.0], loss="cauchy", f_scale=3.0)
+    assert cauchy(torch.from_numpy(residuals)).item() * 50 == pytest.approx(solved.cost, rel=1e-12)
+
+
+@needs_native
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+@pytest.mark.parametrize(("channels", "averaged_pixels"), [(1, 1), (3, 16)])
+@pytest.mark.parametrize("misfit", [0.0, 0.2])
+def test_the_compiled_likelihood_with_a_misfit_is_the_readable_one(sensor, channels, averaged_pixels, misfit):
+    radiance, exposures_s, dn = bracket(sensor, channels=channels)
+    settings = (sensor, averaged_pixels, 0.05, misfit)
+    loss, gradient = value_and_gradient(lambda r: likelihood_loss(r, exposures_s, dn, *settings)[0], radiance)
+    truth, true_gradient = value_and_gradient(
+        lambda r: likelihood_loss_reference(r, exposures_s.double(), dn.double(), *settings)[0],
+        radiance.double(),
+    )
+    assert loss.item() == pytest.approx(truth.item(), rel=1e-6)
+    assert_gradients_agree(gradient, true_gradient)
+    residual = likelihood_loss(radiance, exposures_s, dn, *settings)[1]
+    _, true_residual = likelihood_loss_reference(
+        radiance.double(), exposures_s.double(), dn.double(), *settings
+    )
+    torch.testing.assert_close(residual.double(), true_residual, rtol=1e-5, atol=1e-4)  # 4095 DN in float32
+
+
+def test_residuals_over_both_errors_have_unit_variance():
+    radiance, dn = erring(0.2, 3)
+    _, residual = likelihood_loss(radiance, EXPOSURES_S, dn, SENSOR, misfit=0.2)
+    unclipped = residual[dn < SENSOR.white_dn]
+    assert unclipped.square().mean().item() == pytest.approx(1, rel=0.1)
+
+
+def test_a_glint_loses_its_pull_as_it_grows():
+    radiance = torch.full((1, 8, 8, 1), 0.5)
+    pulls = []
+    for glint in (0.6, 1.0, 2.0):
+        dn = SENSOR.expected_dn(radiance, EXPOSURES_S).clone()
+        dn[0, 4, 4] = SENSOR.black_dn + 1000 * glint
+        _, gradient = value_and_gradient(
+            lambda r, dn=dn: likelihood_loss(r, EXPOSURES_S, dn, SENSOR, misfit=0.05)[0], radiance
+        )
+        pulls.append(-gradient[0, 4, 4].item())
+    assert pulls[0] > pulls[1] > pulls[2] > 0
