@@ -12,6 +12,7 @@ import torch
 
 import ground.live
 from ground.evaluate import evaluate
+from ground.listing import find_sessions
 from ground.live import LiveReconstruction, PassEnd, reconstruct_live
 from ground.live_status import LiveStatus, line, read_status
 from ground.reconstruct import reconstruct
@@ -50,9 +51,9 @@ class Writer:
 
 @pytest.fixture(autouse=True)
 def fast(monkeypatch) -> None:
-    """Everything that is due at intervals is due at every step; the surface has few points."""
+    """What is due at intervals is due at every step, but for the shown model; the surface has few points."""
     monkeypatch.setattr("ground.model_files.SURFACE_POINTS", 2_000)
-    for name in ("LOOK_S", "SHOW_S", "STATUS_S", "WAIT_S", "JOIN_PAUSE"):
+    for name in ("LOOK_S", "STATUS_S", "WAIT_S", "JOIN_PAUSE"):
         monkeypatch.setattr(ground.live, name, 0.0)
     monkeypatch.setattr(ground.live, "JOIN_STEPS", 20)
 
@@ -140,7 +141,10 @@ def test_it_waits_and_says_what_is_missing_and_frames_in_eclipse_are_none(tmp_pa
     writer.add(6)
     turns(live, end, 2)
     assert statuses[-1].frames_unusable == 6 and statuses[-1].state == "training"
-    live.report("training", "")
+    (entry,) = find_sessions([tmp_path])
+    assert [run.name for run in entry.runs] == ["live"] and "training, 12 of 18 frames" in entry.runs[
+        0
+    ].problem
     writer.add(3, pose_valid=False)
     turns(live, end, 30)
     assert statuses[-1].frames_received == 21 and statuses[-1].frames_trained == 12
