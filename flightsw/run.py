@@ -77,8 +77,7 @@ def run_pass(
         ObbgsError: what could not be opened, or what ended capture or downlink.
         ValueError: a URL that nothing here can open.
     """
-    captured, camera, no_camera, thread = CaptureCounts(), None, None, None
-    watchdog = Watchdog()
+    captured, camera, no_camera, thread, alive = CaptureCounts(), None, None, None, Watchdog()
     with contextlib.ExitStack() as opened:
         link, counter = _open_link(link_url, key_file, opened)
         if camera_url is not None:
@@ -92,15 +91,7 @@ def run_pass(
         store = open_store(store_dir, mission)
         if link is not None:
             thread = _DownlinkThread(
-                FrameStore(store_dir),
-                link,
-                mission,
-                counter,
-                exit_when_empty,
-                stop,
-                on_sent,
-                camera,
-                watchdog,
+                FrameStore(store_dir), link, mission, counter, exit_when_empty, stop, on_sent, camera, alive
             )
             if camera_url is not None:
                 thread.capturing.set()
@@ -116,7 +107,7 @@ def run_pass(
             if no_camera is not None:
                 raise no_camera
             if camera is not None:
-                captured = _capture(mission, camera, store, stop, report, watchdog)
+                captured = _capture(mission, camera, store, stop, report, alive)
         except Exception as error:
             if thread is not None:  # it may go on for hours until the outbox is empty: log the error now
                 thread.camera_failed = True
