@@ -12,6 +12,8 @@ from rich.console import Console
 from flightsw.icd.mission import ReconstructSection, load_mission
 from ground.cli_options import (
     AsJson,
+    AttitudeChoice,
+    AttitudeGiven,
     BlindReference,
     Budget,
     MeshFormatName,
@@ -28,7 +30,7 @@ from ground.cli_options import (
     Threads,
     TimeLimit,
 )
-from ground.progress import Stop, say, steps_shown
+from ground.progress import Stop, say, shares_shown, steps_shown
 from ground.summary import frames_row, model_rows, table
 from obbgs_base.errors import Interrupted
 
@@ -48,6 +50,7 @@ def reconstruct_command(
     time_limit: TimeLimit = math.inf,
     seed: Seed = None,
     blind_reference: BlindReference = False,
+    attitude: AttitudeGiven = AttitudeChoice.AUTO,
     overwrite: Overwrite = False,
     threads: Threads = None,
     json_: AsJson = False,
@@ -93,6 +96,8 @@ def reconstruct_command(
                 out,
                 overwrite,
                 lambda: stop.requested,
+                attitude.value,
+                shares_shown(stderr),
             )
             stop.raise_at_once()
             say(stderr, "scoring the model and writing its report")
