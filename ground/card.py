@@ -3,10 +3,16 @@
 import math
 
 NOISE_LIKE_CHI2 = 1.5  # up to here the model's own error is under 0.7 sigma of the noise
-SIZES = {"model.ply": "ply_bytes", "model.spz": "spz_bytes", "model.onnx": "onnx_bytes"}
+SIZES = {
+    "model.ply": "ply_bytes",
+    "model.spz": "spz_bytes",
+    "model.glb": "glb_bytes",
+    "model.onnx": "onnx_bytes",
+}
 USES = {
     "model.ply": "the model without loss",
     "model.spz": "quantised, for viewers and storage",
+    "model.glb": "a closed mesh with colours, for other software",
     "model.onnx": "the renderer for use on board",
 }
 
@@ -130,6 +136,13 @@ def _quality(metrics: dict) -> list[str]:
                 f"- Stated uncertainty: intervals that should hold 90 % hold {100 * metrics[key]:.0f} % of the {of} "
                 "on the target in held-out frames."
             )
+    if "mesh_triangles" in metrics:
+        unseen = f"{100 * metrics['mesh_unseen_share']:.1f} % of its area"
+        lines.append(
+            f"- Mesh: {metrics['mesh_triangles']:,} triangles, closed. {unseen} was seen by none of "
+            f"{metrics['mesh_views']} views: there the surface only bounds what no view saw. The vertex attribute "
+            "_SEEN_BY_VIEWS counts the views that see each vertex."
+        )
     if metrics.get("onnx_fits_uplink") is False:
         lines.append("- model.onnx is too large for the uplink: train with a smaller --budget.")
     return lines

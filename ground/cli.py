@@ -22,7 +22,7 @@ from ground.cli_options import (
     SessionDir,
     UplinkCommand,
 )
-from ground.cli_runs import evaluate_command, reconstruct_command, report_command
+from ground.cli_runs import evaluate_command, mesh_command, reconstruct_command, report_command
 from ground.cli_systems import dictionary_command, yamcs_command
 from ground.cli_view import view_command
 from obbgs_base.command_line import new_app, run
@@ -68,7 +68,7 @@ def listen_command(
         signal.signal(number, lambda *_: stop.set())
     with (
         Forwarder(forward) if forward is not None else contextlib.nullcontext() as forwarder,
-        statuses_shown(stderr, json_) as (on_status, on_event),
+        statuses_shown(stderr, json_, link, session) as (on_status, on_event),
     ):
         summary = listen(
             link,
@@ -183,6 +183,7 @@ app.command("live")(live_command)
 app.command("reconstruct")(reconstruct_command)
 app.command("evaluate")(evaluate_command)
 app.command("report")(report_command)
+app.command("mesh")(mesh_command)
 app.command("view")(view_command)
 app.command("compare")(compare_command)
 app.command("list")(list_command)

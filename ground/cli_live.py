@@ -107,7 +107,7 @@ def _receive(
         signal.signal(number, lambda *_: stop.set())
     show = Lines(stderr)
     with LiveProcess(session, run, options, lambda text: say(stderr, text)) as training:
-        with statuses_shown(stderr, as_json) as (on_status, on_event):
+        with statuses_shown(stderr, as_json, link, session) as (on_status, on_event):
 
             def with_model(status: Status) -> None:
                 training.tend()
@@ -124,8 +124,11 @@ def _receive(
                 on_event=on_event,
             )
         stop.clear()  # the next signal ends the training
-        say(stderr, f"{summary.frames_received} frames received, {summary.frames_in_session} in {session}")
-        training.finish(stop.is_set, lambda facts: show("model", line(facts)))
+        if not as_json:
+            say(
+                stderr, f"{summary.frames_received} frames received, {summary.frames_in_session} in {session}"
+            )
+        training.finish(stop.is_set, lambda facts: None if as_json else show("model", line(facts)))
     metrics = json.loads((run / "metrics.json").read_bytes())
     if as_json:
         print(json.dumps({"type": "summary"} | dataclasses.asdict(summary) | {"model": metrics}))

@@ -24,6 +24,14 @@ class Quality(StrEnum):
     BEST = "best"
 
 
+class AttitudeChoice(StrEnum):
+    """Where the target's attitude comes from, as `ground.reconstruct.AttitudeSource`."""
+
+    AUTO = "auto"
+    TAGGED = "tagged"
+    UNKNOWN = "unknown"
+
+
 class ImportFormat(StrEnum):
     """Formats that a session can be made from."""
 
@@ -54,6 +62,15 @@ class ExportFormat(StrEnum):
 
     NERF = "nerf"
     NERFSTUDIO = "nerfstudio"
+
+
+class MeshFormatName(StrEnum):
+    """Formats of meshes."""
+
+    GLB = "glb"
+    OBJ = "obj"
+    STL = "stl"
+    PLY = "ply"
 
 
 class UplinkCommand(StrEnum):
@@ -130,6 +147,14 @@ ReconstructMission = Annotated[
 ]
 TimeLimit = Annotated[float, typer.Option(help="Seconds for each training; then the model is made as it is.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="The same seed makes the same model; default: 7.")]
+AttitudeGiven = Annotated[
+    AttitudeChoice,
+    typer.Option(
+        "--attitude",
+        help="The target's attitude. tagged: as the pose tags assume it; unknown: found from the frames; auto: unknown "
+        "where the tags say so.",
+    ),
+]
 BlindReference = Annotated[
     bool, typer.Option(help="Train a second time without exposure times, for comparison.")
 ]

@@ -1,17 +1,22 @@
-"""The commands of `ground` that make, score and show a model: reconstruct, evaluate, report."""
+"""The commands of `ground` that make, score and show a model: reconstruct, evaluate, report, mesh."""
 
 import json
 import math
 import os
 from pathlib import Path
+from typing import Annotated
 
+import typer
 from rich.console import Console
 
 from flightsw.icd.mission import ReconstructSection, load_mission
 from ground.cli_options import (
     AsJson,
+    AttitudeChoice,
+    AttitudeGiven,
     BlindReference,
     Budget,
+    MeshFormatName,
     MethodName,
     Overwrite,
     QualityName,
@@ -25,7 +30,7 @@ from ground.cli_options import (
     Threads,
     TimeLimit,
 )
-from ground.progress import Stop, say, steps_shown
+from ground.progress import Stop, say, shares_shown, steps_shown
 from ground.summary import frames_row, model_rows, table
 from obbgs_base.errors import Interrupted
 
@@ -45,6 +50,7 @@ def reconstruct_command(
     time_limit: TimeLimit = math.inf,
     seed: Seed = None,
     blind_reference: BlindReference = False,
+    attitude: AttitudeGiven = AttitudeChoice.AUTO,
     overwrite: Overwrite = False,
     threads: Threads = None,
     json_: AsJson = False,
@@ -90,6 +96,8 @@ def reconstruct_command(
                 out,
                 overwrite,
                 lambda: stop.requested,
+                attitude.value,
+                shares_shown(stderr),
             )
             stop.raise_at_once()
             say(stderr, "scoring the model and writing its report")
@@ -125,6 +133,36 @@ def report_command(
 
     path = write_report(session, name, out)
     print(json.dumps({"report": str(path)}) if json_ else path)
+
+
+def mesh_command(
+    session: SessionDir,
+    name: RunName = "run",
+    out: RunsDir = None,
+    format_: Annotated[
+        MeshFormatName, typer.Option("--format", help="The format to write.")
+    ] = MeshFormatName.GLB,
+    json_: AsJson = False,
+) -> None:
+    """Write a finished run's surface into its folder as a closed mesh: model.glb, or mesh.FORMAT.
+
+    Example: ground mesh --session demo/session --name demo --format obj
+    """
+    from ground.mesh_files import write_mesh
+    from ground.model_files import white_radiance_of
+    from ground.runs import open_run
+    from ground.training_frames import split
+
+    run = open_run(session, name, out)
+    training, _ = split(run.session)
+    stem = "model" if format_ is MeshFormatName.GLB else "mesh"  # model.ply holds the Gaussians
+    path = run.folder / f"{stem}.{format_.value}"
+    facts = write_mesh(run.gaussians, run.session, training, path, white_radiance_of(run.session, training))
+    if json_:
+        print(json.dumps({"mesh": str(path)} | facts))
+    else:
+        unseen = f"{100 * facts['mesh_unseen_share']:.1f} % of the area seen by no view"
+        print(f"{facts['mesh_triangles']:,} triangles, {unseen}: {path}")
 
 
 def _interrupted(folder: Path | None) -> str:

@@ -10,7 +10,8 @@ from typing import Any
 
 import yaml
 
-from ground.runs import read_metrics
+from ground.live_status import line, read_status
+from ground.runs import is_live, read_metrics, unfinished_folder
 from ground.session import SessionError, flight_counts, read_header, read_records
 
 DEEPEST = 3  # levels of folders below the given ones in which sessions are looked for
@@ -121,6 +122,8 @@ def _runs(session: Path) -> list[RunEntry]:
     if not folder.is_dir():
         return []
     paths = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.endswith(".replaced"))
+    hidden = {unfinished_folder(path) for path in paths if is_live(path)}  # a live run shows itself
+    paths = [path for path in paths if path not in hidden]
     return sorted(map(_run_entry, paths), key=lambda run: run.made_utc)
 
 
@@ -133,6 +136,8 @@ def _run_entry(folder: Path) -> RunEntry:
             name[1 : -len(".part")],
             "unfinished: `ground reconstruct` with this name goes on with it",
         )
+    elif is_live(folder):
+        problem = f"unfinished, `ground live` with this name goes on with it: {line(read_status(folder))}"
     else:
         try:
             metrics = read_metrics(folder / "metrics.json")

@@ -147,7 +147,7 @@ class LiveReconstruction:
         self._over = ""  # why the pass is over
         self._missing = "waiting for the first frame"
         self._tried = -1  # frames that no training could begin with
-        self._joined = self._joined_step = 0
+        self._joined = self._joined_step = self._saved_step = 0
         self._joined_s = self._joining_s = 0.0
         self._looks, self._shows, self._reports, self._saves = map(_Every, (LOOK_S, SHOW_S, STATUS_S, SAVE_S))
 
@@ -164,6 +164,8 @@ class LiveReconstruction:
         elif self._over:
             return False
         else:
+            if self.steps != self._saved_step:
+                self.save()
             time.sleep(WAIT_S)
         if self.trainer is not None and self._shows.due():
             self._show(self.trainer)
@@ -188,6 +190,7 @@ class LiveReconstruction:
             if self._over or trainer.stop_reason() or (learnt and paused):
                 trainer.join(self.arrivals.frames[self._joined :])
                 self._note_joined(now_s)
+                self.save()
         elif self._over:
             trainer.release()
 
@@ -229,6 +232,7 @@ class LiveReconstruction:
         trainer.withhold()
         self.trainer = trainer
         self._note_joined(began_s)
+        self.save()
 
     def _resumed(self) -> bool:
         """Go on from the newest checkpoint whose frames have all arrived, if there is one."""
@@ -296,6 +300,7 @@ class LiveReconstruction:
         except OSError as error:
             log.warning("step %d: %s cannot be written: %s", self.steps, path, error)
             return
+        self._saved_step = self.steps
         for other in self._part.iterdir():
             if CHECKPOINT.fullmatch(other.name) and other != path:
                 other.unlink()

@@ -61,7 +61,9 @@ def read_status(folder: Path) -> dict[str, Any]:
 
 
 def line(facts: dict[str, Any]) -> str:
-    """Return a status in one line of text."""
+    """Return a status as `read_status` gives it in one line of text."""
+    if not facts:
+        return "its status cannot be read"
     frames = f"{facts['frames_trained']} of {facts['frames_received']} frames"
     text = f"{facts['state']}, {frames}, step {facts['step']} ({100 * facts['share']:.0f} % of the schedule)"
     if facts["gaussians"] is not None:

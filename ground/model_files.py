@@ -10,6 +10,7 @@ import numpy as np
 import onnxruntime
 
 from ground.cameras import cameras_of, median_sun_direction, predicted_image, sensor_of, sun_direction
+from ground.mesh_files import write_mesh
 from ground.session import FrameRecord, Session, SessionError
 from ground.uplink import MAX_MODEL_BYTES
 from obbgs_base.errors import Interrupted
@@ -78,14 +79,15 @@ def write_models(
     session: Session,
     training: list[FrameRecord],
     held_out: list[FrameRecord],
-) -> float | None:
-    """Write the model in every format, the one trained blind to exposure, and the surface.
+) -> dict:
+    """Write the model in every format, the one trained blind to exposure, and the surface as points and as a mesh.
 
-    Returns the agreement of the ONNX renderer with ours in dB (see `onnx_parity_db`); None where it was not measured.
+    Returns what metrics.json says of the files: onnx_parity_db, the agreement of the ONNX renderer with ours in dB
+    (None where it was not measured), and of the mesh what `write_mesh` returns.
     """
     camera, sensor = session.camera, sensor_of(session.camera)
     exposures_s = exposure_times_s(training)
-    white_radiance = (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * exposures_s[0])
+    white_radiance = white_radiance_of(session, training)
     sun_dir = median_sun_direction(training)
     cameras = cameras_of(session, training)
     outputs.make("model.ply", lambda path: save_ply(gaussians, path, white_radiance, sun_dir, cameras))
@@ -93,6 +95,10 @@ def write_models(
         outputs.make("blind.ply", lambda path: save_ply(blind, path, white_radiance, sun_dir, cameras))
     outputs.make("model.spz", lambda path: save_spz(gaussians, path, white_radiance, sun_dir))
     outputs.make("surface.ply", lambda path: _write_surface(gaussians, session, training, path))
+    mesh = outputs.make(
+        "model.glb", lambda path: write_mesh(gaussians, session, training, path, white_radiance)
+    )
+    facts: dict = {"onnx_parity_db": None} | (mesh or {})
     exported = outputs.make(
         "model.onnx",
         lambda path: export_onnx(
@@ -107,7 +113,7 @@ def write_models(
         ),
     )
     if exported is None:
-        return None
+        return facts
     if exported.size_bytes > MAX_MODEL_BYTES:
         log.warning(
             "model.onnx has %d bytes and the spacecraft accepts %d: `ground uplink model` will refuse it",
@@ -116,9 +122,10 @@ def write_models(
         )
     views = held_out or training
     views = views[:: max(1, len(views) // PARITY_VIEWS)][:PARITY_VIEWS]
-    return outputs.make(
+    parity_db = outputs.make(
         "onnx_parity_db", lambda _: onnx_parity_db(exported.path, gaussians, session, views, sensor)
     )
+    return facts | {"onnx_parity_db": parity_db}
 
 
 def onnx_parity_db(
@@ -144,11 +151,17 @@ def onnx_parity_db(
 def model_sizes(folder: Path) -> dict:
     """Return the bytes of each form of the model (None for a missing one) and whether the uplink accepts model.onnx."""
     sizes = {}
-    for name in ("ply", "spz", "onnx"):
+    for name in ("ply", "spz", "glb", "onnx"):
         path = folder / f"model.{name}"
         sizes[f"{name}_bytes"] = path.stat().st_size if path.is_file() else None
     onnx_bytes = sizes["onnx_bytes"]
     return sizes | {"onnx_fits_uplink": None if onnx_bytes is None else onnx_bytes <= MAX_MODEL_BYTES}
+
+
+def white_radiance_of(session: Session, training: list[FrameRecord]) -> float:
+    """Return the radiance that the shortest exposure of the training frames shows as white."""
+    sensor = sensor_of(session.camera)
+    return (sensor.white_dn - sensor.black_dn) / (sensor.dn_per_radiance_s * exposure_times_s(training)[0])
 
 
 def exposure_times_s(records: list[FrameRecord]) -> list[float]:

@@ -35,6 +35,20 @@ def steps_shown(console: Console) -> Iterator[Callable[[str, "StepInfo"], None]]
             logging.getLogger(name).removeHandler(events)
 
 
+def shares_shown(console: Console) -> Callable[[str, float], None]:
+    """Return a function that prints what is being done and the share that is done, at first and every ten seconds."""
+    last: tuple[str, float] = ("", 0.0)
+
+    def show(what: str, share: float) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if what != last[0] or now - last[1] > PLAIN_S:
+            last = (what, now)
+            say(console, f"{what}: {share:.0%}")
+
+    return show
+
+
 @contextlib.contextmanager
 def _bars(console: Console) -> Iterator[Callable[[str, "StepInfo"], None]]:
     with Progress(

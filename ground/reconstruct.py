@@ -7,7 +7,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
+from ground.attitude import FILE as ATTITUDE_FILE
+from ground.attitude import FoundAttitude, find_attitude, in_body_axes
 from ground.cameras import sensor_of
 from ground.estimated_poses import write_estimate
 from ground.model_files import Outputs, model_sizes, write_models
@@ -22,6 +25,7 @@ from obbgs_core.train.result import StepInfo, TrainResult
 from obbgs_core.train.trainer import train
 
 log = logging.getLogger(__name__)
+AttitudeSource = Literal["auto", "tagged", "unknown"]
 KNOWN, BLIND = "known exposure", "blind to exposure"  # the trainings of a run
 
 
@@ -45,6 +49,8 @@ def reconstruct(
     out: Path | None = None,
     overwrite: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
+    attitude: AttitudeSource = "auto",
+    on_search: Callable[[str, float], None] = lambda what, share: None,
 ) -> Path:
     """Train on a session and return the run folder, which appears only when it is complete.
 
@@ -59,11 +65,14 @@ def reconstruct(
         out: the folder of runs; None: runs/ in the session.
         overwrite: replace a finished run of the same name.
         should_stop: called after each step and before each file; True saves the work and raises Interrupted.
+        attitude: of the target. tagged: as the pose tags assume it; unknown: found from the frames, which are taken
+            relative to inertial axes; auto: unknown where the tags say so.
+        on_search: called with what is being done to find the attitude, and the share of it that is done.
 
     Raises:
         SessionError: the session cannot be used; the name is not a plain folder name, or is that of a finished run or
             of one that another process is making; or the folder of runs cannot be written.
-        ReconstructionError: the frames allow no model (too few, all black).
+        ReconstructionError: the frames allow no model (too few, all black), or leave the attitude open.
         ValueError: unknown method or setting, or a time limit that is not positive.
         Interrupted: should_stop returned True.
     """
@@ -75,11 +84,16 @@ def reconstruct(
     check_replaceable(folder, overwrite)
     training, held_out = split(session)
     sensor = sensor_of(session.camera)
-    frames = [training_frame(session, record) for record in training]
     configs = {KNOWN: config}
     if blind_reference and config.exposure_aware:
         configs[BLIND] = dataclasses.replace(config, exposure_aware=False)
-    with unfinished_run(folder, overwrite, kept=[_checkpoint(label) for label in configs]) as part:
+    kept = [ATTITUDE_FILE, *(_checkpoint(label) for label in configs)]
+    with unfinished_run(folder, overwrite, kept) as part:
+        found = _attitude(session, training, attitude, part / ATTITUDE_FILE, on_search, should_stop)
+        if found is not None:
+            session = in_body_axes(session, found)
+            training, held_out = split(session)
+        frames = [training_frame(session, record) for record in training]
 
         def trained(label: str, config: MethodConfig) -> TrainResult:
             def on_step(info: StepInfo) -> None:
@@ -122,10 +136,12 @@ def finish_run(
     part, result, blind = outputs.folder, results[KNOWN], results.get(BLIND)
     assert result is not None
     blind_gaussians = blind.gaussians if blind else None
-    parity_db = write_models(outputs, result.gaussians, blind_gaussians, session, training, held_out)
+    files = write_models(outputs, result.gaussians, blind_gaussians, session, training, held_out)
     outputs.require("model.ply")
     metrics = training_metrics(result, blind, session, training, held_out)
-    metrics |= {"onnx_parity_db": parity_db} | model_sizes(part) | {"missing_outputs": outputs.missing}
+    if (found := FoundAttitude.read(part / ATTITUDE_FILE)) is not None:
+        metrics["attitude"] = found.motion.facts()
+    metrics |= files | model_sizes(part) | {"missing_outputs": outputs.missing}
     log.info("%d Gaussians in %.1f s: %s", len(result.gaussians), result.seconds, result.stop_reason)
     with written_to(folder.parent):
         (part / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
@@ -133,6 +149,26 @@ def finish_run(
         write_estimate(part, result.pose_estimate)
         write_config(session, result.config, seed, part / "config.yaml")
         publish(part, folder)
+
+
+def _attitude(
+    session: Session,
+    training: list[FrameRecord],
+    source: AttitudeSource,
+    path: Path,
+    on_search: Callable[[str, float], None],
+    should_stop: Callable[[], bool],
+) -> FoundAttitude | None:
+    """Return the attitude that is found from the frames, or was before an interruption; None where tags are trusted."""
+    if source == "tagged" or (source == "auto" and session.navigation.attitude != "unknown"):
+        path.unlink(missing_ok=True)
+        return None
+    found = FoundAttitude.read(path)
+    if found is None:
+        found = find_attitude(session, training, on_search, should_stop)
+        found.write(path)
+    log.info("attitude of the target from its outlines: %s", found.motion.summary())
+    return found
 
 
 def _checkpoint(label: str) -> str:

@@ -11,6 +11,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ground import attitude
+from ground.attitude import FoundAttitude, in_body_axes
 from ground.cameras import sensor_of
 from ground.live_status import LIVE_STATUS
 from ground.session import FrameRecord, Session, SessionError, open_session
@@ -74,6 +76,8 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
         raise SessionError(
             f"{folder} is not a finished run; make one with `ground reconstruct --name {name}`"
         )
+    if (found := FoundAttitude.read(folder / attitude.FILE)) is not None:
+        session = in_body_axes(session, found)
     training, held_out = split(session)
     metrics = read_metrics(folder / "metrics.json")
     if not metrics[

@@ -142,6 +142,7 @@ class Session:
     encoding: str  # of the digital numbers: linear in light, or srgb (display values)
     navigation: Navigation
     registration: Mapping[str, Any] | None  # of photographs: what structure from motion made of them
+    attitude_estimated: bool = False  # poses are in axes of the target that were found
 
     @property
     def frames_captured(self) -> int | None:

@@ -1,10 +1,23 @@
 """Which modules belong to which extra of the package, so that a command can say what to install for a missing one."""
 
 EXTRAS = {
-    "ground": {"cv2", "gsply", "onnx", "onnxruntime", "plotly", "plyfile", "scipy", "torch"},
+    "ground": {
+        *(
+            "cv2",
+            "gsply",
+            "manifold3d",
+            "onnx",
+            "onnxruntime",
+            "plotly",
+            "plyfile",
+            "scipy",
+            "skimage",
+            "torch",
+        ),
+        "trimesh",
+    },
     "compare": {"dask", "distributed", "matplotlib", "psutil", "pycolmap"},  # and those of ground
     "view": {"viser"},  # and those of ground
-    "hil": {"trimesh"},  # and those of ground
 }
 
 

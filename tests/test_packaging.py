@@ -113,7 +113,10 @@ def test_a_module_that_no_extra_brings_is_a_defect_and_stays_one():
 
 
 def test_every_extra_of_the_package_is_known_to_the_message():
-    modules = {"opencv-contrib-python-headless": "cv2"}  # where the package has another name
+    modules = {
+        "opencv-contrib-python-headless": "cv2",
+        "scikit-image": "skimage",
+    }  # where the package has another name
     listed = {extra: requirements(extra)[len(requirements()) :] for extra in EXTRAS}
     names = {extra: {modules.get(r.name, r.name) for r in wanted} for extra, wanted in listed.items()}
     assert names == EXTRAS

@@ -43,7 +43,7 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     "ground.viewer": {"obbgs_base", "flightsw.icd", "ground", "ground.session"}
     | LIBRARY - {"obbgs_core.train"},
     "ground": CONTRACT
-    | {"flightsw.ports", "ground.formats", "ground.compare", "ground.viewer"}
+    | {"flightsw.ports", "ground.formats", "ground.compare", "ground.viewer", "obbgs_core.attitude"}
     | SESSIONS
     | LIBRARY,
     "hil.watched": {"obbgs_base"},

@@ -63,6 +63,14 @@ class TargetMotion:
         """Return the attitudes [N, 3, 3] at times from the epoch."""
         return self.epoch_to_body @ attitudes(self.parameters[None], times_s)[0]
 
+    def summary(self) -> str:
+        """Return the motion in a few words."""
+        facts = self.facts()
+        axis = ", ".join(f"{x:.3f}" for x in facts["axis_inertial"])
+        share = facts["rate_sigma_deg_s"] / facts["rate_deg_s"]
+        turning = f"{facts['kind']}, once in {facts['period_s']:.1f} s (± {share:.2%}) about ({axis})"
+        return f"{turning} ± {facts['axis_sigma_deg']:.2f} degrees, from {self.views} outlines"
+
     def facts(self) -> dict:
         """Return spin axis, rate and inertia ratios with standard deviations, in degrees, for a report.
 

@@ -47,7 +47,7 @@ def surface_points(
         ValueError: no camera, or a count under 1; the radiance depends on the Sun's direction, and the cameras do not
             hold it.
     """
-    gaussians = _bright(gaussians, cameras)
+    gaussians = bright(gaussians, cameras)
     if len(gaussians) == 0:
         return torch.zeros(0, 3), torch.zeros(0, 3)
     return fused_points(lambda c: depth_map(gaussians, cameras.one(c)), cameras, count, seed)
@@ -60,7 +60,7 @@ def surface_positions(gaussians: Gaussians, cameras: Cameras, count: int = 100_0
     Raises:
         ValueError: as there.
     """
-    gaussians = _bright(gaussians, cameras)
+    gaussians = bright(gaussians, cameras)
     if len(gaussians) == 0:
         return torch.zeros(0, 3)
     return _fused(lambda c: depth_map(gaussians, cameras.one(c)), cameras, count, seed)[0]
@@ -114,7 +114,7 @@ def _fused(
     return points[chosen], patch[chosen, 0].long()
 
 
-def _bright(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
+def bright(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
     """Return the Gaussians that differ from the background: black ones in front of a black sky change no image."""
     if len(gaussians) == 0:
         return gaussians

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import trimesh
 import yaml
 from rich.console import Console
 from typer.testing import CliRunner
@@ -20,6 +21,7 @@ from flightsw import model_file
 from flightsw.icd.mission import METHODS, VARIANTS, ConfigError, ReconstructSection, load_mission
 from flightsw.icd.telemetry import DICTIONARY
 from ground import cli, uplink
+from ground.card import model_card
 from ground.cli_options import ExportFormat, ImportFormat, Quality, UplinkCommand
 from ground.evaluate import evaluate
 from ground.progress import Stop, steps_shown
@@ -37,7 +39,7 @@ from obbgs_core.train.result import StepInfo
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 QUICK = {"steps": 8, "start.count": 600, "growth.max_gaussians": 800, "light.sh_degree": 0}
-FILES = {"model.ply", "model.spz", "surface.ply", "model.onnx"}
+FILES = {"model.ply", "model.spz", "model.glb", "surface.ply", "model.onnx"}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -71,6 +73,7 @@ def fail(*arguments, **named):
     [
         ("save_spz", "model.spz"),
         ("surface_points", "surface.ply"),
+        ("write_mesh", "model.glb"),
         ("export_onnx", "model.onnx"),
         ("onnx_parity_db", "onnx_parity_db"),
     ],
@@ -87,6 +90,21 @@ def test_what_cannot_be_made_of_a_model_is_named_and_the_rest_is_there(session, 
     log = (folder / "log").read_text()
     assert f"{missing} is not made: RuntimeError: no such luck" in log and "Traceback" in log
     assert (f"not made: {missing}", "RuntimeError: no such luck") in model_rows(metrics)
+
+
+@pytest.mark.parametrize(("format_", "name"), [("glb", "model.glb"), ("stl", "mesh.stl")])
+def test_the_mesh_of_a_finished_run_is_written_in_the_format_asked_for(session, finished, format_, name):
+    copy = Path(shutil.copytree(finished / "runs", session / "runs", dirs_exist_ok=True)) / "run" / name
+    copy.unlink(missing_ok=True)
+    done = CliRunner().invoke(cli.app, ["mesh", "--session", str(session), "--format", format_, "--json"])
+    assert done.exit_code == 0, done.output
+    facts = json.loads(done.stdout)
+    assert facts["mesh"] == str(copy) and 0 < facts["mesh_triangles"] <= 50_000
+    read = trimesh.load_mesh(copy)
+    read.merge_vertices(merge_norm=True)
+    assert read.is_watertight and len(read.faces) == facts["mesh_triangles"]
+    card = model_card("today", json.loads((finished / "runs" / "run" / "metrics.json").read_text()))
+    assert f"- Mesh: {facts['mesh_triangles']:,} triangles" in card and "| model.glb |" in card
 
 
 def test_the_command_trains_and_ends_well_where_the_model_is_too_large_for_onnx(session, monkeypatch):

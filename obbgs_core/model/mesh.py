@@ -1,0 +1,26 @@
+"""A closed triangle mesh of the target, and how well each of its vertices was seen."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+MeshFormat = Literal["glb", "obj", "stl", "ply"]
+
+
+@dataclass(frozen=True)
+class SurfaceMesh:
+    """Triangles that enclose a volume, outwards by the right-hand rule.
+
+    vertices [V, 3] float64 m, body frame; triangles [F, 3] int64; colours [V, C] float32, C = 1 or 3, scene-linear:
+    the albedo in units of the Sun's light if `is_albedo`, otherwise the mean radiance towards the views that see the
+    vertex; seen_by [V] int64, the number of views, of `views`, that see it. Where that is 0 the surface only bounds
+    what no view could see, and its colour is that of the nearest vertex that was seen.
+    """
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+    colours: np.ndarray
+    seen_by: np.ndarray
+    views: int
+    is_albedo: bool

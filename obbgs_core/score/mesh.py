@@ -1,0 +1,241 @@
+"""A watertight mesh of what the model's depth maps leave solid."""
+
+import dataclasses
+
+import manifold3d
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy import ndimage
+from scipy.spatial import KDTree
+from skimage.measure import marching_cubes
+from torch import Tensor
+
+from obbgs_core.errors import ExportError
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.mesh import SurfaceMesh
+from obbgs_core.render import lit_from, render
+from obbgs_core.score.surface import bright, depth_map
+
+MAX_TRIANGLES = 50_000
+VIEWS = 24  # are compared, evenly chosen of those given
+VOXEL_PX = 1.5  # width of a voxel in pixels, at the median depth
+CHUNK = 30_000  # nodes at a time, such that their distances stay in the processor's cache
+MAX_NODES = 2_000_000  # wider voxels are used if there would be more
+BAND_VOXELS = 1.5  # a view says nothing of what lies deeper than this behind the surface that it sees
+SEEN_THROUGH = 0.15  # of the views that see a place; if so many see past it, it is empty
+THICKER_VOXELS = 0.5  # on each side, so that a plate thinner than a voxel is not lost between two nodes
+AT_LEAST_SEEING = 2  # views; what fewer see is taken for solid
+BLOCK = 8  # nodes along a side that are decided on together first
+FEWEST_NODES = 8  # of a piece that is kept
+FIRST_TOLERANCE_VOXELS = 0.1  # of the simplification
+SAME_DEPTH_VOXELS = 2.0  # within which a vertex counts as seen
+
+
+@torch.no_grad()
+def surface_mesh(
+    gaussians: Gaussians, cameras: Cameras, sun_dir: Tensor | None = None, max_triangles: int = MAX_TRIANGLES
+) -> SurfaceMesh:
+    """Return a watertight mesh of all that the views do not see through.
+
+    Each place of a grid gets its distances from the planes that the views see there, positive in front, and far in
+    front where a view sees past it. The distance that SEEN_THROUGH of them exceed is 0 on the surface, also of a thin
+    plate, of which half of the views look at the other side. Marching cubes make triangles of the zeros, after hollows
+    that no view sees into were filled and specks were removed; the triangles are then merged until there are few
+    enough, such that the mesh stays closed.
+
+    Args:
+        gaussians: on the CPU, as the cameras.
+        cameras: the training cameras, one for each bracket is enough.
+        sun_dir: [3] unit, body frame: the illumination under which models are shown whose harmonics turn with the Sun.
+
+    Raises:
+        ValueError: no camera, or fewer than 100 triangles asked for; the model turns with the Sun and sun_dir is None.
+        ExportError: the views see nothing solid.
+    """
+    if len(cameras) == 0 or max_triangles < 100:
+        raise ValueError(
+            f"expected a camera and at least 100 triangles, got {len(cameras)} and {max_triangles}"
+        )
+    cameras = _evenly_chosen(cameras)
+    solid = bright(gaussians, cameras)
+    if len(solid) == 0:
+        raise ExportError(
+            "the model has no Gaussian that is brighter than the sky: there is nothing to make a mesh of"
+        )
+    maps = [depth_map(solid, cameras.one(c)) for c in range(len(cameras))]
+    depths = [depth for depth, _ in maps]
+    if not any(depth.isfinite().any() for depth in depths):
+        raise ExportError(
+            "the model has no opaque surface in any view, so there is nothing to make a mesh of"
+        )
+    corner, nodes, voxel_m = _blocks(depths, cameras)
+    values = torch.cat([_fused(corner + n * voxel_m, maps, cameras, voxel_m) for n in nodes.split(CHUNK)])
+    volume, first = _without_specks(values, nodes, voxel_m)
+    if not (volume < 0).any():
+        raise ExportError("the views see through all that the model shows: no mesh can be made of it")
+    vertices, triangles, _, _ = marching_cubes(volume, 0.0)
+    vertices = vertices * voxel_m + (corner + first * voxel_m).numpy()
+    vertices, triangles = _simplified(vertices, triangles, max_triangles, voxel_m)
+    colours, seen_by = _appearance(
+        torch.from_numpy(vertices).float(), gaussians, depths, cameras, sun_dir, voxel_m
+    )
+    return SurfaceMesh(vertices, triangles, colours, seen_by, len(cameras), gaussians.shading == "lambert")
+
+
+def _evenly_chosen(cameras: Cameras) -> Cameras:
+    """Return at most VIEWS of the cameras."""
+    chosen = torch.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().long()
+    sun_dir = None if cameras.sun_dir is None else cameras.sun_dir[chosen]
+    return dataclasses.replace(
+        cameras, world_to_camera=cameras.world_to_camera[chosen], K=cameras.K[chosen], sun_dir=sun_dir
+    )
+
+
+def _blocks(depths: list[Tensor], cameras: Cameras) -> tuple[Tensor, Tensor, float]:
+    """Return corner [3] m, nodes [P, 3] (integers) of blocks that are not surely empty, and the width of a voxel m."""
+    seen = torch.cat([_back_projected(depth, cameras.one(c)) for c, depth in enumerate(depths)])
+    lower, upper = seen.amin(dim=0), seen.amax(dim=0)
+    z = torch.cat([depth[depth.isfinite()] for depth in depths])
+    voxel_m = VOXEL_PX * float(z.median() / cameras.K[:, 0, 0].mean())
+    voxel_m = max(voxel_m, float((upper - lower).prod() / (64 * MAX_NODES)) ** (1 / 3))
+    inside = torch.stack(torch.meshgrid(*[torch.arange(BLOCK)] * 3, indexing="ij"), dim=-1).reshape(-1, 3)
+    while True:
+        corner, width_m = lower - 2 * voxel_m, BLOCK * voxel_m
+        counts = ((upper - corner + 2 * voxel_m) / width_m).ceil().long()
+        blocks = torch.cartesian_prod(*[torch.arange(n) for n in counts.tolist()]).reshape(-1, 3)
+        blocks = blocks[~_surely_empty(corner + (blocks + 0.5) * width_m, width_m, depths, cameras)]
+        if len(blocks) * BLOCK**3 <= MAX_NODES:
+            return corner, (blocks[:, None] * BLOCK + inside).reshape(-1, 3), voxel_m
+        voxel_m *= 1.25
+
+
+def _surely_empty(centres: Tensor, width_m: float, depths: list[Tensor], cameras: Cameras) -> Tensor:
+    """Return which blocks [P] lie, whole, in front of all that enough views see, or outside of most images."""
+    radius_m = width_m * 3**0.5 / 2
+    past, inside = torch.zeros(len(centres)), torch.zeros(len(centres))
+    for c, depth in enumerate(depths):
+        z, index, within, _ = _on_image(centres, cameras.one(c))
+        nearest_m = max(radius_m, float(z[within].amin()) - radius_m) if within.any() else radius_m
+        reach = min(int(radius_m * float(cameras.K[c, :2, :2].max()) / nearest_m) + 1, max(depth.shape))
+        least = -F.max_pool2d(-depth[None], (2 * reach + 1, 1), 1, (reach, 0))
+        least = -F.max_pool2d(-least, (1, 2 * reach + 1), 1, (0, reach))[0]
+        past += within & (least.flatten()[index] - z > radius_m)
+        inside += within
+    return (past > SEEN_THROUGH * len(cameras)) | (inside < len(cameras) / 2)
+
+
+def _fused(places: Tensor, maps: list[tuple[Tensor, Tensor]], cameras: Cameras, voxel_m: float) -> Tensor:
+    """Return how far outside of the solid each place [P] is, m, and below 0 inside."""
+    in_front = torch.full((len(places), len(cameras)), torch.inf)
+    for c, (depth, slope) in enumerate(maps):
+        z, index, within, from_centre = _on_image(places, cameras.one(c))
+        slope = slope.flatten(0, 1)[index]
+        tilt = slope * (cameras.K[c].diagonal()[:2] / z[:, None])  # of the surface against the image plane
+        along_sight = depth.flatten()[index] + (slope * from_centre).sum(dim=1) - z
+        distance = along_sight / (1 + tilt.square().sum(dim=1)).sqrt()
+        in_front[:, c] = torch.where(
+            within & (distance > -BAND_VOXELS * voxel_m), distance.clamp(max=3 * voxel_m), torch.inf
+        )
+    seeing = in_front.isfinite().sum(dim=1)
+    exceeded = ((seeing - 1).clamp(min=0) * (1 - SEEN_THROUGH)).round().long()
+    value = in_front.sort(dim=1).values.gather(1, exceeded[:, None])[:, 0]
+    return torch.where(seeing >= AT_LEAST_SEEING, value, -3 * voxel_m) - THICKER_VOXELS * voxel_m
+
+
+def _without_specks(values: Tensor, nodes: Tensor, voxel_m: float) -> tuple[np.ndarray, Tensor]:
+    """Return the values as a volume surrounded by emptiness, and its first node [3]; hollows filled, specks removed."""
+    first = nodes.amin(dim=0) - 1
+    volume = torch.full((nodes.amax(dim=0) - first + 2).tolist(), voxel_m)
+    volume[tuple((nodes - first).T)] = values
+    volume = volume.numpy()
+    empty = _pieces(volume >= 0)
+    volume[(empty != empty[0, 0, 0]) & (volume >= 0)] = -voxel_m
+    pieces = _pieces(volume < 0)
+    sizes = np.bincount(pieces.ravel())
+    volume[(pieces > 0) & (sizes < FEWEST_NODES)[pieces]] = voxel_m
+    return volume, first
+
+
+def _pieces(mask: np.ndarray) -> np.ndarray:
+    """Return the number of the connected piece that each element belongs to, 0 outside of all."""
+    pieces = np.zeros(mask.shape, dtype=np.int32)
+    ndimage.label(mask, output=pieces)
+    return pieces
+
+
+def _simplified(
+    vertices: np.ndarray, triangles: np.ndarray, max_triangles: int, voxel_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a mesh of at most so many triangles, which stays closed.
+
+    The distance by which vertices may move grows until that is reached.
+    """
+    mesh = manifold3d.Mesh64(vertices.astype(np.float64), triangles.astype(np.uint64))
+    solid = manifold3d.Manifold(mesh)
+    if solid.status() != manifold3d.Error.NoError:
+        raise ExportError(f"the surface is not closed ({solid.status()}), which should not happen")
+    tolerance_m = FIRST_TOLERANCE_VOXELS * voxel_m
+    while solid.num_tri() > max_triangles:
+        solid = solid.simplify(tolerance_m)
+        tolerance_m *= 1.25
+    if solid.num_tri() == 0:
+        raise ExportError(
+            f"nothing is left of the surface with at most {max_triangles} triangles; allow more"
+        )
+    simple = solid.to_mesh64()
+    return np.array(simple.vert_properties[:, :3]), np.array(simple.tri_verts, dtype=np.int64)
+
+
+def _appearance(
+    vertices: Tensor,
+    gaussians: Gaussians,
+    depths: list[Tensor],
+    cameras: Cameras,
+    sun_dir: Tensor | None,
+    voxel_m: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return colours [V, C] and the number of views that see each vertex [V]."""
+    if gaussians.shading == "lambert":
+        shown = dataclasses.replace(gaussians, shading="view")  # its harmonics are albedos
+    else:
+        shown = lit_from(gaussians, sun_dir)
+    total, seen_by = torch.zeros(len(vertices), gaussians.sh.shape[2]), torch.zeros(len(vertices))
+    for c, depth in enumerate(depths):
+        camera = cameras.one(c)
+        z, index, within, _ = _on_image(vertices, camera)
+        seen = within & ((depth.flatten()[index] - z).abs() < SAME_DEPTH_VOXELS * voxel_m)
+        radiance = render(shown, camera).radiance[0].flatten(0, 1)
+        total += torch.where(seen[:, None], radiance[index], 0)
+        seen_by += seen
+    known = seen_by > 0
+    colours = total / seen_by.clamp(min=1)[:, None]
+    if known.any() and not known.all():
+        _, nearest = KDTree(vertices[known].numpy()).query(vertices[~known].numpy())
+        colours[~known] = colours[known][torch.from_numpy(nearest)]
+    return colours.numpy(), seen_by.long().numpy()
+
+
+def _back_projected(depth: Tensor, camera: Cameras) -> Tensor:
+    """Return body-frame points [P, 3] of a depth map's solid pixels, every fourth along each side."""
+    v, u = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    u, v, z = (values[::4, ::4] for values in (u, v, depth))
+    u, v, z = u[z.isfinite()], v[z.isfinite()], z[z.isfinite()]
+    K, R, t = camera.K[0], camera.world_to_camera[0, :3, :3], camera.world_to_camera[0, :3, 3]
+    ray = torch.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], torch.ones_like(u)], dim=1)
+    return (z[:, None] * ray - t) @ R
+
+
+def _on_image(points: Tensor, camera: Cameras) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the depth of points [P] m, the index of their pixel [P], which lie on the image [P], and their place in
+    the pixel from its centre [P, 2] px."""
+    K, R, t = camera.K[0], camera.world_to_camera[0, :3, :3], camera.world_to_camera[0, :3, 3]
+    p = points @ (K @ R).T + K @ t
+    z = p[:, 2]
+    place = p[:, :2] / z.clamp(min=camera.near_m)[:, None]
+    u, v = place.unbind(dim=1)
+    within = (z > camera.near_m) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    column, row = u.clamp(0, camera.width - 1).long(), v.clamp(0, camera.height - 1).long()
+    from_centre = place - torch.stack([column, row], dim=1) - 0.5
+    return z, row * camera.width + column, within, from_centre

@@ -1,0 +1,149 @@
+"""Meshes of models whose surface is known, and their files as other software reads them."""
+
+import json
+import math
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial import KDTree
+
+from obbgs_core.errors import ExportError
+from obbgs_core.io.mesh import save_mesh
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.mesh import SurfaceMesh
+from obbgs_core.score.mesh import surface_mesh
+from tests.obbgs_core.test_surface import SIZE, cameras_around, discs, sphere
+
+ROOT = Path(__file__).parents[2]
+PIXEL_M = 3.0 / (1.6 * SIZE)  # on the near side of the sphere, from cameras 4 m from its centre
+
+
+def solid(mesh: SurfaceMesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.triangles, process=False)
+
+
+@pytest.fixture(scope="module")
+def ball() -> SurfaceMesh:
+    return surface_mesh(sphere(), cameras_around(20), max_triangles=6000)
+
+
+def test_a_sphere_of_discs_gives_a_closed_sphere_of_few_triangles(ball):
+    shape = solid(ball)
+    assert shape.is_watertight and shape.is_winding_consistent and shape.body_count == 1
+    assert 1000 < len(ball.triangles) <= 6000
+    radii = np.linalg.norm(ball.vertices, axis=1)
+    thickened_m = 1.5 * 0.5 * PIXEL_M * 4 / 3  # voxels are as wide as 1.5 pixels at the median depth
+    assert abs(np.median(radii) - 1 - thickened_m) < PIXEL_M
+    assert shape.volume == pytest.approx(4 / 3 * math.pi * np.mean(radii) ** 3, rel=0.03)
+    assert (ball.seen_by > 0).all() and ball.seen_by.max() <= ball.views == 20
+
+
+def test_a_plate_without_thickness_keeps_its_area_and_place():
+    grid = torch.linspace(-0.8, 0.8, 24)
+    x, y = (t.flatten() for t in torch.meshgrid(grid, grid, indexing="ij"))
+    centres = torch.stack([x, y, torch.zeros_like(x)], dim=1)
+    plate = discs(centres, torch.tensor([[0.0, 0.0, 1.0]]).expand(len(x), 3), 0.04)
+    shape = solid(surface_mesh(plate, cameras_around(20)))
+    assert shape.is_watertight
+    gaps, _ = KDTree(shape.sample(20_000, seed=0)).query(centres.numpy())
+    inner = (centres[:, :2].abs() < 0.65).all(dim=1).numpy()  # its rim, seen edge-on, is rounded
+    assert gaps[inner].max() < 2 * PIXEL_M and gaps.max() < 5 * PIXEL_M
+    assert np.abs(shape.vertices[:, 2]).max() < 2 * PIXEL_M
+
+
+def test_the_side_that_no_view_sees_is_marked_and_closed():
+    around = cameras_around(40)
+    above = torch.nonzero(around.centres[:, 2] > 1.0)[:, 0]
+    cameras = type(around)(around.world_to_camera[above], around.K[above], SIZE, SIZE)
+    mesh = surface_mesh(sphere(), cameras)
+    assert solid(mesh).is_watertight
+    heights = mesh.vertices[:, 2]
+    below = heights < heights.min() + PIXEL_M  # the flat end of what is known
+    assert (mesh.seen_by[heights > 0.7] > 0).all() and (mesh.seen_by[below] == 0).all()
+
+
+def test_what_no_view_shows_has_no_mesh():
+    faint = sphere(100)
+    faint.opacity_logits[:] = -5.0
+    for gaussians in (faint, faint.select(torch.tensor([], dtype=torch.long))):
+        with pytest.raises(ExportError, match="nothing to make a mesh of"):
+            surface_mesh(gaussians, cameras_around(4))
+    with pytest.raises(ValueError, match="at least 100 triangles"):
+        surface_mesh(faint, cameras_around(4), max_triangles=3)
+
+
+def test_the_colour_is_the_radiance_and_under_lamberts_law_the_albedo(ball):
+    assert not ball.is_albedo
+    np.testing.assert_allclose(
+        ball.colours, 0.2820948, rtol=0.15
+    )  # the harmonic of degree 0 of coefficient 1
+    one = sphere()
+    lit = Gaussians(**one.tensors(), shading="lambert", ambient=torch.tensor(0.1))
+    cameras = cameras_around(20)
+    suns = torch.tensor([[0.0, 0.0, 1.0]]).expand(20, 3)
+    mesh = surface_mesh(lit, type(cameras)(cameras.world_to_camera, cameras.K, SIZE, SIZE, sun_dir=suns))
+    assert mesh.is_albedo
+    dark_side = mesh.vertices[:, 2] < -0.5  # the same albedo as the lit one
+    np.testing.assert_allclose(mesh.colours[dark_side].mean(), ball.colours.mean(), rtol=0.02)
+
+
+@pytest.mark.parametrize("file_type", ["glb", "obj", "stl", "ply"])
+def test_trimesh_reads_the_same_closed_body_from_every_format(ball, tmp_path, file_type):
+    path = tmp_path / f"mesh.{file_type}"
+    save_mesh(ball, path, float(ball.colours.max()))
+    read = trimesh.load_scene(path).to_mesh()
+    read.merge_vertices(merge_norm=True, merge_tex=True)
+    assert read.is_watertight and len(read.faces) == len(ball.triangles)
+    assert read.volume == pytest.approx(solid(ball).volume, rel=1e-4)
+
+
+def test_the_files_keep_how_many_views_saw_each_vertex(ball, tmp_path):
+    save_mesh(ball, tmp_path / "mesh.glb", 1.0)
+    (geometry,) = trimesh.load_scene(tmp_path / "mesh.glb").geometry.values()
+    np.testing.assert_array_equal(geometry.vertex_attributes["_SEEN_BY_VIEWS"].ravel(), ball.seen_by)
+    save_mesh(ball, tmp_path / "mesh.ply", 1.0)
+    assert b"SEEN_BY_VIEWS" in (tmp_path / "mesh.ply").read_bytes()[:600]
+    with pytest.raises(ValueError, match="glb, obj, stl, ply"):
+        save_mesh(ball, tmp_path / "mesh.fbx", 1.0)
+    assert {path.name for path in tmp_path.iterdir()} == {"mesh.glb", "mesh.ply"}
+
+
+def test_khronos_own_validator_has_nothing_to_say(ball, tmp_path):
+    if not shutil.which("node") or not (ROOT / "node_modules" / "gltf-validator").is_dir():
+        pytest.skip("npm install --no-save gltf-validator, in the project's folder, brings the validator")
+    save_mesh(ball, tmp_path / "mesh.glb", 1.0)
+    script = """const bytes = new Uint8Array(require("fs").readFileSync(process.argv[1]));
+        require("gltf-validator").validateBytes(bytes).then(r => console.log(JSON.stringify(r.issues)));"""
+    arguments = ["node", "-e", script, str(tmp_path / "mesh.glb")]
+    done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60)
+    issues = json.loads(done.stdout)
+    assert (issues["numErrors"], issues["numWarnings"], issues["numInfos"]) == (0, 0, 0), issues["messages"]
+
+
+def test_blender_opens_it_in_the_bodys_own_axes(ball, tmp_path):
+    python = ROOT / ".venv-blender" / "bin" / "python"
+    if not python.exists():
+        pytest.skip("Blender's Python is not installed: ./setup.sh installs it")
+    save_mesh(ball, tmp_path / "mesh.glb", 1.0)
+    code = f"""
+import bpy, json
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.import_scene.gltf(filepath={str(tmp_path / "mesh.glb")!r})
+(body,) = [o for o in bpy.data.objects if o.type == "MESH"]
+corners = [body.matrix_world @ v.co for v in body.data.vertices]
+names = sorted(a.name for a in body.data.attributes)
+print("READ", json.dumps([[list(c) for c in corners[:50]], names, len(body.data.polygons)]))
+"""
+    done = subprocess.run(
+        [str(python), "-c", code], capture_output=True, text=True, check=True, timeout=120, cwd=tmp_path
+    )
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("READ ")]
+    corners, names, polygons = json.loads(line.removeprefix("READ "))
+    gaps, _ = KDTree(ball.vertices).query(np.array(corners))
+    assert gaps.max() < 1e-5 and polygons == len(ball.triangles)
+    assert "_SEEN_BY_VIEWS" in names and any(name.lower().startswith("col") for name in names)
