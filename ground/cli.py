@@ -68,7 +68,7 @@ def listen_command(
         signal.signal(number, lambda *_: stop.set())
     with (
         Forwarder(forward) if forward is not None else contextlib.nullcontext() as forwarder,
-        statuses_shown(stderr, json_) as (on_status, on_event),
+        statuses_shown(stderr, json_, link, session) as (on_status, on_event),
     ):
         summary = listen(
             link,

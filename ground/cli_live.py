@@ -107,7 +107,7 @@ def _receive(
         signal.signal(number, lambda *_: stop.set())
     show = Lines(stderr)
     with LiveProcess(session, run, options, lambda text: say(stderr, text)) as training:
-        with statuses_shown(stderr, as_json) as (on_status, on_event):
+        with statuses_shown(stderr, as_json, link, session) as (on_status, on_event):
 
             def with_model(status: Status) -> None:
                 training.tend()

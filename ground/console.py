@@ -7,6 +7,7 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console, Group, RenderableType
@@ -20,6 +21,7 @@ from flightsw.icd.telemetry import DICTIONARY, printable
 from ground.ingest import Status
 from ground.live_status import line as model_line
 from ground.telemetry import plain
+from ground.terminal_pictures import COLUMNS, LatestPicture
 
 PLAIN_S, JSON_S = 10.0, 1.0  # between lines where there is no screen
 RATE_WINDOW_S = 5.0
@@ -42,13 +44,13 @@ hang_ups packets_not_forwarded
 
 
 @contextlib.contextmanager
-def statuses_shown(console: Console, as_json: bool) -> Iterator[tuple[Any, Any]]:
-    """Give two functions for `listen`, which show a status and an event.
+def statuses_shown(console: Console, as_json: bool, link: str, session: Path) -> Iterator[tuple[Any, Any]]:
+    """Give two functions for `listen`, which show a status and an event of a link (its URL) and a session's folder.
 
     On a terminal they draw a screen; elsewhere they print a line every ten seconds and each event; with `as_json` a
     line of JSON on stdout every second and for each event.
     """
-    view, next_line_s = ConsoleView(), float("-inf")
+    view, next_line_s = ConsoleView(link, session), float("-inf")
     live = console.is_terminal and not as_json
 
     def on_status(status: Status) -> None:
@@ -81,7 +83,9 @@ def statuses_shown(console: Console, as_json: bool) -> Iterator[tuple[Any, Any]]
 class ConsoleView:
     """Draws statuses, and keeps those of the last seconds to compute data rates."""
 
-    def __init__(self) -> None:
+    def __init__(self, link: str, session: Path) -> None:
+        self._link, self._session = link, session
+        self._picture = LatestPicture(session)
         self._history: deque[tuple[float, int, int]] = deque()
 
     def rates(self, status: Status) -> tuple[float, float] | None:
@@ -103,14 +107,21 @@ class ConsoleView:
         top = Table.grid(expand=True, padding=(0, 1))
         top.add_column(ratio=1)
         top.add_column(ratio=1)
-        top.add_row(Panel(_link(status, down, up), title="link"), Panel(_flight(status), title="spacecraft"))
+        title = Text.assemble("link ", (printable(self._link), "bold"))
+        top.add_row(Panel(_link(status, down, up), title=title), Panel(_flight(status), title="spacecraft"))
+        picture = self._picture.after(status.summary.thumbnails_received, status.summary.frames_in_session)
+        name = Text.assemble("session ", (printable(str(self._session)), "bold"))
         model = [Panel(Text(model_line(status.model)), title="model")] if status.model else []
-        return Group(
-            top,
-            Panel(_files(status, down), title="files"),
+        left = Group(
+            Panel(_files(status, down), title=name),
             *model,
             Panel(_commands_and_events(status), title="events"),
         )
+        bottom = Table.grid(expand=True, padding=(0, 1))
+        bottom.add_column(ratio=1)
+        bottom.add_column(width=COLUMNS + 4)
+        bottom.add_row(left, Panel(picture, title=self._picture.name or "latest picture"))
+        return Group(top, bottom)
 
     def line(self, status: Status) -> str:
         """Return the status in one line of text."""
@@ -145,8 +156,8 @@ def _link(status: Status, down: float, up: float) -> Table:
     s = status.summary
     rows: list[tuple[str, Text]] = [
         ("state", Text(state, colour)),
-        ("rate down / up", Text(f"{down / 1e3:.1f} / {up / 1e3:.1f} kB/s")),
-        ("received", Text(f"{s.bytes_received:,} B, {s.packets_received:,} packets")),
+        ("rate down / up", Text(f"{size(down)}/s / {size(up)}/s")),
+        ("received", Text(f"{size(s.bytes_received)}, {s.packets_received:,} packets")),
         (
             "frames",
             Text(
@@ -195,9 +206,17 @@ def shown(name: str, value: Any) -> str:
     if isinstance(value, tuple):
         return ", ".join(f"{number:g}" for number in value) + f" {item.unit}"
     if item.unit == "B":
-        return f"{value / 1e6:,.1f} MB"
+        return size(value)
     number = f"{value:.1f}" if isinstance(value, float) else f"{value}"
     return f"{number} {item.unit}".rstrip()
+
+
+def size(count: float) -> str:
+    """Return a number of bytes with the unit that leaves at most four digits before the point."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= factor:
+            return f"{count / factor:.1f} {unit}"
+    return f"{count:.0f} B"
 
 
 def _files(status: Status, down: float) -> RenderableType:
@@ -211,7 +230,7 @@ def _files(status: Status, down: float) -> RenderableType:
         left = f"{before_bytes / down:.0f} s left" if down and size_bytes else ""
         bar = ProgressBar(total=max(size_bytes, 1), completed=file.received_bytes, width=30)
         name = printable(file.name)[:30] or "(not named yet)"
-        table.add_row(Text(name), bar, Text(f"{file.received_bytes:,} of {size_bytes:,} B"), Text(left))
+        table.add_row(Text(name), bar, Text(f"{size(file.received_bytes)} of {size(size_bytes)}"), Text(left))
     return table
 
 

@@ -2,7 +2,10 @@
 
 import io
 import json
+from pathlib import Path
 
+import imagecodecs
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -11,10 +14,12 @@ from flightsw.icd.frame import HEADER, encode_frame
 from flightsw.icd.packet import APID_EVENTS, APID_FRAME_HEADERS, APID_HOUSEKEEPING, APID_REPORTS
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import Incoming
-from ground.console import PLAIN_S, ConsoleView, link_state, shown
+from ground.console import PLAIN_S, ConsoleView, link_state, shown, size
 from ground.ingest import ListenSummary, Status
 from ground.telemetry import TelemetryLog
+from ground.terminal_pictures import COLUMNS, LatestPicture, stretched
 
+LINK, HERE = "serial:///dev/ttyUSB0?baud=921600", Path("nowhere/pass-12")
 SAMPLES = {"text": "x", "bytes": b"\xab\xcd\xef\x01" * 8, "float64": 1.5}
 
 
@@ -53,7 +58,7 @@ def screen(view: ConsoleView, now: Status) -> str:
 
 
 def test_the_screen_shows_link_spacecraft_files_and_events():
-    view = ConsoleView()
+    view = ConsoleView(LINK, HERE)
     view.rates(status(now_s=6.0, summary=ListenSummary(packets_received=1)))
     drawn = screen(
         view,
@@ -66,16 +71,16 @@ def test_the_screen_shows_link_spacecraft_files_and_events():
             commands=[(4, "bracket", "accepted")],
         ),
     )
-    for text in ("10.0 / 0.0 kB/s", "00000012.obf", "5,000 of 25,000 B", "2 s left", "(not named yet)"):
+    for text in ("10.0 kB/s / 0 B/s", "00000012.obf", "5.0 kB of 25.0 kB", "2 s left", "(not named yet)"):
         assert text in drawn
-    for text in ("bracket 7 lost", "command bracket 4: accepted", "0.05, 0.1 ms", "abcdef01", "5,000.0 MB"):
+    for text in ("bracket 7 lost", "command bracket 4: accepted", "0.05, 0.1 ms", "abcdef01", "5.0 GB"):
         assert text in drawn
 
 
 @pytest.mark.parametrize(
     ("changes", "text", "colour"),
     [
-        ({}, "5,000.0 MB", "32"),
+        ({}, "5.0 GB", "32"),
         ({"disk_free_bytes": 5 * 10**8}, "500.0 MB", "33"),
         ({"disk_free_bytes": 10**7}, "10.0 MB", "1;31"),
         ({"mode": "safe"}, "safe", "1;31"),
@@ -83,7 +88,9 @@ def test_the_screen_shows_link_spacecraft_files_and_events():
     ],
 )
 def test_limits_are_shown_in_colour(changes, text, colour):
-    assert f"\x1b[{colour}m{text}" in screen(ConsoleView(), status(housekeeping=housekeeping(**changes)))
+    assert f"\x1b[{colour}m{text}" in screen(
+        ConsoleView(LINK, HERE), status(housekeeping=housekeeping(**changes))
+    )
 
 
 def test_the_links_state_is_told_by_port_and_silence():
@@ -96,7 +103,7 @@ def test_the_links_state_is_told_by_port_and_silence():
 def test_names_and_texts_from_the_link_cannot_move_the_cursor_or_style_the_screen():
     hostile = "\x1b[2J[bold red]\r\n"
     drawn = screen(
-        ConsoleView(),
+        ConsoleView(LINK, HERE),
         status(
             incoming=[Incoming(hostile, 0, 10)],
             events=[{"received_utc_ns": 1 << 80, "text": hostile, "severity": "info"}],
@@ -107,15 +114,15 @@ def test_names_and_texts_from_the_link_cannot_move_the_cursor_or_style_the_scree
 
 def test_before_any_telemetry_there_is_a_screen_and_a_line_all_the_same():
     empty = status(housekeeping={}, summary=ListenSummary())
-    assert "no housekeeping yet" in screen(ConsoleView(), empty)
-    assert "outbox ?" in ConsoleView().line(empty)
-    assert "outbox 0" in ConsoleView().line(status())
+    assert "no housekeeping yet" in screen(ConsoleView(LINK, HERE), empty)
+    assert "outbox ?" in ConsoleView(LINK, HERE).line(empty)
+    assert "outbox 0" in ConsoleView(LINK, HERE).line(status())
 
 
 @pytest.mark.parametrize("every_s", [0.25, 1.0, 5.0, PLAIN_S])
 def test_the_rate_is_told_however_rarely_a_line_is_printed(every_s):
     """`ground listen` without a terminal prints a line every ten seconds, longer than the rate's own window."""
-    view, texts = ConsoleView(), []
+    view, texts = ConsoleView(LINK, HERE), []
     for number in range(round(30.0 / every_s)):
         now_s = number * every_s
         summary = ListenSummary(bytes_received=round(40_000 * now_s), bytes_sent=round(300 * now_s))
@@ -125,7 +132,7 @@ def test_the_rate_is_told_however_rarely_a_line_is_printed(every_s):
 
 
 def test_the_rate_is_of_the_last_seconds_only():
-    view = ConsoleView()
+    view = ConsoleView(LINK, HERE)
     for now_s, received in ((0.0, 0), (10.0, 10**6), (12.0, 10**6), (16.0, 10**6 + 60_000)):
         rates = view.rates(status(now_s=now_s, summary=ListenSummary(bytes_received=received)))
     assert rates == (10_000.0, 0.0)  # since 10 s: the newest status that is at least 5 s old
@@ -134,7 +141,7 @@ def test_the_rate_is_of_the_last_seconds_only():
 def test_frames_that_flight_took_are_counted_or_said_to_be_unknown():
     for taken, text in ((None, "24 received / unknown captured"), (48, "24 received / 48 captured")):
         now = status(summary=ListenSummary(frames_in_session=24, frames_captured=taken))
-        assert text in screen(ConsoleView(), now) and text in ConsoleView().line(now)
+        assert text in screen(ConsoleView(LINK, HERE), now) and text in ConsoleView(LINK, HERE).line(now)
 
 
 def test_a_model_and_the_lack_of_one_are_shown():
@@ -190,3 +197,53 @@ def test_a_disk_that_refuses_telemetry_is_counted_and_the_pass_goes_on(tmp_path)
     log = TelemetryLog(tmp_path)
     log.add(APID_EVENTS, DICTIONARY.events["warning"].pack(utc_ns=5, problem="first"))
     assert log.write_failures == 1 and log.events[-1]["text"] == "first"
+
+
+def test_link_and_session_are_named_and_nothing_in_a_name_moves_the_cursor():
+    drawn = screen(ConsoleView("can://can0\x1b[2J", Path("there/pass-7")), status())
+    assert "there/pass-7" in drawn and "can://can0?" in drawn and "\x1b[2J" not in drawn
+
+
+@pytest.mark.parametrize(
+    ("count", "told"),
+    [(0, "0 B"), (999, "999 B"), (1500, "1.5 kB"), (2.5e6, "2.5 MB"), (8e9, "8.0 GB")],
+)
+def test_bytes_are_told_in_units_that_a_person_reads(count, told):
+    assert size(count) == told
+
+
+def written(folder: Path, number: int, dn: np.ndarray) -> None:
+    folder.mkdir(exist_ok=True)
+    (folder / f"{number:06d}.png").write_bytes(bytes(imagecodecs.png_encode(dn)))
+
+
+def test_the_latest_picture_is_drawn_in_half_blocks(tmp_path):
+    """A white square right of the middle of a black picture is white there, and black elsewhere."""
+    dn = np.full((72, 72), 64, np.uint16)
+    dn[24:48, 36:60] = 4000
+    picture = LatestPicture(tmp_path)
+    assert str(picture.after(0, 0)) == "none yet"
+    written(tmp_path / "frames", 3, dn)
+    lines = picture.after(0, 1).split("\n")
+    assert picture.name == "frame 3" and len(lines) == 18 and {len(line) for line in lines} == {COLUMNS}
+    inside, outside = (str(lines[8].get_style_at_offset(Console(), at)) for at in (24, 5))
+    assert inside == "rgb(255,255,255) on rgb(255,255,255)" and outside == "rgb(0,0,0) on rgb(0,0,0)"
+    drawn = screen(ConsoleView(LINK, tmp_path), status(summary=ListenSummary(frames_in_session=1)))
+    assert "frame 3" in drawn and "▀" in drawn
+
+
+def test_a_picture_that_cannot_be_read_leaves_the_one_before_it(tmp_path):
+    written(tmp_path / "thumbnails", 1, np.arange(48 * 48, dtype=np.uint16).reshape(48, 48))
+    picture = LatestPicture(tmp_path)
+    before = picture.after(1, 0)
+    assert picture.name == "thumbnail 1"
+    (tmp_path / "thumbnails" / "000002.png").write_bytes(b"damaged")
+    assert picture.after(2, 0) is before and picture.name == "thumbnail 1"
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (5, 300), (300, 5), (48, 64, 3), (37, 37)])
+def test_pictures_of_any_shape_fit_the_panel(shape):
+    rng = np.random.default_rng(0)
+    image = stretched(rng.integers(0, 4096, shape, dtype=np.uint16))
+    assert image.shape[0] % 2 == 0 and image.shape[1] <= COLUMNS and image.shape[2] == 3
+    assert (stretched(np.full(shape, 7, np.uint16)) == 0).all()
