@@ -32,9 +32,6 @@ from obbgs_core.train.state import TrainingState
 
 log = logging.getLogger(__name__)
 CHI2_MEMORY = 0.98  # share of the running chi² that a step keeps; the rest is the step's own
-MISFIT_FROM = (
-    0.5  # share of the steps from which the model's own error counts: before, most of it is yet to be learnt
-)
 CHECKPOINT_EVERY_S = 20.0
 LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
 FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
@@ -126,8 +123,7 @@ class Trainer:
         cameras = batch.cameras if state.poses is None else state.poses.cameras(drawn, batch.cameras)
         sunlit = state.shadows.sunlit(state.gaussians, cameras, state.steps_done)
         rendered = self._compensated(render(state.model, cameras, sunlit=sunlit), batch)
-        misfit = state.misfit if share >= MISFIT_FROM else None
-        loss, residual = image_loss(rendered, batch, setup.sensor, config.loss, misfit)
+        loss, residual = image_loss(rendered, batch, setup.sensor, config.loss, state.misfit)
         if not torch.isfinite(loss):
             raise Diverged(state.steps_done, loss.item())
         prior = priors(state.gaussians, rendered, batch, setup.radius_m, config.loss)

@@ -11,9 +11,11 @@ import pytest
 import torch
 
 import ground.live
+from flightsw.icd.mission import ConfigError
 from ground.evaluate import evaluate
 from ground.listing import find_sessions
 from ground.live import LiveReconstruction, PassEnd, reconstruct_live
+from ground.live_process import LiveProcess, TrainingFailed
 from ground.live_status import LiveStatus, line, read_status
 from ground.reconstruct import reconstruct
 from ground.runs import open_run, unfinished_run
@@ -230,3 +232,21 @@ def test_every_eighth_bracket_is_held_out_whatever_else_came(tmp_path):
         bracket: int
 
     assert {r["bracket"] for r in records if is_held_out(Record(r["bracket"]))} == {7, 15}  # pyright: ignore
+
+
+def test_a_key_that_cannot_be_read_is_said_before_anything_is_trained(tmp_path):
+    Writer(tmp_path / "s").add(48)
+    with pytest.raises(ConfigError, match="cannot read the key"):
+        reconstruct_live(tmp_path / "s", key_file=tmp_path / "none.key")
+    assert not (tmp_path / "s" / "runs").exists()
+
+
+def test_a_training_that_fails_by_itself_is_not_started_again_and_its_message_is_shown(tmp_path):
+    (tmp_path / "runs" / "live").mkdir(parents=True)  # not ours to replace
+    said: list[str] = []
+    options = ["--session", str(tmp_path), "--threads", "1"]
+    with LiveProcess(tmp_path, tmp_path / "runs" / "live", options, said.append) as training:
+        with pytest.raises(TrainingFailed, match="exists and is not a finished run, so it is not replaced"):
+            training.finish(lambda: False, lambda facts: None)
+        training.tend()
+    assert len(said) == 1 and "receiving goes on" in said[0]
