@@ -21,9 +21,11 @@ from flightsw.ports import Link, open_link
 from flightsw.sequencer import CaptureCounts, capture
 from flightsw.settings import load_settings
 from flightsw.store import FrameStore, open_store
+from flightsw.watchdog import Watchdog, notify
 
 log = logging.getLogger(__name__)
 LINGER_S = 0.5  # after the last delivery
+EXPOSURE_WITHIN_S = 120.0  # with all attempts of the camera; later than this, capture hangs
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ def run_pass(
         ObbgsError: what could not be opened, or what ended capture or downlink.
         ValueError: a URL that nothing here can open.
     """
-    captured, camera, no_camera, thread = CaptureCounts(), None, None, None
+    captured, camera, no_camera, thread, alive = CaptureCounts(), None, None, None, Watchdog()
     with contextlib.ExitStack() as opened:
         link, counter = _open_link(link_url, key_file, opened)
         if camera_url is not None:
@@ -89,11 +91,12 @@ def run_pass(
         store = open_store(store_dir, mission)
         if link is not None:
             thread = _DownlinkThread(
-                FrameStore(store_dir), link, mission, counter, exit_when_empty, stop, on_sent, camera
+                FrameStore(store_dir), link, mission, counter, exit_when_empty, stop, on_sent, camera, alive
             )
             if camera_url is not None:
                 thread.capturing.set()
             thread.start()
+        notify("READY=1")
 
         def report(counts: CaptureCounts) -> None:
             if thread is not None:
@@ -104,7 +107,7 @@ def run_pass(
             if no_camera is not None:
                 raise no_camera
             if camera is not None:
-                captured = _capture(mission, camera, store, stop, report)
+                captured = _capture(mission, camera, store, stop, report, alive)
         except Exception as error:
             if thread is not None:  # it may go on for hours until the outbox is empty: log the error now
                 thread.camera_failed = True
@@ -114,6 +117,7 @@ def run_pass(
             if thread is not None:
                 thread.capturing.clear()
                 thread.join()
+            notify("STOPPING=1")
         if thread is not None and thread.error is not None:
             raise thread.error
     left = FrameStore(store_dir)  # opened again: the downlink has its own
@@ -145,27 +149,36 @@ def _capture(
     store: FrameStore,
     stop: threading.Event,
     on_counts: Callable[[CaptureCounts], None],
+    watchdog: Watchdog,
 ) -> CaptureCounts:
     def wait_until(utc_ns: int) -> None:
         while (
             not camera.has_own_clock and not stop.is_set() and (left_s := (utc_ns - time.time_ns()) / 1e9) > 0
         ):
+            watchdog.expect("capture", EXPOSURE_WITHIN_S)
             camera.reconnect()
-            stop.wait(min(left_s, RETRY_S) if camera.lost else left_s)
+            pause_s = min(left_s, RETRY_S) if camera.lost else left_s
+            watchdog.expect("capture", pause_s + EXPOSURE_WITHIN_S)
+            stop.wait(pause_s)
 
     def on_frame(counts: CaptureCounts) -> None:
+        watchdog.expect("capture", EXPOSURE_WITHIN_S)
         counts.packets_lost = camera.packets_lost
         on_counts(counts)
 
-    counts = capture(
-        mission,
-        camera,
-        store,
-        on_frame=on_frame,
-        should_stop=stop.is_set,
-        wait_until=wait_until,
-        settings=lambda: load_settings(store.folder, mission),
-    )
+    watchdog.expect("capture", EXPOSURE_WITHIN_S)
+    try:
+        counts = capture(
+            mission,
+            camera,
+            store,
+            on_frame=on_frame,
+            should_stop=stop.is_set,
+            wait_until=wait_until,
+            settings=lambda: load_settings(store.folder, mission),
+        )
+    finally:
+        watchdog.ended("capture")
     if camera.lost:
         log.error("the camera did not come back: %d exposures were not taken", counts.lost_with_camera)
     return counts
@@ -184,6 +197,7 @@ class _DownlinkThread(threading.Thread):
         stop: threading.Event,
         on_progress: Callable[[DownlinkProgress], None],
         camera: ReconnectingCamera | None,
+        watchdog: Watchdog,
     ):
         super().__init__(name="downlink", daemon=True)
         self.capturing = threading.Event()  # set while more frames may come
@@ -193,7 +207,7 @@ class _DownlinkThread(threading.Thread):
         self.error: Exception | None = None
         self._store, self._link, self._mission, self._counter = store, link, mission, counter
         self._exit_when_empty, self._stop_event = exit_when_empty, stop
-        self._on_progress, self._camera = on_progress, camera
+        self._on_progress, self._camera, self._watchdog = on_progress, camera, watchdog
         self._empty_since_s: float | None = None
 
     def run(self) -> None:
@@ -228,6 +242,7 @@ class _DownlinkThread(threading.Thread):
 
     def _keep(self, now: DownlinkProgress) -> None:
         self.result = now
+        self._watchdog.alive()  # from this loop only: a downlink that hangs is silent
         self._on_progress(now)
 
     def _should_stop(self) -> bool:

@@ -12,6 +12,7 @@ from ground.card import chi2_explained, frames_captured, scored_frames
 from ground.page import as_yaml, cards, page, plot, section, two_tables
 from ground.plots import histogram_figure, training_figure
 from ground.report_frames import frames_section, scored_section
+from ground.report_poses import poses_section
 from ground.runs import Run, open_run, written_to
 from ground.session import SessionError
 from ground.splat_view import splat_view
@@ -38,6 +39,8 @@ def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
             _result(run, truth),
             frames_section(run),
             scored_section(run, truth),
+            poses_section(run),
+            _registration(run),
             _training(run),
             _histogram(run),
             _losses(run),
@@ -163,6 +166,23 @@ def _model(run: Run) -> str:
         if median_sun_direction(list(run.session.frames)) is not None:
             note += f" The Sun's direction spans {run.metrics['sun_span_deg']:.1f} degrees."
     return section("Model", note, splat_view(run))
+
+
+def _registration(run: Run) -> str:
+    """Return which photographs structure from motion registered; nothing for frames that came with their poses."""
+    found = run.session.registration
+    if found is None:
+        return ""
+    left_out = ", ".join(map(str, found["left_out"])) or "none"
+    rows = [
+        ("photographs registered", f"{len(run.session.frames):,}"),
+        ("left out, because they could not be", html.escape(left_out)),
+    ]
+    note = (
+        "Structure from motion found the cameras of these photographs. Their scale is unknown: one metre is the radius "
+        "that holds nine tenths of the points."
+    )
+    return section("Registration", note, two_tables(rows))
 
 
 def _training(run: Run) -> str:

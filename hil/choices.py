@@ -7,4 +7,4 @@ LinkKind = Literal["serial", "slcan", "slcan-fd"]  # a serial line, or a CAN or 
 FaultKind = Literal["none", "standard"]  # standard: hil.links.faults.STANDARD_FAULTS and a cut in the middle
 SensorKind = Literal["paper", "spacecam"]  # hil.sky.sensor.PRESETS
 NavigationKind = Literal["realistic", "perfect"]  # with the errors of hil.world.navigation_errors, or exact
-NAVIGATION: NavigationKind = "perfect"  # unless something else is asked for
+NAVIGATION: NavigationKind = "realistic"  # unless something else is asked for

@@ -61,7 +61,8 @@ def _rate_deg_s(world: World, utc_ns: int) -> np.ndarray:
     step_s = 0.5
     later = world.gcrs_to_body(utc_ns + round(step_s * NS))
     turn = Rotation.from_matrix(later @ world.gcrs_to_body(utc_ns).T)
-    return -np.degrees(turn.as_rotvec()) / step_s
+    rate_deg_s = -np.degrees(turn.as_rotvec()) / step_s
+    return np.where(np.abs(rate_deg_s) > 1e-9, rate_deg_s, 0.0)  # less is rounding
 
 
 def _states(

@@ -1,0 +1,108 @@
+"""What the report says of estimated poses, on frames of a known model whose tags were made to err."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ground.cameras import sensor_of
+from ground.estimated_poses import write_estimate
+from ground.report_poses import pose_history, poses_section
+from ground.runs import Run
+from ground.session import Navigation, open_session
+from ground.training_frames import split
+from obbgs_base.navigation_errors import SIZE, SharedParameters
+from obbgs_core.pose_estimate import PoseEstimate
+from tests import scenes
+from tests.small_sessions import small_session
+
+BORESIGHT_RAD, LEFT_RAD = 0.02, 0.001
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory):
+    """A run whose model is the truth, tags that err by a turn of each, and an estimate that is right."""
+    folder = small_session(tmp_path_factory.mktemp("session"))
+    sigmas = SharedParameters(boresight_rad=np.full(3, BORESIGHT_RAD))
+    session = dataclasses.replace(open_session(folder), navigation=Navigation(sigmas=sigmas))
+    gaussians = scenes.target(seed=0)
+    training, held_out = split(session)
+    true = np.array([record.world_to_camera for record in training])
+    turns = 0.05 * np.random.default_rng(2).normal(size=(len(true), 3))
+    error = np.tile(np.eye(4), (len(true), 1, 1))
+    error[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
+    tagged = error @ true
+    covariance = np.zeros((SIZE, SIZE))
+    boresight = slice(14, 17)  # after 3 + 3 + 3 + 3 + 2 others
+    covariance[boresight, boresight] = LEFT_RAD**2 * np.eye(3)
+    brackets = bracket_numbers_of(training)
+    rows = max(brackets) + 1
+    estimate = PoseEstimate(
+        frame_ids=[record.id for record in training],
+        brackets=brackets,
+        tagged=tagged,
+        estimated=true,
+        shared=SharedParameters(boresight_rad=[0.011, 0, 0]),
+        shared_prior=sigmas,
+        shared_posterior=SharedParameters(boresight_rad=[LEFT_RAD, LEFT_RAD, 0.9 * BORESIGHT_RAD]),
+        shared_covariance=covariance,
+        own=np.zeros((rows, 6)),
+        own_prior=np.zeros((rows, 6)),
+        own_posterior=np.full((rows, 6), 0.003),
+    )
+    metrics = {"scored_frames": "held_out"}
+    run = Run(folder, session, held_out, sensor_of(session.camera), gaussians, None, metrics)
+    write_estimate(folder, estimate)
+    return run, estimate, turns
+
+
+def bracket_numbers_of(records) -> list[int]:
+    order = sorted({record.bracket for record in records})
+    return [order.index(record.bracket) for record in records]
+
+
+def test_corrections_undo_the_errors_and_carry_their_deviations(example):
+    run, estimate, turns = example
+    history = pose_history(run, estimate)
+    assert (np.diff(history.minutes) >= 0).all()
+    place_of = {number: place for place, number in enumerate(estimate.frame_ids)}
+    for row, number in enumerate(history.frame_ids):
+        np.testing.assert_allclose(history.correction[row, :3], -turns[place_of[number]], atol=1e-6)
+        np.testing.assert_allclose(
+            np.diag(history.prior[row]), [BORESIGHT_RAD**2] * 3 + [0] * 3, rtol=1e-4, atol=1e-12
+        )
+        expected = [LEFT_RAD**2 + 0.003**2] * 3 + [0.003**2] * 3
+        np.testing.assert_allclose(np.diag(history.posterior[row]), expected, rtol=1e-4)
+
+
+def test_the_residual_is_that_of_noise_from_the_right_poses_only(example):
+    run, estimate, _ = example
+    history = pose_history(run, estimate)
+    assert 0.7 < np.median(history.chi2_estimated) < 1.4  # the model is the truth
+    assert (history.chi2_tagged > 2 * history.chi2_estimated).mean() > 0.8
+    assert history.misfits == []
+
+
+def test_the_section_tells_values_with_both_deviations_and_what_the_frames_do_not_determine(example):
+    run, *_ = example
+    page = poses_section(run)
+    assert (
+        "boresight, camera x" in page and "0.6303 ± 0.057 (stated ± 1.1) deg" in page
+    )  # 0.011 rad in degrees
+    assert "boresight, camera z: not determined by the frames" in page
+    assert "relative position" not in page  # exact by the tags
+    assert page.count("plotly-graph-div") == 3
+
+
+def test_a_bracket_whose_residual_stands_out_is_named(example):
+    run, estimate, _ = example
+    moved, place, turn = estimate.estimated.copy(), 4, np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0.0, 0.0, 0.6]).as_matrix()
+    moved[place] = turn @ moved[place]
+    history = pose_history(run, dataclasses.replace(estimate, estimated=moved))
+    assert history.misfits == [estimate.frame_ids[place]]
+
+
+def test_a_run_with_poses_as_tagged_has_no_such_section(example, tmp_path):
+    assert poses_section(dataclasses.replace(example[0], folder=tmp_path)) == ""
