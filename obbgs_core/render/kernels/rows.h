@@ -96,9 +96,9 @@ inline float expected_dn(float signal, const SensorModel& s, float& inverse_sigm
   return s.black + signal;
 }
 
-// Robust penalty of a squared residual; its slope is residual / q. Where the model's own error is not known: Charbonnier,
-// knee^2 (q - 1) without the cancellation, q = sqrt(1 + (r / knee)^2). Otherwise Cauchy, tail^2 / 2 log(q),
-// q = 1 + (r / tail)^2, of residuals over both errors: `share` is the noise's share of their deviation.
+// Robust penalty of a squared residual; its slope is residual / q. Where the model's own error is not known:
+// Charbonnier, knee^2 (q - 1) without the cancellation, q = sqrt(1 + (r / knee)^2). Otherwise Cauchy, tail^2 / 2
+// log(q), q = 1 + (r / tail)^2, of residuals over both errors: `share` is the noise's share of their deviation.
 inline float robust(float& squared, float signal, float inverse_sigma, const SensorModel& s, float& share, float& q) {
   const float seen = signal < 0 ? 0.0f : (signal > s.white - s.black ? s.white - s.black : signal);
   const float error = seen * inverse_sigma;
