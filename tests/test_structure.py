@@ -37,7 +37,7 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     "ground.session": {"obbgs_base", "flightsw.icd", "ground.telemetry"},
     "ground.session_writer": {"obbgs_base", "flightsw.icd", "ground.session", "ground.telemetry"},
     "ground.formats": {"obbgs_base", "flightsw.icd", "ground.session", "ground.session_writer"},
-    "ground.baselines": CORE | {"obbgs_core.start", "obbgs_core.score"},
+    "ground.baselines": CORE | {"obbgs_core.start", "obbgs_core.score", "ground.formats"},
     "ground.compare": {"obbgs_base", "flightsw.icd", "ground", "ground.baselines", "ground.session"}
     | LIBRARY,
     "ground.viewer": {"obbgs_base", "flightsw.icd", "ground", "ground.session"}

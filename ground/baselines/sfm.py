@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from ground.baselines.reconstruction import Reconstruction, Work
+from ground.formats.photographs import silent_colmap
 from obbgs_base.errors import Interrupted
 from obbgs_base.files import write_whole
 from obbgs_core.frames import TrainingFrame, mean_exposure_s, usable
@@ -63,7 +64,7 @@ def reconstruct_sfm(
 
     frames, _ = usable(frames, exposure_aware=True)
     views = pictures_of(frames, sensor, pictures)
-    with _folder(views, work) as folder, _silence():
+    with _folder(views, work) as folder, silent_colmap():
         clock = _Clock(folder / "seconds", work)
         _write_pictures(views, folder / "images")
         pycolmap.set_random_seed(SEED)
@@ -171,19 +172,6 @@ def _folder(views: list[Picture], work: Work) -> Iterator[Path]:
     folder = work.folder / f"sfm-{digest.hexdigest()[:16]}"
     folder.mkdir(parents=True, exist_ok=True)
     yield folder
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Keep COLMAP's log to its fatal errors while it works."""
-    import pycolmap
-
-    before = pycolmap.logging.minloglevel, pycolmap.logging.logtostderr
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel, pycolmap.logging.logtostderr = before
 
 
 def _name(index: int) -> str:

@@ -91,7 +91,7 @@ def read_photographs(
                 f"stopped after {100 * share:.0f} % of structure from motion; what was found is kept in {work}"
             )
 
-    with _silence():
+    with silent_colmap():
         pycolmap.set_random_seed(SEED)
         extraction = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
         with pycolmap.Database.open(database) as opened:
@@ -187,7 +187,7 @@ def _intrinsics(camera: "pycolmap.Camera") -> Intrinsics:
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
+def silent_colmap() -> Iterator[None]:
     """Keep COLMAP's log to its fatal errors while it works."""
     import pycolmap
 

@@ -26,6 +26,7 @@ from torch import Tensor
 from flightsw.icd.frame import Frame, PoseTag
 from flightsw.icd.mission import CameraSection
 from flightsw.icd.quaternion import matrix_to_quat
+from ground.cameras import sensor_of
 from ground.compare.case import Case
 from ground.session import SCHEMA_VERSION
 from ground.session_writer import frame_line
@@ -128,14 +129,7 @@ def exposed_by(target: Target, model: SensorModel, seed: int = 0) -> Target:
         dn = torch.from_numpy(read_out(model, seen, frame.exposure_time_s, noise).astype(np.float32))
         exposed = replace(frame, dn=dn, psf_sigma_px=camera.psf_sigma_px)
         views.append(View(exposed, torch.from_numpy(through_lens(light, camera)), view.alpha))
-    sensor = Sensor(
-        camera.black_dn,
-        camera.white_dn,
-        camera.dn_per_radiance_s,
-        camera.electrons_per_dn,
-        camera.read_noise_dn,
-    )
-    return replace(target, sensor=sensor, views=views)
+    return replace(target, sensor=sensor_of(camera), views=views)
 
 
 def load(name: str, size: int = 400, sigma: float = PAPER_SIGMA, seed: int = 0) -> Case:

@@ -139,11 +139,11 @@ def assert_gradients_agree(ours: torch.Tensor, truth: torch.Tensor) -> None:
 @needs_native
 @pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
 @pytest.mark.parametrize(("channels", "averaged_pixels"), [(1, 1), (3, 16)])
-@pytest.mark.parametrize("edge_weight", [0.0, 0.05])
-def test_the_compiled_likelihood_is_the_readable_one(sensor, channels, averaged_pixels, edge_weight):
+@pytest.mark.parametrize(("edge_weight", "misfit"), [(0.0, 0.0), (0.05, 0.0), (0.05, 0.2)])
+def test_the_compiled_likelihood_is_the_readable_one(sensor, channels, averaged_pixels, edge_weight, misfit):
     radiance, exposures_s, dn = bracket(sensor, channels=channels)
     assert (dn == sensor.white_dn).float().mean() > 0.05 and (radiance < 0).any()
-    settings = (sensor, averaged_pixels, edge_weight)
+    settings = (sensor, averaged_pixels, edge_weight, misfit)
     loss, gradient = value_and_gradient(lambda r: likelihood_loss(r, exposures_s, dn, *settings)[0], radiance)
     truth, true_gradient = value_and_gradient(
         lambda r: likelihood_loss_reference(r, exposures_s.double(), dn.double(), *settings)[0],
