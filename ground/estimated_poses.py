@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from flightsw.icd.quaternion import matrix_to_quat
 from ground.session import FrameRecord, Session, SessionError
 from ground.training_frames import training_frame
 from ground.truth import Truth
@@ -43,16 +44,34 @@ def read_estimate(folder: Path) -> PoseEstimate | None:
         raise SessionError(f"{path} cannot be read: {error}; make the run again") from error
 
 
+def estimated_records(records: list[FrameRecord], estimate: PoseEstimate | None) -> list[FrameRecord]:
+    """Return training frames with the poses that the training found, without those that it left out.
+
+    They are as they were where it left the poses as tagged.
+    """
+    if estimate is None:
+        return records
+    poses = dict(zip(estimate.frame_ids, estimate.estimated, strict=True))
+    return [_placed(record, poses[record.id]) for record in records if record.id in poses]
+
+
 def settled_records(
     gaussians: Gaussians, session: Session, records: list[FrameRecord], sensor: Sensor, estimate: PoseEstimate
 ) -> list[FrameRecord]:
     """Return held-out frames with the poses that are settled on their pictures, the model fixed."""
     frames = with_estimate([training_frame(session, record) for record in records], estimate)
     poses = settled_poses(gaussians, frames, sensor)
-    return [
-        dataclasses.replace(r, world_to_camera=p.double().numpy())
-        for r, p in zip(records, poses, strict=True)
-    ]
+    return [_placed(record, pose.double().numpy()) for record, pose in zip(records, poses, strict=True)]
+
+
+def _placed(record: FrameRecord, world_to_camera: np.ndarray) -> FrameRecord:
+    position_m = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
+    return dataclasses.replace(
+        record,
+        world_to_camera=world_to_camera,
+        quat_body_to_camera=matrix_to_quat(world_to_camera[:3, :3]),
+        position_body_m=position_m,
+    )
 
 
 @dataclass(frozen=True)

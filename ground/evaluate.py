@@ -1,6 +1,5 @@
 """The scores of a finished run: against its held-out frames and, where a simulator left it, against the truth."""
 
-import dataclasses
 import json
 import math
 from pathlib import Path
@@ -10,7 +9,7 @@ import torch
 
 from ground.cameras import camera_of, exposed, predicted_image
 from ground.card import model_card
-from ground.estimated_poses import Alignment, read_estimate, settled_records
+from ground.estimated_poses import Alignment, estimated_records, read_estimate, settled_records
 from ground.intervals import interval_scores
 from ground.runs import Run, open_run, written_to
 from ground.scores import ScoredView, clean_scores, cloud_scores, display_scores, noisy_psnr_db
@@ -102,10 +101,7 @@ def _interval_figures(
 ) -> dict[str, float]:
     """Return how often the intervals hold that the model states of the held-out frames."""
     radiance = [] if truth is None else [torch.from_numpy(truth.radiance(record)[0]) for record in shown]
-    training = split(run.session)[0]
-    if estimate is not None:
-        poses = dict(zip(estimate.frame_ids, estimate.estimated, strict=True))
-        training = [dataclasses.replace(r, world_to_camera=poses[r.id]) for r in training if r.id in poses]
+    training = estimated_records(split(run.session)[0], estimate)
     known, scored = ([training_frame(run.session, r) for r in records] for records in (training, shown))
     return interval_scores(run.gaussians, known, run.sensor, scored, radiance)
 

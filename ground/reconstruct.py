@@ -12,7 +12,7 @@ from typing import Literal
 from ground.attitude import FILE as ATTITUDE_FILE
 from ground.attitude import FoundAttitude, find_attitude, in_body_axes
 from ground.cameras import sensor_of
-from ground.estimated_poses import write_estimate
+from ground.estimated_poses import estimated_records, write_estimate
 from ground.model_files import Outputs, model_sizes, write_models
 from ground.run_record import training_metrics, write_config, write_history
 from ground.runs import check_replaceable, publish, run_folder, unfinished_run, written_to
@@ -136,7 +136,8 @@ def finish_run(
     part, result, blind = outputs.folder, results[KNOWN], results.get(BLIND)
     assert result is not None
     blind_gaussians = blind.gaussians if blind else None
-    files = write_models(outputs, result.gaussians, blind_gaussians, session, training, held_out)
+    posed = estimated_records(training, result.pose_estimate)
+    files = write_models(outputs, result.gaussians, blind_gaussians, session, posed, held_out)
     outputs.require("model.ply")
     metrics = training_metrics(result, blind, session, training, held_out)
     if (found := FoundAttitude.read(part / ATTITUDE_FILE)) is not None:

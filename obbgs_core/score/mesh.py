@@ -71,6 +71,8 @@ def surface_mesh(
             "the model has no opaque surface in any view, so there is nothing to make a mesh of"
         )
     corner, nodes, voxel_m = _blocks(depths, cameras)
+    if len(nodes) == 0:
+        raise ExportError("no surface lies in the images of half of the views: no mesh can be made of it")
     values = torch.cat([_fused(corner + n * voxel_m, maps, cameras, voxel_m) for n in nodes.split(CHUNK)])
     volume, first = _without_specks(values, nodes, voxel_m)
     if not (volume < 0).any():
