@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from ground.estimated_poses import FILE, Alignment, read_estimate, write_estimate
+from flightsw.icd.quaternion import quat_to_matrix
+from ground.estimated_poses import FILE, Alignment, estimated_records, read_estimate, write_estimate
 from ground.session import SessionError, open_session
 from ground.truth import Truth
 from obbgs_base.navigation_errors import SharedParameters
@@ -68,3 +69,15 @@ def test_a_model_that_moved_with_its_poses_is_found_again(estimate):
     assert figures["pose_error_deg"] < 1e-4 and figures["pose_error_px"] < 1e-3
     # half of the tags are turned by 0.1 rad about the line of sight, and no motion of the body undoes that
     assert 1 < figures["pose_error_tagged_deg"] < np.degrees(0.1)
+
+
+def test_surfaces_are_seen_from_the_poses_that_were_found_and_frames_left_out_are_left_out(estimate):
+    records = list(open_session(GOLDEN).frames)
+    assert estimated_records(records, None) is records
+    fewer = dataclasses.replace(estimate, frame_ids=estimate.frame_ids[1:], estimated=estimate.estimated[1:])
+    found = estimated_records(records, fewer)
+    assert [record.id for record in found] == fewer.frame_ids
+    for record, pose in zip(found, fewer.estimated, strict=True):
+        np.testing.assert_array_equal(record.world_to_camera, pose)
+        np.testing.assert_allclose(pose[:3, :3] @ record.position_body_m + pose[:3, 3], 0, atol=1e-6)
+        np.testing.assert_allclose(quat_to_matrix(record.quat_body_to_camera), pose[:3, :3], atol=1e-6)
