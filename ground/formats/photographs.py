@@ -76,6 +76,8 @@ def read_photographs(
     """
     import pycolmap
 
+    if not folder.is_dir():
+        raise FormatError(f"{folder} is not a folder: expected one with at least {FEWEST} photographs")
     names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)[:count]
     if len(names) < FEWEST:
         raise FormatError(f"{folder}: expected at least {FEWEST} photographs, found {len(names)}")

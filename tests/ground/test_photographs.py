@@ -133,6 +133,8 @@ def test_pictures_that_have_nothing_in_common_are_refused_in_one_sentence(photog
         cv2.imwrite(str(tmp_path / f"{i}.png"), picture)
     with pytest.raises(FormatError, match="no 3 of 3 photographs have enough features in common"):
         read_photographs(tmp_path, tmp_path / "work")
+    with pytest.raises(FormatError, match="nowhere is not a folder"):
+        read_photographs(tmp_path / "nowhere", tmp_path / "other")
     with pytest.raises(FormatError, match="at least 3 photographs, found 0"):
         read_photographs(tmp_path / "work", tmp_path / "other")
     cv2.imwrite(str(tmp_path / "3.png"), np.zeros((32, 64), np.uint8))
