@@ -12,6 +12,7 @@ from PIL import Image
 
 from ground.cameras import exposed, median_sun_direction
 from ground.runs import Run, open_run
+from ground.turntable import looking_at
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.render import render
 
@@ -46,17 +47,9 @@ def turntable(run: Run) -> Cameras:
     range_m = float(np.median([np.linalg.norm(record.position_body_m) for record in run.session.frames]))
     focal_px = WIDTH / 2 * range_m / (MARGIN * radius_m)
     K = torch.tensor([[focal_px, 0, WIDTH / 2], [0, focal_px, HEIGHT / 2], [0, 0, 1.0]])
-    elevation = np.radians(ELEVATION_DEG)
-    poses = []
-    for azimuth in 2 * np.pi * np.arange(VIEWS) / VIEWS:
-        z = -np.array(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-        )
-        x = np.cross(z, [0.0, 0.0, 1.0]) / np.cos(elevation)  # to the right in the image
-        pose = np.eye(4)
-        pose[:3, :3] = x, np.cross(z, x), z  # OpenCV axes: right, down, forward
-        pose[2, 3] = range_m
-        poses.append(torch.tensor(pose, dtype=torch.float32))
+    elevation_rad = float(np.radians(ELEVATION_DEG))
+    azimuths_rad = 2 * np.pi * np.arange(VIEWS) / VIEWS
+    poses = [looking_at(torch.zeros(3), range_m, float(a), elevation_rad) for a in azimuths_rad]
     sun_dir = median_sun_direction(list(run.session.frames))
     return Cameras(
         torch.stack(poses),

@@ -20,6 +20,7 @@ from obbgs_core.pose_corrections import PoseCorrections, motion_of
 from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.render import render
 
+MARGINS_PX = {"l": 60, "r": 20, "t": 20, "b": 45}
 AXES = {"x": "#1f6feb", "y": "#2a9d8f", "z": "#d1652a"}
 ORBIT, BODY = ("radial", "transverse", "normal"), ("x", "y", "z")
 SHOWN = {  # the parameters that a pass shares: words, unit, axes
@@ -181,7 +182,7 @@ def correction_figure(history: PoseHistory) -> go.Figure:
                 )
         figure.update_yaxes(title_text=f"{'rotation' if row == 1 else 'shift'}, {unit}", row=row, col=1)
     figure.update_xaxes(title_text="minutes", row=2, col=1)
-    figure.update_layout(height=460, margin={"l": 60, "r": 20, "t": 20, "b": 45})
+    figure.update_layout(height=460, margin=MARGINS_PX)
     return figure
 
 
@@ -216,7 +217,7 @@ def ellipse_figure(history: PoseHistory) -> go.Figure:
     )
     figure.update_yaxes(title_text="shift along camera y, m", scaleanchor="x")
     figure.update_xaxes(title_text="shift along camera x, m")
-    figure.update_layout(height=460, margin={"l": 60, "r": 20, "t": 20, "b": 45}, legend={"orientation": "h"})
+    figure.update_layout(height=460, margin=MARGINS_PX, legend={"orientation": "h"})
     return figure
 
 
@@ -246,5 +247,5 @@ def residual_figure(history: PoseHistory) -> go.Figure:
         )
     figure.update_yaxes(title_text="residual chi²", type="log")
     figure.update_xaxes(title_text="minutes")
-    figure.update_layout(height=320, margin={"l": 60, "r": 20, "t": 20, "b": 45}, legend={"orientation": "h"})
+    figure.update_layout(height=320, margin=MARGINS_PX, legend={"orientation": "h"})
     return figure
