@@ -227,7 +227,7 @@ def test_only_the_target_s_part_of_the_picture_is_rendered_and_nothing_of_it_is_
             picture = render(worker, mission, pose, tmp_path / "r.npz")
             # a filtered pixel reaches less than one pixel over the outline
             assert (picture["alpha"][binary_erosion(seen, iterations=2, border_value=1)] == 255).all()
-            outside = ~binary_dilation(seen, iterations=2)
+            outside = np.logical_not(binary_dilation(seen, iterations=2))
             assert not picture["alpha"][outside].any() and not picture["radiance"][outside].any()
             covered.append(seen.sum())
     finally:
