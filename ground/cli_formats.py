@@ -17,6 +17,8 @@ from ground.cli_options import (
     BackgroundGiven,
     ExportFormat,
     ImportFormat,
+    PoseChoice,
+    PosesGiven,
     PoseSigmaGiven,
     SessionDir,
     ValuesGiven,
@@ -24,7 +26,9 @@ from ground.cli_options import (
 
 if TYPE_CHECKING:
     from ground.formats.photographs import Registered
-    from ground.formats.views import PoseSigmas
+    from ground.formats.views import PoseSigmas, View
+
+MOST_NAMED = 30  # pictures in one line; --json names all
 
 stderr = Console(stderr=True)
 
@@ -36,6 +40,7 @@ def import_command(
     values: ValuesGiven = None,
     background: BackgroundGiven = None,
     pose_sigma: PoseSigmaGiven = None,
+    poses: PosesGiven = PoseChoice.CHECK,
     frames: Annotated[
         int | None,
         typer.Option(min=1, help="Import only the first so many pictures (of each split); default: all."),
@@ -74,14 +79,19 @@ def import_command(
         case ImportFormat.IMAGES:
             found = _photographs(folder, session, frames)
             views, sigmas, registration = found.views, found.sigmas, found.described()
-    views = first_of_each_split(views, frames)
+    views, found_poses = first_of_each_split(views, frames), {}
+    source = f"{format_.value}: {folder}"
+    if format_ is not ImportFormat.IMAGES and poses is not PoseChoice.STATED:
+        views, found_poses = _checked_poses(views, given_sigmas or sigmas, poses is PoseChoice.MEND)
+        if poses is PoseChoice.MEND and found_poses:
+            source += f", poses mended: {', '.join(f'{len(v)} {k}' for k, v in found_poses.items())}"
     given = None if values is None else Values(values.value)
     with Progress(TextColumn("importing"), BarColumn(), TimeRemainingColumn(), console=stderr) as progress:
         task = progress.add_task("import", total=len(views))
         count = write_session(
             views,
             session,
-            f"{format_.value}: {folder}",
+            source,
             given,
             white,
             exported,
@@ -90,11 +100,41 @@ def import_command(
             registration,
         )
     if json_:
-        print(json.dumps({"frames": count, "session": str(session), **(registration or {})}))
+        print(json.dumps({"frames": count, "session": str(session), **(registration or {}), **found_poses}))
         return
     print(f"{count} frames in {session}")
     if registration and registration["left_out"]:
         print(f"left out, because they could not be registered: {', '.join(registration['left_out'])}")
+
+
+def _checked_poses(
+    views: "list[View]", sigmas: "PoseSigmas", mend: bool
+) -> "tuple[list[View], dict[str, list[str]]]":
+    """Return the views, mended if that is wanted, and the names of those that do not fit, by what is wrong.
+
+    What was found and what to do is said on stderr.
+    """
+    from ground.formats.epipolar import check_poses, mended
+
+    with Progress(TextColumn("checking poses"), BarColumn(), TimeRemainingColumn(), console=stderr) as bar:
+        task = bar.add_task("check", total=len(views))
+        check = check_poses(views, sigmas, lambda: bar.advance(task))
+    wrong = {"turned": check.turned, "contradicting": check.contradicting}
+    names = {kind: [views[i].image.name for i in indices] for kind, indices in wrong.items() if indices}
+    said = {
+        "turned": "fit their pictures when turned by 180 degrees about the line of sight",
+        "contradicting": "contradict what their pictures share with their neighbours",
+    }
+    done = {"turned": ("are turned", "turns them"), "contradicting": ("are left out", "leaves them out")}
+    for kind, pictures in names.items():
+        more = f" and {len(pictures) - MOST_NAMED} more" if len(pictures) > MOST_NAMED else ""
+        advice = f"they {done[kind][0]}" if mend else f"--poses mend {done[kind][1]}"
+        stderr.print(
+            f"{len(pictures)} of {len(views)} cameras {said[kind]}: {', '.join(pictures[:MOST_NAMED])}{more}; {advice}",
+            soft_wrap=True,
+            highlight=False,
+        )
+    return mended(views, check) if mend else views, names
 
 
 def _pose_sigmas(text: str) -> "PoseSigmas":

@@ -57,6 +57,14 @@ class Background(StrEnum):
     WHITE = "white"
 
 
+class PoseChoice(StrEnum):
+    """What is done about stated cameras that their pictures contradict."""
+
+    CHECK = "check"
+    MEND = "mend"
+    STATED = "stated"
+
+
 class ExportFormat(StrEnum):
     """Formats that a session can be written in."""
 
@@ -111,6 +119,15 @@ PoseSigmaGiven = Annotated[
         metavar="DEG,M",
         help="How far the poses can err, as standard deviations in degrees and metres; the training "
         "corrects them within it. Default: exact poses; for the format images what its features say.",
+    ),
+]
+PosesGiven = Annotated[
+    PoseChoice,
+    typer.Option(
+        "--poses",
+        help="Whether the pictures fit their stated cameras, as features show that neighbours share. check: the others "
+        "are named; mend: cameras that fit when turned by 180 degrees are turned, other pictures that do not fit are "
+        "left out; stated: not looked at.",
     ),
 ]
 # of `ground reconstruct`

@@ -124,7 +124,7 @@ def adam_step(
     gradient: Array,
     first: Array,
     second: Array,
-    rate: float,
+    rates: Array,
     b1: float,
     b2: float,
     eps: float,

@@ -73,7 +73,7 @@ def make_frame() -> Callable[..., Frame]:
 
 @pytest.fixture(scope="session")
 def skyfield_oracle():
-    """Skyfield's time scale and its own DE421, from the file we ship."""
+    """Skyfield's time scale and the whole DE421, of which flight carries an excerpt."""
     spec = importlib.util.find_spec("skyfield_data")
     assert spec and spec.origin
     ephemeris = skyfield.api.Loader(str(Path(spec.origin).parent / "data"))("de421.bsp")

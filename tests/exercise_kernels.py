@@ -147,12 +147,12 @@ def exercise_threads(module: ModuleType, kernel: str) -> None:
 def exercise_losses(module: ModuleType) -> None:
     """Call the losses on images with clipped and invalid readings."""
     rng = np.random.default_rng(1)
-    for averaged_pixels in (1.0, 4.0):
-        sensor = module.SensorModel(64.0, 4095.0, 2.0, 3.0, averaged_pixels, averaged_pixels * 0.04)
+    for averaged_pixels, misfit in ((1.0, None), (4.0, None), (4.0, 0.1)):
+        sensor = module.SensorModel(64.0, 4095.0, 2.0, 3.0, averaged_pixels, misfit)
         for shape in [(2, 53, 37, 3), (1, 3, 3, 1), (1, 1, 1, 3), (2, 2, 5, 1), (3, 130, 20, 1)]:
             dn = np.round(np.clip(rng.uniform(-200, 4500, shape), 0, 4095)).astype(np.float32)
             gains, floors = np.full(shape[0], 4e3, dtype=np.float32), np.full(shape[0], 50, dtype=np.float32)
-            weighted = sensor, floors, 3.0, 0.2  # with the model's own error
+            weighted = sensor, floors, 3.0, 0.2
             radiance = ((dn - 64) / 4e3 * rng.uniform(0.8, 1.2, shape)).astype(np.float32)
             for invalid in (False, True):
                 if invalid:
@@ -186,14 +186,15 @@ def exercise_losses(module: ModuleType) -> None:
 
 
 def exercise_adam(module: ModuleType) -> None:
-    for count in (1, 1000, 100_003):
+    for count, period in ((1, 1), (1000, 1), (100_003, 1), (48 * 2100, 48), (3 * 5000, 5000)):
+        rates = np.linspace(0.01, 0.02, period, dtype=np.float32)
         results = []
         for threads in THREADS:
             rng = np.random.default_rng(count)
             parameter, first, second = (rng.random(count, dtype=np.float32) for _ in range(3))
             for _ in range(3):
                 gradient = rng.normal(size=count).astype(np.float32)
-                module.adam_step(parameter, gradient, first, second, 0.01, 0.9, 0.999, 1e-15, threads)
+                module.adam_step(parameter, gradient, first, second, rates, 0.9, 0.999, 1e-15, threads)
             results.append([parameter, first, second])
         assert same(results)
 
@@ -217,6 +218,13 @@ def exercise_refusals(module: ModuleType) -> None:
         except ValueError:
             continue
         raise AssertionError(f"{name} of a wrong size was accepted")
+    numbers = [np.zeros(10, np.float32) for _ in range(4)]
+    for rates in (empty(0), empty(3)):
+        try:
+            module.adam_step(*numbers, rates, 0.9, 0.999, 1e-15, 1)
+        except ValueError:
+            continue
+        raise AssertionError(f"{len(rates)} rates for ten numbers were accepted")
 
 
 def main() -> None:

@@ -41,7 +41,9 @@ class OrbitSection:
             raise ConfigError(path, f"expected ISO 8601, got {self.start_utc!r}") from error
         require(moment.tzinfo is not None, path, "say the time zone: end the time with Z")
         require(
-            1970 <= moment.year <= 2052, path, f"expected 1970 to 2052, where DE421 ends, got {moment.year}"
+            2000 <= moment.year <= 2052,
+            path,
+            f"expected 2000 to 2052, the years of the Sun's ephemeris, got {moment.year}",
         )
         whole = moment.astimezone(UTC).replace(microsecond=0)
         return int(whole.timestamp()) * 1_000_000_000 + moment.microsecond * 1000

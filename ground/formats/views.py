@@ -279,6 +279,19 @@ def image_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
+def read_grey(view: View) -> np.ndarray:
+    """Return the mean colour [H, W] of a view's picture, 0..1, on black where it is transparent.
+
+    Raises:
+        FormatError: it cannot be read, or has another size than its camera.
+    """
+    image = _read_image(view.image, view.intrinsics)
+    image = image / float(np.iinfo(image.dtype).max)
+    colours = _channels(image)
+    grey = image[..., :colours].mean(axis=2)
+    return grey * image[..., -1] if image.shape[2] > colours else grey
+
+
 def _decode(path: Path) -> np.ndarray:
     try:
         image = np.asarray(imagecodecs.imread(path))

@@ -76,12 +76,15 @@ class Adam:
         for name, parameter in gaussians.parameters().items():
             if parameter.grad is None:
                 continue
-            values, gradient, rate = parameter.detach(), parameter.grad.contiguous(), rates[name] * correction
+            values, gradient = parameter.detach(), parameter.grad.contiguous()
+            rate = torch.as_tensor(rates[name] * correction, dtype=values.dtype)
             first, second = self.first[name], self.second[name]
             native = compiled.module_for(values)
-            if native is not None and not isinstance(rate, Tensor):  # the same in one pass over memory
-                threads = torch.get_num_threads()
-                native.adam_step(values, gradient, first, second, rate, b1, b2, self.eps, threads)
+            if native is not None:  # the same in one pass over memory
+                if rate.ndim:  # one for each number of a Gaussian
+                    rate = rate[0].expand(values.shape[1:])
+                each, threads = rate.reshape(-1), torch.get_num_threads()
+                native.adam_step(values, gradient, first, second, each, b1, b2, self.eps, threads)
             else:
                 first.lerp_(gradient, 1 - b1)
                 second.mul_(b2).addcmul_(gradient, gradient, value=1 - b2)

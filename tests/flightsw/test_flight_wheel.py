@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from flightsw.orbit import EPHEMERIS
+
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "packaging" / "flight"
 BUILD = "import sys; from hatchling.build import build_wheel; print(build_wheel(sys.argv[1]))"
@@ -33,7 +35,8 @@ def test_it_holds_flight_and_what_it_shares_and_nothing_compiled(wheel):
         for path in (ROOT / part).rglob("*.py")
     }
     assert {name for name in names if name.endswith(".py")} == expected
-    assert {"flightsw/icd/dictionary.yaml", "flightsw/obbgs-flight.service"} <= names
+    beside = {"flightsw/icd/dictionary.yaml", "flightsw/obbgs-flight.service", f"flightsw/{EPHEMERIS.name}"}
+    assert beside <= names
     assert not [name for name in names if name.endswith((".so", ".cpp", ".pyc"))]
 
 

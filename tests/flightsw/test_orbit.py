@@ -1,17 +1,20 @@
 """Orbits, Sun and shadow against skyfield and the published SGP4 vectors."""
 
+import contextlib
+import importlib.util
 import itertools
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
+from jplephem.spk import SPK
 from skyfield.api import EarthSatellite
 from skyfield.sgp4lib import TEME
 
 from flightsw.errors import OrbitError
 from flightsw.icd.mission import load_mission
-from flightsw.orbit import in_eclipse, propagate, sun_position_gcrs, teme_to_gcrs
+from flightsw.orbit import EPHEMERIS, in_eclipse, propagate, sun_position_gcrs, teme_to_gcrs
 
 ROOT = Path(__file__).parents[2]
 ARCSEC_RAD = np.pi / 648_000
@@ -60,6 +63,22 @@ def test_sun_direction_matches_skyfield_to_two_arcseconds(skyfield_oracle, missi
     ours = sun_position_gcrs(mission.orbit.start_utc_ns)
     cosine = ours @ expected / np.linalg.norm(ours) / np.linalg.norm(expected)
     assert np.arccos(np.clip(cosine, -1, 1)) < 2 * ARCSEC_RAD
+
+
+def test_the_excerpt_of_the_ephemeris_is_de421_itself():
+    spec = importlib.util.find_spec("skyfield_data")
+    assert spec and spec.origin
+    with (
+        contextlib.closing(SPK.open(str(Path(spec.origin).parent / "data" / "de421.bsp"))) as whole,
+        contextlib.closing(SPK.open(str(EPHEMERIS))) as excerpt,
+    ):
+        jd = np.random.default_rng(0).uniform(2_451_545.0, 2_471_184.0, 1000)  # 2000-01-01 to 2053-10-08
+        for pair in ((0, 10), (0, 3), (3, 399)):
+            # the same coefficients, but times are counted from another beginning: some us of rounding at 30 km/s
+            one_metre_km = 1e-3
+            np.testing.assert_allclose(
+                excerpt[pair].compute(jd), whole[pair].compute(jd), rtol=0, atol=one_metre_km
+            )
 
 
 def test_shadow_entry_matches_skyfield_to_two_seconds(skyfield_oracle):

@@ -8,6 +8,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.train.adam import Adam
 
 needs_native = pytest.mark.skipif(compiled._rasterizer is None, reason="the compiled module is not installed")
+COEFFICIENT_RATES = torch.tensor([1.0] + [0.05] * 15).reshape(1, 16, 1) * 0.01  # as 3DGS sets them
 RATES = {"means": 1e-3, "quats": 2e-3, "log_scales": 5e-3, "opacity_logits": 0.05, "sh": 0.01}
 
 
@@ -27,10 +28,10 @@ def with_gradients(model: Gaussians, step: int) -> Gaussians:
     return model
 
 
-def after(steps: int, model: Gaussians) -> dict[str, torch.Tensor]:
+def after(steps: int, model: Gaussians, rates: dict = RATES) -> dict[str, torch.Tensor]:
     adam = Adam(model)
     for step in range(steps):
-        adam.step(with_gradients(model, step), RATES)
+        adam.step(with_gradients(model, step), rates)
     return {name: tensor.detach() for name, tensor in model.tensors().items()}
 
 
@@ -49,10 +50,12 @@ def test_twenty_steps_end_where_torch_optim_ends(dtype):
 
 
 @needs_native
-def test_the_compiled_step_is_the_readable_step(monkeypatch):
-    native = after(20, gaussians())
+@pytest.mark.parametrize("sh", [0.01, COEFFICIENT_RATES], ids=["one rate", "a rate a coefficient"])
+def test_the_compiled_step_is_the_readable_step(monkeypatch, sh):
+    rates = RATES | {"sh": sh}
+    native = after(20, gaussians(), rates)
     monkeypatch.setattr(compiled, "_rasterizer", None)
-    for name, expected in after(20, gaussians()).items():
+    for name, expected in after(20, gaussians(), rates).items():
         torch.testing.assert_close(native[name], expected, rtol=0, atol=2e-6, msg=name)
 
 

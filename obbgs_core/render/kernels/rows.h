@@ -357,12 +357,13 @@ void squared_error_row(int n, const float* __restrict radiance, const float* __r
 }
 
 void adam_block(size_t n, float* __restrict parameter, const float* __restrict gradient, float* __restrict first,
-                float* __restrict second, float rate, float one_minus_b1, float b2, float one_minus_b2, float eps) {
+                float* __restrict second, const float* __restrict rates, float one_minus_b1, float b2,
+                float one_minus_b2, float eps) {
   for (size_t i = 0; i < n; ++i) {
     const float g = gradient[i];
     first[i] += one_minus_b1 * (g - first[i]);
     second[i] = b2 * second[i] + one_minus_b2 * g * g;
-    parameter[i] -= rate * first[i] / (std::sqrt(second[i]) + eps);
+    parameter[i] -= rates[i] * first[i] / (std::sqrt(second[i]) + eps);
   }
 }
 

@@ -30,7 +30,8 @@ namespace {
 const RowLoops* loops = &portable::row_loops;  // of the instruction set in use
 
 constexpr int kBandRows = 40;
-constexpr int kBlockParameters = 1 << 15;
+constexpr size_t kBlockParameters = 1 << 15;
+constexpr size_t kRepeatedRates = 1 << 10;  // a table that stays in the first cache
 
 // ------------------------------------------------------------------------------------------------- bands of rows
 
@@ -278,21 +279,29 @@ std::pair<double, double> fit(Array radiance, Array alpha, Array dn, Array gains
   return {averaged * sum.squares / sum.variances, sum.error / shape.values()};
 }
 
-// One Adam step of one parameter, in place; rate already holds the bias correction.
-void adam_step(Array parameter, Array gradient, Array first, Array second, double rate, double b1, double b2,
+// One Adam step of one parameter, in place. The rates already hold the bias correction; fewer than the numbers of the
+// parameter repeat along it, one for each coefficient of a Gaussian or one for all.
+void adam_step(Array parameter, Array gradient, Array first, Array second, Array rates, double b1, double b2,
                double eps, int threads) {
-  const size_t n = parameter.size();
+  const size_t n = parameter.size(), period = rates.size();
   expect(gradient, "gradient", n);
   expect(first, "first", n);
   expect(second, "second", n);
+  if (period == 0 || n % period != 0)
+    throw std::invalid_argument("rates: expected a number of them that divides " + std::to_string(n) + ", got " +
+                                std::to_string(period));
+  std::vector<float> repeated(period * std::max<size_t>(1, kRepeatedRates / period));
+  for (size_t i = 0; i < repeated.size(); ++i) repeated[i] = rates.data()[i % period];
   float *p = parameter.data(), *m = first.data(), *v = second.data();
   const float* g = gradient.data();
   nb::gil_scoped_release release;
-  const int blocks = int((n + kBlockParameters - 1) / kBlockParameters);
+  const size_t tile = repeated.size(), block_size = tile * std::max<size_t>(1, kBlockParameters / tile);
+  const int blocks = int((n + block_size - 1) / block_size);
   parallel_for(blocks, threads, [&](int block) {
-    const size_t at = size_t(block) * kBlockParameters, count = std::min(n - at, size_t(kBlockParameters));
-    loops->adam_block(count, p + at, g + at, m + at, v + at, float(rate), float(1 - b1), float(b2), float(1 - b2),
-                      float(eps));
+    const size_t end = std::min(n, (size_t(block) + 1) * block_size);
+    for (size_t at = size_t(block) * block_size; at < end; at += tile)
+      loops->adam_block(std::min(tile, end - at), p + at, g + at, m + at, v + at, repeated.data(), float(1 - b1),
+                        float(b2), float(1 - b2), float(eps));
   });
 }
 
@@ -326,5 +335,5 @@ void bind_training(nb::module_& m) {
         "clamped"_a, "residual"_a.noconvert(), "gradient"_a.none().noconvert(), "threads"_a);
   m.def("fit", &obbgs::fit, "radiance"_a, "alpha"_a, "dn"_a, "gains"_a, "sensor"_a, "least_alpha"_a, "threads"_a);
   m.def("adam_step", &obbgs::adam_step, "parameter"_a.noconvert(), "gradient"_a, "first"_a.noconvert(),
-        "second"_a.noconvert(), "rate"_a, "b1"_a, "b2"_a, "eps"_a, "threads"_a);
+        "second"_a.noconvert(), "rates"_a, "b1"_a, "b2"_a, "eps"_a, "threads"_a);
 }
