@@ -170,7 +170,7 @@ def test_the_spin_of_an_unknown_target_is_found_from_its_frames(monkeypatch):
     assert axis < 1.5 and abs(facts["period_s"] * np.linalg.norm(RATE_RAD_S) / 2 / np.pi - 1) < 0.01
     expected = np.array([0.0, 0.0, np.linalg.norm(RATE_RAD_S)])
     np.testing.assert_allclose(motion.epoch_to_body @ RATE_RAD_S, expected, atol=5e-4)
-    assert {what for what, _ in shown} == {"searching the spin", "following the motion"}
+    assert {what for what, _ in shown} == {"searching the spin", "following the motion", "judging the motion"}
     assert all(0 <= share <= 1 for _, share in shown)
 
 
