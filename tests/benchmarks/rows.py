@@ -20,6 +20,10 @@ NAMES = (
     "condition",
     "target",
 )  # what a line of a table is called by, where a row has it
+BUDGETS = {
+    "steps_share": "share of the steps",
+    "largest": "at most Gaussians",
+}  # and these where rows differ in them
 FIGURES = {  # key of a row: column title and format
     "psnr_clean_db": ("clean PSNR", "{:.2f} dB"),
     "psnr_foreground_db": ("foreground", "{:.2f} dB"),
@@ -68,11 +72,12 @@ def page(files: Iterable[Path]) -> str:
 
 def _table(rows: list[dict]) -> list[str]:
     names = [key for key in NAMES if any(key in row for row in rows)]
+    names += [key for key in BUDGETS if len({row.get(key) for row in rows}) > 1]
     figures = [key for key in FIGURES if any(row.get(key) is not None for row in rows)]
     groups: dict[tuple, list[dict]] = {}
     for row in rows:
         groups.setdefault(tuple(row.get(key, "") for key in names), []).append(row)
-    titles = [*names, "seeds", *(FIGURES[key][0] for key in figures)]
+    titles = [*(BUDGETS.get(name, name) for name in names), "seeds", *(FIGURES[key][0] for key in figures)]
     lines = ["| " + " | ".join(titles) + " |", "| " + " | ".join(["---"] * len(titles)) + " |"]
     for name, members in groups.items():
         cells = [*map(str, name), str(len(members))]
