@@ -1,4 +1,4 @@
-"""The command line `flightsw`: capture, downlink, serve, triage, plan, fsck."""
+"""The command line `flightsw`: selftest, plan, capture, downlink, serve, triage, fsck."""
 
 import dataclasses
 import json
@@ -185,6 +185,41 @@ def plan_command(mission: MissionFile = Path("mission.yaml"), json_: AsJson = Fa
         )
     for utc, change in planned.shadow:
         print(f"shadow: the target {change} it at {utc}")
+
+
+@app.command()
+def selftest(
+    camera: Annotated[str | None, typer.Option("--camera", help="Take one bracket with this camera.")] = None,
+    link: Annotated[str | None, typer.Option("--link", help="Open this link and send packets.")] = None,
+    loopback: Annotated[
+        bool, typer.Option("--loopback", help="A plug on the link returns what is sent: test that it does.")
+    ] = False,
+    mission: MissionFile = Path("mission.yaml"),
+    store: StoreDir = Path("store"),
+    key: Annotated[Path | None, typer.Option("--key", help="Check this key and its counter.")] = None,
+    json_: AsJson = False,
+) -> None:
+    """Check clock, disk, computer and orbital elements, and key, link and camera if they are named; stop flight first.
+
+    Says for each what was found and, where something is wrong, what to do. Exits with 1 when a check failed; a warning
+    leaves 0.
+
+    Example: flightsw selftest --camera gige://192.168.0.10 --link 'serial:///dev/ttyS1?baud=921600' --key mission.key
+    """
+    from flightsw.selftest import Finding, self_test
+
+    def show(finding: Finding) -> None:
+        if not json_:
+            print(f"{finding.state:8} {finding.check:11} {finding.found}")
+            if finding.advice:
+                print(f"{'':20} -> {finding.advice}")
+
+    findings = self_test(load_mission(mission), store, camera, link, loopback, key, on_finding=show)
+    failed = sum(finding.state == "failed" for finding in findings)
+    if json_:
+        print(json.dumps({"ok": not failed, "findings": [dataclasses.asdict(f) for f in findings]}))
+    if failed:
+        raise typer.Exit(1)
 
 
 @app.command("fsck")

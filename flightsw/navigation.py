@@ -231,6 +231,13 @@ class NavigationStream:
                 os.close(stream)
         self._socket = self._descriptor = None
 
+    def first(self, wait_s: float) -> NavigationState | None:
+        """Return the first state of the stream, waiting for it; None if none came."""
+        deadline_s = time.monotonic() + wait_s
+        while not self._states and time.monotonic() < deadline_s:
+            self._read(0)
+        return self._states[0] if self._states else None
+
     def at(self, utc_ns: int) -> NavigationState:
         """Return the state at a time, waiting `wait_s` for one that is not older.
 

@@ -10,10 +10,12 @@ import numpy as np
 
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from ground.cameras import sensor_of
-from ground.session import FrameRecord, Session, SessionError
+from ground.session import FrameRecord, Navigation, Session, SessionError
 from ground.training_frames import training_frame
 from obbgs_base.files import write_whole
-from obbgs_core.attitude.estimate import TargetMotion, estimate_motion
+from obbgs_core.attitude.estimate import estimate_motion
+from obbgs_core.attitude.target_motion import TargetMotion
+from obbgs_core.pose_estimate import PoseEstimate
 
 FILE = "attitude.json"
 
@@ -89,13 +91,48 @@ def find_attitude(
 
 
 def in_body_axes(session: Session, found: FoundAttitude) -> Session:
-    """Return a session with all poses and Sun directions in the axes of its target, as they were found."""
+    """Return a session with all poses and Sun directions in the axes of its target, as they were found.
+
+    Its navigation says how far attitude, rate and inertia ratios may err, so that a training refines them.
+    """
     times_s = np.array([(r.mid_exposure_utc_ns - found.epoch_utc_ns) / 1e9 for r in session.frames])
     records = []
     for record, attitude in zip(session.frames, found.motion.inertial_to_body(times_s), strict=True):
         turned = _turned(record, attitude @ _assumed(session, record).T)
         records.append(dataclasses.replace(turned, quat_inertial_to_body=matrix_to_quat(attitude)))
-    return dataclasses.replace(session, frames=tuple(records), attitude_estimated=True)
+    navigation = _navigation(session.navigation, found)
+    return dataclasses.replace(session, frames=tuple(records), navigation=navigation, attitude_estimated=True)
+
+
+def refined_motion(found: FoundAttitude, session: Session, estimate: PoseEstimate | None) -> TargetMotion:
+    """Return the motion from the epoch that `found` counts from, as a training on a session in its axes refined it."""
+    if estimate is None:
+        return found.motion
+    shift_s = (session.navigation.epoch_utc_ns - found.epoch_utc_ns) / 1e9
+    return found.motion.at_epoch(shift_s).refined(estimate).at_epoch(-shift_s)
+
+
+def _navigation(stated: Navigation, found: FoundAttitude) -> Navigation:
+    """Return what tags state of their shared errors, with the target's rotation and its deviations as found.
+
+    The epoch is that of the tags where they state how the orbit errs from there on.
+    """
+    orbit_errs = stated.sigmas.position_m.any() or stated.sigmas.velocity_m_s.any()
+    epoch_utc_ns = stated.epoch_utc_ns if orbit_errs else found.epoch_utc_ns
+    motion = found.motion.at_epoch((epoch_utc_ns - found.epoch_utc_ns) / 1e9)
+    sigmas = motion.sigmas()
+    return dataclasses.replace(
+        stated,
+        epoch_utc_ns=epoch_utc_ns,
+        rate_rad_s=tuple(motion.rate_body_rad_s.tolist()),
+        inertia=tuple(motion.moments.tolist()),
+        sigmas=dataclasses.replace(
+            stated.sigmas,
+            attitude_rad=sigmas.attitude_rad,
+            rate_rad_s=sigmas.rate_rad_s,
+            inertia_ratios=sigmas.inertia_ratios,
+        ),
+    )
 
 
 def _assumed(session: Session, record: FrameRecord) -> np.ndarray:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from ground.attitude import FILE as ATTITUDE_FILE
-from ground.attitude import FoundAttitude, find_attitude, in_body_axes
+from ground.attitude import FoundAttitude, find_attitude, in_body_axes, refined_motion
 from ground.cameras import sensor_of
 from ground.estimated_poses import estimated_records, write_estimate
 from ground.model_files import Outputs, model_sizes, write_models
@@ -93,6 +93,7 @@ def reconstruct(
         if found is not None:
             session = in_body_axes(session, found)
             training, held_out = split(session)
+            configs = {label: _refining(config) for label, config in configs.items()}
         frames = [training_frame(session, record) for record in training]
 
         def trained(label: str, config: MethodConfig) -> TrainResult:
@@ -105,7 +106,7 @@ def reconstruct(
             return result
 
         outputs = Outputs(part, should_stop)
-        result, blind = trained(KNOWN, config), None
+        result, blind = trained(KNOWN, configs[KNOWN]), None
         if BLIND in configs:
             try:
                 blind = trained(BLIND, configs[BLIND])
@@ -141,7 +142,8 @@ def finish_run(
     outputs.require("model.ply")
     metrics = training_metrics(result, blind, session, training, held_out)
     if (found := FoundAttitude.read(part / ATTITUDE_FILE)) is not None:
-        metrics["attitude"] = found.motion.facts()
+        metrics["attitude"] = refined_motion(found, session, result.pose_estimate).facts()
+        metrics["attitude_from_outlines"] = found.motion.facts()
     metrics |= files | model_sizes(part) | {"missing_outputs": outputs.missing}
     log.info("%d Gaussians in %.1f s: %s", len(result.gaussians), result.seconds, result.stop_reason)
     with written_to(folder.parent):
@@ -170,6 +172,13 @@ def _attitude(
         found.write(path)
     log.info("attitude of the target from its outlines: %s", found.motion.summary())
     return found
+
+
+def _refining(config: MethodConfig) -> MethodConfig:
+    """Return a method that refines poses wherever it may: an attitude from outlines errs for certain."""
+    if config.poses.refine != "auto":
+        return config
+    return dataclasses.replace(config, poses=dataclasses.replace(config.poses, refine="always"))
 
 
 def _checkpoint(label: str) -> str:

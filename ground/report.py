@@ -11,6 +11,7 @@ from ground.cameras import median_sun_direction
 from ground.card import chi2_explained, frames_captured, scored_frames
 from ground.page import as_yaml, cards, page, plot, section, two_tables
 from ground.plots import histogram_figure, training_figure
+from ground.report_attitude import attitude_section
 from ground.report_frames import frames_section, scored_section
 from ground.report_poses import poses_section
 from ground.runs import Run, open_run, written_to
@@ -39,6 +40,7 @@ def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
             _result(run, truth),
             frames_section(run),
             scored_section(run, truth),
+            attitude_section(run),
             poses_section(run),
             _registration(run),
             _training(run),

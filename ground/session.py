@@ -105,6 +105,8 @@ class Navigation:
     epoch_utc_ns: the time at which the shared parameters are those of the start.
     mean_motion_rad_s: of the target's orbit; 0: not known.
     quat_inertial_to_rtn: [4] to radial, transverse and normal axes at the epoch.
+    rate_rad_s, inertia: [3] the target's angular velocity at the epoch and its moments of inertia (ratios matter), body
+        axes; a rate of 0: not known, then the frames' attitudes say how it turns.
     sigmas: standard deviations of the parameters that all frames share.
     """
 
@@ -113,6 +115,8 @@ class Navigation:
     epoch_utc_ns: int = 0
     mean_motion_rad_s: float = 0.0
     quat_inertial_to_rtn: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+    rate_rad_s: tuple[float, ...] = (0.0, 0.0, 0.0)
+    inertia: tuple[float, ...] = (1.0, 1.0, 1.0)
     sigmas: SharedParameters = field(default_factory=SharedParameters)
 
     def __post_init__(self):
@@ -122,6 +126,10 @@ class Navigation:
         quat = self.quat_inertial_to_rtn
         unit = len(quat) == 4 and abs(math.hypot(*quat) - 1) < 1e-6
         require(unit, "session.navigation.quat_inertial_to_rtn", f"expected a unit quaternion, got {quat}")
+        rate, inertia = self.rate_rad_s, self.inertia
+        require(len(rate) == 3, "session.navigation.rate_rad_s", f"expected 3 numbers, got {rate}")
+        positive = len(inertia) == 3 and min(inertia) > 0
+        require(positive, "session.navigation.inertia", f"expected 3 positive moments, got {inertia}")
 
 
 @dataclass(frozen=True)

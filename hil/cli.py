@@ -124,16 +124,24 @@ def camera(
     seed: Seed = 1,
     attitude: KnownAttitude = None,
     real_time: RealTime = 0.0,
+    prerender: Annotated[
+        bool,
+        typer.Option(
+            "--prerender",
+            help="Render the planned exposures before serving; those already in --cache are kept. A GigE client that "
+            "gives no times then sees the planned moment nearest to the simulated time, over and over.",
+        ),
+    ] = False,
 ) -> None:
     """Serve the simulated camera until stopped; prints its URL. Frames are rendered when a client requests them.
 
-    With --gige any GenICam client can use it: `arv-viewer-0.8`, `arv-camera-test-0.8 -n 127.0.0.1`, `flightsw`.
+    With --gige any GenICam client can use it: `arv-viewer-0.8`, `arv-camera-test-0.8 -n 127.0.0.1`, `flightsw`. One
+    that takes pictures at its own rate wants --prerender, too.
 
     Example: hil camera --listen hil:///tmp/camera.sock --scenario v-bar --mesh target.glb
     """
-    from hil.cameras.gige import GigeCameraServer
-    from hil.cameras.virtual import CameraServer
-    from hil.sky.render_farm import RenderFarm
+    from hil.camera_service import serve_camera
+    from hil.processes import unwind_on_sigterm
     from hil.world.navigation import write_flight_inputs
     from hil.world.world import load_world, told
 
@@ -141,19 +149,9 @@ def camera(
     if scenario:
         written = write_flight_inputs(world, inputs, seed if navigation == "realistic" else None)
         print(f"start flight with --mission {written.mission_path}", file=sys.stderr)
-    stop = _stop_event()
-    with RenderFarm(world.mission, mesh, cache, workers=1) as farm:
-        more = {"pose_at": world.pose_at, "real_time": real_time}
-        if gige:
-            serving = GigeCameraServer(world.mission, farm.radiance, **more)
-        else:
-            serving = CameraServer(world.mission, farm.radiance, listen, **more)
-        with serving as server:
-            print(server.url, flush=True)
-            while not stop.wait(1.0):
-                server.check()
-            counts = f"{server.late_frames} late, {server.failures} failed"
-            print(f"{server.exposures} exposures served, {counts}", file=sys.stderr)
+    unwind_on_sigterm()  # while rendering; then a signal ends the service
+    where = None if gige else listen
+    serve_camera(world, mesh, cache, where, real_time, prerender, _stop_event, Console(stderr=True))
 
 
 @app.command()

@@ -1,6 +1,7 @@
 """Corrections of the poses of a pass: few parameters that all frames share, and six small numbers for each bracket."""
 
 import dataclasses
+import math
 
 import numpy as np
 import torch
@@ -206,44 +207,55 @@ class PoseCorrections:
         self.curvature = torch.zeros(len(self.of_frame), 6, 6, dtype=torch.float64)
 
     def fix_gauge(self, gaussians: Gaussians, frames: list[TrainingFrame]) -> Gaussians:
-        """Return the model moved rigidly to where the corrections, moved with it, are smallest in their deviations.
+        """Return the model moved and scaled to where the corrections, moved with it, are smallest in their deviations.
 
-        Moving the model rigidly by d and every pose by its inverse changes no image, so training leaves d open. Motions
-        that would change a direction in which a tag is exact are excluded, unless a shared parameter takes them up.
+        Moving the model rigidly by d and every pose by its inverse changes no image, nor does a larger model that is
+        farther away by as much, so training leaves both open. Changes that would move a direction in which a tag is
+        exact are excluded, unless a shared parameter takes them up.
         """
         whole, target = torch.eye(4, dtype=torch.float64), self.corrected(list(range(len(frames)))).double()
-        for _ in range(GAUGE_ROUNDS if self.sigmas.any() else 1):
+        log_scale = 0.0
+        for _ in range(GAUGE_ROUNDS):
             motion, shared = self._gauge(target)
-            rigid = rigid_motions(motion[None])[0]
-            whole, target = rigid @ whole, target @ torch.linalg.inv(rigid)
+            rigid = rigid_motions(motion[None, :6])[0]
+            scale = torch.exp(motion[6])
+            whole[:3] *= scale
+            target[:, :3, 3] *= scale
+            log_scale += float(motion[6])
+            whole = rigid @ whole
+            target = target @ torch.linalg.inv(rigid)
             if shared.numel():
                 change = torch.zeros(SIZE, dtype=torch.float64)
                 change[self.free] = self.sigmas[self.free] * shared
                 self._move_shared(frames, self.shared + change)
             left = motion_vectors(target @ torch.linalg.inv(self.moved))
             self.value = _times(self.whitening.inverse, self._bracket_means(left)).float()
-        turn = motion_vectors(whole[None])[0, :3].float()
-        rigid = whole.float()
+        similarity = whole.float()
+        turn = motion_vectors(whole[None] / math.exp(log_scale))[0, :3].float()
         return dataclasses.replace(  # a turn this small does not show in the radiance
             gaussians,
-            means=gaussians.means @ rigid[:3, :3].T + rigid[:3, 3],
+            means=gaussians.means @ similarity[:3, :3].T + similarity[:3, 3],
+            log_scales=gaussians.log_scales + log_scale,
             quats=multiply(from_rotation_vectors(turn).expand(len(gaussians), 4), gaussians.quats),
         )
 
     def _gauge(self, poses: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the motion [6] of the body that makes the corrections smallest, and the change [S] of the shared ones.
+        """Return the change of the body that makes the corrections smallest, and that of the shared parameters [S].
 
-        The motion adds adjoint · d to each correction, which the shared parameters may take up instead.
+        The former [7] is a small motion and a logarithm of its size. It adds adjoint · d to each correction, which the
+        shared parameters may take up instead.
         """
         size = self.by_shared.shape[2]
-        adjoint = self._bracket_means(torch.cat([-adjoints(poses), -self.by_shared], dim=2))  # [P, 6, 6 + S]
+        farther = torch.cat([torch.zeros(len(poses), 3, 1, dtype=poses.dtype), poses[:, :3, 3:]], dim=1)
+        columns = [-adjoints(poses), farther, -self.by_shared]
+        adjoint = self._bracket_means(torch.cat(columns, dim=2))  # [P, 6, 7 + S]
         free = _null_space((self.whitening.exact @ adjoint).flatten(0, 1))
         own_rows = (self.whitening.inverse @ adjoint).flatten(0, 1)
-        shared_rows = torch.cat([torch.zeros(size, 6, dtype=torch.float64), torch.eye(size).double()], dim=1)
+        shared_rows = torch.cat([torch.zeros(size, 7, dtype=torch.float64), torch.eye(size).double()], dim=1)
         rows = torch.cat([own_rows, shared_rows]) @ free
         now = torch.cat([self.value.flatten().double(), (self.shared / self.sigmas)[self.free]])
         change = free @ (torch.linalg.pinv(rows) @ -now)
-        return change[:6], change[6:]
+        return change[:7], change[7:]
 
     def _bracket_means(self, of_frames: Tensor) -> Tensor:
         """Return the mean over each bracket's frames [P, ...] of what each frame has [F, ...]."""

@@ -147,8 +147,8 @@ def exercise_threads(module: ModuleType, kernel: str) -> None:
 def exercise_losses(module: ModuleType) -> None:
     """Call the losses on images with clipped and invalid readings."""
     rng = np.random.default_rng(1)
-    for averaged_pixels in (1.0, 4.0):
-        sensor = module.SensorModel(64.0, 4095.0, 2.0, 3.0, averaged_pixels)
+    for averaged_pixels, misfit in ((1.0, None), (4.0, None), (4.0, 0.1)):
+        sensor = module.SensorModel(64.0, 4095.0, 2.0, 3.0, averaged_pixels, misfit)
         for shape in [(2, 53, 37, 3), (1, 3, 3, 1), (1, 1, 1, 3), (2, 2, 5, 1), (3, 130, 20, 1)]:
             dn = np.round(np.clip(rng.uniform(-200, 4500, shape), 0, 4095)).astype(np.float32)
             gains = np.full(shape[0], 4e3, dtype=np.float32)

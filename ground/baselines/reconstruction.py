@@ -10,6 +10,18 @@ from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.cameras import Cameras
+from obbgs_core.pose_estimate import PoseEstimate
+
+
+@dataclass(frozen=True)
+class EstimatedPoses:
+    """The poses that a method made of those it was given, so that its model lies in a frame of its own.
+
+    settled: from held-out frames to the same in poses that are settled on their pictures, the model fixed.
+    """
+
+    estimate: PoseEstimate
+    settled: Callable[[list[TrainingFrame]], list[TrainingFrame]]
 
 
 @dataclass(frozen=True)
@@ -25,6 +37,7 @@ class Reconstruction:
     figures: further columns of its row, such as the number of registered frames.
     intervals: from held-out frames, their true radiance (or none) and the frames that calibrate to how often stated
         intervals hold, as `ground.intervals.interval_scores` has it; None where the method states no uncertainty.
+    poses: None where the method takes the poses as they are given.
     """
 
     points: Tensor
@@ -36,6 +49,7 @@ class Reconstruction:
     intervals: (
         Callable[[list[TrainingFrame], list[Tensor], Sequence[TrainingFrame]], dict[str, float]] | None
     ) = None
+    poses: EstimatedPoses | None = None
 
     @staticmethod
     def nothing(seconds: float, reason: str) -> "Reconstruction":

@@ -11,8 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ground.baselines.reconstruction import Reconstruction
 from ground.cameras import exposed, sensor_of
 from ground.compare.errors import CompareError
+from ground.estimated_poses import Alignment
 from ground.scores import ScoredView, clean_scores, cloud_scores, display_scores, noisy_psnr_db
 from ground.session import FrameRecord, Session, open_session, read_header
 from ground.training_frames import split, training_frame
@@ -57,6 +59,39 @@ class Case:
     def noisy(self) -> list[Tensor]:
         """The held-out frames as received [H, W, C] in 0..1."""
         return [frame.dn / self.sensor.white_dn for frame in self.held_out]
+
+    def of_views(self, views: Sequence[int]) -> "Case":
+        """Return the case with only some of its held-out frames, by their index."""
+        held_out, radiance, coverage = (
+            [of[i] for i in views if of] for of in (self.held_out, self.radiance, self.coverage)
+        )
+        return dataclasses.replace(self, held_out=held_out, radiance=radiance, coverage=coverage)
+
+    def seen_by(self, reconstruction: Reconstruction) -> tuple["Case", dict[str, float]]:
+        """Return the case in the frame of a reconstruction, and how far off its poses are where the truth is known.
+
+        It is the case itself where the method takes the poses as they are given. Where it estimated them, the model may
+        have moved as a whole: the truth moves rigidly, so that the true poses of the training come nearest to the
+        estimated ones. Without truth each held-out frame is settled on its picture, the model fixed.
+        """
+        poses = reconstruction.poses
+        if poses is None or self.session is None:
+            return self, {}
+        calibration = poses.settled(list(self.calibration)) if self.calibration else ()
+        if self.cloud_m is None:
+            return dataclasses.replace(
+                self, held_out=poses.settled(self.held_out), calibration=calibration
+            ), {}
+        alignment = Alignment.of(poses.estimate, self.session, Truth(self.session))
+        motion = alignment.motion
+        held_out = [
+            dataclasses.replace(frame, world_to_camera=(frame.world_to_camera.double() @ motion).float())
+            for frame in self.held_out
+        ]
+        turn, shift_m = motion[:3, :3].numpy(), motion[:3, 3].numpy()
+        cloud_m = (self.cloud_m - shift_m) @ turn
+        moved = dataclasses.replace(self, held_out=held_out, cloud_m=cloud_m, calibration=calibration)
+        return moved, alignment.figures()
 
     def image_scores(self, images: Sequence[Tensor]) -> dict[str, float]:
         """Return the scores of a method's images [H, W, C] of the held-out frames: noisy, and clean where known."""

@@ -39,11 +39,12 @@ class Follower:
 
     def __init__(self, case: Case, folder: Path, stop: Path, marks: tuple[float, ...] = MARKS):
         self.points: list[dict[str, float]] = []  # share, seconds, PSNR, Chamfer distance
-        self._case, self._folder, self._stop, self._marks = case, folder, stop, marks
+        self._folder, self._stop, self._marks = folder, stop, marks
         self._psnr = "psnr_clean_db" if case.radiance else "psnr_noisy_db"
         count = len(case.held_out)
-        self._views = sorted({round(i * (count - 1) / max(1, CURVE_VIEWS - 1)) for i in range(CURVE_VIEWS)})
-        self._expected = case.clean or case.noisy
+        self._case = case.of_views(
+            sorted({round(i * (count - 1) / max(1, CURVE_VIEWS - 1)) for i in range(CURVE_VIEWS)})
+        )
         self._looked_s = self._told_s = -1e9
         self._share, self._meter, self._joules_before = 0.0, EnergyMeter(), 0.0
         kept = _read(folder / CURVE)
@@ -105,14 +106,13 @@ class Follower:
 
     def _measured(self, reconstruction: Reconstruction) -> dict[str, float]:
         figures: dict[str, float] = {}
+        case, _ = self._case.seen_by(reconstruction)
         if reconstruction.image is not None:
-            values = []
-            for i in self._views:
-                image = image_of(reconstruction, self._case.held_out[i])
-                values.append(psnr_db(image, self._expected[i]))
+            pairs = zip(case.held_out, case.clean or case.noisy, strict=True)
+            values = [psnr_db(image_of(reconstruction, frame), expected) for frame, expected in pairs]
             figures[self._psnr] = round(sum(values) / len(values), 4)
-        if self._case.cloud_m is not None and len(reconstruction.points):
-            scores = self._case.cloud_scores(reconstruction.points, torch.zeros(0, 3))
+        if case.cloud_m is not None and len(reconstruction.points):
+            scores = case.cloud_scores(reconstruction.points, torch.zeros(0, 3))
             figures["chamfer"] = round(scores["chamfer"], 5)
         return figures
 

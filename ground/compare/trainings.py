@@ -1,5 +1,6 @@
 """Trainings of Gaussians as compared methods: resumable, followed on the way, ended early where they have converged."""
 
+import dataclasses
 import functools
 import time
 from collections.abc import Callable
@@ -7,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ground.baselines.reconstruction import Reconstruction, Work
+from ground.baselines.reconstruction import EstimatedPoses, Reconstruction, Work
 from ground.compare.follow import MARKS
 from ground.intervals import interval_scores
 from ground.model_files import SURFACE_POINTS
@@ -16,7 +17,10 @@ from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.io.ply import save_ply
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.pose_corrections import with_estimate
+from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.render import render
+from obbgs_core.score.poses import settled_poses
 from obbgs_core.score.surface import surface_positions
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.config import MethodConfig
@@ -80,9 +84,10 @@ def reconstruct_gaussians(
     result = trainer.result(reason)
     if work.folder is not None:
         save_ply(result.gaussians, work.folder / MODEL, sun_dir=frames[0].sun_dir)
+    posed = _estimated(frames, result.pose_estimate)
     return Reconstruction(
         points=result.gaussians.means,
-        surface=surface_positions(result.gaussians, cameras_of(frames), SURFACE_POINTS, seed),
+        surface=surface_positions(result.gaussians, cameras_of(posed), SURFACE_POINTS, seed),
         image=imaging(result.gaussians, sensor, result.exposing),
         size_bytes=sum(4 * tensor.numel() for tensor in result.gaussians.parameters().values()),
         seconds=result.seconds,
@@ -98,10 +103,31 @@ def reconstruct_gaussians(
             "poses": result.poses,
         },
         # the images of other methods need more than a radiance and an exposure time
-        intervals=functools.partial(interval_scores, result.gaussians, frames, sensor)
+        intervals=functools.partial(interval_scores, result.gaussians, posed, sensor)
         if config.exposure_aware and not config.compensation
         else None,
+        poses=_poses(result.gaussians, sensor, result.pose_estimate),
     )
+
+
+def _estimated(frames: list[TrainingFrame], estimate: PoseEstimate | None) -> list[TrainingFrame]:
+    """Return training frames with the poses that a training found, without those that it left out."""
+    if estimate is None:
+        return frames
+    poses = dict(zip(estimate.frame_ids, torch.from_numpy(estimate.estimated).float(), strict=True))
+    return [dataclasses.replace(f, world_to_camera=poses[f.id]) for f in frames if f.id in poses]
+
+
+def _poses(gaussians: Gaussians, sensor: Sensor, estimate: PoseEstimate | None) -> EstimatedPoses | None:
+    if estimate is None:
+        return None
+
+    def settled(frames: list[TrainingFrame]) -> list[TrainingFrame]:
+        tagged = with_estimate(frames, estimate)
+        poses = settled_poses(gaussians, tagged, sensor)
+        return [dataclasses.replace(f, world_to_camera=p) for f, p in zip(frames, poses, strict=True)]
+
+    return EstimatedPoses(estimate, settled)
 
 
 def imaging(gaussians: Gaussians, sensor: Sensor, exposing: Exposing) -> Callable[[Cameras, float], Tensor]:
@@ -129,11 +155,12 @@ def _may_end(trainer: Trainer) -> bool:
 
 def _snapshot(trainer: Trainer, frames: list[TrainingFrame]) -> Reconstruction:
     """Return the training as it stands, without points on its surface, which take long."""
-    gaussians = trainer.gaussians
+    gaussians, poses = trainer.gaussians, trainer.state.poses
     return Reconstruction(
         points=gaussians.means,
         surface=torch.zeros(0, 3),
         image=imaging(gaussians, trainer.setup.sensor, trainer.exposing),
         size_bytes=0,
         seconds=trainer.state.seconds,
+        poses=_poses(gaussians, trainer.setup.sensor, poses.estimate(frames) if poses else None),
     )

@@ -76,10 +76,11 @@ def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict
             follower.settled,
         )
         outcome = wanted.run(task)
-        row |= scores(case, outcome, out / VIEWS / f"{cell.digest}.npz")
+        seen, pose_errors = case.seen_by(outcome.reconstruction)
+        row |= _rounded_all(pose_errors) | scores(seen, outcome, out / VIEWS / f"{cell.digest}.npz")
         if outcome.reconstruction.intervals is not None:
             row |= _rounded_all(
-                outcome.reconstruction.intervals(case.held_out, case.radiance, case.calibration)
+                outcome.reconstruction.intervals(seen.held_out, seen.radiance, seen.calibration)
             )
         if curve := follower.finish(outcome.reconstruction):
             row["curve"] = curve

@@ -8,11 +8,14 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from ground.formats.views import EXACT, FormatError, PoseSigmas, View, read_grey
+
+if TYPE_CHECKING:
+    import cv2
 
 MOST_PX = 1000  # larger pictures are made smaller before features are sought
 FEATURES = 1500  # of a picture, at most
@@ -172,6 +175,8 @@ def _scale(view: View) -> float:
 
 
 def _pairs(views: Sequence[View], on_view: Callable[[], None]) -> list[_Pair]:
+    import cv2  # here and below: the ground station starts without it
+
     sift = cv2.SIFT.create(nfeatures=FEATURES)
     features = []
     for view in views:
@@ -182,8 +187,10 @@ def _pairs(views: Sequence[View], on_view: Callable[[], None]) -> list[_Pair]:
     ]
 
 
-def _features(sift: cv2.SIFT, view: View) -> tuple[np.ndarray, np.ndarray | None]:
+def _features(sift: "cv2.SIFT", view: View) -> tuple[np.ndarray, np.ndarray | None]:
     """Return where a picture has features [M, 2] px, without the lens's distortion, and their descriptors."""
+    import cv2
+
     image = read_grey(view)
     # faint pictures are stretched, because features are sought above a fixed contrast
     grey = np.clip(255 / max(float(np.quantile(image, 0.999)), 1 / 255) * image, 0, 255).astype(np.uint8)
@@ -218,6 +225,8 @@ def _matched(
     views: Sequence[View], features: list[tuple[np.ndarray, np.ndarray | None]], i: int, j: int, scale: float
 ) -> _Pair | None:
     """Return what two pictures share; nothing where that is too little to compare their cameras."""
+    import cv2
+
     (at_i, of_i), (at_j, of_j) = features[i], features[j]
     if of_i is None or of_j is None or min(len(of_i), len(of_j)) < FEWEST_MATCHES:
         return None

@@ -12,7 +12,7 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -49,12 +49,15 @@ class GigeCameraServer:
     time, which runs from the mission's start in real time or `real_time` times as fast. Without a trigger the camera
     runs freely at its frame rate. LateFrameCount counts frames that were not ready in time: in free running they are
     left out, triggered ones are sent late. A picture's time stamp is the simulated time at which the shutter opened.
+    With `moments` the exposures that no client gave a time for are taken at the moment nearest to the present simulated
+    time, and after the last one the pass begins again: these pictures can be rendered beforehand.
 
     Args:
         radiance: gives the scene-linear radiance [H, W, C] for a true pose.
         pose_at: UTC ns to the true pose; by default the mission's own orbits and attitude.
         real_time: with a factor a picture that was requested with its time is sent no earlier than its exposure has
             ended on the simulated clock; 0 is lock step.
+        moments: mid-exposure times, UTC ns, in ascending order.
 
     Raises:
         CaptureError: Aravis is not installed.
@@ -69,8 +72,10 @@ class GigeCameraServer:
         seed: int = 0,
         pose_at: Callable[[int], PoseTag] | None = None,
         real_time: float = 0.0,
+        moments: Sequence[int] = (),
     ):
         self.mission, self.radiance, self.seed = mission, radiance, seed
+        self.moments = moments
         self.pose_at = pose_at or functools.partial(pose_tag, mission)
         self.clock = SimulatedClock(mission, real_time)
         self.url = f"gige://{LOOPBACK}"
@@ -154,13 +159,24 @@ class GigeCameraServer:
         elapsed_s = (time.monotonic() - self._started_s) * (self.clock.factor or 1.0)
         return self.mission.orbit.start_utc_ns + round(elapsed_s * NS)
 
+    def _moment_for(self, utc_ns: int) -> int:
+        """Return the moment of the pass, which is repeated, that is nearest to a time; without moments the time."""
+        if not self.moments:
+            return utc_ns
+        first, last = self.moments[0], self.moments[-1]
+        period_ns = last - first + max(1, round(self.mission.bracket.interval_s * NS))
+        in_pass_ns = first + (utc_ns - first) % period_ns
+        return min(self.moments, key=lambda moment: abs(moment - in_pass_ns))
+
     def _take(self, start_utc_ns: int, timed: bool) -> None:
         """Expose and let the fake camera send the picture; if its time was given (`timed`), not before that.
 
         If rendering fails, the client receives no picture.
         """
         exposure_s = self._read(EXPOSURE_US) / 1e6
-        mid_ns = start_utc_ns + round(exposure_s * NS / 2)
+        half_ns = round(exposure_s * NS / 2)
+        noise_seed = (self.seed, start_utc_ns + half_ns)  # two exposures at one moment differ in their noise
+        mid_ns = start_utc_ns + half_ns if timed else self._moment_for(start_utc_ns + half_ns)
         gain = 10 ** (self._read(GAIN_TENTH_DB) / 200)
         camera = self.mission.camera
         amplified = dataclasses.replace(
@@ -170,17 +186,16 @@ class GigeCameraServer:
         )
         try:
             radiance = self.radiance(self.pose_at(mid_ns))
-            rng = np.random.default_rng((self.seed, mid_ns))
-            dn = expose(radiance, exposure_s, amplified, rng)
+            dn = expose(radiance, exposure_s, amplified, np.random.default_rng(noise_seed))
             self._picture = self._encode(dn, camera)
         except Exception as error:  # whatever fails in rendering, later triggers must be served
             self.failures += 1
             log.warning("no picture: %r", error)
             return
         if timed:
-            self.clock.release(start_utc_ns + round(exposure_s * NS), self._stop.wait)
+            self.clock.release(mid_ns + half_ns, self._stop.wait)
             self._write(LATE_FRAMES, self.late_frames)
-        self._picture_utc_ns = start_utc_ns
+        self._picture_utc_ns = mid_ns - half_ns
         self._sent.clear()
         self._write(FAKE_TRIGGER, 1)
         if self._sent.wait(SEND_S):

@@ -2,15 +2,15 @@
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from obbgs_base.errors import Interrupted
 from obbgs_core.attitude import search
-from obbgs_core.attitude.motion import SPIN, TUMBLE, attitudes, inertia, principal
+from obbgs_core.attitude.motion import SPIN, TUMBLE, attitudes, principal
 from obbgs_core.attitude.outlines import outlines
 from obbgs_core.attitude.refine import difference_steps, refined, spread
+from obbgs_core.attitude.target_motion import TargetMotion
 from obbgs_core.attitude.views import Views, views
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame
@@ -28,81 +28,13 @@ ARCS = (
 UNRELATED = 12  # random motions whose disagreement shows what no relation looks like
 EXPLAINED = 0.15  # a motion explains the outlines when it leaves less than this share of that disagreement
 TUMBLES = 0.9  # a tumble is believed when it leaves less than this share of what a steady spin leaves
-LARGEST_SIGMA_DEG = 5.0  # of the attitude in the mean of the pass; with more it counts as not determined
+OVERDISPERSION = 2.0  # by which measured errors exceed the deviations of the refinement
+LARGEST_SIGMA_DEG = 10.0  # of the attitude in the mean of the pass; with more it counts as not determined
 POLISHING = 8  # steps
 
 
 class AttitudeUndetermined(ReconstructionError):
     """The frames do not determine the target's attitude; the message says why."""
-
-
-@dataclass(frozen=True)
-class TargetMotion:
-    """How a target rotates, in its own axes.
-
-    parameters: [3] of a steady spin or [8] of a tumble at time 0, in the inertial axes (`obbgs_core.attitude.motion`).
-    covariance: of the parameters.
-    epoch_to_body: [3, 3] rotation from the inertial axes at time 0 to the target's axes: of a spin, z is along the
-        angular velocity; of a tumble they are the principal axes by rising moment.
-    disagreement: of the outlines, as a share of what unrelated motions leave.
-    views: number of outlines that were compared.
-    """
-
-    parameters: np.ndarray
-    covariance: np.ndarray
-    epoch_to_body: np.ndarray
-    disagreement: float
-    views: int
-
-    @property
-    def tumbles(self) -> bool:
-        """Whether the angular velocity changes, as that of a torque-free body of unequal moments does."""
-        return len(self.parameters) == TUMBLE
-
-    def inertial_to_body(self, times_s: np.ndarray) -> np.ndarray:
-        """Return the attitudes [N, 3, 3] at times from the epoch."""
-        return self.epoch_to_body @ attitudes(self.parameters[None], times_s)[0]
-
-    def summary(self) -> str:
-        """Return the motion in a few words."""
-        facts = self.facts()
-        axis = ", ".join(f"{x:.3f}" for x in facts["axis_inertial"])
-        share = facts["rate_sigma_deg_s"] / facts["rate_deg_s"]
-        turning = f"{facts['kind']}, once in {facts['period_s']:.1f} s (± {share:.2%}) about ({axis})"
-        return f"{turning} ± {facts['axis_sigma_deg']:.2f} degrees, from {self.views} outlines"
-
-    def facts(self) -> dict:
-        """Return spin axis, rate and inertia ratios with standard deviations, in degrees, for a report.
-
-        The axis is that of the angular momentum, which stands still in inertial axes; of a spin it is the axis of
-        rotation. The rate is that at time 0.
-        """
-
-        def derived(parameters: np.ndarray) -> np.ndarray:
-            momentum = inertia(parameters) @ parameters[:SPIN]
-            rate = np.degrees(parameters[:SPIN])
-            ratios = principal(parameters).moments[:2] if self.tumbles else np.zeros(0)
-            return np.concatenate([momentum / np.linalg.norm(momentum), [np.linalg.norm(rate)], rate, ratios])
-
-        sigmas = np.sqrt(np.diag(self.covariance))
-        small = 1e-4 * np.maximum(sigmas, 1e-12)
-        value = derived(self.parameters)
-        J = np.stack([(derived(self.parameters + d) - value) / d.sum() for d in np.diag(small)], axis=1)
-        sigma = np.sqrt(np.diag(J @ self.covariance @ J.T))
-        return {
-            "kind": "tumble" if self.tumbles else "spin",
-            "axis_inertial": value[:3].round(6).tolist(),
-            "axis_sigma_deg": float(np.degrees(np.linalg.norm(sigma[:3]))),
-            "rate_deg_s": float(value[3]),
-            "rate_sigma_deg_s": float(sigma[3]),
-            "period_s": float(360 / value[3]),
-            "rate_inertial_deg_s": value[4:7].tolist(),
-            "rate_inertial_sigma_deg_s": sigma[4:7].tolist(),
-            "inertia_ratios": value[7:].tolist(),
-            "inertia_ratios_sigma": sigma[7:].tolist(),
-            "outlines_compared": self.views,
-            "disagreement": self.disagreement,
-        }
 
 
 def estimate_motion(
@@ -220,7 +152,7 @@ def _judged(best: list[search.Candidate], fine: Views, unrelated: float, seed: i
             f"the outlines of {len(fine)} brackets equally well. The target may be too symmetric, or seen from one "
             "side only; take brackets from more directions, or give its attitude"
         )
-    covariance = spread(fine, first.parameters, seed)
+    covariance = OVERDISPERSION**2 * spread(fine, first.parameters, seed)
     sigma_deg = float(np.degrees(_attitude_sigma_rad(first.parameters, covariance, fine.times_s)))
     if sigma_deg > LARGEST_SIGMA_DEG:
         raise AttitudeUndetermined(

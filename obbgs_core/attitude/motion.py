@@ -47,6 +47,16 @@ def principal(parameters: np.ndarray) -> Principal:
     return Principal(moments / moments[2], axes * np.sign(np.linalg.det(axes)))
 
 
+def of_principal(rate_rad_s: np.ndarray, moments: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return the parameters [8] of a rate and of principal moments [3] about axes, the columns of [3, 3], body frame.
+
+    Moments of which one exceeds the sum of the others, as no body has them, are taken for the nearest that can be.
+    """
+    mass = np.maximum(moments.sum() / 2 - moments, 1e-3 * moments.sum())
+    logarithm = axes @ np.diag(np.log(mass) - np.log(mass).mean()) @ axes.T
+    return np.concatenate([rate_rad_s, np.einsum("kij,ij->k", _SHAPES, logarithm)])
+
+
 def attitudes(parameters: np.ndarray, times_s: np.ndarray) -> np.ndarray:
     """Return the rotations from inertial to body axes [B, N, 3, 3] of motions [B, 3 or 8] at times [N] from the epoch.
 

@@ -9,7 +9,7 @@ Gaussians sets SPZ's flag `antialiased`: viewers that know it do the same, with 
 
 Rounding errors: means half of 2^-bits m with as many bits as the model's extent allows, sigmas 3 %, opacities 1/510,
 display colours 1/270. Sigmas are clamped to 45 um .. 380 m, display colours to 1.44, which is 2.2 times the white
-radiance.
+radiance, their higher harmonics to -1 .. 1.
 """
 
 import gzip

@@ -18,8 +18,9 @@ import torch
 from flightsw.icd.quaternion import quat_to_matrix
 from ground.cameras import exposed
 from ground.scores import ScoredView, clean_scores, cloud_scores
+from ground.truth import read_points
 from hil.sky.sensor import converted
-from hil.world.scenario import Scene, load_scenario
+from hil.world.scenario import Scenario, Scene, load_scenario
 from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displaced_motion
 from obbgs_core.frames import Navigation, TrainingFrame, cameras_of
 from obbgs_core.io.ply import load_ply, save_ply
@@ -32,6 +33,7 @@ from obbgs_core.sensor import Sensor
 from obbgs_core.train import train
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.presets import preset
+from obbgs_core.train.result import TrainResult
 from tests.benchmarks import targets
 from tests.benchmarks.rows import shown
 
@@ -74,10 +76,9 @@ def target_model(name: str, size_px: int, steps: int) -> Gaussians:
 
 
 def photographed(
-    model: Gaussians, cloud: np.ndarray, scenario_name: str, brackets: int, size_px: int, seed: int
+    model: Gaussians, cloud: np.ndarray, scenario: Scenario, brackets: int, size_px: int, seed: int
 ) -> Pass:
     """Return the frames of a scenario's first brackets as they are spread over its whole duration, with exact poses."""
-    scenario = load_scenario(scenario_name)
     scene, start_ns = Scene(scenario), scenario.orbit.start_utc_ns
     times_s = np.repeat(np.linspace(0, scenario.duration_s, brackets), len(EXPOSURES_S))
     times_s += np.tile(np.arange(len(EXPOSURES_S)) * FRAME_SPACING_S, brackets)
@@ -226,9 +227,19 @@ def scored(
     seen: Pass, frames: list[TrainingFrame], config: MethodConfig, seed: int
 ) -> dict[str, float | str]:
     """Return the scores of a training on all brackets but every eighth, on which it is scored."""
+    trained, _ = divided(seen)
+    return scores(seen, frames, train([frames[i] for i in trained], SENSOR, config, seed))
+
+
+def divided(seen: Pass) -> tuple[list[int], list[int]]:
+    """Return the indices of the frames for training and of those that are held out."""
     held_out = [i for i, f in enumerate(seen.frames) if (f.bracket or 0) % HELD_OUT == HELD_OUT - 1]
-    trained = [i for i in range(len(frames)) if i not in set(held_out)]
-    result = train([frames[i] for i in trained], SENSOR, config, seed)
+    return [i for i in range(len(seen.frames)) if i not in set(held_out)], held_out
+
+
+def scores(seen: Pass, frames: list[TrainingFrame], result: TrainResult) -> dict[str, float | str]:
+    """Return the scores on held-out brackets of a training on the others of `frames`."""
+    trained, held_out = divided(seen)
     true, radius_m = torch.stack([f.world_to_camera for f in seen.frames]), seen.size_m / 2
     found, tags = result.pose_estimate, [frames[i] for i in held_out]
     estimated = torch.stack([frames[i].world_to_camera for i in trained])
@@ -266,6 +277,8 @@ def scored(
 
 
 def main() -> None:
+    from tests.benchmarks import unknown_attitude  # which builds on this module
+
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -273,28 +286,50 @@ def main() -> None:
         "--quick", action="store_true", help="one seed, 100x100 pixels, 49 brackets, 600 steps"
     )
     parser.add_argument("--target", default="TDRS", choices=targets.names(), help="default: %(default)s")
+    parser.add_argument("--run", type=Path, help="a run folder whose model is the target instead")
     parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, help="default: all, one with --quick")
-    parser.add_argument("--conditions", nargs="+", choices=list(CONDITIONS), help="default: all")
+    known = [*CONDITIONS, *unknown_attitude.CONDITIONS]
+    parser.add_argument("--conditions", nargs="+", choices=known, help="default: all")
+    parser.add_argument("--seeds", nargs="+", type=int, help="default: 0 to 4, or 0 with --quick")
     parser.add_argument("--json", action="store_true", help="print rows as JSON lines")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    size_px, brackets, steps, seeds = (100, 49, 600, 1) if arguments.quick else (200, 121, 1500, 5)
-    model = target_model(arguments.target, size_px, 600)
-    cloud = targets.expose(arguments.target, size_px).cloud
+    size_px, brackets, steps, seeds = (100, 49, 600, [0]) if arguments.quick else (200, 121, 1500, range(5))
+    name, model, cloud = target(arguments.target, arguments.run, size_px)
     config = preset("obbgs", {"steps": steps, "light.max_sh_degree": 0})
-    for scenario in arguments.scenarios or SCENARIOS:
-        for seed in range(seeds):
-            seen = photographed(model, cloud, scenario, brackets, size_px, seed)
-            chosen = arguments.conditions or list(CONDITIONS)
+    conditions = arguments.conditions or known
+
+    def show(condition: str, scenario: str, seed: int, figures: dict) -> None:
+        row = {"condition": condition, "scenario": scenario, "target": name, "seed": seed}
+        print(shown(row | figures, "poses", arguments.json), flush=True)
+
+    for seed in seeds if arguments.seeds is None else arguments.seeds:
+        for scenario in arguments.scenarios or SCENARIOS:
+            chosen = [condition for condition in CONDITIONS if condition in conditions]
             if arguments.quick and not arguments.conditions and scenario != SCENARIOS[0]:
-                chosen = ["exact", "correlated_1"]
+                chosen = ["correlated_1"]
+            if not chosen:
+                continue
+            seen = photographed(model, cloud, load_scenario(scenario), brackets, size_px, seed)
             exact_db = float("nan")
-            for name in dict.fromkeys(["exact", *chosen]):
-                figures = scored(seen, CONDITIONS[name](seen, seed), config, seed)
-                if name == "exact":
+            for condition in dict.fromkeys(["exact", *chosen]):
+                figures = scored(seen, CONDITIONS[condition](seen, seed), config, seed)
+                if condition == "exact":
                     exact_db = figures["psnr_clean_db"]
-                row = {"condition": name, "scenario": scenario, "target": arguments.target, "seed": seed}
-                print(shown(row | figures | {"psnr_exact_db": exact_db}, "poses", arguments.json), flush=True)
+                show(condition, scenario, seed, figures | {"psnr_exact_db": exact_db})
+        for condition in (c for c in unknown_attitude.CONDITIONS if c in conditions):
+            figures = unknown_attitude.row(condition, model, cloud, size_px, config, seed)
+            show(condition, "tumbling", seed, figures)
+
+
+def target(name: str, run: Path | None, size_px: int) -> tuple[str, Gaussians, np.ndarray]:
+    """Return name, model and surface points of the target, largest dimension 2 m: a rendered one, or a run's model."""
+    if run is None:
+        return name, target_model(name, size_px, 600), targets.expose(name, size_px).cloud
+    cloud, model = read_points(run / "surface.ply"), load_ply(run / "model.ply")
+    scale = targets.LARGEST_DIMENSION / np.ptp(cloud, axis=0).max()
+    model = dataclasses.replace(model, means=model.means * scale, log_scales=model.log_scales + np.log(scale))
+    return run.name, model, cloud * scale
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ def run(*arguments: str, tool: str = "flightsw") -> subprocess.CompletedProcess:
 
 @pytest.mark.parametrize(
     ("tool", "command"),
-    [("flightsw", c) for c in ("capture", "serve", "downlink", "triage", "plan", "fsck")]
+    [("flightsw", c) for c in ("capture", "serve", "downlink", "triage", "plan", "fsck", "selftest")]
     + [("ground", c) for c in ("listen", "key", "uplink", "reconstruct", "evaluate", "report")]
     + [("hil", c) for c in ("demo", "camera", "link", "target")],
 )

@@ -9,12 +9,18 @@ import pytest
 import torch
 
 from flightsw.icd.quaternion import quat_to_matrix
+from ground.baselines.reconstruction import EstimatedPoses, Reconstruction
+from ground.compare.case import load_case
 from ground.estimated_poses import FILE, Alignment, estimated_records, read_estimate, write_estimate
 from ground.session import SessionError, open_session
 from ground.truth import Truth
 from obbgs_base.navigation_errors import SharedParameters
+from obbgs_core.frames import cameras_of
 from obbgs_core.model.motions import rigid_motions
 from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.render import render
+from obbgs_core.score.poses import moved
+from tests.scenes import random_gaussians
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
 MOTION = rigid_motions(torch.tensor([[0.02, -0.03, 0.01, 0.2, -0.1, 0.3]]).double())[0]
@@ -81,3 +87,27 @@ def test_surfaces_are_seen_from_the_poses_that_were_found_and_frames_left_out_ar
         np.testing.assert_array_equal(record.world_to_camera, pose)
         np.testing.assert_allclose(pose[:3, :3] @ record.position_body_m + pose[:3, 3], 0, atol=1e-6)
         np.testing.assert_allclose(quat_to_matrix(record.quat_body_to_camera), pose[:3, :3], atol=1e-6)
+
+
+def test_a_comparison_sees_a_model_from_where_its_estimated_poses_put_it(estimate):
+    """Truth that moves with the model gives the same pictures and distances as a model that had stayed."""
+    case = load_case(GOLDEN)
+    model, asked = random_gaussians(20), []
+
+    def settled(frames):
+        asked.append(frames)
+        return frames[:1]
+
+    as_given, nothing = Reconstruction.nothing(0.0, ""), torch.zeros(0, 3)
+    assert case.seen_by(as_given) == (case, {})
+    estimated = Reconstruction(nothing, nothing, None, 0, 0.0, poses=EstimatedPoses(estimate, settled))
+    seen, figures = case.seen_by(estimated)
+    assert figures["pose_error_deg"] < 1e-4 < 1 < figures["pose_error_tagged_deg"] and not asked
+    for given, there in zip(case.held_out, seen.held_out, strict=True):
+        expected = render(moved(model, MOTION), cameras_of([given])).radiance
+        torch.testing.assert_close(render(model, cameras_of([there])).radiance, expected, rtol=0, atol=1e-3)
+    still = torch.from_numpy(case.cloud_m)
+    back = (still - MOTION[:3, 3]) @ MOTION[:3, :3]
+    assert case.cloud_scores(back, back)["chamfer"] > 0.01 > 1e-6 > seen.cloud_scores(back, back)["chamfer"]
+    unknown = dataclasses.replace(case, radiance=[], coverage=[], cloud_m=None)
+    assert unknown.seen_by(estimated)[0].held_out == case.held_out[:1] and asked[-1] == case.held_out

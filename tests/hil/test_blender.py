@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import binary_dilation, binary_erosion, map_coordinates
 
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, load_mission
@@ -18,6 +18,7 @@ from hil.sky import SHIPPED
 from hil.sky.blender import MeshError, Worker
 from hil.sky.motion import image_velocity
 from hil.sky.render_farm import RenderFarm
+from tests.raycast import Box, cast
 
 ROOT = Path(__file__).parents[2]
 MODELS = ROOT.parent / "shared" / "models"
@@ -193,6 +194,45 @@ def test_the_image_velocity_carries_a_picture_to_where_a_later_render_sees_it(tm
     # what remains at scale 1 is the shading, which changes as the target turns, and the renderer's noise
     assert error(1.0) < 0.65 * error(0.0)
     assert error(1.0) < min(error(0.5), error(1.5), error(-1.0))
+
+
+def test_only_the_target_s_part_of_the_picture_is_rendered_and_nothing_of_it_is_missing(tmp_path):
+    """Compared with rays cast by another program: in the middle, over each corner, out of view, around the camera."""
+    half_m = np.array([3.0, 0.8, 1.2])  # a box of 6 m in the origin stays where it is
+    trimesh.creation.box(extents=2 * half_m).export(tmp_path / "box.stl")
+    box = Box(np.zeros(3), half_m, np.eye(3), seed=0)
+    far, beside = (
+        (25.0, 18.0, 30.0),
+        (1.0, 0.1, 1.6),
+    )  # seen from beside, one end of the box lies behind the camera
+    worker = Worker(tmp_path / "box.stl", samples=4, ambient=1.0)
+    covered = []
+    try:
+        for position, focal_px, centre_px in (
+            (far, 300.0, 36.5),
+            (far, 300.0, 2.0),
+            (far, 300.0, 70.0),
+            (far, 300.0, -400.0),
+            (beside, 20.0, 36.5),
+        ):
+            mission, pose = camera_mission(73, focal_px, centre_px), pose_at(position)
+            depth = render(worker, mission, pose, tmp_path / "d.npz", op="geometry")["depth"]
+            _, expected = cast([box], pose.world_to_camera, np.array(mission.camera.K), 73)
+            seen = expected > 0
+            both = seen & np.isfinite(depth)
+            np.testing.assert_allclose(
+                depth[both], expected[both], rtol=1e-3
+            )  # up to 0.005 px aside, on slanting faces
+            assert (np.isfinite(depth) != seen).sum() <= 2  # where a ray meets an edge
+            picture = render(worker, mission, pose, tmp_path / "r.npz")
+            # a filtered pixel reaches less than one pixel over the outline
+            assert (picture["alpha"][binary_erosion(seen, iterations=2, border_value=1)] == 255).all()
+            outside = np.logical_not(binary_dilation(seen, iterations=2))
+            assert not picture["alpha"][outside].any() and not picture["radiance"][outside].any()
+            covered.append(seen.sum())
+    finally:
+        worker.close()
+    assert covered[3] == 0 and min(covered[:3]) > 100 and 1000 < covered[4] < 73 * 73
 
 
 def test_rendering_is_cached_and_the_same_again(tmp_path):

@@ -1,6 +1,7 @@
 """Pose corrections held by the whole covariance of the tags: what is corrected, how, and what never is."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -260,7 +261,7 @@ def test_settling_the_gauge_changes_no_image_however_much_is_exact(frames, covar
 
 
 def test_the_gauge_is_settled_by_the_whole_covariance(frames):
-    """Of all twins none has smaller corrections: a little more of any motion of the body makes them larger."""
+    """Of all twins none has smaller corrections: moving or growing the body a little more makes them larger."""
     doubted = tagged(frames, random_covariance(4) / 9)
     poses = PoseCorrections(doubted)
     with torch.no_grad():
@@ -269,12 +270,30 @@ def test_the_gauge_is_settled_by_the_whole_covariance(frames):
     settled_at = motions(poses).double()
     least = _prior(poses, settled_at)
     tags = torch.stack([f.world_to_camera for f in doubted]).double()
-    for k in range(6):
+    for k in range(7):
         for sign in (-1, 1):
-            body = rigid_motions(sign * 1e-4 * torch.eye(6).double()[k][None])[0]
-            moved = rigid_motions(settled_at) @ tags @ torch.linalg.inv(body) @ torch.linalg.inv(tags)
+            body = rigid_motions(sign * 1e-4 * torch.eye(7).double()[k, :6][None])[0]
+            farther = rigid_motions(settled_at) @ tags
+            farther[:, :3, 3] *= 1 + sign * 1e-4 * (k == 6)
+            moved = farther @ torch.linalg.inv(body) @ torch.linalg.inv(tags)
             turns = torch.from_numpy(Rotation.from_matrix(moved[:, :3, :3].numpy()).as_rotvec())
             assert _prior(poses, torch.cat([turns, moved[:, :3, 3]], dim=1)) > least
+
+
+def test_a_range_that_no_picture_shows_returns_to_the_tags(frames):
+    """A model that is larger, and farther away by as much, gives the same pictures: the tags alone say its size."""
+    doubted = tagged(frames, torch.diag(torch.tensor([1e-3] * 3 + [0.05] * 3).double() ** 2))
+    poses, gaussians = PoseCorrections(doubted), model()
+    farther = torch.stack([f.world_to_camera for f in doubted]).double()[:, :3, 3]
+    with torch.no_grad():  # all brackets 1 % farther away, and none of it elsewhere
+        poses.value[:, 3:] = (0.01 / 0.05 * farther).float()
+    grown = dataclasses.replace(
+        gaussians, means=1.01 * gaussians.means, log_scales=gaussians.log_scales + math.log(1.01)
+    )
+    found = poses.fix_gauge(grown, doubted)
+    assert float(poses.value.abs().max()) < 1e-3  # deviations; before: 0.4 and more
+    torch.testing.assert_close(found.means, gaussians.means, atol=1e-4, rtol=0)
+    torch.testing.assert_close(found.log_scales, gaussians.log_scales, atol=1e-4, rtol=0)
 
 
 def _prior(poses: PoseCorrections, motions: Tensor) -> float:

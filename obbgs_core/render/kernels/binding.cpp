@@ -43,7 +43,9 @@ std::vector<Kernel> available_kernels() {  // best first
   if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq") &&
       __builtin_cpu_supports("avx512bw"))
     kernels.push_back(OBBGS_KERNEL(avx512));
-  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) kernels.push_back(OBBGS_KERNEL(avx2));
+  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
+      __builtin_cpu_supports("bmi2"))
+    kernels.push_back(OBBGS_KERNEL(avx2));
 #endif
   kernels.push_back(OBBGS_KERNEL(portable));
   return kernels;

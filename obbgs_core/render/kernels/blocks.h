@@ -1,9 +1,8 @@
-// What compositing and its gradient share: tiles, and what one splat does to one 4x4 block of pixels.
+// What compositing and its gradient share: tiles, and what one splat does to one block of pixels.
 // Included once for each instruction set, by composite.cpp and composite_backward.cpp.
 #pragma once
-#include "rasterizer.h"
-#include "simd.h"
 #include "threads.h"
+#include "tiles.h"
 
 namespace obbgs {
 namespace KERNEL {
@@ -16,12 +15,12 @@ struct Tile {
   int camera, x0, y0, width, height;  // pixels inside the image
 
   Tile(const Scene& s, int index) {
-    const int tiles_x = s.tiles_x(), of_camera = index % (tiles_x * s.tiles_y());
-    camera = index / (tiles_x * s.tiles_y());
-    x0 = of_camera % tiles_x * kTile;
-    y0 = of_camera / tiles_x * kTile;
-    width = s.width - x0 < kTile ? s.width - x0 : kTile;
-    height = s.height - y0 < kTile ? s.height - y0 : kTile;
+    const int across = tiles_x(s), of_camera = index % (across * tiles_y(s));
+    camera = index / (across * tiles_y(s));
+    x0 = of_camera % across * kTileWidth;
+    y0 = of_camera / across * kTileHeight;
+    width = s.width - x0 < kTileWidth ? s.width - x0 : kTileWidth;
+    height = s.height - y0 < kTileHeight ? s.height - y0 : kTileHeight;
   }
 
   // Calls visit(x, y, pixel, block, lane) for every pixel.
@@ -30,7 +29,8 @@ struct Tile {
     for (int y = 0; y < height; ++y) {
       const size_t row = (size_t(camera) * s.height + y0 + y) * s.width + x0;
       for (int x = 0; x < width; ++x)
-        visit(x0 + x, y0 + y, row + x, (y / kBlock) * 8 + x / kBlock, (y % kBlock) * kBlock + x % kBlock);
+        visit(x0 + x, y0 + y, row + x, (y / kBlockHeight) * 8 + x / kBlockWidth,
+              (y % kBlockHeight) * kBlockWidth + x % kBlockWidth);
     }
   }
 };
@@ -41,14 +41,14 @@ struct Grid {
   float block_x[kBlocks], block_y[kBlocks];
   Grid() {
     for (int l = 0; l < kLanes; ++l) {
-      const int column = l % kBlock, row = l / kBlock;
+      const int column = l % kBlockWidth, row = l / kBlockWidth;
       lane_x[l] = float(column) + 0.5f;
       lane_y[l] = float(row) + 0.5f;
     }
     for (int k = 0; k < kBlocks; ++k) {
       const int column = k % 8, row = k / 8;
-      block_x[k] = float(column * kBlock);
-      block_y[k] = float(row * kBlock);
+      block_x[k] = float(column * kBlockWidth);
+      block_y[k] = float(row * kBlockHeight);
     }
   }
 };
@@ -56,8 +56,9 @@ struct Grid {
 // What of a splat is constant over the blocks of a tile; u0 and v0 belong to the block at the tile's corner.
 struct Brush {
   vf k1, k2, k3, level, cutoff, u0, v0;
+  bool clamped;  // its alpha may reach the largest
   OBBGS_INLINE Brush(const Splat& s, const Tile& tile, const Grid& grid)
-      : k1(s.k1), k2(s.k2), k3(s.k3), level(s.level), cutoff(s.cutoff) {
+      : k1(s.k1), k2(s.k2), k3(s.k3), level(s.level), cutoff(s.cutoff), clamped(kLog2ClampedAlpha < s.level) {
     const float x = s.x - float(tile.x0), y = s.y - float(tile.y0);
     u0 = fma(k1, grid.lane_x - x, k2 * (grid.lane_y - y));
     v0 = k3 * (grid.lane_y - y);
@@ -75,7 +76,8 @@ OBBGS_INLINE Touch touch(const Brush& b, const Grid& grid, int k, vf T) {
   const vf v = fma(b.k3, grid.block_y[k], b.v0);
   const vf alpha = exp2_unbounded(minus_fma(u, u, minus_fma(v, v, b.level)));
   mask on = (b.cutoff <= alpha) & (vf(0.0f) < T);
-  vf weight = zero_unless(on, smaller(alpha, kMaxAlpha) * T), after = T - weight;
+  const vf share = b.clamped ? smaller(alpha, kMaxAlpha) : alpha;
+  vf weight = zero_unless(on, share * T), after = T - weight;
   const mask stop = on & (after < vf(kMinTransmittance));
   if (__builtin_expect(any(stop), 0)) {  // these pixels end here, before this splat
     on = and_not(on, stop);
@@ -86,16 +88,16 @@ OBBGS_INLINE Touch touch(const Brush& b, const Grid& grid, int k, vf T) {
 }
 
 // Calls work<channels, features>(..., tile) for every tile of the scene.
-#define OBBGS_FOR_TILES(scene, count, work, threads, ...)                                 \
-  const auto run = [&](auto tile_work) {                                                  \
-    parallel_for(scene.tiles(), worthwhile(threads, frame.pairs.size(), kPairsPerThread), \
-                 [&](int tile) { tile_work(__VA_ARGS__, tile); });                        \
-  };                                                                                      \
-  switch (10 * scene.channels + count) {                                                  \
-    case 11: run(work<1, 1>); break;                                                      \
-    case 12: run(work<1, 2>); break;                                                      \
-    case 33: run(work<3, 3>); break;                                                      \
-    default: run(work<3, 4>); break;                                                      \
+#define OBBGS_FOR_TILES(scene, count, work, threads, ...)                                \
+  const auto run = [&](auto tile_work) {                                                 \
+    parallel_for(tiles(scene), worthwhile(threads, frame.pairs.size(), kPairsPerThread), \
+                 [&](int tile) { tile_work(__VA_ARGS__, tile); });                       \
+  };                                                                                     \
+  switch (10 * scene.channels + count) {                                                 \
+    case 11: run(work<1, 1>); break;                                                     \
+    case 12: run(work<1, 2>); break;                                                     \
+    case 33: run(work<3, 3>); break;                                                     \
+    default: run(work<3, 4>); break;                                                     \
   }
 
 }  // namespace

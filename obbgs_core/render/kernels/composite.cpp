@@ -1,4 +1,4 @@
-// Front-to-back compositing of binned splats, one 4x4 block a vector.
+// Front-to-back compositing of binned splats, one block of pixels a vector.
 #include "blocks.h"
 
 namespace obbgs {
@@ -41,7 +41,7 @@ void composite_tile(const Scene& s, Frame& frame, const Images& out, const Grid&
       for (int f = 0; f < F; ++f) light[k][f] = multiply_add(t.weight, feature[f], light[k][f]);
       median[k] = select((t.after <= vf(0.5f)) & (vf(0.5f) < T[k]), depth, median[k]);
       T[k] = t.after;
-      if (!any(vf(0.0f) < t.after)) open &= ~(1ull << k);
+      if (all_negative(t.after)) open &= ~(1ull << k);
     }
     pair.blocks = lit;
   }

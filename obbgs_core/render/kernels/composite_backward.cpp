@@ -1,32 +1,9 @@
-// The gradient of compositing, front to back like compositing itself, one 4x4 block a vector.
+// The gradient of compositing, front to back like compositing itself, one block of pixels a vector.
 #include "blocks.h"
 
 namespace obbgs {
 namespace KERNEL {
 namespace {
-
-// record[slot(i)] = the sum of all lanes of sums[i].
-template <int N>
-OBBGS_INLINE void store_sums(const vf (&sums)[N], float* record) {
-#if defined(__AVX512F__)
-  // Adds while transposing: sixteen vectors in four rounds.
-  __m512 v[16], half[8], quarter[4];
-  for (int i = 0; i < 16; ++i) v[i] = i < N ? sums[i].part[0] : _mm512_setzero_ps();
-  for (int i = 0; i < 8; ++i)
-    half[i] = _mm512_add_ps(_mm512_shuffle_f32x4(v[2 * i], v[2 * i + 1], 0x44),
-                            _mm512_shuffle_f32x4(v[2 * i], v[2 * i + 1], 0xEE));
-  for (int i = 0; i < 4; ++i)
-    quarter[i] = _mm512_add_ps(_mm512_shuffle_f32x4(half[2 * i], half[2 * i + 1], 0x88),
-                               _mm512_shuffle_f32x4(half[2 * i], half[2 * i + 1], 0xDD));
-  const auto add = [](__m512 a, __m512 b) { return _mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b)); };
-  const __m512d low = _mm512_castps_pd(add(quarter[0], quarter[1])),
-                high = _mm512_castps_pd(add(quarter[2], quarter[3]));
-  _mm512_store_ps(record, _mm512_add_ps(_mm512_castpd_ps(_mm512_unpacklo_pd(low, high)),
-                                        _mm512_castpd_ps(_mm512_unpackhi_pd(low, high))));
-#else
-  for (int i = 0; i < N; ++i) record[slot(i)] = sum(sums[i]);
-#endif
-}
 
 // The state of a tile's pixels, by block, while its splats are taken front to back.
 template <int F>
@@ -89,7 +66,6 @@ void composite_backward_tile(const Scene& s, const Frame& frame, const Images& o
     vf feature[F], sums[kFirstFeature + F];
     for (int f = 0; f < F; ++f) feature[f] = splat.feature[f];
     for (vf& total : sums) total = 0.0f;
-    int touched = 0;
     for (uint64_t left = pair.blocks; left; left &= left - 1) {
       const int k = __builtin_ctzll(left);
       const Touch t = touch(brush, grid, k, T[k]);
@@ -98,7 +74,8 @@ void composite_backward_tile(const Scene& s, const Frame& frame, const Images& o
       const vf share = t.weight * dot;
       behind[k] = behind[k] - share;
       // d loss / d alpha * alpha; where alpha is clamped, the Gaussian's shape has no gradient
-      const vf slope = zero_unless(t.alpha < vf(kMaxAlpha), share - behind[k] * (t.weight * reciprocal(t.after)));
+      vf slope = share - behind[k] * (t.weight * reciprocal(t.after));
+      if (brush.clamped) slope = zero_unless(t.alpha < vf(kMaxAlpha), slope);
       const vf slope_u = slope * t.u, slope_v = slope * t.v;
       sums[kG] = sums[kG] + slope;
       sums[kGU] = sums[kGU] + slope_u;
@@ -107,11 +84,10 @@ void composite_backward_tile(const Scene& s, const Frame& frame, const Images& o
       sums[kGUV] = multiply_add(slope_u, t.v, sums[kGUV]);
       sums[kGVV] = multiply_add(slope_v, t.v, sums[kGVV]);
       for (int f = 0; f < F; ++f) sums[kFirstFeature + f] = multiply_add(grad[k][f], t.weight, sums[kFirstFeature + f]);
-      touched += count(t.on);
+      sums[kPixels] = sums[kPixels] + zero_unless(t.on, 1.0f);
       T[k] = t.after;
     }
-    store_sums(sums, record);
-    record[kPixels] = float(touched);
+    add_lanes(sums, record);
   }
 }
 

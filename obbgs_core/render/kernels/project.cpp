@@ -1,4 +1,4 @@
-// Gaussians to splats: projection, opacity and radiance of sixteen Gaussians at a time.
+// Gaussians to splats: projection, opacity and radiance of a vector of Gaussians at a time.
 #include <vector>
 
 #include "projection.h"

@@ -1,5 +1,5 @@
 // The gradient of the projection, from the sums that compositing left for each splat to the model and the poses;
-// sixteen Gaussians at a time. d_x stands for the derivative of the loss by x.
+// a vector of Gaussians at a time. d_x stands for the derivative of the loss by x.
 #include <vector>
 
 #include "projection.h"
@@ -27,8 +27,8 @@ struct SplatSums {
         const float* record = records + size_t(splats[l].first_record + r) * kRecord;
         for (int i = 0; i < kRecord; ++i) total[l][i] += record[i];
       }
-      pixels[l] = total[l][kPixels];
-      if (total[l][kPixels] > 0) {
+      pixels[l] = total[l][slot(kPixels)];
+      if (total[l][slot(kPixels)] > 0) {
         k[0][l] = splats[l].k1;
         k[1][l] = splats[l].k2;
         k[2][l] = splats[l].k3;

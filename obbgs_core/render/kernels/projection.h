@@ -1,4 +1,4 @@
-// Sixteen Gaussians at a time: their parameters, and their affine (EWA) projection into one camera.
+// A vector of Gaussians at a time: their parameters, and their affine (EWA) projection into one camera.
 // Included once for each instruction set, by project.cpp and project_backward.cpp.
 #pragma once
 #include <algorithm>
@@ -19,7 +19,7 @@ constexpr float kMinNorm = 1e-12f;
 inline mask finite(vf x) { return absolute(x) <= vf(FLT_MAX); }
 inline vf dot(const vf* a, const vf* b) { return fma(a[2], b[2], fma(a[1], b[1], a[0] * b[0])); }
 
-// Sixteen Gaussians from `first` on; beyond the end the last one is repeated.
+// As many Gaussians as a vector has lanes, from `first` on; beyond the end the last one is repeated.
 struct Group {
   int first, size, index[kLanes];
 

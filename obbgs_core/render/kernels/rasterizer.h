@@ -1,4 +1,4 @@
-// The CPU rasterizer: projection (project.cpp), which 4x4 pixel blocks each Gaussian touches (bins.cpp), compositing
+// The CPU rasterizer: projection (project.cpp), which blocks of pixels each Gaussian touches (bins.cpp), compositing
 // over them (composite.cpp), and the gradient (composite_backward.cpp, project_backward.cpp). These are compiled once
 // for each instruction set; binding.cpp picks one at run time.
 #pragma once
@@ -8,13 +8,11 @@
 
 namespace obbgs {
 
-constexpr int kBlock = 4;  // pixels along a block's side: one 16-lane vector a block
-constexpr int kTile = 32;  // pixels along a tile's side: 8x8 blocks, one 64-bit mask
-
 // Python has the same numbers; binding.cpp shows these to the test that compares them. Source: Kerbl et al. 2023.
 constexpr float kMinAlpha = 1.0f / 255;        // fainter contributions are skipped; lowered with a peak
 constexpr float kLog2MinAlpha = -7.99435344f;  // log2(kMinAlpha)
 constexpr float kMaxAlpha = 0.99f;
+constexpr float kLog2ClampedAlpha = -0.015f;  // below log2(kMaxAlpha): a level up to this is never clamped
 constexpr float kMinTransmittance = 1e-4f;    // a pixel is finished before its transmittance would fall below
 constexpr float kMinPeakShare = 1.0f / 4096;  // a Gaussian whose peak falls to less of its opacity is not drawn
 constexpr float kMinDepthAlpha = 1e-6f;       // the depth is 0 where alpha is not above this
@@ -35,10 +33,6 @@ struct Scene {
   float ambient;        // added to the Sun's light on every side
   const float* footprint_px2;  // [cameras] variance of what a pixel averages over, added to the 2D covariance
   bool peak_lowered;           // so that the added variance leaves a Gaussian's light as it is
-
-  int tiles_x() const { return (width + kTile - 1) / kTile; }
-  int tiles_y() const { return (height + kTile - 1) / kTile; }
-  int tiles() const { return cameras * tiles_x() * tiles_y(); }  // a camera's tiles follow the previous camera's
 };
 
 // One Gaussian in one camera. At offset d px from (x, y): alpha = 2^(level - u^2 - v^2), u = k1 dx + k2 dy, v = k3 dy,
@@ -115,12 +109,10 @@ struct SceneGradients {
   float *means2d, *pixels;  // [cameras, gaussians, 2] loss per px, [cameras, gaussians] pixels touched
 };
 
-// Sums over one splat's pixels in one tile of g = dL/dalpha * alpha and of its features' gradients. `slot` is where the
-// i-th sum lies: the order that falls out of adding up sixteen vectors at once.
-enum Sum { kG, kGU, kGV, kGUU, kGUV, kGVV, kFirstFeature };
-constexpr int slot(int sum) { return 4 * (sum % 4) + sum / 4; }
-constexpr int kPixels = 15;
-static_assert(kFirstFeature + kMaxFeatures < kRecord, "the last slot holds the pixel count");
+// Sums over one splat's pixels in one tile: g = dL/dalpha * alpha, their number, its features' gradients; `slot` in
+// simd.h is where in the record each lies.
+enum Sum { kG, kGU, kGV, kGUU, kGUV, kGVV, kPixels, kFirstFeature };
+static_assert(kFirstFeature + kMaxFeatures <= kRecord, "every sum has its place");
 
 #define OBBGS_DECLARE_KERNEL(name)                                                                             \
   namespace name {                                                                                             \

@@ -1,4 +1,4 @@
-// The radiance of sixteen Gaussians towards a camera, as in lighting.py and sh.py.
+// The radiance of a vector of Gaussians towards a camera, as in lighting.py and sh.py.
 // Included once for each instruction set, by project.cpp and project_backward.cpp.
 #pragma once
 #include "projection.h"

@@ -1,6 +1,7 @@
-// Sixteen float lanes in every instruction set: one 4x4 pixel block, or sixteen Gaussians.
+// Vectors of eight or sixteen floats: one block of pixels, or as many Gaussians.
 // Included once for each instruction set; KERNEL names the namespace. Built without contraction of a*b+c: `fma` rounds
-// once everywhere, so that every instruction set takes the same decisions at the cutoffs.
+// once everywhere. Instruction sets with blocks of one shape take the same decisions at the cutoffs; where blocks have
+// another shape, a pixel's place in its block rounds otherwise in the last bit.
 #pragma once
 #include <cstdint>
 #include <cstring>
@@ -13,13 +14,12 @@
 namespace obbgs {
 namespace KERNEL {
 
-constexpr int kLanes = 16;
 #if defined(__AVX512F__)
-constexpr int kWidth = 16;  // lanes of one register
+constexpr int kLanes = 16, kWidth = 16;  // of a vector, and of one register
 #elif defined(__AVX2__)
-constexpr int kWidth = 8;
+constexpr int kLanes = 8, kWidth = 8;
 #else
-constexpr int kWidth = 4;
+constexpr int kLanes = 16, kWidth = 4;
 #endif
 constexpr int kParts = kLanes / kWidth;
 
@@ -147,7 +147,7 @@ OBBGS_INLINE mask operator<=(vf a, vf b) { return {_mm512_cmp_ps_mask(a.part[0],
 OBBGS_INLINE mask operator&(mask a, mask b) { return {__mmask16(a.bits & b.bits)}; }
 OBBGS_INLINE mask and_not(mask a, mask b) { return {__mmask16(a.bits & ~b.bits)}; }
 OBBGS_INLINE bool any(mask m) { return m.bits; }
-OBBGS_INLINE int count(mask m) { return __builtin_popcount(m.bits); }
+OBBGS_INLINE bool all_negative(vf a) { return _mm512_cmp_ps_mask(a.part[0], _mm512_setzero_ps(), _CMP_NLT_UQ) == 0; }
 OBBGS_INLINE vf select(mask m, vf a, vf b) {
   a.part[0] = _mm512_mask_blend_ps(m.bits, b.part[0], a.part[0]);
   return a;
@@ -175,21 +175,12 @@ OBBGS_INLINE mask and_not(mask a, mask b) {
   return a;
 }
 OBBGS_INLINE vf select(mask m, vf a, vf b) {
-  for (int p = 0; p < kParts; ++p) a.part[p] = m.part[p] ? a.part[p] : b.part[p];
-  return a;
-}
-OBBGS_INLINE int lanes_of(mask m) {  // one bit a lane
-  int bits = 0;
-  for (int p = 0; p < kParts; ++p) {
 #if defined(__AVX2__)
-    bits |= _mm256_movemask_ps(reinterpret_cast<__m256>(m.part[p])) << (8 * p);
-#elif defined(__SSE2__)
-    bits |= _mm_movemask_ps(reinterpret_cast<__m128>(m.part[p])) << (4 * p);
+  a.part[0] = _mm256_blendv_ps(b.part[0], a.part[0], reinterpret_cast<__m256>(m.part[0]));
 #else
-    for (int l = 0; l < kWidth; ++l) bits |= (m.part[p][l] & 1) << (kWidth * p + l);
+  for (int p = 0; p < kParts; ++p) a.part[p] = m.part[p] ? a.part[p] : b.part[p];
 #endif
-  }
-  return bits;
+  return a;
 }
 OBBGS_INLINE bool any(mask m) {
   IntPart all = m.part[0];
@@ -204,7 +195,13 @@ OBBGS_INLINE bool any(mask m) {
 #endif
   return merged;
 }
-OBBGS_INLINE int count(mask m) { return __builtin_popcount(lanes_of(m)); }
+OBBGS_INLINE bool all_negative(vf a) {
+#if defined(__AVX2__)
+  return _mm256_movemask_ps(a.part[0]) == 0xFF;
+#else
+  return !any(vf(0.0f) <= a);
+#endif
+}
 #endif
 
 OBBGS_INLINE vf zero_unless(mask m, vf a) { return select(m, a, vf(0.0f)); }
@@ -215,6 +212,15 @@ OBBGS_INLINE vf smaller(vf a, vf b) {  // a where either is not a number
 }
 OBBGS_INLINE vf larger(vf a, vf b) {
   a.part[0] = _mm512_max_ps(b.part[0], a.part[0]);
+  return a;
+}
+#elif defined(__AVX2__)
+OBBGS_INLINE vf smaller(vf a, vf b) {
+  a.part[0] = _mm256_min_ps(b.part[0], a.part[0]);
+  return a;
+}
+OBBGS_INLINE vf larger(vf a, vf b) {
+  a.part[0] = _mm256_max_ps(b.part[0], a.part[0]);
   return a;
 }
 #else
@@ -256,6 +262,45 @@ OBBGS_INLINE float sum(vf v) {
     for (int l = 0; l < half; ++l) lane[l] += lane[l + half];
   return lane[0];
 }
+
+// record[slot(i)] = the sum of all lanes of sums[i], for up to sixteen vectors: where the order falls out of adding up
+// many at once, it is as it falls.
+#if defined(__AVX512F__)
+constexpr int slot(int sum) { return 4 * (sum % 4) + sum / 4; }
+template <int N>
+OBBGS_INLINE void add_lanes(const vf (&sums)[N], float* record) {  // adds while transposing: four rounds
+  __m512 v[16], half[8], quarter[4];
+  for (int i = 0; i < 16; ++i) v[i] = i < N ? sums[i].part[0] : _mm512_setzero_ps();
+  for (int i = 0; i < 8; ++i)
+    half[i] = _mm512_add_ps(_mm512_shuffle_f32x4(v[2 * i], v[2 * i + 1], 0x44),
+                            _mm512_shuffle_f32x4(v[2 * i], v[2 * i + 1], 0xEE));
+  for (int i = 0; i < 4; ++i)
+    quarter[i] = _mm512_add_ps(_mm512_shuffle_f32x4(half[2 * i], half[2 * i + 1], 0x88),
+                               _mm512_shuffle_f32x4(half[2 * i], half[2 * i + 1], 0xDD));
+  const auto add = [](__m512 a, __m512 b) { return _mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b)); };
+  const __m512d low = _mm512_castps_pd(add(quarter[0], quarter[1])),
+                high = _mm512_castps_pd(add(quarter[2], quarter[3]));
+  _mm512_store_ps(record, _mm512_add_ps(_mm512_castpd_ps(_mm512_unpacklo_pd(low, high)),
+                                        _mm512_castpd_ps(_mm512_unpackhi_pd(low, high))));
+}
+#else
+constexpr int slot(int sum) { return sum; }
+template <int N>
+OBBGS_INLINE void add_lanes(const vf (&sums)[N], float* record) {
+#if defined(__AVX2__)
+  for (int first = 0; first < N; first += 8) {
+    __m256 v[8];
+    for (int i = 0; i < 8; ++i) v[i] = first + i < N ? sums[first + i].part[0] : _mm256_setzero_ps();
+    const __m256 low = _mm256_hadd_ps(_mm256_hadd_ps(v[0], v[1]), _mm256_hadd_ps(v[2], v[3])),
+                 high = _mm256_hadd_ps(_mm256_hadd_ps(v[4], v[5]), _mm256_hadd_ps(v[6], v[7]));
+    _mm256_store_ps(record + first,
+                    _mm256_add_ps(_mm256_permute2f128_ps(low, high, 0x20), _mm256_permute2f128_ps(low, high, 0x31)));
+  }
+#else
+  for (int i = 0; i < N; ++i) record[i] = sum(sums[i]);
+#endif
+}
+#endif
 
 // 2^x, relative error 2e-7. Below -126 the result is negative or not a number, which no cutoff lets pass; below -380 it
 // is wrong.

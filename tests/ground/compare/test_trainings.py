@@ -1,5 +1,6 @@
 """Trainings as compared methods: interrupted and resumed, ended early, and followed on the way."""
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -52,6 +53,28 @@ def test_a_training_ends_early_only_after_half_of_its_steps_and_not_against_its_
     assert early.figures["converged"] and early.figures["steps"] == STEPS // 2
     whole = trained(case, OURS, Work(), settled=lambda: True)
     assert not whole.figures["converged"] and whole.figures["steps"] == STEPS
+
+
+def test_a_training_that_estimates_its_poses_hands_them_on_and_its_curve_is_measured_after_alignment(
+    case, tmp_path
+):
+    doubt = torch.diag(torch.tensor([0.01, 0.01, 0.01, 0.02, 0.02, 0.02]) ** 2)
+    frames = [dataclasses.replace(frame, pose_covariance=doubt) for frame in case.training]
+    changes = {"steps": STEPS, "start.count": 150, "poses.refine": "always", "poses.refine_from": 0.1}
+    followed = Follower(case, tmp_path, tmp_path / "stop")
+    config = preset("obbgs", changes | {"chi2_end": 1e-9})
+    result = reconstruct_gaussians(frames, case.sensor, config, 0, Work(None, followed.on_step))
+    assert result.poses is not None and result.poses.estimate.frame_ids == [frame.id for frame in frames]
+    seen, figures = case.seen_by(result)
+    assert (
+        figures["pose_error_px"] < 20 and figures["pose_error_tagged_px"] < 1e-2
+    )  # exact tags were moved a little
+    curve = followed.finish(result)
+    views = [image_of(result, frame) for frame in seen.held_out]
+    assert curve[-1]["psnr_clean_db"] == pytest.approx(seen.image_scores(views)["psnr_clean_db"], abs=1e-3)
+    tagged = [dataclasses.replace(frame, pose_covariance=doubt) for frame in case.held_out]
+    for before, after in zip(tagged, result.poses.settled(tagged), strict=True):
+        assert not torch.equal(before.world_to_camera, after.world_to_camera)
 
 
 def test_a_time_limit_of_nothing_is_the_untrained_start(case):

@@ -1,0 +1,77 @@
+"""Checks of what the pass needs to be tagged with poses: elements, the Sun's ephemeris, the navigation source."""
+
+import time
+from datetime import UTC, datetime
+
+import numpy as np
+
+from flightsw.errors import NavigationError, OrbitError
+from flightsw.icd.mission import Mission
+from flightsw.icd.pose_sections import NavigationSection
+from flightsw.navigation import NavigationStream
+from flightsw.orbit import propagate, sun_position_gcrs
+from flightsw.selftest.finding import Finding
+
+NS = 1_000_000_000
+NEWER = "put newer two-line elements into the mission file, on the ground as well"
+
+
+def check_orbit(mission: Mission) -> list[Finding]:
+    """Check that both satellites and the Sun can be computed in the pass and now, and how old the elements are."""
+    orbit, bracket = mission.orbit, mission.bracket
+    now_ns, first_ns = time.time_ns(), mission.orbit.start_utc_ns
+    last_ns = first_ns + round((bracket.count - 1) * bracket.interval_s * NS)
+    times = {"the first trigger": first_ns, "the last trigger": last_ns, "now": now_ns}
+    ages_days, ranges_m = {}, {}
+    for name, utc_ns in times.items():
+        try:
+            states = [propagate(tle, utc_ns) for tle in (orbit.target_tle, orbit.chaser_tle)]
+            sun_position_gcrs(utc_ns)
+        except OrbitError as error:
+            state = Finding.warning if name == "now" else Finding.failed
+            return [state("orbit", f"at {name} ({_utc(utc_ns)}): {error}", NEWER)]
+        ages_days[name] = max(abs(state.element_age_days) for state in states)
+        ranges_m[name] = float(np.linalg.norm(states[0].position_m - states[1].position_m))
+    findings = []
+    if ages_days["the first trigger"] > orbit.max_element_age_days:
+        found = (
+            f"elements are {ages_days['the first trigger']:.1f} days old at the first trigger, "
+            f"{orbit.max_element_age_days:g} are allowed: every pose will be marked invalid"
+        )
+        findings.append(Finding.failed("orbit", found, NEWER))
+    if last_ns < now_ns:
+        days = (now_ns - last_ns) / (86_400 * NS)
+        found = f"the pass ended {days:.1f} days ago; elements are {ages_days['now']:.1f} days old now"
+        findings.append(
+            Finding.warning("orbit", found, "set orbit.start_utc, or give --start now on a bench")
+        )
+    if not findings:
+        found = (
+            f"first trigger at {_utc(first_ns)}, range {ranges_m['the first trigger']:.0f} m, elements "
+            f"{ages_days['the first trigger']:.1f} days old then, {ages_days['now']:.1f} now"
+        )
+        findings.append(Finding.ok("orbit", found))
+    if mission.navigation.source != "sgp4":
+        findings += _navigation(mission.navigation)
+    return findings
+
+
+def _navigation(section: NavigationSection) -> list[Finding]:
+    """Check that the navigation source can be opened and sends states."""
+    advice = "start the navigation filter, or correct navigation.source"
+    try:
+        stream = NavigationStream(section)
+    except NavigationError as error:
+        return [Finding.failed("navigation", str(error), advice)]
+    try:
+        state = stream.first(section.wait_s)
+    finally:
+        stream.close()
+    if state is None:
+        found = f"no state came from {section.source} in {section.wait_s:g} s ({stream.bad_lines} unreadable lines)"
+        return [Finding.failed("navigation", found, advice)]
+    return [Finding.ok("navigation", f"{section.source} sends states, the first of {_utc(state.utc_ns)}")]
+
+
+def _utc(utc_ns: int) -> str:
+    return datetime.fromtimestamp(utc_ns / NS, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
