@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
+from ground.attitude_choice import chosen_by_training
 from ground.cameras import sensor_of
 from ground.session import FrameRecord, Navigation, Session, SessionError
 from ground.training_frames import training_frame
@@ -86,7 +87,15 @@ def find_attitude(
     for record in training:
         seen = _turned(record, _assumed(session, record).T)
         frames.append(training_frame(session, seen))
-    motion = estimate_motion(frames, times_s, sensor_of(session.camera), on_progress, should_stop)
+    sensor = sensor_of(session.camera)
+
+    def decide(motions: list[TargetMotion]) -> int | None:
+        def on_share(share: float) -> None:
+            on_progress("comparing rotations by short trainings", share)
+
+        return chosen_by_training(frames, times_s, sensor, motions, on_share, should_stop)
+
+    motion = estimate_motion(frames, times_s, sensor, on_progress, should_stop, decide=decide)
     return FoundAttitude(epoch_utc_ns, motion)
 
 

@@ -14,12 +14,14 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
 from obbgs_core.model.pose_covariance import whitening
 from obbgs_core.model.rotations import from_rotation_vectors, multiply
+from obbgs_core.normal_equations import NormalEquations, ReducedEquations, times
 from obbgs_core.pose_estimate import PoseEstimate
-from obbgs_core.registration import PoseInformation
+from obbgs_core.registration import CellInformation, PoseInformation
 
 NULL = 1e-9  # a singular value of rows of unit length that is zero up to rounding
 LINEAR = 0.1  # prior deviations by which shared parameters move before their effect is linearised anew
 GAUGE_ROUNDS = 3  # of the linear problem that fixes the gauge; its error is of second order in the motion
+SETTLED = 0.01  # deviations: no further round follows one that moves no correction by more
 
 
 class PoseCorrections:
@@ -59,16 +61,14 @@ class PoseCorrections:
         )  # [F, 6, S] motion by whitened parameter
         if self.sigmas.any():
             self._move_shared(frames, self.shared)
-        self.gathered = 0  # pictures since the last step
-        self._clear()
+        self.clear()
 
     def extended(self, frames: list[TrainingFrame]) -> "PoseCorrections":
         """Return the corrections of more frames, which begin with those of this one; new brackets have no own yet."""
-        more, known = PoseCorrections(frames), len(self.of_frame)
+        more = PoseCorrections(frames)
         if more.sigmas.any():
             more._move_shared(frames, self.shared)
         more.value[: len(self.value)] = self.value
-        more.gradient[:known], more.curvature[:known] = self.gradient, self.curvature
         return more
 
     @property
@@ -94,7 +94,7 @@ class PoseCorrections:
     def corrected(self, indices: list[int]) -> Tensor:
         """Return the poses [B, 4, 4] of frames with their corrections."""
         rows = self.rows(indices)
-        own = rigid_motions(_times(self.whitening.root[rows], self.value[rows]).double())
+        own = rigid_motions(times(self.whitening.root[rows], self.value[rows]).double())
         return (own @ self.moved[indices]).float()
 
     def cameras(self, indices: list[int], cameras: Cameras) -> Cameras:
@@ -107,21 +107,24 @@ class PoseCorrections:
         return [dataclasses.replace(f, world_to_camera=p) for f, p in zip(frames, poses, strict=True)]
 
     def gather(self, indices: list[int], information: PoseInformation) -> None:
-        """Keep what pictures say of their poses until the next step; a frame's newest picture counts."""
+        """Keep what pictures of frames say of their poses, in place of what earlier ones said."""
         self.gradient[indices], self.curvature[indices] = information.gradient, information.curvature
-        self.gathered += len(indices)
+        if information.cells is not None:
+            self.cells |= dict(zip(indices, information.cells, strict=True))
+            self.cell_m = information.cell_m
 
-    @property
-    def is_due(self) -> bool:
-        """Whether as many pictures were gathered as there are frames."""
-        return self.gathered >= len(self.of_frame)
+    def clear(self) -> None:
+        """Forget what was gathered."""
+        self.gradient = torch.zeros(len(self.of_frame), 6, dtype=torch.float64)
+        self.curvature = torch.zeros(len(self.of_frame), 6, 6, dtype=torch.float64)
+        self.cells: dict[int, CellInformation] = {}
+        self.cell_m = 0.0
 
     def step(self, frames: list[TrainingFrame], extra: Tensor | None = None) -> Tensor:
         """Move all corrections to the minimum of what was gathered plus their priors.
 
-        One step of Gauss and Newton in all parameters together: the brackets' own are eliminated first (Schur
-        complement, as in bundle adjustment; Triggs et al. 2000), so that its cost grows with the number of frames only.
-        The prior of a bracket counts once.
+        One step of Gauss and Newton in all parameters together, and in the places of the surface's cells where pictures
+        told of them. The prior of a bracket counts once.
 
         Args:
             extra: [F, 6, E] motions by further parameters of unit variance that are to be estimated along.
@@ -132,18 +135,14 @@ class PoseCorrections:
         normal = self._normal_equations(extra)
         all_shared, own = normal.solution()
         shared, others = all_shared.split([self.by_shared.shape[2], 0 if extra is None else extra.shape[2]])
-        rows = torch.tensor(self.of_frame)
-        motion = _times(self.by_shared, shared) + _times(self.whitening.root.double(), own)[rows]
-        self.gradient += _times(self.curvature, motion)  # until the frames speak again
         if shared.numel():
             change = torch.zeros(SIZE, dtype=torch.float64)
             change[self.free] = self.sigmas[self.free] * shared
             self._move_shared(frames, self.shared + change)
-        self.value = _times(self.whitening.support, self.value + own.float())
-        self.gathered = 0
+        self.value = times(self.whitening.support, self.value + own.float())
         return others
 
-    def _normal_equations(self, extra: Tensor | None = None) -> "NormalEquations":
+    def _normal_equations(self, extra: Tensor | None = None) -> NormalEquations | ReducedEquations:
         rows, count = torch.tensor(self.of_frame), len(self.value)
         root = self.whitening.root.double()[rows]
         curvature, gradient = self.curvature, self.gradient
@@ -155,19 +154,24 @@ class PoseCorrections:
         def summed(of_frames: Tensor) -> Tensor:
             return torch.zeros(count, *of_frames.shape[1:], dtype=torch.float64).index_add(0, rows, of_frames)
 
-        return NormalEquations(
+        normal = NormalEquations(
             summed(own @ root) + torch.eye(6, dtype=torch.float64),
             summed(own @ by_shared),
             (by_shared.mT @ curvature @ by_shared).sum(0) + torch.eye(len(now), dtype=torch.float64),
-            -summed(_times(root.mT, gradient)) - self.value.double(),
-            -_times(by_shared.mT, gradient).sum(0) - now,
+            -summed(times(root.mT, gradient)) - self.value.double(),
+            -times(by_shared.mT, gradient).sum(0) - now,
         )
+        if not self.cells:
+            return normal
+        seen, cells = list(self.cells), list(self.cells.values())
+        brackets = [self.of_frame[i] for i in seen]
+        return normal.with_cells(cells, brackets, root[seen], by_shared[seen], self.cell_m)
 
     def estimate(self, frames: list[TrainingFrame]) -> PoseEstimate:
         """Return the corrected poses and their corrections, with prior and posterior deviations.
 
-        The posterior deviations are those of the likelihood that was gathered last, with the model as it is: what moves
-        poses and model together is not counted in them.
+        The posterior deviations are those of the likelihood that was gathered last; where its pictures told of the
+        surface's cells, what moves poses and surface together counts as not known.
         """
         normal = self._normal_equations()
         shared, own = normal.covariances()
@@ -188,7 +192,7 @@ class PoseCorrections:
             shared_prior=prior,
             shared_posterior=SharedParameters.of(torch.cat([posterior[:-1], last]).numpy()),
             shared_covariance=spread.numpy(),
-            own=_times(root, self.value.double()).numpy(),
+            own=times(root, self.value.double()).numpy(),
             own_prior=(root @ root.mT).diagonal(dim1=1, dim2=2).sqrt().numpy(),
             own_posterior=(root @ own @ root.mT).diagonal(dim1=1, dim2=2).clamp(min=0).sqrt().numpy(),
         )
@@ -201,10 +205,6 @@ class PoseCorrections:
         if not further <= LINEAR:  # also the first time, when it is NaN
             columns = torch.from_numpy(jacobian(motion, at))
             self.by_shared, self.linear_at = columns[:, :, self.free] * self.sigmas[self.free], shared
-
-    def _clear(self) -> None:
-        self.gradient = torch.zeros(len(self.of_frame), 6, dtype=torch.float64)
-        self.curvature = torch.zeros(len(self.of_frame), 6, 6, dtype=torch.float64)
 
     def fix_gauge(self, gaussians: Gaussians, frames: list[TrainingFrame]) -> Gaussians:
         """Return the model moved and scaled to where the corrections, moved with it, are smallest in their deviations.
@@ -228,8 +228,10 @@ class PoseCorrections:
                 change = torch.zeros(SIZE, dtype=torch.float64)
                 change[self.free] = self.sigmas[self.free] * shared
                 self._move_shared(frames, self.shared + change)
-            left = motion_vectors(target @ torch.linalg.inv(self.moved))
-            self.value = _times(self.whitening.inverse, self._bracket_means(left)).float()
+            left, before = motion_vectors(target @ torch.linalg.inv(self.moved)), self.value
+            self.value = times(self.whitening.inverse, self._bracket_means(left)).float()
+            if max([*(self.value - before).abs().flatten(), *shared.abs()]) < SETTLED:
+                break
         similarity = whole.float()
         turn = motion_vectors(whole[None] / math.exp(log_scale))[0, :3].float()
         return dataclasses.replace(  # a turn this small does not show in the radiance
@@ -284,34 +286,6 @@ def with_estimate(frames: list[TrainingFrame], estimate: PoseEstimate) -> list[T
     ]
 
 
-@dataclasses.dataclass(frozen=True)
-class NormalEquations:
-    """Normal equations with a block for each bracket and one for what all share; float64, priors included."""
-
-    own: Tensor  # [P, 6, 6]
-    mixed: Tensor  # [P, 6, S]
-    shared: Tensor  # [S, S]
-    own_right: Tensor  # [P, 6]
-    shared_right: Tensor  # [S]
-
-    def _reduced(self) -> tuple[Tensor, Tensor]:
-        """Return the shared block with the brackets eliminated, and own⁻¹ mixed [P, 6, S]."""
-        eliminated = torch.linalg.solve(self.own, self.mixed)
-        return self.shared - (self.mixed.mT @ eliminated).sum(0), eliminated
-
-    def solution(self) -> tuple[Tensor, Tensor]:
-        """Return the shared parameters [S] and those of the brackets [P, 6]."""
-        reduced, eliminated = self._reduced()
-        shared = torch.linalg.solve(reduced, self.shared_right - _times(eliminated.mT, self.own_right).sum(0))
-        return shared, torch.linalg.solve(self.own, self.own_right) - eliminated @ shared
-
-    def covariances(self) -> tuple[Tensor, Tensor]:
-        """Return the covariance of the shared parameters [S, S] and those of the brackets [P, 6, 6]."""
-        reduced, eliminated = self._reduced()
-        shared = torch.linalg.inv(reduced)
-        return shared, torch.linalg.inv(self.own) + eliminated @ shared @ eliminated.mT
-
-
 def motion_of(frames: list[TrainingFrame]) -> NominalMotion:
     """Return the nominal motion of frames that state their navigation."""
     navigation = frames[0].navigation
@@ -330,10 +304,6 @@ def motion_of(frames: list[TrainingFrame]) -> NominalMotion:
         rate_rad_s=navigation.rate_rad_s,
         inertia=navigation.inertia,
     )
-
-
-def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
-    return (matrices @ vectors[..., None])[..., 0]
 
 
 def _null_space(rows: Tensor) -> Tensor:

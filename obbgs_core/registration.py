@@ -13,6 +13,7 @@ from obbgs_core.losses import ON_TARGET_ALPHA
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.sensor import Sensor
 
+CELLS = 1024  # along each axis of the body
 KNEE = 2.0  # of the robust penalty, as in `losses.charbonnier`
 
 
@@ -21,10 +22,28 @@ class PoseInformation:
     """The quadratic model of each picture's negative log likelihood by its motion, nats; float64.
 
     gradient: [B, 6] at no motion; curvature: [B, 6, 6] of Gauss and Newton, never negative.
+    cells: what each picture says of the places of the surface's cells, where that was asked for.
+    cell_m: their edge.
     """
 
     gradient: Tensor
     curvature: Tensor
+    cells: "list[CellInformation] | None" = None
+    cell_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class CellInformation:
+    """How a picture's negative log likelihood changes where the surface moves: in cubes, each by a shift of its own.
+
+    numbers: [k] of the cubes; gradient: [k, 3] by their shifts, m, body axes; curvature: [k, 3, 3];
+    mixed: [k, 3, 6] second derivatives by shift and motion of the pose.
+    """
+
+    numbers: Tensor
+    gradient: Tensor
+    curvature: Tensor
+    mixed: Tensor
 
 
 @torch.no_grad()
@@ -37,8 +56,9 @@ def pose_information(
     dn: Tensor,
     sensor: Sensor,
     averaged_pixels: int = 1,
+    cell_m: float = 0.0,
 ) -> PoseInformation:
-    """Return what rendered pictures say of the errors of their poses.
+    """Return what rendered pictures say of the errors of their poses, and of the places of the surface's cells.
 
     A motion shifts each pixel's light by the image flow of its depth (Lucas and Kanade 1981; the flow of a point by the
     camera's motion, Chaumette and Hutchinson 2006). Residuals are taken in deviations of their own mean square where it
@@ -49,13 +69,16 @@ def pose_information(
     Args:
         radiance [B, H, W, C], alpha and depth [B, H, W]: rendered with the cameras.
         exposure_time_s, dn, averaged_pixels: as for `losses.likelihood_loss`.
+        cell_m: above 0: edge of the cubes that the surface is divided into. The values of a cube in a picture are then
+            counted as one, because what a model still gets wrong is alike in neighbouring pixels and channels.
     """
-    gradients, curvatures = [], []
+    gradients, curvatures, cells = [], [], []
     for i in range(len(radiance)):
         seen = alpha[i] > ON_TARGET_ALPHA
         near = F.max_pool2d(seen[None, None].float(), 3, 1, 1)[0, 0] > 0
         slope = _image_slope(radiance[i], near)  # [n, C, 2]
-        flow = _flow(depth[i], seen, near, cameras.world_to_camera[i], cameras.K[i])  # [n, 2, 6]
+        points = _points(depth[i], seen, near, cameras.K[i])  # [n, 3]
+        flow = point_flow(points, cameras.K[i].expand(len(points), 3, 3))  # [n, 2, 6]
         residual, by_radiance = _residual(
             radiance[i][near], exposure_time_s[i, 0], dn[i][near], sensor, averaged_pixels
         )
@@ -65,9 +88,32 @@ def pose_information(
         residual = residual.flatten().double()
         dispersion = residual.square().mean().clamp(min=1)
         weight = (1 + residual.square() / (KNEE**2 * dispersion)).rsqrt() / dispersion
+        if cell_m:
+            pose = cameras.world_to_camera[i].double()
+            numbers = _cell_numbers((points.double() - pose[:3, 3]) @ pose[:3, :3], cell_m)
+            numbers = numbers.repeat_interleave(radiance.shape[-1])  # of each row
+            weight = weight * len(numbers.unique()) / max(1, len(numbers))
+            cells.append(_cell_information(numbers, rows, rows[:, 3:] @ pose[:3, :3], weight, residual))
         gradients.append(rows.T @ (weight * residual))
         curvatures.append(rows.T @ (weight[:, None] * rows))
-    return PoseInformation(torch.stack(gradients), torch.stack(curvatures))
+    return PoseInformation(torch.stack(gradients), torch.stack(curvatures), cells or None, cell_m)
+
+
+def _cell_numbers(points: Tensor, cell_m: float) -> Tensor:
+    """Return the numbers [n] of the cubes in which points [n, 3] of the body lie."""
+    at = (points / cell_m).floor().long().clamp(-CELLS // 2, CELLS // 2 - 1) + CELLS // 2
+    return (at[:, 0] * CELLS + at[:, 1]) * CELLS + at[:, 2]
+
+
+def _cell_information(
+    numbers: Tensor, by_motion: Tensor, by_point: Tensor, weight: Tensor, residual: Tensor
+) -> CellInformation:
+    """Return the sums over the rows [n] of each cell: residuals [n] with derivatives [n, 6] and [n, 3] and weights."""
+    cells, place = torch.unique(numbers, return_inverse=True)
+    table = torch.cat([by_point, by_motion, residual[:, None]], dim=1)  # [n, 10]
+    products = (weight[:, None] * by_point)[:, :, None] * table[:, None, :]
+    summed = torch.zeros(len(cells), 3, 10, dtype=torch.float64).index_add(0, place, products)
+    return CellInformation(cells, summed[..., 9], summed[..., :3], summed[..., 3:9])
 
 
 def _image_slope(image: Tensor, at: Tensor) -> Tensor:
@@ -78,12 +124,13 @@ def _image_slope(image: Tensor, at: Tensor) -> Tensor:
     return torch.stack([dx[at], dy[at]], dim=-1)
 
 
-def _flow(depth: Tensor, seen: Tensor, at: Tensor, world_to_camera: Tensor, K: Tensor) -> Tensor:
-    """Return the motion of pixels [n, 2, 6] px by the motion; pixels beside the target have its origin's depth."""
-    z = torch.where(seen, depth, world_to_camera[2, 3])[at].clamp(min=1e-6)
+def _points(depth: Tensor, seen: Tensor, at: Tensor, K: Tensor) -> Tensor:
+    """Return the points [n, 3] m, camera axes, of chosen pixels; those beside the target are as deep as its edge."""
+    sums = F.avg_pool2d(torch.stack([torch.where(seen, depth, 0.0), seen.float()])[:, None], 3, 1, 1)[:, 0]
+    z = torch.where(seen, depth, sums[0] / sums[1].clamp(min=1e-6))[at].clamp(min=1e-6)
     rows, columns = torch.nonzero(at, as_tuple=True)
     x, y = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
-    return point_flow(torch.stack([x * z, y * z, z], dim=1), K.expand(len(z), 3, 3))
+    return torch.stack([x * z, y * z, z], dim=1)
 
 
 def point_flow(points: Tensor, K: Tensor) -> Tensor:

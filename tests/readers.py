@@ -63,6 +63,15 @@ def splat_transform(readers: Path, *arguments: str | Path) -> None:
 
 
 class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def do_GET(self) -> None:
+        if (
+            self.path == "/favicon.ico"
+        ):  # which browsers ask for; its absence would be an error on the console
+            self.send_response(204)
+            self.end_headers()
+        else:
+            super().do_GET()
+
     def log_message(self, *_: object) -> None:
         pass
 

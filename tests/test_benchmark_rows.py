@@ -27,6 +27,15 @@ def test_the_page_has_a_line_a_method_and_target_with_the_mean_over_seeds(tmp_pa
     assert "| theirs | TDRS | 1 | 30.00 dB |" in page
 
 
+def test_budgets_stand_on_lines_of_their_own_where_rows_differ_in_them(tmp_path):
+    made = [{"method": "ours", "target": "T", "largest": n, "psnr_clean_db": n / 100} for n in (1000, 2000)]
+    whole = {"method": "ours", "target": "T", "psnr_clean_db": 30.0}
+    (tmp_path / "size.jsonl").write_text("".join(json.dumps(row) + "\n" for row in [*made, whole]))
+    page = rows.page([tmp_path / "size.jsonl"])
+    assert "| method | target | at most Gaussians | seeds |" in page
+    assert "| ours | T | 2000 | 1 | 20.00 dB |" in page and "| ours | T |  | 1 | 30.00 dB |" in page
+
+
 def test_the_committed_page_is_made_of_the_committed_rows():
     page = rows.FOLDER / "RESULTS.md"
     assert page.read_text() == rows.page(sorted(rows.FOLDER.glob("*.jsonl")))

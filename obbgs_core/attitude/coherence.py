@@ -30,6 +30,23 @@ def coherences(views: Views, attitudes: Tensor, points: Tensor) -> Tensor:
         points: [V, 3] in radii of the target, at most a cell apart.
     """
     count, n = len(attitudes), views.lit.shape[-1]
+    cells, occupancy = _occupied(views, attitudes, points)
+    covered = torch.zeros(count, len(views), n * n)
+    covered.scatter_reduce_(2, cells, occupancy[:, None].expand(-1, len(views), -1), "amax")
+    lit = views.lit.flatten(1)
+    return torch.minimum(covered, lit).sum(dim=(1, 2)) / lit.sum()
+
+
+def hull_axes(views: Views, attitudes: Tensor) -> Tensor:
+    """Return the principal axes of the hull, the columns of [3, 3], body frame, under one motion [N, 3, 3]."""
+    points = grid_points(FILL * views.cell)
+    _, occupancy = _occupied(views, attitudes[None], points)
+    return torch.linalg.eigh((points * occupancy[0, :, None]).T @ points).eigenvectors
+
+
+def _occupied(views: Views, attitudes: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the cells [B, N, V] that points project to, and their occupancies [B, V], 0 to 1."""
+    n = views.lit.shape[-1]
     R, t = views.world_to_camera[:, :3, :3], views.world_to_camera[:, :3, 3]
     to_camera = R @ attitudes.transpose(-1, -2)  # [B, N, 3, 3]
     p = to_camera @ points.T + t[:, :, None]  # [B, N, 3, V]
@@ -38,8 +55,4 @@ def coherences(views: Views, attitudes: Tensor, points: Tensor) -> Tensor:
     offset = torch.arange(len(views))[:, None] * n * n
     near = F.max_pool2d(views.open, 3, 1, 1)  # light anywhere near
     seen = near.flatten()[(cells + offset).flatten()].view_as(u)
-    occupancy = torch.exp(-(1 - seen).mean(dim=1) / FORGIVEN)  # [B, V]
-    covered = torch.zeros(count, len(views), n * n)
-    covered.scatter_reduce_(2, cells, occupancy[:, None].expand(-1, len(views), -1), "amax")
-    lit = views.lit.flatten(1)
-    return torch.minimum(covered, lit).sum(dim=(1, 2)) / lit.sum()
+    return cells, torch.exp(-(1 - seen).mean(dim=1) / FORGIVEN)

@@ -4,12 +4,15 @@ import logging
 from collections.abc import Callable
 
 import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
 
 from obbgs_base.errors import Interrupted
 from obbgs_core.attitude import search
+from obbgs_core.attitude.coherence import hull_axes
 from obbgs_core.attitude.motion import SPIN, TUMBLE, attitudes, principal
 from obbgs_core.attitude.outlines import outlines
-from obbgs_core.attitude.refine import difference_steps, refined, spread
+from obbgs_core.attitude.refine import cost, difference_steps, refined, spread
 from obbgs_core.attitude.target_motion import TargetMotion
 from obbgs_core.attitude.views import Views, views
 from obbgs_core.errors import ReconstructionError
@@ -29,6 +32,10 @@ UNRELATED = 12  # random motions whose disagreement shows what no relation looks
 EXPLAINED = 0.15  # a motion explains the outlines when it leaves less than this share of that disagreement
 TUMBLES = 0.9  # a tumble is believed when it leaves less than this share of what a steady spin leaves
 OVERDISPERSION = 2.0  # by which measured errors exceed the deviations of the refinement
+LEAST_UNRELATED = 1.0  # disagreement, per ray: true motions of other targets leave 0.5 to 1
+ROUND = (
+    0.05  # of that disagreement, at most, is left when a body is rolled about an axis that it is round about
+)
 LARGEST_SIGMA_DEG = 10.0  # of the attitude in the mean of the pass; with more it counts as not determined
 POLISHING = 8  # steps
 
@@ -44,6 +51,7 @@ def estimate_motion(
     on_progress: Callable[[str, float], None] = lambda what, share: None,
     should_stop: Callable[[], bool] = lambda: False,
     seed: int = 0,
+    decide: Callable[[list[TargetMotion]], int | None] = lambda motions: None,
 ) -> TargetMotion:
     """Return the motion that makes the outlines of a pass agree on one body.
 
@@ -51,6 +59,8 @@ def estimate_motion(
         frames: with poses and Sun relative to inertial axes through the target's centre of mass.
         times_s: [N] of the frames; time 0 is the reference epoch.
         on_progress: called with what is being done and the share of it that is done.
+        decide: called with motions whose outlines agree equally well; returns the index of the right one, None where it
+            cannot tell.
 
     Raises:
         AttitudeUndetermined: too few frames show light, no motion explains them, or several do.
@@ -66,27 +76,38 @@ def estimate_motion(
     silhouettes, at_s = [found[i] for i in order], times_s[order]
     coarse, fine = (views(silhouettes, at_s, radius_m, cells) for cells in (COARSE, FINE))
     unrelated = _unrelated_cost(fine, seed)
+    if unrelated < LEAST_UNRELATED:
+        raise AttitudeUndetermined(
+            "the target's attitude is not known and cannot be found: its outlines agree under any motion, as those "
+            "of a body that looks alike from all sides do; give its attitude"
+        )
+
+    def report(what: str, share: float) -> None:
+        if should_stop():
+            raise Interrupted("interrupted while the target's attitude was searched; nothing of it is kept")
+        on_progress(what, share)
+
+    best = _candidates(coarse, fine, unrelated, report)
+    report("judging the motion", 0.0)
+    return _decided(_judged(best, fine, unrelated, seed), fine, unrelated, seed, decide)
+
+
+def _candidates(
+    coarse: Views, fine: Views, unrelated: float, report: Callable[[str, float], None]
+) -> list[search.Candidate]:
+    """Return motions that may explain all views, best first, from one arc after another until one explains them."""
     best: list[search.Candidate] = []
     for middle, stride in ARCS:
         arc = _arc(len(fine), middle, stride)
         if arc is None:
             continue
-
-        def report(what: str, share: float) -> None:
-            if should_stop():
-                raise Interrupted(
-                    "interrupted while the target's attitude was searched; nothing of it is kept"
-                )
-            on_progress(what, share)
-
         candidates = search.searched(coarse, fine, arc, report)
         best = _ranked([*best, *candidates], fine)
-        log.info(
-            "from view %d: %s of the unrelated disagreement", arc[len(arc) // 2], best[0].cost / unrelated
-        )
-        if best[0].cost < EXPLAINED * unrelated:
+        share = best[0].cost / unrelated
+        log.info("from view %d: %s of the unrelated disagreement", arc[len(arc) // 2], share)
+        if share < EXPLAINED:
             break
-    return _judged(best, fine, unrelated, seed)
+    return best
 
 
 def _arc(count: int, middle: float, stride: int) -> np.ndarray | None:
@@ -115,24 +136,24 @@ def _ranked(candidates: list[search.Candidate], fine: Views) -> list[search.Cand
     return search.distinct(scored, fine)
 
 
-def _judged(best: list[search.Candidate], fine: Views, unrelated: float, seed: int) -> TargetMotion:
-    """Return the best candidate, polished, as a spin if that explains the outlines as well as a tumble.
+def _judged(best: list[search.Candidate], fine: Views, unrelated: float, seed: int) -> list[TargetMotion]:
+    """Return the motions that explain the outlines equally well, best first, each a spin if that does as well.
 
     Raises:
-        AttitudeUndetermined: nothing explains the outlines, or different motions do.
+        AttitudeUndetermined: nothing explains the outlines.
     """
+    axes = fine.world_to_camera[int(np.abs(fine.times_s).argmin()), :3, :3].double().numpy().T
+    mirror = search.mirrored(best[0].parameters[None], axes)[0]
     polished = []
-    for candidate in best[:2]:
+    for parameters in (*(candidate.parameters for candidate in best[:2]), mirror):
+        found = []
         for size in (SPIN, TUMBLE):
-            moved, cost = refined(fine, candidate.parameters[None, :size], POLISHING, seed)
-            polished.append(search.Candidate(moved[0], float(cost[0])))
+            moved, costs = refined(fine, parameters[None, :size], POLISHING, seed)
+            found.append(search.Candidate(moved[0], float(costs[0])))
+        steady, tumble = found
+        polished.append(tumble if tumble.cost < TUMBLES * steady.cost else steady)
     ranked = search.distinct(polished, fine)
-    first = ranked[0]
-    spins = [c for c in polished if len(c.parameters) == SPIN]
-    steady = min(spins, key=lambda c: c.cost)
-    if first.cost > TUMBLES * steady.cost:
-        first = steady
-    share = first.cost / unrelated
+    share = ranked[0].cost / unrelated
     if share >= EXPLAINED:
         raise AttitudeUndetermined(
             "the target's attitude is not known and cannot be found: no spin and no torque-free tumble with at least "
@@ -140,27 +161,61 @@ def _judged(best: list[search.Candidate], fine: Views, unrelated: float, seed: i
             "the disagreement of unrelated motions). The target may look alike from all sides, turn faster than the "
             "brackets follow, or not turn freely; take brackets more often, or give its attitude"
         )
-    others = [
-        c
-        for c in ranked
-        if c.cost < first.cost / TUMBLES and search.apart_rad(c, first, fine) > search.APART_RAD
+    equal = [c.parameters for c in ranked if c.cost <= ranked[0].cost / TUMBLES]
+    return [
+        TargetMotion(p, OVERDISPERSION**2 * spread(fine, p, seed), _own_axes(p), share, len(fine))
+        for p in equal
     ]
-    if others:
-        apart = np.degrees(search.apart_rad(others[0], first, fine))
+
+
+def _decided(
+    motions: list[TargetMotion],
+    fine: Views,
+    unrelated: float,
+    seed: int,
+    decide: Callable[[list[TargetMotion]], int | None],
+) -> TargetMotion:
+    """Return the right one of motions that explain the outlines equally well.
+
+    Raises:
+        AttitudeUndetermined: nothing tells them apart, or they leave the attitude open.
+    """
+    if _is_round(motions[0], fine, unrelated, seed):
+        raise AttitudeUndetermined(
+            "the target's attitude is not known and cannot be found: its outlines are those of a body that is round "
+            "about an axis, and do not show how it rolls about that; give its attitude"
+        )
+    chosen = 0 if len(motions) == 1 else decide(motions)
+    if chosen is None:
+        first, second = (search.Candidate(m.parameters, 0.0) for m in motions[:2])
+        apart = np.degrees(search.apart_rad(first, second, fine))
         raise AttitudeUndetermined(
             f"the target's attitude is not known and cannot be found: two motions, {apart:.0f} degrees apart, explain "
-            f"the outlines of {len(fine)} brackets equally well. The target may be too symmetric, or seen from one "
-            "side only; take brackets from more directions, or give its attitude"
+            f"the outlines of {len(fine)} brackets equally well, and nothing else tells them apart. The target may be "
+            "too symmetric, or seen from one side only; take brackets from more directions, or give its attitude"
         )
-    covariance = OVERDISPERSION**2 * spread(fine, first.parameters, seed)
-    sigma_deg = float(np.degrees(_attitude_sigma_rad(first.parameters, covariance, fine.times_s)))
+    motion = motions[chosen]
+    sigma_deg = float(np.degrees(_attitude_sigma_rad(motion.parameters, motion.covariance, fine.times_s)))
     if sigma_deg > LARGEST_SIGMA_DEG:
         raise AttitudeUndetermined(
             "the target's attitude is not known and cannot be found: the outlines leave it open by "
-            f"{sigma_deg:.0f} degrees in the mean of the pass, as those of a body that is round about its axis do; "
-            "give its attitude"
+            f"{sigma_deg:.0f} degrees in the mean of the pass; give its attitude"
         )
-    return TargetMotion(first.parameters, covariance, _own_axes(first.parameters), share, len(fine))
+    return motion
+
+
+def _is_round(motion: TargetMotion, fine: Views, unrelated: float, seed: int) -> bool:
+    """Return whether the outlines agree even when the body is rolled at random about an axis of its hull."""
+    body = motion.inertial_to_body(fine.times_s)
+    axes = hull_axes(fine, torch.from_numpy(body).float()).double().numpy()
+    angles = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(fine))
+    rolled = [
+        cost(fine, Rotation.from_rotvec(angles[:, None] * axis).as_matrix() @ body, seed) for axis in axes.T
+    ]
+    log.info(
+        "rolled about axes of its hull: at least %.3f of the unrelated disagreement", min(rolled) / unrelated
+    )
+    return min(rolled) < ROUND * unrelated
 
 
 def _attitude_sigma_rad(parameters: np.ndarray, covariance: np.ndarray, times_s: np.ndarray) -> float:

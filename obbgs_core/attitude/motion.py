@@ -121,5 +121,11 @@ def at_epoch(parameters: np.ndarray, epoch_s: float) -> np.ndarray:
     body = attitudes(parameters[None], np.array([epoch_s]))[0, 0]
     moments = inertia(parameters)
     rate = np.linalg.solve(body.T @ moments @ body, moments @ parameters[:SPIN])
-    shape = body.T @ np.einsum("k,kij->ij", parameters[SPIN:], _SHAPES) @ body
-    return np.concatenate([rate, np.einsum("kij,ij->k", _SHAPES, shape)])
+    return np.concatenate([rate, turned(parameters, body.T)[SPIN:]])
+
+
+def turned(parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Return the parameters [3 or 8] of a motion after target and motion are turned by a rotation [3, 3]."""
+    shape = np.einsum("k,kij->ij", parameters[SPIN:], _SHAPES[: len(parameters) - SPIN])
+    coefficients = np.einsum("kij,ij->k", _SHAPES, rotation @ shape @ rotation.T)
+    return np.concatenate([rotation @ parameters[:SPIN], coefficients[: len(parameters) - SPIN]])

@@ -103,6 +103,13 @@ def refined(views: Views, parameters: np.ndarray, steps: int, seed: int = 0) -> 
     return np.stack([p for p, _ in found]), np.array([c for _, c in found]) / float(chosen.weight.sum())
 
 
+def cost(views: Views, attitudes: np.ndarray, seed: int = 0) -> float:
+    """Return the cost per ray of any attitudes [N, 3, 3], as `refined` has it of a motion's."""
+    chosen = rays(views, seed)
+    missed = residuals(views, chosen, torch.from_numpy(attitudes)[None].float()).double() / RAY_SIGMA
+    return float(missed.square().sum() / chosen.weight.sum())
+
+
 def difference_steps(parameters: np.ndarray, times_s: np.ndarray, turn_rad: float) -> np.ndarray:
     """Return by how much to change each parameter of a motion to turn the target by `turn_rad`, root mean square."""
     small = np.full(len(parameters), 1e-3)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from obbgs_core.attitude.coherence import FILL, coherences, grid_points
-from obbgs_core.attitude.motion import TUMBLE, at_epoch, attitudes
+from obbgs_core.attitude.motion import TUMBLE, at_epoch, attitudes, turned
 from obbgs_core.attitude.refine import refined
 from obbgs_core.attitude.views import Views
 
@@ -60,10 +60,13 @@ def spins(views: Views, on_share: Callable[[float], None]) -> np.ndarray:
     return turns[chosen] / span_s
 
 
-def mirrored(rates_rad_s: np.ndarray, view_to_inertial: np.ndarray) -> np.ndarray:
-    """Return the spins [K, 3] of the mirrored targets that show the same outlines from far away in one direction."""
+def mirrored(motions: np.ndarray, view_to_inertial: np.ndarray) -> np.ndarray:
+    """Return the motions [K, 3 or 8] of mirrored targets that show the same outlines from far away in one direction.
+
+    The reflection in the plane of the picture acts on them as half a turn about the line of sight does.
+    """
     flip = view_to_inertial @ np.diag([-1.0, -1.0, 1.0]) @ view_to_inertial.T
-    return rates_rad_s @ flip.T
+    return np.stack([turned(motion, flip) for motion in motions])
 
 
 def apart_rad(a: Candidate, b: Candidate, views: Views) -> float:

@@ -14,10 +14,9 @@ from obbgs_core.errors import Diverged
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.losses import fit_figures, relative_misfit
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.registration import pose_information
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
-from obbgs_core.train import decisions
+from obbgs_core.train import decisions, pose_rounds
 from obbgs_core.train.adam import learning_rates
 from obbgs_core.train.appearance import described, freeze_later_degrees
 from obbgs_core.train.batches import Batch
@@ -25,7 +24,6 @@ from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import outliers
 from obbgs_core.train.joining import check_joinable, join, release, withhold
 from obbgs_core.train.objective import image_loss, priors
-from obbgs_core.train.poses import ALIGNED_FROM
 from obbgs_core.train.result import Exposing, StepInfo, TrainResult
 from obbgs_core.train.setup import prepare
 from obbgs_core.train.sparsity import DROPPED_UNTIL, dropped
@@ -131,12 +129,13 @@ class Trainer:
         (loss + prior).backward()
         if decisions.is_recorded(setup, share):
             decisions.observe(setup, state, rendered, batch, residual, share)
-        if self._drops(share):  # figures and poses are of the whole model, as it was before the step
+        if self._drops(share):  # figures are of the whole model, as it was before the step
             with torch.no_grad():
                 seen = self._compensated(render(state.model, cameras, sunlit=sunlit), batch)
         self._descend(share)
-        self._move_poses(seen, batch, share)
         decisions.decide_poses(setup, state, share)
+        if pose_rounds.is_due(setup, state, share):
+            pose_rounds.move(setup, state, scale)
         decisions.change_number(setup, state, batch, residual, moment)
         decisions.select_model(setup, state, scale)
         self._measure(seen, batch)
@@ -173,19 +172,6 @@ class Trainer:
         state.gaussians.psf_sigma_px.detach().clamp_(min=LEAST_PSF_SIGMA_PX)
         if state.compensation is not None:
             state.compensation.step(share)
-
-    def _move_poses(self, rendered: Rendered, batch: Batch, share: float) -> None:
-        """Gather what the step's frames say of their poses; once every frame has spoken, move the poses."""
-        state, poses = self.state, self.state.poses
-        begin = ALIGNED_FROM if state.poses_aligned else self.setup.config.poses.refine_from
-        if poses is None or share < begin:
-            return
-        images = (rendered.radiance.detach(), rendered.alpha.detach(), rendered.depth.detach())
-        cameras = poses.cameras(batch.indices, batch.cameras)
-        readings = (batch.exposure_time_s, batch.dn, self.setup.sensor, batch.averaged_pixels)
-        poses.gather(batch.indices, pose_information(*images, cameras, *readings))
-        if poses.is_due:
-            poses.step(self.setup.frames)
 
     def _measure(self, rendered: Rendered, batch: Batch) -> None:
         """Keep the running chi² on the target, the model's own error, and the PSNR of this step's frames."""
@@ -279,7 +265,7 @@ class Trainer:
         return Exposing(self.setup.reference_exposure_s, maps)
 
     def result(self, stop_reason: str) -> TrainResult:
-        """Return the model as it stands, filtered as the method asks, and with its gauge fixed where poses moved.
+        """Return the model as it stands, filtered as the method asks, with the poses that it was made with.
 
         Raises:
             Diverged: no Gaussian is finite.
@@ -291,8 +277,6 @@ class Trainer:
             stray = outliers(gaussians)
             removed = int(stray.sum())
             gaussians = gaussians.select(torch.nonzero(~stray)[:, 0])
-        if state.poses is not None:
-            gaussians = state.poses.fix_gauge(gaussians, setup.frames)
         return TrainResult(
             gaussians=gaussians,
             config=setup.config,
@@ -303,7 +287,7 @@ class Trainer:
             appearance=described(state.gaussians, state.appearance_reason),
             growth=f"until step {min(state.steps_done, round(setup.config.steps_until(setup.config.growth.end)))}",
             poses=state.poses_decided or "as tagged (training ended before this was decided)",
-            pose_estimate=None if state.poses is None else state.poses.estimate(setup.frames),
+            pose_estimate=pose_rounds.estimate(setup, state, setup.config.image_scale(self.share)),
             exposing=self.exposing,
             misfit=state.misfit,
             sun_span_deg=setup.sun_span_deg,

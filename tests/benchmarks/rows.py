@@ -20,6 +20,10 @@ NAMES = (
     "condition",
     "target",
 )  # what a line of a table is called by, where a row has it
+BUDGETS = {
+    "steps_share": "share of the steps",
+    "largest": "at most Gaussians",
+}  # and these where rows differ in them
 FIGURES = {  # key of a row: column title and format
     "psnr_clean_db": ("clean PSNR", "{:.2f} dB"),
     "psnr_foreground_db": ("foreground", "{:.2f} dB"),
@@ -30,6 +34,12 @@ FIGURES = {  # key of a row: column title and format
     "accuracy_surface": ("accuracy", "{:.4f}"),
     "gaussians": ("Gaussians", "{:,.0f}"),
     "seconds": ("seconds", "{:.0f}"),
+    "psnr_after_a_third_db": ("after a third of the pass", "{:.1f} dB"),
+    "psnr_live_db": ("live, at the end", "{:.2f} dB"),
+    "psnr_afterwards_db": ("trained afterwards", "{:.2f} dB"),
+    "seconds_to_half_db": ("within 0.5 dB after", "{:.0f} s"),
+    "latency_live_median_s": ("latency, live", "{:.2f} s"),
+    "latency_alone_median_s": ("latency, no training", "{:.2f} s"),
 }
 
 
@@ -62,15 +72,18 @@ def page(files: Iterable[Path]) -> str:
 
 def _table(rows: list[dict]) -> list[str]:
     names = [key for key in NAMES if any(key in row for row in rows)]
-    figures = [key for key in FIGURES if any(key in row for row in rows)]
+    names += [key for key in BUDGETS if len({row.get(key) for row in rows}) > 1]
+    figures = [key for key in FIGURES if any(row.get(key) is not None for row in rows)]
     groups: dict[tuple, list[dict]] = {}
     for row in rows:
         groups.setdefault(tuple(row.get(key, "") for key in names), []).append(row)
-    titles = [*names, "seeds", *(FIGURES[key][0] for key in figures)]
+    titles = [*(BUDGETS.get(name, name) for name in names), "seeds", *(FIGURES[key][0] for key in figures)]
     lines = ["| " + " | ".join(titles) + " |", "| " + " | ".join(["---"] * len(titles)) + " |"]
     for name, members in groups.items():
         cells = [*map(str, name), str(len(members))]
-        cells += [_cell([m[key] for m in members if key in m], FIGURES[key][1]) for key in figures]
+        cells += [
+            _cell([m[key] for m in members if m.get(key) is not None], FIGURES[key][1]) for key in figures
+        ]
         lines.append("| " + " | ".join(cells) + " |")
     return lines
 

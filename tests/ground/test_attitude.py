@@ -9,8 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flightsw.icd.quaternion import matrix_to_quat
-from ground import attitude
+from ground import attitude, attitude_choice
 from ground.attitude import FoundAttitude, in_body_axes, refined_motion
+from ground.attitude_choice import chosen_by_training
+from ground.cameras import sensor_of
 from ground.evaluate import evaluate
 from ground.reconstruct import reconstruct
 from ground.report_attitude import attitude_section
@@ -18,9 +20,11 @@ from ground.runs import open_run
 from ground.session import Navigation, Session, SessionError, open_session
 from ground.training_frames import training_frame
 from ground.truth import Truth
+from obbgs_base.errors import Interrupted
 from obbgs_base.navigation_errors import SharedParameters, displaced
 from obbgs_core.attitude.estimate import AttitudeUndetermined
 from obbgs_core.attitude.motion import at_epoch, attitudes, principal
+from obbgs_core.attitude.search import mirrored
 from obbgs_core.attitude.target_motion import TargetMotion
 from obbgs_core.pose_corrections import motion_of
 from obbgs_core.pose_estimate import PoseEstimate
@@ -169,3 +173,18 @@ def test_tags_that_do_not_state_the_attitude_they_assume_give_no_inertial_poses(
         dataclasses.replace(r, quat_inertial_to_body=np.array([1.0, 0, 0, 0])) for r in session.frames
     )
     in_body_axes(dataclasses.replace(session, frames=stated), found())
+
+
+def test_short_trainings_tell_a_motion_from_that_of_the_mirrored_target(tmp_path, monkeypatch):
+    monkeypatch.setattr(attitude_choice, "STEPS", 60)  # the scene is small
+    session = tumbling_session(tmp_path / "session")
+    frames = [training_frame(session, record) for record in session.frames]
+    times_s = np.array([record.mid_exposure_utc_ns / 1e9 for record in session.frames])
+    true = in_principal_axes(PARAMETERS)
+    to_inertial = frames[0].world_to_camera[:3, :3].double().numpy().T
+    mirror = in_principal_axes(mirrored(PARAMETERS[None], to_inertial)[0])
+    arguments = (frames, times_s, sensor_of(session.camera))
+    assert chosen_by_training(*arguments, [mirror, true]) == 1
+    assert chosen_by_training(*arguments, [true, true]) is None  # one motion is not better than itself
+    with pytest.raises(Interrupted):
+        chosen_by_training(*arguments, [true, mirror], should_stop=lambda: True)

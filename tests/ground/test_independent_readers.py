@@ -70,6 +70,15 @@ renderer.setAnimationLoop(() => { renderer.render(scene, camera); });
 """
 
 
+NO_EFFECTS = {  # of SuperSplat's viewer
+    "sharpness": {"enabled": False, "amount": 0},
+    "bloom": {"enabled": False, "intensity": 1, "blurLevel": 2},
+    "grading": {"enabled": False, "brightness": 0, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
+    "vignette": {"enabled": False, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
+    "fringing": {"enabled": False, "intensity": 0.5},
+}
+
+
 @pytest.fixture(scope="module")
 def programs() -> Path:
     return readers.installed()
@@ -178,6 +187,37 @@ def test_it_draws_our_file_as_we_do(browser, programs, tmp_path, program, file, 
     assert (
         psnr_db(theirs, expected) > 30
     )  # 32 to 39 dB were seen: what remains is that they blend display colours
+
+
+def test_supersplat_s_viewer_draws_our_file_as_we_do(browser, programs, tmp_path):
+    """splat-transform reads the PLY and writes it, compressed as SOG, beside the viewer."""
+    gaussians, camera = solid("camera", 4, 3), camera_at(VIEWS[1])
+    save_ply(gaussians, tmp_path / "model.ply", WHITE_RADIANCE, cameras=camera)
+    x, y, z = view_of(camera, "")["position"]
+    fov_deg = 2 * math.degrees(math.atan(SIZE_PX / 2 / FOCAL_PX))
+    view = {
+        "position": [-x, -y, z],
+        "target": [0, 0, 0],
+        "fov": fov_deg,
+    }  # it turns PLY by 180 degrees about z
+    settings = {
+        "version": 2,
+        "tonemapping": "none",
+        "highPrecisionRendering": False,
+        "background": {"color": [0, 0, 0]},
+        "animTracks": [],
+    }
+    settings |= {"postEffectSettings": NO_EFFECTS, "cameras": [{"initial": view}], "annotations": []}
+    (tmp_path / "settings.json").write_text(json.dumps(settings | {"startMode": "default"}))
+    options = ["-g", "cpu", "-E", tmp_path / "settings.json", "-U"]
+    (tmp_path / "page").mkdir()
+    readers.splat_transform(programs, *options, tmp_path / "model.ply", tmp_path / "page" / "index.html")
+    query = "noui&noanim&webgl"
+    with (
+        readers.served(tmp_path / "page") as url,
+        opened(browser, f"{url}/index.html?{query}", SIZE_PX, SIZE_PX) as page,
+    ):
+        assert psnr_db(picture(page), ours(gaussians, camera)) > 30  # 32.5 dB were seen
 
 
 @pytest.mark.parametrize(("sh_count", "channels"), [(1, 1), (4, 3), (16, 3)])

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from flightsw.icd.frame import Frame, PoseTag
 from flightsw.store import FrameStore
 from ground.live_status import read_status
 from ground.session import open_session
 from hil.links.virtual_serial import VirtualSerial
 from tests.hil.test_commands_end_to_end import Tools, lines, wait_for
+from tests.session_frames import frames_of
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 FIRST = 27  # frames of nine brackets, the eighth of which is held out
@@ -21,34 +21,6 @@ RECONSTRUCT = (
     "reconstruct:\n  steps: 100\n  settings: {start: {count: 1000}, growth: {max_gaussians: 1200}}\n"
 )
 LIMIT_S = 300  # of any wait; a busy machine needs minutes where a quiet one needs seconds
-
-
-def frames() -> list[Frame]:
-    """Return the frames of the golden session as flight stores them."""
-    session = open_session(GOLDEN / "session")
-    return [
-        Frame(
-            frame_id=r.id,
-            bracket_id=r.bracket,
-            bracket_index=r.bracket_index,
-            bracket_count=3,
-            exposure_time_s=r.exposure_time_s,
-            mid_exposure_utc_ns=r.mid_exposure_utc_ns,
-            pose=PoseTag(
-                r.quat_body_to_camera,
-                r.position_body_m,
-                r.covariance,
-                r.sun_dir_body,
-                r.in_eclipse,
-                r.pose_valid,
-            ),
-            dn=session.dn(r),
-            bit_depth=r.bit_depth,
-            black_dn=r.black_dn,
-            saturated_count=r.saturated,
-        )
-        for r in session.frames
-    ]
 
 
 def child_of(process: int) -> int | None:
@@ -71,7 +43,7 @@ def test_a_model_while_the_frames_arrive_goes_up_by_itself_and_outlives_kills(tm
     mission = tmp_path / "mission.yaml"
     mission.write_text(re.sub(r"reconstruct:.*", RECONSTRUCT, text, flags=re.DOTALL))
     store, session, key = tmp_path / "store", tmp_path / "session", tmp_path / "mission.key"
-    shot, run = frames(), session / "runs" / "live"
+    shot, run = frames_of(open_session(GOLDEN / "session")), session / "runs" / "live"
     for frame in shot[:FIRST]:
         FrameStore(store).put(frame)
 

@@ -1,16 +1,19 @@
 """The simulated GigE camera with frames rendered beforehand, seen by a client of its own protocol code."""
 
+import contextlib
 import itertools
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
+from flightsw.cameras import open_camera
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import load_mission
 from hil.cameras.gige import DESCRIPTION, GigeCameraServer
@@ -84,13 +87,21 @@ def test_what_an_interrupted_prerendering_has_rendered_is_used_again(tmp_path):
     mission = load_mission(tmp_path / "mission.yaml")
     moments = {exposure.mid_exposure_utc_ns for exposure in true_exposures(mission)}
     cache = tmp_path / "renders"
-    command = [str(Path(sys.executable).with_name("hil")), "camera", "--gige", "--prerender"]
+    command = [str(Path(sys.executable).with_name("hil")), "camera", "--prerender"]
     command += ["--mission", str(tmp_path / "mission.yaml"), "--cache", str(cache)]
 
-    def start() -> subprocess.Popen:
-        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    @contextlib.contextmanager
+    def start(*more: str) -> Iterator[subprocess.Popen]:
+        process = subprocess.Popen(
+            [*command, *more], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        try:
+            yield process
+        finally:
+            process.terminate()
+            process.communicate(timeout=LONG_S)
 
-    with start() as first:
+    with start("--gige") as first:
         while not list(cache.glob("*.npz")):
             assert first.poll() is None, first.communicate()[1]
             time.sleep(0.005)
@@ -99,7 +110,7 @@ def test_what_an_interrupted_prerendering_has_rendered_is_used_again(tmp_path):
     kept = {path: path.stat().st_mtime_ns for path in cache.iterdir()}
     assert first.returncode and out == "" and 1 <= len(kept) < 9
     assert all(path.suffix == ".npz" for path in kept)
-    with start() as second:
+    with start("--gige") as second:
         assert second.stdout
         assert second.stdout.readline() == "gige://127.0.0.1\n"
         with GvspClient(DESCRIPTION) as client:
@@ -114,3 +125,12 @@ def test_what_an_interrupted_prerendering_has_rendered_is_used_again(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
     assert len(list(cache.iterdir())) == len(moments) == 9  # free running rendered nothing more
     assert all(p.stamp_ns + 50_000 in moments and p.dn.max() > 500 for p in pictures)
+    with start() as third:  # our own protocol, whose clients give the times
+        assert third.stdout
+        camera = open_camera(third.stdout.readline().strip(), mission.camera)
+        for true in true_exposures(mission)[:2]:
+            start_ns = true.mid_exposure_utc_ns - round(true.exposure_time_s * 5e8)
+            exposure = camera.expose(true.exposure_time_s, start_ns)
+            assert exposure.mid_exposure_utc_ns == true.mid_exposure_utc_ns and exposure.dn.max() > 300
+        camera.close()
+    assert len(list(cache.iterdir())) == 9

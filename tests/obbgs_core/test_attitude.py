@@ -84,11 +84,14 @@ def chaser_poses(times_s: np.ndarray) -> torch.Tensor:
     return poses
 
 
-def pictures(parameters: np.ndarray, times_s: np.ndarray) -> tuple[list[torch.Tensor], torch.Tensor]:
-    """Return masks [64, 64] of the rotating body, without holes, and the poses of their cameras."""
+def pictures(
+    parameters: np.ndarray, times_s: np.ndarray, points: torch.Tensor | None = None
+) -> tuple[list[torch.Tensor], torch.Tensor]:
+    """Return masks [64, 64] of a rotating body, without holes, and the poses of their cameras."""
+    points = body() if points is None else points
     poses, masks = chaser_poses(times_s), []
     for pose, attitude in zip(poses, attitudes(parameters[None], times_s)[0], strict=True):
-        p = body() @ torch.from_numpy(attitude).float() @ pose[:3, :3].T + pose[:3, 3]
+        p = points @ torch.from_numpy(attitude).float() @ pose[:3, :3].T + pose[:3, 3]
         pixels = (p[:, :2] / p[:, 2:] * FOCAL_PX + SIZE_PX / 2).long()
         mask = torch.zeros(SIZE_PX, SIZE_PX, dtype=torch.bool)
         mask[pixels[:, 1], pixels[:, 0]] = True
@@ -102,9 +105,11 @@ def outlines(parameters: np.ndarray, times_s: np.ndarray) -> list[Silhouette]:
     return [Silhouette(m, m, ~m, pose, K).dilated(1) for m, pose in zip(masks, poses, strict=True)]
 
 
-def photographs(parameters: np.ndarray, times_s: np.ndarray) -> list[TrainingFrame]:
-    """Return frames of the rotating body, evenly bright, with the sensor's noise."""
-    masks, poses = pictures(parameters, times_s)
+def photographs(
+    parameters: np.ndarray, times_s: np.ndarray, points: torch.Tensor | None = None
+) -> list[TrainingFrame]:
+    """Return frames of a rotating body, evenly bright, with the sensor's noise."""
+    masks, poses = pictures(parameters, times_s, points)
     rng = torch.Generator().manual_seed(1)
     frames = []
     for index, (mask, pose) in enumerate(zip(masks, poses, strict=True)):
@@ -165,7 +170,7 @@ def test_the_spin_of_an_unknown_target_is_found_from_its_frames(monkeypatch):
     assert axis < 1.5 and abs(facts["period_s"] * np.linalg.norm(RATE_RAD_S) / 2 / np.pi - 1) < 0.01
     expected = np.array([0.0, 0.0, np.linalg.norm(RATE_RAD_S)])
     np.testing.assert_allclose(motion.epoch_to_body @ RATE_RAD_S, expected, atol=5e-4)
-    assert {what for what, _ in shown} == {"searching the spin", "following the motion"}
+    assert {what for what, _ in shown} == {"searching the spin", "following the motion", "judging the motion"}
     assert all(0 <= share <= 1 for _, share in shown)
 
 
@@ -174,3 +179,43 @@ def test_few_or_dark_frames_do_not_determine_an_attitude():
     frames = photographs(RATE_RAD_S, times_s)
     with pytest.raises(AttitudeUndetermined, match="10 brackets show light"):
         estimate_motion(frames[:10], times_s[:10], scenes.SENSOR)
+
+
+def round_body(radius: float, half_length: float) -> torch.Tensor:
+    """Return points [V, 3] of a cylinder about z."""
+    rng = np.random.default_rng(1)
+    turn, share = rng.uniform(0, 2 * np.pi, 9000), np.sqrt(rng.uniform(0, 1, 9000))
+    x, y = radius * share * np.cos(turn), radius * share * np.sin(turn)
+    return torch.from_numpy(np.stack([x, y, rng.uniform(-half_length, half_length, 9000)], axis=1)).float()
+
+
+def ball() -> torch.Tensor:
+    points = torch.randn(9000, 3, generator=torch.Generator().manual_seed(2))
+    return 0.8 * points / points.norm(dim=1, keepdim=True)
+
+
+def test_a_spin_of_less_than_half_a_turn_in_the_pass_is_found(monkeypatch):
+    monkeypatch.setattr(search, "MOST_TURN_RAD", 0.2)  # it turns by 0.12 rad from view to view
+    times_s, rate = (np.arange(26) - 13) * 20.0, RATE_RAD_S / 3
+    motion = estimate_motion(photographs(rate, times_s), times_s, scenes.SENSOR)
+    turns = np.einsum(
+        "ij,njk,nlk->nil",
+        motion.epoch_to_body,
+        attitudes(rate[None], times_s)[0],
+        motion.inertial_to_body(times_s),
+    )
+    assert not motion.tumbles and max(map(turned, turns)) < np.radians(4)
+
+
+def test_a_body_that_is_round_about_its_axis_does_not_tell_how_it_rolls(monkeypatch):
+    monkeypatch.setattr(search, "MOST_TURN_RAD", 0.15)
+    times_s = (np.arange(26) - 13) * 20.0
+    frames = photographs(np.array([0.005, 0.0, 0.0005]), times_s, round_body(0.4, 0.9))
+    with pytest.raises(AttitudeUndetermined, match="round about an axis"):
+        estimate_motion(frames, times_s, scenes.SENSOR)
+
+
+def test_a_ball_does_not_tell_how_it_turns():
+    times_s = np.arange(26) * 20.0
+    with pytest.raises(AttitudeUndetermined, match="agree under any motion"):
+        estimate_motion(photographs(RATE_RAD_S, times_s, ball()), times_s, scenes.SENSOR)

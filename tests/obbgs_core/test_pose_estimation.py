@@ -14,7 +14,8 @@ from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import Navigation, TrainingFrame, cameras_of, usable
 from obbgs_core.losses import likelihood_loss
 from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
-from obbgs_core.pose_corrections import NormalEquations, PoseCorrections, with_estimate
+from obbgs_core.normal_equations import NormalEquations
+from obbgs_core.pose_corrections import PoseCorrections, with_estimate
 from obbgs_core.registration import pose_information
 from obbgs_core.render import render
 from obbgs_core.score.poses import best_motion, moved, pose_errors, settled_poses
@@ -122,6 +123,71 @@ def test_the_gradient_by_a_pose_is_that_of_autograd(erring):
     scale = torch.tensor([1.0, 1, 0.1, 1 / RANGE_M, 1 / RANGE_M, 1 / RANGE_M]).double()
     a, b = ours * scale, true_gradient * scale
     assert float(a @ b / a.norm() / b.norm()) > 0.97
+
+
+def seen_with_cells(model, true: list[TrainingFrame], indices: list[int], cell_m: float):
+    """Return what pictures of a model say of true poses and of the surface's cells."""
+    chosen = [true[i] for i in indices]
+    cameras = cameras_of(chosen)
+    with torch.no_grad():
+        r = render(model, cameras)
+    dn, exposure_s = torch.stack([f.dn for f in chosen]), torch.full((len(chosen), 1, 1, 1), 1e-4)
+    images = (r.radiance, r.alpha, r.depth, cameras, exposure_s, dn, SENSOR)
+    return pose_information(*images, cell_m=cell_m)
+
+
+def test_a_surface_that_moves_as_one_is_a_motion_of_the_camera(erring):
+    """The derivatives by the pose, which autograd confirms above, are those by a common shift of all cells."""
+    true, _ = erring
+    information = seen_with_cells(MODEL, true, [4], 0.2)
+    assert information.cells is not None
+    (cells,) = information.cells
+    shift = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
+    to_camera = true[4].world_to_camera[:3, :3].double()
+    by_camera = information.curvature[0][:, 3:] @ to_camera @ shift
+    torch.testing.assert_close((cells.mixed.mT @ shift).sum(0), by_camera)
+    torch.testing.assert_close(to_camera @ cells.gradient.sum(0), information.gradient[0][3:])
+
+
+def test_eliminating_the_cells_solves_the_whole_system(erring):
+    """NumPy solves for brackets, shared parameters and cells at once; less is known than of a surface that stays."""
+    true, frames = erring
+    indices = [0, 3, 8, 15]
+    information = seen_with_cells(MODEL, true, indices, 0.3)
+    poses = PoseCorrections([frames[i] for i in indices])
+    poses.gather([0, 1, 2, 3], information)
+    equations = poses._normal_equations()
+    shared, own = equations.solution()
+    assert information.cells is not None
+    numbers = np.unique(np.concatenate([c.numbers for c in information.cells]))
+    P, S = len(poses.value), poses.by_shared.shape[2]
+    n = 6 * P + S
+    size = n + 3 * len(numbers)
+    whole, right = np.eye(size), np.zeros(size)
+    whole[n:, n:] /= 0.3**2
+    for f, (cells, bracket) in enumerate(zip(information.cells, poses.of_frame, strict=True)):
+        design = np.zeros((6, n))
+        design[:, 6 * bracket : 6 * bracket + 6] = poses.whitening.root[bracket].double()
+        design[:, 6 * P :] = poses.by_shared[f]
+        whole[:n, :n] += design.T @ information.curvature[f].numpy() @ design
+        right[:n] -= design.T @ information.gradient[f].numpy()
+        for k, number in enumerate(cells.numbers.numpy()):
+            at = n + 3 * int(np.searchsorted(numbers, number))
+            whole[at : at + 3, at : at + 3] += cells.curvature[k].numpy()
+            whole[at : at + 3, :n] += cells.mixed[k].numpy() @ design
+            whole[:n, at : at + 3] += (cells.mixed[k].numpy() @ design).T
+            right[at : at + 3] -= cells.gradient[k].numpy()
+    solved, covariance = np.linalg.solve(whole, right), np.linalg.inv(whole)
+    np.testing.assert_allclose(own.flatten(), solved[: 6 * P], rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(shared, solved[6 * P : n], rtol=1e-6, atol=1e-8)
+    of_shared, of_own = equations.covariances()
+    np.testing.assert_allclose(of_shared, covariance[6 * P : n, 6 * P : n], rtol=1e-6, atol=1e-10)
+    for p in range(P):
+        at = slice(6 * p, 6 * p + 6)
+        np.testing.assert_allclose(of_own[p], covariance[at, at], rtol=1e-6, atol=1e-10)
+    poses.cells = {}
+    fixed, _ = poses._normal_equations().covariances()
+    assert (of_shared.diagonal() >= fixed.diagonal() - 1e-12).all()
 
 
 def test_eliminating_the_brackets_solves_the_whole_system():

@@ -1,0 +1,32 @@
+"""The frames of a recorded session as flight stored them, to be sent down once more."""
+
+from flightsw.icd.frame import Frame, PoseTag
+from ground.session import Session
+
+
+def frames_of(session: Session) -> list[Frame]:
+    """Return the session's frames, in their order."""
+    brackets = [record.bracket for record in session.frames]
+    return [
+        Frame(
+            frame_id=r.id,
+            bracket_id=r.bracket,
+            bracket_index=r.bracket_index,
+            bracket_count=brackets.count(r.bracket),
+            exposure_time_s=r.exposure_time_s,
+            mid_exposure_utc_ns=r.mid_exposure_utc_ns,
+            pose=PoseTag(
+                r.quat_body_to_camera,
+                r.position_body_m,
+                r.covariance,
+                r.sun_dir_body,
+                r.in_eclipse,
+                r.pose_valid,
+            ),
+            dn=session.dn(r),
+            bit_depth=r.bit_depth,
+            black_dn=r.black_dn,
+            saturated_count=r.saturated,
+        )
+        for r in session.frames
+    ]
