@@ -91,6 +91,8 @@ def likelihood(
     dn: Array,
     gains: Array,
     sensor: SensorModel,
+    misfit_floors: Array,
+    weight: float,
     edge_weight: float,
     residual: Array,
     gradient: Array | None,

@@ -13,11 +13,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from obbgs_core import compiled
+from obbgs_core.misfit import ModelError, model_error
 from obbgs_core.sensor import Sensor
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Wang et al. 2004
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
-MISFIT_ROWS = 50  # of an image that the model's own error is measured on, about
 ON_TARGET_ALPHA = 0.05  # pixels with more alpha than this count as target in the figures of a fit
 
 
@@ -41,8 +41,9 @@ def likelihood_loss(
         dn: read [B, H, W, C].
         averaged_pixels: sensor pixels averaged into each pixel of dn; the noise is smaller by its root.
         misfit: the model's own error as a share of the light (`relative_misfit`), which no averaging makes smaller. The
-            residual is then over both errors together, and the penalty Cauchy's: what the model cannot explain, such as
-            the glint of a mirror, loses its pull. None: only the noise is known, and the penalty is `charbonnier`.
+            residual is then over both errors together (`model_error`), and the penalty Cauchy's: what the model cannot
+            explain, such as the glint of a mirror, loses its pull. It is weighted so that what pulls on average pulls
+            as before. None: only the noise is known, and the penalty is `charbonnier`.
 
     Returns:
         loss: scalar; residual: [B, H, W, C], `Sensor.deviance_residual` over its deviation, without gradient.
@@ -55,8 +56,12 @@ def likelihood_loss(
     if native is None:
         settings = (averaged_pixels, edge_weight, misfit)
         return likelihood_loss_reference(radiance, exposure_time_s, dn, sensor, *settings)
-    model = _sensor_model(native, sensor, averaged_pixels, misfit)
-    return _swept(native.likelihood, radiance, exposure_time_s, dn, sensor, model, edge_weight)
+    error = ModelError(0.0, torch.zeros(len(dn)), 1.0)
+    if misfit is not None:
+        error = model_error(radiance, exposure_time_s, dn, sensor, averaged_pixels, misfit)
+    model = _sensor_model(native, sensor, averaged_pixels, None if misfit is None else error.by_light)
+    settings = (model, error.floor_dn2.float(), error.weight, edge_weight)
+    return _swept(native.likelihood, radiance, exposure_time_s, dn, sensor, *settings)
 
 
 def likelihood_loss_reference(
@@ -73,11 +78,10 @@ def likelihood_loss_reference(
     if misfit is None:
         loss = charbonnier(residual)
     else:
+        error = model_error(radiance, exposure_time_s, dn, sensor, averaged_pixels, misfit)
         prediction = sensor.predicted(radiance.detach(), exposure_time_s)
-        light_dn = (prediction.expected_dn - sensor.black_dn).clamp(0, sensor.white_dn - sensor.black_dn)
-        both = 1 + averaged_pixels * (misfit * light_dn).square() / prediction.variance_dn2
-        residual = residual / both.sqrt()
-        loss = cauchy(residual)
+        residual = residual / (1 + error.variance_dn2(prediction, sensor) / prediction.variance_dn2).sqrt()
+        loss = error.weight * cauchy(residual)
     if edge_weight:
         visible = sensor.expected_dn(radiance, exposure_time_s).clamp(max=sensor.white_dn)
         loss = loss + edge_weight * sobel_edge_loss(sensor.stabilised(visible), sensor.stabilised(dn))
@@ -188,25 +192,6 @@ def cauchy(normalised_residual: Tensor, tail: float = 3.0) -> Tensor:
     return (0.5 * tail * tail * torch.log1p((normalised_residual / tail) ** 2)).mean()
 
 
-@torch.no_grad()
-def relative_misfit(
-    radiance: Tensor, exposure_time_s: Tensor, dn: Tensor, sensor: Sensor, averaged_pixels: int = 1
-) -> float:
-    """Return the model's own error as a share of the light, by the method of moments; NaN where nothing is seen.
-
-    Its square is the mean square by which readings differ from their expectation, less the noise, over the mean square
-    of the light; 0 where noise explains the difference. Values that are lit above twice the noise count, saturated ones
-    do not. The arguments are as for `likelihood_loss`; of large images, every so many pixels are taken.
-    """
-    step = max(1, radiance.shape[1] // MISFIT_ROWS)
-    radiance, dn = radiance[:, ::step, ::step], dn[:, ::step, ::step]
-    prediction = sensor.predicted(radiance, exposure_time_s)
-    light_dn, variance = prediction.expected_dn - sensor.black_dn, prediction.variance_dn2 / averaged_pixels
-    seen = (light_dn > 2 * variance.sqrt()) & (dn < sensor.white_dn)
-    excess = ((prediction.expected_dn - dn).square() - variance)[seen].sum()
-    return (excess / light_dn.square()[seen].sum()).clamp(min=0).sqrt().item()
-
-
 def ssim(a: Tensor, b: Tensor) -> Tensor:
     """Return the mean structural similarity of images in 0..1, Gaussian window, zero padding as in 3DGS."""
     return ssim_map(a, b).mean()
@@ -275,14 +260,14 @@ def _gains(sensor: Sensor, exposure_time_s: Tensor) -> Tensor:
 
 
 def _swept(
-    sweep, radiance: Tensor, exposure_time_s: Tensor, dn: Tensor, sensor: Sensor, model, *weights: float
+    sweep, radiance: Tensor, exposure_time_s: Tensor, dn: Tensor, sensor: Sensor, *settings: Any
 ) -> tuple[Tensor, Tensor]:
     """Return a compiled loss, with its gradient if the radiance needs one, and its residual."""
     values = radiance.detach().contiguous()
     residual = torch.empty_like(values)
     gradient = torch.empty_like(values) if radiance.requires_grad else None
     gains, threads = _gains(sensor, exposure_time_s), torch.get_num_threads()
-    loss = sweep(values, dn.contiguous(), gains, model, *weights, residual, gradient, threads)
+    loss = sweep(values, dn.contiguous(), gains, *settings, residual, gradient, threads)
     if gradient is None:
         return radiance.new_tensor(loss), residual
     return _KnownGradient.apply(radiance, loss, gradient), residual

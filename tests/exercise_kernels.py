@@ -151,7 +151,8 @@ def exercise_losses(module: ModuleType) -> None:
         sensor = module.SensorModel(64.0, 4095.0, 2.0, 3.0, averaged_pixels, misfit)
         for shape in [(2, 53, 37, 3), (1, 3, 3, 1), (1, 1, 1, 3), (2, 2, 5, 1), (3, 130, 20, 1)]:
             dn = np.round(np.clip(rng.uniform(-200, 4500, shape), 0, 4095)).astype(np.float32)
-            gains = np.full(shape[0], 4e3, dtype=np.float32)
+            gains, floors = np.full(shape[0], 4e3, dtype=np.float32), np.full(shape[0], 50, dtype=np.float32)
+            weighted = sensor, floors, 3.0, 0.2
             radiance = ((dn - 64) / 4e3 * rng.uniform(0.8, 1.2, shape)).astype(np.float32)
             for invalid in (False, True):
                 if invalid:
@@ -170,7 +171,7 @@ def exercise_losses(module: ModuleType) -> None:
                 results = []
                 for threads in THREADS:
                     residual, gradient = np.empty_like(dn), np.empty_like(dn)
-                    value = module.likelihood(radiance, dn, gains, sensor, 0.2, residual, gradient, threads)
+                    value = module.likelihood(radiance, dn, gains, *weighted, residual, gradient, threads)
                     results.append([np.float64(value), residual.copy(), gradient.copy()])
                     value = module.published(
                         radiance, dn, gains, sensor, 0.2, 0.1, True, residual, gradient, threads
@@ -179,7 +180,7 @@ def exercise_losses(module: ModuleType) -> None:
                     alpha = rng.random(shape[:3], dtype=np.float32)
                     module.fit(radiance, alpha, dn, gains, sensor, 0.05, threads)
                     residual = np.empty_like(dn)
-                    module.likelihood(radiance, dn, gains, sensor, 0.2, residual, None, threads)
+                    module.likelihood(radiance, dn, gains, *weighted, residual, None, threads)
                     module.published(radiance, dn, gains, sensor, 0.2, 0.1, False, residual, None, threads)
                 assert same(results)
 

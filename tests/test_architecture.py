@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FORBIDDEN = {
-    "flightsw": {"torch", "cv2", "obbgs_core", "ground", "hil", "scipy", "plotly", "trimesh"},
+    "flightsw": {"torch", "cv2", "imagecodecs", "obbgs_core", "ground", "hil", "scipy", "plotly", "trimesh"},
     "flightsw.icd": {"torch", "cv2", "obbgs_core", "ground", "hil", "serial"},
     "flightsw.ports": {"torch", "cv2", "obbgs_core", "ground", "hil"},
     "obbgs_core": {"flightsw", "ground", "hil", "typer", "rich", "serial"},

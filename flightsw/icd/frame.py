@@ -6,9 +6,9 @@ import zlib
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
-import imagecodecs
 import numpy as np
 
+from flightsw.icd.codestream import decode_pixels, encode_pixels
 from flightsw.icd.packet import CrcMismatch, PacketError, PacketTooShort
 from flightsw.icd.quaternion import quat_to_matrix
 
@@ -29,7 +29,6 @@ NOT_STATED = (0.0, 0.0, 0.0, 0.0, 0.0)  # assumed attitude and correlation time,
 CRC = struct.Struct(">I")
 FLAG_ECLIPSE, FLAG_POSE_VALID, FLAG_MASKED = 1, 2, 4
 CODEC_JPEG_LS = 1
-END_OF_IMAGE = b"\xff\xd9"
 MAX_PIXELS = 8192 * 8192
 THUMBNAIL_PX = 64  # longest side of a thumbnail
 THUMBNAIL_MAX_ERROR = 2  # DN
@@ -162,8 +161,9 @@ def encode_frame(frame: Frame, *, max_error_dn: int = 0, roi_mask: np.ndarray | 
             raise ValueError(f"roi_mask has shape {roi_mask.shape}, the frame {dn.shape[:2]}")
         dn = np.where(roi_mask.reshape(roi_mask.shape + (1,) * (dn.ndim - 2)), dn, np.uint16(frame.black_dn))
         flags |= FLAG_MASKED
-    codestream = bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(dn), level=max_error_dn))
-    decoded = dn if max_error_dn == 0 else imagecodecs.jpegls_decode(codestream)
+    codestream = encode_pixels(dn, max_error_dn)
+    shape = (dn.shape[0], dn.shape[1], 1 if dn.ndim == 2 else 3)
+    decoded = dn if max_error_dn == 0 else decode_pixels(codestream, shape)
     pose = frame.pose
     assumed = np.zeros(4) if pose.quat_inertial_to_body is None else pose.quat_inertial_to_body
     header = HEADER.pack(
@@ -177,9 +177,7 @@ def encode_frame(frame: Frame, *, max_error_dn: int = 0, roi_mask: np.ndarray | 
         flags,
         frame.exposure_time_s,
         frame.mid_exposure_utc_ns,
-        dn.shape[0],
-        dn.shape[1],
-        1 if dn.ndim == 2 else 3,
+        *shape,
         frame.bit_depth,
         CODEC_JPEG_LS,
         max_error_dn,
@@ -306,19 +304,7 @@ def _frame_from(fields: tuple, codestream: bytes, pixel_crc: int) -> Frame:
             f"codec {codec}, {channels} channels, pose source {source}, attitude {attitude}, {height}x{width}: "
             "out of range"
         )
-    expected_size = (height, width, channels)
-    if _codestream_size(codestream) != expected_size:  # before decoding: hostile sizes must not take memory
-        raise PacketError(f"the header says {expected_size}, the codestream {_codestream_size(codestream)}")
-    if not codestream.endswith(END_OF_IMAGE):
-        raise PacketError("the JPEG-LS codestream does not end: the decoder would search for seconds")
-    try:
-        dn = imagecodecs.jpegls_decode(codestream)
-    except (imagecodecs.JpeglsError, ValueError, RuntimeError) as error:
-        raise PacketError(f"the JPEG-LS codestream cannot be decoded: {error}") from error
-    expected_shape = (height, width) if channels == 1 else (height, width, channels)
-    if dn.shape != expected_shape or dn.dtype != np.uint16:
-        raise PacketError(f"the header says {expected_shape}, the codestream {dn.shape} {dn.dtype}")
-    dn = dn.astype(np.uint16)
+    dn = decode_pixels(codestream, (height, width, channels))
     if _pixel_crc(dn) != pixel_crc:
         raise CrcMismatch("the decoded pixels do not fit their CRC-32")
     covariance = np.zeros((6, 6))
@@ -342,18 +328,6 @@ def _frame_from(fields: tuple, codestream: bytes, pixel_crc: int) -> Frame:
         )
     except ValueError as error:
         raise PacketError(f"frame {frame_id}: {error}") from error
-
-
-def _codestream_size(codestream: bytes) -> tuple[int, int, int] | None:
-    """Return height, width and components that a JPEG-LS codestream announces, None if it announces none."""
-    at = 2  # after the start-of-image marker
-    while at + 10 <= len(codestream) and codestream[at] == 0xFF:
-        marker, length = codestream[at + 1], int.from_bytes(codestream[at + 2 : at + 4], "big")
-        if marker == 0xF7:  # start of a JPEG-LS frame (ISO 14495-1)
-            _, height, width, components = struct.unpack_from(">BHHB", codestream, at + 4)
-            return height, width, components
-        at += 2 + length
-    return None
 
 
 def _pixel_crc(dn: np.ndarray) -> int:

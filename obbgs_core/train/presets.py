@@ -73,9 +73,10 @@ PRESETS: dict[str, MethodConfig] = {
                 kind="likelihood",
                 ssim_weight=0.0,
                 edge_weight=0.05,
+                misfit=True,
                 sh_weight=1.0,
-                flat_weight=3.0,
-                sky_weight=0.2,
+                flat_weight=15.0,
+                sky_weight=1.0,
             ),
             growth=GrowthSettings(
                 max_gaussians=10_000,

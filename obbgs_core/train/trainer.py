@@ -12,7 +12,8 @@ import torch
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.losses import fit_figures, relative_misfit
+from obbgs_core.losses import fit_figures
+from obbgs_core.misfit import relative_misfit
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
@@ -181,7 +182,8 @@ class Trainer:
         if not math.isnan(chi2):
             known = not math.isnan(state.chi2)
             state.chi2 = CHI2_MEMORY * state.chi2 + (1 - CHI2_MEMORY) * chi2 if known else chi2
-        if self.setup.config.loss.misfit:
+        settings = self.setup.config.loss
+        if settings.misfit and settings.kind == "likelihood":
             misfit = relative_misfit(images[0], *images[2:], self.setup.sensor, batch.averaged_pixels)
             if not math.isnan(misfit):
                 last = misfit if state.misfit is None else state.misfit

@@ -9,7 +9,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from obbgs_core.losses import cauchy, likelihood_loss, relative_misfit
+from obbgs_core.losses import cauchy, likelihood_loss
+from obbgs_core.misfit import OWN, model_error, relative_misfit
 from obbgs_core.sensor import Sensor
 from tests.obbgs_core.test_losses import (
     value_and_gradient,
@@ -20,12 +21,13 @@ EXPOSURES_S = torch.full((1, 1, 1, 1), 1e-4)
 
 
 def erring(share: float, seed: int, noise: bool = True) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return a prediction [1, 120, 90, 1] that errs by a share of the light, and readings."""
+    """Return a prediction [1, 120, 90, 1] that errs by a share of the light, its own or another's, and readings."""
     g = torch.Generator().manual_seed(seed)
     radiance = 0.2 + 1.5 * torch.rand(1, 120, 90, 1, generator=g)
     expected = SENSOR.expected_dn(radiance, EXPOSURES_S)
     light_dn = expected - SENSOR.black_dn
-    dn = expected + share * light_dn * torch.randn(expected.shape, generator=g)
+    spread = (OWN * light_dn.square() + (1 - OWN) * light_dn.square().mean()).sqrt()
+    dn = expected + share * spread * torch.randn(expected.shape, generator=g)
     if noise:
         dn = dn + SENSOR.variance_dn2(expected).sqrt() * torch.randn(expected.shape, generator=g)
     return radiance, dn
@@ -73,3 +75,48 @@ def test_a_glint_loses_its_pull_as_it_grows():
         )
         pulls.append(-gradient[0, 4, 4].item())
     assert pulls[0] > pulls[1] > pulls[2] > 0
+
+
+@pytest.mark.parametrize("averaged_pixels", [1, 4])
+def test_the_error_is_spread_over_a_picture_as_the_formula_says(averaged_pixels):
+    rng = np.random.default_rng(1)
+    radiance = np.where(rng.random((2, 40, 30, 1)) < 0.5, 0, rng.uniform(0.3, 1.2, (2, 40, 30, 1)))
+    times_s = np.array([1e-4, 2e-4]).reshape(2, 1, 1, 1)
+    seen, exposures_s = torch.from_numpy(radiance), torch.from_numpy(times_s)
+    error = model_error(seen, exposures_s, seen, SENSOR, averaged_pixels, misfit=0.3)
+    light_dn = 1e7 * times_s * radiance
+    noise = light_dn / 4 + 5**2 + 1 / 12
+    lit, floors = radiance > 0, error.floor_dn2.numpy()
+    for i in range(2):  # over the lit pixels of each picture, the squared share of the light
+        both = (error.by_light * light_dn[i] ** 2 + floors[i])[lit[i]]
+        assert both.sum() == pytest.approx(averaged_pixels * 0.09 * (light_dn[i] ** 2).sum())
+    assert floors[1] == pytest.approx(
+        floors[0] * (light_dn[1][lit[1]] ** 2).mean() / (light_dn[0][lit[0]] ** 2).mean()
+    )
+    inflated = np.sqrt(1 + (error.by_light * light_dn**2 + floors.reshape(2, 1, 1, 1)) / noise)
+    assert error.weight == pytest.approx(inflated[lit].mean())
+
+
+def test_a_model_that_is_far_off_pulls_as_hard_against_the_priors_as_without_the_misfit():
+    """What a training has yet to learn is taken for misfit: the pull must not vanish with it."""
+    radiance = torch.full((1, 30, 30, 1), 0.3)
+    dn = SENSOR.expected_dn(3 * radiance, EXPOSURES_S)
+    misfit = relative_misfit(radiance, EXPOSURES_S, dn, SENSOR)
+    assert misfit == pytest.approx(2, rel=1e-3)
+    pulls = [
+        value_and_gradient(lambda r, k=k: likelihood_loss(r, EXPOSURES_S, dn, SENSOR, misfit=k)[0], radiance)[
+            1
+        ].mean()
+        for k in (None, misfit)
+    ]
+    assert (
+        0.4 < (pulls[1] / pulls[0]).item() < 1
+    )  # one deviation of both errors, against two of the noise at most
+
+
+def test_a_dark_prediction_has_no_misfit_and_the_loss_is_finite():
+    radiance = torch.zeros(1, 8, 8, 1)
+    dn = torch.full_like(radiance, 500.0)
+    error = model_error(radiance, EXPOSURES_S, dn, SENSOR, 1, misfit=0.5)
+    assert error.floor_dn2.item() == 0 and error.weight == 1
+    assert torch.isfinite(likelihood_loss(radiance, EXPOSURES_S, dn, SENSOR, misfit=0.5)[0])

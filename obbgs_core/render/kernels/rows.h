@@ -22,7 +22,8 @@ struct SensorModel {
   float read_variance;   // DN^2, quantisation included
   float anscombe_floor;  // electrons^2
   float root_averaged;   // sqrt of the sensor pixels in one pixel: averaging shrinks the noise
-  float misfit;          // squared relative error of the model times the sensor pixels in one; negative: not known
+  float misfit;          // variance of the model's own error over the squared light; negative: not known
+  float misfit_floor;    // DN^2, what it is beside that everywhere in a picture; both times the sensor pixels in one
 };
 
 struct Window {
@@ -101,9 +102,9 @@ inline float expected_dn(float signal, const SensorModel& s, float& inverse_sigm
 // log(q), q = 1 + (r / tail)^2, of residuals over both errors: `share` is the noise's share of their deviation.
 inline float robust(float& squared, float signal, float inverse_sigma, const SensorModel& s, float& share, float& q) {
   const float seen = signal < 0 ? 0.0f : (signal > s.white - s.black ? s.white - s.black : signal);
-  const float error = seen * inverse_sigma;
   const bool known = s.misfit >= 0;
-  share = known ? 1.0f / std::sqrt(1.0f + s.misfit * error * error) : 1.0f;
+  const float error = (s.misfit * seen * seen + s.misfit_floor) * inverse_sigma * inverse_sigma;
+  share = known ? 1.0f / std::sqrt(1.0f + error) : 1.0f;
   squared *= share * share;
   const float w = squared * (1.0f / (kTail * kTail)), bounded = w < 1e29f ? w : 1e29f + 0 * w;
   const float smooth = std::sqrt(1.0f + squared * (1.0f / (kKnee * kKnee)));

@@ -155,23 +155,27 @@ void expect(const Array& array, const char* name, size_t count) {
                                 std::to_string(array.size()));
 }
 
-// Mean robust penalty of the deviance residual + edge_weight * mean Sobel difference, stabilised scale.
-double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, double edge_weight, Array residual,
-                  std::optional<Array> gradient, int threads) {
+// weight * mean robust penalty of the deviance residual + edge_weight * mean Sobel difference, stabilised scale.
+// misfit_floors: of each image, see SensorModel.
+double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, Array misfit_floors, double weight,
+                  double edge_weight, Array residual, std::optional<Array> gradient, int threads) {
   const Shape shape = shape_of(radiance, "radiance");
   expect(dn, "dn", radiance.size());
   expect(gains, "gains", shape.count);
+  expect(misfit_floors, "misfit_floors", shape.count);
   expect(residual, "residual", radiance.size());
   if (gradient) expect(*gradient, "gradient", radiance.size());
-  const float *r = radiance.data(), *d = dn.data(), *gain = gains.data();
+  const float *r = radiance.data(), *d = dn.data(), *gain = gains.data(), *floors = misfit_floors.data();
   float *out = residual.data(), *g = gradient ? gradient->data() : nullptr;
-  const double scale = 1 / shape.values(), edge_scale = edge_weight / shape.edges();
+  const double scale = weight / shape.values(), edge_scale = edge_weight / shape.edges();
   const auto at_a_clip = [&](float reading) { return reading <= 0 || reading >= s.white; };
   nb::gil_scoped_release release;
   return sum_over_bands(shape, threads, [&](const Band& band) {
     const int n = shape.row();
     const size_t image = band.image * shape.image();
     const float t = gain[band.image];
+    SensorModel of_image = s;
+    of_image.misfit_floor = floors[band.image];
     std::vector<float> penalty(n, 0.0f), unwanted(n);
     for (int y = band.begin; y < band.end; ++y) {
       const size_t at = image + size_t(y) * n;
@@ -180,7 +184,7 @@ double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, d
       const auto row = s.root_averaged > 1 ? loops->averaged_likelihood_row
                        : clipped           ? loops->likelihood_row
                                            : loops->unclipped_likelihood_row;
-      row(n, r + at, d + at, t, s, out + at, penalty.data(), slope);
+      row(n, r + at, d + at, t, of_image, out + at, penalty.data(), slope);
       loops->scale_row(n, float(scale), slope);
     }
     double sum = scale * total(penalty);
@@ -321,11 +325,12 @@ void bind_training(nb::module_& m) {
                                float(read_noise_dn * read_noise_dn + 1.0 / 12),
                                float(3.0 / 8 + read_noise_e * read_noise_e),
                                float(std::sqrt(averaged_pixels)),
-                               misfit ? float(*misfit * *misfit * averaged_pixels) : -1.0f};
+                               misfit ? float(*misfit) : -1.0f,
+                               0.0f};
       });
   // arrays that are filled in place must not be converted: the result would go into a copy
-  m.def("likelihood", &obbgs::likelihood, "radiance"_a, "dn"_a, "gains"_a, "sensor"_a, "edge_weight"_a,
-        "residual"_a.noconvert(), "gradient"_a.none().noconvert(), "threads"_a);
+  m.def("likelihood", &obbgs::likelihood, "radiance"_a, "dn"_a, "gains"_a, "sensor"_a, "misfit_floors"_a, "weight"_a,
+        "edge_weight"_a, "residual"_a.noconvert(), "gradient"_a.none().noconvert(), "threads"_a);
   m.def("published", &obbgs::published, "radiance"_a, "dn"_a, "gains"_a, "sensor"_a, "ssim_weight"_a, "edge_weight"_a,
         "clamped"_a, "residual"_a.noconvert(), "gradient"_a.none().noconvert(), "threads"_a);
   m.def("fit", &obbgs::fit, "radiance"_a, "alpha"_a, "dn"_a, "gains"_a, "sensor"_a, "least_alpha"_a, "threads"_a);

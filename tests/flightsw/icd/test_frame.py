@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from flightsw.icd.codestream import decode_pixels, encode_pixels
 from flightsw.icd.frame import (
     HEADER,
     CrcMismatch,
@@ -24,6 +25,9 @@ from flightsw.icd.frame import (
     read_header,
 )
 
+SPIFF_BYTES = (
+    44  # an optional header that other writers of JPEG-LS put first (ISO 14495-1, annex F of part 2)
+)
 finite = st.floats(-1e6, 1e6)
 own_fixture = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -159,7 +163,23 @@ def test_a_container_of_version_1_is_still_read(make_frame):
     header = header_of(container)
     assert (len(header), len(header_of(encode_frame(frame)))) == (310, HEADER.size)
     values, newest = read_header(header), read_header(header_of(encode_frame(frame)))
+    assert values.pop("codestream_bytes") - newest.pop("codestream_bytes") == SPIFF_BYTES
     assert values == newest and values["attitude"] == "known"
+
+
+@pytest.mark.parametrize("near", [0, 1, 3, 64, 255])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (3, 2, 3), (40, 31), (20, 33, 3)])
+@pytest.mark.parametrize("white", [1, 255, 4095, 65535])
+def test_another_coder_reads_our_pixels_and_writes_those_we_read(near, shape, white):
+    """imagecodecs has CharLS in a build of its own, and puts a SPIFF header before the same codestream."""
+    dn = np.random.default_rng(near).integers(0, white + 1, shape, dtype=np.uint16)
+    ours, theirs = encode_pixels(dn, near), bytes(imagecodecs.jpegls_encode(dn, level=near))
+    size = (*shape, 1)[:3]
+    decoded = decode_pixels(ours, size)
+    np.testing.assert_array_equal(imagecodecs.jpegls_decode(ours), decoded)
+    np.testing.assert_array_equal(decode_pixels(theirs, size), decoded)
+    assert np.abs(decoded.astype(int) - dn).max() <= near and decoded.dtype == np.uint16
+    assert ours[2:] == theirs[2 + SPIFF_BYTES :]
 
 
 def test_a_tag_of_unknown_attitude_is_in_inertial_axes(make_frame):

@@ -1,0 +1,79 @@
+"""The model's own error beside the noise: how large it is, and how it spreads over a picture."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from obbgs_core.sensor import Prediction, Sensor
+
+ROWS = 50  # of an image that the model's own error is measured on, about
+OWN = 0.8  # share of the error's variance that goes with a pixel's own light; the rest goes with that of its picture
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """What the model's own error adds to the variance of a reading, over the sensor pixels that are averaged in it."""
+
+    by_light: float  # times the squared light of the pixel
+    floor_dn2: Tensor  # [B] everywhere in each picture
+    weight: float  # of the loss, by which the mean pull on the lit pixels stays that of the noise alone
+
+    def variance_dn2(self, prediction: Prediction, sensor: Sensor) -> Tensor:
+        """Return that variance for each pixel [B, H, W, C]."""
+        return self.by_light * _light_dn(prediction, sensor).square() + self.floor_dn2[:, None, None, None]
+
+
+@torch.no_grad()
+def model_error(
+    radiance: Tensor, exposure_time_s: Tensor, dn: Tensor, sensor: Sensor, averaged_pixels: int, misfit: float
+) -> ModelError:
+    """Return how the model's own error spreads over some pictures, where it is a share `misfit` of the light.
+
+    Most of its variance goes with the squared light of each pixel, since albedo, normals and glints err by a share of
+    it, and the rest (1 - `OWN`) with the mean square over the lit pixels of the picture, since misplaced edges and
+    shadows err by the light of other pixels. Over the lit pixels that adds up to the squared share of the light. The
+    other arguments are as for `likelihood_loss`; of large images, every so many pixels are taken.
+    """
+    radiance, dn = _sampled(radiance, dn)
+    prediction = sensor.predicted(radiance, exposure_time_s)
+    squares = _light_dn(prediction, sensor).square()
+    variance = prediction.variance_dn2 / averaged_pixels
+    seen = squares > 4 * variance
+    per_picture = (squares * seen).sum(dim=(1, 2, 3)) / seen.sum(dim=(1, 2, 3)).clamp(min=1)
+    share = averaged_pixels * misfit**2
+    floor_dn2 = share * (1 - OWN) * per_picture
+    error = ModelError(share * OWN, floor_dn2, 1.0)
+    if not seen.any():
+        return error
+    both = 1 + error.variance_dn2(prediction, sensor) / prediction.variance_dn2
+    return ModelError(share * OWN, floor_dn2, both.sqrt()[seen].mean().item())
+
+
+@torch.no_grad()
+def relative_misfit(
+    radiance: Tensor, exposure_time_s: Tensor, dn: Tensor, sensor: Sensor, averaged_pixels: int = 1
+) -> float:
+    """Return the model's own error as a share of the light, by the method of moments; NaN where nothing is seen.
+
+    Its square is the mean square by which readings differ from their expectation, less the noise, over the mean square
+    of the light; 0 where noise explains the difference. Values that are lit above twice the noise count, saturated ones
+    do not. The arguments are as for `likelihood_loss`; of large images, every so many pixels are taken.
+    """
+    radiance, dn = _sampled(radiance, dn)
+    prediction = sensor.predicted(radiance, exposure_time_s)
+    light_dn, variance = prediction.expected_dn - sensor.black_dn, prediction.variance_dn2 / averaged_pixels
+    seen = (light_dn > 2 * variance.sqrt()) & (dn < sensor.white_dn)
+    excess = ((prediction.expected_dn - dn).square() - variance)[seen].sum()
+    return (excess / light_dn.square()[seen].sum()).clamp(min=0).sqrt().item()
+
+
+def _sampled(*images: Tensor) -> tuple[Tensor, ...]:
+    """Return about 50 rows of each image and as many columns."""
+    step = max(1, images[0].shape[1] // ROWS)
+    return tuple(image[:, ::step, ::step] for image in images)
+
+
+def _light_dn(prediction: Prediction, sensor: Sensor) -> Tensor:
+    """Return what is expected above black, as far as it can be read."""
+    return (prediction.expected_dn.detach() - sensor.black_dn).clamp(0, sensor.white_dn - sensor.black_dn)
