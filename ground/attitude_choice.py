@@ -29,6 +29,11 @@ CERTAIN = (
 )
 
 
+# A wrong rotation must not be excused as the model's own error. With these weights of the priors, its held-out loss in
+# the test of a mirrored motion is 7 standard errors above that of the true one; with the method's own, 2.5.
+NOISE_ALONE = {"loss.misfit": False, "loss.flat_weight": 3.0, "loss.sky_weight": 0.2}
+
+
 def chosen_by_training(
     frames: list[TrainingFrame],
     times_s: np.ndarray,
@@ -86,7 +91,7 @@ def held_out_losses(frames: list[TrainingFrame], sensor: Sensor) -> np.ndarray:
     """Return the mean loss of each held-out bracket [B] after a short training on the others."""
     brackets = sorted({frame.bracket for frame in frames if frame.bracket is not None})
     held_out = brackets[HELD_OUT // 2 :: HELD_OUT]
-    config = preset("obbgs", {"steps": STEPS, "poses.refine": "never"})
+    config = preset("obbgs", {"steps": STEPS, "poses.refine": "never", **NOISE_ALONE})
     model = train([f for f in frames if f.bracket not in held_out], sensor, config).gaussians
     losses: dict[int, list[float]] = {bracket: [] for bracket in held_out}
     for frame in frames:

@@ -21,7 +21,7 @@ from obbgs_core.pose_estimate import PoseEstimate
 
 ROTATIONAL = slice(6, 6 + TUMBLE)  # attitude, rate and inertia ratios among the shared parameters
 # deviations that a training leaves at least, as a share of those before it: it states them for a model without error
-LEAST_LEFT = 0.2
+LEAST_LEFT = 0.4
 OWN_AXES_RAD = 0.1  # how far a refinement may turn the principal axes where equal moments leave them open
 
 

@@ -18,6 +18,7 @@ NAMES = (
     "method",
     "ablation",
     "condition",
+    "scenario",
     "target",
 )  # what a line of a table is called by, where a row has it
 BUDGETS = {
@@ -26,6 +27,11 @@ BUDGETS = {
 }  # and these where rows differ in them
 FIGURES = {  # key of a row: column title and format
     "psnr_clean_db": ("clean PSNR", "{:.2f} dB"),
+    "psnr_settled_db": ("from settled poses", "{:.2f} dB"),
+    "psnr_exact_db": ("with exact tags", "{:.2f} dB"),
+    "pose_error_deg": ("pose error", "{:.3f} deg"),
+    "pose_error_range": ("of the range", "{:.2%}"),
+    "pose_error_px": ("in the picture", "{:.2f} px"),
     "psnr_foreground_db": ("foreground", "{:.2f} dB"),
     "psnr_clean_pooled_db": ("pooled", "{:.2f} dB"),
     "chamfer": ("Chamfer", "{:.4f}"),
