@@ -83,8 +83,8 @@ def import_command(
     source = f"{format_.value}: {folder}"
     if format_ is not ImportFormat.IMAGES and poses is not PoseChoice.STATED:
         views, found_poses = _checked_poses(views, given_sigmas or sigmas, poses is PoseChoice.MEND)
-        if poses is PoseChoice.MEND and found_poses:
-            source += f", poses mended: {', '.join(f'{len(v)} {k}' for k, v in found_poses.items())}"
+        if poses is PoseChoice.MEND:
+            source += "".join(f", {len(pictures)} poses {kind}" for kind, pictures in found_poses.items())
     given = None if values is None else Values(values.value)
     with Progress(TextColumn("importing"), BarColumn(), TimeRemainingColumn(), console=stderr) as progress:
         task = progress.add_task("import", total=len(views))
@@ -119,21 +119,23 @@ def _checked_poses(
     with Progress(TextColumn("checking poses"), BarColumn(), TimeRemainingColumn(), console=stderr) as bar:
         task = bar.add_task("check", total=len(views))
         check = check_poses(views, sigmas, lambda: bar.advance(task))
-    wrong = {"turned": check.turned, "contradicting": check.contradicting}
+    wrong = {"turned": check.turned, "contradicting": check.contradicting, "unchecked": check.unchecked}
     names = {kind: [views[i].image.name for i in indices] for kind, indices in wrong.items() if indices}
     said = {
         "turned": "fit their pictures when turned by 180 degrees about the line of sight",
         "contradicting": "contradict what their pictures share with their neighbours",
+        "unchecked": "could not be checked, as their pictures share too little with others",
     }
-    done = {"turned": ("are turned", "turns them"), "contradicting": ("are left out", "leaves them out")}
+    done = {
+        "turned": ("they are turned", "--poses mend turns them"),
+        "contradicting": ("they are left out", "--poses mend leaves them out"),
+        "unchecked": ("they are taken as stated",) * 2,
+    }
     for kind, pictures in names.items():
-        more = f" and {len(pictures) - MOST_NAMED} more" if len(pictures) > MOST_NAMED else ""
-        advice = f"they {done[kind][0]}" if mend else f"--poses mend {done[kind][1]}"
-        stderr.print(
-            f"{len(pictures)} of {len(views)} cameras {said[kind]}: {', '.join(pictures[:MOST_NAMED])}{more}; {advice}",
-            soft_wrap=True,
-            highlight=False,
-        )
+        named = ", ".join(pictures[:MOST_NAMED]) + ", ..." * (len(pictures) > MOST_NAMED)
+        where = "" if len(pictures) == len(views) else f": {named}"
+        what = f"{len(pictures)} of {len(views)} cameras {said[kind]}{where}; {done[kind][not mend]}"
+        stderr.print(what, soft_wrap=True, highlight=False)
     return mended(views, check) if mend else views, names
 
 

@@ -32,6 +32,8 @@ log = logging.getLogger(__name__)
 STEPS = (
     1000  # of the schedule; what is left of it when the last frames have joined takes about 15 s on two cores
 )
+# what helps few frames alone would shape the model that the many frames to come inherit
+MANY_EXPECTED = {"sparse.dropout": 0.0, "sparse.sky_weight": 0.0}
 FEWEST_BRACKETS = 4  # that the first hull is carved of, while more may come
 JOIN_STEPS = 60  # at least, from frames that join to the next: the interval of growth
 JOIN_PAUSE = (
@@ -77,7 +79,7 @@ def reconstruct_live(
         ValueError: a setting that does not exist, or with which no frames can join.
         Interrupted: should_stop returned True.
     """
-    config = preset("obbgs", {"steps": STEPS} | (changes or {}))
+    config = preset("obbgs", {"steps": STEPS} | MANY_EXPECTED | (changes or {}))
     folder = run_folder(session_dir, name, out)
     check_replaceable(folder, overwrite)
     uplink = None if key_file is None else LiveUplink(session_dir, key_file)

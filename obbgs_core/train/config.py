@@ -1,10 +1,11 @@
 """The settings of a method in one tree; each group is defined beside the code that uses it."""
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import Literal
 
 from obbgs_core.model.gaussians import Footprint
-from obbgs_core.settings import at_least_one, check
+from obbgs_core.settings import at_least_one, check, number
 from obbgs_core.start.initialisation import StartSettings
 from obbgs_core.train.adam import RateSettings
 from obbgs_core.train.appearance import LightSettings
@@ -12,6 +13,7 @@ from obbgs_core.train.growth import GrowthSettings
 from obbgs_core.train.objective import LossSettings
 from obbgs_core.train.parsimony import ParsimonySettings
 from obbgs_core.train.poses import PoseSettings
+from obbgs_core.train.sparsity import SparseSettings, few_share
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ class MethodConfig:
     smoothing_px2: float = 0.0
     # an affine map of the colours of each training frame is learnt with the model (later 3DGS)
     compensation: bool = False
+    dropout: float = number(0.0, most=0.9)  # share of the Gaussians that each step leaves out (DropGaussian)
     outlier_filter: bool = False  # remove Gaussians far from the centre from the finished model
     chi2_end: float = 0.0  # above 0: stop after growth when the running chi² falls to this; 1 is pure noise
     start: StartSettings = field(default_factory=StartSettings)
@@ -63,6 +66,7 @@ class MethodConfig:
     parsimony: ParsimonySettings = field(default_factory=ParsimonySettings)
     light: LightSettings = field(default_factory=LightSettings)
     poses: PoseSettings = field(default_factory=PoseSettings)
+    sparse: SparseSettings = field(default_factory=SparseSettings)
 
     def __post_init__(self):
         check(self)
@@ -84,6 +88,16 @@ class MethodConfig:
                 "coarse must be triples of an image scale of 0 to 1, a number of frames and a share of the steps, of "
                 f"less than 1 in all, got {self.coarse}"
             )
+
+    def for_frames(self, count: int) -> "MethodConfig":
+        """Return the settings as they are for so many frames."""
+        few = few_share(count)
+        sky_weight = max(self.loss.sky_weight, few * self.sparse.sky_weight)
+        return dataclasses.replace(
+            self,
+            dropout=max(self.dropout, few * self.sparse.dropout),
+            loss=dataclasses.replace(self.loss, sky_weight=sky_weight),
+        )
 
     def stages(self) -> list[tuple[int, float, int]]:
         """Return the stages of the training: the first step, counted from 0, the image scale and the frames of a step.

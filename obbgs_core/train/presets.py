@@ -12,6 +12,7 @@ from obbgs_core.train.growth import GrowthSettings
 from obbgs_core.train.objective import LossSettings
 from obbgs_core.train.parsimony import ParsimonySettings
 from obbgs_core.train.poses import PoseSettings
+from obbgs_core.train.sparsity import SparseSettings
 
 # Kerbl et al., 3D Gaussian Splatting, 2023: the defaults of every group are theirs
 _3DGS = MethodConfig(
@@ -95,6 +96,7 @@ PRESETS: dict[str, MethodConfig] = {
             parsimony=ParsimonySettings(prune_at=(0.3, 0.5, 0.7, 0.85), keep_above_opacity=0.65),
             light=LightSettings(sh_degree=0, max_sh_degree=1, sun_span_deg=5.0),
             poses=PoseSettings(refine="auto"),
+            sparse=SparseSettings(dropout=0.3, sky_weight=3.0),
         ),
     )
 }

@@ -100,6 +100,7 @@ def prepare(
             f"{dark} of {len(checked)} frames are black (eclipse, or exposures too short): only {len(lit)} rise above "
             f"the noise, {FEWEST_FRAMES} are needed"
         )
+    config = config.for_frames(len(lit))
     rng = torch.Generator().manual_seed(seed)
     outlines, poses, why = settled(lit, silhouettes(lit, sensor), config.poses.refine != "never")
     posed = lit if poses is None else poses.frames(lit)

@@ -27,6 +27,7 @@ from obbgs_core.train.joining import check_joinable, join, release, withhold
 from obbgs_core.train.objective import image_loss, priors
 from obbgs_core.train.result import Exposing, StepInfo, TrainResult
 from obbgs_core.train.setup import prepare
+from obbgs_core.train.sparsity import DROPPED_UNTIL, dropped
 from obbgs_core.train.state import TrainingState
 
 log = logging.getLogger(__name__)
@@ -121,7 +122,7 @@ class Trainer:
         batch = setup.batches.batch(drawn, scale)
         cameras = batch.cameras if state.poses is None else state.poses.cameras(drawn, batch.cameras)
         sunlit = state.shadows.sunlit(state.gaussians, cameras, state.steps_done)
-        rendered = self._compensated(render(state.model, cameras, sunlit=sunlit), batch)
+        seen = rendered = self._compensated(render(self._drawn(share), cameras, sunlit=sunlit), batch)
         loss, residual = image_loss(rendered, batch, setup.sensor, config.loss, state.misfit)
         if not torch.isfinite(loss):
             raise Diverged(state.steps_done, loss.item())
@@ -129,16 +130,28 @@ class Trainer:
         (loss + prior).backward()
         if decisions.is_recorded(setup, share):
             decisions.observe(setup, state, rendered, batch, residual, share)
+        if self._drops(share):  # figures are of the whole model, as it was before the step
+            with torch.no_grad():
+                seen = self._compensated(render(state.model, cameras, sunlit=sunlit), batch)
         self._descend(share)
         decisions.decide_poses(setup, state, share)
         if pose_rounds.is_due(setup, state, share):
             pose_rounds.move(setup, state, scale)
         decisions.change_number(setup, state, batch, residual, moment)
         decisions.select_model(setup, state, scale)
-        self._measure(rendered, batch)
+        self._measure(seen, batch)
         state.steps_done += 1
         state.seconds += time.monotonic() - began
         return self._recorded(loss.item())
+
+    def _drops(self, share: float) -> bool:
+        """Return whether Gaussians are left out of a step."""
+        return self.setup.config.dropout > 0 and share < DROPPED_UNTIL
+
+    def _drawn(self, share: float) -> Gaussians:
+        """Return the Gaussians that a step renders."""
+        model, rate = self.state.model, self.setup.config.dropout
+        return dropped(model, rate, self.state.rng) if self._drops(share) else model
 
     def _compensated(self, rendered: Rendered, batch: Batch) -> Rendered:
         """Return what was rendered in the colours of its frames, where the method learns those."""

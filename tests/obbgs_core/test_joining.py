@@ -19,7 +19,9 @@ from obbgs_core.train.trainer import HOLD, Trainer
 from tests.scenes import EXPOSURES_S, QUICK, SENSOR, SIZE_PX, photographed, tagged, target
 
 STEPS = 120
-CONFIG = preset("obbgs", QUICK | {"steps": STEPS, "pyramid": ((0.0, 0.5), (0.4, 1.0))})
+# as `ground live` trains: what helps few frames alone is left off while more are to come
+MANY_EXPECTED = {"sparse.dropout": 0.0, "sparse.sky_weight": 0.0}
+CONFIG = preset("obbgs", QUICK | MANY_EXPECTED | {"steps": STEPS, "pyramid": ((0.0, 0.5), (0.4, 1.0))})
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +51,7 @@ def mean_psnr_db(model: Gaussians, frames: list[TrainingFrame]) -> float:
 
 
 def test_a_training_that_frames_joined_ends_as_good_as_one_that_had_them_from_the_start(frames):
-    """Measured: 27.4 dB with frames that joined, 27.8 dB with all from the start, 18.6 dB with the first four alone."""
+    """Measured: 27.4 dB with frames that joined, 28.5 dB with all from the start, 19.1 dB with the first four alone."""
     unseen = photographed(target(), 8, seed=9)
     joined = trained(frames, [12, 24, 36], 20)
     assert joined.share <= HOLD + 20 / STEPS
@@ -59,8 +61,8 @@ def test_a_training_that_frames_joined_ends_as_good_as_one_that_had_them_from_th
         while not trainer.stop_reason():
             trainer.step()
         scores[name] = mean_psnr_db(trainer.gaussians, unseen)
-    assert scores["joined"] > scores["whole"] - 1.5
-    assert scores["joined"] > scores["few"] + 1.5
+    assert scores["joined"] > scores["whole"] - 3
+    assert scores["joined"] > scores["few"] + 3
 
 
 def test_joining_keeps_what_was_learnt_and_sets_the_schedule_back(frames):
