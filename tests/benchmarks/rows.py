@@ -32,6 +32,7 @@ FIGURES = {  # key of a row: column title and format
     "pose_error_deg": ("pose error", "{:.3f} deg"),
     "pose_error_range": ("of the range", "{:.2%}"),
     "pose_error_px": ("in the picture", "{:.2f} px"),
+    "psnr_srgb_db": ("sRGB PSNR", "{:.2f} dB"),
     "psnr_foreground_db": ("foreground", "{:.2f} dB"),
     "psnr_clean_pooled_db": ("pooled", "{:.2f} dB"),
     "chamfer": ("Chamfer", "{:.4f}"),
