@@ -70,7 +70,7 @@ def reconstruct_gaussians(
             reason = f"converged at step {trainer.state.steps_done} of {config.steps}"
             break
         info = trainer.step()
-        work.on_step(info.step / info.steps, info.seconds, lambda: _snapshot(trainer, frames))
+        work.on_step(info.step / info.steps, info.seconds, lambda: _snapshot(trainer))
         if work.should_stop():
             save()
             raise Interrupted(f"interrupted at step {info.step} of {info.steps}")
@@ -153,14 +153,15 @@ def _may_end(trainer: Trainer) -> bool:
     return half_done and trainer.is_past_growth and not config.chi2_end
 
 
-def _snapshot(trainer: Trainer, frames: list[TrainingFrame]) -> Reconstruction:
+def _snapshot(trainer: Trainer) -> Reconstruction:
     """Return the training as it stands, without points on its surface, which take long."""
-    gaussians, poses = trainer.gaussians, trainer.state.poses
+    gaussians, setup, poses = trainer.gaussians, trainer.setup, trainer.state.poses
+    estimate = None if poses is None else poses.estimate(setup.frames)  # dark frames are not among those
     return Reconstruction(
         points=gaussians.means,
         surface=torch.zeros(0, 3),
-        image=imaging(gaussians, trainer.setup.sensor, trainer.exposing),
+        image=imaging(gaussians, setup.sensor, trainer.exposing),
         size_bytes=0,
         seconds=trainer.state.seconds,
-        poses=_poses(gaussians, trainer.setup.sensor, poses.estimate(frames) if poses else None),
+        poses=_poses(gaussians, setup.sensor, estimate),
     )
