@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from ground.cameras import predicted_image
+from ground.estimated_poses import Alignment, read_estimate
 from ground.evaluate import clean_image
 from ground.pictures import ERROR_FULL_SCALE, bounding_box, heat, tone
 from ground.runs import open_run
@@ -19,7 +20,9 @@ SIZE_PX = 200
 def main(session: Path, name: str) -> None:
     run = open_run(session, name)
     truth = Truth(run.session)
-    rows, scored = [], [truth.posed(r) for r in run.scored]
+    estimate = read_estimate(run.folder)
+    motion = None if estimate is None else Alignment.of(estimate, run.session, truth).motion.numpy()
+    rows, scored = [], [truth.posed(record, motion) for record in run.scored]
     brackets = sorted({r.bracket for r in scored})
     for exposure_s in sorted({r.exposure_time_s for r in scored}):
         cells = []
