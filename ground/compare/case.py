@@ -61,11 +61,13 @@ class Case:
         return [frame.dn / self.sensor.white_dn for frame in self.held_out]
 
     def of_views(self, views: Sequence[int]) -> "Case":
-        """Return the case with only some of its held-out frames, by their index."""
+        """Return the case with only some of its held-out frames, by their index, and nothing to calibrate by."""
         held_out, radiance, coverage = (
             [of[i] for i in views if of] for of in (self.held_out, self.radiance, self.coverage)
         )
-        return dataclasses.replace(self, held_out=held_out, radiance=radiance, coverage=coverage)
+        return dataclasses.replace(
+            self, held_out=held_out, radiance=radiance, coverage=coverage, calibration=()
+        )
 
     def seen_by(self, reconstruction: Reconstruction) -> tuple["Case", dict[str, float]]:
         """Return the case in the frame of a reconstruction, and how far off its poses are where the truth is known.
