@@ -51,7 +51,7 @@ def estimated_records(records: list[FrameRecord], estimate: PoseEstimate | None)
     """
     if estimate is None:
         return records
-    poses = dict(zip(estimate.frame_ids, estimate.estimated, strict=True))
+    poses = estimate.by_frame()
     return [_placed(record, poses[record.id]) for record in records if record.id in poses]
 
 

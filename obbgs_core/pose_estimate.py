@@ -31,6 +31,10 @@ class PoseEstimate:
     own_prior: np.ndarray  # [P, 6] deviations
     own_posterior: np.ndarray  # [P, 6] deviations
 
+    def by_frame(self) -> dict[int, np.ndarray]:
+        """Return the estimated pose [4, 4] of each frame of the training, by its number."""
+        return dict(zip(self.frame_ids, self.estimated, strict=True))
+
     def unobservable(self) -> list[str]:
         """Return the shared parameters of which the frames tell little, as `boresight_rad[2]`."""
         names = [f"{name}[{i}]" if size > 1 else name for name, size in LENGTHS.items() for i in range(size)]

@@ -114,7 +114,7 @@ def _estimated(frames: list[TrainingFrame], estimate: PoseEstimate | None) -> li
     """Return training frames with the poses that a training found, without those that it left out."""
     if estimate is None:
         return frames
-    poses = dict(zip(estimate.frame_ids, torch.from_numpy(estimate.estimated).float(), strict=True))
+    poses = {number: torch.from_numpy(pose).float() for number, pose in estimate.by_frame().items()}
     return [dataclasses.replace(f, world_to_camera=poses[f.id]) for f in frames if f.id in poses]
 
 
