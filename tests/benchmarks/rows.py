@@ -35,6 +35,8 @@ FIGURES = {  # key of a row: column title and format
     "psnr_srgb_db": ("sRGB PSNR", "{:.2f} dB"),
     "psnr_foreground_db": ("foreground", "{:.2f} dB"),
     "psnr_clean_pooled_db": ("pooled", "{:.2f} dB"),
+    "ssim_clean": ("SSIM", "{:.4f}"),
+    "lpips": ("LPIPS", "{:.4f}"),
     "chamfer": ("Chamfer", "{:.4f}"),
     "hausdorff": ("Hausdorff", "{:.3f}"),
     "completeness_surface": ("surface complete", "{:.1f} %"),
