@@ -15,11 +15,10 @@ from ground.session import FrameRecord, Navigation, Session, SessionError
 from ground.training_frames import training_frame
 from obbgs_base.files import write_whole
 from obbgs_core.attitude.estimate import estimate_motion
-from obbgs_core.attitude.outlines import whole_outlines
+from obbgs_core.attitude.outlines import centred
 from obbgs_core.attitude.target_motion import TargetMotion
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.pose_estimate import PoseEstimate
-from obbgs_core.start.alignment import centred
 
 FILE = "attitude.json"
 
@@ -87,7 +86,7 @@ def find_attitude(
     epoch_utc_ns = (min(times_ns) + max(times_ns)) // 2
     times_s = (np.array(times_ns) - epoch_utc_ns) / 1e9
     sensor, frames = sensor_of(session.camera), _in_inertial_axes(session, training)
-    frames = centred(frames, whole_outlines(frames, sensor))
+    frames = centred(frames, sensor)
 
     def decide(motions: list[TargetMotion]) -> int | None:
         def on_share(share: float) -> None:

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 
 from obbgs_core.frames import TrainingFrame, bracket_numbers
 from obbgs_core.sensor import Sensor
-from obbgs_core.start import hull
+from obbgs_core.start import alignment, hull
 from obbgs_core.start.hull import Silhouette
 
 OPEN_SIGMA = 4.0  # a mean of 3x3 pixels above this may be light
@@ -43,6 +43,11 @@ def whole_outlines(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, Sil
     """Return the outline in all pixels of each bracket's longest exposure that shows light, by the frame's index."""
     whole = {i: outline(frames[i], sensor, 1) for i in longest_exposures(frames)}
     return {i: s for i, s in whole.items() if int(s.certain.sum()) >= FEWEST_LIT_PX}
+
+
+def centred(frames: list[TrainingFrame], sensor: Sensor) -> list[TrainingFrame]:
+    """Return frames, in inertial axes, moved to where their outlines are around the target's centre: `alignment`."""
+    return alignment.centred(frames, whole_outlines(frames, sensor))
 
 
 def outlines(frames: list[TrainingFrame], sensor: Sensor, cells: int) -> tuple[dict[int, Silhouette], float]:

@@ -17,12 +17,11 @@ from obbgs_core.attitude import search
 from obbgs_core.attitude.coherence import FILL, coherences, grid_points
 from obbgs_core.attitude.estimate import AttitudeUndetermined, estimate_motion
 from obbgs_core.attitude.motion import SPIN, TUMBLE, at_epoch, attitudes, inertia, principal
-from obbgs_core.attitude.outlines import whole_outlines
+from obbgs_core.attitude.outlines import centred
 from obbgs_core.attitude.refine import refined
 from obbgs_core.attitude.search import mirrored
 from obbgs_core.attitude.views import views
 from obbgs_core.frames import Navigation, TrainingFrame
-from obbgs_core.start.alignment import centred
 from obbgs_core.start.hull import Silhouette
 from tests import scenes
 
@@ -190,7 +189,7 @@ def test_a_boresight_that_errs_is_taken_out_of_the_outlines_and_an_exact_one_sta
         dataclasses.replace(f, world_to_camera=error @ f.world_to_camera, navigation=Navigation(sigmas))
         for f in true
     ]
-    moved = centred(tagged, whole_outlines(tagged, scenes.SENSOR))
+    moved = centred(tagged, scenes.SENSOR)
     if not any(boresight_rad):
         assert moved is tagged
     for before, after, exact in zip(tagged, moved, true, strict=True):
