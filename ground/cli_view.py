@@ -21,7 +21,7 @@ def view_command(
 ) -> None:
     """Show a model on a page in the browser, with its cameras, frames and the Sun, until stopped.
 
-    A run that is still being made is drawn again whenever its model is renewed.
+    A run that is still being made is drawn again whenever its model is renewed; until there is one the page waits.
 
     Example: ground view pass-12/runs/first
     """

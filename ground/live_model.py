@@ -31,13 +31,16 @@ class ShownModel:
         self.offered_step: int | None = None  # of the last model that was offered
         self.held_out_db = math.nan
         self._folder, self._arrivals = folder, arrivals
+        self._scored_frames = 0  # held-out frames that had come when held_out_db was found
         self._images: dict[int, torch.Tensor] = {}  # held-out frames [H, W, C] as fractions of full scale
 
     def offer(self, gaussians: Gaussians, step: int) -> bool:
         """Show a model, unless the shown one is better by the same held-out frames; return whether it was shown."""
         self.offered_step, offered_db = step, self.score_db(gaussians)
         if self.gaussians is not None:
-            self.held_out_db = self.score_db(self.gaussians)
+            if len(self._arrivals.held_out) != self._scored_frames:
+                self.held_out_db = self.score_db(self.gaussians)
+            self._scored_frames = len(self._arrivals.held_out)
             if self.held_out_db > offered_db:
                 return False
         gaussians = gaussians.trainable().detach()  # a copy: training goes on in place
@@ -47,6 +50,7 @@ class ShownModel:
             log.warning("step %d: %s cannot be renewed: %s", step, self._folder / "model.ply", error)
             return False
         self.gaussians, self.step, self.held_out_db = gaussians, step, offered_db
+        self._scored_frames = len(self._arrivals.held_out)
         return True
 
     def score_db(self, gaussians: Gaussians) -> float:

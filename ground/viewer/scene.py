@@ -1,15 +1,16 @@
 """One model in the viewer's scene: its splats, the mesh, cameras with their frames, and the Sun."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import viser
 
 from flightsw.icd.quaternion import matrix_to_quat
-from ground.cameras import sun_direction
+from ground.cameras import sensor_of, sun_direction
 from ground.pictures import tone
-from ground.session import FrameRecord, SessionError
+from ground.session import FrameRecord, Session, SessionError
 from ground.turntable import extent
 from ground.viewer.source import Shown
 from ground.viewer.splats import colours, error_colours, shapes, uncertainty_colours
@@ -108,45 +109,69 @@ class Placed:
         )
         self.handles["sun"] = [arrow, label]
 
-    def draw_cameras(self, records: list[FrameRecord], chosen: Any, visible: bool) -> None:
+    def draw_cameras(
+        self, records: list[FrameRecord], chosen: Callable[[FrameRecord], None], visible: bool
+    ) -> None:
         """Put one camera for each bracket into the scene, with a small picture; `chosen` is called with its frame."""
         for handle in self.handles["cameras"]:
             handle.remove()
-        one_per_bracket = list({record.bracket: record for record in records}.values())
-        kept = np.unique(np.linspace(0, len(one_per_bracket) - 1, MOST_CAMERAS).round().astype(int))
-        self.handles["cameras"] = [self._camera(one_per_bracket[i], chosen, visible) for i in kept]
-
-    def _camera(self, record: FrameRecord, chosen: Any, visible: bool) -> Any:
-        session = self.shown.session
-        away = record.position_body_m - self.centre_m
-        position = self.offset + CAMERAS_AT * RADIUS * away / max(float(np.linalg.norm(away)), 1e-9)
-        handle = self._server.scene.add_camera_frustum(
-            f"/{self._name}/cameras/{record.id}",
-            fov=0.5,
-            aspect=session.camera.width / session.camera.height,
-            scale=1.2,
-            thickness=0.04,
-            color=(209, 101, 42),
-            image=self.thumbnail(record),
-            wxyz=tuple(matrix_to_quat(record.world_to_camera[:3, :3].T)),
-            position=tuple(position),
-            visible=visible,
-        )
-        handle.on_click(lambda _: chosen(record))
-        return handle
-
-    def thumbnail(self, record: FrameRecord) -> np.ndarray | None:
-        """Return a frame in screen brightness, bytes [H, W, 3], every so many pixels; None if it cannot be read."""
-        try:
-            dn = self.shown.session.dn(record)
-        except SessionError:
-            return None
-        step = math.ceil(max(dn.shape[:2]) / THUMBNAIL_PX)
-        image = dn[::step, ::step].astype(np.float32) / self.shown.sensor.white_dn
-        image = image.reshape(*image.shape[:2], -1)
-        return tone(image, self.shown.sensor, self.shown.session.encoding)
+        self.handles["cameras"] = []
+        for record in one_per_bracket(records):
+            away = record.position_body_m - self.centre_m
+            handle = add_camera(
+                self._server, self._name, self.shown.session, record, away, self.offset, visible
+            )
+            handle.on_click(lambda _, record=record: chosen(record))
+            self.handles["cameras"].append(handle)
 
     def show(self, part: str, visible: bool) -> None:
         """Show or hide a part: splats, mesh, cameras, sun."""
         for handle in self.handles.get(part, ()):
             handle.visible = visible
+
+
+def one_per_bracket(records: list[FrameRecord]) -> list[FrameRecord]:
+    """Return the last frame of each bracket, of at most MOST_CAMERAS brackets, spread evenly."""
+    last = list({record.bracket: record for record in records}.values())
+    kept = np.unique(np.linspace(0, len(last) - 1, MOST_CAMERAS).round().astype(int))
+    return [last[i] for i in kept]
+
+
+def add_camera(
+    server: viser.ViserServer,
+    name: str,
+    session: Session,
+    record: FrameRecord,
+    away: np.ndarray,
+    offset: np.ndarray,
+    visible: bool,
+) -> viser.CameraFrustumHandle:
+    """Put the camera of a frame with a small picture into the scene, below a name, and return it.
+
+    Args:
+        away: [3] in its direction, seen from the model, body frame.
+        offset: [3] of the model, in units of the scene.
+    """
+    return server.scene.add_camera_frustum(
+        f"/{name}/cameras/{record.id}",
+        fov=0.5,
+        aspect=session.camera.width / session.camera.height,
+        scale=1.2,
+        thickness=0.04,
+        color=(209, 101, 42),
+        image=picture(session, record, THUMBNAIL_PX),
+        wxyz=tuple(matrix_to_quat(record.world_to_camera[:3, :3].T)),
+        position=tuple(offset + CAMERAS_AT * RADIUS * away / max(float(np.linalg.norm(away)), 1e-9)),
+        visible=visible,
+    )
+
+
+def picture(session: Session, record: FrameRecord, largest_px: int) -> np.ndarray | None:
+    """Return a frame in screen brightness, bytes [H, W, 3], every so many pixels; None if it cannot be read."""
+    try:
+        dn = session.dn(record)
+    except SessionError:
+        return None
+    sensor, step = sensor_of(session.camera), math.ceil(max(dn.shape[:2]) / largest_px)
+    image = dn[::step, ::step].astype(np.float32) / sensor.white_dn
+    return tone(image.reshape(*image.shape[:2], -1), sensor, session.encoding)

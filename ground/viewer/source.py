@@ -10,7 +10,7 @@ from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
 
-MODEL, MESH = "model.ply", "model.glb"
+HEADER, MODEL, MESH = "session.json", "model.ply", "model.glb"
 
 
 @dataclass(frozen=True)
@@ -25,23 +25,32 @@ class Shown:
 
 
 class Source:
-    """A run's folder that is watched: its model.ply may be renewed, whole, by a reconstruction under way.
+    """A run's folder that is watched: a reconstruction under way may renew its model.ply, whole, or has yet to make it.
+
+    folder: of the run; None: of a session that has no run with a model yet.
 
     Args:
         path: of a run (a folder in runs/ of a session), or of a session, whose newest run is shown.
 
     Raises:
-        SessionError: neither of them, or a session without a run.
+        SessionError: neither of them.
     """
 
     def __init__(self, path: Path):
-        self.folder = run_of(path)
-        self.session_path = session_of(self.folder)
+        self.session_path = session_of(path)
+        self.folder = newest_run(path) if (path / HEADER).is_file() else path
         self._read: tuple[int, int, int] | None = None
 
     @property
     def name(self) -> str:
-        return f"{self.session_path.resolve().name}/{self.folder.name}"
+        session = self.session_path.resolve().name
+        return session if self.folder is None else f"{session}/{self.folder.resolve().name}"
+
+    def is_ready(self) -> bool:
+        """Return whether there is a model to show."""
+        if self.folder is None:
+            self.folder = newest_run(self.session_path)
+        return self._stamp() is not None
 
     def renewed(self) -> bool:
         """Return whether model.ply is another than was read last."""
@@ -56,8 +65,9 @@ class Source:
         stamp = self._stamp()
         if stamp is None:
             raise SessionError(
-                f"{self.folder} has no {MODEL} yet; `ground reconstruct` or `ground live` makes one"
+                f"{self.name} has no {MODEL} yet; `ground reconstruct` or `ground live` makes one"
             )
+        assert self.folder is not None
         session = open_session(self.session_path)
         mesh = self.folder / MESH
         shown = Shown(
@@ -74,6 +84,8 @@ class Source:
 
     def _stamp(self) -> tuple[int, int, int] | None:
         """Return what changes when a file is replaced whole; None where there is none."""
+        if self.folder is None:
+            return None
         try:
             status = os.stat(self.folder / MODEL)
         except OSError:
@@ -81,35 +93,39 @@ class Source:
         return status.st_ino, status.st_mtime_ns, status.st_size
 
 
-def run_of(path: Path) -> Path:
-    """Return a run's folder, for itself or for its session.
+def newest_run(session: Path) -> Path | None:
+    """Return the folder of a session's run whose model was renewed last; None where no run has a model."""
+    models = {
+        path: _renewed_ns(path) for path in session.glob(f"runs/*/{MODEL}") if path.parent.name[0] != "."
+    }
+    return max(models, key=lambda path: models[path]).parent if models else None
+
+
+def _renewed_ns(path: Path) -> int:
+    """Return when a file was renewed; 0 where it has been removed meanwhile."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+def session_of(path: Path) -> Path:
+    """Return the session that a path names, or in which the run lies, or will lie, that it names.
 
     Raises:
-        SessionError: neither a run with a model nor a session that has one.
+        SessionError: it names neither.
     """
-    if (path / MODEL).is_file():
+    if (path / HEADER).is_file():
         return path
-    if (path / "session.json").is_file():
-        runs = [
-            model.parent for model in path.glob(f"runs/*/{MODEL}") if not model.parent.name.startswith(".")
-        ]
-        if runs:
-            return max(runs, key=lambda run: (run / MODEL).stat().st_mtime_ns)
+    run = path.resolve()
+    session = run.parent.parent
+    if (session / HEADER).is_file() and (run.parent.name == "runs" or (run / MODEL).is_file()):
+        return session
+    if (run / MODEL).is_file():
         raise SessionError(
-            f"{path} has no run with a {MODEL} yet: make one with `ground reconstruct --session {path}`"
+            f"{path} does not lie in runs/ of a session, whose frames and camera the viewer needs"
         )
     raise SessionError(
-        f"{path} is neither a session (session.json) nor a run ({MODEL}, in runs/ of a session)"
+        f"{path} is neither a session ({HEADER}) nor a run in runs/ of one; a session begins with `ground listen`, "
+        "`ground live` or `ground import`"
     )
-
-
-def session_of(run: Path) -> Path:
-    """Return the session that holds a run.
-
-    Raises:
-        SessionError: the run does not lie in runs/ of a session.
-    """
-    session = run.resolve().parent.parent
-    if (session / "session.json").is_file():
-        return session
-    raise SessionError(f"{run} does not lie in runs/ of a session, whose frames and camera the viewer needs")

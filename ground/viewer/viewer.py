@@ -18,6 +18,7 @@ from ground.turntable import VIEWS, circle, moving_png, pictures
 from ground.viewer.door import opened
 from ground.viewer.scene import COLOURS, RADIUS, SENSOR, Placed
 from ground.viewer.source import Source
+from ground.viewer.waiting import awaited
 from obbgs_core.errors import ReconstructionError
 
 log = logging.getLogger(__name__)
@@ -45,20 +46,26 @@ def view(
 ) -> None:
     """Show one run, or two side by side, until told to stop; `on_ready` receives the port.
 
+    Until each has a model the page says what is waited for and shows the frames that have come.
+
     Raises:
-        SessionError, ReconstructionError: a run cannot be read at the start. Later ones are logged, and the model that
-            was read last stays.
+        SessionError, ReconstructionError: a session or the first model of a run cannot be read. Later ones are logged,
+            and the model that was read last stays.
         ViewError: the port cannot be bound.
     """
-    shown = [source.load() for source in sources]
     server = opened(host, port)
     try:
+        on_ready(server.get_port())
+        server.scene.set_up_direction("+z")
+        server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
+        if not awaited(server, sources, should_stop, POLL_S):
+            return
+        shown = [source.load() for source in sources]
         first = Placed(server, "a", shown[0], np.zeros(3))
         placed = [first]
         for other in shown[1:]:
             placed.append(Placed(server, "b", other, np.array([APART * RADIUS, 0.0, 0.0]), first.per_metre))
         viewer = Viewer(server, placed)
-        on_ready(server.get_port())
         while not should_stop():
             for i, source in enumerate(sources):
                 if source.renewed():
@@ -78,11 +85,11 @@ class Viewer:
         self.server, self.placed = server, placed
         self.lock = threading.RLock()  # viser calls from threads of its own
         self.frames = _in_time(placed[0])
-        server.scene.set_up_direction("+z")
-        server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         self._controls()
         self._start_camera()
         server.on_client_connect(self._limit_zoom)
+        for client in server.get_clients().values():  # who waited for the model
+            self._reset(client)
         self.draw_all()
 
     @property

@@ -2,7 +2,9 @@
 
 import logging
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 import torch
@@ -38,11 +40,13 @@ class StartSettings:
         check(self, "start")
 
 
-def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.Silhouette]:
+def silhouettes(
+    frames: list[TrainingFrame], sensor: Sensor, known: Mapping[int, hull.Silhouette] = MappingProxyType({})
+) -> dict[int, hull.Silhouette]:
     """Return silhouettes of the longest exposures by the frame's index, as tagged.
 
     Shadowed faces are brightest there. Where these frames are few those of the next longest exposure join them: a view
-    that misses a shadowed face does less harm than no view.
+    that misses a shadowed face does less harm than no view. Those that are `known` are not made again.
     """
     chosen: dict[int, TrainingFrame] = {}
     for exposure_s in sorted({f.exposure_time_s for f in frames}, reverse=True):
@@ -50,6 +54,9 @@ def silhouettes(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, hull.S
             chosen |= {i: f for i, f in enumerate(frames) if f.exposure_time_s == exposure_s}
     outlines = {}
     for i, f in chosen.items():
+        if i in known:
+            outlines[i] = known[i]
+            continue
         light = hull.light(f.dn, sensor, f.background, f.exposure_time_s)
         outlines[i] = hull.silhouette(light, sensor, f.world_to_camera, f.K)
     return outlines

@@ -4,7 +4,9 @@ import dataclasses
 import functools
 import hashlib
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
@@ -57,7 +59,8 @@ class TrainingSetup:
     reference_exposure_s: float | None  # what every exposure was taken for when exposure is ignored
     dark_frames: int  # left out: nothing in them rises above the noise
     tagged_exposures_s: list[float]  # of the frames, also where the method ignores them
-    outlines: dict[int, Silhouette]  # of the long exposures, by the frame's index
+    silhouettes: dict[int, Silhouette]  # of the long exposures as tagged, by the frame's index
+    outlines: dict[int, Silhouette]  # the same, grown or moved by the errors of the poses
     start_means: Tensor  # [N, 3] m, of the first Gaussians
 
     @property
@@ -84,9 +87,16 @@ class TrainingSetup:
 
 
 def prepare(
-    frames: list[TrainingFrame], sensor: Sensor, config: MethodConfig, seed: int
+    frames: list[TrainingFrame],
+    sensor: Sensor,
+    config: MethodConfig,
+    seed: int,
+    known: Mapping[int, Silhouette] = MappingProxyType({}),
 ) -> tuple[TrainingSetup, TrainingState]:
     """Return the setup of a training and its state before the first step.
+
+    Args:
+        known: silhouettes of a setup of the first of these frames, which are not made again.
 
     Raises:
         TooFewFrames, ReconstructionError: as in `train`.
@@ -102,7 +112,8 @@ def prepare(
         )
     config = config.for_frames(len(lit))
     rng = torch.Generator().manual_seed(seed)
-    outlines, poses, why = settled(lit, silhouettes(lit, sensor), config.poses.refine != "never")
+    seen = silhouettes(lit, sensor, known)
+    outlines, poses, why = settled(lit, seen, config.poses.refine != "never")
     posed = lit if poses is None else poses.frames(lit)
     config, budget = _limited(config, sum(int(outline.certain.sum()) for outline in outlines.values()))
     log.info("budget: %s", budget)
@@ -128,6 +139,7 @@ def prepare(
         reference_exposure_s=reference_exposure_s,
         dark_frames=dark,
         tagged_exposures_s=[f.exposure_time_s for f, shows in zip(frames, shown, strict=True) if shows],
+        silhouettes=seen,
         outlines=outlines,
         start_means=gaussians.means.detach(),
     )

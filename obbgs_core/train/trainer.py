@@ -35,7 +35,9 @@ CHI2_MEMORY = 0.98  # share of the running chi² that a step keeps; the rest is 
 CHECKPOINT_EVERY_S = 20.0
 LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
 FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
-HOLD = 0.4  # share of the steps that the schedule is set back to when frames join: from there pictures have full size
+# Shares of the steps that the schedule is set back to when frames join: HOLD, from where pictures have full size, if
+# MANY_NEW or more of all frames are new; the fewer they are the nearer to HOLD_OF_FEW, where growth is over.
+HOLD, HOLD_OF_FEW, MANY_NEW = 0.4, 0.7, 0.3
 PACE_STEPS = 50  # the time left is estimated from the pace of so many steps
 
 
@@ -218,10 +220,10 @@ class Trainer:
             return f"all {config.steps} steps done (residual chi² {state.chi2:.2f})"
         return ""
 
-    def join(self, frames: list[TrainingFrame], hold: float = HOLD) -> None:
+    def join(self, frames: list[TrainingFrame]) -> None:
         """Go on with more frames: the model is kept, and the start is carved again of all frames.
 
-        The schedule is set back to the share `hold` of the steps, so that it ends only when no frames come any more.
+        The schedule is set back, the further the more of the frames are new, so that it ends only when none come.
 
         Raises:
             ValueError: the method's training cannot take in frames, see `check_joinable`.
@@ -229,18 +231,22 @@ class Trainer:
         """
         check_joinable(self.setup.config)
         began = time.monotonic()
-        joined, fresh = prepare(self._given + frames, self.setup.sensor, self._asked, self.setup.seed)
-        join(self.setup, self.state, joined, fresh, hold)
-        self.setup, self._given = joined, self._given + frames
+        every = self._given + frames
+        joined, fresh = prepare(
+            every, self.setup.sensor, self._asked, self.setup.seed, self.setup.silhouettes
+        )
+        few = max(0.0, 1 - len(frames) / len(every) / MANY_NEW)
+        join(self.setup, self.state, joined, fresh, HOLD + few * (HOLD_OF_FEW - HOLD))
+        self.setup, self._given = joined, every
         self.state.seconds += time.monotonic() - began
 
     def withhold(self) -> None:
         """Keep back the brackets that will decide on the poses, however few there are yet, because frames will join."""
         withhold(self.setup, self.state)
 
-    def release(self, hold: float = HOLD) -> None:
+    def release(self) -> None:
         """Train on the brackets that were kept back too if they are too few to decide, because no more frames join."""
-        release(self.setup, self.state, hold)
+        release(self.setup, self.state, HOLD)
 
     @property
     def share(self) -> float:

@@ -6,10 +6,12 @@ own. The models that `ground live` shows are kept as they come and scored afterw
 `ground listen`, which trains nothing: what the link loses and how late frames come must not depend on the training.
 
 `latency` is the time from the shutter to the session; `seconds_to_half_db` that from the last frame's arrival until the
-shown model is within 0.5 dB of one trained on everything afterwards, None where it never is.
+shown model is within 0.5 dB of one trained on everything afterwards, None where it never is. The same in seconds of
+the training's processor time does not depend on what else the machine does.
 """
 
 import argparse
+import contextlib
 import json
 import shutil
 import statistics
@@ -19,6 +21,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import psutil
 import torch
 
 from flightsw.icd.frame import Frame
@@ -54,7 +57,9 @@ class Flown:
 
     taken_s: dict[int, float] = field(default_factory=dict)  # by frame
     arrived_s: dict[int, float] = field(default_factory=dict)
-    models: list[tuple[float, Path]] = field(default_factory=list)  # shown from then on
+    # shown from then on, the training's processor time until then, s, and the file
+    models: list[tuple[float, float, Path]] = field(default_factory=list)
+    last_cpu_s: float = 0.0  # processor time of the training when the last frame had come
     losses: dict[str, int] = field(default_factory=dict)
     finished_s: float = 0.0
 
@@ -116,14 +121,23 @@ def _watch(
             store.put(frame)
         for record in _lines(session / "frames.jsonl")[len(flown.arrived_s) :]:
             flown.arrived_s[record["id"]] = time.monotonic() - began_s
+            flown.last_cpu_s = _cpu_s(ground)
         if model.exists() and (stamp_ns := model.stat().st_mtime_ns) != renewed_ns:
             renewed_ns, kept = stamp_ns, store.folder.with_name(f"model-{len(flown.models)}.ply")
             shutil.copy(model, kept)
-            flown.models.append((time.monotonic() - began_s, kept))
+            flown.models.append((time.monotonic() - began_s, _cpu_s(ground), kept))
         if now_s > LIMIT_S:
             raise SystemExit(f"the pass has not ended after {LIMIT_S:g} s")
         time.sleep(POLL_S)
     flown.finished_s = time.monotonic() - began_s
+
+
+def _cpu_s(ground: subprocess.Popen) -> float:
+    """Return the processor time of the processes that a process has started: of the training beside a listener."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        times = [child.cpu_times() for child in psutil.Process(ground.pid).children(recursive=True)]
+        return sum(each.user + each.system for each in times)
+    return 0.0
 
 
 def _lines(path: Path) -> list[dict]:
@@ -155,12 +169,12 @@ def measure(session_dir: Path, mission: Path, seconds: float, folder: Path) -> d
     subprocess.run([installed("ground"), *reconstruct], check=True, stdout=subprocess.DEVNULL)
     afterwards_s = time.monotonic() - began_s
     afterwards_db = clean_psnr_db(folder / "runs" / "afterwards" / "model.ply", session)
-    scored = [(when_s, clean_psnr_db(path, session)) for when_s, path in live.models]
+    scored = [(when_s, cpu_s, clean_psnr_db(path, session)) for when_s, cpu_s, path in live.models]
     last_s = max(live.arrived_s.values())
-    close = [when_s for when_s, db in scored if db >= afterwards_db - CLOSE_DB]
+    close = next(((s, cpu_s) for s, cpu_s, db in scored if db >= afterwards_db - CLOSE_DB), None)
 
     def at(when_s: float) -> float | None:
-        before = [db for shown_s, db in scored if shown_s <= when_s]
+        before = [db for shown_s, _, db in scored if shown_s <= when_s]
         return round(before[-1], 2) if before else None
 
     return {
@@ -171,9 +185,10 @@ def measure(session_dir: Path, mission: Path, seconds: float, folder: Path) -> d
         "baud_rate": load_mission(mission).link.baud_rate,
         "psnr_after_a_third_db": at(seconds / 3),
         "psnr_at_last_frame_db": at(last_s),
-        "psnr_live_db": round(scored[-1][1], 2) if scored else None,
+        "psnr_live_db": round(scored[-1][2], 2) if scored else None,
         "psnr_afterwards_db": round(afterwards_db, 2),
         "seconds_to_half_db": round(max(0.0, close[0] - last_s), 1) if close else None,
+        "cpu_seconds_to_half_db": round(max(0.0, close[1] - live.last_cpu_s), 1) if close else None,
         "seconds_to_finished": round(live.finished_s - last_s, 1),
         "seconds_of_afterwards": round(afterwards_s, 1),
         "models_shown": len(scored),

@@ -1,11 +1,15 @@
 """`ground view`: which run it shows, who may connect, what colours mean, and its page in a browser."""
 
+import contextlib
 import dataclasses
+import queue
 import shutil
 import socket
+import threading
 import time
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import pytest
 import torch
@@ -16,13 +20,15 @@ from websockets.sync.client import connect
 
 from ground import cli
 from ground.cameras import predicted_image
+from ground.live import reconstruct_live
 from ground.pictures import tone
 from ground.session import SessionError
 from ground.viewer import splats, viewer
 from ground.viewer.door import ViewError, opened, refused
 from ground.viewer.scene import Placed
 from ground.viewer.source import Shown, Source
-from obbgs_core.io.ply import save_ply
+from obbgs_base.errors import Interrupted
+from obbgs_core.io.ply import load_ply, save_ply
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from tests import scenes
@@ -51,7 +57,7 @@ def test_a_run_is_found_by_its_folder_or_its_session_and_read_again_when_renewed
     save_ply(scenes.target(seed=1), folder / "runs" / "newer" / "model.ply")
     assert Source(folder / "runs" / "run").name == "copy/run"
     source = Source(folder)
-    assert source.folder.name == "newer" and source.renewed()
+    assert source.folder is not None and source.folder.name == "newer" and source.renewed()
     assert len(source.load().gaussians) == 60 and not source.renewed()
     save_ply(scenes.target(count=70), source.folder / "model.ply")
     assert source.renewed() and len(source.load().gaussians) == 70
@@ -64,12 +70,67 @@ def test_a_run_is_found_by_its_folder_or_its_session_and_read_again_when_renewed
 def test_what_is_no_run_is_told_so(session, tmp_path):
     with pytest.raises(SessionError, match=r"neither a session \(session\.json\) nor a run"):
         Source(tmp_path)
-    shutil.copytree(session, tmp_path / "s", ignore=shutil.ignore_patterns("runs"))
-    with pytest.raises(SessionError, match="has no run with a"):
-        Source(tmp_path / "s")
+    with pytest.raises(SessionError, match=r"neither a session \(session\.json\) nor a run"):
+        Source(session / "frames" / "live")
     shutil.copytree(session / "runs" / "run", tmp_path / "alone")
     with pytest.raises(SessionError, match=r"does not lie in runs/ of a session"):
         Source(tmp_path / "alone")
+
+
+def test_a_run_that_is_yet_to_come_is_waited_for(session, tmp_path):
+    folder = tmp_path / "s"
+    shutil.copytree(session, folder, ignore=shutil.ignore_patterns("runs"))
+    for path in (folder, folder / "runs" / "live"):
+        source = Source(path)
+        assert not source.is_ready() and not source.renewed()
+        shutil.copytree(session / "runs" / "run", folder / "runs" / "live")
+        assert source.is_ready() and source.renewed() and source.name == "s/live"
+        shutil.rmtree(folder / "runs")
+
+
+def test_the_page_waits_for_the_first_model_of_a_growing_run_and_follows_it(session, tmp_path):
+    """In the browser: what is waited for, frames as they come, then the splats that a real training shows."""
+    folder = tmp_path / "pass"
+    shutil.copytree(session, folder, ignore=shutil.ignore_patterns("runs", "frames.jsonl"))
+    lines, stop = (session / "frames.jsonl").read_text().splitlines(keepends=True), threading.Event()
+
+    def arrive(count: int) -> None:
+        with open(folder / "frames.jsonl", "a") as index:
+            index.writelines(lines[:count])
+        del lines[:count]
+
+    def train() -> None:
+        with contextlib.suppress(Interrupted):
+            reconstruct_live(folder, changes={"steps": 60, "start.count": 400}, should_stop=stop.is_set)
+
+    ports = queue.Queue()
+    sources = [Source(folder / "runs" / "live")]
+    shown = threading.Thread(target=viewer.view, args=(sources, "127.0.0.1", 0, ports.put, stop.is_set))
+    trained = threading.Thread(target=train)
+    shown.start()
+    try:
+        with chromium() as browser, page_of(browser, f"http://127.0.0.1:{ports.get()}", known=VISERS) as page:
+            page.wait_for_selector("text=Waiting for the first model of pass/live.")
+            page.wait_for_selector("text=0 frames have come.")
+            arrive(3)
+            page.wait_for_selector("text=3 frames have come.")
+            trained.start()
+            page.wait_for_selector("text=4 brackets are needed to begin")
+            arrive(9)
+            page.wait_for_selector("text=Timeline of the pass")
+            assert page.get_by_text("have come").count() == 0
+            gaussians = len(load_ply(folder / "runs" / "live" / "model.ply"))
+            page.wait_for_selector(f"text={gaussians:,} Gaussians")
+            page.get_by_text("Look through its camera").click()
+            page.wait_for_timeout(3000)  # the splats fade in
+            with_splats = screenshot(page)
+            page.get_by_text("Splats", exact=True).click()
+            page.wait_for_timeout(1000)
+            assert np.abs(with_splats - screenshot(page)).max() > 50
+    finally:
+        stop.set()
+        shown.join()
+        trained.join()
 
 
 @pytest.mark.parametrize(
@@ -232,6 +293,11 @@ def through_camera(client, placed: Placed, record, exposure_s: float) -> tuple[n
     theirs = on_black.reshape(camera.height, times, camera.width, times, 3).mean(axis=(1, 3))
     image = predicted_image(shown.gaussians, shown.session, record, shown.sensor, exposure_s)
     return theirs, tone(image.numpy(), shown.sensor, shown.session.encoding).astype(float)
+
+
+def screenshot(page) -> np.ndarray:
+    """Return what a page shows, [H, W, 3]."""
+    return np.asarray(imagecodecs.png_decode(page.screenshot()))[..., :3].astype(int)
 
 
 def waited_for(what, seconds: float = 100):

@@ -15,7 +15,7 @@ from obbgs_core.score.metrics import psnr_db
 from obbgs_core.train.joining import NEW_SPACINGS
 from obbgs_core.train.presets import preset
 from obbgs_core.train.setup import TOO_FEW_BRACKETS
-from obbgs_core.train.trainer import HOLD, Trainer
+from obbgs_core.train.trainer import HOLD, HOLD_OF_FEW, Trainer
 from tests.scenes import EXPOSURES_S, QUICK, SENSOR, SIZE_PX, photographed, tagged, target
 
 STEPS = 120
@@ -78,9 +78,20 @@ def test_joining_keeps_what_was_learnt_and_sets_the_schedule_back(frames):
     assert torch.equal(trainer.state.adam.second["means"][new], moments[old])
     assert trainer.state.steps_done == round(HOLD * STEPS) and len(trainer.state.history) == 70
     assert len(trainer.setup.frames) == 36
+    late = trained(frames, [34], 110)
+    late.join(frames[34:])  # few that are new set it back by less
+    assert HOLD * STEPS < late.state.steps_done < round(HOLD_OF_FEW * STEPS)
     early = trained(frames, [18], 10)
     early.join(frames[18:])
     assert early.state.steps_done == 10  # nothing to set back
+
+
+def test_silhouettes_that_were_made_before_a_joining_are_those_of_a_training_of_all_frames(frames):
+    joined, whole = trained(frames, [4, 12], 1), Trainer(frames[:12], SENSOR, CONFIG, seed=3)
+    assert list(joined.setup.silhouettes) == list(whole.setup.silhouettes)
+    for i, silhouette in whole.setup.silhouettes.items():
+        for name in ("certain", "likely", "sky", "world_to_camera", "K"):
+            assert torch.equal(getattr(joined.setup.silhouettes[i], name), getattr(silhouette, name))
 
 
 def test_gaussians_where_the_new_silhouettes_see_nothing_are_given_up(frames):
@@ -151,7 +162,7 @@ def test_brackets_that_decide_on_the_poses_have_never_been_trained_on(frames):
         trainer.join(doubted[first : first + 6])
     while not trainer.state.poses_decided:
         trainer.step()
-    assert "correcting a validation bracket gains" in trainer.state.poses_decided
+    assert "that a validation bracket's pose errs" in trainer.state.poses_decided
     assert sorted(index for group in trainer.state.order.groups for index in group) == list(range(42))
 
 
