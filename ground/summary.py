@@ -3,7 +3,7 @@
 from rich.table import Table
 from rich.text import Text
 
-from ground.card import chi2_explained, frames_captured, scored_frames
+from ground.card import chi2_explained, frames_captured, scored_frames, size_explained
 
 PSNR_LABELS = {
     "psnr_clean_db": "against noiseless exposures",
@@ -38,6 +38,8 @@ def model_rows(metrics: dict) -> list[tuple[str, str]]:
         rows.append(("Chamfer distance of the centres", f"{metrics['chamfer']:.4f} (largest dimension = 2)"))
     if known("completeness_surface"):
         rows.append(("true surface within 0.01 of the model's", f"{metrics['completeness_surface']:.1f} %"))
+    if size := size_explained(metrics):
+        rows.append(("size of the model", size))
     rows.append(("Gaussians", f"{metrics['gaussians']:,}"))
     if known("budget"):
         rows.append(("budget", metrics["budget"]))
