@@ -36,7 +36,7 @@ AXES = 250  # directions that a lobe is tried in, 13 degrees apart
 LEAST_GAIN = 3.0  # nats: a Gaussian whose lobe gains less starts with the weight FAINT
 FAINT = 0.05
 SURE = 2.0  # standard errors by which the gain on the other half must exceed zero
-AT_ONCE = 100  # Gaussians whose axes are searched together, for memory's sake
+AT_ONCE = 16  # Gaussians whose axes are searched together, for memory's sake
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,8 @@ def test_a_lobe_is_the_ggx_distribution_over_its_peak(alpha, angle):
         return alpha**2 / (math.pi * math.cos(t) ** 4 * (alpha**2 + math.tan(t) ** 2) ** 2)
 
     for cosine, half_vector in ((math.cos(angle), True), (math.cos(2 * angle), False)):
-        seen = lobe(*torch.tensor([cosine, alpha], dtype=torch.float64), half_vector)
+        at, roughness = torch.tensor([cosine, alpha], dtype=torch.float64)
+        seen = lobe(at, roughness, half_vector)
         assert float(seen) == pytest.approx(ggx(angle) / ggx(0.0), rel=1e-6, abs=1e-9)
 
 
@@ -107,8 +108,10 @@ def test_kernels_match_the_reference_in_float64(kernel, shading, sh_count, chann
     assert error.max() < 2e-2 and error.mean() < 1e-5
     assert {"lobes", "gloss", "means", "world_to_camera"} <= set(expected)
     for name, gradient in expected.items():
+        found = gradients[name]
+        assert gradient is not None and found is not None
         within = 1e-4 * float(gradient.abs().max())
-        torch.testing.assert_close(gradients[name].double(), gradient, rtol=0, atol=within, msg=name)
+        torch.testing.assert_close(found.double(), gradient, rtol=0, atol=within, msg=name)
 
 
 @pytest.mark.parametrize(("shading", "sh_count"), [("view", 1), ("sun", 4), ("lambert", 1)])
@@ -232,7 +235,7 @@ def test_highlights_are_found_and_explain_views_that_were_not_trained_on(shiny_f
     assert "on views that they are not fitted to" in appearance
     assert not matt.gaussians.has_highlights and "highlight" not in matt.result("").appearance
     errors = [_squared_error(trainer.gaussians, held_out) for trainer in (shiny, matt)]
-    assert errors[0] < 0.9 * errors[1]  # 0.82 was seen
+    assert errors[0] < 0.9 * errors[1]  # 0.39 was seen
     first = _trainer(training)
     for _ in range(40):
         first.step()
