@@ -15,7 +15,9 @@ from ground.session import FrameRecord, Navigation, Session, SessionError
 from ground.training_frames import training_frame
 from obbgs_base.files import write_whole
 from obbgs_core.attitude.estimate import estimate_motion
+from obbgs_core.attitude.outlines import centred
 from obbgs_core.attitude.target_motion import TargetMotion
+from obbgs_core.frames import TrainingFrame
 from obbgs_core.pose_estimate import PoseEstimate
 
 FILE = "attitude.json"
@@ -83,11 +85,8 @@ def find_attitude(
     times_ns = [record.mid_exposure_utc_ns for record in training]
     epoch_utc_ns = (min(times_ns) + max(times_ns)) // 2
     times_s = (np.array(times_ns) - epoch_utc_ns) / 1e9
-    frames = []
-    for record in training:
-        seen = _turned(record, _assumed(session, record).T)
-        frames.append(training_frame(session, seen))
-    sensor = sensor_of(session.camera)
+    sensor, frames = sensor_of(session.camera), _in_inertial_axes(session, training)
+    frames = centred(frames, sensor)
 
     def decide(motions: list[TargetMotion]) -> int | None:
         def on_share(share: float) -> None:
@@ -97,6 +96,23 @@ def find_attitude(
 
     motion = estimate_motion(frames, times_s, sensor, on_progress, should_stop, decide=decide)
     return FoundAttitude(epoch_utc_ns, motion)
+
+
+def _in_inertial_axes(session: Session, records: list[FrameRecord]) -> list[TrainingFrame]:
+    """Return frames with poses in inertial axes; how the target turns is neither in them nor in what may err."""
+    stated = session.navigation
+    orbit = dataclasses.replace(
+        stated.sigmas, attitude_rad=np.zeros(3), rate_rad_s=np.zeros(3), inertia_ratios=np.zeros(2)
+    )
+    resting = dataclasses.replace(stated, rate_rad_s=(0.0, 0.0, 0.0), sigmas=orbit)
+    at_rest = dataclasses.replace(session, navigation=resting)
+    return [
+        training_frame(
+            at_rest,
+            dataclasses.replace(_turned(r, _assumed(session, r).T), quat_inertial_to_body=None),
+        )
+        for r in records
+    ]
 
 
 def in_body_axes(session: Session, found: FoundAttitude) -> Session:

@@ -2,6 +2,7 @@
 
 import math
 
+SHOWN_SIZE_ERROR_PERCENT = 0.1  # of refined poses; a smaller one costs no picture anything
 NOISE_LIKE_CHI2 = 1.5  # up to here the model's own error is under 0.7 sigma of the noise
 SIZES = {
     "model.ply": "ply_bytes",
@@ -28,6 +29,17 @@ def frames_captured(metrics: dict) -> str:
     """Return how many frames the spacecraft reported to have taken; "unknown" without its telemetry."""
     captured = metrics.get("frames_captured")
     return "unknown" if captured is None else f"{captured:,}"
+
+
+def size_explained(metrics: dict) -> str:
+    """Return by how much a model of refined poses has the wrong size, and its score without that; "" if by nothing."""
+    error = metrics.get("size_error_percent")
+    if error is None or abs(error) < SHOWN_SIZE_ERROR_PERCENT:
+        return ""
+    return (
+        f"{abs(error):.1f} % too {'large' if error > 0 else 'small'}, at a range that is as wrong, which pictures do "
+        f"not show; {metrics['similarity_psnr_clean_db']:.2f} dB against noiseless exposures once it is corrected"
+    )
 
 
 def chi2_explained(chi2: float) -> str:
@@ -133,6 +145,8 @@ def _quality(metrics: dict) -> list[str]:
     ):
         if key in metrics:
             lines.append("- " + text.format(metrics[key]))
+    if size := size_explained(metrics):
+        lines.append(f"- The model is {size}.")
     for key, of in (("interval_90_noisy", "readings"), ("interval_90_clean", "noiseless exposures")):
         if key in metrics:
             lines.append(

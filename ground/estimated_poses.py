@@ -17,7 +17,7 @@ from obbgs_base.files import write_whole
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.pose_corrections import with_estimate
 from obbgs_core.pose_estimate import PoseEstimate
-from obbgs_core.score.poses import PoseErrors, best_motion, pose_errors, settled_poses
+from obbgs_core.score.poses import PoseErrors, best_motion, pose_errors, settled_poses, size_of
 from obbgs_core.sensor import Sensor
 
 FILE = "poses_estimated.json"
@@ -78,13 +78,16 @@ def _placed(record: FrameRecord, world_to_camera: np.ndarray) -> FrameRecord:
 class Alignment:
     """How a model whose poses were estimated lies in the true body frame.
 
-    motion: [4, 4] rigid, from the model's frame to the true one; before, after: errors of the training's poses as
-    tagged and as estimated, each after the motion that suits it best.
+    motion: [4, 4] rigid, from the model's frame to the true one; similarity: the same with the model's size free.
+    before, after: errors of the training's poses as tagged and as estimated, each after the rigid motion that suits it
+    best; after_similarity: as estimated, after the similarity.
     """
 
     motion: Tensor
+    similarity: Tensor
     before: PoseErrors
     after: PoseErrors
+    after_similarity: PoseErrors
 
     @staticmethod
     def of(estimate: PoseEstimate, session: Session, truth: Truth) -> "Alignment":
@@ -100,15 +103,18 @@ class Alignment:
         radius_m, focal_px = truth.largest_dimension_m / 2, session.camera.fx_px
         tagged, estimated = torch.from_numpy(estimate.tagged), torch.from_numpy(estimate.estimated)
         motion = best_motion(estimated, true, radius_m)
+        similarity = best_motion(estimated, true, radius_m, with_size=True)
         as_tagged = best_motion(tagged, true, radius_m)
         return Alignment(
             motion,
+            similarity,
             pose_errors(tagged, true, as_tagged, radius_m, focal_px),
             pose_errors(estimated, true, motion, radius_m, focal_px),
+            pose_errors(estimated, true, similarity, radius_m, focal_px),
         )
 
     def figures(self) -> dict[str, float]:
-        """Return the errors for metrics.json."""
+        """Return the errors for metrics.json; size_error_percent: by how much the model is too large."""
         return {
             "pose_error_tagged_deg": self.before.rotation_deg,
             "pose_error_tagged_range": self.before.range_share,
@@ -116,4 +122,8 @@ class Alignment:
             "pose_error_deg": self.after.rotation_deg,
             "pose_error_range": self.after.range_share,
             "pose_error_px": self.after.pixels,
+            "similarity_pose_error_deg": self.after_similarity.rotation_deg,
+            "similarity_pose_error_range": self.after_similarity.range_share,
+            "similarity_pose_error_px": self.after_similarity.pixels,
+            "size_error_percent": 100 * (1 / size_of(self.similarity) - 1),
         }

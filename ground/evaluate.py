@@ -14,7 +14,14 @@ from ground.intervals import interval_scores
 from ground.mesh_files import read_mesh_points
 from ground.model_files import SURFACE_POINTS
 from ground.runs import Run, open_run, written_to
-from ground.scores import ScoredView, clean_scores, cloud_scores, display_scores, noisy_psnr_db
+from ground.scores import (
+    ScoredView,
+    clean_scores,
+    cloud_scores,
+    display_scores,
+    noisy_psnr_db,
+    of_similarity,
+)
 from ground.session import FrameRecord
 from ground.training_frames import split, training_frame
 from ground.truth import Truth, read_points
@@ -55,6 +62,9 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
       completeness of that part.
     - psnr_clean_settled_db: from the settled poses; pose_error_deg, pose_error_range (of the range), pose_error_px: of
       the training's estimated poses, root mean squares, and pose_error_tagged_... of its tags; only of refined poses.
+    - size_error_percent: by how much the model of refined poses is too large, which no picture shows where navigation
+      leaves the range open; similarity_psnr_clean_db and other keys with that beginning: after the motion of the model
+      that corrects its size as well.
 
     Raises:
         SessionError: no such session or run, damaged metrics or truth, or a run folder that cannot be written.
@@ -77,6 +87,9 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
             motion = alignment.motion.numpy()
             settled = clean_scores([_scored(run, truth, record) for record in shown])
             figures |= alignment.figures() | {"psnr_clean_settled_db": settled["psnr_clean_db"]}
+            similarity = alignment.similarity.numpy()
+            sized = [_scored(run, truth, truth.posed(record, similarity)) for record in run.scored]
+            figures |= of_similarity(clean_scores(sized) | _cloud_figures(run, truth, similarity))
         shown = [truth.posed(record, motion) for record in run.scored]
         figures |= clean_scores([_scored(run, truth, record) for record in shown])
         figures |= _radiance_figures(run, truth, shown) | _cloud_figures(run, truth, motion)

@@ -133,6 +133,8 @@ def _details(m: dict) -> list[tuple[str, str]]:
         "psnr_clean_db": "clean PSNR, dB",
         **{key: f"… at {_exposure_ms(key)} ms, dB" for key in m if _exposure_ms(key)},
         "psnr_clean_foreground_db": "… of the foreground, dB",
+        "size_error_percent": "… the model is too large by, %",
+        "similarity_psnr_clean_db": "… with the model's size corrected, dB",
         "psnr_clean_blind_db": "… of the training without exposure times, dB",
         "psnr_noisy_db": f"PSNR of {scored_frames(m)} against their noisy readings, dB",
         "psnr_srgb_db": "… of display values (sRGB), dB",

@@ -15,6 +15,7 @@ from obbgs_core.score.metrics import cloud_distances, foreground_psnr_db, psnr_d
 from obbgs_core.sensor import Sensor
 
 log = logging.getLogger(__name__)
+OF_SIMILARITY = ("psnr_clean_db", "psnr_clean_foreground_db", "chamfer", "completeness_surface")
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,11 @@ def cloud_scores(
             distances = cloud_distances(cloud_m * units_per_m, true_cloud, shown)
             figures |= {f"{key}{name}": value for key, value in distances.items()}
     return figures if shown is None else figures | {"surface_shown": 100 * float(shown.mean())}
+
+
+def of_similarity(figures: dict[str, float]) -> dict[str, float]:
+    """Return those of the scores of a model after the best similarity that are shown beside those of a rigid motion."""
+    return {f"similarity_{key}": figures[key] for key in OF_SIMILARITY if key in figures}
 
 
 def _mean(values: list[float]) -> float:

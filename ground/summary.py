@@ -3,7 +3,7 @@
 from rich.table import Table
 from rich.text import Text
 
-from ground.card import chi2_explained, frames_captured, scored_frames
+from ground.card import chi2_explained, frames_captured, scored_frames, size_explained
 
 PSNR_LABELS = {
     "psnr_clean_db": "against noiseless exposures",
@@ -41,6 +41,8 @@ def model_rows(metrics: dict) -> list[tuple[str, str]]:
         more = "" if shown is None else f" ({shown:.1f} % of what the frames show)"
         text = f"{metrics['completeness_surface']:.1f} %{more}"
         rows.append(("true surface within 0.01 of the model's", text))
+    if size := size_explained(metrics):
+        rows.append(("size of the model", size))
     rows.append(("Gaussians", f"{metrics['gaussians']:,}"))
     if known("budget"):
         rows.append(("budget", metrics["budget"]))

@@ -159,14 +159,16 @@ class Truth:
         """Return a frame's record with its true pose in place of the received one.
 
         Args:
-            motion: [4, 4] rigid, from the frame of the model to the true body frame; None: they are the same.
+            motion: [4, 4] from the frame of the model to the true body frame, as in `Alignment`; None: they are one.
 
         Raises:
             SessionError: the truth has no such frame.
         """
         self._require(record)
         pose = self._poses[record.id]
-        return dataclasses.replace(record, world_to_camera=pose if motion is None else pose @ motion)
+        if motion is not None:  # a similarity's size makes the range larger instead
+            pose = pose @ motion / np.array([[np.cbrt(np.linalg.det(motion[:3, :3]))] * 3 + [1.0]]).T
+        return dataclasses.replace(record, world_to_camera=pose)
 
     def radiance(self, record: FrameRecord) -> tuple[np.ndarray, np.ndarray]:
         """Return a frame's scene-linear radiance [H, W, C] and coverage [H, W] in 0..1, both float32.

@@ -4,7 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-LARGEST_TURN_RAD = 0.06  # of a Runge-Kutta step: it errs by less than 1e-8 rad
+STEADY = 1e-14  # torque over twice the energy up to which the rates do not change
+LEAST_COMPLEMENT = (
+    1e-30  # of the functions' parameter: a body this near its middle axis stays there for 35 rad
+)
+MEAN_ROUNDS = 10  # of the arithmetic-geometric mean, which doubles its digits in each
+SAMPLES = 256  # in a period of the speed of precession
 
 
 @dataclass(frozen=True)
@@ -73,7 +78,9 @@ def free_rotation(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return how far P bodies have turned since time 0 [P, N, 3, 3] and their rates [P, N, 3] rad/s, body axes.
 
-    Euler's equations without torque; a fourth-order Runge-Kutta method where the moments of inertia differ.
+    Euler's equations without torque, in closed form: the rates are Jacobi's elliptic functions of time, and the body
+    turns about the constant angular momentum at a speed that has their period, whose Fourier series is integrated. How
+    long the body turns does not matter for the time that this takes.
 
     Args:
         rate_rad_s: [P, 3] at time 0, body axes.
@@ -81,65 +88,124 @@ def free_rotation(
 
     Raises:
         ValueError: a moment is not positive.
+
+    Source: Landau and Lifshitz, Mechanics, 1976, paragraph 37.
     """
     if not (inertia > 0).all():
         raise ValueError(
             f"expected positive moments of inertia, got {inertia.min():g}; inertia_ratios must be above -1"
         )
-    if np.allclose(inertia, inertia[:, :1], rtol=1e-14, atol=0):  # no torque acts on the rates
-        turned = rotations(-rate_rad_s[:, None] * times_s[:, None])
-        return turned, np.broadcast_to(rate_rad_s[:, None], (*turned.shape[:2], 3))
-    turned = np.empty((len(rate_rad_s), len(times_s), 3, 3))
-    rates = np.empty((len(rate_rad_s), len(times_s), 3))
-    order = np.argsort(times_s, kind="stable")
-    later = times_s[order] >= 0
-    for indices in (order[later], order[~later][::-1]):
-        quats, now, at_s = np.tile([1.0, 0, 0, 0], (len(rate_rad_s), 1)), rate_rad_s, 0.0
-        for index in indices:
-            span_s = float(times_s[index] - at_s)
-            steps = int(np.ceil(abs(span_s) * np.linalg.norm(now, axis=1).max() / LARGEST_TURN_RAD))
-            for _ in range(steps):
-                quats, now = _runge_kutta(quats, now, inertia, span_s / steps)
-            at_s = float(times_s[index])
-            turned[:, index], rates[:, index] = _from_quats(quats), now
+    turned = rotations(-rate_rad_s[:, None] * times_s[:, None])
+    rates = np.repeat(rate_rad_s[:, None], len(times_s), axis=1)
+    torque = np.linalg.norm(np.cross(inertia * rate_rad_s, rate_rad_s), axis=1)
+    tumbles = torque > STEADY * (inertia * rate_rad_s**2).sum(axis=1)
+    if tumbles.any():
+        turned[tumbles], rates[tumbles] = _tumbling(times_s, rate_rad_s[tumbles], inertia[tumbles])
     return turned, rates
 
 
-def _runge_kutta(
-    quats: np.ndarray, rates: np.ndarray, inertia: np.ndarray, step_s: float
+def _tumbling(
+    times_s: np.ndarray, rate_rad_s: np.ndarray, inertia: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return body-to-start quaternions [P, 4] and rates [P, 3] a step later, by the fourth-order method."""
+    """Return turns and rates as `free_rotation`, of bodies whose rates change. Shapes are [P, 1] and [P, N]."""
+    # Axes in the order of their moments a, b, c, rising or falling: so that the rate about the last keeps its sign.
+    order = np.argsort(inertia, axis=1)
+    excess = _excess(rate_rad_s, inertia, order)[0][:, 0]
+    order[excess < 0] = order[excess < 0, ::-1]
+    excess, (a, b, c), (p, q, r) = _excess(rate_rad_s, inertia, order)
+    first2 = a * p**2 + b * (c - b) / (c - a) * q**2  # (2 E c - L²) / (c - a), E the energy, L the momentum
+    last2 = c * r**2 + b * (b - a) / (c - a) * q**2  # (L² - 2 E a) / (c - a)
+    largest = np.sqrt(first2 / a), np.sqrt(first2 / b * (c - a) / (c - b)), np.sqrt(last2 / c)
+    left_handed = (order[:, 1:2] - order[:, :1]) % 3 == 2
+    way = np.where(left_handed, -1, 1) * np.sign((c - a) * r)
+    speed = way * np.sqrt((c - b) * (c - a) / (a * b) * last2 / c)  # rad/s of the functions' argument
+    means = _means(np.maximum(np.abs(excess / ((c - b) * last2)), LEAST_COMPLEMENT))
+    half = np.pi / means[-1][0]  # period of the squares: twice the complete elliptic integral
+    start = _argument(np.arctan2(q / largest[1], p / largest[0]), means)
+    at = start + speed * times_s
+    sine, cosine, slope = _jacobi(at, means)
+    sorted_rates = np.stack([largest[0] * cosine, largest[1] * sine, np.sign(r) * largest[2] * slope], axis=2)
+    rates = np.empty_like(sorted_rates)
+    np.put_along_axis(rates, np.broadcast_to(order[:, None], rates.shape), sorted_rates, axis=2)
 
-    def slopes(state: np.ndarray) -> np.ndarray:
-        w, x, y, z, p, q, r = state.T
-        a, b, c = inertia.T
-        return np.stack(
-            [
-                0.5 * (-x * p - y * q - z * r),
-                0.5 * (w * p + y * r - z * q),
-                0.5 * (w * q + z * p - x * r),
-                0.5 * (w * r + x * q - y * p),
-                (b - c) / a * q * r,
-                (c - a) / b * r * p,
-                (a - b) / c * p * q,
-            ],
-            axis=1,
+    # how fast a body axis turns about the angular momentum, over a period, and its integral by its Fourier series; of
+    # the first axis and the last, that which stays farther away from the momentum
+    sine, cosine, slope = _jacobi(half * np.arange(SAMPLES) / SAMPLES, means)
+    parts = np.stack(
+        [a * (largest[0] * cosine) ** 2, b * (largest[1] * sine) ** 2, c * (largest[2] * slope) ** 2]
+    )
+    squares = parts * np.stack([a, b, c])  # [3, P, samples] of the momentum about each axis
+    is_last = (squares[:2].sum(axis=0).min(axis=1) > squares[1:].sum(axis=0).min(axis=1))[:, None]
+    others = np.stack([is_last, np.ones_like(is_last), ~is_last])
+    momentum = np.linalg.norm(inertia * rate_rad_s, axis=1, keepdims=True)
+    speeds = momentum * (parts * others).sum(axis=0) / (squares * others).sum(axis=0)
+    series = np.fft.rfft(speeds, axis=1).real[:, None, : SAMPLES // 2] / SAMPLES
+    series[..., 1:] *= 2
+    turns = (
+        np.arange(SAMPLES // 2) * (speed * times_s / half)[..., None]
+    )  # [P, N, harmonics] of each since time 0
+    middle = np.arange(SAMPLES // 2) * ((start + at) / half)[..., None]  # twice their mean phase, in turns
+    angle = times_s * (series * np.sinc(turns) * np.cos(np.pi * middle)).sum(axis=2)
+
+    axis = np.eye(3)[np.where(is_last, order[:, 2:], order[:, :1])]
+    about = np.zeros((*angle.shape, 3))
+    about[..., 2] = -angle
+    frames = _momentum_frames(inertia[:, None] * rates, axis)
+    return frames @ rotations(about) @ _momentum_frames((inertia * rate_rad_s)[:, None], axis).swapaxes(
+        2, 3
+    ), rates
+
+
+def _excess(
+    rates: np.ndarray, inertia: np.ndarray, order: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return L² - 2 E b [P, 1], without cancellation, and the moments and rates [3, P, 1] in an order of the axes."""
+    a, b, c = moments = np.take_along_axis(inertia, order, axis=1).T[..., None]
+    p, _, r = ordered = np.take_along_axis(rates, order, axis=1).T[..., None]
+    return a * (a - b) * p**2 + c * (c - b) * r**2, moments, ordered
+
+
+def _momentum_frames(momentum: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Return [P, N, 3, 3], in body axes the columns: an axis across the momentum [P, N, 3], their cross product, it."""
+    z = momentum / np.linalg.norm(momentum, axis=-1, keepdims=True)
+    x = axis - (axis * z).sum(axis=-1, keepdims=True) * z
+    x = x / np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def _means(complement: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return a, b and c of each round of the arithmetic-geometric mean of a complementary parameter 1 - m [P, 1].
+
+    Source: Abramowitz and Stegun, Handbook of Mathematical Functions, 1964, 17.6.
+    """
+    a, b, c = np.ones_like(complement), np.sqrt(complement), np.sqrt(1 - complement.clip(max=1))
+    rounds = [(a, b, c)]
+    for _ in range(MEAN_ROUNDS):
+        a, b, c = (a + b) / 2, np.sqrt(a * b), (a - b) / 2
+        rounds.append((a, b, c))
+    return rounds
+
+
+def _argument(amplitude: np.ndarray, means: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Return the incomplete elliptic integral of the first kind of an amplitude (17.6.8)."""
+    for a, b, _ in means[:-1]:
+        whole = np.round(amplitude / np.pi) * np.pi
+        amplitude = (
+            amplitude + whole + np.arctan2(b * np.sin(amplitude - whole), a * np.cos(amplitude - whole))
         )
-
-    state = np.concatenate([quats, rates], axis=1)
-    k1 = slopes(state)
-    k2 = slopes(state + step_s / 2 * k1)
-    k3 = slopes(state + step_s / 2 * k2)
-    k4 = slopes(state + step_s * k3)
-    state = state + step_s / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    quats = state[:, :4] / np.linalg.norm(state[:, :4], axis=1, keepdims=True)
-    return quats, state[:, 4:]
+    return amplitude / (2**MEAN_ROUNDS * means[-1][0])
 
 
-def _from_quats(quats: np.ndarray) -> np.ndarray:
-    """Return start-to-body rotations [P, 3, 3] of body-to-start quaternions [P, 4]."""
-    w, cross = quats[:, :1, None], cross_matrices(quats[:, 1:])
-    return (np.eye(3) + 2 * w * cross + 2 * cross @ cross).swapaxes(-1, -2)
+def _jacobi(
+    argument: np.ndarray, means: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Jacobi's elliptic functions sn, cn and dn [P, N] of arguments [P, N] (16.4)."""
+    whole = 2 * np.pi / means[-1][0]  # their period
+    amplitude = 2**MEAN_ROUNDS * means[-1][0] * (argument - np.round(argument / whole) * whole)
+    for a, _, c in means[:0:-1]:
+        amplitude = (amplitude + np.arcsin(c / a * np.sin(amplitude))) / 2
+    sine, cosine = np.sin(amplitude), np.cos(amplitude)
+    return sine, cosine, np.sqrt(cosine**2 + means[0][1] ** 2 * sine**2)
 
 
 def rotations(vectors: np.ndarray) -> np.ndarray:

@@ -265,18 +265,14 @@ def _attitudes(
     times_s, nominal = motion.times_s, motion.inertial_to_body
     if motion.rate_rad_s.any():
         inertia = motion.inertia * np.concatenate([1 + ratios, np.ones((len(ratios), 1))], axis=1)
-        turned, rates = free_rotation(times_s, motion.rate_rad_s + rate, inertia)
-        before = _nominal_rotation(times_s.tobytes(), motion.rate_rad_s.tobytes(), motion.inertia.tobytes())
+        rows, of_row = np.unique(
+            np.concatenate([motion.rate_rad_s + rate, inertia], axis=1), axis=0, return_inverse=True
+        )  # most parameters change none of these
+        turned, rates = (part[of_row] for part in free_rotation(times_s, rows[:, :3], rows[:, 3:]))
+        before, _ = free_rotation(times_s, motion.rate_rad_s[None], motion.inertia[None])
         to_body = turned @ rotations(attitude)[:, None] @ before.swapaxes(-1, -2) @ nominal
         return rotations(-rates * clock[:, None]) @ to_body
     turning = turning_of(times_s, nominal)
     grown = np.einsum("nij,pj->pni", turning.integral_s, rate @ turning.at_epoch)
     to_body = rotations(-grown) @ nominal @ rotations(attitude @ turning.at_epoch)[:, None]
     return rotations(-turning.rates_rad_s * clock[:, None]) @ to_body
-
-
-@functools.lru_cache(maxsize=4)
-def _nominal_rotation(times_s: bytes, rate_rad_s: bytes, inertia: bytes) -> np.ndarray:
-    """Return the attitudes [1, N, 3, 3] of a motion that does not change while its parameters do, from float64."""
-    rows = (np.frombuffer(part)[None] for part in (rate_rad_s, inertia))
-    return free_rotation(np.frombuffer(times_s), *rows)[0]

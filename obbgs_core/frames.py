@@ -44,8 +44,8 @@ class TrainingFrame:
     """One exposure: dn [H, W, C] float, known exposure time, pose [4, 4] body to camera, K [3, 3] px.
 
     pose_covariance: [6, 6] float64, of the motion that in front of world_to_camera makes the tagged pose the true one:
-        rotation vector about the camera's axes (rad), then shift along them (m); None or zeros: the pose is exact but
-        for what the navigation's parameters change.
+        rotation vector about the camera's axes (rad) and shift along them (m), as in `model.motions`; None or zeros:
+        the pose is exact but for what the navigation's parameters change.
     sun_dir: [3] towards the Sun, unit, body frame; None: not known.
     background: radiance of what is seen where the target is not, the same in all frames of a training; space is black.
     psf_sigma_px: of the optics, as in `Cameras`, the same in all frames; None: not calibrated, a method whose footprint

@@ -20,6 +20,7 @@ from ground.session import FrameRecord, Session, open_session, read_header
 from ground.training_frames import split, training_frame
 from ground.truth import Truth
 from obbgs_core.frames import TrainingFrame
+from obbgs_core.score.poses import seen_after, size_of
 from obbgs_core.score.shown import shown_points
 from obbgs_core.sensor import Sensor
 
@@ -72,12 +73,17 @@ class Case:
             self, held_out=held_out, radiance=radiance, coverage=coverage, calibration=()
         )
 
-    def seen_by(self, reconstruction: Reconstruction) -> tuple["Case", dict[str, float]]:
+    def seen_by(
+        self, reconstruction: Reconstruction, with_size: bool = False
+    ) -> tuple["Case", dict[str, float]]:
         """Return the case in the frame of a reconstruction, and how far off its poses are where the truth is known.
 
         It is the case itself where the method takes the poses as they are given. Where it estimated them, the model may
         have moved as a whole: the truth moves rigidly, so that the true poses of the training come nearest to the
         estimated ones. Without truth each held-out frame is settled on its picture, the model fixed.
+
+        Args:
+            with_size: the truth changes its size as well to come nearest.
         """
         poses = reconstruction.poses
         if poses is None or self.session is None:
@@ -88,14 +94,20 @@ class Case:
                 self, held_out=poses.settled(self.held_out), calibration=calibration
             ), {}
         alignment = Alignment.of(poses.estimate, self.session, Truth(self.session))
-        motion = alignment.motion
+        motion = alignment.similarity if with_size else alignment.motion
+        true = seen_after(torch.stack([frame.world_to_camera.double() for frame in self.held_out]), motion)
         held_out = [
-            dataclasses.replace(frame, world_to_camera=(frame.world_to_camera.double() @ motion).float())
-            for frame in self.held_out
+            dataclasses.replace(frame, world_to_camera=pose.float())
+            for frame, pose in zip(self.held_out, true, strict=True)
         ]
-        turn, shift_m = motion[:3, :3].numpy(), motion[:3, 3].numpy()
-        cloud_m = (self.cloud_m - shift_m) @ turn
-        moved = dataclasses.replace(self, held_out=held_out, cloud_m=cloud_m, calibration=calibration)
+        back, shift_m = torch.linalg.inv(motion[:3, :3]).numpy(), motion[:3, 3].numpy()
+        moved = dataclasses.replace(
+            self,
+            held_out=held_out,
+            cloud_m=(self.cloud_m - shift_m) @ back.T,
+            units_per_m=self.units_per_m * size_of(motion),
+            calibration=calibration,
+        )
         return moved, alignment.figures()
 
     def image_scores(self, images: Sequence[Tensor]) -> dict[str, float]:

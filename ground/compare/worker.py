@@ -17,6 +17,7 @@ from ground.compare.origin import commit, with_origin
 from ground.compare.rows import locked
 from ground.compare.trainings import MODEL
 from ground.compare.views import write_views
+from ground.scores import of_similarity
 from obbgs_core.errors import ReconstructionError
 
 BENCH = "compare"
@@ -78,6 +79,8 @@ def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict
         outcome = wanted.run(task)
         seen, pose_errors = case.seen_by(outcome.reconstruction)
         row |= _rounded_all(pose_errors) | scores(seen, outcome, out / VIEWS / f"{cell.digest}.npz")
+        if pose_errors:
+            row |= _after_similarity(case.seen_by(outcome.reconstruction, with_size=True)[0], outcome)
         if outcome.reconstruction.intervals is not None:
             row |= _rounded_all(
                 outcome.reconstruction.intervals(seen.held_out, seen.radiance, seen.calibration)
@@ -89,6 +92,15 @@ def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict
     except (ReconstructionError, CompareError) as error:
         row["error"] = f"{type(error).__name__}: {error}"
     return with_origin(row, BENCH, command)
+
+
+def _after_similarity(case: Case, outcome: Outcome) -> dict[str, Any]:
+    """Return the scores of a model whose size is corrected too, of a case that it sees so."""
+    result = outcome.reconstruction
+    figures = case.cloud_scores(result.points, result.surface)
+    if result.image is not None:
+        figures |= case.image_scores([image_of(result, frame) for frame in case.held_out])
+    return _rounded_all(of_similarity(figures))
 
 
 def scores(case: Case, outcome: Outcome, views: Path) -> dict[str, Any]:

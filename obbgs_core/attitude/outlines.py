@@ -7,7 +7,7 @@ import torch.nn.functional as F
 
 from obbgs_core.frames import TrainingFrame, bracket_numbers
 from obbgs_core.sensor import Sensor, dark_reading
-from obbgs_core.start import hull
+from obbgs_core.start import alignment, hull
 from obbgs_core.start.hull import Silhouette
 
 OPEN_SIGMA = 4.0  # a mean of 3x3 pixels above this may be light
@@ -39,15 +39,24 @@ def outline(frame: TrainingFrame, sensor: Sensor, binned: int) -> Silhouette:
     return Silhouette((mean > LIT_SIGMA) & (signal > PIXEL_SIGMA), likely, ~likely, frame.world_to_camera, K)
 
 
+def whole_outlines(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, Silhouette]:
+    """Return the outline in all pixels of each bracket's longest exposure that shows light, by the frame's index."""
+    whole = {i: outline(frames[i], sensor, 1) for i in longest_exposures(frames)}
+    return {i: s for i, s in whole.items() if int(s.certain.sum()) >= FEWEST_LIT_PX}
+
+
+def centred(frames: list[TrainingFrame], sensor: Sensor) -> list[TrainingFrame]:
+    """Return frames, in inertial axes, moved to where their outlines are around the target's centre: `alignment`."""
+    return alignment.centred(frames, whole_outlines(frames, sensor))
+
+
 def outlines(frames: list[TrainingFrame], sensor: Sensor, cells: int) -> tuple[dict[int, Silhouette], float]:
     """Return the outlines of each bracket's longest exposure by the frame's index, and the target's radius, m.
 
     Args:
         cells: width of the pictures in which outlines are compared; smaller pixels are averaged.
     """
-    chosen = longest_exposures(frames)
-    whole = {i: outline(frames[i], sensor, 1) for i in chosen}
-    whole = {i: s for i, s in whole.items() if int(s.certain.sum()) >= FEWEST_LIT_PX}
+    whole = whole_outlines(frames, sensor)
     radius_m = hull.radius_m(list(whole.values()))
     if radius_m == 0:
         return {}, 0.0

@@ -1,19 +1,29 @@
-"""Small rigid motions: a rotation vector (rad), then a shift (m), in front of a pose [4, 4]."""
+"""Rigid motions as six numbers: a rotation vector (rad) and a shift (m), both at once, in front of a pose [4, 4].
+
+They are the exponential coordinates of the motion (Barfoot and Furgale 2014). A turn about a far point stays a turn
+about that point at any angle, and the motion that undoes another has its numbers with the other sign; a rotation that
+is followed by a shift would have neither.
+"""
 
 import torch
 from torch import Tensor
 
 SMALLEST_TURN_RAD = 1e-9  # a rotation vector below has the skew part of its matrix for it
+SERIES_BELOW_RAD = 1e-2  # of angle: the series of `motion_vectors` errs by less than 1e-11 there
 
 
 def rigid_motions(xi: Tensor) -> Tensor:
-    """Return [B, 4, 4] of rotation vectors (rad) and shifts (m) [B, 6]; exact rotations for any angle."""
+    """Return the motions [B, 4, 4] of rotation vectors (rad) and shifts (m) [B, 6], at any angle."""
+    unit = (
+        xi[:, 3:].detach().norm(dim=1)[:, None, None].clamp(min=1)
+    )  # so that rounding follows the angle alone
     generator = torch.zeros(len(xi), 4, 4, dtype=xi.dtype)
     generator[:, :3, :3] = cross_matrices(xi[:, :3])
+    generator[:, :3, 3:] = xi[:, 3:, None] / unit
     motion = torch.matrix_exp(generator)
-    shift = torch.zeros_like(motion)
-    shift[:, :3, 3] = xi[:, 3:]
-    return motion + shift
+    return torch.cat(
+        [motion[:, :, :3], torch.cat([unit * motion[:, :3, 3:], motion[:, 3:, 3:]], dim=1)], dim=2
+    )
 
 
 def motion_vectors(motions: Tensor) -> Tensor:
@@ -25,7 +35,12 @@ def motion_vectors(motions: Tensor) -> Tensor:
     cosine = (R.diagonal(dim1=1, dim2=2).sum(1, keepdim=True) - 1) / 2
     angle = torch.atan2(sine, cosine)
     turn = torch.where(sine > SMALLEST_TURN_RAD, axis * angle / sine.clamp(min=SMALLEST_TURN_RAD), axis)
-    return torch.cat([turn, motions[:, :3, 3]], dim=1)
+    half = angle / 2
+    series, safe = 1 / 12 + angle.square() / 720, half.clamp(min=SERIES_BELOW_RAD / 2)
+    second = torch.where(angle < SERIES_BELOW_RAD, series, (1 - safe / safe.tan()) / (2 * safe) ** 2)
+    cross, place = cross_matrices(turn), motions[:, :3, 3:]
+    shift = place - cross @ place / 2 + second[..., None] * cross @ cross @ place
+    return torch.cat([turn, shift[..., 0]], dim=1)
 
 
 def adjoints(poses: Tensor) -> Tensor:

@@ -1,8 +1,9 @@
 """Fair scores of models whose poses were refined: the model may have moved as a whole, and its tags err.
 
 Pictures are compared from poses that are settled on each held-out frame with the model fixed, and from true poses
-after the rigid motion of the model that brings its estimated poses nearest to the true ones. Geometry is compared after
-that motion.
+after the motion of the model that brings its estimated poses nearest to the true ones: a rigid one, and a similarity,
+which may change the model's size as well. A larger target that is farther away by as much gives the same pictures, so
+where navigation leaves the range open nothing can tell the size. Geometry and poses are compared after either motion.
 """
 
 import dataclasses
@@ -44,23 +45,42 @@ class PoseErrors:
     pixels: float
 
 
-def best_motion(estimated: Tensor, true: Tensor, radius_m: float) -> Tensor:
-    """Return the rigid motion [4, 4] of the body after which estimated poses see it most nearly as the true ones do.
+def best_motion(estimated: Tensor, true: Tensor, radius_m: float, with_size: bool = False) -> Tensor:
+    """Return the motion [4, 4] of the body after which estimated poses see it most nearly as the true ones do.
 
     The sum of the squared angles between the projections of seven points, the body's origin and six at `radius_m` from
     it, is least: what pictures show counts, and an error along the line of sight counts as little as it shows.
 
     Args:
         estimated, true: [N, 4, 4] world_to_camera; a point x of the model is at motion · x in the true body frame.
+        with_size: a similarity, its upper left block size times a rotation, instead of a rigid motion.
     """
     estimated, true = estimated.double(), true.double()
     motion = torch.eye(4, dtype=torch.float64)
     for _ in range(ROUNDS):
-        now = true @ motion
+        now = seen_after(true, motion)
         flow, left = _views(now, estimated, radius_m)
-        rows = (flow @ adjoints(now)[:, None]).flatten(0, 2)
-        motion = motion @ rigid_motions((torch.linalg.pinv(rows) @ left.flatten())[None])[0]
+        nearer = torch.cat(
+            [torch.zeros_like(now[:, :3, 3:]), -now[:, :3, 3:]], dim=1
+        )  # by the logarithm of size
+        columns = torch.cat([adjoints(now), nearer], dim=2) if with_size else adjoints(now)
+        change = torch.linalg.pinv((flow @ columns[:, None]).flatten(0, 2)) @ left.flatten()
+        motion = motion @ rigid_motions(change[None, :6])[0]
+        if with_size:
+            motion[:3, :3] *= torch.exp(change[6])
     return motion
+
+
+def size_of(motion: Tensor) -> float:
+    """Return the factor by which a rigid motion (1) or a similarity [4, 4] makes the body larger."""
+    return torch.linalg.det(motion[:3, :3].double()).item() ** (1 / 3)
+
+
+def seen_after(poses: Tensor, motion: Tensor) -> Tensor:
+    """Return the poses [N, 4, 4] that see the body before a motion [4, 4] as given ones see it after: rigid again."""
+    seen = poses @ motion
+    seen[:, :3] /= size_of(motion)
+    return seen
 
 
 def _views(now: Tensor, wanted: Tensor, radius_m: float) -> tuple[Tensor, Tensor]:
@@ -75,7 +95,7 @@ def pose_errors(
     estimated: Tensor, true: Tensor, motion: Tensor, radius_m: float, focal_px: float
 ) -> PoseErrors:
     """Return how far estimated poses [N, 4, 4] are from true ones after the body's motion [4, 4]."""
-    estimated, moved = estimated.double(), true.double() @ motion.double()
+    estimated, moved = estimated.double(), seen_after(true.double(), motion.double())
     errors = motion_vectors(estimated @ torch.linalg.inv(moved))
     centres = [-(p[:, :3, :3].mT @ p[:, :3, 3:])[..., 0] for p in (estimated, moved)]
     ranges = moved[:, :3, 3].norm(dim=1)

@@ -60,6 +60,30 @@ def settled(
     return grown(outlines, errors_px), None, ""
 
 
+def centred(frames: list[TrainingFrame], outlines: dict[int, hull.Silhouette]) -> list[TrainingFrame]:
+    """Return frames with the target in the middle of its silhouettes, moved there within what their tags allow.
+
+    For poses relative to inertial axes, in which the target turns, so that no hull says which poses are better. They
+    are moved where the silhouettes' centres are farther from the target's centre than a body's own asymmetry explains.
+
+    Args:
+        outlines: silhouettes of some of the frames, by index, with tagged poses.
+    """
+    poses = PoseCorrections(frames)
+    if not outlines or not (poses.rank.any() or poses.free.any()):
+        return frames
+    lit, K, centres_px, radii_px = _centres(frames, outlines)
+    tagged_px = float(
+        _seen(poses, lit, torch.zeros(3, dtype=torch.float64), K, centres_px)[2].norm(dim=1).median()
+    )
+    if tagged_px < OFFSET * radii_px.median():
+        return frames
+    # the mean of a turning body's centres lies on the axis of its rotation, along which nothing is lost by a shift
+    moved, left_px = _aligned(frames, outlines, offset=0.0)
+    log.info("outlines are %.1f px off the target's centre as tagged, %.1f px aligned", tagged_px, left_px)
+    return moved.frames(frames) if left_px < BETTER * tagged_px else frames
+
+
 def grown(outlines: dict[int, hull.Silhouette], errors_px: dict[int, int]) -> dict[int, hull.Silhouette]:
     """Return silhouettes grown by the least reach that makes them coherent, each by its own limit at most."""
     most = max(errors_px.values())
@@ -85,21 +109,19 @@ def _coherence(
 
 
 def _aligned(
-    frames: list[TrainingFrame], outlines: dict[int, hull.Silhouette]
+    frames: list[TrainingFrame], outlines: dict[int, hull.Silhouette], offset: float = OFFSET
 ) -> tuple[PoseCorrections, float]:
     """Return poses at which one point of the body projects to the silhouettes' centres, and what is left, px.
 
-    The point is the body's origin plus an offset that is estimated as well. The lit part's centre is not quite that of
-    one point: it is taken to err by a tenth of the silhouette's radius.
+    The point is the body's origin plus an offset that is estimated as well, whose deviation is `offset` radii of the
+    silhouettes. The lit part's centre is not quite that of one point: it is taken to err by a tenth of the radius.
     """
     poses, point = PoseCorrections(frames), torch.zeros(3, dtype=torch.float64)
-    lit = [i for i, outline in outlines.items() if outline.certain.any()]
-    centres, radii = zip(*(_centre(outlines[i].certain) for i in lit), strict=True)
-    centres_px, sigma_px = torch.stack(centres), CENTRE_SIGMA * torch.tensor(radii, dtype=torch.float64)
-    K = torch.stack([frames[i].K for i in lit]).double()
+    lit, K, centres_px, radii_px = _centres(frames, outlines)
+    sigma_px = CENTRE_SIGMA * radii_px
     ranges_m = torch.stack([frames[i].world_to_camera[2, 3] for i in lit]).clamp(min=1e-6)
     # the prior deviation of the point from the origin
-    offset_m = OFFSET * float((sigma_px / CENTRE_SIGMA * ranges_m / K[:, 0, 0]).median())
+    offset_m = offset * float((radii_px * ranges_m / K[:, 0, 0]).median())
     by_offset = torch.zeros(len(frames), 6, 3, dtype=torch.float64)
     for _ in range(ROUNDS):
         at, turn, away_px = _seen(poses, lit, point, K, centres_px)
@@ -114,6 +136,16 @@ def _aligned(
         by_offset[lit, 3:] = offset_m * turn
         point = point + offset_m * poses.step(frames, extra=by_offset)
     return poses, float(_seen(poses, lit, point, K, centres_px)[2].norm(dim=1).median())
+
+
+def _centres(
+    frames: list[TrainingFrame], outlines: dict[int, hull.Silhouette]
+) -> tuple[list[int], Tensor, Tensor, Tensor]:
+    """Return which silhouettes show light, with K [L, 3, 3], their centres [L, 2] px and radii [L] px."""
+    lit = [i for i, outline in outlines.items() if outline.certain.any()]
+    centres, radii = zip(*(_centre(outlines[i].certain) for i in lit), strict=True)
+    K = torch.stack([frames[i].K for i in lit]).double()
+    return lit, K, torch.stack(centres), torch.tensor(radii, dtype=torch.float64)
 
 
 def _seen(

@@ -10,6 +10,7 @@ from torch import Tensor
 from obbgs_core.errors import Diverged
 from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.render import Rendered
+from obbgs_core.train import pose_rounds
 from obbgs_core.train.appearance import SUN_FROM, described, raised_degree
 from obbgs_core.train.batches import Batch, FrameOrder
 from obbgs_core.train.config import Moment
@@ -29,12 +30,9 @@ from obbgs_core.train.parsimony import justified
 from obbgs_core.train.setup import TrainingSetup
 from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import TrainingState
-from obbgs_core.train.validation import correction_gain
+from obbgs_core.train.validation import correction_evidence
 
 log = logging.getLogger(__name__)
-# Poses are refined if their likelihood gain, less its standard error, exceeds its BIC penalty by this factor. Gains of
-# 0.5 to 1.3 penalties were measured with exact tags, 2.9 to 5.4 at 1 px of error (docs/experiments/012).
-REFINING_RATIO = 1.5
 
 
 def smooth(setup: TrainingSetup, state: TrainingState) -> None:
@@ -79,21 +77,25 @@ def observe(
 
 
 def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> None:
-    """Refine the poses if correcting the validation brackets gains `REFINING_RATIO` times its BIC penalty.
+    """Refine the poses if the validation brackets say that they err: their log Bayes factor exceeds its standard error.
 
-    The validation brackets are trained on from then on.
+    They are asked before each round of refinement, until they say so or pictures have their full size: a model of
+    coarse pictures shows large errors only. They are trained on from then on.
     """
     config = setup.config
-    if state.poses_decided or share < config.poses.refine_from:
+    if state.poses_decided or share < config.poses.refine_from or not pose_rounds.is_turn(setup, state):
         return
     scale = config.image_scale(share)
     brackets = [setup.batches.batch(b, scale) for b in state.order.validation_brackets]
-    gain, error = correction_gain(state.model.detach(), setup.frames, brackets, setup.sensor)
-    refined = gain - error > REFINING_RATIO
+    cell_m = pose_rounds.cell_m(setup)
+    evidence, error = correction_evidence(state.model.detach(), setup.frames, brackets, setup.sensor, cell_m)
+    refined = evidence > error
+    if not refined and scale < config.image_scale(1):
+        return
     state.poses = PoseCorrections(setup.frames) if refined else None
     state.poses_decided = (
-        f"{'refined' if refined else 'as tagged'} (step {state.steps_done + 1}: correcting a validation bracket gains "
-        f"{gain:.1f} ± {error:.1f} times its BIC penalty)"
+        f"{'refined' if refined else 'as tagged'} (step {state.steps_done + 1}: that a validation bracket's pose errs "
+        f"has a log Bayes factor of {evidence:.1f} ± {error:.1f})"
     )
     log.info("poses %s", state.poses_decided)
     state.order = FrameOrder.of(setup.frames, config.bracket_steps, [], state.order.turn)

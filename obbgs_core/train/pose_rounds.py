@@ -17,11 +17,18 @@ RENDERED = 6  # frames at a time
 def is_due(setup: TrainingSetup, state: TrainingState, share: float) -> bool:
     """Return whether the poses move in this step."""
     begin = ALIGNED_FROM if state.poses_aligned else setup.config.poses.refine_from
-    if state.poses is None or share < begin:
-        return False
+    return state.poses is not None and share >= begin and is_turn(setup, state)
+
+
+def is_turn(setup: TrainingSetup, state: TrainingState) -> bool:
+    """Return whether it is the turn of a round."""
     whole = setup.config.steps_until(1) - setup.config.steps_until(0)
-    interval = max(1, round(whole / ROUNDS))
-    return state.steps_done % interval == 0
+    return state.steps_done % max(1, round(whole / ROUNDS)) == 0
+
+
+def cell_m(setup: TrainingSetup) -> float:
+    """Return the edge of the cells that the surface is divided into."""
+    return setup.radius_m / CELLS
 
 
 def move(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
@@ -64,5 +71,4 @@ def _gather(setup: TrainingSetup, state: TrainingState, indices: list[int], scal
         rendered = render(model, cameras)
         images = (rendered.radiance, rendered.alpha, rendered.depth)
         readings = (batch.exposure_time_s, batch.dn, setup.sensor, batch.averaged_pixels)
-        cell_m = setup.radius_m / CELLS
-        poses.gather(batch.indices, pose_information(*images, cameras, *readings, cell_m=cell_m))
+        poses.gather(batch.indices, pose_information(*images, cameras, *readings, cell_m=cell_m(setup)))

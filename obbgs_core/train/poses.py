@@ -14,7 +14,7 @@ ALIGNED_FROM = 0.15
 class PoseSettings:
     """Whether the tagged poses are refined together with the Gaussians."""
 
-    # auto: if the likelihood gain on the validation brackets justifies it
+    # auto: if the validation brackets say that they err
     refine: Literal["never", "always", "auto"] = "never"
     # share of the steps before which the model is too coarse to correct poses
     refine_from: float = fraction(0.25)

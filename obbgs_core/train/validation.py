@@ -6,10 +6,10 @@ import math
 import torch
 
 from obbgs_core.frames import TrainingFrame, bracket_numbers
-from obbgs_core.losses import ON_TARGET_ALPHA, fit_figures, likelihood_loss
+from obbgs_core.losses import likelihood_loss
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.pose_corrections import PoseCorrections
-from obbgs_core.registration import pose_information
+from obbgs_core.registration import PoseInformation, pose_information
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.batches import Batch
@@ -33,15 +33,19 @@ def every_seventh_bracket(frames: list[TrainingFrame]) -> list[list[int]]:
     return [[i for i, number in enumerate(numbers) if number == wanted] for wanted in chosen]
 
 
-def correction_gain(
-    model: Gaussians, frames: list[TrainingFrame], brackets: list[Batch], sensor: Sensor
+def correction_evidence(
+    model: Gaussians, frames: list[TrainingFrame], brackets: list[Batch], sensor: Sensor, cell_m: float
 ) -> tuple[float, float]:
-    """Return the likelihood gain of correcting a bracket's pose over its BIC penalty: the mean, and its standard error.
+    """Return the log Bayes factor of "the pose errs as its tag states" to "it is exact": mean over brackets, its error.
 
-    The model was not trained on these brackets, so it cannot have adapted to their tags. The gain is that of fitting a
-    bracket's correction to the fixed model, in nats. It is divided by chi² as for overdispersed counts (Lebreton et al.
-    1992), because a coarse model errs by more than noise, and alike in neighbouring pixels. The penalty is half the
-    number of corrected directions times ln(values on the target) (Schwarz 1978).
+    The model was not trained on these brackets, so it cannot have adapted to their tags. A bracket's correction z, in
+    deviations of what its tag states, is fitted to the fixed model. With A the curvature of the likelihood there the
+    logarithm is nearly z (1 + A) z / 2 - ln det(1 + A) / 2 (Laplace's approximation; Dickey 1971). What a coarse model
+    gets wrong is alike in neighbouring pixels and in all frames of a bracket: the values of a cell of the surface in a
+    bracket count as one.
+
+    Args:
+        cell_m: edge of the surface's cells, as in `registration.pose_information`.
     """
     poses = PoseCorrections(frames)
     # a bracket is corrected by itself, so its own errors are those that all frames share as well
@@ -49,33 +53,34 @@ def correction_gain(
         dataclasses.replace(f, navigation=None, pose_covariance=c)
         for f, c in zip(frames, poses.covariances, strict=True)
     ]
-    poses, ratios = PoseCorrections(alone), []
-    for batch in brackets:
-        directions = int(poses.rank[poses.of_frame[batch.indices[0]]])
-        if directions:
-            (tagged, _, _), (corrected, chi2, values) = _fitted(model, alone, poses, batch, sensor)
-            gain = (tagged - corrected) * batch.dn.numel() / chi2
-            ratios.append(gain / (0.5 * directions * math.log(values)))
-    ratios = torch.tensor(ratios)
-    return ratios.mean().item(), ratios.std().item() / math.sqrt(len(ratios))
+    poses = PoseCorrections(alone)
+    found = torch.tensor([_evidence(model, alone, poses, batch, sensor, cell_m) for batch in brackets])
+    return found.mean().item(), found.std().item() / math.sqrt(len(found))
 
 
-def _fitted(
-    model: Gaussians, frames: list[TrainingFrame], poses: PoseCorrections, batch: Batch, sensor: Sensor
-) -> tuple[tuple[float, float, int], tuple[float, float, int]]:
-    """Fit a bracket's correction; return loss with prior, chi² and values on the target, as tagged and as corrected."""
+def _evidence(
+    model: Gaussians,
+    frames: list[TrainingFrame],
+    poses: PoseCorrections,
+    batch: Batch,
+    sensor: Sensor,
+    cell_m: float,
+) -> float:
+    """Fit a bracket's correction and return its log Bayes factor; of the steps the likeliest pose counts."""
     images, found = (batch.exposure_time_s, batch.dn, sensor, batch.averaged_pixels), []
-    row = poses.of_frame[batch.indices[0]]
+    row, count = poses.of_frame[batch.indices[0]], len(batch.indices)
+    root = poses.whitening.root[row].double()
     for _ in range(FIT_STEPS + 1):
         cameras = poses.cameras(batch.indices, batch.cameras)
         with torch.no_grad():
             rendered = render(model, cameras)
         loss = likelihood_loss(rendered.radiance, *images)[0].item()
-        loss += 0.5 * poses.value[row].square().sum().item() / batch.dn.numel()
-        chi2, _ = fit_figures(rendered.radiance, rendered.alpha, *images)
-        on_target = int((rendered.alpha > ON_TARGET_ALPHA).sum()) * batch.averaged_pixels * batch.dn.shape[-1]
-        found.append((loss, chi2, max(2, on_target)))
         views = (rendered.radiance, rendered.alpha, rendered.depth, cameras)
-        poses.gather(batch.indices, pose_information(*views, *images))
+        told = pose_information(*views, *images, cell_m=cell_m)
+        told = PoseInformation(told.gradient / count, told.curvature / count)
+        precision = torch.eye(6, dtype=torch.float64) + root.T @ told.curvature.sum(0) @ root
+        z = poses.value[row].double()
+        found.append((loss, float(z @ precision @ z - torch.logdet(precision)) / 2))
+        poses.gather(batch.indices, told)
         poses.step(frames)
-    return found[0], min(found)
+    return min(found)[1]

@@ -28,7 +28,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.motions import adjoints, rigid_motions
 from obbgs_core.pose_corrections import with_estimate
 from obbgs_core.render import render
-from obbgs_core.score.poses import best_motion, pose_errors, settled_poses
+from obbgs_core.score.poses import best_motion, pose_errors, seen_after, settled_poses, size_of
 from obbgs_core.sensor import Sensor
 from obbgs_core.train import train
 from obbgs_core.train.config import MethodConfig
@@ -246,9 +246,12 @@ def scores(seen: Pass, frames: list[TrainingFrame], result: TrainResult) -> dict
     if found is not None:
         estimated, tags = torch.from_numpy(found.estimated), with_estimate(tags, found)
     motion = best_motion(estimated, true[trained], radius_m)
-    errors = pose_errors(estimated, true[trained], motion, radius_m, seen.frames[0].K[0, 0].item())
+    similarity = best_motion(estimated, true[trained], radius_m, with_size=True)
+    focal_px = seen.frames[0].K[0, 0].item()
+    errors, sized = (
+        pose_errors(estimated, true[trained], m, radius_m, focal_px) for m in (motion, similarity)
+    )
     settled = settled_poses(result.gaussians, tags, SENSOR) if found is not None else true[held_out]
-    in_model = (true[held_out].double() @ motion).float()  # true poses as the model's frame has them
 
     def clean_db(poses: torch.Tensor) -> float:
         views = []
@@ -263,12 +266,17 @@ def scores(seen: Pass, frames: list[TrainingFrame], result: TrainResult) -> dict
     means = result.gaussians.means.double().numpy() @ motion[:3, :3].numpy().T + motion[:3, 3].numpy()
     cloud = cloud_scores({"": means}, seen.cloud_m, targets.LARGEST_DIMENSION / seen.size_m)
     return {
-        "psnr_clean_db": clean_db(in_model),
+        "psnr_clean_db": clean_db(seen_after(true[held_out].double(), motion).float()),
+        "psnr_similarity_db": clean_db(seen_after(true[held_out].double(), similarity).float()),
         "psnr_settled_db": clean_db(settled),
         "chamfer": cloud["chamfer"],
         "pose_error_deg": errors.rotation_deg,
         "pose_error_range": errors.range_share,
         "pose_error_px": errors.pixels,
+        "similarity_pose_error_deg": sized.rotation_deg,
+        "similarity_pose_error_range": sized.range_share,
+        "similarity_pose_error_px": sized.pixels,
+        "size_error_percent": 100 * (1 / size_of(similarity) - 1),
         "chi2": result.history[-1].chi2,
         "gaussians": len(result.gaussians),
         "seconds": result.seconds,

@@ -77,6 +77,28 @@ def test_a_model_that_moved_with_its_poses_is_found_again(estimate):
     assert 1 < figures["pose_error_tagged_deg"] < np.degrees(0.1)
 
 
+@pytest.mark.parametrize("size", [1.04, 0.97])
+def test_a_model_of_another_size_is_told_and_scored_as_one_of_the_true_size(estimate, size):
+    """Cameras farther away by as much show the larger model as before; scores after the similarity are as of truth."""
+    farther = estimate.estimated.copy()
+    farther[:, :3, 3] *= size
+    larger, case = dataclasses.replace(estimate, estimated=farther), load_case(GOLDEN)
+    figures = Alignment.of(larger, open_session(GOLDEN), Truth(open_session(GOLDEN))).figures()
+    assert figures["size_error_percent"] == pytest.approx(100 * (size - 1), abs=1e-3)
+    assert figures["similarity_pose_error_range"] < 1e-5 < 0.02 < figures["pose_error_range"]
+    nothing = torch.zeros(0, 3)
+    made = Reconstruction(nothing, nothing, None, 0, 0.0, poses=EstimatedPoses(larger, lambda frames: frames))
+    true_m = torch.from_numpy(case.cloud_m)
+    model_m = size * (true_m - MOTION[:3, 3]) @ MOTION[:3, :3]
+    rigid, sized = (case.seen_by(made, with_size)[0] for with_size in (False, True))
+    assert rigid.cloud_scores(model_m, model_m)["chamfer"] > 0.005
+    assert sized.cloud_scores(model_m, model_m)["chamfer"] < 1e-6
+    for given, there in zip(case.held_out, sized.held_out, strict=True):
+        at = there.world_to_camera[:3, :3].double() @ model_m.T + there.world_to_camera[:3, 3:]
+        was = given.world_to_camera[:3, :3].double() @ true_m.T + given.world_to_camera[:3, 3:]
+        torch.testing.assert_close(at[:2] / at[2], was[:2] / was[2], rtol=0, atol=1e-6)
+
+
 def test_surfaces_are_seen_from_the_poses_that_were_found_and_frames_left_out_are_left_out(estimate):
     records = list(open_session(GOLDEN).frames)
     assert estimated_records(records, None) is records

@@ -1,5 +1,7 @@
 """The attitude of an unknown target: its free rotation, the agreement of outlines, and the search for its motion."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -10,14 +12,16 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from hil.world.attitude import tumble
+from obbgs_base.navigation_errors import SharedParameters
 from obbgs_core.attitude import search
 from obbgs_core.attitude.coherence import FILL, coherences, grid_points
 from obbgs_core.attitude.estimate import AttitudeUndetermined, estimate_motion
 from obbgs_core.attitude.motion import SPIN, TUMBLE, at_epoch, attitudes, inertia, principal
+from obbgs_core.attitude.outlines import centred
 from obbgs_core.attitude.refine import refined
 from obbgs_core.attitude.search import mirrored
 from obbgs_core.attitude.views import views
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import Navigation, TrainingFrame
 from obbgs_core.start.hull import Silhouette
 from tests import scenes
 
@@ -172,6 +176,29 @@ def test_the_spin_of_an_unknown_target_is_found_from_its_frames(monkeypatch):
     np.testing.assert_allclose(motion.epoch_to_body @ RATE_RAD_S, expected, atol=5e-4)
     assert {what for what, _ in shown} == {"searching the spin", "following the motion", "judging the motion"}
     assert all(0 <= share <= 1 for _, share in shown)
+
+
+@pytest.mark.parametrize("boresight_rad", [[0.02, 0.04, 0.0], [0.0, 0.0, 0.0]])
+def test_a_boresight_that_errs_is_taken_out_of_the_outlines_and_an_exact_one_stays(boresight_rad):
+    times_s = (np.arange(26) - 13) * 20.0
+    sigmas = SharedParameters(boresight_rad=np.full(3, 0.05))
+    true = photographs(RATE_RAD_S, times_s)
+    error = torch.eye(4)
+    error[:3, :3] = torch.from_numpy(Rotation.from_rotvec(boresight_rad).as_matrix())
+    tagged = [
+        dataclasses.replace(f, world_to_camera=error @ f.world_to_camera, navigation=Navigation(sigmas))
+        for f in true
+    ]
+    moved = centred(tagged, scenes.SENSOR)
+    if not any(boresight_rad):
+        assert moved is tagged
+    for before, after, exact in zip(tagged, moved, true, strict=True):
+        seen, off = (f.world_to_camera[:2, 3] / RANGE_M * FOCAL_PX for f in (after, before))
+        wanted = exact.world_to_camera[:2, 3] / RANGE_M * FOCAL_PX
+        assert (
+            seen - wanted
+        ).norm() < 3  # of the target's 16 px of radius; its outline's centre is not its own
+        assert (off - wanted).norm() > 25 or not any(boresight_rad)
 
 
 def test_few_or_dark_frames_do_not_determine_an_attitude():

@@ -53,7 +53,6 @@ def test_wrong_poses_are_refined_and_exact_ones_are_left_alone(wrong):
         "growth.max_gaussians": 2000,
         "poses.refine_from": 0.4,
     }
-    # 0.6 degrees: gains of 3.1 to 3.8 BIC penalties less a standard error, where 1.5 is the limit; 1.6 to 2.1 at 0.3
     frames = tagged(photographed(target(80, seed=5), 42), wrong, sigma_rad=0.01)
     trainer = Trainer(frames, SENSOR, preset("obbgs", changes | {"poses.refine": "auto"}))
     while not trainer.state.poses_decided:

@@ -8,6 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from skimage import transform
 
 from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displaced_motion
 from obbgs_core.errors import ReconstructionError
@@ -18,7 +19,7 @@ from obbgs_core.normal_equations import NormalEquations
 from obbgs_core.pose_corrections import PoseCorrections, with_estimate
 from obbgs_core.registration import pose_information
 from obbgs_core.render import render
-from obbgs_core.score.poses import best_motion, moved, pose_errors, settled_poses
+from obbgs_core.score.poses import best_motion, moved, pose_errors, seen_after, settled_poses, size_of
 from obbgs_core.start.alignment import settled
 from obbgs_core.start.initialisation import silhouettes
 from obbgs_core.train.presets import preset
@@ -292,6 +293,28 @@ def test_the_best_motion_is_the_one_that_moved_all_poses(draw):
     torch.testing.assert_close(found, motion, rtol=0, atol=1e-6)
     left = pose_errors(estimated, true, found, 1.0, FOCAL_PX)
     assert left.rotation_deg < 1e-4 and left.range_share < 1e-6 and left.pixels < 1e-3
+
+
+@settings(max_examples=8)
+@given(st.lists(st.floats(-0.2, 0.2), min_size=7, max_size=7))
+def test_a_model_of_another_size_is_undone_by_the_similarity_alone(draw):
+    """Cameras as much farther away see the larger model as before, with Umeyama's similarity of their centres."""
+    true, size = _poses(a_pass(6)[0]).double(), float(np.exp(draw[6]))
+    motion = rigid_motions(torch.tensor([draw[:6]]).double())[0]
+    estimated = true @ motion
+    estimated[:, :3, 3] *= size  # of a model that is as much too large
+    found = best_motion(estimated, true, 1.0, with_size=True)
+    assert size_of(found) == pytest.approx(1 / size, rel=1e-6)
+    torch.testing.assert_close(seen_after(true, found), estimated, rtol=0, atol=1e-5)
+    centres, goal = (np.linalg.inv(p.numpy())[:, :3, 3].T for p in (estimated, true))
+    expected = transform.estimate_transform("similarity", centres.T, goal.T).params
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    left = pose_errors(estimated, true, found, 1.0, FOCAL_PX)
+    assert left.rotation_deg < 1e-4 and left.range_share < 1e-6 and left.pixels < 1e-3
+    rigid = best_motion(estimated, true, 1.0)
+    assert size_of(rigid) == pytest.approx(1)
+    if abs(draw[6]) > 0.01:
+        assert pose_errors(estimated, true, rigid, 1.0, FOCAL_PX).range_share > 0.005
 
 
 def test_moving_model_and_poses_changes_no_picture(erring):

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+import scipy.linalg
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,7 +16,7 @@ from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame, usable
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.model.motions import rigid_motions
+from obbgs_core.model.motions import motion_vectors, rigid_motions
 from obbgs_core.model.pose_covariance import flaw, whitening
 from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.registration import pose_information
@@ -25,7 +26,7 @@ from obbgs_core.start.initialisation import silhouettes
 from obbgs_core.train.batches import Batches
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
-from obbgs_core.train.validation import correction_gain
+from obbgs_core.train.validation import correction_evidence
 from tests import scenes
 from tests.scenes import QUICK, RANGE_M, SENSOR, intrinsics, target
 
@@ -173,8 +174,8 @@ def test_what_a_tag_knows_exactly_is_never_moved(frames, exact):
     torch.testing.assert_close(told.float(), poses.value, rtol=1e-3, atol=1e-4)
 
 
-def test_the_price_of_a_correction_counts_only_the_directions_that_may_be_corrected(frames):
-    """With next to no variance in four more directions the gain stays as it is, and has to pay for six numbers."""
+def test_an_error_of_a_pose_has_evidence_and_a_doubt_without_error_its_price(frames):
+    """Next to no variance in further directions costs nothing; a tenfold doubt costs ln 10 a direction (Occam)."""
     turn = torch.from_numpy(Rotation.from_rotvec([0.3, -0.5, 0.7]).as_matrix())
     axes = torch.block_diag(turn, turn)
     deviations = torch.tensor([5e-3, 5e-3, 0, 0, 0, 0]).double()
@@ -184,13 +185,19 @@ def test_the_price_of_a_correction_counts_only_the_directions_that_may_be_correc
             frames, torch.tensor([1.0, -1]).repeat(6)[:, None] * (axes @ deviations).float(), strict=True
         )
     ]
-    gains = []
-    for variances in (deviations**2, deviations**2 + 1e-12):
-        doubted = tagged(wrong, axes @ torch.diag(variances) @ axes.T)
+
+    def evidence(shown: list[TrainingFrame], variances: Tensor) -> float:
+        doubted = tagged(shown, axes @ torch.diag(variances) @ axes.T)
         batches = Batches(doubted, SENSOR.white_dn)
         brackets = [batches.batch([i], 1.0) for i in range(len(doubted))]
-        gains.append(correction_gain(model(), doubted, brackets, SENSOR)[0])
-    assert gains[0] > 10 and gains[0] / gains[1] == pytest.approx(6 / 2, rel=0.1)
+        return correction_evidence(model(), doubted, brackets, SENSOR, 0.05)[0]
+
+    erring = evidence(wrong, deviations**2)
+    assert erring > 10
+    assert evidence(wrong, deviations**2 + 1e-12) == pytest.approx(erring, rel=0.02)
+    exact, doubtful = evidence(frames, deviations**2), evidence(frames, 100 * deviations**2)
+    assert exact < -1
+    assert exact - doubtful == pytest.approx(2 * math.log(10), rel=0.1)  # of two directions
 
 
 def test_a_bracket_is_corrected_by_the_mean_of_its_frames_covariances(frames):
@@ -466,7 +473,20 @@ def test_fixing_the_gauge_changes_no_image():
 @given(st.integers(0, 10_000))
 def test_rigid_motions_match_scipy(seed):
     rng = np.random.default_rng(seed)
-    vector, shift = rng.normal(size=3), rng.normal(size=3)
+    vector, shift = rng.normal(size=3), 100 * rng.normal(size=3)
     motion = rigid_motions(torch.tensor(np.concatenate([vector, shift]))[None])[0].numpy()
+    generator = np.zeros((4, 4))
+    generator[:3, :3], generator[:3, 3] = np.cross(np.eye(3), vector), shift
+    np.testing.assert_allclose(motion, scipy.linalg.expm(generator), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(motion[:3, :3], Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(motion[:3, 3], shift)
+
+
+@given(st.integers(0, 10_000))
+def test_a_turn_about_a_far_point_leaves_it_where_it_is(seed):
+    """So a target that is turned by degrees can be turned back where its tag allows no other motion."""
+    rng = np.random.default_rng(seed)
+    point, vector = np.array([0.0, 0, 400]) + rng.normal(size=3), 0.05 * rng.normal(size=3)
+    motion = rigid_motions(torch.from_numpy(np.concatenate([vector, np.cross(point, vector)]))[None])[0]
+    np.testing.assert_allclose(motion.numpy() @ np.append(point, 1), np.append(point, 1), atol=1e-9)
+    vectors = motion_vectors(torch.linalg.inv(motion)[None])[0]
+    np.testing.assert_allclose(vectors, -np.concatenate([vector, np.cross(point, vector)]), atol=1e-9)
