@@ -292,7 +292,7 @@ class Trainer:
             stop_reason=stop_reason,
             start=setup.start,
             budget=setup.budget,
-            appearance=described(state.gaussians, state.appearance_reason),
+            appearance=described(state.gaussians, state.appearance_reason, state.highlights_reason),
             growth=f"until step {min(state.steps_done, round(setup.config.steps_until(setup.config.growth.end)))}",
             poses=state.poses_decided or "as tagged (training ended before this was decided)",
             pose_estimate=pose_rounds.estimate(setup, state, setup.config.image_scale(self.share)),
