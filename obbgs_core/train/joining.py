@@ -92,7 +92,9 @@ def withhold(setup: TrainingSetup, state: TrainingState) -> None:
     Brackets keep their numbers when others follow, so those that decide have never been trained on.
     """
     withheld = every_seventh_bracket(setup.frames) if state.poses_decided in ("", TOO_FEW_BRACKETS) else []
-    state.order = FrameOrder.of(setup.frames, setup.config.bracket_steps, withheld, state.order.turn)
+    state.order = FrameOrder.of(
+        setup.frames, setup.config.bracket_steps, withheld, state.order.turn, state.misfits
+    )
 
 
 def release(setup: TrainingSetup, state: TrainingState, hold: float) -> None:
