@@ -119,6 +119,12 @@ def _appearance(metrics: dict) -> list[str]:
             "direction; model.spz, and what other viewers show of model.ply, are lit from "
             f"({x:.3f}, {y:.3f}, {z:.3f}), target body frame."
         )
+    if highlights := metrics.get("highlights"):
+        lines.append(
+            f"- Highlights: each Gaussian mirrors the Sun in one lobe (GGX, alpha {highlights['alpha']:.2f}). "
+            "model.ply and model.onnx hold them; model.spz, and what other viewers show of model.ply, hold them as "
+            "harmonics of degree 3, far wider and fainter; the colours of model.glb do not follow the view."
+        )
     if metrics.get("background"):
         lines.append(
             f"- Trained in front of a background of radiance {metrics['background']:g}, which model.onnx draws. "

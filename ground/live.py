@@ -33,7 +33,7 @@ STEPS = 1000  # of the schedule; a third of it is left when the last few frames 
 # what helps few frames alone would shape the model that the many frames to come inherit
 MANY_EXPECTED = {"sparse.dropout": 0.0, "sparse.sky_weight": 0.0}
 FEWEST_BRACKETS = 4  # that the first hull is carved of, while more may come
-JOIN_STEPS = 60  # at least, from frames that join to the next: the interval of growth
+JOIN_STEPS = 60  # at least, from frames that join to the next
 JOIN_PAUSE = (
     3.0  # at least so many times what the last joining took, from one to the next while frames arrive
 )

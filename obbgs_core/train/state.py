@@ -78,6 +78,7 @@ class TrainingState:
     poses_aligned: bool  # whether they were moved before the first step
     poses_decided: str  # whether the poses are refined, and why; empty: the validation brackets will decide
     appearance_reason: str  # why the radiance depends on what it does
+    highlights_reason: str = ""  # why it has highlights or not; empty: not tested
     smoothing_m: Tensor | None = None  # [N] deviations of the 3D filter; None: the method has none
     compensation: Compensation | None = None  # None: the colours of all frames are the model's
     misfits: list[int] = field(

@@ -17,7 +17,7 @@ from obbgs_core.score.metrics import cloud_distances
 from obbgs_core.sensor import Sensor
 from obbgs_core.start import hull
 from obbgs_core.train.adam import Adam
-from obbgs_core.train.growth import grow, keep, outliers
+from obbgs_core.train.growth import grow, keep, outliers, split_long_axis
 from tests.scenes import random_gaussians
 
 
@@ -123,6 +123,28 @@ def test_growth_clones_the_small_splits_the_large_and_carries_the_moments():
     assert adam.first["means"][:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9, 0, 0, 0]
     kept = keep(grown, adam, torch.arange(12) != 5)
     assert len(kept) == 11 and adam.second["sh"].shape[0] == 11 and kept.means.requires_grad
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_two_along_the_longest_axis_have_the_mean_and_the_covariance_of_the_one(seed):
+    """The moments of an even mixture of two normals: mean of the means, mean covariance plus that of the means."""
+    rng = np.random.default_rng(seed)
+    gaussians = random_gaussians(6, seed=seed % 1000).trainable()
+    with torch.no_grad():
+        gaussians.log_scales += torch.from_numpy(rng.normal(size=(6, 3))).float()
+    growing = torch.tensor([False, True, False, True, True, False])
+    grown, kept = split_long_axis(gaussians, Adam(gaussians), growing)
+    assert kept.tolist() == [0, 2, 5] and len(grown) == 9
+    with torch.no_grad():
+        torch.testing.assert_close(grown.means[:3], gaussians.means[kept])
+        one, left, right = gaussians.select(growing), *(grown.select(torch.arange(i, i + 3)) for i in (3, 6))
+        half = (left.means - right.means) / 2
+        mixed = (left.covariances() + right.covariances()) / 2 + half[:, :, None] * half[:, None, :]
+        torch.testing.assert_close((left.means + right.means) / 2, one.means, atol=1e-5, rtol=1e-4)
+        size = one.scales.max() ** 2
+        torch.testing.assert_close(mixed / size, one.covariances() / size, atol=1e-5, rtol=1e-3)
+        assert (half.norm(dim=1) > 0.5 * one.scales.amax(dim=1)).all()
+        torch.testing.assert_close(left.opacity_logits, one.opacity_logits)
 
 
 def test_adam_matches_torch():
