@@ -92,6 +92,9 @@ def _training(metrics: dict) -> list[str]:
     ):
         if key in metrics:
             lines.append(f"- {name}: {metrics[key]}.")
+    if misfits := metrics.get("misfit_frames"):
+        listed = ", ".join(map(str, misfits))
+        lines.append(f"- Left out, because they fit no pose that their tags allow: frames {listed}.")
     if metrics.get("removed_not_finite"):
         lines.append(
             f"- {metrics['removed_not_finite']:,} Gaussians were removed: a parameter became NaN or infinite."
@@ -115,6 +118,12 @@ def _appearance(metrics: dict) -> list[str]:
             f"- Shadows of parts on one another are {shadows}. model.ply and model.onnx hold the model for every Sun "
             "direction; model.spz, and what other viewers show of model.ply, are lit from "
             f"({x:.3f}, {y:.3f}, {z:.3f}), target body frame."
+        )
+    if highlights := metrics.get("highlights"):
+        lines.append(
+            f"- Highlights: each Gaussian mirrors the Sun in one lobe (GGX, alpha {highlights['alpha']:.2f}). "
+            "model.ply and model.onnx hold them; model.spz, and what other viewers show of model.ply, hold them as "
+            "harmonics of degree 3, far wider and fainter; the colours of model.glb do not follow the view."
         )
     if metrics.get("background"):
         lines.append(

@@ -14,6 +14,7 @@ import yaml
 from ground.cameras import median_sun_direction
 from ground.model_files import exposure_times_s
 from ground.session import FrameRecord, Session
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import native_kernels
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.result import TrainResult
@@ -39,6 +40,7 @@ def training_metrics(
         "budget": result.budget,
         "sh_degree": math.isqrt(result.gaussians.sh.shape[1]) - 1,
         "shading": result.gaussians.shading,
+        "highlights": _highlights(result.gaussians),
         "appearance": result.appearance,
         "growth": result.growth,
         "poses": result.poses,
@@ -52,6 +54,7 @@ def training_metrics(
         "removed_outliers": result.removed_outliers,
         "removed_not_finite": result.removed_not_finite,
         "dark_frames": result.dark_frames,
+        "misfit_frames": result.misfit_frames,
         "chi2": None if math.isnan(chi2) else chi2,
         "misfit": result.misfit,  # null: not learnt
         "frames_received": len(session.frames),
@@ -75,6 +78,14 @@ def training_metrics(
             "blind_reference_exposure_s": blind.reference_exposure_s,
         }
     return metrics
+
+
+def _highlights(gaussians: Gaussians) -> dict | None:
+    """Return the material that the highlights share, for metrics.json; None without highlights."""
+    if not gaussians.has_highlights:
+        return None
+    alpha, *peak = (round(value, 5) for value in gaussians.gloss.exp().tolist())
+    return {"alpha": alpha, "peak_radiance": peak}
 
 
 def write_history(results: dict[str, TrainResult | None], path: Path) -> None:

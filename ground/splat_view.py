@@ -53,7 +53,8 @@ def packed(run: Run, gaussians: Gaussians) -> tuple[dict, dict[str, np.ndarray]]
     """Return what the page needs to draw the Gaussians: facts for JSON, and arrays.
 
     means: [N, 3] float32, m. params: [N, texels, 4] float16: quaternion, log scales and opacity, coefficients of
-    radiance padded with zeros. sunlit: [suns, N] bytes, the share of each Sun that reaches a Gaussian, 255 for all.
+    radiance padded with zeros, then axis and weight of the highlight in a model that has them. sunlit: [suns, N] bytes,
+    the share of each Sun that reaches a Gaussian, 255 for all.
     """
     session, count = run.session, len(gaussians)
     suns = _suns(session.frames) if gaussians.shading != "view" else _suns(session.frames)[:1]
@@ -66,7 +67,10 @@ def packed(run: Run, gaussians: Gaussians) -> tuple[dict, dict[str, np.ndarray]]
     padding = torch.zeros(count, -colours.shape[1] % 4)
     shape = torch.cat([gaussians.log_scales, gaussians.opacities[:, None]], dim=1)
     quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
-    params = torch.cat([quats, shape, colours, padding], dim=1)
+    lobes = gaussians.lobes.clone()  # a texel at the end: the axis and the weight itself
+    if gaussians.has_highlights:
+        lobes = torch.cat([torch.nn.functional.normalize(lobes[:, :3], dim=1), lobes[:, 3:].exp()], dim=1)
+    params = torch.cat([quats, shape, colours, padding, lobes], dim=1)
     centre, radius_m = extent(gaussians)
     middle = session.frames[len(session.frames) // 2].position_body_m - centre.numpy()
     x, y, z = (middle / max(float(np.linalg.norm(middle)), 1e-9)).tolist()
@@ -78,6 +82,7 @@ def packed(run: Run, gaussians: Gaussians) -> tuple[dict, dict[str, np.ndarray]]
         "channels": gaussians.sh.shape[2],
         "shading": gaussians.shading,
         "ambient": float(gaussians.ambient),
+        "gloss": _gloss(gaussians),
         "footprint": footprint_facts(gaussians, session.camera.psf_sigma_px),
         "centre_m": centre.tolist(),
         "radius_m": radius_m,
@@ -93,6 +98,14 @@ def packed(run: Run, gaussians: Gaussians) -> tuple[dict, dict[str, np.ndarray]]
     }
     arrays = {"means": gaussians.means.numpy(), "params": params.numpy().astype(np.float16), "sunlit": sunlit}
     return facts, arrays
+
+
+def _gloss(gaussians: Gaussians) -> dict | None:
+    """Return roughness and peak radiance, three channels, of the highlights; None without them."""
+    if not gaussians.has_highlights:
+        return None
+    alpha, *peak = gaussians.gloss.exp().tolist()
+    return {"alpha": alpha, "peak": peak if len(peak) == 3 else 3 * peak}
 
 
 def footprint_facts(gaussians: Gaussians, psf_sigma_px: float | None) -> dict:

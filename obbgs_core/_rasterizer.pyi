@@ -37,6 +37,7 @@ class Rasterization:
         sun_dir: Array | None,
         sunlit: Array | None,
         ambient: float,
+        added: Array | None,
         footprint_px2: Array,
         peak_lowered: bool,
     ) -> None: ...
@@ -67,6 +68,7 @@ class Rasterization:
         world_to_camera: Array,
         ambient: Array,
         footprint_px2: Array,
+        added: Array | None,
         screen_means2d: Array,
         pixels: Array,
     ) -> None: ...

@@ -68,6 +68,15 @@ def relative_misfit(
     return (excess / light_dn.square()[seen].sum()).clamp(min=0).sqrt().item()
 
 
+@torch.no_grad()
+def mean_light2(prediction: Prediction, sensor: Sensor, averaged_pixels: int) -> Tensor:
+    """Return the mean square of what is expected above black over the lit pixels of each picture [B, 1, 1, 1], DN²."""
+    squares = _light_dn(prediction, sensor).square()
+    lit = squares > 4 * prediction.variance_dn2 / averaged_pixels
+    count = lit.sum(dim=(1, 2, 3), keepdim=True).clamp(min=1)
+    return (squares * lit).sum(dim=(1, 2, 3), keepdim=True) / count
+
+
 def _sampled(*images: Tensor) -> tuple[Tensor, ...]:
     """Return about 50 rows of each image and as many columns."""
     step = max(1, images[0].shape[1] // ROWS)

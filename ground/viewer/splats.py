@@ -79,7 +79,7 @@ def error_colours(shown: Shown) -> np.ndarray:
     weighted image by the Gaussian's radiance.
     """
     probe = dataclasses.replace(
-        shown.gaussians.detach(),
+        shown.gaussians.detach().matt(),
         sh=torch.full(
             (len(shown.gaussians), 1, 1), 10 / C0
         ).requires_grad_(),  # radiance 10: softplus is linear

@@ -34,12 +34,21 @@ const SHADE = `
     for (int k = 0; k < coefficients; k++)
       for (int c = 0; c < 3; c++) sum[c] += b[k] * coefficient(i, k, channels == 3 ? c : 0);
     vec3 radiance = vec3(soft(sum.x), soft(sum.y), soft(sum.z));
+    float lit = 1.0;
     if (shading == 2) { // Lambert's law: the shortest axis on the camera's side is the normal
       vec3 normal = scales.x <= scales.y && scales.x <= scales.z ? turned[0]
         : scales.y <= scales.z ? turned[1] : turned[2];
       normal *= -sign(dot(normal, direction));
       float before = fetch(sunlit, sunBefore * count + i).r, after = fetch(sunlit, sunAfter * count + i).r;
-      radiance *= soft(dot(normal, sun)) * mix(before, after, sunShare) + ambient;
+      lit = mix(before, after, sunShare);
+      radiance *= soft(dot(normal, sun)) * lit + ambient;
+    }
+    if (alpha > 0.0) { // a highlight: GGX around the lobe's axis
+      vec4 lobe = fetch(params, (i + 1) * perSplat - 1);
+      float cosine = dot(lobe.xyz, shading == 0 ? -direction : normalize(sun - direction));
+      float cos2 = shading == 0 ? 0.5 + 0.5 * cosine : pow(max(cosine, 0.0), 2.0);
+      float root = alpha * alpha / max(1.0 - cos2 * (1.0 - alpha * alpha), 1e-9);
+      radiance += lit * lobe.w * root * root * shine;
     }
     return radiance;
   }`;
@@ -47,8 +56,8 @@ const SHADE = `
 const VERTEX = `#version 300 es
   precision highp float; precision highp int; precision highp sampler2D;
   uniform sampler2D means, params, sunlit;
-  uniform mat3 rotation; uniform vec3 translation, sun, eye; uniform vec2 size; uniform float focal, widened, unit;
-  uniform float ambient, sunShare; uniform bool lowers;
+  uniform mat3 rotation; uniform vec3 translation, sun, eye, shine; uniform vec2 size;
+  uniform float focal, widened, unit, ambient, sunShare, alpha; uniform bool lowers;
   uniform int perSplat, coefficients, channels, shading, count, sunBefore, sunAfter;
   in uint index;
   out vec2 offset; flat out vec3 conic; flat out vec3 light; flat out vec2 peak;
@@ -220,6 +229,7 @@ class Drawing {
     gl.uniform1i(at.lowers, model.footprint.lowers_peak);
     const unit = sensor.dn_per_radiance_s * exposureS / (sensor.white_dn - sensor.black_dn);
     gl.uniform1f(at.unit, unit); gl.uniform1f(at.ambient, model.ambient);
+    gl.uniform1f(at.alpha, model.gloss ? model.gloss.alpha : 0); gl.uniform3fv(at.shine, model.gloss ? model.gloss.peak : [0, 0, 0]);
     gl.uniform1i(at.perSplat, model.texels); gl.uniform1i(at.coefficients, model.coefficients);
     gl.uniform1i(at.channels, model.channels); gl.uniform1i(at.count, model.count);
     gl.uniform1i(at.shading, ["view", "sun", "lambert"].indexOf(model.shading));

@@ -8,6 +8,9 @@ ignore. Everything else means the same there and here: metres, logarithms of sig
 If our radiance depends on the Sun's direction instead of the viewing direction, a comment of the header says so, and
 f_dc and f_rest hold the colours with the Sun in the direction that the comment names.
 
+A model with highlights has lobe_x, lobe_y, lobe_z and lobe_log_weight (`Gaussians.lobes`) and the material that they
+share in a comment. Viewers show them as harmonics of degree 3 in f_dc and f_rest, wider and fainter than they are.
+
 Most viewers widen every Gaussian by 0.3 px² of their screen and keep its peak, the footprint `kerbl`. Another footprint
 stands in a comment, and `opacity` is then made for such viewers: the model's own, which follows as fitted_opacity,
 times the root of the share by which 0.3 px² would lower the peak at the distance of the cameras. All of the share would
@@ -16,6 +19,7 @@ match there and let a viewer see through the surface from nearer.
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,6 +36,8 @@ from obbgs_core.render import lit_from, project
 DISPLAY_GAMMA = 2.2
 TURNS_WITH_SUN = "comment radiance_sh turn with the Sun"
 FOOTPRINT = "comment footprint "
+LOBE_NAMES = ("lobe_x", "lobe_y", "lobe_z", "lobe_log_weight")
+HIGHLIGHTS = "comment highlights: GGX of alpha "
 LAMBERT = "comment radiance_sh are albedos in units of the Sun's light, ambient light "
 
 
@@ -91,6 +97,8 @@ def save_ply(
     table |= {f"rot_{i}": gaussians.quats[:, i] for i in range(4)}
     for k in range(coefficients):
         table |= {f"radiance_sh_{k}_{c}": gaussians.sh[:, k, c] for c in range(channels)}
+    if gaussians.has_highlights:
+        table |= {name: gaussians.lobes[:, i] for i, name in enumerate(LOBE_NAMES)}
     if for_viewers is not None:
         table["fitted_opacity"] = gaussians.opacity_logits
     comments = [
@@ -102,6 +110,11 @@ def save_ply(
         comments.append(f"{kind}; f_dc: with the Sun towards {x:.6f} {y:.6f} {z:.6f}, body frame")
     if gaussians.footprint != "kerbl":
         comments.append(f"{FOOTPRINT}{gaussians.footprint}, psf_sigma_px {gaussians.psf_sigma_px.item():.9g}")
+    if gaussians.has_highlights:
+        alpha, *peak = (f"{value:.9g}" for value in gaussians.gloss.exp().tolist())
+        comments.append(
+            f"{HIGHLIGHTS}{alpha}, peak radiance {' '.join(peak)}; in f_dc and f_rest of degree 3, wider"
+        )
     write_whole(path, _ply(table, *comments))
 
 
@@ -153,11 +166,15 @@ def load_ply(path: Path) -> Gaussians:
     channels = 1 + max(int(name.split("_")[3]) for name in radiance)
     shading: Shading = "view"
     ambient = torch.zeros(())
-    fitted = {}
+    fitted: dict[str, Any] = {}
     for line in lines:
         if line.startswith(FOOTPRINT):
             footprint, _, psf_sigma_px = line.removeprefix(FOOTPRINT).partition(", psf_sigma_px ")
-            fitted = {"footprint": footprint, "psf_sigma_px": torch.tensor(float(psf_sigma_px))}
+            fitted |= {"footprint": footprint, "psf_sigma_px": torch.tensor(float(psf_sigma_px))}
+        if line.startswith(HIGHLIGHTS):
+            alpha, _, peak = line.removeprefix(HIGHLIGHTS).partition(";")[0].partition(", peak radiance ")
+            fitted["gloss"] = torch.tensor([float(value) for value in (alpha, *peak.split())]).log()
+            fitted["lobes"] = torch.stack([table[name] for name in LOBE_NAMES], 1)
         if line.startswith(TURNS_WITH_SUN):
             shading = "sun"
         elif line.startswith(LAMBERT):

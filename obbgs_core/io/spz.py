@@ -4,7 +4,8 @@ gsply quantises and packs; this file converts our radiance to display colours (s
 axis points up and its z axis backwards, those of 3DGS PLYs down and forwards, so y and z change sign, as in Niantic's
 own converter: both files then look alike in a viewer. The comment of the gzip header holds what is needed to turn the
 display colours back into radiance: the white radiance and the number of channels. A model whose radiance depends on the
-Sun's direction is written as it looks with the Sun in one direction. A model whose footprint lowers the peak of thin
+Sun's direction is written as it looks with the Sun in one direction, and highlights as harmonics of degree 3, wider and
+fainter than they are. A model whose footprint lowers the peak of thin
 Gaussians sets SPZ's flag `antialiased`: viewers that know it do the same, with 0.3 px² on their own screen.
 
 Rounding errors: means half of 2^-bits m with as many bits as the model's extent allows, sigmas 3 %, opacities 1/510,

@@ -14,6 +14,7 @@ Footprint = Literal["kerbl", "mip-splatting", "camera"]
 # With the pixel's own 1/12 px² it makes 0.15 px², the best of several on rendered pictures.
 DEFAULT_PSF_SIGMA_PX = 0.26
 TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+LOBE = 4  # numbers of a Gaussian's lobe: three for its axis, then the logarithm of its weight
 
 
 @dataclass
@@ -28,6 +29,12 @@ class Gaussians:
     - `lambert`: K = 1, an albedo. Radiance is albedo·(max(0, n·s)·V(s) + ambient): n the shortest axis on the camera's
       side, s the Sun, V the share of it that other Gaussians let through (`render.sunlit_shares`), all of the light in
       units of the Sun's. The maximum is as soft as `sh.radiance`, and ambient [] is one number for all.
+
+    A model may have highlights (`render.highlights`): each Gaussian then mirrors the Sun in one more lobe, which is
+    added to that radiance. lobes [N, 4]: its axis (normalised on use) and the logarithm of its weight; the axis is
+    the direction in which it is seen at its brightest, or with the shadings `sun` and `lambert` the normal of the
+    mirror. gloss [1 + C]: the logarithms of the roughness alpha of GGX and of the peak radiance of a weight of 1,
+    shared by all as one material is. A model without highlights has lobes [N, 0] and gloss [0].
 
     Projected Gaussians are widened by what each pixel averages over, the `footprint`. It belongs to the model, because
     opacities and scales were fitted with it:
@@ -47,6 +54,8 @@ class Gaussians:
     ambient: Tensor = field(default_factory=lambda: torch.zeros(()))
     footprint: Footprint = "kerbl"
     psf_sigma_px: Tensor = field(default_factory=lambda: torch.tensor(DEFAULT_PSF_SIGMA_PX))
+    lobes: Tensor = field(default_factory=lambda: torch.zeros(0, 0))
+    gloss: Tensor = field(default_factory=lambda: torch.zeros(0))
 
     def __post_init__(self):
         n = self.means.shape[0]
@@ -60,6 +69,13 @@ class Gaussians:
                 raise ValueError(f"{name} must be {list(shape)}, got {list(getattr(self, name).shape)}")
         if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[2] not in (1, 3):
             raise ValueError(f"sh must be [{n}, K, 1 or 3], got {list(self.sh.shape)}")
+        if not self.has_highlights:
+            self.lobes = self.means.new_zeros(n, 0)
+        elif tuple(self.lobes.shape) != (n, LOBE) or len(self.gloss) != 1 + self.sh.shape[2]:
+            raise ValueError(
+                f"lobes must be [{n}, {LOBE}] with gloss [{1 + self.sh.shape[2]}], or both empty, got "
+                f"{list(self.lobes.shape)} with {list(self.gloss.shape)}"
+            )
         if self.shading not in get_args(Shading):
             raise ValueError(f"shading must be one of {', '.join(get_args(Shading))}, got {self.shading!r}")
         if self.footprint not in get_args(Footprint):
@@ -68,6 +84,11 @@ class Gaussians:
             )
         if self.shading == "lambert" and self.sh.shape[1] != 1:
             raise ValueError(f"an albedo is sh [{n}, 1, 1 or 3], got {list(self.sh.shape)}")
+
+    @property
+    def has_highlights(self) -> bool:
+        """Whether each Gaussian has a lobe in which it mirrors the Sun."""
+        return self.lobes.shape[1] > 0
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -92,12 +113,18 @@ class Gaussians:
         return self.axes @ self.axes.transpose(1, 2)
 
     def tensors(self) -> dict[str, Tensor]:
-        """What is stored of each Gaussian, by name."""
-        return {name: getattr(self, name) for name in TENSORS}
+        """What is stored of each Gaussian, by name; without lobes where the model has none."""
+        names = (*TENSORS, "lobes") if self.has_highlights else TENSORS
+        return {name: getattr(self, name) for name in names}
 
     def parameters(self) -> dict[str, Tensor]:
-        """All that is optimised, by name: what is stored of each Gaussian, the ambient light, the point spread."""
-        return self.tensors() | {"ambient": self.ambient, "psf_sigma_px": self.psf_sigma_px}
+        """All that is optimised, by name: what is stored of each Gaussian, then what all of them share."""
+        shared = {"ambient": self.ambient, "psf_sigma_px": self.psf_sigma_px}
+        return self.tensors() | shared | ({"gloss": self.gloss} if self.has_highlights else {})
+
+    def matt(self) -> "Gaussians":
+        """Return the model without its highlights."""
+        return dataclasses.replace(self, lobes=self.lobes[:, :0], gloss=self.gloss[:0])
 
     def select(self, index: Tensor) -> "Gaussians":
         """Return the Gaussians that an index or mask picks."""
@@ -115,5 +142,5 @@ class Gaussians:
 
     @staticmethod
     def concatenate(parts: "list[Gaussians]") -> "Gaussians":
-        tensors = {name: torch.cat([getattr(p, name) for p in parts]) for name in TENSORS}
+        tensors = {name: torch.cat([getattr(p, name) for p in parts]) for name in parts[0].tensors()}
         return dataclasses.replace(parts[0], **tensors)

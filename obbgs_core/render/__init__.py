@@ -28,8 +28,9 @@ def render(
     cameras: Cameras,
     backend: str = "auto",
     sunlit: Tensor | None = None,
+    added: Tensor | None = None,
 ) -> Rendered:
-    """Render radiance, alpha and depth of all cameras.
+    """Render radiance, alpha and depth of all cameras, with the highlights of a model that has some.
 
     Front-to-back compositing on the cameras' background (Kerbl et al. 2023): alpha = min(0.99, opacity·exp(-d²/2)),
     where d is the Mahalanobis distance from the projected mean; contributions under 1/255 are skipped, and a pixel is
@@ -41,6 +42,7 @@ def render(
             PyTorch, any dtype and device), or `auto`: native where it can run.
         sunlit: [C, N] visibility of each camera's Sun from each Gaussian, 0..1, only used under Lambert's law; computed
             from shadow maps (`sunlit_shares`) where it is not given.
+        added: [C, N, channels] radiance of each Gaussian towards each camera, on top of the model's own.
 
     Raises:
         ValueError: an unknown backend, or one that is not available here; the model's radiance depends on the Sun's
@@ -51,7 +53,7 @@ def render(
         sunlit = None
     elif suns is not None and sunlit is None:
         sunlit = sunlit_shares(gaussians, suns, backend)
-    rendered = rasterize(gaussians, cameras, backend, suns, sunlit)
+    rendered = rasterize(gaussians, cameras, backend, suns, sunlit, added)
     if cameras.background:
         rendered.radiance = rendered.radiance + (1 - rendered.alpha)[..., None] * cameras.background
     return rendered

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.render.highlights import highlights
 from obbgs_core.render.native import native_kernels, render_native
 from obbgs_core.render.reference import render_reference
 from obbgs_core.render.rendered import Rendered
@@ -16,20 +17,25 @@ def rasterize(
     backend: str,
     suns: Tensor | None = None,
     sunlit: Tensor | None = None,
+    added: Tensor | None = None,
 ) -> Rendered:
     """Render with a known illumination, by the backend of this name (see `render`).
 
     Args:
         suns: [C, 3] unit vectors towards the Sun, body frame; None for a model of shading `view`.
         sunlit: [C, N] visibility of each camera's Sun from each Gaussian, for a model of shading `lambert`, else None.
+        added: [C, N, channels] radiance of each Gaussian towards each camera, on top of the model's own; or None.
 
     Raises:
         ValueError: an unknown backend, or one that is not available here.
     """
     kernel = _kernel(backend, gaussians.means)
     if kernel is None:
-        return render_reference(gaussians, cameras, suns, sunlit)
-    return render_native(kernel, gaussians, cameras, suns, sunlit)
+        return render_reference(gaussians, cameras, suns, sunlit, added)
+    shine = highlights(gaussians, cameras, suns, sunlit)  # the kernels know harmonics and Lambert's law
+    if shine is not None:
+        added = shine if added is None else shine + added
+    return render_native(kernel, gaussians, cameras, suns, sunlit, added)
 
 
 def _kernel(backend: str, like: Tensor) -> str | None:

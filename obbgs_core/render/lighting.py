@@ -10,6 +10,7 @@ from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.rotations import quats_to_matrices
 from obbgs_core.model.sh import C0, fit, from_radiance, radiance, sh_basis, softplus
+from obbgs_core.render.highlights import highlights_along
 
 INITIAL_ALBEDO = 2.0  # over a Gaussian's mean radiance: half of the Suns, about, shine on its other side
 INITIAL_AMBIENT = 0.02  # in units of the Sun's light
@@ -18,12 +19,15 @@ INITIAL_AMBIENT = 0.02  # in units of the Sun's light
 def radiance_along(
     gaussians: Gaussians, directions: Tensor, sun_dir: Tensor | None = None, sunlit: Tensor | None = None
 ) -> Tensor:
-    """Return each Gaussian's radiance [N, C] along `directions` [N, 3] (unit, camera to Gaussian).
+    """Return each Gaussian's radiance [N, C] along `directions` [N, 3] (unit, camera to Gaussian), highlights included.
 
     Args:
         sun_dir: [3] unit, body frame; needed unless the shading is `view`.
         sunlit: [N] visibility of the Sun from each Gaussian, 0..1; needed if the shading is `lambert`.
     """
+    if gaussians.has_highlights:
+        matt = radiance_along(gaussians.matt(), directions, sun_dir, sunlit)
+        return matt + highlights_along(gaussians, directions, sun_dir, sunlit)
     if gaussians.shading == "view":
         return radiance(gaussians.sh, directions)
     assert sun_dir is not None  # the callers check it
@@ -73,9 +77,10 @@ def mean_radiance(gaussians: Gaussians, cameras: Cameras) -> Tensor:
 
 
 def without_sun(gaussians: Gaussians, sun_dir: Tensor | None, sunlit: Tensor | None) -> Gaussians:
-    """Return the model as it looks with the Sun towards `sun_dir` [3], in the shading `view`.
+    """Return the model as it looks with the Sun towards `sun_dir` [3], in harmonics of the view alone.
 
     Exact for shading `sun`. Under Lambert's law the two sides of a Gaussian differ: harmonics of degree 1 are fitted.
+    Highlights become harmonics of degree 3, far wider and fainter than they are.
 
     Args:
         sunlit: [N], as for `radiance_along`.
@@ -83,21 +88,21 @@ def without_sun(gaussians: Gaussians, sun_dir: Tensor | None, sunlit: Tensor | N
     Raises:
         ValueError: the radiance depends on the Sun's direction, and none is given.
     """
-    if gaussians.shading == "view":
+    if gaussians.shading == "view" and not gaussians.has_highlights:
         return gaussians
-    if sun_dir is None:
+    if gaussians.shading != "view" and sun_dir is None:
         raise ValueError("the model's radiance turns with the Sun: give sun_dir, the Sun's direction")
-    if gaussians.shading == "sun":
+    if sun_dir is not None and gaussians.shading == "sun" and not gaussians.has_highlights:
         basis = sh_basis(sun_dir.reshape(1, 3).to(gaussians.sh), gaussians.sh.shape[1])
         constant = (basis[0, :, None] * gaussians.sh).sum(dim=1, keepdim=True) / C0
         return dataclasses.replace(gaussians, sh=constant, shading="view")
-    directions, to_coefficients = fit(4)
+    directions, to_coefficients = fit(16 if gaussians.has_highlights else 4)
     seen = [radiance_along(gaussians, d.expand(len(gaussians), 3), sun_dir, sunlit) for d in directions]
     before_softplus = C0 * from_radiance(torch.stack(seen, dim=1))
     fitted = torch.einsum("kd,ndc->nkc", to_coefficients, before_softplus)
-    return dataclasses.replace(gaussians, sh=fitted, shading="view")
+    return dataclasses.replace(gaussians.matt(), sh=fitted, shading="view")
 
 
 def constant_radiance(gaussians: Gaussians) -> Gaussians:
     """Return the same shapes, without gradient, with a constant radiance: enough to render depths, and cheaper."""
-    return dataclasses.replace(gaussians.detach(), sh=gaussians.sh.detach()[:, :1], shading="view")
+    return dataclasses.replace(gaussians.detach().matt(), sh=gaussians.sh.detach()[:, :1], shading="view")

@@ -11,7 +11,7 @@ from torch import Tensor
 from obbgs_core import compiled
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.footprint import footprint_px2, lowers_peak
-from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.gaussians import TENSORS, Gaussians
 from obbgs_core.render.rendered import Rendered, ScreenGradients
 
 log = logging.getLogger(__name__)
@@ -31,12 +31,14 @@ def render_native(
     cameras: Cameras,
     suns: Tensor | None,
     sunlit: Tensor | None,
+    added: Tensor | None = None,
 ) -> Rendered:
     """Render with one of `native_kernels()`, in float32 on the CPU; other arguments as of `backends.rasterize`."""
     peak_lowered = lowers_peak(gaussians)
     request = _Request(kernel, cameras, suns, sunlit, peak_lowered, ScreenGradients())
     footprint = footprint_px2(gaussians, cameras)
-    tensors = (*gaussians.tensors().values(), cameras.world_to_camera, gaussians.ambient, footprint)
+    stored = [getattr(gaussians, name) for name in TENSORS]
+    tensors = (*stored, cameras.world_to_camera, gaussians.ambient, footprint, added)
     images: Any = _Rasterize.apply(request, *tensors)
     return Rendered(*images, screen=request.screen)
 
@@ -68,6 +70,7 @@ class _Rasterize(torch.autograd.Function):
         world_to_camera,
         ambient,
         footprint,
+        added,
     ):
         cameras = request.cameras
         module = compiled.module_for()
@@ -87,6 +90,7 @@ class _Rasterize(torch.autograd.Function):
             sun_dir=None if request.suns is None else _float32(request.suns),
             sunlit=None if request.sunlit is None else _float32(request.sunlit),
             ambient=ambient.item(),
+            added=None if added is None else _float32(added),
             footprint_px2=_float32(footprint),
             peak_lowered=request.peak_lowered,
         )
@@ -104,7 +108,8 @@ class _Rasterize(torch.autograd.Function):
             radii,
         )
         ctx.set_materialize_grads(False)
-        inputs = (means, quats, log_scales, opacity_logits, sh, world_to_camera, ambient, footprint)
+        shapes = (means, quats, log_scales, opacity_logits)
+        inputs = (*shapes, sh, world_to_camera, ambient, footprint, added)
         ctx.save_for_backward(*inputs, radiance, depth)
         ctx.rasterization, ctx.screen = rasterization, request.screen
         ctx.mark_non_differentiable(median_depth, radii)
@@ -115,7 +120,7 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor | None):  # pyright: ignore[reportIncompatibleMethodOverride]
         radiance, alpha, depth, _, means2d, _ = grad_outputs
         *inputs, radiance_image, depth_image = ctx.saved_tensors
-        gradients = [torch.empty(t.shape) for t in inputs]
+        gradients = [None if t is None else torch.empty(t.shape) for t in inputs]
         count, n = inputs[5].shape[0], inputs[0].shape[0]
         screen_means2d, pixels = torch.empty(count, n, 2), torch.empty(count, n)
         ctx.rasterization.backward(
@@ -130,7 +135,7 @@ class _Rasterize(torch.autograd.Function):
         )
         ctx.screen.means2d.update(enumerate(screen_means2d))
         ctx.screen.pixels.update(enumerate(pixels))
-        return None, *(g.to(t.dtype) for g, t in zip(gradients, inputs, strict=True))
+        return None, *(None if g is None else g.to(t.dtype) for g, t in zip(gradients, inputs, strict=True))
 
 
 def _float32(tensor: Tensor) -> Tensor:

@@ -22,7 +22,11 @@ BAND_ELEMENTS = 4_000_000  # pixels times Gaussians that are composited at once:
 
 
 def render_reference(
-    gaussians: Gaussians, cameras: Cameras, suns: Tensor | None, sunlit: Tensor | None
+    gaussians: Gaussians,
+    cameras: Cameras,
+    suns: Tensor | None,
+    sunlit: Tensor | None,
+    added: Tensor | None = None,
 ) -> Rendered:
     """Render with plain PyTorch; arguments as of `backends.rasterize`."""
     projected = project(gaussians, cameras)
@@ -37,7 +41,10 @@ def render_reference(
         shares = projected.peak_shares[c]
         opacities = gaussians.opacities * shares
         sun, share = (None if each is None else each[c] for each in (suns, sunlit))
-        features = [radiance_along(gaussians, directions[c], sun, share), depths[:, None]]
+        light = radiance_along(gaussians, directions[c], sun, share)
+        if added is not None:
+            light = light + added[c]
+        features = [light, depths[:, None]]
         image, transmittance, median = composite(
             means2d,
             conics,

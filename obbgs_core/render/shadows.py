@@ -54,7 +54,7 @@ def sunlit_shares(gaussians: Gaussians, sun_dir: Tensor, backend: str = "auto") 
 
 
 def lit_from(gaussians: Gaussians, sun_dir: Tensor | None) -> Gaussians:
-    """Return the model as it looks with the Sun towards `sun_dir` [3] (unit, body frame), in the shading `view`.
+    """Return the model as it looks with the Sun towards `sun_dir` [3] (unit, body frame), in harmonics of the view.
 
     Raises:
         ValueError: the radiance depends on the Sun's direction, and none is given.

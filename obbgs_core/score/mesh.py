@@ -200,7 +200,7 @@ def _appearance(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return colours [V, C] and the number of views that see each vertex [V]."""
     if gaussians.shading == "lambert":
-        shown = dataclasses.replace(gaussians, shading="view")  # its harmonics are albedos
+        shown = dataclasses.replace(gaussians.matt(), shading="view")  # its harmonics are albedos
     else:
         shown = lit_from(gaussians, sun_dir)
     total, seen_by = torch.zeros(len(vertices), gaussians.sh.shape[2]), torch.zeros(len(vertices))

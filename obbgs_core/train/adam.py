@@ -11,6 +11,9 @@ from obbgs_core.model.gaussians import TENSORS, Gaussians
 from obbgs_core.settings import check
 
 OPACITY_RATE = 0.05  # of opacity logits a step (Kerbl et al. 2023)
+AXIS_RATE = 0.01  # of the axes of highlights a step
+WEIGHT_RATE = 0.03  # of the logarithms of their weights a step
+GLOSS_RATE = 0.01  # of the logarithms of roughness and peak radiance a step
 PSF_RATE = 0.002  # of the point spread a step, in pixels of the sensor
 AMBIENT_RATE = 0.001  # of the ambient light a step, in units of the Sun's
 
@@ -35,7 +38,7 @@ class RateSettings:
 def learning_rates(
     rates: RateSettings, share: float, unit_m: float, coefficients: int, radiance_unit: float = 1.0
 ) -> dict[str, float | Tensor]:
-    """Return the rate of each parameter after a share of the steps, of `sh` [1, K, 1] where coefficients differ.
+    """Return each parameter's rate after a share of the steps: of `sh` [1, K, 1] if they differ, of `lobes` [1, 4].
 
     Args:
         unit_m: the method's unit of length.
@@ -54,6 +57,8 @@ def learning_rates(
         "log_scales": rates.log_scales * decay,
         "opacity_logits": OPACITY_RATE * decay,
         "sh": sh,
+        "lobes": torch.tensor([[AXIS_RATE, AXIS_RATE, AXIS_RATE, WEIGHT_RATE]]) * decay,
+        "gloss": GLOSS_RATE * decay,
         "ambient": AMBIENT_RATE * decay,
         "psf_sigma_px": PSF_RATE * decay,
     }
@@ -97,15 +102,18 @@ class Adam:
         self.second[name].zero_()
 
     def widen(self, gaussians: Gaussians) -> None:
-        """Follow coefficients of radiance that were added: their moments are zero."""
+        """Follow coefficients of radiance that were added, or highlights: their moments are zero."""
         for moments in (self.first, self.second):
             more = torch.zeros_like(gaussians.sh)
             more[:, : moments["sh"].shape[1]] = moments["sh"]
             moments["sh"] = more
+            for name in ("lobes", "gloss"):
+                if gaussians.has_highlights and name not in moments:
+                    moments[name] = torch.zeros_like(getattr(gaussians, name))
 
     def follow(self, kept: Tensor, added: int) -> None:
         """Keep the moments of the Gaussians `kept` (index) and append zeros for `added` new ones."""
         for moments in (self.first, self.second):
-            for name in TENSORS:
+            for name in (*TENSORS, "lobes") if "lobes" in moments else TENSORS:
                 rest = torch.zeros(added, *moments[name].shape[1:], dtype=moments[name].dtype)
                 moments[name] = torch.cat([moments[name][kept], rest])

@@ -34,6 +34,9 @@ class LightSettings:
     sun_span_deg: float = 0.0  # above 0: the Sun is tested too where its direction spans more than this
     # albedo, normal and cast shadows | harmonics towards the Sun
     sun_shading: Literal["lambert", "linear"] = "lambert"
+    highlights: bool = (
+        False  # tested on withheld views, and given to all Gaussians where these are explained better
+    )
 
     def __post_init__(self):
         check(self, "light")
@@ -103,9 +106,12 @@ def raised_degree(
     return raised, f"degree {degree}: {'; '.join(tested)}"
 
 
-def described(gaussians: Gaussians, reason: str) -> str:
-    """Return what the radiance depends on, in words, with the reason where there is one."""
+def described(gaussians: Gaussians, *reasons: str) -> str:
+    """Return what the radiance depends on, in words, with the reasons where there are some."""
     what = "constant" if gaussians.sh.shape[1] == 1 else f"turns with the {gaussians.shading}"
     if gaussians.shading == "lambert":
         what = f"follows Lambert's law with cast shadows, ambient {gaussians.ambient.item():.3f} of the Sun"
-    return f"{what} ({reason})" if reason else what
+    if gaussians.has_highlights:
+        what += f", with highlights of roughness {gaussians.gloss[0].exp().item():.2f}"
+    why = "; ".join(reason for reason in reasons if reason)
+    return f"{what} ({why})" if why else what

@@ -1,5 +1,6 @@
 """What a training decides on the way: pose refinement, adding and removing Gaussians, what the radiance depends on."""
 
+import dataclasses
 import logging
 import math
 from typing import Literal
@@ -14,6 +15,7 @@ from obbgs_core.train import pose_rounds
 from obbgs_core.train.appearance import SUN_FROM, described, raised_degree
 from obbgs_core.train.batches import Batch, FrameOrder
 from obbgs_core.train.config import Moment
+from obbgs_core.train.glints import FEWEST_STEPS, HIGHLIGHTS_FROM, lobed
 from obbgs_core.train.growth import (
     GRADIENT_THRESHOLD,
     Growth,
@@ -141,12 +143,15 @@ def change_number(
 
 
 def select_model(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
-    """Prune by BIC and test a higher harmonic degree, when due; a moving Sun is tested once before that as well.
+    """Prune by BIC and test a higher harmonic degree, when due; a moving Sun and highlights are tested once before.
 
     Args:
         scale: of the images that the likelihood is taken of.
     """
     config, now = setup.config, state.steps_done + 1
+    settled = now == round(config.steps_until(HIGHLIGHTS_FROM)) >= FEWEST_STEPS
+    if settled and config.light.highlights and not state.gaussians.has_highlights:
+        add_highlights(setup, state, scale)
     if any(now == round(config.steps_until(at)) for at in config.parsimony.prune_at):
         prune_by_bic(setup, state, scale)
         raise_degree(setup, state, scale, ("sun", "view") if setup.sun_moves else ("view",))
@@ -179,6 +184,29 @@ def raise_degree(
     if reason:
         state.appearance_reason = f"step {state.steps_done + 1}, {reason}"
         log.info("radiance %s", described(state.gaussians, state.appearance_reason))
+
+
+def add_highlights(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
+    """Give every Gaussian a highlight, if views that are withheld from the choice are explained better by them."""
+    drop_not_finite(state)
+    found = lobed(
+        state.model,
+        setup.batches,
+        setup.sensor,
+        scale,
+        state.misfit,
+        state.shadows,
+        state.steps_done,
+    )
+    if found.gaussians is not None:
+        changed = {name: getattr(found.gaussians, name) for name in ("sh", "lobes", "gloss")}
+        state.gaussians = dataclasses.replace(state.gaussians, **changed).trainable()
+        state.adam.widen(state.gaussians)
+    gain = f"{found.gain:.0f} ± {found.error:.0f} nats"
+    state.highlights_reason = (
+        f"step {state.steps_done + 1}, highlights would gain {gain} on views that they are not fitted to"
+    )
+    log.info("radiance %s", described(state.gaussians, state.highlights_reason))
 
 
 def drop_not_finite(state: TrainingState) -> None:

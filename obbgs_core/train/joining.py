@@ -7,6 +7,7 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from obbgs_core.frames import cameras_of
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.start import hull
 from obbgs_core.train.adam import Adam
@@ -14,6 +15,7 @@ from obbgs_core.train.appearance import SUN_FROM
 from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.decisions import smooth
+from obbgs_core.train.glints import first_lobes
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.parsimony import padded_to
 from obbgs_core.train.setup import TOO_FEW_BRACKETS, UNTESTED, TrainingSetup
@@ -59,13 +61,20 @@ def join(
     if joined.sun_moves and not setup.sun_moves and config.light.sh_degree == 0:
         position = min(position, max(0, round(config.steps_until(SUN_FROM)) - 1))
         # a direction that was chosen while the Sun stood still is chosen again
-        gaussians = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1].contiguous(), shading="view")
+        constant = gaussians.sh[:, :1].contiguous()
+        gaussians = dataclasses.replace(gaussians.matt(), sh=constant, shading="view")
         state.adam = Adam(gaussians)
     kept = torch.nonzero(_stays(gaussians, joined))[:, 0]
     old, start = gaussians.select(kept), fresh.gaussians.detach()
     added = torch.nonzero(_is_new(start, setup.start_means, old.means))[:, 0]
     added = added[: max(0, config.growth.max_gaussians - len(kept))]
-    new = dataclasses.replace(start.select(added), sh=padded_to(start.sh[added], gaussians.sh.shape[1]))
+    new = dataclasses.replace(
+        start.select(added),
+        sh=padded_to(start.sh[added], gaussians.sh.shape[1]),
+    )
+    if gaussians.has_highlights:
+        centre = cameras_of(joined.frames[:1]).centres[0]
+        new = dataclasses.replace(new, lobes=first_lobes(new.means, centre), gloss=gaussians.gloss)
     log.info(
         "%d frames: %d of %d Gaussians stay on the hull, %d join them",
         *(len(joined.frames), len(kept), len(gaussians), len(new)),
@@ -92,7 +101,9 @@ def withhold(setup: TrainingSetup, state: TrainingState) -> None:
     Brackets keep their numbers when others follow, so those that decide have never been trained on.
     """
     withheld = every_seventh_bracket(setup.frames) if state.poses_decided in ("", TOO_FEW_BRACKETS) else []
-    state.order = FrameOrder.of(setup.frames, setup.config.bracket_steps, withheld, state.order.turn)
+    state.order = FrameOrder.of(
+        setup.frames, setup.config.bracket_steps, withheld, state.order.turn, state.misfits
+    )
 
 
 def release(setup: TrainingSetup, state: TrainingState, hold: float) -> None:

@@ -95,7 +95,7 @@ PRESETS: dict[str, MethodConfig] = {
                 means=4e-3, means_end=2e-5, quats=0.01, log_scales=0.02, sh=0.04, final_share=0.2
             ),
             parsimony=ParsimonySettings(prune_at=(0.3, 0.5, 0.7, 0.85), keep_above_opacity=0.65),
-            light=LightSettings(sh_degree=0, max_sh_degree=1, sun_span_deg=5.0),
+            light=LightSettings(sh_degree=0, max_sh_degree=1, sun_span_deg=5.0, highlights=True),
             poses=PoseSettings(refine="auto"),
             sparse=SparseSettings(dropout=0.3, sky_weight=3.0),
         ),

@@ -53,7 +53,12 @@ def model(shading: str, footprint: str, sh_count: int, channels: int) -> Gaussia
     sh = torch.cat([1.5 + gaussians.sh[:, :1].abs(), 0.5 * gaussians.sh[:, 1:]], dim=1)
     means, ambient = gaussians.means * 0.4, torch.tensor(0.05)
     log_scales, psf = gaussians.log_scales + 0.3, torch.tensor(0.4)
+    shading, _, shining = shading.partition(", ")
     changes = {"shading": shading, "ambient": ambient, "footprint": footprint, "psf_sigma_px": psf}
+    if shining:  # each mirrors the Sun as well
+        rng = torch.Generator().manual_seed(1)
+        lobes, peak = torch.randn(300, 4, generator=rng), torch.linspace(3.0, 1.5, channels)
+        changes |= {"lobes": lobes, "gloss": torch.cat([torch.tensor([0.3]), peak]).log()}
     return dataclasses.replace(gaussians, means=means, log_scales=log_scales, sh=sh, **changes)
 
 
@@ -93,6 +98,8 @@ def still(page) -> None:
     ("shading", "footprint", "sh_count", "channels"),
     [
         ("view", "camera", 1, 1),
+        ("view, shining", "camera", 1, 3),
+        ("lambert, shining", "camera", 1, 1),
         ("view", "kerbl", 16, 3),
         ("view", "mip-splatting", 4, 1),
         ("sun", "camera", 4, 3),

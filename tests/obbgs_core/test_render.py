@@ -53,7 +53,9 @@ def looking_at_origin(
 
 
 def outputs_and_gradients(gaussians: Gaussians, cameras: Cameras, backend: str, sunlit=None):
-    parameters = gaussians.parameters() if gaussians.shading == "lambert" else gaussians.tensors()
+    parameters = gaussians.parameters()
+    if gaussians.shading != "lambert":
+        parameters = {n: t for n, t in parameters.items() if n not in ("ambient", "psf_sigma_px")}
     leaves = {name: value.clone().requires_grad_() for name, value in parameters.items()}
     pose = cameras.world_to_camera.clone().requires_grad_()
     moved = dataclasses.replace(cameras, world_to_camera=pose)

@@ -1,6 +1,7 @@
 """The radiance of `render.lighting` in an ONNX graph."""
 
 import numpy as np
+import torch.nn.functional as F
 
 from obbgs_core.io.onnx.graph import Graph, to_numpy
 from obbgs_core.io.onnx.projection import View
@@ -44,10 +45,36 @@ SH_TERMS = [
 
 def radiance_towards(g: Graph, gaussians: Gaussians, camera: View) -> str:
     """Return the radiance [N, C] towards the camera, as `render.lighting.radiance_along`."""
+    sunlit = lit_shares(g, gaussians) if gaussians.shading == "lambert" else None
+    matt = _matt(g, gaussians, camera, sunlit)
+    return g.op("Add", matt, _highlights(g, gaussians, camera, sunlit)) if gaussians.has_highlights else matt
+
+
+def _highlights(g: Graph, gaussians: Gaussians, camera: View, sunlit: str | None) -> str:
+    """Return the radiance [N, C] of the lobes, as `render.highlights.highlights_along`."""
+    towards = g.op("Neg", _directions(g, gaussians, camera))
+    axis = to_numpy(F.normalize(gaussians.lobes[:, :3], dim=1))
+    if gaussians.shading == "view":
+        cosine = g.op("ReduceSum", g.op("Mul", towards, axis), g.ints(1), keepdims=1)
+        cos2 = g.op("Mul", g.op("Add", cosine, 1.0), 0.5)
+    else:
+        half = _unit(g, g.op("Add", towards, g.op("Reshape", "sun_dir", g.ints(1, 3))))
+        cosine = g.op("Relu", g.op("ReduceSum", g.op("Mul", half, axis), g.ints(1), keepdims=1))
+        cos2 = g.op("Mul", cosine, cosine)
+    alpha2 = float(gaussians.gloss[0].exp() ** 2)
+    below = g.op("Max", g.op("Sub", 1.0, g.op("Mul", cos2, 1 - alpha2)), 1e-12)
+    root = g.op("Div", alpha2, below)
+    peak = to_numpy(gaussians.lobes[:, 3:].exp() * gaussians.gloss[1:].exp())
+    light = g.op("Mul", g.op("Mul", root, root), peak)
+    return light if sunlit is None else g.op("Mul", light, g.op("Unsqueeze", sunlit, g.ints(1)))
+
+
+def _matt(g: Graph, gaussians: Gaussians, camera: View, sunlit: str | None) -> str:
+    """Return the radiance [N, C] towards the camera without highlights."""
     sh = to_numpy(gaussians.sh)
     constant = (np.logaddexp(0, SOFTNESS * C0 * sh[:, 0]) / SOFTNESS).astype(np.float32)
-    if gaussians.shading == "lambert":
-        return g.op("Mul", constant, g.op("Unsqueeze", _light(g, gaussians, camera), g.ints(1)))
+    if sunlit is not None:
+        return g.op("Mul", constant, g.op("Unsqueeze", _light(g, gaussians, camera, sunlit), g.ints(1)))
     if sh.shape[1] == 1:
         return g.value(constant)
     if gaussians.shading == "sun":
@@ -61,18 +88,22 @@ def radiance_towards(g: Graph, gaussians: Gaussians, camera: View) -> str:
 def _directions(g: Graph, gaussians: Gaussians, camera: View) -> str:
     """Return unit vectors from the camera to each Gaussian [N, 3]."""
     centre = g.op("Neg", g.op("MatMul", camera.t, camera.R))  # [1, 3]
-    direction = g.op("Sub", to_numpy(gaussians.means), centre)
-    length = g.op("Sqrt", g.op("ReduceSum", g.op("Mul", direction, direction), g.ints(1), keepdims=1))
-    return g.op("Div", direction, g.op("Max", length, 1e-12))
+    return _unit(g, g.op("Sub", to_numpy(gaussians.means), centre))
 
 
-def _light(g: Graph, gaussians: Gaussians, camera: View) -> str:
+def _unit(g: Graph, vectors: str) -> str:
+    """Return vectors [N, 3] over their lengths."""
+    length = g.op("Sqrt", g.op("ReduceSum", g.op("Mul", vectors, vectors), g.ints(1), keepdims=1))
+    return g.op("Div", vectors, g.op("Max", length, 1e-12))
+
+
+def _light(g: Graph, gaussians: Gaussians, camera: View, sunlit: str) -> str:
     """Return the irradiance of each Gaussian [N] over that of a surface that faces the Sun, ambient light included."""
     normals = to_numpy(shortest_axes(gaussians))
     along = g.op("ReduceSum", g.op("Mul", _directions(g, gaussians, camera), normals), g.ints(1), keepdims=0)
     facing = g.op("Neg", g.op("Sign", along))
     cosine = g.op("Mul", g.op("MatMul", normals, "sun_dir"), facing)
-    light = g.op("Mul", _softplus(g, cosine), lit_shares(g, gaussians))
+    light = g.op("Mul", _softplus(g, cosine), sunlit)
     return g.op("Add", light, float(gaussians.ambient))
 
 

@@ -72,12 +72,13 @@ class Rasterization {
  public:
   Rasterization(const std::string& kernel, int width, int height, float near_m, Array means, Array quats,
                 Array log_scales, Array opacity_logits, Array sh, Array world_to_camera, Array K,
-                std::optional<Array> sun_dir, std::optional<Array> sunlit, float ambient, Array footprint_px2,
-                bool peak_lowered)
+                std::optional<Array> sun_dir, std::optional<Array> sunlit, float ambient, std::optional<Array> added,
+                Array footprint_px2, bool peak_lowered)
       : kernel_(kernel_called(kernel)),
         arrays_{means, quats, log_scales, opacity_logits, sh, world_to_camera, K, footprint_px2} {
     if (sun_dir) arrays_.push_back(*sun_dir);
     if (sunlit) arrays_.push_back(*sunlit);
+    if (added) arrays_.push_back(*added);
     const size_t n = opacity_logits.size(), cameras = world_to_camera.size() / 16;
     const size_t coefficients = sh.ndim() == 3 ? sh.shape(1) : 0, channels = sh.ndim() == 3 ? sh.shape(2) : 0;
     if (width < 1 || height < 1 || width > 16384 || height > 16384)
@@ -105,6 +106,7 @@ class Rasterization {
               sun_dir ? data_of(*sun_dir, "sun_dir", 3 * cameras) : nullptr,
               sunlit ? data_of(*sunlit, "sunlit", n * cameras) : nullptr,
               ambient,
+              added ? data_of(*added, "added", n * cameras * channels) : nullptr,
               data_of(footprint_px2, "footprint_px2", cameras),
               peak_lowered};
   }
@@ -122,7 +124,8 @@ class Rasterization {
   void backward(int threads, Array radiance, Array depth, std::optional<Strided> grad_radiance,
                 std::optional<Strided> grad_alpha, std::optional<Strided> grad_depth, std::optional<Array> grad_means2d,
                 Array means, Array quats, Array log_scales, Array opacity_logits, Array sh, Array world_to_camera,
-                Array ambient, Array footprint_px2, Array screen_means2d, Array pixels) const {
+                Array ambient, Array footprint_px2, std::optional<Array> added, Array screen_means2d,
+                Array pixels) const {
     const obbgs::Scene& s = scene_;
     if (!frame_.tile_begin.size()) throw std::logic_error("backward before forward");
     const size_t n = s.gaussians, splats = n * s.cameras;
@@ -138,6 +141,7 @@ class Rasterization {
                                     data_of(world_to_camera, "world_to_camera", 16 * size_t(s.cameras)),
                                     data_of(ambient, "ambient", 1),
                                     data_of(footprint_px2, "footprint_px2", s.cameras),
+                                    added ? data_of(*added, "added", splats * s.channels) : nullptr,
                                     data_of(screen_means2d, "screen_means2d", 2 * splats),
                                     data_of(pixels, "pixels", splats)};
     nb::gil_scoped_release release;
@@ -211,18 +215,18 @@ NB_MODULE(_rasterizer, m) {
   obbgs::use_row_loops(*available_kernels().front().row_loops);
   nb::class_<Rasterization>(m, "Rasterization")
       .def(nb::init<const std::string&, int, int, float, Array, Array, Array, Array, Array, Array, Array,
-                    std::optional<Array>, std::optional<Array>, float, Array, bool>(),
+                    std::optional<Array>, std::optional<Array>, float, std::optional<Array>, Array, bool>(),
            nb::arg("kernel"), nb::arg("width"), nb::arg("height"), nb::arg("near_m"), nb::arg("means"),
            nb::arg("quats"), nb::arg("log_scales"), nb::arg("opacity_logits"), nb::arg("sh"),
            nb::arg("world_to_camera"), nb::arg("K"), nb::arg("sun_dir").none(), nb::arg("sunlit").none(),
-           nb::arg("ambient"), nb::arg("footprint_px2"), nb::arg("peak_lowered"))
+           nb::arg("ambient"), nb::arg("added").none(), nb::arg("footprint_px2"), nb::arg("peak_lowered"))
       .def("forward", &Rasterization::forward, nb::arg("threads"), nb::arg("radiance"), nb::arg("alpha"),
            nb::arg("depth"), nb::arg("median_depth"), nb::arg("means2d"), nb::arg("radii"))
       .def("backward", &Rasterization::backward, nb::arg("threads"), nb::arg("radiance"), nb::arg("depth"),
            nb::arg("grad_radiance").none(), nb::arg("grad_alpha").none(), nb::arg("grad_depth").none(),
            nb::arg("grad_means2d").none(), nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"),
            nb::arg("opacity_logits"), nb::arg("sh"), nb::arg("world_to_camera"), nb::arg("ambient"),
-           nb::arg("footprint_px2"), nb::arg("screen_means2d"), nb::arg("pixels"))
+           nb::arg("footprint_px2"), nb::arg("added").none(), nb::arg("screen_means2d"), nb::arg("pixels"))
       .def_prop_ro("pairs", &Rasterization::pairs)
       .def_prop_ro("bytes", &Rasterization::bytes);
   bind_training(m);

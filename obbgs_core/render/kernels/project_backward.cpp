@@ -122,10 +122,10 @@ OBBGS_INLINE void point_backward(const Camera& camera, const Projection& p, cons
   d_p[2] = d_depth - along * p.inverse_z;
 }
 
-// Through the radiance: adds to the group's gradients and d_ambient, and sets d_direction, the derivative by
-// the vector from the camera to the Gaussian.
+// Through the radiance: adds to the group's gradients and d_ambient, writes those by the added radiance, and sets
+// d_direction, the derivative by the vector from the camera to the Gaussian.
 OBBGS_INLINE void shading_backward(const Scene& s, const Group& group, const Model& m, const Camera& camera,
-                                   const SplatSums& sums, int features, mask on, GroupGradients& d,
+                                   const SplatSums& sums, int features, mask on, float* added, GroupGradients& d,
                                    vf (&d_direction)[3], vf& d_ambient) {
   const Shading shading(s, group, m, camera);
   const bool view_dependent = s.sh_count > 1 && !s.sun_dir;
@@ -133,6 +133,7 @@ OBBGS_INLINE void shading_backward(const Scene& s, const Group& group, const Mod
   for (int b = 0; b < s.sh_count; ++b) weight[b] = 0.0f;
   for (int f = 0; f < s.channels; ++f) {
     const vf d_radiance = sums.get(kFirstFeature + f);
+    if (added) group.put(added, s.channels, f, zero_unless(on, d_radiance));
     const vf d_raw = d_radiance * softplus_slope(shading.raw[f]) * shading.light;
     if (s.sunlit) d_light = d_light + d_radiance * softplus(shading.raw[f]);
     for (int b = 0; b < s.sh_count; ++b) {
@@ -177,7 +178,7 @@ OBBGS_INLINE void pose_backward(const Model& m, const Camera& camera, const Proj
 // One group in one camera: from the sums over its splats to the group, the camera and the ambient light.
 OBBGS_INLINE void camera_backward(const Scene& s, const Group& group, const Model& m, const Camera& camera,
                                   const SplatSums& sums, int features, const float* means2d_in, float* means2d,
-                                  GroupGradients& d, vf* d_camera, vf& d_ambient) {
+                                  float* added, GroupGradients& d, vf* d_camera, vf& d_ambient) {
   const Projection p(s, m, camera);
   const mask on = p.drawn & (vf(0.0f) < load(sums.lit));
   d.logit = d.logit + zero_unless(on, sums.get(kG) * (vf(1.0f) - m.opacity));
@@ -195,7 +196,7 @@ OBBGS_INLINE void camera_backward(const Scene& s, const Group& group, const Mode
   d_camera[12] = d_camera[12] + covariance_backward(s, m, p, on, screen, sums.get(kG), d.A, d_U);
   const vf d_depth = features > s.channels ? sums.get(kFirstFeature + s.channels) : vf(0.0f);
   point_backward(camera, p, R, d_x, d_y, d_depth, d_U, d_p);
-  shading_backward(s, group, m, camera, sums, features, on, d, d_direction, d_ambient);
+  shading_backward(s, group, m, camera, sums, features, on, added, d, d_direction, d_ambient);
   pose_backward(m, camera, p, R, on, d_p, d_U, d_direction, d.mean, d_camera);
 }
 
@@ -268,14 +269,16 @@ void project_backward(const Scene& s, const Frame& frame, const float* records, 
       for (int c = 0; c < s.cameras; ++c) {
         const size_t base = c * n;
         float* means2d = out.means2d + 2 * base;
+        float* added = out.added ? out.added + base * s.channels : nullptr;
         const SplatSums sums(s, group, &frame.splats[base + first], records, out.means2d_in != nullptr,
                              out.pixels + base + first);
         if (sums.none) {
           std::fill_n(means2d + 2 * first, 2 * group.size, 0.0f);
+          if (added) std::fill_n(added + size_t(first) * s.channels, group.size * s.channels, 0.0f);
           continue;
         }
         const float* means2d_in = out.means2d_in ? out.means2d_in + 2 * base : nullptr;
-        camera_backward(s, group, m, cameras[c], sums, features, means2d_in, means2d, d,
+        camera_backward(s, group, m, cameras[c], sums, features, means2d_in, means2d, added, d,
                         &d_cameras[size_t(c) * kCamera], d_ambient);
       }
       write_gradients(s, group, m, d, out);

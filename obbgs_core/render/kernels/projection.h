@@ -81,7 +81,7 @@ struct Model {
 
 struct Camera {
   float R[3][3], t[3], fx, fy, cx, cy, limit_x, limit_y, footprint_px2;
-  const float *sun_dir, *sunlit;  // [3] and [gaussians], or null
+  const float *sun_dir, *sunlit, *added;  // [3], [gaussians] and [gaussians, channels], or null
 
   Camera(const Scene& s, int index) {
     const float *w = s.world_to_camera + 16 * index, *K = s.K + 9 * index;
@@ -98,6 +98,7 @@ struct Camera {
     footprint_px2 = s.footprint_px2[index];
     sun_dir = s.sun_dir ? s.sun_dir + 3 * index : nullptr;
     sunlit = s.sunlit ? s.sunlit + size_t(index) * s.gaussians : nullptr;
+    added = s.added ? s.added + size_t(index) * s.gaussians * s.channels : nullptr;
   }
 };
 

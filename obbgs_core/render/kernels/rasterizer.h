@@ -31,6 +31,7 @@ struct Scene {
   const float* sun_dir;  // [cameras, 3] direction at which the harmonics are evaluated; null: the viewing direction
   const float* sunlit;  // [cameras, gaussians] visibility of the Sun; sh is then an albedo under Lambert's law; or null
   float ambient;        // added to the Sun's light on every side
+  const float* added;   // [cameras, gaussians, channels] radiance that is added to what the harmonics say; or null
   const float* footprint_px2;  // [cameras] variance of what a pixel averages over, added to the 2D covariance
   bool peak_lowered;           // so that the added variance leaves a Gaussian's light as it is
 };
@@ -106,6 +107,7 @@ struct ImageGradients {
 struct SceneGradients {
   const float* means2d_in;  // [cameras, gaussians, 2] gradient of the projected means from elsewhere, or null
   float *means, *quats, *log_scales, *opacity_logits, *sh, *world_to_camera, *ambient, *footprint_px2;
+  float* added;        // [cameras, gaussians, channels], or null
   float *means2d, *pixels;  // [cameras, gaussians, 2] loss per px, [cameras, gaussians] pixels touched
 };
 

@@ -86,8 +86,9 @@ inline vf softplus_slope(vf x) {
 
 // The radiance of a group towards a camera.
 struct Shading {
-  vf direction[3], distance, basis[16], raw[3], facing;  // facing: sign that turns the normal against `direction`
-  vf normal[3], sun[3], cosine, sunlit, light;           // sun: where it is given; cosine, sunlit: under Lambert's law
+  vf direction[3], distance, basis[16], raw[3], added[3];
+  vf facing;                                    // sign that turns the normal against `direction`
+  vf normal[3], sun[3], cosine, sunlit, light;  // sun: where it is given; cosine, sunlit: under Lambert's law
 
   Shading(const Scene& s, const Group& g, const Model& m, const Camera& c) {
     for (int j = 0; j < 3; ++j)
@@ -101,6 +102,7 @@ struct Shading {
       raw[f] = 0.0f;
       for (int k = 0; k < s.sh_count; ++k)
         raw[f] = fma(basis[k], g.get(s.sh, s.sh_count * s.channels, k * s.channels + f), raw[f]);
+      added[f] = c.added ? g.get(c.added, s.channels, f) : vf(0.0f);
     }
     light = 1.0f;
     if (c.sunlit) {
@@ -115,7 +117,7 @@ struct Shading {
     }
   }
 
-  vf radiance(int f) const { return softplus(raw[f]) * light; }
+  vf radiance(int f) const { return fma(softplus(raw[f]), light, added[f]); }
 };
 
 }  // namespace

@@ -1,0 +1,63 @@
+"""Highlights: what a Gaussian mirrors of the Sun, one lobe of the microfacet distribution GGX for each."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.gaussians import Gaussians
+
+
+def highlights(
+    gaussians: Gaussians, cameras: Cameras, suns: Tensor | None, sunlit: Tensor | None
+) -> Tensor | None:
+    """Return the radiance [C, N, channels] that each Gaussian's lobe adds towards each camera; None without lobes.
+
+    Args:
+        suns, sunlit: as for `backends.rasterize`.
+    """
+    if not gaussians.has_highlights:
+        return None
+    found = []
+    for c, centre in enumerate(cameras.centres):
+        sun, share = (None if each is None else each[c] for each in (suns, sunlit))
+        found.append(highlights_along(gaussians, F.normalize(gaussians.means - centre, dim=1), sun, share))
+    return torch.stack(found)
+
+
+def highlights_along(
+    gaussians: Gaussians, directions: Tensor, sun_dir: Tensor | None, sunlit: Tensor | None
+) -> Tensor:
+    """Return the radiance [N, C] that the lobes add along `directions`; arguments as of `lighting.radiance_along`."""
+    axis = F.normalize(gaussians.lobes[:, :3], dim=1)
+    brightest = brightest_axes(directions, None if gaussians.shading == "view" else sun_dir)
+    half_vector = gaussians.shading != "view"
+    share = lobe((brightest * axis).sum(dim=1), gaussians.gloss[0].exp(), half_vector)
+    share = share * gaussians.lobes[:, 3].exp()
+    if sunlit is not None:
+        share = share * sunlit.to(share)
+    share = torch.where(share.isfinite(), share, torch.zeros_like(share))  # what is not finite is not drawn
+    return share[:, None] * gaussians.gloss[1:].exp()
+
+
+def brightest_axes(directions: Tensor, sun_dir: Tensor | None) -> Tensor:
+    """Return the axes [N, 3] of lobes that are seen at their brightest along `directions` [N, 3], camera to Gaussian.
+
+    Without a Sun that is the direction to the camera, otherwise the half vector of camera and Sun, the normal of a
+    mirror that shows the Sun.
+    """
+    if sun_dir is None:
+        return -directions
+    return F.normalize(sun_dir.detach().to(directions) - directions, dim=1)
+
+
+def lobe(cosine: Tensor, alpha: Tensor, half_vector: bool) -> Tensor:
+    """Return the GGX distribution over its peak, by the cosine of the angle between a lobe's axis and the brightest.
+
+    With the angle t between half vector and normal, D(t) / D(0) = (a² / (1 + (a² - 1) cos² t))² (Walter et al. 2007).
+    A view at the angle u from the direction in which the mirror shows the Sun has t = u/2, exactly in the plane of Sun
+    and normal: cos² t = (1 + cos u) / 2.
+    """
+    cos2 = cosine.clamp(min=0).square() if half_vector else (1 + cosine) / 2
+    alpha2 = alpha.square()
+    return (alpha2 / (alpha2 * cos2 + (1 - cos2)).clamp(min=1e-12)).square()

@@ -1,0 +1,216 @@
+"""Chooses by withheld views whether the target has highlights, and where each Gaussian's lobe points at first.
+
+Each view says with which radiance it sees a Gaussian: compositing is linear in the radiances, and where all that a
+pixel shows changes alike, the log-likelihood is a parabola in the change. A lobe is then a curve through these points,
+and the best of many axes is found without rendering again. The equations are in docs/method.md.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from obbgs_core.misfit import mean_light2
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.sh import from_radiance, radiance
+from obbgs_core.render import render
+from obbgs_core.render.highlights import brightest_axes, lobe
+from obbgs_core.sensor import Sensor
+from obbgs_core.train.appearance import Shadows
+from obbgs_core.train.batches import Batches
+
+HIGHLIGHTS_FROM = (
+    0.15  # share of the steps at which highlights are tested; later they gain less (experiment 042)
+)
+FEWEST_STEPS = (
+    100  # before that a model has not settled, and parallax that it does not have yet looks like highlights
+)
+VIEWS = 48  # training frames that are rendered, spread evenly
+SAMPLE = 128  # Gaussians that decide, spread evenly
+ALPHAS = (0.1, 0.2, 0.4)  # roughness of GGX that is tried
+STRENGTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # of a lobe's peak over the mean radiance: tried
+AXES = 400  # directions that a lobe is tried in, 10 degrees apart
+LEAST_GAIN = 3.0  # nats: a Gaussian whose lobe gains less starts with the weight FAINT
+FAINT = 0.05
+AT_ONCE = 100  # Gaussians whose axes are searched together, for memory's sake
+
+
+@dataclass(frozen=True)
+class Lobes:
+    """What highlights a training starts with, and what they gain.
+
+    gaussians: with a lobe each; None where views that the lobes are not fitted to gain nothing.
+    gain, error: nats over all frames, and its standard error.
+    """
+
+    gaussians: Gaussians | None
+    gain: float
+    error: float
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What V views say of a change of the radiance of N Gaussians."""
+
+    slope: Tensor  # [N, V, C] derivative of the log-likelihood by it
+    information: Tensor  # [N, V, C] the parabola's curvature, if all that a pixel shows changes alike
+    axes: Tensor  # [N, V, 3] unit, of a lobe that is seen at its brightest
+    sunlit: Tensor  # [N, V] share of the Sun that reaches it, where the model knows it; else 1
+    half_vector: bool  # whether these axes are half vectors
+
+    def of(self, gaussians: Tensor, views: Tensor) -> "_Seen":
+        """Return a part of it; indices or masks."""
+        parts = (self.slope, self.information, self.axes, self.sunlit)
+        slope, information, axes, sunlit = (part[gaussians][:, views] for part in parts)
+        return _Seen(slope, information, axes, sunlit, self.half_vector)
+
+    def shares(self, axes: Tensor, alpha: float) -> Tensor:
+        """Return the share of its peak [N, V, M] at which a lobe along each of some axes [M, 3] is seen."""
+        return lobe(self.axes @ axes.T, torch.tensor(alpha), self.half_vector) * self.sunlit[..., None]
+
+    def parabolas(self, shares: Tensor) -> tuple[Tensor, Tensor]:
+        """Return slope and curvature [N, M] by a lobe's strength, grey, with the best constant beside each strength."""
+        slope, information = self.slope.sum(-1), self.information.sum(-1)
+        with_constant = torch.einsum("nv,nvm->nm", information, shares)
+        by_constant = with_constant / information.sum(1, keepdim=True).clamp(min=1e-12)
+        slopes = torch.einsum("nv,nvm->nm", slope, shares) - by_constant * slope.sum(1, keepdim=True)
+        curvatures = torch.einsum("nv,nvm->nm", information, shares.square()) - by_constant * with_constant
+        return slopes, curvatures
+
+
+def lobed(
+    gaussians: Gaussians,
+    batches: Batches,
+    sensor: Sensor,
+    scale: float,
+    misfit: float | None,
+    shadows: Shadows,
+    step: int,
+) -> Lobes:
+    """Return the Gaussians with a lobe each, if views that the lobes were not fitted to are explained better by them.
+
+    Every second view is one half. For each roughness and strength, the axes that gain most on one half are scored on
+    the other; what gains most there is chosen for all Gaussians and fitted to all views. Nothing is drawn at random.
+
+    Args:
+        scale: of the images.
+        misfit: the model's own error, see `likelihood_loss`.
+        shadows: of the model at this step.
+    """
+    model = gaussians.detach()
+    seen = _seen(model, batches, sensor, scale, misfit, shadows, step)
+    unit = radiance(model.sh[:, :1], torch.zeros_like(model.means)).mean().item()
+    axes = _sphere(AXES)
+    sample = torch.arange(0, len(model), max(1, len(model) // SAMPLE))
+    times = len(model) / len(sample) * len(batches.frames) / seen.slope.shape[1]
+    gains = _gains_on_other_half(seen, sample, axes, unit)  # [alphas, strengths, sample]
+    best = int(gains.sum(dim=2).argmax())
+    of_sample = gains.flatten(0, 1)[best]
+    gain = of_sample.sum().item() * times
+    error = of_sample.std(correction=0).item() * math.sqrt(len(sample)) * times
+    if not gain > 0:
+        return Lobes(None, gain, error)
+    alpha, strength = ALPHAS[best // len(STRENGTHS)], STRENGTHS[best % len(STRENGTHS)] * unit
+    return Lobes(_with_lobes(model, seen, axes, alpha, strength), gain, error)
+
+
+def _gains_on_other_half(seen: _Seen, sample: Tensor, axes: Tensor, unit: float) -> Tensor:
+    """Return what lobes fitted to one half of the views gain on the other [alphas, strengths, sample], nats."""
+    gains = torch.zeros(len(ALPHAS), len(STRENGTHS), len(sample))
+    even = torch.arange(seen.slope.shape[1]) % 2 == 0
+    for fitted, other in ((even, ~even), (~even, even)):
+        halves = [seen.of(sample, views) for views in (fitted, other)]
+        for a, alpha in enumerate(ALPHAS):
+            (slope, curvature), (slope_there, curvature_there) = (
+                half.parabolas(half.shares(axes, alpha)) for half in halves
+            )
+            for k, strength in enumerate(STRENGTHS):
+                s = strength * unit
+                here, at = (s * slope - 0.5 * s * s * curvature).max(dim=1)
+                there = (s * slope_there - 0.5 * s * s * curvature_there).gather(1, at[:, None])[:, 0]
+                gains[a, k] += torch.where(here > LEAST_GAIN, there, 0.0)
+    return gains
+
+
+def _with_lobes(model: Gaussians, seen: _Seen, axes: Tensor, alpha: float, strength: float) -> Gaussians:
+    """Return the model with the best of some axes for each Gaussian, and with the colours that then fit best."""
+    every, found, gained = torch.ones(seen.slope.shape[1], dtype=torch.bool), [], []
+    for part in torch.arange(len(model)).split(AT_ONCE):
+        views = seen.of(part, every)
+        slope, curvature = views.parabolas(views.shares(axes, alpha))
+        gain, at = (strength * slope - 0.5 * strength**2 * curvature).max(dim=1)
+        found.append(axes[at])
+        gained.append(gain)
+    axis, bright = torch.cat(found), torch.cat(gained) > LEAST_GAIN
+    weight = torch.where(bright, 1.0, FAINT)
+    cosine = (seen.axes * axis[:, None]).sum(dim=-1)
+    share = (lobe(cosine, torch.tensor(alpha), seen.half_vector) * seen.sunlit * bright[:, None])[..., None]
+    information = seen.information.sum(1).clamp(min=1e-12)  # [N, C]
+    with_constant, slope = (seen.information * share).sum(1), seen.slope.sum(1)
+    up = (seen.slope * share).sum((0, 1)) - (with_constant / information * slope).sum(0)
+    down = (seen.information * share.square()).sum((0, 1)) - (with_constant.square() / information).sum(0)
+    strengths = (up / down.clamp(min=1e-12)).clamp(0.1 * strength, 10 * strength)  # [C]
+    before = radiance(model.sh[:, :1], torch.zeros_like(model.means))
+    # the ridge keeps what hardly any view sees
+    change = (slope - with_constant * strengths) / (information + information.mean())
+    sh = model.sh.clone()
+    sh[:, 0] = from_radiance((before + change).clamp(min=0.02 * before.mean()))
+    lobes = torch.cat([axis, weight.log()[:, None]], dim=1)
+    gloss = torch.cat([torch.tensor([alpha]), strengths]).log()
+    return dataclasses.replace(model, sh=sh, lobes=lobes, gloss=gloss)
+
+
+def _seen(
+    model: Gaussians,
+    batches: Batches,
+    sensor: Sensor,
+    scale: float,
+    misfit: float | None,
+    shadows: Shadows,
+    step: int,
+) -> _Seen:
+    """Return what some of the training frames say of the Gaussians, in both errors, the model's and the noise."""
+    found = [[], [], [], []]
+    for index in range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS)):
+        batch = batches.batch([index], scale)
+        sunlit = shadows.sunlit(model, batch.cameras, step)
+        added = torch.zeros(1, len(model), model.sh.shape[2], requires_grad=True)
+        rendered = render(model, batch.cameras, sunlit=sunlit, added=added)
+        prediction = sensor.predicted(rendered.radiance.detach(), batch.exposure_time_s)
+        variance = prediction.variance_dn2 / batch.averaged_pixels
+        if misfit is not None:
+            # everywhere the same: a highlight where there is none is as wrong as none where there is one
+            variance = variance + misfit**2 * mean_light2(prediction, sensor, batch.averaged_pixels)
+        gain = sensor.dn_per_radiance_s * batch.exposure_time_s.reshape(-1, 1, 1, 1)
+        expected = prediction.expected_dn
+        known = (batch.dn < sensor.white_dn) | (expected < sensor.white_dn)  # saturated: at least this much
+        weight = known * gain / variance
+        image = rendered.radiance
+        (slope,) = torch.autograd.grad(image, added, weight * (batch.dn - expected), retain_graph=True)
+        alike = weight * gain * rendered.alpha.detach()[..., None]
+        (information,) = torch.autograd.grad(image, added, alike)
+        lit = torch.ones(len(model)) if sunlit is None else sunlit[0].to(slope)
+        directions = F.normalize(model.means - batch.cameras.centres[0], dim=1)
+        sun = None if model.shading == "view" else batch.cameras.known_suns()[0]
+        axes = brightest_axes(directions, sun)
+        for values, more in zip(found, (slope[0], information[0], axes, lit), strict=True):
+            values.append(more)
+    slope, information, axes, sunlit = (torch.stack(values, dim=1) for values in found)
+    return _Seen(slope, information, axes, sunlit, model.shading != "view")
+
+
+def first_lobes(means: Tensor, camera_centre: Tensor) -> Tensor:
+    """Return faint lobes [N, 4] for Gaussians that join a model with highlights, each towards a camera."""
+    axis = F.normalize(camera_centre - means, dim=1)
+    return torch.cat([axis, torch.full((len(means), 1), math.log(FAINT))], dim=1)
+
+
+def _sphere(count: int) -> Tensor:
+    """Return unit vectors [count, 3] spread over the sphere (Fibonacci lattice)."""
+    place = torch.arange(count) + 0.5
+    z, angle = 1 - 2 * place / count, math.pi * (1 + math.sqrt(5)) * place
+    across = (1 - z * z).sqrt()
+    return torch.stack([across * angle.cos(), across * angle.sin(), z], dim=1)
