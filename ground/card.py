@@ -92,6 +92,9 @@ def _training(metrics: dict) -> list[str]:
     ):
         if key in metrics:
             lines.append(f"- {name}: {metrics[key]}.")
+    if misfits := metrics.get("misfit_frames"):
+        listed = ", ".join(map(str, misfits))
+        lines.append(f"- Left out, because they fit no pose that their tags allow: frames {listed}.")
     if metrics.get("removed_not_finite"):
         lines.append(
             f"- {metrics['removed_not_finite']:,} Gaussians were removed: a parameter became NaN or infinite."

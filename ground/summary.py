@@ -46,6 +46,8 @@ def model_rows(metrics: dict) -> list[tuple[str, str]]:
     rows.append(("Gaussians", f"{metrics['gaussians']:,}"))
     if known("budget"):
         rows.append(("budget", metrics["budget"]))
+    if misfits := metrics.get("misfit_frames"):
+        rows.append(("left out, fit no pose that their tags allow", f"frames {', '.join(map(str, misfits))}"))
     removed = [f"{metrics[key]:,} {label}" for key, label in REMOVED.items() if metrics.get(key)]
     if removed:
         rows.append(("left out", ", ".join(removed)))

@@ -1,5 +1,6 @@
 """The frames of each step: which are drawn, and their images at the scale of the step."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -88,10 +89,15 @@ class FrameOrder:
         by_exposure: bool,
         validation_brackets: list[list[int]],
         turn: int = 0,
+        left_out: Sequence[int] = (),
         visits: dict[int, int] | None = None,
     ) -> "FrameOrder":
-        """Return the order of all frames but those of the validation brackets; visits: of frames drawn before."""
-        withheld = {index for bracket in validation_brackets for index in bracket}
+        """Return the order of all frames but those of the validation brackets, and those that are left out for good.
+
+        Args:
+            visits: how often frames were drawn before.
+        """
+        withheld = {index for bracket in validation_brackets for index in bracket} | set(left_out)
         groups: dict[float, list[int]] = {}
         for index, frame in enumerate(frames):
             if index not in withheld:

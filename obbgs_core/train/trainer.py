@@ -300,6 +300,7 @@ class Trainer:
             misfit=state.misfit,
             sun_span_deg=setup.sun_span_deg,
             dark_frames=setup.dark_frames,
+            misfit_frames=[setup.frames[i].id for i in state.misfits],
             removed_outliers=removed,
             removed_not_finite=state.removed_not_finite,
             seconds=state.seconds,
