@@ -92,6 +92,9 @@ def _training(metrics: dict) -> list[str]:
     ):
         if key in metrics:
             lines.append(f"- {name}: {metrics[key]}.")
+    if misfits := metrics.get("misfit_frames"):
+        listed = ", ".join(map(str, misfits))
+        lines.append(f"- Left out, because they fit no pose that their tags allow: frames {listed}.")
     if metrics.get("removed_not_finite"):
         lines.append(
             f"- {metrics['removed_not_finite']:,} Gaussians were removed: a parameter became NaN or infinite."
@@ -145,6 +148,9 @@ def _quality(metrics: dict) -> list[str]:
         ("psnr_clean_foreground_db", "The same on the pixels that the target covers: {:.2f} dB."),
         ("chamfer", "Chamfer distance of the centres (the target's largest dimension = 2): {:.4f}."),
         ("completeness_surface", "Of the true surface, {:.1f} % lies within 0.01 of surface.ply."),
+        ("completeness_shown_surface", "Of the part of it that the frames show, {:.1f} % does."),
+        ("completeness_mesh", "Of the true surface, {:.1f} % lies within 0.01 of model.glb."),
+        ("completeness_shown_mesh", "Of the part of it that the frames show, {:.1f} % does."),
     ):
         if key in metrics:
             lines.append("- " + text.format(metrics[key]))

@@ -54,6 +54,7 @@ def training_metrics(
         "removed_outliers": result.removed_outliers,
         "removed_not_finite": result.removed_not_finite,
         "dark_frames": result.dark_frames,
+        "misfit_frames": result.misfit_frames,
         "chi2": None if math.isnan(chi2) else chi2,
         "misfit": result.misfit,  # null: not learnt
         "frames_received": len(session.frames),

@@ -1,5 +1,6 @@
 """What a training found of the errors of its poses: corrections with their prior and posterior deviations."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +35,16 @@ class PoseEstimate:
     def by_frame(self) -> dict[int, np.ndarray]:
         """Return the estimated pose [4, 4] of each frame of the training, by its number."""
         return dict(zip(self.frame_ids, self.estimated, strict=True))
+
+    def of_frames(self, indices: list[int]) -> "PoseEstimate":
+        """Return the estimate of some of its frames, by their place in it; the brackets stay all."""
+        return dataclasses.replace(
+            self,
+            frame_ids=[self.frame_ids[i] for i in indices],
+            brackets=[self.brackets[i] for i in indices],
+            tagged=self.tagged[indices],
+            estimated=self.estimated[indices],
+        )
 
     def unobservable(self) -> list[str]:
         """Return the shared parameters of which the frames tell little, as `boresight_rad[2]`."""

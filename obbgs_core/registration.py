@@ -24,12 +24,14 @@ class PoseInformation:
     gradient: [B, 6] at no motion; curvature: [B, 6, 6] of Gauss and Newton, never negative.
     cells: what each picture says of the places of the surface's cells, where that was asked for.
     cell_m: their edge.
+    dispersion: [B] mean squared residual of each picture, 1 where only noise is left; none where none was compared.
     """
 
     gradient: Tensor
     curvature: Tensor
     cells: "list[CellInformation] | None" = None
     cell_m: float = 0.0
+    dispersion: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def pose_information(
         cell_m: above 0: edge of the cubes that the surface is divided into. The values of a cube in a picture are then
             counted as one, because what a model still gets wrong is alike in neighbouring pixels and channels.
     """
-    gradients, curvatures, cells = [], [], []
+    gradients, curvatures, cells, dispersions = [], [], [], []
     for i in range(len(radiance)):
         seen = alpha[i] > ON_TARGET_ALPHA
         near = F.max_pool2d(seen[None, None].float(), 3, 1, 1)[0, 0] > 0
@@ -96,7 +98,9 @@ def pose_information(
             cells.append(_cell_information(numbers, rows, rows[:, 3:] @ pose[:3, :3], weight, residual))
         gradients.append(rows.T @ (weight * residual))
         curvatures.append(rows.T @ (weight[:, None] * rows))
-    return PoseInformation(torch.stack(gradients), torch.stack(curvatures), cells or None, cell_m)
+        dispersions.append(residual.square().mean())
+    dispersion = torch.stack(dispersions)
+    return PoseInformation(torch.stack(gradients), torch.stack(curvatures), cells or None, cell_m, dispersion)
 
 
 def _cell_numbers(points: Tensor, cell_m: float) -> Tensor:

@@ -1,10 +1,14 @@
 """When and how the poses move together with the model that is trained on them."""
 
+import logging
+
 import torch
+from torch import Tensor
 
 from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.registration import pose_information
 from obbgs_core.render import render
+from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.poses import ALIGNED_FROM
 from obbgs_core.train.setup import TrainingSetup
 from obbgs_core.train.state import TrainingState
@@ -12,6 +16,13 @@ from obbgs_core.train.state import TrainingState
 ROUNDS = 25  # in which the poses would move if they did so during the whole training
 CELLS = 12  # of the surface along the target's radius
 RENDERED = 6  # frames at a time
+MISFIT_FROM = (
+    0.6  # share of the steps after which brackets that do not fit are left out: poses have mostly settled
+)
+# of the logarithms of the brackets' residuals: median absolute deviations, scaled to those of a normal distribution,
+# above the median, and the least factor above it
+MISFIT_DEVIATIONS, MISFIT_FACTOR = 6.0, 5.0
+log = logging.getLogger(__name__)
 
 
 def is_due(setup: TrainingSetup, state: TrainingState, share: float) -> bool:
@@ -34,41 +45,87 @@ def cell_m(setup: TrainingSetup) -> float:
 def move(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
     """Move the poses to where one frame of each bracket wants them if the surface goes along; settle the gauge.
 
-    The frames of a bracket take turns.
+    The frames of a bracket take turns. At the first round after `MISFIT_FROM` of the steps, brackets whose residuals
+    stand out are left out of the training for good.
 
     Args:
         scale: of the images.
     """
     poses = state.poses
     assert poses is not None
-    turn, brackets = state.steps_done, [[] for _ in range(len(poses.value))]
+    turn, brackets, left_out = state.steps_done, [[] for _ in range(len(poses.value))], set(state.misfits)
     for index, bracket in enumerate(poses.of_frame):
-        brackets[bracket].append(index)
-    _gather(setup, state, [members[turn % len(members)] for members in brackets], scale)
+        if index not in left_out:
+            brackets[bracket].append(index)
+    shown = [members for members in brackets if members]
+    dispersion = _gather(setup, state, [members[turn % len(members)] for members in shown], scale)
+    whole = setup.config.steps_until(1) - setup.config.steps_until(0)
+    since = state.steps_done - setup.config.steps_until(MISFIT_FROM)
+    if 0 <= since < round(whole / ROUNDS):
+        _leave_out(setup, state, [shown[i] for i in torch.nonzero(standing_out(dispersion))[:, 0].tolist()])
     poses.step(setup.frames)
     poses.clear()
     state.gaussians = poses.fix_gauge(state.gaussians.detach(), setup.frames).trainable()
+
+
+def standing_out(dispersion: Tensor) -> Tensor:
+    """Return which residuals [P] are so far above most others that something else than the model's error is in them."""
+    logs = dispersion.log()
+    above = logs - logs.nanmedian()  # NaN: the target is not in the picture
+    spread = 1.4826 * above.abs().nanmedian()
+    return above > torch.maximum(MISFIT_DEVIATIONS * spread, torch.tensor(MISFIT_FACTOR).log())
+
+
+def _leave_out(setup: TrainingSetup, state: TrainingState, brackets: list[list[int]]) -> None:
+    """Train no more on some brackets, and forget what they said of the poses."""
+    poses = state.poses
+    assert poses is not None
+    if not brackets:
+        return
+    for index in (i for members in brackets for i in members):
+        state.misfits.append(index)
+        poses.gradient[index], poses.curvature[index] = 0, 0
+        poses.cells.pop(index, None)
+    names = ", ".join(str(setup.frames[i].id) for i in state.misfits)
+    log.warning(
+        "step %d: frames %s fit no pose that their tags allow and are left out", state.steps_done, names
+    )
+    state.order = FrameOrder.of(
+        setup.frames,
+        setup.config.bracket_steps,
+        state.order.validation_brackets,
+        state.order.turn,
+        state.misfits,
+    )
 
 
 def estimate(setup: TrainingSetup, state: TrainingState, scale: float) -> PoseEstimate | None:
     """Return what all frames say of the poses by the model as it stands; None where they are as tagged."""
     if state.poses is None:
         return None
-    _gather(setup, state, list(range(len(setup.frames))), scale)
-    found = state.poses.estimate(setup.frames)
+    fitting = [i for i in range(len(setup.frames)) if i not in set(state.misfits)]
+    _gather(setup, state, fitting, scale)
+    found = state.poses.estimate(setup.frames).of_frames(fitting)
     state.poses.clear()
     return found
 
 
 @torch.no_grad()
-def _gather(setup: TrainingSetup, state: TrainingState, indices: list[int], scale: float) -> None:
-    """Let pictures of the model as it stands say what the frames tell of their poses and of the surface."""
+def _gather(setup: TrainingSetup, state: TrainingState, indices: list[int], scale: float) -> Tensor:
+    """Let pictures of the model as it stands say what the frames tell of their poses and of the surface.
+
+    Returns the mean squared residual [len(indices)] of each.
+    """
     poses, model = state.poses, state.model.detach()
     assert poses is not None
+    dispersions = []
     for first in range(0, len(indices), RENDERED):
         batch = setup.batches.batch(indices[first : first + RENDERED], scale)
         cameras = poses.cameras(batch.indices, batch.cameras)
         rendered = render(model, cameras)
         images = (rendered.radiance, rendered.alpha, rendered.depth)
         readings = (batch.exposure_time_s, batch.dn, setup.sensor, batch.averaged_pixels)
-        poses.gather(batch.indices, pose_information(*images, cameras, *readings, cell_m=cell_m(setup)))
+        told = pose_information(*images, cameras, *readings, cell_m=cell_m(setup))
+        poses.gather(batch.indices, told)
+        dispersions.append(told.dispersion)
+    return torch.cat(dispersions)

@@ -66,6 +66,7 @@ class TrainResult:
     misfit: float | None  # the model's own error as a share of the light; None: it was not learnt
     sun_span_deg: float  # largest angle between two frames' Suns, body frame
     dark_frames: int  # left out: nothing in them rises above the noise
+    misfit_frames: list[int]  # left out, by their ids: they fitted no pose that their tags allow
     removed_outliers: int
     removed_not_finite: int  # Gaussians removed because a parameter became NaN or infinite
     seconds: float

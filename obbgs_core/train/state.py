@@ -28,7 +28,7 @@ from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 5  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 6  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,9 @@ class TrainingState:
     highlights_reason: str = ""  # why it has highlights or not; empty: not tested
     smoothing_m: Tensor | None = None  # [N] deviations of the 3D filter; None: the method has none
     compensation: Compensation | None = None  # None: the colours of all frames are the model's
+    misfits: list[int] = field(
+        default_factory=list
+    )  # frames that are left out: they fit no pose that their tags allow
     boxes: list[Obb] = field(default_factory=list)  # behind the worst tiles since the last growth inside them
     shadows: Shadows = field(default_factory=Shadows)
     chi2: float = math.nan  # running mean

@@ -244,7 +244,11 @@ def scores(seen: Pass, frames: list[TrainingFrame], result: TrainResult) -> dict
     found, tags = result.pose_estimate, [frames[i] for i in held_out]
     estimated = torch.stack([frames[i].world_to_camera for i in trained])
     if found is not None:
-        estimated, tags = torch.from_numpy(found.estimated), with_estimate(tags, found)
+        estimated, tags, trained = (
+            torch.from_numpy(found.estimated),
+            with_estimate(tags, found),
+            found.frame_ids,  # without those that were left out
+        )
     motion = best_motion(estimated, true[trained], radius_m)
     similarity = best_motion(estimated, true[trained], radius_m, with_size=True)
     focal_px = seen.frames[0].K[0, 0].item()
@@ -264,7 +268,7 @@ def scores(seen: Pass, frames: list[TrainingFrame], result: TrainResult) -> dict
         return clean_scores(views)["psnr_clean_db"]
 
     means = result.gaussians.means.double().numpy() @ motion[:3, :3].numpy().T + motion[:3, 3].numpy()
-    cloud = cloud_scores(means, np.zeros((0, 3)), seen.cloud_m, targets.LARGEST_DIMENSION / seen.size_m)
+    cloud = cloud_scores({"": means}, seen.cloud_m, targets.LARGEST_DIMENSION / seen.size_m)
     return {
         "psnr_clean_db": clean_db(seen_after(true[held_out].double(), motion).float()),
         "psnr_similarity_db": clean_db(seen_after(true[held_out].double(), similarity).float()),

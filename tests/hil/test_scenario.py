@@ -10,7 +10,7 @@ from flightsw.icd.mission import ConfigError, Mission, TargetAttitudeSection
 from flightsw.pose import pose_tag
 from hil.world.scenario import SCENARIOS, Scenario, Scene, describe, load_scenario
 
-NAMES = ["approach", "eclipse", "fly-around", "sparse", "tumbling", "v-bar"]
+NAMES = ["approach", "eclipse", "fly-around", "slow-tumble", "sparse", "tumbling", "v-bar"]
 
 
 def test_the_ready_made_scenarios_are_these():
@@ -135,5 +135,5 @@ def test_a_wrong_scenario_is_refused_by_name(tmp_path, change, key):
 
 
 def test_an_unknown_scenario_is_answered_with_the_known_ones():
-    with pytest.raises(ConfigError, match="fly-around, sparse, tumbling"):
+    with pytest.raises(ConfigError, match="fly-around, slow-tumble, sparse, tumbling"):
         load_scenario("fly_around")

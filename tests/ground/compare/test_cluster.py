@@ -17,7 +17,7 @@ from tests.small_sessions import small_session
 
 pytestmark = pytest.mark.timeout(900)  # half a minute on an idle core
 ENVIRONMENT = os.environ | {"OMP_WAIT_POLICY": "passive", "OMP_NUM_THREADS": "1"}
-LONG = ["--methods", "black,3dgs", "--budgets", "0.04@400"]  # 1,200 steps: some seconds
+LONG = ["--methods", "black,3dgs", "--budgets", "0.02@400"]  # 600 steps: some seconds
 
 
 @pytest.fixture
@@ -130,7 +130,7 @@ def test_ctrl_c_saves_a_training_and_the_same_command_goes_on(sessions, compare,
         "--methods",
         "3dgs",
         "--budgets",
-        "0.15@400",  # long enough that the signal arrives before the end
+        "0.06@400",  # long enough that the signal arrives before the end
         "--workers",
         "1",
         "--out",

@@ -1,0 +1,75 @@
+"""Brackets that fit no pose that their tags allow: found, left out, and named."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from obbgs_core.frames import TrainingFrame
+from obbgs_core.train import pose_rounds
+from obbgs_core.train.adam import Adam
+from obbgs_core.train.growth import Growth
+from obbgs_core.train.pose_rounds import MISFIT_DEVIATIONS, MISFIT_FACTOR, MISFIT_FROM, standing_out
+from obbgs_core.train.presets import preset
+from obbgs_core.train.trainer import Trainer
+from tests.scenes import QUICK, SENSOR, photographed, tagged, target
+
+CONFIG = preset("obbgs", QUICK | {"poses.refine": "always"})
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[TrainingFrame]:
+    return tagged(photographed(target(60, seed=5), 26, exposures_s=(1e-4,)), True, sigma_rad=0.004)
+
+
+def trained(frames: list[TrainingFrame]) -> Trainer:
+    """Return a training that has found the true model when poses have mostly settled, with one more round done."""
+    trainer = Trainer(frames, SENSOR, CONFIG)
+    state = trainer.state
+    state.gaussians = target(60, seed=5).trainable()
+    state.adam, state.growth = Adam(state.gaussians), Growth.of(len(state.gaussians))
+    for share in (0.3, 0.5, MISFIT_FROM):
+        state.steps_done = round(share * CONFIG.steps)
+        pose_rounds.move(trainer.setup, state, 1.0)
+    return trainer
+
+
+def swapped(frames: list[TrainingFrame]) -> list[TrainingFrame]:
+    """Return frames of which two have each other's picture: no pose near the tagged ones shows it."""
+    return [dataclasses.replace(f, dn=frames[{4: 17, 17: 4}.get(i, i)].dn) for i, f in enumerate(frames)]
+
+
+def test_frames_whose_poses_err_by_more_than_their_tags_say_are_left_out_and_named(frames):
+    trainer = trained(swapped(frames))
+    result = trainer.result("")
+    assert sorted(result.misfit_frames) == [4, 17]
+    assert {i for group in trainer.state.order.groups for i in group} == set(range(26)) - {4, 17}
+    assert result.pose_estimate is not None
+    assert result.pose_estimate.frame_ids == [i for i in range(26) if i not in (4, 17)]
+    assert result.pose_estimate.estimated.shape == (24, 4, 4)
+    trainer.join([dataclasses.replace(frames[0], id=26)])  # what is left out stays so when others come
+    assert {i for group in trainer.state.order.groups for i in group} == set(range(27)) - {4, 17}
+    trainer.step()
+
+
+def test_frames_that_err_as_their_tags_say_all_stay(frames):
+    trainer = trained(frames)
+    assert trainer.result("").misfit_frames == []
+    assert {i for group in trainer.state.order.groups for i in group} == set(range(26))
+
+
+def test_residuals_stand_out_by_scipys_median_absolute_deviation():
+    rng = np.random.default_rng(3)
+    residuals = np.exp(rng.normal(2, 0.3, 60))
+    residuals[[5, 40]] *= [30, 8]
+    residuals[7] = np.nan  # the target is not in the picture
+    logs = np.log(residuals)
+    spread = stats.median_abs_deviation(logs, scale="normal", nan_policy="omit")
+    limit = np.nanmedian(logs) + max(MISFIT_DEVIATIONS * spread, np.log(MISFIT_FACTOR))
+    found = standing_out(torch.from_numpy(residuals))
+    assert found[5] and not found[7]
+    np.testing.assert_array_equal(found.numpy(), logs > limit)
+    alike = standing_out(torch.tensor([1.0, 1.0, 1.0, 4.8, 5.2]))
+    assert alike.tolist() == [False, False, False, False, True]
