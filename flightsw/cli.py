@@ -192,7 +192,11 @@ def selftest(
     camera: Annotated[str | None, typer.Option("--camera", help="Take one bracket with this camera.")] = None,
     link: Annotated[str | None, typer.Option("--link", help="Open this link and send packets.")] = None,
     loopback: Annotated[
-        bool, typer.Option("--loopback", help="A plug on the link returns what is sent: test that it does.")
+        bool,
+        typer.Option(
+            "--loopback",
+            help="Test that packets come back: by a plug on a serial line, by a second socket on a CAN interface.",
+        ),
     ] = False,
     mission: MissionFile = Path("mission.yaml"),
     store: StoreDir = Path("store"),

@@ -148,6 +148,9 @@ def _quality(metrics: dict) -> list[str]:
         ("psnr_clean_foreground_db", "The same on the pixels that the target covers: {:.2f} dB."),
         ("chamfer", "Chamfer distance of the centres (the target's largest dimension = 2): {:.4f}."),
         ("completeness_surface", "Of the true surface, {:.1f} % lies within 0.01 of surface.ply."),
+        ("completeness_shown_surface", "Of the part of it that the frames show, {:.1f} % does."),
+        ("completeness_mesh", "Of the true surface, {:.1f} % lies within 0.01 of model.glb."),
+        ("completeness_shown_mesh", "Of the part of it that the frames show, {:.1f} % does."),
     ):
         if key in metrics:
             lines.append("- " + text.format(metrics[key]))

@@ -11,6 +11,8 @@ from ground.cameras import camera_of, exposed, predicted_image
 from ground.card import model_card
 from ground.estimated_poses import Alignment, estimated_records, read_estimate, settled_records
 from ground.intervals import interval_scores
+from ground.mesh_files import read_mesh_points
+from ground.model_files import SURFACE_POINTS
 from ground.runs import Run, open_run, written_to
 from ground.scores import (
     ScoredView,
@@ -27,6 +29,7 @@ from obbgs_base.files import write_whole
 from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
+from obbgs_core.score.shown import shown_points
 
 
 def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
@@ -54,7 +57,9 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     - psnr_clean_blind_db: psnr_clean_db of the training that ignored exposure times.
     - psnr_radiance_db: of scene-linear radiance, the brightest true pixel of a frame as 1.
     - chamfer, hausdorff, accuracy, completeness: of the Gaussians' centres, in units where the target's largest
-      dimension is 2; the same with _surface: of the points in surface.ply.
+      dimension is 2; the same with _surface: of the points in surface.ply; with _mesh: of points on model.glb.
+    - surface_shown: percentage of the true surface that the training frames show (`shown_points`); completeness_shown:
+      completeness of that part.
     - psnr_clean_settled_db: from the settled poses; pose_error_deg, pose_error_range (of the range), pose_error_px: of
       the training's estimated poses, root mean squares, and pose_error_tagged_... of its tags; only of refined poses.
     - size_error_percent: by how much the model of refined poses is too large, which no picture shows where navigation
@@ -101,12 +106,16 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
 
 def _cloud_figures(run: Run, truth: Truth, motion: np.ndarray | None) -> dict[str, float]:
     """Return the scores of the model's geometry, after a motion [4, 4] to the true body frame."""
-    surface, motion = np.zeros((0, 3)), np.eye(4) if motion is None else motion
+    motion = np.eye(4) if motion is None else motion
+    clouds = {"": run.gaussians.means.double().numpy()}
     if (run.folder / "surface.ply").exists():
-        surface = read_points(run.folder / "surface.ply")
-    centres = run.gaussians.means.double().numpy()
-    centres, surface = (points @ motion[:3, :3].T + motion[:3, 3] for points in (centres, surface))
-    return cloud_scores(centres, surface, truth.cloud_m, 2 / truth.largest_dimension_m)
+        clouds["_surface"] = read_points(run.folder / "surface.ply")
+    if (run.folder / "model.glb").exists():
+        clouds["_mesh"] = read_mesh_points(run.folder / "model.glb", SURFACE_POINTS)
+    clouds = {name: points @ motion[:3, :3].T + motion[:3, 3] for name, points in clouds.items()}
+    training = [training_frame(run.session, truth.posed(record)) for record in split(run.session)[0]]
+    shown = None if run.session.background else shown_points(truth.cloud_m, training, run.sensor)
+    return cloud_scores(clouds, truth.cloud_m, 2 / truth.largest_dimension_m, shown)
 
 
 def _interval_figures(

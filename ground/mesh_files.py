@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from ground.cameras import cameras_of, median_sun_direction
-from ground.session import FrameRecord, Session
+from ground.session import FrameRecord, Session, SessionError
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.mesh import SurfaceMesh
 
@@ -35,6 +35,25 @@ def write_mesh(
         "mesh_views": mesh.views,
         "mesh_unseen_share": round(unseen_share(mesh), 4),
     }
+
+
+def read_mesh_points(path: Path, count: int, seed: int = 0) -> np.ndarray:
+    """Return points [count, 3] m, body frame, at random places of the area of a mesh that `write_mesh` wrote as glTF.
+
+    Raises:
+        SessionError: it cannot be read.
+    """
+    import trimesh
+    import trimesh.sample
+
+    from obbgs_core.io.mesh import Z_UP_TO_Y_UP
+
+    try:
+        mesh = trimesh.load_scene(path).to_mesh()
+        points = trimesh.sample.sample_surface(mesh, count, seed=seed)[0]
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, NotImplementedError) as error:
+        raise SessionError(f"{path} is damaged: {error}") from error
+    return np.asarray(points) @ Z_UP_TO_Y_UP[:3, :3]  # the inverse of a rotation is its transpose
 
 
 def unseen_share(mesh: SurfaceMesh) -> float:

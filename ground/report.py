@@ -104,6 +104,11 @@ def _main_figures(m: dict, imported: bool) -> list[tuple[str, str]]:
         figures.append((f"{m['chamfer']:.4f}", text))
     if "completeness_surface" in m:
         text = f"of the true surface lies within {COMPLETENESS_RADIUS} of the model's surface"
+        if "completeness_shown_surface" in m:
+            text += (
+                f"; {m['completeness_shown_surface']:.1f} % of the part that the frames show, which is "
+                f"{m['surface_shown']:.0f} % of it"
+            )
         figures.append((f"{m['completeness_surface']:.1f} %", text))
     figures.append((f"{m['gaussians']:,}", "Gaussians make up the model"))
     figures.append(
@@ -142,6 +147,11 @@ def _details(m: dict) -> list[tuple[str, str]]:
         "accuracy": "mean distance from the centres to the true surface",
         "completeness": f"true surface within {COMPLETENESS_RADIUS} of a centre, %",
         "completeness_surface": f"true surface within {COMPLETENESS_RADIUS} of a point in surface.ply, %",
+        "completeness_shown_surface": "… of the part that the frames show, %",
+        "completeness_mesh": f"true surface within {COMPLETENESS_RADIUS} of model.glb, %",
+        "completeness_shown_mesh": "… of the part that the frames show, %",
+        "accuracy_mesh": "mean distance from model.glb to the true surface",
+        "surface_shown": "part of the true surface that the frames show: in view, and above their noise, %",
     }
     return [
         (text, f"{value:.4g}") for key, text in names.items() if (value := _finite(m.get(key))) is not None

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,28 +88,31 @@ def clean_scores(views: Sequence[ScoredView]) -> dict[str, float]:
 
 
 def cloud_scores(
-    points_m: np.ndarray, surface_m: np.ndarray, true_cloud_m: np.ndarray, units_per_m: float
+    clouds_m: Mapping[str, np.ndarray],
+    true_cloud_m: np.ndarray,
+    units_per_m: float,
+    shown: np.ndarray | None = None,
 ) -> dict[str, float]:
     """Return the distances of a model's points from the true surface, where the target's largest dimension is 2 units.
 
     Args:
-        points_m: [N, 3], the Gaussians' centres, or the points of a cloud.
-        surface_m: [M, 3], points on the model's surface.
+        clouds_m: [N, 3] by what is added to the figures' names: nothing for the Gaussians' centres, or the points of a
+            cloud; `_surface` for points on the model's surface, `_mesh` for points on its mesh.
         true_cloud_m: [K, 3], points of the true surface.
         units_per_m: 2 over the target's largest dimension.
+        shown: [K], which of those the training frames show; None: unknown.
 
     Returns:
-        chamfer, hausdorff, accuracy and completeness as `cloud_distances` has them; the same with _surface of the
-        points on the surface. Those of an empty cloud are missing.
+        chamfer, hausdorff, accuracy and completeness as `cloud_distances` has them, but for empty clouds;
+        surface_shown: percentage of the true surface that the frames show.
     """
     true_cloud = true_cloud_m * units_per_m
     figures: dict[str, float] = {}
-    if len(points_m):
-        figures |= cloud_distances(points_m * units_per_m, true_cloud)
-    if len(surface_m):
-        on_surface = cloud_distances(surface_m * units_per_m, true_cloud)
-        figures |= {f"{key}_surface": value for key, value in on_surface.items()}
-    return figures
+    for name, cloud_m in clouds_m.items():
+        if len(cloud_m):
+            distances = cloud_distances(cloud_m * units_per_m, true_cloud, shown)
+            figures |= {f"{key}{name}": value for key, value in distances.items()}
+    return figures if shown is None else figures | {"surface_shown": 100 * float(shown.mean())}
 
 
 def of_similarity(figures: dict[str, float]) -> dict[str, float]:

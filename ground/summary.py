@@ -37,7 +37,10 @@ def model_rows(metrics: dict) -> list[tuple[str, str]]:
     if known("chamfer"):
         rows.append(("Chamfer distance of the centres", f"{metrics['chamfer']:.4f} (largest dimension = 2)"))
     if known("completeness_surface"):
-        rows.append(("true surface within 0.01 of the model's", f"{metrics['completeness_surface']:.1f} %"))
+        shown = metrics.get("completeness_shown_surface")
+        more = "" if shown is None else f" ({shown:.1f} % of what the frames show)"
+        text = f"{metrics['completeness_surface']:.1f} %{more}"
+        rows.append(("true surface within 0.01 of the model's", text))
     if size := size_explained(metrics):
         rows.append(("size of the model", size))
     rows.append(("Gaussians", f"{metrics['gaussians']:,}"))

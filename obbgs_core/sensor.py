@@ -129,3 +129,13 @@ def clipped_moments(mean: Tensor, sigma: Tensor, most: float) -> tuple[Tensor, T
 def _density(z: Tensor) -> Tensor:
     """Return the density of the standard normal distribution."""
     return torch.exp(-0.5 * z.clamp(-12, 12) ** 2) / math.sqrt(2 * math.pi)
+
+
+def dark_reading(sensor: Sensor) -> tuple[float, float]:
+    """Return mean and deviation, DN, of a pixel without light: normal noise on the black level, clipped at zero."""
+    mean, sigma = sensor.black_dn, math.hypot(sensor.read_noise_dn, math.sqrt(1 / 12))
+    share = 0.5 * (1 + math.erf(mean / sigma / math.sqrt(2)))
+    density = math.exp(-0.5 * (mean / sigma) ** 2) / math.sqrt(2 * math.pi)
+    first = mean * share + sigma * density
+    second = (mean**2 + sigma**2) * share + mean * sigma * density
+    return first, math.sqrt(second - first**2)

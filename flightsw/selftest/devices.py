@@ -7,7 +7,7 @@ import numpy as np
 from flightsw.cameras import open_camera
 from flightsw.cameras.camera import Camera, Exposure
 from flightsw.errors import CaptureError
-from flightsw.icd.can import FLIGHT_SIDE
+from flightsw.icd.can import FLIGHT_SIDE, GROUND_SIDE
 from flightsw.icd.framing import Deframer, frame_packet
 from flightsw.icd.link_url import parse_link_url
 from flightsw.icd.mission import CameraSection, Mission
@@ -19,6 +19,7 @@ NS = 1_000_000_000
 IDLE_APID = 0x7FF  # packets that every receiver ignores (CCSDS 133.0-B)
 ECHO_S = 2.0  # for the last byte to come back
 LOOP_S = 2.0  # of sending, at most
+ADAPTER_S = 0.5  # for an slcan adapter's first answer
 BITS_PER_BYTE = 10  # on a serial line
 SIGMAS = 6.0  # of noise: none of a picture's pixels lies so far out by chance
 TIME_TOLERANCE = 0.1  # of an exposure time
@@ -27,7 +28,10 @@ DARK_PERCENTILE, LIT_PERCENTILE = 1.0, 99.9  # of pixels: a dead or a hot pixel 
 
 
 def check_link(url: str, loopback: bool, max_packet_bytes: int) -> list[Finding]:
-    """Check that a link opens and takes packets, and, with a loop-back plug, that they come back unchanged.
+    """Check that a link opens and takes packets, and, with `loopback`, that they come back unchanged.
+
+    On a serial line a plug returns them, on a CAN interface a second socket of this program. An slcan adapter can only
+    be asked whether it answers.
 
     Raises:
         ConfigError: the URL is not usable.
@@ -39,23 +43,81 @@ def check_link(url: str, loopback: bool, max_packet_bytes: int) -> list[Finding]
         advice = "look at the device's name (ls -l /dev, ip link) and give this user the group dialout"
         return [Finding.failed("link", str(error), advice)]
     with link:
-        if parsed.scheme != "serial":
-            if loopback:
-                advice = "leave --loopback out, and start `ground listen` on the other side"
-                return [Finding.failed("link", "a CAN bus returns nobody his own messages", advice)]
-            return [Finding.ok("link", f"{parsed.device} opens; a CAN bus is tested by the other side only")]
-        return [_looped(link, parsed.device, loopback, max_packet_bytes)]
+        if parsed.scheme == "serial":
+            return [_looped(link, parsed.device, loopback, max_packet_bytes)]
+        if parsed.scheme == "slcan":
+            return [_adapter(link, parsed.device, loopback)]
+        if loopback:
+            with open_link(url, GROUND_SIDE) as other:
+                return [_through_interface(link, other, parsed.device, max_packet_bytes)]
+        found = f"{parsed.device} opens (--loopback tests the interface, the bus only the other side)"
+        return [Finding.ok("link", found)]
+
+
+def _idle_packets(baud_rate: float, max_packet_bytes: int) -> list[bytes]:
+    """Return packets of random bytes that every receiver ignores, of several sizes, as many as the line is fast for."""
+    rng = np.random.default_rng()
+    room = int(LOOP_S * baud_rate / BITS_PER_BYTE)
+    packets = []
+    for size in (16, 64, 256, max_packet_bytes - 6, max_packet_bytes - 6):
+        if not packets or room > 2 * size:
+            packets.append(pack_packet(TELEMETRY, IDLE_APID, len(packets), rng.bytes(size)))
+            room -= 2 * size
+    return packets
+
+
+def _adapter(link: Link, device: str, loopback: bool) -> Finding:
+    """Look whether an slcan adapter answers the commands that open the bus."""
+    if loopback:
+        advice = "leave --loopback out, and start `ground listen` on the other side"
+        return Finding.failed("link", "an slcan adapter returns nobody his own messages", advice)
+    deadline_s = time.monotonic() + ADAPTER_S
+    while time.monotonic() < deadline_s and not link.bytes_read:
+        link.exchange(0.02)
+    if link.losses["adapter_errors"]:
+        found = f"{device}: the adapter refuses to open the bus"
+        return Finding.failed(
+            "link", found, "look at bit rate and fd in the URL, and at what the adapter can do"
+        )
+    answer = "the adapter answers" if link.bytes_read else "the adapter says nothing, as some do"
+    return Finding.ok("link", f"{device} opens, {answer}; a CAN bus is tested by the other side only")
+
+
+def _through_interface(link: Link, other: Link, device: str, max_packet_bytes: int) -> Finding:
+    """Send idle packets to a second socket on a CAN interface, which returns them as the ground would send its own.
+
+    The kernel passes frames on to other sockets once the controller has sent them, which takes another node that
+    acknowledges them, or a controller in loop-back mode.
+    """
+    sent, returned = _idle_packets(link.baud_rate, max_packet_bytes), []
+    there, back = Deframer(max_packet_bytes), Deframer(max_packet_bytes)
+    waiting, answers, started_s = list(sent), [], time.monotonic()
+    while time.monotonic() < started_s + LOOP_S + ECHO_S and len(returned) < len(sent) and link.connected:
+        if waiting and link.ready:
+            link.write(frame_packet(waiting.pop(0)))
+        answers += there.feed(other.exchange(0.0))
+        if answers and other.ready:
+            other.write(frame_packet(answers.pop(0)))
+        returned += back.feed(link.exchange(0.001))
+    elapsed_s = time.monotonic() - started_s
+    if sorted(returned) == sorted(sent):
+        found = (
+            f"{device}: {len(sent)} packets went through the interface and back in {1e3 * elapsed_s:.0f} ms"
+        )
+        return Finding.ok("link", found)
+    if not link.connected or link.hang_ups:
+        return Finding.failed("link", f"{device} hung up", "is the interface up (ip -details link show)?")
+    found = f"{device}: {len(returned)} of {len(sent)} packets came back through the interface"
+    advice = (
+        "is the interface up, and is there another node on the bus to acknowledge frames, or is the controller in "
+        "loop-back mode (ip link set can0 type can loopback on)? No `ground listen` may be on the bus meanwhile"
+    )
+    return Finding.failed("link", found, advice)
 
 
 def _looped(link: Link, device: str, loopback: bool, max_packet_bytes: int) -> Finding:
     """Send idle packets of random bytes and look at what comes back."""
-    rng = np.random.default_rng()
-    room = int(LOOP_S * link.baud_rate / BITS_PER_BYTE)
-    sent = []
-    for size in (16, 64, 256, max_packet_bytes - 6, max_packet_bytes - 6):
-        if not sent or room > 2 * size:
-            sent.append(pack_packet(TELEMETRY, IDLE_APID, len(sent), rng.bytes(size)))
-            room -= 2 * size
+    sent = _idle_packets(link.baud_rate, max_packet_bytes)
     deframer, returned = Deframer(max_packet_bytes), []
     started_s = time.monotonic()
     for packet in sent:

@@ -21,6 +21,7 @@ from ground.training_frames import split, training_frame
 from ground.truth import Truth
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.score.poses import seen_after, size_of
+from obbgs_core.score.shown import shown_points
 from obbgs_core.sensor import Sensor
 
 # what session.json holds besides what decides a comparison: how the frames came, and when
@@ -34,6 +35,7 @@ class Case:
     held_out: in their true poses where the truth is known, so that errors of their tags do not count.
     radiance: [H, W, C], scene-linear, and coverage: [H, W] in 0..1, of each held-out frame; empty without truth.
     cloud_m: [N, 3], points of the true surface, body frame; None without truth.
+    shown: [N], which of those the training frames show; None where it is not known.
     units_per_m: 2 over the target's largest dimension.
     session: where the frames came from; None for frames that are in no session.
     calibration: frames that are neither trained on nor scored, by which stated uncertainties are calibrated.
@@ -49,6 +51,7 @@ class Case:
     units_per_m: float = 1.0
     session: Session | None = None
     calibration: Sequence[TrainingFrame] = ()
+    shown: np.ndarray | None = None
 
     @property
     def clean(self) -> list[Tensor]:
@@ -123,8 +126,8 @@ class Case:
         """Return the scores of a method's points [N, 3] and surface points [M, 3]; {} where no surface is known."""
         if self.cloud_m is None:
             return {}
-        points, surface = points_m.double().numpy(), surface_m.double().numpy()
-        return cloud_scores(points, surface, self.cloud_m, self.units_per_m)
+        clouds = {"": points_m.double().numpy(), "_surface": surface_m.double().numpy()}
+        return cloud_scores(clouds, self.cloud_m, self.units_per_m, self.shown)
 
     def true_radiance(self) -> Callable[[TrainingFrame], Tensor]:
         """Return a function from a training frame to its true radiance [H, W, C].
@@ -192,7 +195,17 @@ def load_case(folder: Path, sector_deg: float = 0.0) -> Case:
         2 / truth.largest_dimension_m,
         session,
         calibration,
+        None if session.background else _shown(truth, training, given, sensor),
     )
+
+
+def _shown(
+    truth: Truth, records: list[FrameRecord], frames: list[TrainingFrame], sensor: Sensor
+) -> np.ndarray:
+    """Return which points [N] of the true surface frames show, in their true poses."""
+    poses = [torch.from_numpy(truth.posed(record).world_to_camera).float() for record in records]
+    posed = [dataclasses.replace(f, world_to_camera=pose) for f, pose in zip(frames, poses, strict=True)]
+    return shown_points(truth.cloud_m, posed, sensor)
 
 
 def _sector(training: list[FrameRecord], width_deg: float) -> Callable[[FrameRecord], bool]:

@@ -37,6 +37,7 @@ METRICS = (
     Metric("hausdorff", "Hausdorff", "{:.3f}", False),
     Metric("completeness_centres", "centres complete, %", "{:.1f}", True),
     Metric("completeness_surface", "surface complete, %", "{:.1f}", True),
+    Metric("completeness_shown_surface", "complete of what is shown, %", "{:.1f}", True),
     Metric("accuracy_surface", "accuracy", "{:.4f}", False),
     Metric("interval_90_clean", "90 % intervals hold, share", "{:.2f}", None),
     Metric("gaussians", "Gaussians", "{:,.0f}", None),

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 
 from obbgs_core.frames import TrainingFrame, bracket_numbers
-from obbgs_core.sensor import Sensor
+from obbgs_core.sensor import Sensor, dark_reading
 from obbgs_core.start import alignment, hull
 from obbgs_core.start.hull import Silhouette
 
@@ -31,7 +31,7 @@ def outline(frame: TrainingFrame, sensor: Sensor, binned: int) -> Silhouette:
     """Return where a frame shows light, after squares of `binned` pixels were averaged."""
     dn = hull.light(frame.dn, sensor, frame.background, frame.exposure_time_s).mean(dim=-1)
     dn = F.avg_pool2d(dn[None], binned)[0]
-    sky_dn, sigma_dn = hull.dark_reading(sensor)
+    sky_dn, sigma_dn = dark_reading(sensor)
     signal = (dn - sky_dn) / (sigma_dn / binned / math.sqrt(frame.dn.shape[2]))
     mean = F.avg_pool2d(signal[None], 3, 1, 1)[0] * 3
     likely = mean > OPEN_SIGMA

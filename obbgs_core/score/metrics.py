@@ -36,11 +36,14 @@ def ssim(a: Tensor, b: Tensor) -> float:
     return ssim_map(a[None], b[None])[..., border:-border, border:-border].mean().item()
 
 
-def cloud_distances(cloud: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+def cloud_distances(
+    cloud: np.ndarray, truth: np.ndarray, shown: np.ndarray | None = None
+) -> dict[str, float]:
     """Return the distances between two clouds [N, 3], [M, 3], in their units.
 
     chamfer: the mean of the two directions' mean nearest-neighbour distances. hausdorff: the same of the largest ones.
     accuracy: mean distance cloud to truth. completeness: percentage of true points within 0.01 of the cloud.
+    completeness_shown: the same of those true points that are `shown` [M], where any are.
 
     Raises:
         ValueError: a cloud is empty or not finite.
@@ -50,9 +53,13 @@ def cloud_distances(cloud: np.ndarray, truth: np.ndarray) -> dict[str, float]:
             raise ValueError(f"{name} must be finite points [N, 3] with N > 0, got shape {points.shape}")
     to_truth, _ = KDTree(truth).query(cloud)
     to_cloud, _ = KDTree(cloud).query(truth)
-    return {
+    is_found = to_cloud < COMPLETENESS_RADIUS
+    figures = {
         "chamfer": 0.5 * float(to_truth.mean()) + 0.5 * float(to_cloud.mean()),
         "hausdorff": 0.5 * float(to_truth.max()) + 0.5 * float(to_cloud.max()),
         "accuracy": float(to_truth.mean()),
-        "completeness": 100 * float((to_cloud < COMPLETENESS_RADIUS).mean()),
+        "completeness": 100 * float(is_found.mean()),
     }
+    if shown is not None and shown.any():
+        figures["completeness_shown"] = 100 * float(is_found[shown].mean())
+    return figures

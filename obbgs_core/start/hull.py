@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_core.sensor import Sensor
+from obbgs_core.sensor import Sensor, dark_reading
 
 log = logging.getLogger(__name__)
 # a window's mean above this is light with few false alarms; the target's radius is taken from it
@@ -114,16 +114,6 @@ def shows_light(dn: Tensor, sensor: Sensor) -> bool:
     signal = F.avg_pool2d((dn.mean(dim=-1) - sky_dn)[None], 3, 1)
     bright = signal > CERTAIN_SIGMA * sigma_dn / math.sqrt(dn.shape[2]) / 3
     return int(bright.sum()) >= FEWEST_BRIGHT_PX
-
-
-def dark_reading(sensor: Sensor) -> tuple[float, float]:
-    """Return mean and deviation, DN, of a pixel without light: normal noise on the black level, clipped at zero."""
-    mean, sigma = sensor.black_dn, math.hypot(sensor.read_noise_dn, math.sqrt(1 / 12))
-    share = 0.5 * (1 + math.erf(mean / sigma / math.sqrt(2)))
-    density = math.exp(-0.5 * (mean / sigma) ** 2) / math.sqrt(2 * math.pi)
-    first = mean * share + sigma * density
-    second = (mean**2 + sigma**2) * share + mean * sigma * density
-    return first, math.sqrt(second - first**2)
 
 
 def radius_m(silhouettes: list[Silhouette]) -> float:

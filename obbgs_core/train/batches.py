@@ -1,7 +1,7 @@
 """The frames of each step: which are drawn, and their images at the scale of the step."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 import torch.nn.functional as F
@@ -9,6 +9,8 @@ from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame, averaged, cameras_of
 from obbgs_core.model.cameras import Cameras
+
+MOST_AT_ONCE = 3
 
 
 @dataclass(frozen=True)
@@ -66,16 +68,20 @@ class Batches:
 class FrameOrder:
     """Draws frames at random without replacement, from each group in turn.
 
+    One that joined late is drawn up to MOST_AT_ONCE times a round, until it has been drawn about as often as others.
+
     groups: indices of the frames to train on, those of one exposure time in each group, or all in one.
     validation_brackets: indices of the frames that are not drawn, by bracket.
     remaining: what is left of each group in this round, drawn from the end.
     turn: frames drawn so far.
+    visits: how often each frame was drawn, by its index.
     """
 
     groups: list[list[int]]
     validation_brackets: list[list[int]]
     remaining: list[list[int]]
     turn: int = 0
+    visits: dict[int, int] = field(default_factory=dict)
 
     @staticmethod
     def of(
@@ -84,14 +90,21 @@ class FrameOrder:
         validation_brackets: list[list[int]],
         turn: int = 0,
         left_out: Sequence[int] = (),
+        visits: dict[int, int] | None = None,
     ) -> "FrameOrder":
-        """Return the order of all frames but those of the validation brackets, and those that are left out for good."""
+        """Return the order of all frames but those of the validation brackets, and those that are left out for good.
+
+        Args:
+            visits: how often frames were drawn before.
+        """
         withheld = {index for bracket in validation_brackets for index in bracket} | set(left_out)
         groups: dict[float, list[int]] = {}
         for index, frame in enumerate(frames):
             if index not in withheld:
                 groups.setdefault(frame.exposure_time_s if by_exposure else 0.0, []).append(index)
-        return FrameOrder(list(groups.values()), validation_brackets, [[] for _ in groups], turn)
+        return FrameOrder(
+            list(groups.values()), validation_brackets, [[] for _ in groups], turn, visits or {}
+        )
 
     def draw(self, count: int, rng: torch.Generator) -> list[int]:
         """Return the indices of the next frames."""
@@ -99,10 +112,21 @@ class FrameOrder:
         for _ in range(count):
             group = self.turn % len(self.groups)
             if not self.remaining[group]:
-                members = self.groups[group]
+                members = self._round(self.groups[group])
                 self.remaining[group] = [
                     members[i] for i in torch.randperm(len(members), generator=rng).tolist()
                 ]
             drawn.append(self.remaining[group].pop())
+            self.visits[drawn[-1]] = self.visits.get(drawn[-1], 0) + 1
             self.turn += 1
         return drawn
+
+    def _round(self, members: list[int]) -> list[int]:
+        """Return the frames of a group's next round, those that were drawn less than others several times."""
+        visits = [self.visits.get(i, 0) for i in members]
+        most = max(visits)
+        return [
+            i
+            for i, n in zip(members, visits, strict=True)
+            for _ in range(min(MOST_AT_ONCE, (most + 1) // (n + 1)))
+        ]

@@ -102,14 +102,22 @@ def withhold(setup: TrainingSetup, state: TrainingState) -> None:
     """
     withheld = every_seventh_bracket(setup.frames) if state.poses_decided in ("", TOO_FEW_BRACKETS) else []
     state.order = FrameOrder.of(
-        setup.frames, setup.config.bracket_steps, withheld, state.order.turn, state.misfits
+        setup.frames,
+        setup.config.bracket_steps,
+        withheld,
+        state.order.turn,
+        state.misfits,
+        state.order.visits,
     )
 
 
 def release(setup: TrainingSetup, state: TrainingState, hold: float) -> None:
     """Train on the withheld brackets too where they stayed too few for a decision, because no frames follow."""
     if state.poses_decided == TOO_FEW_BRACKETS and state.order.validation_brackets:
-        state.order = FrameOrder.of(setup.frames, setup.config.bracket_steps, [], state.order.turn)
+        order = state.order
+        state.order = FrameOrder.of(
+            setup.frames, setup.config.bracket_steps, [], order.turn, visits=order.visits
+        )
         state.steps_done = min(state.steps_done, round(setup.config.steps_until(hold)))
 
 

@@ -35,9 +35,9 @@ CHI2_MEMORY = 0.98  # share of the running chi² that a step keeps; the rest is 
 CHECKPOINT_EVERY_S = 20.0
 LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
 FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
-# Shares of the steps that the schedule is set back to when frames join: HOLD, where Gaussians are still added, if
-# MANY_NEW or more of all frames are new; the fewer they are the nearer to HOLD_OF_FEW, where growth is over.
-HOLD, HOLD_OF_FEW, MANY_NEW = 0.4, 0.7, 0.3
+# Shares of the steps that the schedule is set back to when frames join: HOLD, from where pictures have full size, if
+# MANY_NEW or more of all frames are new; the fewer they are the nearer to HOLD_OF_FEW, where Gaussians are still added.
+HOLD, HOLD_OF_FEW, MANY_NEW = 0.25, 0.4, 0.3
 PACE_STEPS = 50  # the time left is estimated from the pace of so many steps
 
 

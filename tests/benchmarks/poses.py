@@ -268,7 +268,7 @@ def scores(seen: Pass, frames: list[TrainingFrame], result: TrainResult) -> dict
         return clean_scores(views)["psnr_clean_db"]
 
     means = result.gaussians.means.double().numpy() @ motion[:3, :3].numpy().T + motion[:3, 3].numpy()
-    cloud = cloud_scores(means, np.zeros((0, 3)), seen.cloud_m, targets.LARGEST_DIMENSION / seen.size_m)
+    cloud = cloud_scores({"": means}, seen.cloud_m, targets.LARGEST_DIMENSION / seen.size_m)
     return {
         "psnr_clean_db": clean_db(seen_after(true[held_out].double(), motion).float()),
         "psnr_similarity_db": clean_db(seen_after(true[held_out].double(), similarity).float()),

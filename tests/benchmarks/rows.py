@@ -45,6 +45,7 @@ FIGURES = {  # key of a row: column title and format
     "chamfer": ("Chamfer", "{:.4f}"),
     "hausdorff": ("Hausdorff", "{:.3f}"),
     "completeness_surface": ("surface complete", "{:.1f} %"),
+    "completeness_shown_surface": ("complete of what is shown", "{:.1f} %"),
     "accuracy_surface": ("accuracy", "{:.4f}"),
     "gaussians": ("Gaussians", "{:,.0f}"),
     "seconds": ("seconds", "{:.0f}"),

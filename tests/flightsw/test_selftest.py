@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import random
 import socket
 import subprocess
 import threading
@@ -12,6 +13,7 @@ import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -134,6 +136,61 @@ def test_what_comes_back_over_the_link(answer, loopback, state, found, monkeypat
     with port(answer) as url:
         (finding,) = devices.check_link(url, loopback, 1100)
     assert finding.state == state and found in finding.found
+
+
+@pytest.mark.parametrize(("fd", "keeps"), [(0, 1.0), (1, 1.0), (0, 0.5), (0, 0.0)])
+def test_packets_go_through_a_can_interface_and_back(fd, keeps, monkeypatch):
+    """On python-can's virtual bus, of which a part of the frames is lost."""
+    real_bus, rng = can.Bus, random.Random(0)
+
+    def virtual_bus(channel, interface, fd):
+        bus = real_bus(channel, interface="virtual")
+        send = bus.send
+        bus.send = lambda message, timeout=None: send(message, timeout) if rng.random() < keeps else None
+        return bus
+
+    monkeypatch.setattr(can, "Bus", virtual_bus)
+    monkeypatch.setattr(devices, "LOOP_S", 0.5)
+    monkeypatch.setattr(devices, "ECHO_S", 5.0 if keeps == 1 else 0.1)
+    monkeypatch.setattr("flightsw.ports.port.CLOSE_S", 0.1)
+    url = f"can://self{keeps}{fd}?fd={fd}"
+    (finding,) = devices.check_link(url, True, 1100)
+    assert finding.state == ("ok" if keeps == 1 else "failed"), finding
+    assert (
+        "5 packets went through the interface and back" if keeps == 1 else "of 5 packets"
+    ) in finding.found
+    (finding,) = devices.check_link(url, False, 1100)
+    assert finding.state == "ok" and "--loopback tests the interface" in finding.found
+
+
+@pytest.mark.skipif(not Path("/proc/net/can").exists(), reason="the kernel has no CAN (modprobe can vcan)")
+def test_packets_go_through_a_real_virtual_can_interface_and_back():
+    add = subprocess.run(["ip", "link", "add", "dev", "obbgs1", "type", "vcan"], capture_output=True)
+    if add.returncode:
+        pytest.skip(f"no virtual CAN interface: {add.stderr.decode().strip()}")
+    try:
+        subprocess.run(["ip", "link", "set", "obbgs1", "up"], check=True)
+        (finding,) = devices.check_link("can://obbgs1", True, 1100)
+        assert finding.state == "ok" and "through the interface and back" in finding.found
+    finally:
+        subprocess.run(["ip", "link", "del", "obbgs1"], check=True)
+
+
+@pytest.mark.parametrize(
+    ("answer", "state", "found"),
+    [
+        (lambda data: b"\r" * data.count(b"\r"), "ok", "the adapter answers"),
+        (lambda data: b"", "ok", "the adapter says nothing"),
+        (lambda data: b"\a" * data.count(b"\r"), "failed", "refuses to open the bus"),
+    ],
+)
+def test_an_slcan_adapter_is_asked_whether_it_opens_the_bus(answer, state, found):
+    with port(answer) as url:
+        adapter = url.replace("serial://", "slcan://").replace("?baud=921600", "")
+        (finding,) = devices.check_link(adapter, False, 1100)
+        assert finding.state == state and found in finding.found
+        (finding,) = devices.check_link(adapter, True, 1100)
+        assert finding.state == "failed" and "returns nobody" in finding.found
 
 
 def test_a_port_that_is_missing_hangs_up_or_takes_nothing_is_told_apart(monkeypatch, tmp_path):

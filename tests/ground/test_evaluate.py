@@ -5,13 +5,16 @@ import math
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+import trimesh
 
 from ground.card import chi2_explained, model_card
 from ground.compare.case import load_case
 from ground.compare.trainings import imaging
 from ground.evaluate import evaluate
+from ground.mesh_files import read_mesh_points
 from ground.reconstruct import reconstruct
 from ground.report import write_report
 from ground.session import SessionError
@@ -139,3 +142,40 @@ def test_damaged_metrics_are_named_by_their_file(session, tmp_path, content, tol
     with pytest.raises(SessionError) as caught:
         read(tmp_path / "session", "run")
     assert str(path) in str(caught.value) and told in str(caught.value)
+
+
+def distance_to_triangles(point: np.ndarray, triangles: np.ndarray) -> float:
+    """Return the distance of a point from the nearest plane of those triangles [F, 3, 3] that it lies over."""
+    corner, sides = triangles[:, 0], triangles[:, 1:] - triangles[:, :1]
+    away = point - corner
+    gram = sides @ sides.transpose(0, 2, 1)
+    flat = np.linalg.det(gram) > 1e-18
+    weights = np.linalg.solve(gram[flat], (sides @ away[..., None])[flat])[..., 0]
+    over = (weights >= -1e-6).all(axis=1) & (weights.sum(axis=1) <= 1 + 1e-6)
+    left = away[flat] - (weights[:, :, None] * sides[flat]).sum(axis=1)
+    return float(np.linalg.norm(left[over], axis=1).min(initial=np.inf))
+
+
+def test_the_mesh_is_scored_by_points_on_its_area_and_what_the_frames_show_apart(session):
+    """The mesh's points lie on triangles of the file, and both halves of its area have their share of them."""
+    metrics = evaluate(session, "run")
+    path = session / "runs" / "run" / "model.glb"
+    points = read_mesh_points(path, 500)
+    mesh = trimesh.load_scene(path).to_mesh()
+    y_up = points[:, [0, 2, 1]] * [1, 1, -1]  # glTF's axes
+    assert max(distance_to_triangles(point, mesh.triangles) for point in y_up[:50]) < 1e-6
+    half = mesh.triangles_center[:, 0] > np.median(mesh.triangles_center[:, 0])
+    share = mesh.area_faces[half].sum() / mesh.area_faces.sum()
+    on_half = (y_up[:, 0] > np.median(mesh.triangles_center[:, 0])).mean()
+    assert abs(on_half - share) < 0.1  # four deviations of 500 points
+    assert 0 < metrics["surface_shown"] < 100
+    for name in ("", "_surface", "_mesh"):
+        assert metrics[f"completeness_shown{name}"] >= metrics[f"completeness{name}"] * 0.9
+    page = write_report(session, "run").read_text()
+    assert "of the part that the frames show" in page and "within 0.01 of model.glb" in page
+    path.rename(path.with_suffix(".kept"))
+    path.write_bytes(b"glTF" + bytes(20))
+    with pytest.raises(SessionError, match=r"model\.glb is damaged"):
+        evaluate(session, "run")
+    path.unlink()
+    path.with_suffix(".kept").rename(path)

@@ -81,3 +81,25 @@ def test_validation_brackets_are_withheld_whole():
         sorted(drawn[:63]) == sorted(drawn[63:]) == sorted(set(range(72)) - {i for b in brackets for i in b})
     )
     assert validation_brackets(frames[:51]) == []  # 17 brackets hold only two for validation
+
+
+def test_frames_that_join_late_are_drawn_more_often_until_they_have_caught_up():
+    frames = photographed(target(5), 24, size_px=8)
+    order, rng = FrameOrder.of(frames[:12], True, []), torch.Generator().manual_seed(0)
+    order.draw(12 * 8, rng)
+    assert set(order.visits.values()) == {8}
+    order = FrameOrder.of(frames, True, [], order.turn, visits=order.visits)
+    drawn = order.draw(48, rng)  # a round: each of the old once, each of the new three times
+    assert sorted(drawn) == sorted([*range(12), *[i for i in range(12, 24) for _ in range(3)]])
+    for _ in range(20):
+        order.draw(24, rng)
+    visits = [order.visits[i] for i in range(24)]
+    assert min(visits) * 2 > max(visits)
+    assert all(n >= 8 for n in visits)
+
+
+def test_frames_that_were_there_from_the_start_are_drawn_once_a_round():
+    frames = photographed(target(5), 12, size_px=8)
+    order, rng = FrameOrder.of(frames, True, []), torch.Generator().manual_seed(0)
+    for _ in range(5):
+        assert sorted(order.draw(12, rng)) == list(range(12))
