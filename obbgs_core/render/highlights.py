@@ -18,37 +18,37 @@ def highlights(
     """
     if not gaussians.has_highlights:
         return None
-    found = []
-    for c, centre in enumerate(cameras.centres):
-        sun, share = (None if each is None else each[c] for each in (suns, sunlit))
-        found.append(highlights_along(gaussians, F.normalize(gaussians.means - centre, dim=1), sun, share))
-    return torch.stack(found)
+    directions = F.normalize(gaussians.means - cameras.centres[:, None], dim=-1)
+    return highlights_along(gaussians, directions, None if suns is None else suns[:, None], sunlit)
 
 
 def highlights_along(
     gaussians: Gaussians, directions: Tensor, sun_dir: Tensor | None, sunlit: Tensor | None
 ) -> Tensor:
-    """Return the radiance [N, C] that the lobes add along `directions`; arguments as of `lighting.radiance_along`."""
+    """Return the radiance [..., N, C] that the lobes add along `directions` [..., N, 3].
+
+    Arguments as of `lighting.radiance_along`, for one camera or, with one more axis at the front, for several.
+    """
     axis = F.normalize(gaussians.lobes[:, :3], dim=1)
     brightest = brightest_axes(directions, None if gaussians.shading == "view" else sun_dir)
     half_vector = gaussians.shading != "view"
-    share = lobe((brightest * axis).sum(dim=1), gaussians.gloss[0].exp(), half_vector)
+    share = lobe((brightest * axis).sum(dim=-1), gaussians.gloss[0].exp(), half_vector)
     share = share * gaussians.lobes[:, 3].exp()
     if sunlit is not None:
         share = share * sunlit.to(share)
     share = torch.where(share.isfinite(), share, torch.zeros_like(share))  # what is not finite is not drawn
-    return share[:, None] * gaussians.gloss[1:].exp()
+    return share[..., None] * gaussians.gloss[1:].exp()
 
 
 def brightest_axes(directions: Tensor, sun_dir: Tensor | None) -> Tensor:
-    """Return the axes [N, 3] of lobes that are seen at their brightest along `directions` [N, 3], camera to Gaussian.
+    """Return the axes [..., 3] of lobes seen at their brightest along `directions` [..., 3], camera to Gaussian.
 
     Without a Sun that is the direction to the camera, otherwise the half vector of camera and Sun, the normal of a
     mirror that shows the Sun.
     """
     if sun_dir is None:
         return -directions
-    return F.normalize(sun_dir.detach().to(directions) - directions, dim=1)
+    return F.normalize(sun_dir.detach().to(directions) - directions, dim=-1)
 
 
 def lobe(cosine: Tensor, alpha: Tensor, half_vector: bool) -> Tensor:
@@ -60,4 +60,4 @@ def lobe(cosine: Tensor, alpha: Tensor, half_vector: bool) -> Tensor:
     """
     cos2 = cosine.clamp(min=0).square() if half_vector else (1 + cosine) / 2
     alpha2 = alpha.square()
-    return (alpha2 / (alpha2 * cos2 + (1 - cos2)).clamp(min=1e-12)).square()
+    return (alpha2 / (1 - (1 - alpha2) * cos2).clamp(min=1e-12)).square()

@@ -28,21 +28,22 @@ HIGHLIGHTS_FROM = (
 FEWEST_STEPS = (
     100  # before that a model has not settled, and parallax that it does not have yet looks like highlights
 )
-VIEWS = 48  # training frames that are rendered, spread evenly
-SAMPLE = 128  # Gaussians that decide, spread evenly
-ALPHAS = (0.1, 0.2, 0.4)  # roughness of GGX that is tried
-STRENGTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # of a lobe's peak over the mean radiance: tried
-AXES = 400  # directions that a lobe is tried in, 10 degrees apart
+VIEWS = 120  # training frames that are rendered, spread evenly: few of them show the glint of one Gaussian
+SAMPLE = 192  # Gaussians that decide, spread evenly
+ALPHAS = (0.2, 0.4)  # roughness of GGX that is tried
+STRENGTHS = (1.0, 2.0, 4.0, 8.0, 16.0)  # of a lobe's peak over the mean radiance: tried
+AXES = 250  # directions that a lobe is tried in, 13 degrees apart
 LEAST_GAIN = 3.0  # nats: a Gaussian whose lobe gains less starts with the weight FAINT
 FAINT = 0.05
-AT_ONCE = 100  # Gaussians whose axes are searched together, for memory's sake
+SURE = 2.0  # standard errors by which the gain on the other half must exceed zero
+AT_ONCE = 16  # Gaussians whose axes are searched together, for memory's sake
 
 
 @dataclass(frozen=True)
 class Lobes:
     """What highlights a training starts with, and what they gain.
 
-    gaussians: with a lobe each; None where views that the lobes are not fitted to gain nothing.
+    gaussians: with a lobe each; None where no gain on views that the lobes are not fitted to is sure.
     gain, error: nats over all frames, and its standard error.
     """
 
@@ -93,7 +94,7 @@ def lobed(
     """Return the Gaussians with a lobe each, if views that the lobes were not fitted to are explained better by them.
 
     Every second view is one half. For each roughness and strength, the axes that gain most on one half are scored on
-    the other; what gains most there is chosen for all Gaussians and fitted to all views. Nothing is drawn at random.
+    the other; what surely gains most there is chosen for all Gaussians and fitted to all views. Nothing is random.
 
     Args:
         scale: of the images.
@@ -107,11 +108,11 @@ def lobed(
     sample = torch.arange(0, len(model), max(1, len(model) // SAMPLE))
     times = len(model) / len(sample) * len(batches.frames) / seen.slope.shape[1]
     gains = _gains_on_other_half(seen, sample, axes, unit)  # [alphas, strengths, sample]
-    best = int(gains.sum(dim=2).argmax())
-    of_sample = gains.flatten(0, 1)[best]
-    gain = of_sample.sum().item() * times
-    error = of_sample.std(correction=0).item() * math.sqrt(len(sample)) * times
-    if not gain > 0:
+    gained = gains.flatten(0, 1) * times
+    totals, errors = gained.sum(dim=1), gained.std(dim=1, correction=0) * math.sqrt(len(sample))
+    best = int((totals - SURE * errors).argmax())
+    gain, error = totals[best].item(), errors[best].item()
+    if not gain > SURE * error:
         return Lobes(None, gain, error)
     alpha, strength = ALPHAS[best // len(STRENGTHS)], STRENGTHS[best % len(STRENGTHS)] * unit
     return Lobes(_with_lobes(model, seen, axes, alpha, strength), gain, error)

@@ -108,6 +108,17 @@ def test_the_card_tells_the_models_own_error_where_it_was_learnt(session, misfit
     assert ("own error, beside the noise: 21 % of the light" in card) == told
 
 
+@pytest.mark.parametrize(
+    ("highlights", "told"), [({"alpha": 0.213, "peak_radiance": [2.0]}, True), (None, False)]
+)
+def test_the_card_tells_which_files_hold_the_highlights(session, highlights, told):
+    metrics = json.loads((session / "runs" / "run" / "metrics.json").read_text()) | {"highlights": highlights}
+    card = model_card("2026-07-21T00:00:00+00:00", metrics)
+    assert (
+        "mirrors the Sun in one lobe (GGX, alpha 0.21). model.ply and model.onnx hold them" in card
+    ) == told
+
+
 @pytest.mark.parametrize("chi2", [None, math.nan])
 def test_a_run_without_chi2_or_onnx_has_its_card_and_report(session, tmp_path, chi2):
     shutil.copytree(session, tmp_path / "session")
