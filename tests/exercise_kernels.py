@@ -77,7 +77,7 @@ def rasterize(
     """Return all that the forward and the backward pass write."""
     gaussians, views = len(scene["means"]), len(scene["world_to_camera"])
     rasterization = module.Rasterization(
-        kernel=kernel, height=size[0], width=size[1], near_m=0.01, ambient=0.1, **scene
+        kernel=kernel, height=size[0], width=size[1], near_m=0.01, ambient=0.1, **{"added": None} | scene
     )
     channels = scene["sh"].shape[2]
     radiance = empty(views, *size, channels)
@@ -86,7 +86,9 @@ def rasterize(
     rasterization.forward(threads, radiance, alpha, depth, median_depth, means2d, radii)
     names = ("means", "quats", "log_scales", "opacity_logits", "sh", "world_to_camera")
     gradients = [np.empty_like(scene[name]) for name in names]
-    gradients += [empty(1), empty(views), empty(views, gaussians, 2), empty(views, gaussians)]
+    gradients += [empty(1), empty(views)]
+    of_added = None if scene.get("added") is None else np.full_like(scene["added"], np.nan)
+    of_screen = [empty(views, gaussians, 2), empty(views, gaussians)]
     of_radiance = np.broadcast_to(np.float32(1), radiance.shape)  # its strides are zero
     of_depth = None if asked == "radiance" else np.ones_like(depth)
     of_means2d = None if asked == "radiance" else np.ones_like(means2d)
@@ -99,7 +101,10 @@ def rasterize(
         of_depth,
         of_means2d,
         *gradients,
+        of_added,
+        *of_screen,
     )
+    gradients += of_screen if of_added is None else [*of_screen, of_added]
     assert rasterization.bytes >= rasterization.pairs >= 0
     images = [radiance, alpha, depth, median_depth]
     return [*images, means2d, radii, *gradients]
@@ -125,6 +130,7 @@ def exercise_rasterizer(module: ModuleType, kernel: str) -> None:
                 scene["sunlit"] = rng.random((2, count), dtype=np.float32) if shading == "lambert" else None
                 scene["sun_dir"] = None if shading == "view" else scene["sun_dir"]
                 scene["peak_lowered"] = channels == 3
+                scene["added"] = rng.random((2, count, 3), dtype=np.float32) if channels == 3 else None
                 for asked in ASKED if count == 17 else ["depth"]:
                     results = [rasterize(module, kernel, scene, size, threads, asked) for threads in THREADS]
                     assert same(results)  # the number of threads changes no bit
