@@ -69,7 +69,7 @@ def test_comparing_runs_names_exactly_the_settings_that_differ(passes, tmp_path)
     runs = passes / "2026" / "pass-12" / "runs"
     found = json.loads(called("compare-runs", str(runs / "first"), str(runs / "second"), "--json"))
     assert found["settings"]["method.name"] == ["obbgs", "3dgs"]
-    assert found["settings"]["method.growth.interval"] == [60, 10]
+    assert found["settings"]["method.growth.interval"] == [preset("obbgs").growth.interval, 10]
     assert "method.steps" not in found["settings"] and "seed" not in found["settings"]
     assert found["figures"]["train_steps"] == [8, 8]
     same = json.loads(called("compare-runs", str(runs / "first"), str(runs / "first"), "--json"))

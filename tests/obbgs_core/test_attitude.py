@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
@@ -53,6 +53,7 @@ def test_a_tumble_is_that_of_the_simulator(rate, shape, time_s):
 
 @settings(max_examples=15, deadline=None)
 @given(rates, shapes, st.floats(-200, 200), st.floats(-200, 200))
+@example(np.full(3, 1.5e-153), np.zeros(5), 0.0, 1.0)
 def test_the_epoch_does_not_change_a_motion(rate, shape, epoch_s, time_s):
     parameters = np.concatenate([rate, shape])
     before = attitudes(parameters[None], np.array([epoch_s, epoch_s + time_s]))[0]
