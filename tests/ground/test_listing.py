@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from ground import cli
 from ground.reconstruct import reconstruct
+from obbgs_core.train.presets import preset
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
 TINY = {"steps": 8, "start.count": 300, "growth.max_gaussians": 300}
