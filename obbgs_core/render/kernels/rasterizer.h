@@ -107,7 +107,7 @@ struct ImageGradients {
 struct SceneGradients {
   const float* means2d_in;  // [cameras, gaussians, 2] gradient of the projected means from elsewhere, or null
   float *means, *quats, *log_scales, *opacity_logits, *sh, *world_to_camera, *ambient, *footprint_px2;
-  float* added;        // [cameras, gaussians, channels], or null
+  float* added;             // [cameras, gaussians, channels], or null
   float *means2d, *pixels;  // [cameras, gaussians, 2] loss per px, [cameras, gaussians] pixels touched
 };
 
