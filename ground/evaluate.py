@@ -81,7 +81,7 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
         figures |= display_scores(pairs, run.sensor, run.session.encoding)
     truth = Truth(run.session) if Truth.exists(run.session) else None
     if truth is not None:
-        motion = None
+        motion, (clouds, seen) = None, _geometry(run, truth)
         if estimate is not None:
             alignment = Alignment.of(estimate, run.session, truth)
             motion = alignment.motion.numpy()
@@ -89,10 +89,10 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
             figures |= alignment.figures() | {"psnr_clean_settled_db": settled["psnr_clean_db"]}
             similarity = alignment.similarity.numpy()
             sized = [_scored(run, truth, truth.posed(record, similarity)) for record in run.scored]
-            figures |= of_similarity(clean_scores(sized) | _cloud_figures(run, truth, similarity))
+            figures |= of_similarity(clean_scores(sized) | _cloud_figures(clouds, seen, truth, similarity))
         shown = [truth.posed(record, motion) for record in run.scored]
         figures |= clean_scores([_scored(run, truth, record) for record in shown])
-        figures |= _radiance_figures(run, truth, shown) | _cloud_figures(run, truth, motion)
+        figures |= _radiance_figures(run, truth, shown) | _cloud_figures(clouds, seen, truth, motion)
     if run.metrics["scored_frames"] == "held_out" and not run.metrics.get("reference_exposure_s"):
         figures |= _interval_figures(run, truth, shown, estimate)
     metrics = {**run.metrics, **{key: round(value, 5) for key, value in figures.items()}}
@@ -104,17 +104,25 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     return metrics
 
 
-def _cloud_figures(run: Run, truth: Truth, motion: np.ndarray | None) -> dict[str, float]:
-    """Return the scores of the model's geometry, after a motion [4, 4] to the true body frame."""
-    motion = np.eye(4) if motion is None else motion
+def _geometry(run: Run, truth: Truth) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+    """Return the model's points by the names of their scores, and which points of the true surface the frames show."""
     clouds = {"": run.gaussians.means.double().numpy()}
     if (run.folder / "surface.ply").exists():
         clouds["_surface"] = read_points(run.folder / "surface.ply")
     if (run.folder / "model.glb").exists():
         clouds["_mesh"] = read_mesh_points(run.folder / "model.glb", SURFACE_POINTS)
-    clouds = {name: points @ motion[:3, :3].T + motion[:3, 3] for name, points in clouds.items()}
+    if run.session.background:
+        return clouds, None
     training = [training_frame(run.session, truth.posed(record)) for record in split(run.session)[0]]
-    shown = None if run.session.background else shown_points(truth.cloud_m, training, run.sensor)
+    return clouds, shown_points(truth.cloud_m, training, run.sensor)
+
+
+def _cloud_figures(
+    clouds: dict[str, np.ndarray], shown: np.ndarray | None, truth: Truth, motion: np.ndarray | None
+) -> dict[str, float]:
+    """Return the scores of the model's geometry, after a motion [4, 4] to the true body frame."""
+    if motion is not None:
+        clouds = {name: points @ motion[:3, :3].T + motion[:3, 3] for name, points in clouds.items()}
     return cloud_scores(clouds, truth.cloud_m, 2 / truth.largest_dimension_m, shown)
 
 
