@@ -19,23 +19,30 @@ from hil.links.virtual_serial import VirtualSerial
 
 PACKETS = [bytes([number % 256]) * (20 + number % 50) for number in range(300)]
 STREAM = b"".join(map(frame_packet, PACKETS))
+FIRST_PACKETS = b"".join(map(frame_packet, PACKETS[:20]))
 
 
-def send(line: VirtualLink, stream: bytes, quiet_s: float = 0.3) -> bytes:
-    """Send a stream down the line as fast as it takes it; return what arrives until it is quiet."""
-    received, last_s = b"", time.monotonic()
+def send(line: VirtualSerial, stream: bytes) -> bytes:
+    """Send a stream down the line as fast as it takes it; return what arrives until every byte is accounted for."""
+    received, end_s = b"", time.monotonic() + 60
+    lane = line.statistics()["down"]
+    bytes_in_at_end, bytes_out_before = lane.bytes_in + len(stream), lane.bytes_out
     with (
         serial.Serial(line.flight_device, timeout=0, write_timeout=0, exclusive=True) as near,
         serial.Serial(line.ground_device, timeout=0, exclusive=True) as far,
     ):
-        while stream or time.monotonic() - last_s < quiet_s:
+        while (
+            lane.bytes_in < bytes_in_at_end
+            or lane.bytes_in + lane.duplicated_bytes
+            > lane.bytes_out + lane.lost_bytes + lane.cut_bytes + lane.overrun_bytes
+            or len(received) < lane.bytes_out - bytes_out_before
+        ):
+            assert time.monotonic() < end_s, f"the line stands still: {lane}"
             with contextlib.suppress(BlockingIOError):
                 stream = stream[os.write(near.fileno(), stream) :]
-            data = far.read(65_536)
-            if data:
-                received, last_s = received + data, time.monotonic()
+            received += far.read(65_536)
             time.sleep(0.001)
-    return received
+        return received + far.read(65_536)
 
 
 def assert_counts_add_up(line: VirtualSerial) -> None:
@@ -49,8 +56,8 @@ def test_without_faults_every_byte_passes_at_the_line_s_rate():
     baud_rate = 115_200
     with VirtualSerial(baud_rate) as line:
         began_s = time.monotonic()
-        assert send(line, STREAM, quiet_s=0.1) == STREAM
-        seconds = time.monotonic() - began_s - 0.1
+        assert send(line, STREAM) == STREAM
+        seconds = time.monotonic() - began_s
         ideal_s = len(STREAM) * 10 / baud_rate
         assert seconds > 0.95 * ideal_s  # it may be faster by the burst of 10 ms only
         assert_counts_add_up(line)
@@ -126,8 +133,8 @@ def test_both_directions_work_at_once():
 def test_latency_delays_the_first_byte_and_loses_none():
     with VirtualSerial(3_000_000, latency_s=0.3) as line:
         began_s = time.monotonic()
-        assert send(line, STREAM, quiet_s=0.6) == STREAM
-        assert time.monotonic() - began_s > 0.3 + 0.6
+        assert send(line, STREAM) == STREAM
+        assert time.monotonic() - began_s > 0.3
         assert_counts_add_up(line)
 
 
@@ -152,13 +159,13 @@ def test_without_flow_control_what_nobody_reads_in_time_is_lost_and_counted():
 def test_a_running_line_executes_commands():
     with VirtualSerial(3_000_000) as line:
         assert control(line, "cut").startswith("cut")
-        assert send(line, STREAM[:1000]) == b""
+        assert send(line, FIRST_PACKETS) == b""
         assert control(line, "mend").startswith("whole")
         assert "0.25 s" in control(line, "latency 0.25")
         assert "'loss': 1.0" in control(line, "loss 1")
-        assert send(line, STREAM[:1000], quiet_s=0.5) == b""
+        assert send(line, FIRST_PACKETS) == b""
         control(line, "loss 0")
-        assert send(line, STREAM[1000:2000], quiet_s=0.5)
+        assert send(line, FIRST_PACKETS) == FIRST_PACKETS
         assert_counts_add_up(line)
 
 
@@ -174,6 +181,7 @@ def test_run_link_names_its_ends_and_returns_its_counts():
     seen, reports = [], []
 
     def on_ready(line: VirtualLink) -> None:
+        assert isinstance(line, VirtualSerial)
         seen.append((line.flight_url, line.ground_url))
         assert send(line, STREAM[:500]) == STREAM[:500]
 
