@@ -8,10 +8,8 @@ from typing import Any
 
 from ground.compare.methods import reference_names
 
-HOLDS_DB, SHAKEN_DB = (
-    1.0,
-    3.0,
-)  # losses against the frames as taken up to which a method holds, or is only shaken
+# losses against the frames as taken up to which a method holds, or is only shaken
+HOLDS_DB, SHAKEN_DB = 1.0, 3.0
 MARGIN_DB = 1.0  # above the best image without training: less is a failure; seeds scatter by about 0.3 dB
 
 

@@ -15,17 +15,10 @@ from ground.compare.results import with_best
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "results"
-NAMES = (
-    "method",
-    "ablation",
-    "condition",
-    "scenario",
-    "target",
-)  # what a line of a table is called by, where a row has it
-BUDGETS = {
-    "steps_share": "share of the steps",
-    "largest": "at most Gaussians",
-}  # and these where rows differ in them
+# what a line of a table is called by, where a row has it
+NAMES = ("method", "ablation", "condition", "scenario", "target")
+# and these where rows differ in them
+BUDGETS = {"steps_share": "share of the steps", "largest": "at most Gaussians"}
 FIGURES = {  # key of a row: column title and format
     "psnr_clean_db": ("clean PSNR", "{:.2f} dB"),
     "psnr_settled_db": ("from settled poses", "{:.2f} dB"),
