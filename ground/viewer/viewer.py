@@ -199,7 +199,8 @@ class Viewer:
                     each.show(part, self._is_checked(part))
 
     def _expose(self, text: str) -> None:
-        self.exposure.value = float(text)
+        if text in self.brackets.options:
+            self.exposure.value = float(text)
 
     def _choose(self, record: FrameRecord) -> None:
         self.timeline.value = self.frames.index(record)
