@@ -17,9 +17,8 @@ from obbgs_core.train.state import TrainingState
 ROUNDS = 25  # in which the poses would move if they did so during the whole training
 CELLS = 12  # of the surface along the target's radius
 RENDERED = 6  # frames at a time
-MISFIT_FROM = (
-    0.6  # share of the steps after which brackets that do not fit are left out: poses have mostly settled
-)
+# share of the steps after which brackets that do not fit are left out: poses have mostly settled
+MISFIT_FROM = 0.6
 # of the logarithms of the brackets' residuals: median absolute deviations, scaled to those of a normal distribution,
 # above the median
 MISFIT_DEVIATIONS = 6.0
