@@ -26,9 +26,8 @@ log = logging.getLogger(__name__)
 
 TILE_ROWS, TILE_COLUMNS = 20, 40  # px, as in the ground's densification
 SENSOR_METADATA = ("black_dn", "white_dn", "dn_per_radiance_s", "electrons_per_dn", "read_noise_dn")
-SIMILAR_RAD = (
-    0.7  # views so far apart share exp(-1/2) of what they show: about how far a face can be seen from
-)
+# views so far apart share exp(-1/2) of what they show: about how far a face can be seen from
+SIMILAR_RAD = 0.7
 NOISE_CHI2 = 1.25  # below it is the worst tile of pure noise: 1 on average, a deviation of 0.05 for 800 px
 REPEAT = 0.05  # novelty of a view that was sent already: its noise differs
 NICENESS = 10  # of the ranking thread: the link has priority

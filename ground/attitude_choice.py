@@ -24,9 +24,8 @@ from obbgs_core.train.trainer import train
 log = logging.getLogger(__name__)
 STEPS = 150
 HELD_OUT = 5  # every fifth bracket
-CERTAIN = (
-    3.0  # standard errors by which the best rotation's loss on held-out brackets is below that of each other
-)
+# standard errors by which the best rotation's loss on held-out brackets is below that of each other
+CERTAIN = 3.0
 
 
 # A wrong rotation must not be excused as the model's own error. With these weights of the priors, its held-out loss in

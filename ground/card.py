@@ -7,12 +7,14 @@ NOISE_LIKE_CHI2 = 1.5  # up to here the model's own error is under 0.7 sigma of 
 SIZES = {
     "model.ply": "ply_bytes",
     "model.spz": "spz_bytes",
+    "splats.glb": "splats_bytes",
     "model.glb": "glb_bytes",
     "model.onnx": "onnx_bytes",
 }
 USES = {
     "model.ply": "the model without loss",
     "model.spz": "quantised, for viewers and storage",
+    "splats.glb": "splats as glTF (KHR_gaussian_splatting), for viewers",
     "model.glb": "a closed mesh with colours, for other software",
     "model.onnx": "the renderer for use on board",
 }
@@ -116,19 +118,19 @@ def _appearance(metrics: dict) -> list[str]:
         shadows = "cast" if shading == "lambert" else "not modelled"
         lines.append(
             f"- Shadows of parts on one another are {shadows}. model.ply and model.onnx hold the model for every Sun "
-            "direction; model.spz, and what other viewers show of model.ply, are lit from "
+            "direction; model.spz, splats.glb, and what other viewers show of model.ply, are lit from "
             f"({x:.3f}, {y:.3f}, {z:.3f}), target body frame."
         )
     if highlights := metrics.get("highlights"):
         lines.append(
             f"- Highlights: each Gaussian mirrors the Sun in one lobe (GGX, alpha {highlights['alpha']:.2f}). "
-            "model.ply and model.onnx hold them; model.spz, and what other viewers show of model.ply, hold them as "
-            "harmonics of degree 3, far wider and fainter; the colours of model.glb do not follow the view."
+            "model.ply and model.onnx hold them; model.spz, splats.glb, and what other viewers show of model.ply, hold "
+            "them as harmonics of degree 3, far wider and fainter; the colours of model.glb do not follow the view."
         )
     if metrics.get("background"):
         lines.append(
             f"- Trained in front of a background of radiance {metrics['background']:g}, which model.onnx draws. "
-            "model.ply and model.spz do not hold it: set it in the viewer."
+            "model.ply, model.spz and splats.glb do not hold it: set it in the viewer."
         )
     return lines
 

@@ -174,9 +174,8 @@ class _Ingest:
     ):
         self.frames_received = 0
         self.last_packet_s = float("-inf")
-        self.flight_outbox: int | None = (
-            None  # frames still to come, as housekeeping said after the last frame
-        )
+        # frames still to come, as housekeeping said after the last frame
+        self.flight_outbox: int | None = None
         self._link, self._writer, self._on_event, self._forward = link, writer, on_event, forward
         self._stream = PacketStream(TELECOMMAND, mission.link.max_packet_bytes)
         if forward is not None:

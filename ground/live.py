@@ -34,9 +34,8 @@ STEPS = 1000  # of the schedule; 60 % of it is left when the last few frames hav
 MANY_EXPECTED = {"sparse.dropout": 0.0, "sparse.sky_weight": 0.0}
 FEWEST_BRACKETS = 4  # that the first hull is carved of, while more may come
 JOIN_STEPS = 60  # at least, from frames that join to the next
-JOIN_PAUSE = (
-    3.0  # at least so many times what the last joining took, from one to the next while frames arrive
-)
+# at least so many times what the last joining took, from one to the next while frames arrive
+JOIN_PAUSE = 3.0
 LOOK_S, STATUS_S, SHOW_S, SAVE_S = 0.5, 1.0, 5.0, 20.0  # between two looks, statuses, models and checkpoints
 WAIT_S = 0.1  # where there is nothing to train
 CHECKPOINT = re.compile(r"live-(\d+)\.checkpoint", re.ASCII)  # with the number of frames that have joined

@@ -41,9 +41,8 @@ class LiveUplink:
         self._session_dir, self._key_file = session_dir, key_file
         self._sent: Gaussians | None = None  # the model on board or on its way there
         self._sent_text = ""
-        self._under_way: tuple[int, str] | None = (
-            None  # counter and name of the command that has no result yet
-        )
+        # counter and name of the command that has no result yet
+        self._under_way: tuple[int, str] | None = None
         self._is_ordered = False  # the spacecraft has taken the order by triage
         self._not_before_s = -math.inf
 

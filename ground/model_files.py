@@ -10,11 +10,13 @@ import numpy as np
 import onnxruntime
 
 from ground.cameras import cameras_of, median_sun_direction, predicted_image, sensor_of, sun_direction
+from ground.card import SIZES
 from ground.mesh_files import write_mesh
 from ground.session import FrameRecord, Session, SessionError
 from ground.uplink import MAX_MODEL_BYTES
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import ReconstructionError
+from obbgs_core.io.gltf_splats import save_gltf_splats
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.io.ply import save_ply, save_surface_ply
 from obbgs_core.io.spz import save_spz
@@ -94,6 +96,9 @@ def write_models(
     if blind is not None:
         outputs.make("blind.ply", lambda path: save_ply(blind, path, white_radiance, sun_dir, cameras))
     outputs.make("model.spz", lambda path: save_spz(gaussians, path, white_radiance, sun_dir))
+    outputs.make(
+        "splats.glb", lambda path: save_gltf_splats(gaussians, path, white_radiance, sun_dir, cameras)
+    )
     outputs.make("surface.ply", lambda path: _write_surface(gaussians, session, training, path))
     mesh = outputs.make(
         "model.glb", lambda path: write_mesh(gaussians, session, training, path, white_radiance)
@@ -150,10 +155,10 @@ def onnx_parity_db(
 
 def model_sizes(folder: Path) -> dict:
     """Return the bytes of each form of the model (None for a missing one) and whether the uplink accepts model.onnx."""
-    sizes = {}
-    for name in ("ply", "spz", "glb", "onnx"):
-        path = folder / f"model.{name}"
-        sizes[f"{name}_bytes"] = path.stat().st_size if path.is_file() else None
+    sizes: dict = {}
+    for name, key in SIZES.items():
+        path = folder / name
+        sizes[key] = path.stat().st_size if path.is_file() else None
     onnx_bytes = sizes["onnx_bytes"]
     return sizes | {"onnx_fits_uplink": None if onnx_bytes is None else onnx_bytes <= MAX_MODEL_BYTES}
 

@@ -16,9 +16,8 @@ LABEL_WIDTH = "minmax(0, 60px)"
 COLUMNS = 6  # brackets shown for each exposure
 VIEWS_SHOWN = 3
 MARGIN_PX = 10
-ABOVE_EMPTY = (
-    0.01  # of full scale: pixels that differ more from the background are target when pictures are cropped
-)
+# of full scale: pixels that differ more from the background are target when pictures are cropped
+ABOVE_EMPTY = 0.01
 
 
 def frames_section(run: Run) -> str:

@@ -77,9 +77,8 @@ class FrameRecord:
     sha256: str  # of the container as received
     bit_depth: int
     black_dn: float
-    split: str | None = (
-        None  # train, val or test, where an imported data set states it: for all frames or for none
-    )
+    # train, val or test, where an imported data set states it: for all frames or for none
+    split: str | None = None
     K: np.ndarray | None = None  # [3, 3] px, where it is not the session's camera's
     quat_inertial_to_body: np.ndarray | None = None  # [4] attitude of the target that the pose assumes, GCRS
 

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 STEADY = 1e-14  # torque over twice the energy up to which the rates do not change
-LEAST_COMPLEMENT = (
-    1e-30  # of the functions' parameter: a body this near its middle axis stays there for 35 rad
-)
+# of the functions' parameter: a body this near its middle axis stays there for 35 rad
+LEAST_COMPLEMENT = 1e-30
 MEAN_ROUNDS = 10  # of the arithmetic-geometric mean, which doubles its digits in each
 SAMPLES = 256  # in a period of the speed of precession
 

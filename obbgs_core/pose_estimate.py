@@ -7,9 +7,8 @@ import numpy as np
 
 from obbgs_base.navigation_errors import LENGTHS, SharedParameters
 
-DETERMINED = (
-    0.5  # a parameter whose posterior deviation is a larger share of the prior's is called unobservable
-)
+# a parameter whose posterior deviation is a larger share of the prior's is called unobservable
+DETERMINED = 0.5
 
 
 @dataclass(frozen=True, eq=False)

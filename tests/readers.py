@@ -1,7 +1,8 @@
 """Other people's programs that read and draw models of Gaussian splats, from npm; skips where npm cannot bring them.
 
-They are installed once into a folder of the user's cache, outside the repository, without running their scripts. All
-are under the MIT licence: gsplat.js, Spark (with three.js), and PlayCanvas' splat-transform, with SuperSplat's viewer.
+They are installed once into a folder of the user's cache, outside the repository, without running their scripts.
+Under the MIT licence: gsplat.js, Spark (with three.js), and PlayCanvas' splat-transform, with SuperSplat's viewer;
+under Apache 2.0: Babylon.js and Khronos' glTF validator.
 """
 
 import contextlib
@@ -24,6 +25,9 @@ PACKAGES = {
     "@sparkjsdev/spark": "2.2.0",
     "three": "0.180.0",
     "@playcanvas/splat-transform": "2.7.1",
+    "babylonjs": "9.28.0",
+    "babylonjs-loaders": "9.28.0",
+    "gltf-validator": "2.0.0-dev.3.10",
 }
 INSTALL_S = 300.0
 
@@ -60,6 +64,15 @@ def splat_transform(readers: Path, *arguments: str | Path) -> None:
     command = ["node", str(program), "--quiet", "--overwrite", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def gltf_issues(readers: Path, file: Path) -> dict:
+    """Return what Khronos' validator says of a GLB file: counts by severity, and messages."""
+    script = """const bytes = new Uint8Array(require("fs").readFileSync(process.argv[1]));
+        require("gltf-validator").validateBytes(bytes).then(r => console.log(JSON.stringify(r.issues)));"""
+    arguments = ["node", "-e", script, str(file)]
+    done = subprocess.run(arguments, cwd=readers, capture_output=True, text=True, check=True, timeout=60)
+    return json.loads(done.stdout)
 
 
 class _Quiet(http.server.SimpleHTTPRequestHandler):

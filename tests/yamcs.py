@@ -113,9 +113,8 @@ def running_yamcs(folder: Path, change: Callable[[Path], None] = lambda folder: 
     port, web_port = free_ports()
     write_yamcs(folder, port, web_port)
     change(folder)
-    options = (
-        "-XX:TieredStopAtLevel=1 -XX:+UseSerialGC -Xmx400m"  # a short life is not worth the second compiler
-    )
+    # a short life is not worth the second compiler
+    options = "-XX:TieredStopAtLevel=1 -XX:+UseSerialGC -Xmx400m"
     environment = os.environ | {"YAMCS_LIB": str(jars), "JAVA_TOOL_OPTIONS": options}
     with open(folder / "log", "wb") as log:
         process = subprocess.Popen(

@@ -45,9 +45,8 @@ ANSWER_S = 0.2  # for the other side to answer at all, on a busy computer too
 # message (N_Cr), since the next message of the channel ends the wait as well.
 OFFERS, LONGEST_WAIT_S = 5, 1.0
 REST_S = 2.0
-LOOK_S = (
-    0.05  # time between two reads of the port counts for time-outs only up to this: frames may wait unread
-)
+# time between two reads of the port counts for time-outs only up to this: frames may wait unread
+LOOK_S = 0.05
 FIRST_FRAME, CONSECUTIVE_FRAME, FLOW_CONTROL = 1, 2, 3  # the types in the first half byte, ISO 15765-2
 NEVER_MS = 24 * 3600 * 1000
 FD_SIZES = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)  # bytes by length code, ISO 11898-1

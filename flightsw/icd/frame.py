@@ -52,9 +52,8 @@ class PoseTag:
     valid: bool
     source: str = "sgp4"
     attitude: Attitude = "known"
-    quat_inertial_to_body: np.ndarray | None = (
-        None  # [4] the target's attitude that the pose assumes; None: not stated
-    )
+    # [4] the target's attitude that the pose assumes; None: not stated
+    quat_inertial_to_body: np.ndarray | None = None
     correlation_time_s: float = 0.0  # of the tag's errors; 0: independent from bracket to bracket
 
     def __post_init__(self):

@@ -195,9 +195,8 @@ class LinkSection:
     max_packet_bytes: int = 1100
     roi_sigma: float = 4.0
     roi_margin_px: int = 9
-    priority: Literal["oldest", "triage", "thumbnail-first"] = (
-        "thumbnail-first"  # of the outbox, until commanded
-    )
+    # of the outbox, until commanded
+    priority: Literal["oldest", "triage", "thumbnail-first"] = "thumbnail-first"
     housekeeping_s: float = 1.0  # from one housekeeping packet to the next
     checksum: Checksum = "crc-32"  # of each transferred file
     files_in_flight: int = 8  # at most, to the ground

@@ -30,9 +30,8 @@ class NetworkSettings:
 
     sources: int = 4  # views with which each is matched; the paper has 4 in its evaluation
     planes: int = 64  # a multiple of 8
-    longest_px: int = (
-        400  # smaller pictures are enlarged by a whole number to at least this, since depths are a quarter
-    )
+    # smaller pictures are enlarged by a whole number to at least this, since depths are a quarter
+    longest_px: int = 400
     fusion: FusionSettings = field(default_factory=lambda: FusionSettings(least_confidence=0.8))
 
 

@@ -26,9 +26,8 @@ RAYS_AT_ONCE = 8192  # bounds the memory
 POSITIONS_AT_ONCE = 2**16
 MIDDLE = 0.5  # of a step, where images are sampled; trainings draw the place at random
 SURFACE_TRANSMITTANCE = 0.5  # a ray ends where this share of its light is left
-FAINTEST_SURFACE = (
-    3e-3  # of full scale; where a ray ends in less light nothing tells matter from the black sky
-)
+# of full scale; where a ray ends in less light nothing tells matter from the black sky
+FAINTEST_SURFACE = 3e-3
 SURFACE_VIEWS = 40  # at most, spread evenly, whose depths are fused
 
 

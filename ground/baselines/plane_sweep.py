@@ -35,9 +35,8 @@ class SweepSettings:
 
     window_px: int = 7  # odd; windows of this width are correlated
     sources: int = 6  # views with which each is matched
-    kept: int = (
-        3  # the best correlations of each pixel and plane are averaged: in the others it may be hidden
-    )
+    # the best correlations of each pixel and plane are averaged: in the others it may be hidden
+    kept: int = 3
     plane_px: float = 1.0  # from plane to plane a point moves so far in the picture of the widest baseline
     fusion: FusionSettings = field(default_factory=lambda: FusionSettings(least_confidence=0.2))
 

@@ -1,19 +1,30 @@
-"""The viewer's port: a server that binds exactly what was asked for and answers only the page that it served itself."""
+"""The viewer's port: a server that binds exactly what was asked for and answers only the page that it served itself.
+
+What that page could not have said ends its connection before viser acts on it.
+"""
 
 import contextlib
 import functools
 import http
 import io
 import ipaddress
+import logging
 import socket
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any
 from urllib.parse import urlsplit
 
 import viser
 import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+from ground.viewer.messages import wrong
 from obbgs_base.errors import ObbgsError
+
+log = logging.getLogger(__name__)
+POLICY_VIOLATION = 1008  # RFC 6455, section 7.4.1
+LONGEST_REASON = 120  # bytes; section 5.5 allows 123
 
 
 class ViewError(ObbgsError):
@@ -59,22 +70,45 @@ def refused(request: Request, host: str) -> str | None:
 
 @contextlib.contextmanager
 def _guarded(host: str) -> Iterator[None]:
-    """Let a server that is made in the block ask `refused` first; viser has no setting for that."""
+    """Let a server that is made in the block ask `refused` and `wrong` first; viser has no setting for that."""
     serve = websockets.asyncio.server.serve
 
-    def guarded_serve(*args, process_request, **options):
+    def guarded_serve(handler: Callable[[Any], Awaitable[None]], *args, process_request, **options):
+        async def checking(connection: ServerConnection) -> None:
+            await handler(_Checked(connection))
+
         def first(connection, request: Request) -> Response | None:
             if (reason := refused(request, host)) is not None:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
             return process_request(connection, request)
 
-        return serve(*args, process_request=first, **options)
+        return serve(checking, *args, process_request=first, **options)
 
     websockets.asyncio.server.serve = functools.wraps(serve)(guarded_serve)  # pyright: ignore[reportAttributeAccessIssue]
     try:
         yield
     finally:
         websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class _Checked:
+    """A connection that is closed at the first message which is `wrong`."""
+
+    def __init__(self, connection: ServerConnection):
+        self._connection = connection
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._connection, name)
+
+    async def recv(self) -> str | bytes:
+        data = await self._connection.recv()
+        if (reason := wrong(data)) is not None:
+            log.warning("a connection to the page is closed: %s", reason)
+            await self._connection.close(
+                POLICY_VIOLATION, reason.encode()[:LONGEST_REASON].decode(errors="ignore")
+            )
+            return await self._connection.recv()  # raises that it is closed
+        return data
 
 
 def _check_free(host: str, port: int) -> None:

@@ -29,9 +29,8 @@ NEAREST, FARTHEST = (
     1.4,
     40.0,
 )  # radii from the model that the camera may come to: the wheel never flies into it
-REACH = (
-    4.0  # the exposure slider reaches from a quarter of the shortest exposure to so many times the longest
-)
+# the exposure slider reaches from a quarter of the shortest exposure to so many times the longest
+REACH = 4.0
 PICTURE_PX = (1200, 800)
 TURNTABLE_PX = (480, 320)
 PARTS = ("splats", "cameras", "sun", "mesh")
@@ -200,7 +199,8 @@ class Viewer:
                     each.show(part, self._is_checked(part))
 
     def _expose(self, text: str) -> None:
-        self.exposure.value = float(text)
+        if text in self.brackets.options:
+            self.exposure.value = float(text)
 
     def _choose(self, record: FrameRecord) -> None:
         self.timeline.value = self.frames.index(record)

@@ -15,9 +15,8 @@ from hil.world.fly_around import RelativeElements, linear_motion
 
 ALONG_TRACK = 0.02  # of the range
 OTHER_ELEMENTS = 0.002  # of the range, each: eccentricity and inclination vectors
-DRIFT = (
-    0.0002  # of the range: the difference of semi-major axes, 0.2 % of the range along the track in an orbit
-)
+# of the range: the difference of semi-major axes, 0.2 % of the range along the track in an orbit
+DRIFT = 0.0002
 SPIN_RATE = 0.002  # relative
 BORESIGHT_DEG = 0.1
 CLOCK_S = 0.02

@@ -9,9 +9,8 @@ from torch import Tensor
 
 from obbgs_core.attitude.views import Views
 
-FORGIVEN = (
-    0.05  # share of the views that see no light at a point of the target, by which its occupancy falls to 1/e
-)
+# share of the views that see no light at a point of the target, by which its occupancy falls to 1/e
+FORGIVEN = 0.05
 FILL = 0.85  # spacing of the points, in cells
 
 

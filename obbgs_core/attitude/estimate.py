@@ -33,9 +33,8 @@ EXPLAINED = 0.15  # a motion explains the outlines when it leaves less than this
 TUMBLES = 0.9  # a tumble is believed when it leaves less than this share of what a steady spin leaves
 OVERDISPERSION = 2.0  # by which measured errors exceed the deviations of the refinement
 LEAST_UNRELATED = 1.0  # disagreement, per ray: true motions of other targets leave 0.5 to 1
-ROUND = (
-    0.05  # of that disagreement, at most, is left when a body is rolled about an axis that it is round about
-)
+# of that disagreement, at most, is left when a body is rolled about an axis that it is round about
+ROUND = 0.05
 LARGEST_SIGMA_DEG = 10.0  # of the attitude in the mean of the pass; with more it counts as not determined
 POLISHING = 8  # steps
 

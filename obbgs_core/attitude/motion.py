@@ -9,12 +9,10 @@ trace, as only ratios of moments show in the motion. Any such matrix belongs to 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import solve_ivp
-from scipy.spatial.transform import Rotation
+
+from obbgs_base.free_rotation import free_rotation, rotations
 
 SPIN, TUMBLE = 3, 8  # numbers of parameters
-TOLERANCE = 1e-7  # of the integrated attitude, rad for each step
-AT_REST_RAD_S = 1e-15  # a millionth of a degree in a year
 # an orthonormal basis [5, 3, 3] of the symmetric matrices without trace
 _SHAPES = np.zeros((5, 3, 3))
 _SHAPES[0] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2)
@@ -59,59 +57,13 @@ def of_principal(rate_rad_s: np.ndarray, moments: np.ndarray, axes: np.ndarray) 
 
 
 def attitudes(parameters: np.ndarray, times_s: np.ndarray) -> np.ndarray:
-    """Return the rotations from inertial to body axes [B, N, 3, 3] of motions [B, 3 or 8] at times [N] from the epoch.
-
-    Source: Euler's equations I dω/dt = Iω x ω in body axes, and dq/dt = q (0, ω) / 2 (Markley and Crassidis,
-    Fundamentals of Spacecraft Attitude Determination and Control, 2014).
-    """
+    """Return how motions [B, 3 or 8] have turned at times [N] from the epoch: inertial to body axes [B, N, 3, 3]."""
     if parameters.shape[-1] == SPIN:
-        turns = parameters[:, None, :] * times_s[None, :, None]
-        return Rotation.from_rotvec(-turns.reshape(-1, 3)).as_matrix().reshape(*turns.shape, 3)
-    count = len(parameters)
-    moments = inertia(parameters)
-    inverse = np.linalg.inv(moments)
-
-    def derivative(_: float, flat: np.ndarray) -> np.ndarray:
-        state = flat.reshape(count, 7)
-        q, rate = state[:, :4], state[:, 4:]
-        w, v = q[:, :1], q[:, 1:]
-        momentum = np.einsum("bij,bj->bi", moments, rate)
-        return np.concatenate(
-            [
-                -0.5 * (v * rate).sum(axis=1, keepdims=True),
-                0.5 * (w * rate + np.cross(v, rate)),
-                np.einsum("bij,bj->bi", inverse, np.cross(momentum, rate)),
-            ],
-            axis=1,
-        ).ravel()
-
-    # the squares of slower rates vanish in the solver's error estimate
-    rates = np.where(np.abs(parameters[:, :SPIN]) > AT_REST_RAD_S, parameters[:, :SPIN], 0.0)
-    start = np.concatenate([np.tile([1.0, 0, 0, 0], (count, 1)), rates], axis=1).ravel()
-    quats = np.zeros((count, len(times_s), 4))
-    quats[:, :, 0] = 1
-    for sign in (1, -1):
-        ahead = np.flatnonzero(sign * times_s > 0)
-        if len(ahead) == 0:
-            continue
-        ahead = ahead[np.argsort(sign * times_s[ahead], kind="stable")]
-        asked, place = np.unique(sign * times_s[ahead], return_inverse=True)
-        solved = solve_ivp(
-            derivative,
-            (0.0, sign * asked[-1]),
-            start,
-            method="DOP853",
-            t_eval=sign * asked,
-            rtol=TOLERANCE,
-            atol=TOLERANCE * np.tile([1.0] * 4 + [1e-2] * 3, count),
-        )
-        if not solved.success:
-            raise ValueError(
-                f"the motion cannot be integrated: {solved.message}; parameters {parameters.tolist()}"
-            )
-        quats[:, ahead] = solved.y.reshape(count, 7, -1)[:, :4].transpose(0, 2, 1)[:, place]
-    body_to_inertial = Rotation.from_quat(quats.reshape(-1, 4)[:, [1, 2, 3, 0]]).as_matrix()
-    return body_to_inertial.reshape(count, len(times_s), 3, 3).swapaxes(-1, -2)
+        return rotations(-parameters[:, None, :] * times_s[None, :, None])
+    moments, axes = np.linalg.eigh(inertia(parameters))
+    axes = axes * np.sign(np.linalg.det(axes))[:, None, None]
+    turned, _ = free_rotation(times_s, np.einsum("bji,bj->bi", axes, parameters[:, :SPIN]), moments)
+    return axes[:, None] @ turned @ axes[:, None].swapaxes(-1, -2)
 
 
 def at_epoch(parameters: np.ndarray, epoch_s: float) -> np.ndarray:

@@ -18,6 +18,7 @@ match there and let a viewer see through the surface from nearer.
 """
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ import torch
 from torch import Tensor
 
 from obbgs_base.files import write_whole
-from obbgs_core.errors import ReconstructionError
+from obbgs_core.errors import ExportError, ReconstructionError
 from obbgs_core.model import sh
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.footprint import KERBL_PX2, PIXEL_PX2, lowers_peak
@@ -59,6 +60,17 @@ def radiance_sh(display: Tensor, white_radiance: float, channels: int) -> Tensor
         shown = shown.mean(dim=2, keepdim=True)
     before_softplus = sh.C0 * sh.from_radiance(white_radiance * shown.clamp(min=0) ** DISPLAY_GAMMA)
     return torch.einsum("kd,ndc->nkc", to_coefficients, before_softplus)
+
+
+def require_writable(gaussians: Gaussians, white_radiance: float) -> None:
+    """Raise ExportError if there is no Gaussian, a parameter that is not finite, or no radiance to show as white."""
+    if len(gaussians) == 0:
+        raise ExportError("there is no Gaussian to write")
+    for name, tensor in gaussians.tensors().items():
+        if not tensor.isfinite().all():
+            raise ExportError(f"{name} holds values that are not finite")
+    if not (math.isfinite(white_radiance) and white_radiance > 0):
+        raise ExportError(f"white_radiance must be a positive radiance, got {white_radiance}")
 
 
 def save_ply(

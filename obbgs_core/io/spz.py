@@ -24,9 +24,10 @@ import torch
 
 from obbgs_base.files import write_whole
 from obbgs_core.errors import ExportError, ReconstructionError
-from obbgs_core.io.ply import display_sh, radiance_sh
+from obbgs_core.io.ply import display_sh, radiance_sh, require_writable
 from obbgs_core.model import sh
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.rotations import unit
 from obbgs_core.render import lit_from
 
 FLIP = torch.tensor([1.0, -1.0, -1.0])  # a rotation by 180 degrees about x, its own inverse
@@ -56,19 +57,12 @@ def save_spz(
         ExportError: the model is empty, not finite, or reaches farther than 24 bits of fixed point allow.
     """
     gaussians = lit_from(gaussians.detach(), sun_dir)
-    if len(gaussians) == 0:
-        raise ExportError("there is no Gaussian to write")
-    for name, tensor in gaussians.tensors().items():
-        if not tensor.isfinite().all():
-            raise ExportError(f"{name} holds values that are not finite")
-    if not (math.isfinite(white_radiance) and white_radiance > 0):
-        raise ExportError(f"white_radiance must be a positive radiance, got {white_radiance}")
+    require_writable(gaussians, white_radiance)
     extent_m = float(gaussians.means.abs().max())
     bits = min(MAX_FRACTIONAL_BITS, math.floor(math.log2(LARGEST_FIXED_POINT / max(extent_m, 1e-6))))
     if bits < 1:
         raise ExportError(f"means reach {extent_m:.3g} m; SPZ holds at most {LARGEST_FIXED_POINT / 2:.3g} m")
-    quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
-    quats[quats.norm(dim=1) == 0] = torch.tensor([1.0, 0.0, 0.0, 0.0])  # as in `rotations`
+    quats = unit(gaussians.quats)
     shown = display_sh(gaussians, white_radiance) * _sh_signs(gaussians.sh.shape[1])
     packed = gsply.GSData(
         means=(gaussians.means * FLIP).numpy(),

@@ -4,12 +4,16 @@ import torch
 from torch import Tensor
 
 
-def quats_to_matrices(quats: Tensor) -> Tensor:
-    """Return rotations [..., 3, 3] of quaternions [..., 4]; they need not be unit, a zero one gives the identity."""
+def unit(quats: Tensor) -> Tensor:
+    """Return quaternions [..., 4] scaled to length 1; a zero one becomes the identity."""
     length = quats.norm(dim=-1, keepdim=True)
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
-    unit = torch.where(length > 1e-12, quats / length.clamp(min=1e-12), identity)
-    w, x, y, z = unit.unbind(-1)
+    return torch.where(length > 1e-12, quats / length.clamp(min=1e-12), identity)
+
+
+def quats_to_matrices(quats: Tensor) -> Tensor:
+    """Return rotations [..., 3, 3] of quaternions [..., 4]; they need not be unit, a zero one gives the identity."""
+    w, x, y, z = unit(quats).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z),
         2 * (x * y - w * z),

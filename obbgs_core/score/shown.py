@@ -13,9 +13,8 @@ from obbgs_core.sensor import Sensor, dark_reading
 
 SHOWN_SIGMA = 5.0  # of the noise of the light of all frames together
 FEWEST_VIEWS = 2  # one alone tells no depth
-POINTS_PER_CELL = (
-    2.0  # of the surface facing a camera, at least: through emptier cells those behind would be seen
-)
+# of the surface facing a camera, at least: through emptier cells those behind would be seen
+POINTS_PER_CELL = 2.0
 SAME_DEPTH_CELLS = 3.0  # behind the nearest point of its cell, in widths of a cell, a point is still in view
 
 

@@ -23,9 +23,8 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 
-PRIOR = (
-    0.5  # standard deviation of log scales, opacity logits and quaternions of which the frames say nothing
-)
+# standard deviation of log scales, opacity logits and quaternions of which the frames say nothing
+PRIOR = 0.5
 DRAWS = 16  # models drawn for a deviation
 MIXTURE = 24  # normal distributions that stand for a Student distribution
 FEWEST_DEGREES, MOST_DEGREES = 2.0, 100.0

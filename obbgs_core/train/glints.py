@@ -22,12 +22,10 @@ from obbgs_core.sensor import Sensor
 from obbgs_core.train.appearance import Shadows
 from obbgs_core.train.batches import Batches
 
-HIGHLIGHTS_FROM = (
-    0.15  # share of the steps at which highlights are tested; later they gain less (experiment 042)
-)
-FEWEST_STEPS = (
-    100  # before that a model has not settled, and parallax that it does not have yet looks like highlights
-)
+# share of the steps at which highlights are tested; later they gain less (experiment 042)
+HIGHLIGHTS_FROM = 0.15
+# before that a model has not settled, and parallax that it does not have yet looks like highlights
+FEWEST_STEPS = 100
 VIEWS = 120  # training frames that are rendered, spread evenly: few of them show the glint of one Gaussian
 SAMPLE = 192  # Gaussians that decide, spread evenly
 ALPHAS = (0.2, 0.4)  # roughness of GGX that is tried

@@ -11,20 +11,14 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ground.compare.origin import this_command, with_origin
+from ground.compare.results import with_best
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "results"
-NAMES = (
-    "method",
-    "ablation",
-    "condition",
-    "scenario",
-    "target",
-)  # what a line of a table is called by, where a row has it
-BUDGETS = {
-    "steps_share": "share of the steps",
-    "largest": "at most Gaussians",
-}  # and these where rows differ in them
+# what a line of a table is called by, where a row has it
+NAMES = ("method", "ablation", "condition", "scenario", "target")
+# and these where rows differ in them
+BUDGETS = {"steps_share": "share of the steps", "largest": "at most Gaussians"}
 FIGURES = {  # key of a row: column title and format
     "psnr_clean_db": ("clean PSNR", "{:.2f} dB"),
     "psnr_settled_db": ("from settled poses", "{:.2f} dB"),
@@ -40,6 +34,7 @@ FIGURES = {  # key of a row: column title and format
     "psnr_srgb_db": ("sRGB PSNR", "{:.2f} dB"),
     "psnr_foreground_db": ("foreground", "{:.2f} dB"),
     "psnr_clean_pooled_db": ("pooled", "{:.2f} dB"),
+    "psnr_best_db": ("best on the way", "{:.2f} dB"),
     "ssim_clean": ("SSIM", "{:.4f}"),
     "lpips": ("LPIPS", "{:.4f}"),
     "chamfer": ("Chamfer", "{:.4f}"),
@@ -74,7 +69,7 @@ def page(files: Iterable[Path]) -> str:
         "Made from `results/*.jsonl` by `python -m tests.benchmarks.rows`; do not edit.\n",
     ]
     for file in files:
-        rows = [json.loads(line) for line in file.read_text().splitlines() if line]
+        rows = [with_best(json.loads(line)) for line in file.read_text().splitlines() if line]
         parts.append(f"## {file.stem.replace('-', ' ')}\n")
         for key, title in (("commit", "Commit"), ("machine", "Machine"), ("command", "Command")):
             values = sorted({str(row[key]) for row in rows if key in row})

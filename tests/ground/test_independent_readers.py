@@ -1,4 +1,4 @@
-"""Our PLY and SPZ in other people's programs: what they read, and their pictures against our renderer's."""
+"""Our PLY, SPZ and glTF in other people's programs: what they read, and their pictures against our renderer's."""
 
 import dataclasses
 import json
@@ -12,6 +12,7 @@ import torch
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
+from obbgs_core.io.gltf_splats import save_gltf_splats
 from obbgs_core.io.ply import DISPLAY_GAMMA, save_ply
 from obbgs_core.io.spz import save_spz
 from obbgs_core.model.cameras import Cameras
@@ -69,6 +70,22 @@ await mesh.initialized;
 renderer.setAnimationLoop(() => { renderer.render(scene, camera); });
 """
 
+BABYLON = """
+import "/node_modules/babylonjs/babylon.js";
+import "/node_modules/babylonjs-loaders/babylonjs.loaders.min.js";
+const scene = new BABYLON.Scene(new BABYLON.Engine(canvas, false));
+scene.useRightHandedSystem = true;
+scene.clearColor = new BABYLON.Color4(0, 0, 0, 1);
+await BABYLON.SceneLoader.AppendAsync("", view.file, scene);
+const turn = new BABYLON.Quaternion(-Math.SQRT1_2, 0, 0, Math.SQRT1_2);  // the body's z axis points up, along glTF's y
+const camera = new BABYLON.FreeCamera("camera", new BABYLON.Vector3(...view.position).applyRotationQuaternion(turn));
+const [w, x, y, z] = view.quat, downwards = new BABYLON.Quaternion(1, 0, 0, 0);  // its cameras have y up, look along -z
+camera.rotationQuaternion = turn.multiply(new BABYLON.Quaternion(x, y, z, w)).multiply(downwards);
+camera.updateUpVectorFromRotation = true;
+camera.fov = 2 * Math.atan(view.size / 2 / view.focal);
+camera.minZ = 0.1;
+scene.getEngine().runRenderLoop(() => scene.render());
+"""
 
 NO_EFFECTS = {  # of SuperSplat's viewer
     "sharpness": {"enabled": False, "amount": 0},
@@ -174,12 +191,14 @@ def drawn(browser, programs: Path, folder: Path, page_text: str) -> np.ndarray:
         pytest.param(GSPLAT, "model.ply", 1, id="gsplat.js"),  # knows neither harmonics nor SPZ
         pytest.param(SPARK, "model.ply", 4, id="Spark, PLY"),
         pytest.param(SPARK, "model.spz", 4, id="Spark, SPZ"),
+        pytest.param(BABYLON, "splats.glb", 4, id="Babylon.js, glTF"),
     ],
 )
 def test_it_draws_our_file_as_we_do(browser, programs, tmp_path, program, file, sh_count, footprint):
     gaussians, cameras = solid(footprint, sh_count, 3), [camera_at(direction) for direction in VIEWS]
     save_ply(gaussians, tmp_path / "model.ply", WHITE_RADIANCE, cameras=cameras[0])
     save_spz(gaussians, tmp_path / "model.spz", WHITE_RADIANCE)
+    save_gltf_splats(gaussians, tmp_path / "splats.glb", WHITE_RADIANCE, cameras=cameras[0])
     camera = cameras[1]
     text = PAGE.format(size=SIZE_PX, view=json.dumps(view_of(camera, file)), program=program)
     theirs, expected = drawn(browser, programs, tmp_path, text), ours(gaussians, camera)

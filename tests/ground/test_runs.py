@@ -39,7 +39,7 @@ from obbgs_core.train.result import StepInfo
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 QUICK = {"steps": 8, "start.count": 600, "growth.max_gaussians": 800, "light.sh_degree": 0}
-FILES = {"model.ply", "model.spz", "model.glb", "surface.ply", "model.onnx"}
+FILES = {"model.ply", "model.spz", "splats.glb", "model.glb", "surface.ply", "model.onnx"}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -72,6 +72,7 @@ def fail(*arguments, **named):
     ("part", "missing"),
     [
         ("save_spz", "model.spz"),
+        ("save_gltf_splats", "splats.glb"),
         ("surface_points", "surface.ply"),
         ("write_mesh", "model.glb"),
         ("export_onnx", "model.onnx"),

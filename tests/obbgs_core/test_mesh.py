@@ -2,7 +2,6 @@
 
 import json
 import math
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from obbgs_core.io.mesh import save_mesh
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.mesh import SurfaceMesh
 from obbgs_core.score.mesh import surface_mesh
+from tests import readers
 from tests.obbgs_core.test_surface import SIZE, cameras_around, discs, sphere
 
 ROOT = Path(__file__).parents[2]
@@ -114,14 +114,9 @@ def test_the_files_keep_how_many_views_saw_each_vertex(ball, tmp_path):
 
 
 def test_khronos_own_validator_has_nothing_to_say(ball, tmp_path):
-    if not shutil.which("node") or not (ROOT / "node_modules" / "gltf-validator").is_dir():
-        pytest.skip("npm install --no-save gltf-validator, in the project's folder, brings the validator")
+    programs = readers.installed()
     save_mesh(ball, tmp_path / "mesh.glb", 1.0)
-    script = """const bytes = new Uint8Array(require("fs").readFileSync(process.argv[1]));
-        require("gltf-validator").validateBytes(bytes).then(r => console.log(JSON.stringify(r.issues)));"""
-    arguments = ["node", "-e", script, str(tmp_path / "mesh.glb")]
-    done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60)
-    issues = json.loads(done.stdout)
+    issues = readers.gltf_issues(programs, tmp_path / "mesh.glb")
     assert (issues["numErrors"], issues["numWarnings"], issues["numInfos"]) == (0, 0, 0), issues["messages"]
 
 

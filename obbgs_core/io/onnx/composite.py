@@ -10,9 +10,8 @@ from obbgs_core.io.onnx.graph import Graph
 from obbgs_core.io.onnx.projection import Projected, View
 from obbgs_core.render.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
-TILE = (
-    16  # px: with 8 there are more calls, with 32 more pixels that a Gaussian does not reach; both are slower
-)
+# px: with 8 there are more calls, with 32 more pixels that a Gaussian does not reach; both are slower
+TILE = 16
 
 
 def composite(

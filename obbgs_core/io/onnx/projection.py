@@ -11,9 +11,8 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.projection import FOV_MARGIN, MIN_PEAK_SHARE
 from obbgs_core.render.reference import MIN_ALPHA
 
-NOT_REACHED_PX = (
-    1e9  # subtracted from the extent of Gaussians that are not drawn: a negative box reaches no tile
-)
+# subtracted from the extent of Gaussians that are not drawn: a negative box reaches no tile
+NOT_REACHED_PX = 1e9
 
 
 @dataclass(frozen=True)

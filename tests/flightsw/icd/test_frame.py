@@ -25,9 +25,8 @@ from flightsw.icd.frame import (
     read_header,
 )
 
-SPIFF_BYTES = (
-    44  # an optional header that other writers of JPEG-LS put first (ISO 14495-1, annex F of part 2)
-)
+# an optional header that other writers of JPEG-LS put first (ISO 14495-1, annex F of part 2)
+SPIFF_BYTES = 44
 finite = st.floats(-1e6, 1e6)
 own_fixture = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 

@@ -94,6 +94,17 @@ def test_gains_are_positive_where_a_method_is_better():
     assert results.gain("obbgs", "3dgs", "A", "lpips") is None
 
 
+def test_a_method_that_comes_to_fit_the_noise_is_shown_with_the_best_point_of_its_curve():
+    curve = [
+        {"share": share, "psnr_clean_db": value} for share, value in ((0.1, 31.0), (0.5, 33.0), (1.0, 30.0))
+    ]
+    results = Results(
+        [row("3dgs", psnr_clean_db=30.0, curve=curve), row("black", psnr_clean_db=26.0, curve=[])]
+    )
+    assert results.mean("3dgs", "A", "as taken", "psnr_best_db") == 33.0
+    assert results.mean("black", "A", "as taken", "psnr_best_db") is None
+
+
 def test_trainings_of_several_budgets_are_told_apart():
     rows = [
         row("3dgs", psnr_clean_db=30.0),
