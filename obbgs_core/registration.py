@@ -51,6 +51,7 @@ class CellInformation:
 @torch.no_grad()
 def pose_information(
     radiance: Tensor,
+    slopes: Tensor,
     alpha: Tensor,
     depth: Tensor,
     cameras: Cameras,
@@ -69,7 +70,8 @@ def pose_information(
     solution.
 
     Args:
-        radiance [B, H, W, C], alpha and depth [B, H, W]: rendered with the cameras.
+        radiance [B, H, W, C], its slopes [B, H, W, C, 2] along x and y, per px, alpha and depth [B, H, W]: rendered
+            with the cameras.
         exposure_time_s, dn, averaged_pixels: as for `losses.likelihood_loss`.
         cell_m: above 0: edge of the cubes that the surface is divided into. The values of a cube in a picture are then
             counted as one, because what a model still gets wrong is alike in neighbouring pixels and channels.
@@ -78,7 +80,7 @@ def pose_information(
     for i in range(len(radiance)):
         seen = alpha[i] > ON_TARGET_ALPHA
         near = F.max_pool2d(seen[None, None].float(), 3, 1, 1)[0, 0] > 0
-        slope = _image_slope(radiance[i], near)  # [n, C, 2]
+        slope = slopes[i][near]  # [n, C, 2]
         points = _points(depth[i], seen, near, cameras.K[i])  # [n, 3]
         flow = point_flow(points, cameras.K[i].expand(len(points), 3, 3))  # [n, 2, 6]
         residual, by_radiance = _residual(
@@ -118,14 +120,6 @@ def _cell_information(
     products = (weight[:, None] * by_point)[:, :, None] * table[:, None, :]
     summed = torch.zeros(len(cells), 3, 10, dtype=torch.float64).index_add(0, place, products)
     return CellInformation(cells, summed[..., 9], summed[..., :3], summed[..., 3:9])
-
-
-def _image_slope(image: Tensor, at: Tensor) -> Tensor:
-    """Return the derivatives [n, C, 2] of an image [H, W, C] along x and y at chosen pixels, by central differences."""
-    padded = F.pad(image.movedim(-1, 0)[None], (1, 1, 1, 1), mode="replicate")[0].movedim(0, -1)
-    dx = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2
-    dy = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
-    return torch.stack([dx[at], dy[at]], dim=-1)
 
 
 def _points(depth: Tensor, seen: Tensor, at: Tensor, K: Tensor) -> Tensor:

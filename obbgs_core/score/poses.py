@@ -19,7 +19,7 @@ from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
 from obbgs_core.model.rotations import from_rotation_vectors, multiply
 from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.registration import point_flow, pose_information
-from obbgs_core.render import render
+from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.sensor import Sensor
 
 ROUNDS = 8  # of aligning, Gauss-Newton
@@ -152,7 +152,7 @@ def _settled(model: Gaussians, frame: TrainingFrame, sensor: Sensor) -> Tensor:
         dn, cameras = averaged(frame.dn, factor, sensor.white_dn)[None], whole.scaled(1 / factor)
         for _ in range(STEPS):
             at = poses.cameras([0], cameras)
-            rendered = render(model, at)
+            rendered, slopes = render_with_slopes(model, at)
             images = (exposure_s, dn, sensor, factor * factor)
             if factor == 1:
                 loss = likelihood_loss(rendered.radiance, *images)[0].item() * dn.numel()
@@ -161,9 +161,8 @@ def _settled(model: Gaussians, frame: TrainingFrame, sensor: Sensor) -> Tensor:
                     (loss + 0.5 * poses.value.square().sum().item(), poses.corrected([0])[0]),
                     key=_first,
                 )
-            poses.gather(
-                [0], pose_information(rendered.radiance, rendered.alpha, rendered.depth, at, *images)
-            )
+            views = (rendered.radiance, slopes, rendered.alpha, rendered.depth)
+            poses.gather([0], pose_information(*views, at, *images))
             poses.step(alone)
     return best[1]
 

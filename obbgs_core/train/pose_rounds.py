@@ -5,9 +5,10 @@ import logging
 import torch
 from torch import Tensor
 
+from obbgs_core.misfit import relative_misfit
 from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.registration import pose_information
-from obbgs_core.render import render
+from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.poses import ALIGNED_FROM
 from obbgs_core.train.setup import TrainingSetup
@@ -19,8 +20,9 @@ RENDERED = 6  # frames at a time
 # share of the steps after which brackets that do not fit are left out: poses have mostly settled
 MISFIT_FROM = 0.6
 # of the logarithms of the brackets' residuals: median absolute deviations, scaled to those of a normal distribution,
-# above the median, and the least factor above it
-MISFIT_DEVIATIONS, MISFIT_FACTOR = 6.0, 5.0
+# above the median
+MISFIT_DEVIATIONS = 6.0
+MISFIT_FACTOR = 6.0  # and the residual as a share of the picture's light is above the median by this factor
 log = logging.getLogger(__name__)
 
 
@@ -57,22 +59,30 @@ def move(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
         if index not in left_out:
             brackets[bracket].append(index)
     shown = [members for members in brackets if members]
-    dispersion = _gather(setup, state, [members[turn % len(members)] for members in shown], scale)
+    residuals = _gather(setup, state, [members[turn % len(members)] for members in shown], scale)
     whole = setup.config.steps_until(1) - setup.config.steps_until(0)
     since = state.steps_done - setup.config.steps_until(MISFIT_FROM)
     if 0 <= since < round(whole / ROUNDS):
-        _leave_out(setup, state, [shown[i] for i in torch.nonzero(standing_out(dispersion))[:, 0].tolist()])
+        _leave_out(setup, state, [shown[i] for i in torch.nonzero(standing_out(*residuals))[:, 0].tolist()])
     poses.step(setup.frames)
     poses.clear()
     state.gaussians = poses.fix_gauge(state.gaussians.detach(), setup.frames).trainable()
 
 
-def standing_out(dispersion: Tensor) -> Tensor:
-    """Return which residuals [P] are so far above most others that something else than the model's error is in them."""
+def standing_out(dispersion: Tensor, share: Tensor) -> Tensor:
+    """Return which of P pictures are so far off that something else than the model's error is in them.
+
+    Both residuals have to say so: the smallest error of a pose shows in deviations of the noise where thin structures
+    are seen edge-on, but it moves little of the picture's light there.
+
+    Args:
+        dispersion: [P] mean squares in deviations of the noise, NaN where the target is not in the picture.
+        share: [P] of the picture's light (`relative_misfit`), also NaN there.
+    """
     logs = dispersion.log()
-    above = logs - logs.nanmedian()  # NaN: the target is not in the picture
-    spread = 1.4826 * above.abs().nanmedian()
-    return above > torch.maximum(MISFIT_DEVIATIONS * spread, torch.tensor(MISFIT_FACTOR).log())
+    above = logs - logs.nanmedian()
+    far = above > MISFIT_DEVIATIONS * 1.4826 * above.abs().nanmedian()
+    return far & (share > MISFIT_FACTOR * share.nanmedian())
 
 
 def _leave_out(setup: TrainingSetup, state: TrainingState, brackets: list[list[int]]) -> None:
@@ -110,21 +120,27 @@ def estimate(setup: TrainingSetup, state: TrainingState, scale: float) -> PoseEs
 
 
 @torch.no_grad()
-def _gather(setup: TrainingSetup, state: TrainingState, indices: list[int], scale: float) -> Tensor:
+def _gather(
+    setup: TrainingSetup, state: TrainingState, indices: list[int], scale: float
+) -> tuple[Tensor, Tensor]:
     """Let pictures of the model as it stands say what the frames tell of their poses and of the surface.
 
-    Returns the mean squared residual [len(indices)] of each.
+    Returns the residual of each [len(indices)]: its mean square in deviations of the noise, and its share of the light.
     """
     poses, model = state.poses, state.model.detach()
     assert poses is not None
-    dispersions = []
+    dispersions, shares = [], []
     for first in range(0, len(indices), RENDERED):
         batch = setup.batches.batch(indices[first : first + RENDERED], scale)
         cameras = poses.cameras(batch.indices, batch.cameras)
-        rendered = render(model, cameras)
-        images = (rendered.radiance, rendered.alpha, rendered.depth)
+        rendered, slopes = render_with_slopes(model, cameras)
+        images = (rendered.radiance, slopes, rendered.alpha, rendered.depth)
         readings = (batch.exposure_time_s, batch.dn, setup.sensor, batch.averaged_pixels)
         told = pose_information(*images, cameras, *readings, cell_m=cell_m(setup))
         poses.gather(batch.indices, told)
         dispersions.append(told.dispersion)
-    return torch.cat(dispersions)
+        for one in range(len(cameras)):
+            at = slice(one, one + 1)
+            seen = (rendered.radiance[at], batch.exposure_time_s[at], batch.dn[at])
+            shares.append(relative_misfit(*seen, setup.sensor, batch.averaged_pixels))
+    return torch.cat(dispersions), torch.tensor(shares)

@@ -10,7 +10,7 @@ from obbgs_core.losses import likelihood_loss
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.registration import PoseInformation, pose_information
-from obbgs_core.render import render
+from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.batches import Batch
 
@@ -72,10 +72,9 @@ def _evidence(
     root = poses.whitening.root[row].double()
     for _ in range(FIT_STEPS + 1):
         cameras = poses.cameras(batch.indices, batch.cameras)
-        with torch.no_grad():
-            rendered = render(model, cameras)
+        rendered, slopes = render_with_slopes(model, cameras)
         loss = likelihood_loss(rendered.radiance, *images)[0].item()
-        views = (rendered.radiance, rendered.alpha, rendered.depth, cameras)
+        views = (rendered.radiance, slopes, rendered.alpha, rendered.depth, cameras)
         told = pose_information(*views, *images, cell_m=cell_m)
         told = PoseInformation(told.gradient / count, told.curvature / count)
         precision = torch.eye(6, dtype=torch.float64) + root.T @ told.curvature.sum(0) @ root

@@ -63,13 +63,18 @@ def test_frames_that_err_as_their_tags_say_all_stay(frames):
 def test_residuals_stand_out_by_scipys_median_absolute_deviation():
     rng = np.random.default_rng(3)
     residuals = np.exp(rng.normal(2, 0.3, 60))
-    residuals[[5, 40]] *= [30, 8]
+    residuals[[5, 40]] *= [3000, 20]
     residuals[7] = np.nan  # the target is not in the picture
+    shares = np.sqrt(residuals)
+    shares[40] = np.nanmedian(shares)  # thin structures: many deviations of the noise, but little light
     logs = np.log(residuals)
     spread = stats.median_abs_deviation(logs, scale="normal", nan_policy="omit")
-    limit = np.nanmedian(logs) + max(MISFIT_DEVIATIONS * spread, np.log(MISFIT_FACTOR))
-    found = standing_out(torch.from_numpy(residuals))
-    assert found[5] and not found[7]
-    np.testing.assert_array_equal(found.numpy(), logs > limit)
-    alike = standing_out(torch.tensor([1.0, 1.0, 1.0, 4.8, 5.2]))
-    assert alike.tolist() == [False, False, False, False, True]
+    limit = np.nanmedian(logs) + MISFIT_DEVIATIONS * spread
+    assert (logs > limit)[[5, 40]].all()
+    found = standing_out(torch.from_numpy(residuals), torch.from_numpy(shares))
+    assert found[5] and not found[7] and not found[40]
+    np.testing.assert_array_equal(
+        found.numpy(), (logs > limit) & (shares > MISFIT_FACTOR * np.nanmedian(shares))
+    )
+    far, shares = torch.tensor([1.0, 1.0, 1.0, 9.0, 9.0]), torch.tensor([0.0, 0.1, 0.1, 0.55, 0.65])
+    assert standing_out(far, shares).tolist() == [False, False, False, False, True]

@@ -21,6 +21,7 @@ from obbgs_core.model.pose_covariance import flaw, whitening
 from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.registration import pose_information
 from obbgs_core.render import render
+from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.start.alignment import MOST_DILATION_PX, _error_px, settled
 from obbgs_core.start.initialisation import silhouettes
 from obbgs_core.train.batches import Batches
@@ -80,11 +81,10 @@ def fitted(frames: list[TrainingFrame], steps: int = 8) -> PoseCorrections:
     everything = list(range(len(frames)))
     batch = Batches(frames, SENSOR.white_dn).batch(everything, 1.0)
     for _ in range(steps):
-        with torch.no_grad():
-            rendered = render(gaussians, poses.cameras(everything, batch.cameras))
-        images = (rendered.radiance, rendered.alpha, rendered.depth)
-        readings = (batch.exposure_time_s, batch.dn, SENSOR, batch.averaged_pixels)
         cameras = poses.cameras(everything, batch.cameras)
+        rendered, slopes = render_with_slopes(gaussians, cameras)
+        images = (rendered.radiance, slopes, rendered.alpha, rendered.depth)
+        readings = (batch.exposure_time_s, batch.dn, SENSOR, batch.averaged_pixels)
         poses.gather(everything, pose_information(*images, cameras, *readings))
         poses.step(frames)
     return poses
