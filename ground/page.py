@@ -43,7 +43,8 @@ pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px;
 @media (max-width: 760px) {
   main { padding: 16px 8px 40px; } section { padding: 14px 12px; } h1 { font-size: 21px; overflow-wrap: anywhere; }
   .cards, .two { grid-template-columns: minmax(0, 1fr); } .two > * { min-width: 0; }
-  .card b { font-size: 20px; } td { padding: 5px 4px; overflow-wrap: anywhere; } .grid { gap: 3px; }
+  .card b { font-size: 20px; } td { padding: 5px 4px; overflow-wrap: anywhere; }
+  td.n { white-space: normal; } .grid { gap: 3px; }
   .grid .label, .grid figcaption { font-size: 10px; overflow-wrap: anywhere; }
 }
 """

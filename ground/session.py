@@ -353,7 +353,21 @@ def _record(tree: Any) -> FrameRecord:
         )
     if not FRAME_FILE.fullmatch(values["file"]):
         raise ValueError(f"file is {values['file']!r}, expected frames/000123.png")
+    if values["id"] < 0 or values["exposure_time_s"] <= 0:
+        raise ValueError(
+            f"expected a frame of at least 0 and an exposure time above 0, got frame {values['id']} and "
+            f"{values['exposure_time_s']} s"
+        )
+    if not is_pose(values["world_to_camera"]):
+        raise ValueError(f"world_to_camera must turn and move, got {values['world_to_camera'].tolist()}")
     return FrameRecord(**values)
+
+
+def is_pose(matrix: np.ndarray) -> bool:
+    """Return whether [4, 4] finite numbers are a rotation and a translation."""
+    R = matrix[:3, :3]
+    turns = np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0
+    return bool(turns and (matrix[3] == (0, 0, 0, 1)).all())
 
 
 def is_pinhole(K: np.ndarray) -> bool:

@@ -188,7 +188,13 @@ def test_the_controls_work_and_no_wheel_flies_into_the_model(session, browser, t
         np.testing.assert_array_equal(saved[..., :3], pixels(page, CANVAS))
 
 
-def test_the_report_fits_a_telephone(session, browser):
+def test_the_report_fits_a_telephone(session, browser, tmp_path):
+    """With a simulator's long facts: the six differences of two orbits stand in one cell."""
+    session = Path(shutil.copytree(session, tmp_path / "session"))
+    truth = session / "truth" / "truth.json"
+    facts = json.loads(truth.read_text())
+    orbit = "da -0.13, dlambda -7.99, dex -1.15, dey -0.91, dix 0.46, diy 0.90"
+    truth.write_text(json.dumps(facts | {"simulation": {"navigation": {"orbit_error_m": orbit}}}))
     with opened(browser, as_url(write_report(session, "run")), 390, 800) as page:
         page.wait_for_selector(".main-svg")
         assert page.evaluate("() => document.documentElement.scrollWidth") <= 390

@@ -25,6 +25,8 @@ from flightsw.icd.transfer.pdu import (
 )
 
 POLL_S = 0.02  # between looks at the timers of the transactions
+# of memory that all open files may take, in files of the largest size: a short packet can claim any byte of a file
+LARGEST_FILES = 4
 MAX_NAK_BYTES = 128  # of a PDU: a short one gets through where a CAN bus loses most long messages
 
 
@@ -112,6 +114,7 @@ class Receiver:
         if isinstance(pdu, FileDataPdu):
             self.segments_received += 1
             self.segments_resent += pdu.offset < receiving.received_up_to
+            self._make_room(receiving, pdu.offset + len(pdu.file_data))
             receiving.received_up_to = max(receiving.received_up_to, pdu.offset + len(pdu.file_data))
         elif isinstance(pdu, EofPdu | MetadataPdu):
             receiving.size_bytes = pdu.file_size
@@ -160,8 +163,7 @@ class Receiver:
 
     def _open(self, transaction: int) -> _Receiving:
         if len(self._receiving) >= self._max_open:
-            oldest = min(self._receiving, key=lambda number: self._receiving[number].last_sign_s)
-            del self._receiving[oldest]
+            del self._receiving[min(self._receiving, key=self._last_sign_s)]
         source, destination = self._route
         nak_bytes = min(self._max_pdu_bytes, MAX_NAK_BYTES)
         config, remotes = configuration(destination, source, nak_bytes, self._interval_s, self._checksum)
@@ -171,6 +173,20 @@ class Receiver:
         receiving = _Receiving(handler, user, self._clock.now_s)
         self._receiving[transaction] = receiving
         return receiving
+
+    def _last_sign_s(self, transaction: int) -> float:
+        return self._receiving[transaction].last_sign_s
+
+    def _make_room(self, receiving: _Receiving, size_bytes: int) -> None:
+        """Give up the files that were silent for longest where one of this size would not fit beside them."""
+        sizes = {
+            number: len(other.user.file.content)
+            for number, other in self._receiving.items()
+            if other is not receiving
+        }
+        while sizes and sum(sizes.values()) + size_bytes > LARGEST_FILES * self._max_file_bytes:
+            oldest = min(sizes, key=self._last_sign_s)
+            del self._receiving[oldest], sizes[oldest]
 
     def _step(self, transaction: int, receiving: _Receiving, pdu: Any) -> None:
         try:

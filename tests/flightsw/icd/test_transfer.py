@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from spacepackets.cfdp import ConditionCode, DirectiveType, PduConfig, TransmissionMode
 from spacepackets.cfdp.pdu import AckPdu, EofPdu, FileDataPdu, FinishedPdu, NakPdu
+from spacepackets.cfdp.pdu.file_data import FileDataParams
 from spacepackets.util import ByteFieldU8, ByteFieldU32
 
 from flightsw.icd.packet import PacketError
@@ -296,6 +297,24 @@ def test_hostile_sizes_take_no_memory():
         wire.receiver.receive(wire.sender.next_pdu(0.0) or b"", 0.0)
     assert wire.receiver.open_transactions <= 3
     assert wire.receiver.pdus_refused == 25
+
+
+def test_packets_that_claim_the_last_byte_of_many_files_take_the_memory_of_four():
+    """Each makes room for a whole file; a good file that follows arrives all the same."""
+    wire, largest = Wire(), 10_000
+    wire.receiver = Receiver(MAX_PDU_BYTES, INTERVAL_S, wire.store, max_file_bytes=largest)
+    for number in range(2, 22):
+        sender = Sender(MAX_PDU_BYTES, INTERVAL_S)
+        sender.put("a", content(100), number, 0.0)
+        first, second = (parse_pdu(sender.next_pdu(0.0) or b"") for _ in range(2))
+        data = first if isinstance(first, FileDataPdu) else second
+        claim = FileDataPdu(data.pdu_header.pdu_conf, FileDataParams(b"x", largest - 1))
+        wire.receiver.receive(bytes(claim.pack()), 0.0)
+        assert sum(file.received_bytes for file in wire.receiver.incoming()) <= 4 * largest
+    assert wire.receiver.open_transactions == 4 and wire.receiver.pdus_refused == 0
+    wire.sender.put("good", content(9_000), 1, 0.0)
+    wire.run(10.0)
+    assert wire.stored == {"good": content(9_000)} and wire.delivered == {"good"}
 
 
 def test_a_nak_for_everything_many_times_costs_the_file_once():
