@@ -88,7 +88,7 @@ def first_gaussians(
     if settings.kind == "hull":
         points, voxel_m = hull.hull_points(outlines, radius)
         if len(points) >= FEWEST_HULL_POINTS:
-            chosen = torch.randperm(len(points), generator=rng)[: settings.count]
+            chosen = spread(points, settings.count, rng)
             points = points[chosen] + (torch.rand(len(chosen), 3, generator=rng) - 0.5) * voxel_m
             colours = _colours(points, frames, sensor, settings, rng)
             model = _round_gaussians(points, colours, _mean_spacing(points), coefficients, HULL_OPACITY)
@@ -99,6 +99,33 @@ def first_gaussians(
     spacing = _root_mean_square_spacing if settings.kind == "random" else _mean_spacing
     model = _round_gaussians(points, colours, spacing(points), coefficients, RANDOM_OPACITY)
     return model, radius, f"random, {settings.count} points"
+
+
+def spread(points: Tensor, count: int, rng: torch.Generator) -> Tensor:
+    """Return the indices of at most `count` of the points [M, 3], spread so that no part of them is left out.
+
+    The first is drawn at random; each further one is the farthest from all before it, so that no point is farther from
+    the chosen ones than twice what is possible. If all were drawn at random, a thin mast could get none, and training
+    would show it as one long Gaussian that sticks out at both ends.
+
+    Source: Gonzalez, Clustering to Minimize the Maximum Intercluster Distance, 1985.
+    """
+    if len(points) <= count:
+        return torch.arange(len(points))
+    points = points - points.mean(dim=0)
+    half_square = 0.5 * points.square().sum(dim=1)
+    nearest = torch.full_like(
+        half_square, torch.inf
+    )  # half of the squared distance to the nearest chosen point
+    distance = torch.empty_like(half_square)
+    chosen = [int(torch.randint(len(points), (1,), generator=rng))]
+    for _ in range(count - 1):
+        last = chosen[-1]
+        torch.addmv(half_square, points, points[last], alpha=-1, out=distance)
+        torch.minimum(nearest, distance.add_(float(half_square[last])), out=nearest)
+        nearest[last] = -torch.inf  # not again, whatever rounding says
+        chosen.append(int(nearest.argmax()))
+    return torch.tensor(chosen)
 
 
 def _colours(

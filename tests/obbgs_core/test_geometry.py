@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.distance import cdist
+from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import Rotation
 
 from obbgs_core import obb
@@ -15,7 +15,7 @@ from obbgs_core.model import sh
 from obbgs_core.model.rotations import multiply, quats_to_matrices
 from obbgs_core.score.metrics import cloud_distances
 from obbgs_core.sensor import Sensor
-from obbgs_core.start import hull
+from obbgs_core.start import hull, initialisation
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.growth import grow, keep, outliers, split_long_axis
 from tests.scenes import random_gaussians
@@ -90,6 +90,26 @@ def test_light_does_not_leak_into_the_dark_and_a_faint_face_is_found():
     assert seen.likely[30:90, :18].float().mean() < 0.2  # two pixels beside the lit face only noise is left
     assert seen.sky[32:88, 20:108].float().mean() < 0.02 and not (seen.sky & seen.likely).any()
     assert 0.2 < seen.sky[:, 120:].float().mean() < 0.6
+
+
+def test_the_start_leaves_no_thin_part_out():
+    rng = torch.Generator().manual_seed(0)
+    plate = torch.rand(5000, 3, generator=rng) * torch.tensor([2, 2, 0.02])
+    mast = torch.stack([torch.ones(15), torch.ones(15), torch.linspace(0.1, 0.8, 15)], dim=1)
+    chosen = initialisation.spread(torch.cat([plate, mast]), 500, rng)
+    assert len(chosen.unique()) == 500
+    assert (chosen >= 5000).sum() >= 7  # at random 1.5 of the mast's points would be among them
+
+
+@given(st.integers(2, 60), st.integers(1, 60), st.integers(0, 2**31 - 1))
+def test_spread_points_are_as_far_apart_as_any_other_is_from_them(many, count, seed):
+    rng = torch.Generator().manual_seed(seed)
+    points = torch.randn(many, 3, generator=rng) + 5
+    chosen = initialisation.spread(points, count, rng)
+    assert len(chosen) == len(chosen.unique()) == min(many, count)
+    if 1 < count < many:  # Gonzalez 1985: this is why no other choice covers all points with half the radius
+        between, to_all = pdist(points[chosen].double()), cdist(points.double(), points[chosen].double())
+        assert between.min() >= to_all.min(axis=1).max() * (1 - 1e-3)  # distances are taken in float32
 
 
 def test_views_that_disagree_leave_no_hull():
