@@ -36,9 +36,8 @@ CHI2_MEMORY = 0.98  # share of the running chi² that a step keeps; the rest is 
 CHECKPOINT_EVERY_S = 20.0
 LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
 FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
-# Shares of the steps that the schedule is set back to when frames join: HOLD, from where pictures have full size, if
-# MANY_NEW or more of all frames are new; the fewer they are the nearer to HOLD_OF_FEW, where Gaussians are still added.
-HOLD, HOLD_OF_FEW, MANY_NEW = 0.25, 0.4, 0.3
+# share of the steps that the schedule is set back to when frames join: pictures have full size from there on
+HOLD = 0.25
 PACE_STEPS = 50  # the time left is estimated from the pace of so many steps
 
 
@@ -226,7 +225,7 @@ class Trainer:
     def join(self, frames: list[TrainingFrame]) -> None:
         """Go on with more frames: the model is kept, and the start is carved again of all frames.
 
-        The schedule is set back, the further the more of the frames are new, so that it ends only when none come.
+        The schedule is set back, so that it ends only when none come.
 
         Raises:
             ValueError: the method's training cannot take in frames, see `check_joinable`.
@@ -238,8 +237,7 @@ class Trainer:
         joined, fresh = prepare(
             every, self.setup.sensor, self._asked, self.setup.seed, self.setup.silhouettes
         )
-        few = max(0.0, 1 - len(frames) / len(every) / MANY_NEW)
-        join(self.setup, self.state, joined, fresh, HOLD + few * (HOLD_OF_FEW - HOLD))
+        join(self.setup, self.state, joined, fresh, HOLD)
         self.setup, self._given = joined, every
         self.state.seconds += time.monotonic() - began
 
