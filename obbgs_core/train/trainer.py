@@ -25,6 +25,7 @@ from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import outliers
 from obbgs_core.train.joining import check_joinable, join, release, withhold
 from obbgs_core.train.objective import image_loss, priors
+from obbgs_core.train.poses import HELD_AT, HELD_FROM
 from obbgs_core.train.result import Exposing, StepInfo, TrainResult
 from obbgs_core.train.setup import prepare
 from obbgs_core.train.sparsity import DROPPED_UNTIL, dropped
@@ -143,7 +144,9 @@ class Trainer:
         self._measure(seen, batch)
         state.steps_done += 1
         state.seconds += time.monotonic() - began
-        return self._recorded(loss.item())
+        info = self._recorded(loss.item())
+        pose_rounds.hold(setup, state)
+        return info
 
     def _drops(self, share: float) -> bool:
         """Return whether Gaussians are left out of a step."""
@@ -332,6 +335,10 @@ def _seconds_left(state: TrainingState, config: MethodConfig) -> float:
             for (start, scale, frames), until in zip(levels, ends, strict=True)
         )
 
+    held = state.holds * work(*(round(config.steps_until(share)) for share in (HELD_FROM, HELD_AT)))
     before = state.history[-PACE_STEPS] if len(state.history) >= PACE_STEPS else None
+    if before is not None and before.step >= state.steps_done:  # the schedule was set back since
+        before = None
     since, spent = (before.step, state.seconds - before.seconds) if before else (0, state.seconds)
-    return spent / max(work(since, state.steps_done), 1e-9) * work(state.steps_done, config.steps)
+    left = work(state.steps_done, config.steps) + held
+    return spent / max(work(since, state.steps_done), 1e-9) * left
