@@ -43,7 +43,9 @@ def page() -> str:
                 parts.append(f"```sh\n{' '.join(example.split())}\n```\n")
             hints = typing.get_type_hints(inspect.unwrap(command.callback))
             rows = [
-                _row(option, hints.get(option.name)) for option in command.params if option.name != "help"
+                _row(option, hints.get(option.name))
+                for option in command.params
+                if option.name != "help" and not getattr(option, "hidden", False)
             ]
             if rows:
                 parts.append("\n".join(["| option | default | |", "| --- | --- | --- |", *rows]) + "\n")

@@ -29,7 +29,7 @@ from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import HOLD, Trainer
 
 log = logging.getLogger(__name__)
-STEPS = 1000  # of the schedule; 60 % of it is left when the last few frames have joined: 11 s of one core at 256x256
+STEPS = 1000  # of the schedule; 75 % of it is left when the last frames have joined: 13 to 15 s of a core at 256x256
 # what helps few frames alone would shape the model that the many frames to come inherit
 MANY_EXPECTED = {"sparse.dropout": 0.0, "sparse.sky_weight": 0.0}
 FEWEST_BRACKETS = 4  # that the first hull is carved of, while more may come

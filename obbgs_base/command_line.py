@@ -32,7 +32,8 @@ def _show_version(wanted: bool) -> None:
 
 def new_app(summary: str) -> typer.Typer:
     """Return the command line of a tool, without commands yet; it knows --version and shell completion."""
-    app = typer.Typer(cls=_Group, no_args_is_help=True, help=summary)
+    # as Markdown paragraphs are wrapped anew; otherwise they keep the line ends of the docstrings
+    app = typer.Typer(cls=_Group, no_args_is_help=True, help=summary, rich_markup_mode="markdown")
 
     @app.callback(help=summary)
     def options(

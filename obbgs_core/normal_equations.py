@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from obbgs_core.registration import CellInformation
+from obbgs_core.registration import CellInformation, CellShifts
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,25 @@ class NormalEquations:
         whole[:size, size:] = self.mixed.flatten(0, 1)
         whole[size:, :size] = self.mixed.flatten(0, 1).T
         right = torch.cat([self.own_right.flatten(), self.shared_right])
-        return ReducedEquations(whole - mixed.T @ mixed, right + mixed.T @ gradient, count)
+        eliminated = EliminatedCells(numbers, factor, mixed, gradient, sigma_m)
+        return ReducedEquations(whole - mixed.T @ mixed, right + mixed.T @ gradient, count, eliminated)
+
+
+@dataclass(frozen=True)
+class EliminatedCells:
+    """The equations of the surface's cells, by which their shifts follow from all other parameters."""
+
+    numbers: Tensor  # [k], sorted
+    factor: Tensor  # [k, 3, 3] L, where L Lᵀ are the second derivatives by the shifts, prior included
+    mixed: Tensor  # [3k, 6P + S] L⁻¹ times those by shifts and other parameters
+    gradient: Tensor  # [3k] L⁻¹ times the slopes by the shifts
+    cell_m: float
+
+    def shifts(self, others: Tensor) -> CellShifts:
+        """Return where the cells go when the other parameters change by others [6P + S]."""
+        right = -(self.gradient + self.mixed @ others).view(-1, 3, 1)
+        shifts = torch.linalg.solve_triangular(self.factor.mT, right, upper=True)[..., 0]
+        return CellShifts(self.numbers, shifts, self.cell_m)
 
 
 @dataclass(frozen=True)
@@ -84,11 +102,16 @@ class ReducedEquations:
     matrix: Tensor  # [6P + S, 6P + S]
     right: Tensor  # [6P + S]
     brackets: int  # P
+    cells: EliminatedCells
 
     def solution(self) -> tuple[Tensor, Tensor]:
         """Return the shared parameters [S] and those of the brackets [P, 6]."""
         found = torch.linalg.solve(self.matrix, self.right)
         return found[6 * self.brackets :], found[: 6 * self.brackets].view(-1, 6)
+
+    def shifts(self, shared: Tensor, own: Tensor) -> CellShifts:
+        """Return where the surface's cells go with a solution."""
+        return self.cells.shifts(torch.cat([own.flatten(), shared]))
 
     def covariances(self) -> tuple[Tensor, Tensor]:
         """Return the covariance of the shared parameters [S, S] and those of the brackets [P, 6, 6]."""

@@ -16,7 +16,7 @@ from obbgs_core.model.pose_covariance import whitening
 from obbgs_core.model.rotations import from_rotation_vectors, multiply
 from obbgs_core.normal_equations import NormalEquations, ReducedEquations, times
 from obbgs_core.pose_estimate import PoseEstimate
-from obbgs_core.registration import CellInformation, PoseInformation
+from obbgs_core.registration import CellInformation, CellShifts, PoseInformation
 
 NULL = 1e-9  # a singular value of rows of unit length that is zero up to rounding
 LINEAR = 0.1  # prior deviations by which shared parameters move before their effect is linearised anew
@@ -120,7 +120,9 @@ class PoseCorrections:
         self.cells: dict[int, CellInformation] = {}
         self.cell_m = 0.0
 
-    def step(self, frames: list[TrainingFrame], extra: Tensor | None = None) -> Tensor:
+    def step(
+        self, frames: list[TrainingFrame], extra: Tensor | None = None
+    ) -> tuple[Tensor, CellShifts | None]:
         """Move all corrections to the minimum of what was gathered plus their priors.
 
         One step of Gauss and Newton in all parameters together, and in the places of the surface's cells where pictures
@@ -130,7 +132,7 @@ class PoseCorrections:
             extra: [F, 6, E] motions by further parameters of unit variance that are to be estimated along.
 
         Returns:
-            The change of the further parameters [E] from zero.
+            The change of the further parameters [E] from zero, and where the surface's cells go.
         """
         normal = self._normal_equations(extra)
         all_shared, own = normal.solution()
@@ -140,7 +142,7 @@ class PoseCorrections:
             change[self.free] = self.sigmas[self.free] * shared
             self._move_shared(frames, self.shared + change)
         self.value = times(self.whitening.support, self.value + own.float())
-        return others
+        return others, normal.shifts(all_shared, own) if isinstance(normal, ReducedEquations) else None
 
     def _normal_equations(self, extra: Tensor | None = None) -> NormalEquations | ReducedEquations:
         rows, count = torch.tensor(self.of_frame), len(self.value)

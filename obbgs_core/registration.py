@@ -48,6 +48,23 @@ class CellInformation:
     mixed: Tensor
 
 
+@dataclass(frozen=True)
+class CellShifts:
+    """Where the surface's cells go: shifts [k, 3] m, body axes, of cubes with edge cell_m and numbers [k] (sorted)."""
+
+    numbers: Tensor
+    shifts: Tensor
+    cell_m: float
+
+    def of_points(self, points: Tensor) -> Tensor:
+        """Return the shifts [n, 3] of points [n, 3] m: at most half a cell along each axis, 0 where none is known."""
+        numbers = _cell_numbers(points.double(), self.cell_m)
+        at = torch.searchsorted(self.numbers, numbers).clamp(max=len(self.numbers) - 1)
+        seen = (self.numbers[at] == numbers)[:, None]
+        limit = self.cell_m / 2
+        return torch.where(seen, self.shifts[at], 0.0).clamp(-limit, limit).to(points)
+
+
 @torch.no_grad()
 def pose_information(
     radiance: Tensor,

@@ -134,7 +134,8 @@ def _aligned(
         gradient = -(flow.mT @ (weight[:, None] * away_px)[..., None])[..., 0]
         poses.gather(lit, PoseInformation(gradient, weight[:, None, None] * (flow.mT @ flow)))
         by_offset[lit, 3:] = offset_m * turn
-        point = point + offset_m * poses.step(frames, extra=by_offset)
+        change, _ = poses.step(frames, extra=by_offset)
+        point = point + offset_m * change
     return poses, float(_seen(poses, lit, point, K, centres_px)[2].norm(dim=1).median())
 
 

@@ -85,10 +85,11 @@ def join(
     if state.poses is not None:
         state.poses = state.poses.extended(joined.frames)
     elif state.poses_decided in UNTESTED or fresh.poses is not None:
-        state.poses, state.poses_aligned, state.poses_decided = (
+        state.poses, state.poses_aligned, state.poses_decided, state.holds = (
             fresh.poses,
             fresh.poses_aligned,
             fresh.poses_decided,
+            fresh.holds,
         )
     withhold(joined, state)
     smooth(joined, state)

@@ -1,5 +1,6 @@
 """When and how the poses move together with the model that is trained on them."""
 
+import dataclasses
 import logging
 
 import torch
@@ -10,7 +11,7 @@ from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.registration import pose_information
 from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.train.batches import FrameOrder
-from obbgs_core.train.poses import ALIGNED_FROM
+from obbgs_core.train.poses import ALIGNED_FROM, HELD_AT, HELD_FROM, SURFACE_UNTIL
 from obbgs_core.train.setup import TrainingSetup
 from obbgs_core.train.state import TrainingState
 
@@ -46,7 +47,8 @@ def cell_m(setup: TrainingSetup) -> float:
 def move(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
     """Move the poses to where one frame of each bracket wants them if the surface goes along; settle the gauge.
 
-    The frames of a bracket take turns. At the first round after `MISFIT_FROM` of the steps, brackets whose residuals
+    The frames of a bracket take turns. Where poses were aligned and Gaussians are still added, these go along with the
+    surface. At the first round after `MISFIT_FROM` of the steps, brackets whose residuals
     stand out are left out of the training for good.
 
     Args:
@@ -64,9 +66,19 @@ def move(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
     since = state.steps_done - setup.config.steps_until(MISFIT_FROM)
     if 0 <= since < round(whole / ROUNDS):
         _leave_out(setup, state, [shown[i] for i in torch.nonzero(standing_out(*residuals))[:, 0].tolist()])
-    poses.step(setup.frames)
+    _, shifts = poses.step(setup.frames)
     poses.clear()
-    state.gaussians = poses.fix_gauge(state.gaussians.detach(), setup.frames).trainable()
+    gaussians = state.gaussians.detach()
+    if shifts is not None and state.poses_aligned and setup.config.moment(turn).share < SURFACE_UNTIL:
+        gaussians = dataclasses.replace(gaussians, means=gaussians.means + shifts.of_points(gaussians.means))
+    state.gaussians = poses.fix_gauge(gaussians, setup.frames).trainable()
+
+
+def hold(setup: TrainingSetup, state: TrainingState) -> None:
+    """Set the schedule back, as often as poses that were aligned want it, when it reaches `HELD_AT`."""
+    if state.holds and state.steps_done >= round(setup.config.steps_until(HELD_AT)):
+        state.holds -= 1
+        state.steps_done = round(setup.config.steps_until(HELD_FROM))
 
 
 def standing_out(dispersion: Tensor, share: Tensor) -> Tensor:

@@ -31,6 +31,7 @@ from obbgs_core.train.batches import Batches, FrameOrder
 from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import Growth
+from obbgs_core.train.poses import HOLDS
 from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import Identity, TrainingState
 from obbgs_core.train.validation import validation_brackets
@@ -156,6 +157,7 @@ def prepare(
         poses=poses,
         poses_aligned=bool(why),
         poses_decided=poses_decided,
+        holds=HOLDS if why else 0,
         appearance_reason="as configured" if config.light.sh_degree else "",
     )
     if config.smoothing_px2:

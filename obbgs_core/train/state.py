@@ -28,7 +28,7 @@ from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 6  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 7  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,7 @@ class TrainingState:
     poses: PoseCorrections | None  # None: as tagged
     poses_aligned: bool  # whether they were moved before the first step
     poses_decided: str  # whether the poses are refined, and why; empty: the validation brackets will decide
+    holds: int  # how often the schedule will still be set back for the poses
     appearance_reason: str  # why the radiance depends on what it does
     highlights_reason: str = ""  # why it has highlights or not; empty: not tested
     smoothing_m: Tensor | None = None  # [N] deviations of the 3D filter; None: the method has none

@@ -25,6 +25,7 @@ from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import outliers
 from obbgs_core.train.joining import check_joinable, join, release, withhold
 from obbgs_core.train.objective import image_loss, priors
+from obbgs_core.train.poses import HELD_AT, HELD_FROM
 from obbgs_core.train.result import Exposing, StepInfo, TrainResult
 from obbgs_core.train.setup import prepare
 from obbgs_core.train.sparsity import DROPPED_UNTIL, dropped
@@ -35,9 +36,8 @@ CHI2_MEMORY = 0.98  # share of the running chi² that a step keeps; the rest is 
 CHECKPOINT_EVERY_S = 20.0
 LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
 FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
-# Shares of the steps that the schedule is set back to when frames join: HOLD, from where pictures have full size, if
-# MANY_NEW or more of all frames are new; the fewer they are the nearer to HOLD_OF_FEW, where Gaussians are still added.
-HOLD, HOLD_OF_FEW, MANY_NEW = 0.25, 0.4, 0.3
+# share of the steps that the schedule is set back to when frames join: pictures have full size from there on
+HOLD = 0.25
 PACE_STEPS = 50  # the time left is estimated from the pace of so many steps
 
 
@@ -144,7 +144,9 @@ class Trainer:
         self._measure(seen, batch)
         state.steps_done += 1
         state.seconds += time.monotonic() - began
-        return self._recorded(loss.item())
+        info = self._recorded(loss.item())
+        pose_rounds.hold(setup, state)
+        return info
 
     def _drops(self, share: float) -> bool:
         """Return whether Gaussians are left out of a step."""
@@ -223,7 +225,7 @@ class Trainer:
     def join(self, frames: list[TrainingFrame]) -> None:
         """Go on with more frames: the model is kept, and the start is carved again of all frames.
 
-        The schedule is set back, the further the more of the frames are new, so that it ends only when none come.
+        The schedule is set back, so that it ends only when none come.
 
         Raises:
             ValueError: the method's training cannot take in frames, see `check_joinable`.
@@ -235,8 +237,7 @@ class Trainer:
         joined, fresh = prepare(
             every, self.setup.sensor, self._asked, self.setup.seed, self.setup.silhouettes
         )
-        few = max(0.0, 1 - len(frames) / len(every) / MANY_NEW)
-        join(self.setup, self.state, joined, fresh, HOLD + few * (HOLD_OF_FEW - HOLD))
+        join(self.setup, self.state, joined, fresh, HOLD)
         self.setup, self._given = joined, every
         self.state.seconds += time.monotonic() - began
 
@@ -334,6 +335,10 @@ def _seconds_left(state: TrainingState, config: MethodConfig) -> float:
             for (start, scale, frames), until in zip(levels, ends, strict=True)
         )
 
+    held = state.holds * work(*(round(config.steps_until(share)) for share in (HELD_FROM, HELD_AT)))
     before = state.history[-PACE_STEPS] if len(state.history) >= PACE_STEPS else None
+    if before is not None and before.step >= state.steps_done:  # the schedule was set back since
+        before = None
     since, spent = (before.step, state.seconds - before.seconds) if before else (0, state.seconds)
-    return spent / max(work(since, state.steps_done), 1e-9) * work(state.steps_done, config.steps)
+    left = work(state.steps_done, config.steps) + held
+    return spent / max(work(since, state.steps_done), 1e-9) * left

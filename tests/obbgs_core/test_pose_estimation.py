@@ -11,18 +11,22 @@ from scipy.spatial.transform import Rotation
 from skimage import transform
 
 from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displaced_motion
+from obbgs_core import registration
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import Navigation, TrainingFrame, cameras_of, usable
 from obbgs_core.losses import likelihood_loss
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
-from obbgs_core.normal_equations import NormalEquations
+from obbgs_core.model.sh import from_radiance
+from obbgs_core.normal_equations import NormalEquations, ReducedEquations
 from obbgs_core.pose_corrections import PoseCorrections, with_estimate
-from obbgs_core.registration import pose_information
+from obbgs_core.registration import CellShifts, pose_information
 from obbgs_core.render import render
 from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.score.poses import best_motion, moved, pose_errors, seen_after, settled_poses, size_of
 from obbgs_core.start.alignment import settled
 from obbgs_core.start.initialisation import silhouettes
+from obbgs_core.train.poses import HELD_AT, HELD_FROM, HOLDS
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests import scenes
@@ -182,6 +186,10 @@ def test_eliminating_the_cells_solves_the_whole_system(erring):
     solved, covariance = np.linalg.solve(whole, right), np.linalg.inv(whole)
     np.testing.assert_allclose(own.flatten(), solved[: 6 * P], rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(shared, solved[6 * P : n], rtol=1e-6, atol=1e-8)
+    assert isinstance(equations, ReducedEquations)
+    found = equations.shifts(shared, own)
+    np.testing.assert_array_equal(found.numbers, numbers)
+    np.testing.assert_allclose(found.shifts.flatten(), solved[n:], rtol=1e-6, atol=1e-8)
     of_shared, of_own = equations.covariances()
     np.testing.assert_allclose(of_shared, covariance[6 * P : n, 6 * P : n], rtol=1e-6, atol=1e-10)
     for p in range(P):
@@ -190,6 +198,59 @@ def test_eliminating_the_cells_solves_the_whole_system(erring):
     poses.cells = {}
     fixed, _ = poses._normal_equations().covariances()
     assert (of_shared.diagonal() >= fixed.diagonal() - 1e-12).all()
+
+
+def test_points_go_with_their_cell_but_no_farther_than_half_of_it():
+    points = torch.tensor([[0.05, 0.05, 0.05], [0.15, 0.05, 0.05], [-0.05, 0.05, 0.05]])
+    numbers, order = registration._cell_numbers(points[:2].double(), 0.1).sort()
+    shifts = torch.tensor([[0.01, -0.02, 0.03], [0.2, -0.2, 0.0]]).double()[order]
+    found = CellShifts(numbers, shifts, 0.1).of_points(points)
+    torch.testing.assert_close(found[0], torch.tensor([0.01, -0.02, 0.03]))
+    torch.testing.assert_close(found[1], torch.tensor([0.05, -0.05, 0.0]))
+    assert not found[2].any()
+
+
+def test_slopes_are_differences_of_pictures_taken_half_a_pixel_to_both_sides(erring):
+    cameras = cameras_of([erring[0][2], erring[0][9]])
+    rendered, slopes = render_with_slopes(MODEL, cameras)
+    torch.testing.assert_close(rendered.radiance, render(MODEL, cameras).radiance, rtol=0, atol=0)
+    for axis in (0, 1):
+        before, after = cameras.K.clone(), cameras.K.clone()
+        before[:, axis, 2] += 0.5
+        after[:, axis, 2] -= 0.5
+        sides = [render(MODEL, dataclasses.replace(cameras, K=K)).radiance for K in (before, after)]
+        # contributions under 1/255 are skipped at other places of a grid: float32 sums of others
+        torch.testing.assert_close(slopes[..., axis], sides[1] - sides[0], rtol=1e-4, atol=1e-5)
+
+
+def test_a_panel_seen_edge_on_is_found_in_two_steps():
+    """It is thinner than a pixel; slopes between the pixels of its picture would go a part of the way in each step."""
+    focal_px = 400.0
+    panel = Gaussians(
+        means=torch.tensor([[x, 0.0, 0.0] for x in np.linspace(-2, 2, 9)]).float(),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(9, 1),
+        log_scales=torch.log(torch.tensor([[0.25, 0.01, 0.4]])).repeat(9, 1),
+        opacity_logits=torch.full((9,), 3.0),
+        sh=from_radiance(torch.linspace(0.2, 0.6, 9).view(9, 1, 1)),
+    )
+    pose = torch.eye(4)
+    pose[2, 3] = RANGE_M
+    frame = TrainingFrame(torch.zeros(SIZE, SIZE, 1), 1e-4, pose, scenes.intrinsics(SIZE, focal_px))
+    with torch.no_grad():
+        dn = SENSOR.expected_dn(render(panel, cameras_of([frame])).radiance[0], 1e-4)
+    pixel_m = RANGE_M / focal_px
+    away = pose.clone()
+    away[:2, 3] = torch.tensor([0.1, 0.3]) * pixel_m
+    covariance = torch.diag(torch.tensor([0, 0, 0, pixel_m, pixel_m, 0]).double() ** 2)
+    wrong = dataclasses.replace(frame, dn=dn, world_to_camera=away, pose_covariance=covariance)
+    poses, readings = PoseCorrections([wrong]), (torch.tensor(1e-4).view(1, 1, 1, 1), dn[None], SENSOR)
+    for _ in range(2):
+        cameras = poses.cameras([0], cameras_of([wrong]))
+        r, slopes = render_with_slopes(panel, cameras)
+        poses.gather([0], pose_information(r.radiance, slopes, r.alpha, r.depth, cameras, *readings))
+        poses.step([wrong])
+    left_px = (poses.corrected([0])[0, :2, 3] / pixel_m).abs()
+    assert left_px.max() < 0.02
 
 
 def test_eliminating_the_brackets_solves_the_whole_system():
@@ -359,3 +420,16 @@ def test_frames_of_two_passes_are_refused(erring):
     other = Navigation(dataclasses.replace(SIGMAS, clock_s=np.ones(1)))
     with pytest.raises(ReconstructionError, match="the same navigation"):
         usable([*wrong[:5], dataclasses.replace(wrong[5], navigation=other)], True)
+
+
+def test_the_schedule_is_set_back_for_aligned_poses_as_often_as_it_says(erring):
+    trainer = Trainer(erring[1], SENSOR, preset("obbgs", QUICK | {"poses.refine": "auto"}))
+    assert trainer.state.poses_aligned
+    seen = []
+    while not trainer.stop_reason():
+        info = trainer.step()
+        assert 0 <= info.seconds_left < 1e4
+        seen.append(info.step)
+    held_at, held_from = (round(share * 40) for share in (HELD_AT, HELD_FROM))
+    again = list(range(held_from + 1, held_at + 1))
+    assert seen == [*range(1, held_at + 1), *(HOLDS * again), *range(held_at + 1, 41)]
