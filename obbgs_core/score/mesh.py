@@ -24,8 +24,11 @@ VOXEL_PX = 1.5  # width of a voxel in pixels, at the median depth
 CHUNK = 30_000  # nodes at a time, such that their distances stay in the processor's cache
 MAX_NODES = 2_000_000  # wider voxels are used if there would be more
 BAND_VOXELS = 1.5  # a view says nothing of what lies deeper than this behind the surface that it sees
+# of each Gaussian in the depth maps: the Gaussians of a face lie in layers, of which the outer ones are nearest to it
+COPIES = 3
 SEEN_THROUGH = 0.15  # of the views that see a place; if so many see past it, it is empty
 THICKER_VOXELS = 0.5  # on each side, so that a plate thinner than a voxel is not lost between two nodes
+DRAWN_BACK_VOXELS = 0.3  # of that, when triangles are made; what is left keeps the two sides of a plate apart
 AT_LEAST_SEEING = 2  # views; what fewer see is taken for solid
 BLOCK = 8  # nodes along a side that are decided on together first
 FEWEST_NODES = 8  # of a piece that is kept
@@ -42,8 +45,8 @@ def surface_mesh(
     Each place of a grid gets its distances from the planes that the views see there, positive in front, and far in
     front where a view sees past it. The distance that SEEN_THROUGH of them exceed is 0 on the surface, also of a thin
     plate, of which half of the views look at the other side. Marching cubes make triangles of the zeros, after hollows
-    that no view sees into were filled and specks were removed; the triangles are then merged until there are few
-    enough, such that the mesh stays closed.
+    that no view sees into were filled, and specks and pieces that no view sees were removed; the triangles are then
+    merged until there are few enough, such that the mesh stays closed.
 
     Args:
         gaussians: on the CPU, as the cameras.
@@ -64,7 +67,7 @@ def surface_mesh(
         raise ExportError(
             "the model has no Gaussian that is brighter than the sky: there is nothing to make a mesh of"
         )
-    maps = [depth_map(solid, cameras.one(c)) for c in range(len(cameras))]
+    maps = [depth_map(solid, cameras.one(c), COPIES) for c in range(len(cameras))]
     depths = [depth for depth, _ in maps]
     if not any(depth.isfinite().any() for depth in depths):
         raise ExportError(
@@ -77,8 +80,8 @@ def surface_mesh(
     volume, first = _without_specks(values, nodes, voxel_m)
     if not (volume < 0).any():
         raise ExportError("the views see through all that the model shows: no mesh can be made of it")
-    vertices, triangles, _, _ = marching_cubes(volume, 0.0)
-    vertices = vertices * voxel_m + (corner + first * voxel_m).numpy()
+    vertices, triangles, inwards, _ = marching_cubes(volume, 0.0)
+    vertices = (vertices + DRAWN_BACK_VOXELS * inwards) * voxel_m + (corner + first * voxel_m).numpy()
     vertices, triangles = _simplified(vertices, triangles, max_triangles, voxel_m)
     colours, seen_by = _appearance(
         torch.from_numpy(vertices).float(), gaussians, depths, cameras, sun_dir, voxel_m
@@ -156,7 +159,9 @@ def _without_specks(values: Tensor, nodes: Tensor, voxel_m: float) -> tuple[np.n
     volume[(empty != empty[0, 0, 0]) & (volume >= 0)] = -voxel_m
     pieces = _pieces(volume < 0)
     sizes = np.bincount(pieces.ravel())
-    volume[(pieces > 0) & (sizes < FEWEST_NODES)[pieces]] = voxel_m
+    # -3 voxels or less where all of a piece is taken for solid because no views say that it is not
+    greatest = ndimage.maximum(volume, pieces, np.arange(len(sizes)))
+    volume[(pieces > 0) & ((sizes < FEWEST_NODES) | (greatest < -2 * voxel_m))[pieces]] = voxel_m
     return volume, first
 
 

@@ -123,16 +123,21 @@ def bright(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
 
 
 @torch.no_grad()
-def depth_map(gaussians: Gaussians, camera: Cameras) -> tuple[Tensor, Tensor]:
+def depth_map(gaussians: Gaussians, camera: Cameras, copies: int = 1) -> tuple[Tensor, Tensor]:
     """Return the depth [H, W] m (infinite where the pixel is not solid) and its slope [H, W, 2] m/px of one camera.
 
     The depth is that of the Gaussian at which the transmittance falls to one half, one sigma in front of its maximum
     along the ray, where the surface of a solid lies. The maxima of all rays form, to first order, a plane; for a thin
     disc that is the disc itself.
 
+    Args:
+        copies: of each Gaussian, which make the transmittance of k copies the k-th power of that of one. The depth is
+            then where the transmittance of the model falls to 0.5^(1/copies), nearer to the camera.
+
     Source: Zhang et al., RaDe-GS: Rasterizing Depth in Gaussian Splatting, 2024.
     """
-    median = render(gaussians, camera).median_depth[0]
+    drawn = gaussians if copies == 1 else gaussians.select(torch.arange(len(gaussians)).repeat(copies))
+    median = render(drawn, camera).median_depth[0]
     projected = project(gaussians, camera)
     depths, order = projected.depths[0].sort()
     middles = (depths[1:] + depths[:-1]) / 2

@@ -104,6 +104,22 @@ def test_depth_follows_a_tilted_disc_and_not_its_centre():
     )
 
 
+@pytest.mark.parametrize("copies", [1, 2, 3, 5])
+def test_copies_make_the_depth_that_of_the_layer_where_a_power_of_the_transmittance_is_one_half(copies):
+    """Layers of wide discs, each lets 0.85 of the light through."""
+    layers, through = 8, 0.85
+    heights = torch.arange(layers).double() * 0.1
+    centres = torch.stack([torch.zeros(layers), torch.zeros(layers), 2 + heights], dim=1)
+    facing = torch.tensor([[0.0, 0.0, 1.0]]).expand(layers, 3)
+    stack = discs(centres, facing, radius=50.0, opacity_logit=math.log((1 - through) / through))
+    K = torch.tensor([[[100.0, 0, 16], [0, 100, 16], [0, 0, 1]]])
+    depth, _ = depth_map(stack, Cameras(torch.eye(4)[None], K, 32, 32), copies)
+    crossed = math.ceil(
+        math.log(0.5) / copies / math.log(through)
+    )  # layers until through^n <= 0.5^(1/copies)
+    assert depth[16, 16] == pytest.approx(2 + 0.1 * (crossed - 1), abs=1e-3)
+
+
 def test_no_point_lies_between_two_plates_one_behind_the_other():
     grid = torch.linspace(-1, 1, 30)
     x, y = (t.flatten() for t in torch.meshgrid(grid, grid, indexing="ij"))
