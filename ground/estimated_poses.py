@@ -55,6 +55,22 @@ def estimated_records(records: list[FrameRecord], estimate: PoseEstimate | None)
     return [_placed(record, poses[record.id]) for record in records if record.id in poses]
 
 
+def as_estimated(session: Session, estimate: PoseEstimate | None) -> Session:
+    """Return a session with the poses that a training found, and what its shared errors make of the others' tags."""
+    if estimate is None:
+        return session
+    poses = estimate.by_frame()
+    others = [record for record in session.frames if record.id not in poses and record.pose_valid]
+    if others:
+        frames = with_estimate([training_frame(session, record) for record in others], estimate)
+        poses |= {
+            record.id: frame.world_to_camera.double().numpy()
+            for record, frame in zip(others, frames, strict=True)
+        }
+    records = [_placed(r, poses[r.id]) if r.id in poses else r for r in session.frames]
+    return dataclasses.replace(session, frames=tuple(records))
+
+
 def settled_records(
     gaussians: Gaussians, session: Session, records: list[FrameRecord], sensor: Sensor, estimate: PoseEstimate
 ) -> list[FrameRecord]:

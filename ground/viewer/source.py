@@ -4,7 +4,10 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from ground import attitude
+from ground.attitude import FoundAttitude
 from ground.cameras import sensor_of
+from ground.estimated_poses import as_estimated, read_estimate
 from ground.session import Session, SessionError, open_session
 from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
@@ -15,7 +18,10 @@ HEADER, MODEL, MESH = "session.json", "model.ply", "model.glb"
 
 @dataclass(frozen=True)
 class Shown:
-    """A model with its session, as it was when it was read; mesh: the bytes of model.glb where there is one."""
+    """A model with its session, whose poses are those of the model, as it was when it was read.
+
+    mesh: the bytes of model.glb where there is one.
+    """
 
     name: str
     session: Session
@@ -69,6 +75,9 @@ class Source:
             )
         assert self.folder is not None
         session = open_session(self.session_path)
+        if (found := FoundAttitude.read(self.folder / attitude.FILE)) is not None:
+            session = attitude.in_body_axes(session, found)
+        session = as_estimated(session, read_estimate(self.folder))
         mesh = self.folder / MESH
         shown = Shown(
             self.name,

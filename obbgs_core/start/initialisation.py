@@ -24,6 +24,9 @@ FEWEST_HULL_POINTS = 200  # with fewer the start is random
 FEWEST_VIEWS = 12  # that carve the hull
 VIEWS_FOR_COLOUR = 24  # about so many frames, spread evenly, are averaged for the first radiance
 HULL_OPACITY, RANDOM_OPACITY = 0.5, 0.1  # of the first Gaussians
+# Deviation on the hull over the mean distance to the nearest three: spread points are 1.4 times as far from each other
+# as random ones, and at 1 they hide what is behind them (docs/experiments/046).
+HULL_WIDTH = 0.7
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,8 @@ def first_gaussians(
             chosen = spread(points, settings.count, rng)
             points = points[chosen] + (torch.rand(len(chosen), 3, generator=rng) - 0.5) * voxel_m
             colours = _colours(points, frames, sensor, settings, rng)
-            model = _round_gaussians(points, colours, _mean_spacing(points), coefficients, HULL_OPACITY)
+            width_m = HULL_WIDTH * _mean_spacing(points)
+            model = _round_gaussians(points, colours, width_m, coefficients, HULL_OPACITY)
             return model, radius, f"visual hull, {len(chosen)} points"
         log.warning("the silhouettes agree on only %d points; starting at random", len(points))
     points = (2 * torch.rand(settings.count, 3, generator=rng) - 1) * radius

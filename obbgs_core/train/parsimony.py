@@ -12,12 +12,15 @@ import torch
 from torch import Tensor
 
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.sh import C0
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check, fraction
 from obbgs_core.train.batches import Batches
 
 VIEWS = 36  # training frames that are rendered, spread evenly; gains are scaled to all frames
+# An opaque Gaussian that shows on less than this in every picture hides nothing that its neighbours do not hide too.
+SHOWN_PX = 0.25
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class ParsimonySettings:
 
     prune_at: tuple[float, ...] = fraction(())  # shares of the steps; none: never
     bic_factor: float = 1.0  # on the penalty: larger values give smaller models
-    # Gaussians above it are kept in any case: dark surface explains no light and is surface nevertheless
+    # Gaussians above it are kept where a picture shows them: dark surface explains no light and is surface nevertheless
     keep_above_opacity: float = fraction(1.0)
 
     def __post_init__(self):
@@ -51,10 +54,28 @@ def justified(
     settings: ParsimonySettings,
     rng: torch.Generator,
 ) -> Tensor:
-    """Return which Gaussians [N] gain more likelihood than their BIC penalty, or are too opaque to be removed."""
+    """Return which Gaussians [N] gain more likelihood than their BIC penalty, or are opaque and shown by a picture."""
     gains, values = likelihood_gains(gaussians, batches, sensor, scale, rng)
     kept = gains >= settings.bic_factor * bic_penalty(gaussians, values)
-    return kept | (gaussians.opacities.detach() > settings.keep_above_opacity)
+    surface = gaussians.opacities.detach() > settings.keep_above_opacity
+    return kept | (surface & (shown_px(gaussians, batches, scale) > SHOWN_PX))
+
+
+def shown_px(gaussians: Gaussians, batches: Batches, scale: float) -> Tensor:
+    """Return on how many pixels each Gaussian [N] shows in the picture that shows most of it: its summed weights.
+
+    The weight of a Gaussian in a pixel is the share of the pixel's light that is its own where all are equally bright.
+    """
+    white = dataclasses.replace(
+        gaussians.detach().matt(), sh=torch.full((len(gaussians), 1, 1), 1 / C0), shading="view"
+    )
+    white.sh.requires_grad_()
+    most = torch.zeros(len(gaussians))
+    for index in _chosen(batches):
+        image = render(white, batches.batch([index], scale).cameras).radiance
+        (slope,) = torch.autograd.grad(image.sum(), white.sh)
+        most = torch.maximum(most, slope[:, 0, 0] / C0)
+    return most
 
 
 def likelihood_gains(
@@ -129,7 +150,7 @@ def _views(
     model: Gaussians, batches: Batches, sensor: Sensor, scale: float, rng: torch.Generator
 ) -> Iterator[_View]:
     """Render some of the training frames, spread evenly."""
-    chosen = range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS))
+    chosen = _chosen(batches)
     for index in chosen:
         batch = batches.batch([index], scale)
         radiance = render(model, batch.cameras).radiance
@@ -143,6 +164,11 @@ def _views(
         empty_dn = sensor.expected_dn(torch.tensor(batch.cameras.background), batch.exposure_time_s)
         values = int(((predicted.detach() - empty_dn).abs() > sigma).sum()) * batch.averaged_pixels
         yield _View(predicted, residual, weight, signs, values, len(batches.frames) / len(chosen))
+
+
+def _chosen(batches: Batches) -> range:
+    """Return the indices of the frames that are rendered, spread evenly."""
+    return range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS))
 
 
 def padded(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,10 @@ from ground.compare.case import load_case
 from ground.estimated_poses import FILE, Alignment, estimated_records, read_estimate, write_estimate
 from ground.session import SessionError, open_session
 from ground.truth import Truth
+from ground.viewer.source import Source
 from obbgs_base.navigation_errors import SharedParameters
 from obbgs_core.frames import cameras_of
+from obbgs_core.io.ply import save_ply
 from obbgs_core.model.motions import rigid_motions
 from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.render import render
@@ -109,6 +112,24 @@ def test_surfaces_are_seen_from_the_poses_that_were_found_and_frames_left_out_ar
         np.testing.assert_array_equal(record.world_to_camera, pose)
         np.testing.assert_allclose(pose[:3, :3] @ record.position_body_m + pose[:3, 3], 0, atol=1e-6)
         np.testing.assert_allclose(quat_to_matrix(record.quat_body_to_camera), pose[:3, :3], atol=1e-6)
+
+
+def test_the_viewer_shows_frames_from_the_poses_that_were_found(estimate, tmp_path):
+    """Of a frame that the training was not given the tag stays, where it states no navigation."""
+    session = Path(shutil.copytree(GOLDEN, tmp_path / "session"))
+    run = session / "runs" / "run"
+    run.mkdir(parents=True)
+    save_ply(random_gaussians(20), run / "model.ply")
+    tagged = [record.world_to_camera for record in open_session(session).frames]
+    np.testing.assert_array_equal([r.world_to_camera for r in Source(run).load().session.frames], tagged)
+    by_frame = {
+        name: getattr(estimate, name)[1:] for name in ("frame_ids", "brackets", "tagged", "estimated")
+    }
+    fewer = dataclasses.replace(estimate, **by_frame)
+    write_estimate(run, fewer)
+    first, *others = Source(run).load().session.frames
+    np.testing.assert_allclose(first.world_to_camera, tagged[0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal([r.world_to_camera for r in others], fewer.estimated)
 
 
 def test_a_comparison_sees_a_model_from_where_its_estimated_poses_put_it(estimate):

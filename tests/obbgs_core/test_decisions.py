@@ -1,12 +1,21 @@
 """What a training decides on the way: pruning by BIC, harmonics, and poses by validation brackets."""
 
+import dataclasses
+
 import pytest
 import torch
 
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
 from obbgs_core.train.batches import Batches
-from obbgs_core.train.parsimony import likelihood_gains, next_degree_gain
+from obbgs_core.train.parsimony import (
+    ParsimonySettings,
+    justified,
+    likelihood_gains,
+    next_degree_gain,
+    shown_px,
+)
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
 from tests.scenes import QUICK, SENSOR, photographed, tagged, target
@@ -30,6 +39,35 @@ def test_the_likelihood_gain_of_a_gaussian_matches_removing_it():
             exact[j] += 0.5 * ((dn - all_dn) ** 2 / SENSOR.variance_dn2(all_dn) * lit).sum()
     # 60 draws of 12 frames with a relative deviation of about 1.4 each: 5 % a Gaussian; alpha cutoffs add a little
     torch.testing.assert_close(estimates.mean(0), exact, rtol=0.25, atol=0)
+
+
+def test_the_pixels_that_show_a_gaussian_are_its_weights_in_the_reference_renderer():
+    model = target(8, seed=2)
+    frames = photographed(model, count=5)
+    batches = Batches(frames, SENSOR.white_dn)
+    most = torch.zeros(len(model))
+    for index in range(len(frames)):
+        cameras = batches.batch([index], 1.0).cameras
+        for j in range(len(model)):  # it alone is bright: what is seen is its weight
+            sh = torch.full((len(model), 1, 1), from_radiance(torch.tensor(0.0)).item())
+            sh[j] = from_radiance(torch.tensor(1e4))
+            alone = dataclasses.replace(model.detach(), sh=sh)
+            weights = render(alone, cameras, backend="reference").radiance / 1e4
+            most[j] = torch.maximum(most[j], weights.sum())
+    torch.testing.assert_close(shown_px(model, batches, 1.0), most, rtol=1e-3, atol=1e-3)
+
+
+def test_opaque_gaussians_are_pruned_where_no_picture_shows_them_and_dark_ones_are_not():
+    model = dataclasses.replace(target(8, seed=2).detach(), footprint="camera")
+    frames = photographed(model, count=12)
+    dark = dataclasses.replace(model, sh=torch.full_like(model.sh, from_radiance(torch.tensor(0.0)).item()))
+    dust = dataclasses.replace(model, log_scales=model.log_scales - 6)  # far thinner than a pixel
+    both = Gaussians.concatenate([dark, dust])
+    both.opacity_logits[:] = 3.0
+    rng = torch.Generator().manual_seed(0)
+    settings = ParsimonySettings(keep_above_opacity=0.65)
+    kept = justified(both, Batches(frames, SENSOR.white_dn), SENSOR, 1.0, settings, rng)
+    assert kept.tolist() == [True] * 8 + [False] * 8
 
 
 def test_colour_that_turns_with_the_view_justifies_harmonics_and_plain_colour_does_not():
