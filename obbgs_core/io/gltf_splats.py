@@ -21,7 +21,6 @@ from obbgs_core.io.mesh import Z_UP_TO_Y_UP
 from obbgs_core.io.ply import DISPLAY_GAMMA, display_sh, require_writable, viewer_logits
 from obbgs_core.model import sh
 from obbgs_core.model.cameras import Cameras
-from obbgs_core.model.footprint import lowers_peak
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.rotations import from_rotation_vectors, multiply, unit
 from obbgs_core.render import lit_from
@@ -51,12 +50,10 @@ def save_gltf_splats(
     """
     gaussians = gaussians.detach()
     require_writable(gaussians, white_radiance)
-    logits = gaussians.opacity_logits
-    if cameras is not None and lowers_peak(gaussians):
-        logits = viewer_logits(gaussians, cameras)
+    for_viewers = viewer_logits(gaussians, cameras)
     turn = torch.from_numpy(Z_UP_TO_Y_UP[:3, :3]).float()
     shown = _turned(display_sh(lit_from(gaussians, sun_dir), white_radiance), turn)
-    opacities = torch.sigmoid(logits)
+    opacities = gaussians.opacities if for_viewers is None else torch.sigmoid(for_viewers)
     rotations = unit(multiply(TURN, unit(gaussians.quats)))
     attributes = {
         "POSITION": gaussians.means @ turn.T,

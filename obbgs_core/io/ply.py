@@ -91,9 +91,7 @@ def save_ply(
         ValueError: the radiance depends on the Sun's direction, and sun_dir is not given.
     """
     gaussians = gaussians.detach()
-    for_viewers = (
-        viewer_logits(gaussians, cameras) if cameras is not None and lowers_peak(gaussians) else None
-    )
+    for_viewers = viewer_logits(gaussians, cameras)
     count, coefficients, channels = gaussians.sh.shape
     shown = display_sh(lit_from(gaussians, sun_dir), white_radiance)
     rest = shown[:, 1:].transpose(1, 2).flatten(1)  # all of red, then of green, then of blue
@@ -130,8 +128,13 @@ def save_ply(
     write_whole(path, _ply(table, *comments))
 
 
-def viewer_logits(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Return opacity logits [N] for viewers that widen by 0.3 px² and keep the peak, seen from about these cameras."""
+def viewer_logits(gaussians: Gaussians, cameras: Cameras | None) -> Tensor | None:
+    """Return opacity logits [N] for viewers that widen by 0.3 px² and keep the peak, seen from about these cameras.
+
+    None where the model's own serve: it keeps the peak too, or no cameras are known.
+    """
+    if cameras is None or not lowers_peak(gaussians):
+        return None
     psf_sigma_px = torch.tensor(KERBL_PX2 - PIXEL_PX2).sqrt()
     widened = dataclasses.replace(gaussians, footprint="camera", psf_sigma_px=psf_sigma_px)
     projected = project(widened, dataclasses.replace(cameras, psf_sigma_px=None, scale=1.0))
