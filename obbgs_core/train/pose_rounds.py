@@ -48,8 +48,8 @@ def move(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
     """Move the poses to where one frame of each bracket wants them if the surface goes along; settle the gauge.
 
     The frames of a bracket take turns. Where poses were aligned and Gaussians are still added, these go along with the
-    surface. At the first round after `MISFIT_FROM` of the steps, brackets whose residuals
-    stand out are left out of the training for good.
+    surface. At the first round after `MISFIT_FROM` of the steps, brackets whose residuals stand out are left out of the
+    training for good.
 
     Args:
         scale: of the images.
