@@ -26,12 +26,13 @@ def frames() -> list[TrainingFrame]:
     return photographed(target())
 
 
-def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path):
+@pytest.mark.parametrize("killed_after", [23, 31])  # while Gaussians are added, and after
+def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path, killed_after):
     config = preset("obbgs", QUICK | {"poses.refine": "always", "parsimony.prune_at": (0.5,)})
     tagged = [dataclasses.replace(f, pose_covariance=1e-6 * torch.eye(6).double()) for f in frames]
     whole = train(tagged, SENSOR, config, seed=3)
     first = Trainer(tagged, SENSOR, config, seed=3)
-    for _ in range(23):
+    for _ in range(killed_after):
         first.step()
     first.save(tmp_path / "training.checkpoint")
     steps = []
@@ -43,7 +44,9 @@ def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path):
         lambda info: steps.append(info.step),
         checkpoint=tmp_path / "training.checkpoint",
     )
-    assert steps == list(range(24, 41)) and [i.step for i in resumed.history] == list(range(1, 41))
+    assert steps == list(range(killed_after + 1, 41)) and [i.step for i in resumed.history] == list(
+        range(1, 41)
+    )
     for name, tensor in whole.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
 
