@@ -199,7 +199,7 @@ def add_highlights(setup: TrainingSetup, state: TrainingState, scale: float) -> 
         state.steps_done,
     )
     if found.gaussians is not None:
-        changed = {name: getattr(found.gaussians, name) for name in ("sh", "lobes", "gloss")}
+        changed = {name: getattr(found.gaussians, name) for name in ("sh", "lobes", "gloss", "static_sun")}
         state.gaussians = dataclasses.replace(state.gaussians, **changed).trainable()
         state.adam.widen(state.gaussians)
     gain = f"{found.gain:.0f} ± {found.error:.0f} nats"
