@@ -28,6 +28,7 @@ from obbgs_core.train.batches import Batches
 HIGHLIGHTS_FROM = 0.15
 # before that a model has not settled, and parallax that it does not have yet looks like highlights
 FEWEST_STEPS = 100
+MORE_FRAMES = 1.5  # times as many as at the last test: then they are tested again
 VIEWS = 120  # training frames that are rendered, spread evenly: few of them show the glint of one Gaussian
 SAMPLE = 192  # Gaussians that decide, spread evenly
 ALPHAS = (0.2, 0.4)  # roughness of GGX that is tried

@@ -16,7 +16,7 @@ from obbgs_core.model.sh import C0
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check, fraction
-from obbgs_core.train.batches import Batches
+from obbgs_core.train.batches import Batch, Batches
 
 VIEWS = 36  # training frames that are rendered, spread evenly; gains are scaled to all frames
 # An opaque Gaussian that shows on less than this in every picture hides nothing that its neighbours do not hide too.
@@ -117,7 +117,7 @@ def next_degree_gain(
     slope, curvature, shared = (torch.zeros_like(model.sh) for _ in range(3))
     values, times = 0, 0.0
     for view in _views(model, batches, sensor, scale, rng):
-        residual = view.residual.clamp(-3, 3)  # robust, as the loss is
+        residual = view.residual(sensor).clamp(-3, 3)  # robust, as the loss is
         signal = view.predicted * view.weight
         (g,) = torch.autograd.grad((signal * residual).sum(), model.sh, retain_graph=True)
         (probe,) = torch.autograd.grad((signal * view.signs).sum(), model.sh)
@@ -138,12 +138,19 @@ def next_degree_gain(
 class _View:
     """One training frame as the model predicts it [1, H, W, C], with the random signs of Hutchinson's estimator."""
 
+    batch: Batch
+    radiance: Tensor
     predicted: Tensor  # DN, with its graph
-    residual: Tensor  # (read - expected) / deviation of the reading: mean 0 where the model is true
     weight: Tensor  # 1 / sigma; 0 where saturated, because the reading does not depend on the radiance there
     signs: Tensor
     values: int  # sensor values that show the target above the noise
     times: float  # training frames for each frame that is rendered
+
+    def residual(self, sensor: Sensor) -> Tensor:
+        """Return (read - expected) / deviation of the reading [1, H, W, C]: mean 0 where the model is true."""
+        batch = self.batch
+        residual = sensor.normalised_residual(self.radiance.detach(), batch.exposure_time_s, batch.dn)
+        return -residual * math.sqrt(batch.averaged_pixels)
 
 
 def _views(
@@ -156,14 +163,12 @@ def _views(
         radiance = render(model, batch.cameras).radiance
         prediction = sensor.predicted(radiance, batch.exposure_time_s)
         predicted = prediction.expected_dn
-        residual = -sensor.normalised_residual(radiance.detach(), batch.exposure_time_s, batch.dn)
-        residual *= math.sqrt(batch.averaged_pixels)
         sigma = (prediction.variance_dn2 / batch.averaged_pixels).sqrt()
         weight = torch.where(batch.dn < sensor.white_dn, 1 / sigma, 0.0)
         signs = torch.randint(0, 2, predicted.shape, generator=rng) * 2.0 - 1
         empty_dn = sensor.expected_dn(torch.tensor(batch.cameras.background), batch.exposure_time_s)
         values = int(((predicted.detach() - empty_dn).abs() > sigma).sum()) * batch.averaged_pixels
-        yield _View(predicted, residual, weight, signs, values, len(batches.frames) / len(chosen))
+        yield _View(batch, radiance, predicted, weight, signs, values, len(batches.frames) / len(chosen))
 
 
 def _chosen(batches: Batches) -> range:

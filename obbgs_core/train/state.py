@@ -80,6 +80,7 @@ class TrainingState:
     holds: int  # how often the schedule will still be set back for the poses
     appearance_reason: str  # why the radiance depends on what it does
     highlights_reason: str = ""  # why it has highlights or not; empty: not tested
+    highlights_frames: int = 0  # how many there were when they were tested
     smoothing_m: Tensor | None = None  # [N] deviations of the 3D filter; None: the method has none
     compensation: Compensation | None = None  # None: the colours of all frames are the model's
     misfits: list[int] = field(

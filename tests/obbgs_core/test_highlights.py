@@ -329,3 +329,17 @@ def test_frames_that_join_bring_gaussians_with_faint_lobes(shiny_frames):
     trainer.step()
     assert trainer.state.gaussians.lobes.shape == (len(trainer.gaussians), 4)
     assert trainer.state.gaussians.lobes.isfinite().all()
+
+
+@pytest.mark.usefixtures("tested_early")
+def test_highlights_that_few_frames_do_not_show_are_found_when_more_have_joined(shiny_frames):
+    trainer = _trainer(shiny_frames[:6])
+    for _ in range(40):
+        trainer.step()
+    assert not trainer.gaussians.has_highlights and trainer.state.highlights_frames == 6
+    trainer.join(shiny_frames[6:8])
+    trainer.step()
+    assert trainer.state.highlights_frames == 6  # too few more to ask again
+    trainer.join(shiny_frames[8:])
+    trainer.step()
+    assert trainer.state.highlights_frames == 90 and trainer.gaussians.has_highlights
