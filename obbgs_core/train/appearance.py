@@ -97,7 +97,9 @@ def raised_degree(
     for direction in directions if degree == 1 else (gaussians.shading,):
         turning = dataclasses.replace(gaussians, shading=direction)
         gain, penalty = next_degree_gain(turning, batches, sensor, scale, rng)
-        tested.append(f"with the {direction} it would gain {gain:.0f} nats at a BIC penalty of {penalty:.0f}")
+        tested.append(
+            f"with the {direction} it would gain {gain:,.0f} nats at a BIC penalty of {penalty:,.0f}"
+        )
         if gain > penalty:
             lambert = direction == "sun" and settings.sun_shading == "lambert"
             raised = (lambertian(gaussians) if lambert else padded(turning, degree)).trainable()

@@ -15,7 +15,7 @@ from obbgs_core.train import pose_rounds
 from obbgs_core.train.appearance import SUN_FROM, described, raised_degree
 from obbgs_core.train.batches import Batch, FrameOrder
 from obbgs_core.train.config import Moment
-from obbgs_core.train.glints import FEWEST_STEPS, HIGHLIGHTS_FROM, lobed
+from obbgs_core.train.glints import FEWEST_STEPS, HIGHLIGHTS_FROM, MORE_FRAMES, lobed
 from obbgs_core.train.growth import (
     GRADIENT_THRESHOLD,
     Growth,
@@ -145,14 +145,17 @@ def change_number(
 
 
 def select_model(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
-    """Prune by BIC and test a higher harmonic degree, when due; a moving Sun and highlights are tested once before.
+    """Prune by BIC and test a higher harmonic degree, when due; a moving Sun and highlights are tested before.
+
+    Where no highlights were found they are tested again once half as many frames again have joined.
 
     Args:
         scale: of the images that the likelihood is taken of.
     """
     config, now = setup.config, state.steps_done + 1
-    settled = now == round(config.steps_until(HIGHLIGHTS_FROM)) >= FEWEST_STEPS
-    if settled and config.light.highlights and not state.gaussians.has_highlights:
+    settled = now >= round(config.steps_until(HIGHLIGHTS_FROM)) >= FEWEST_STEPS
+    untested = len(setup.frames) >= MORE_FRAMES * state.highlights_frames
+    if settled and untested and config.light.highlights and not state.gaussians.has_highlights:
         add_highlights(setup, state, scale)
     if any(now == round(config.steps_until(at)) for at in config.parsimony.prune_at):
         prune_by_bic(setup, state, scale)
@@ -201,10 +204,11 @@ def add_highlights(setup: TrainingSetup, state: TrainingState, scale: float) -> 
         state.steps_done,
     )
     if found.gaussians is not None:
-        changed = {name: getattr(found.gaussians, name) for name in ("sh", "lobes", "gloss")}
+        changed = {name: getattr(found.gaussians, name) for name in ("sh", "lobes", "gloss", "static_sun")}
         state.gaussians = dataclasses.replace(state.gaussians, **changed).trainable()
         state.adam.widen(state.gaussians)
-    gain = f"{found.gain:.0f} ± {found.error:.0f} nats"
+    gain = f"{found.gain:,.0f} ± {found.error:,.0f} nats"
+    state.highlights_frames = len(setup.frames)
     state.highlights_reason = (
         f"step {state.steps_done + 1}, highlights would gain {gain} on views that they are not fitted to"
     )

@@ -52,7 +52,7 @@ def cell_m(setup: TrainingSetup) -> float:
 def reach_m(setup: TrainingSetup, share: float) -> float:
     """Return how far training moves a Gaussian from one round to the next: by about its rate in each step."""
     rates = learning_rates(setup.config.rates, share, setup.unit_m, 1, setup.radiance_unit)
-    return rates["means"] * steps_between(setup)
+    return float(rates["means"]) * steps_between(setup)
 
 
 def move(setup: TrainingSetup, state: TrainingState, scale: float) -> None:

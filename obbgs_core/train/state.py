@@ -28,7 +28,7 @@ from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 7  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 8  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,7 @@ class TrainingState:
     holds: int  # how often the schedule will still be set back for the poses
     appearance_reason: str  # why the radiance depends on what it does
     highlights_reason: str = ""  # why it has highlights or not; empty: not tested
+    highlights_frames: int = 0  # how many there were when they were tested
     smoothing_m: Tensor | None = None  # [N] deviations of the 3D filter; None: the method has none
     compensation: Compensation | None = None  # None: the colours of all frames are the model's
     misfits: list[int] = field(
