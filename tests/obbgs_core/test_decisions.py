@@ -10,10 +10,12 @@ from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
 from obbgs_core.train.batches import Batches
 from obbgs_core.train.parsimony import (
+    VIEWS,
     ParsimonySettings,
     justified,
     likelihood_gains,
     next_degree_gain,
+    shown_frames,
     shown_px,
 )
 from obbgs_core.train.presets import preset
@@ -55,6 +57,16 @@ def test_the_pixels_that_show_a_gaussian_are_its_weights_in_the_reference_render
             weights = render(alone, cameras, backend="reference").radiance / 1e4
             most[j] = torch.maximum(most[j], weights.sum())
     torch.testing.assert_close(shown_px(model, batches, 1.0), most, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("count", [12, 105, 117, 120, 231, 363])
+def test_the_frames_that_decide_are_spread_evenly_over_the_exposure_times_of_the_brackets(count):
+    frame = photographed(target(8, seed=2), count=1)[0]
+    frames = [dataclasses.replace(frame, exposure_time_s=(1.0, 2.0, 4.0)[i % 3]) for i in range(count)]
+    shown = [frames[i].exposure_time_s for i in shown_frames(Batches(frames, SENSOR.white_dn))]
+    of_each = [shown.count(seconds) for seconds in (1.0, 2.0, 4.0)]
+    assert max(of_each) - min(of_each) <= 1
+    assert min(count, 0.7 * VIEWS) <= len(shown) < 2 * VIEWS
 
 
 def test_opaque_gaussians_are_pruned_where_no_picture_shows_them_and_dark_ones_are_not():
