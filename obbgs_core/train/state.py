@@ -28,7 +28,7 @@ from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 8  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 9  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
