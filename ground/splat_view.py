@@ -101,11 +101,12 @@ def packed(run: Run, gaussians: Gaussians) -> tuple[dict, dict[str, np.ndarray]]
 
 
 def _gloss(gaussians: Gaussians) -> dict | None:
-    """Return roughness and peak radiance, three channels, of the highlights; None without them."""
+    """Return roughness, peak radiance (three channels) and static Sun of the highlights; None without them."""
     if not gaussians.has_highlights:
         return None
     alpha, *peak = gaussians.gloss.exp().tolist()
-    return {"alpha": alpha, "peak": peak if len(peak) == 3 else 3 * peak}
+    sun = gaussians.static_sun.tolist() or None
+    return {"alpha": alpha, "peak": peak if len(peak) == 3 else 3 * peak, "sun": sun}
 
 
 def footprint_facts(gaussians: Gaussians, psf_sigma_px: float | None) -> dict:

@@ -183,7 +183,7 @@ def _views(results: Results, out: Path, target: str) -> Figure:
         axis.axis("off")
     if kept:
         axes[0, 0].imshow(tone(kept[0][1].expected, kept[0][1].sensor))
-        axes[0, 0].set_title(f"{target}, frame {kept[0][1].frame}", fontsize=9)
+        axes[0, 0].set_title(f"{target}\nframe {kept[0][1].frame}", fontsize=9)
     for column, (name, view) in enumerate(kept, start=1):
         axes[0, column].imshow(tone(view.image, view.sensor))
         axes[0, column].set_title(f"{name}\n{view.psnr_db:.1f} dB", fontsize=9)

@@ -45,8 +45,10 @@ const SHADE = `
     }
     if (alpha > 0.0) { // a highlight: GGX around the lobe's axis
       vec4 lobe = fetch(params, (i + 1) * perSplat - 1);
-      float cosine = dot(lobe.xyz, shading == 0 ? -direction : normalize(sun - direction));
-      float cos2 = shading == 0 ? 0.5 + 0.5 * cosine : pow(max(cosine, 0.0), 2.0);
+      bool mirrors = shading != 0 || dot(staticSun, staticSun) > 0.0; // the axis is the normal of a mirror
+      vec3 source = shading == 0 ? staticSun : sun;
+      float cosine = dot(lobe.xyz, mirrors ? normalize(source - direction) : -direction);
+      float cos2 = mirrors ? pow(max(cosine, 0.0), 2.0) : 0.5 + 0.5 * cosine;
       float root = alpha * alpha / max(1.0 - cos2 * (1.0 - alpha * alpha), 1e-9);
       radiance += lit * lobe.w * root * root * shine;
     }
@@ -56,7 +58,7 @@ const SHADE = `
 const VERTEX = `#version 300 es
   precision highp float; precision highp int; precision highp sampler2D;
   uniform sampler2D means, params, sunlit;
-  uniform mat3 rotation; uniform vec3 translation, sun, eye, shine; uniform vec2 size;
+  uniform mat3 rotation; uniform vec3 translation, sun, staticSun, eye, shine; uniform vec2 size;
   uniform float focal, widened, unit, ambient, sunShare, alpha; uniform bool lowers;
   uniform int perSplat, coefficients, channels, shading, count, sunBefore, sunAfter;
   in uint index;
@@ -230,6 +232,7 @@ class Drawing {
     const unit = sensor.dn_per_radiance_s * exposureS / (sensor.white_dn - sensor.black_dn);
     gl.uniform1f(at.unit, unit); gl.uniform1f(at.ambient, model.ambient);
     gl.uniform1f(at.alpha, model.gloss ? model.gloss.alpha : 0); gl.uniform3fv(at.shine, model.gloss ? model.gloss.peak : [0, 0, 0]);
+    gl.uniform3fv(at.staticSun, model.gloss?.sun ?? [0, 0, 0]);
     gl.uniform1i(at.perSplat, model.texels); gl.uniform1i(at.coefficients, model.coefficients);
     gl.uniform1i(at.channels, model.channels); gl.uniform1i(at.count, model.count);
     gl.uniform1i(at.shading, ["view", "sun", "lambert"].indexOf(model.shading));

@@ -39,6 +39,7 @@ TURNS_WITH_SUN = "comment radiance_sh turn with the Sun"
 FOOTPRINT = "comment footprint "
 LOBE_NAMES = ("lobe_x", "lobe_y", "lobe_z", "lobe_log_weight")
 HIGHLIGHTS = "comment highlights: GGX of alpha "
+STATIC_SUN = ", Sun towards "
 LAMBERT = "comment radiance_sh are albedos in units of the Sun's light, ambient light "
 
 
@@ -122,10 +123,15 @@ def save_ply(
         comments.append(f"{FOOTPRINT}{gaussians.footprint}, psf_sigma_px {gaussians.psf_sigma_px.item():.9g}")
     if gaussians.has_highlights:
         alpha, *peak = (f"{value:.9g}" for value in gaussians.gloss.exp().tolist())
-        comments.append(
-            f"{HIGHLIGHTS}{alpha}, peak radiance {' '.join(peak)}; in f_dc and f_rest of degree 3, wider"
-        )
+        material = f"{alpha}, peak radiance {' '.join(peak)}{_towards(gaussians.static_sun)}"
+        comments.append(f"{HIGHLIGHTS}{material}; in f_dc and f_rest of degree 3, wider")
     write_whole(path, _ply(table, *comments))
+
+
+def _towards(static_sun: Tensor) -> str:
+    """Return the direction of a Sun that stands still, as a header tells it; nothing where it is not known."""
+    direction = " ".join(f"{value:.9g}" for value in static_sun.tolist())
+    return f"{STATIC_SUN}{direction}" if direction else ""
 
 
 def viewer_logits(gaussians: Gaussians, cameras: Cameras | None) -> Tensor | None:
@@ -187,8 +193,10 @@ def load_ply(path: Path) -> Gaussians:
             footprint, _, psf_sigma_px = line.removeprefix(FOOTPRINT).partition(", psf_sigma_px ")
             fitted |= {"footprint": footprint, "psf_sigma_px": torch.tensor(float(psf_sigma_px))}
         if line.startswith(HIGHLIGHTS):
-            alpha, _, peak = line.removeprefix(HIGHLIGHTS).partition(";")[0].partition(", peak radiance ")
+            material, _, sun = line.removeprefix(HIGHLIGHTS).partition(";")[0].partition(STATIC_SUN)
+            alpha, _, peak = material.partition(", peak radiance ")
             fitted["gloss"] = torch.tensor([float(value) for value in (alpha, *peak.split())]).log()
+            fitted["static_sun"] = torch.tensor([float(value) for value in sun.split()])
             fitted["lobes"] = torch.stack([table[name] for name in LOBE_NAMES], 1)
         if line.startswith(TURNS_WITH_SUN):
             shading = "sun"

@@ -32,9 +32,11 @@ class Gaussians:
 
     A model may have highlights (`render.highlights`): each Gaussian then mirrors the Sun in one more lobe, which is
     added to that radiance. lobes [N, 4]: its axis (normalised on use) and the logarithm of its weight; the axis is
-    the direction in which it is seen at its brightest, or with the shadings `sun` and `lambert` the normal of the
-    mirror. gloss [1 + C]: the logarithms of the roughness alpha of GGX and of the peak radiance of a weight of 1,
-    shared by all as one material is. A model without highlights has lobes [N, 0] and gloss [0].
+    the normal of the mirror where the Sun is known, which it is with the shadings `sun` and `lambert` and where
+    static_sun [3] holds its direction (unit, body frame), because it stands still; where static_sun is [0], the
+    direction in which the lobe is seen at its brightest. gloss [1 + C]: the logarithms of the roughness alpha of GGX
+    and of the peak radiance of a weight of 1, shared by all as one material is. A model without highlights has lobes
+    [N, 0] and gloss [0].
 
     Projected Gaussians are widened by what each pixel averages over, the `footprint`. It belongs to the model, because
     opacities and scales were fitted with it:
@@ -56,6 +58,7 @@ class Gaussians:
     psf_sigma_px: Tensor = field(default_factory=lambda: torch.tensor(DEFAULT_PSF_SIGMA_PX))
     lobes: Tensor = field(default_factory=lambda: torch.zeros(0, 0))
     gloss: Tensor = field(default_factory=lambda: torch.zeros(0))
+    static_sun: Tensor = field(default_factory=lambda: torch.zeros(0))
 
     def __post_init__(self):
         n = self.means.shape[0]
@@ -75,6 +78,10 @@ class Gaussians:
             raise ValueError(
                 f"lobes must be [{n}, {LOBE}] with gloss [{1 + self.sh.shape[2]}], or both empty, got "
                 f"{list(self.lobes.shape)} with {list(self.gloss.shape)}"
+            )
+        if tuple(self.static_sun.shape) not in ((0,), (3,)):
+            raise ValueError(
+                f"static_sun must be [3], or [0] if it is not known, got {list(self.static_sun.shape)}"
             )
         if self.shading not in get_args(Shading):
             raise ValueError(f"shading must be one of {', '.join(get_args(Shading))}, got {self.shading!r}")
@@ -124,7 +131,9 @@ class Gaussians:
 
     def matt(self) -> "Gaussians":
         """Return the model without its highlights."""
-        return dataclasses.replace(self, lobes=self.lobes[:, :0], gloss=self.gloss[:0])
+        return dataclasses.replace(
+            self, lobes=self.lobes[:, :0], gloss=self.gloss[:0], static_sun=self.static_sun[:0]
+        )
 
     def select(self, index: Tensor) -> "Gaussians":
         """Return the Gaussians that an index or mask picks."""

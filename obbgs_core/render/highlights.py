@@ -30,9 +30,10 @@ def highlights_along(
     Arguments as of `lighting.radiance_along`, for one camera or, with one more axis at the front, for several.
     """
     axis = F.normalize(gaussians.lobes[:, :3], dim=1)
-    brightest = brightest_axes(directions, None if gaussians.shading == "view" else sun_dir)
-    half_vector = gaussians.shading != "view"
-    share = lobe((brightest * axis).sum(dim=-1), gaussians.gloss[0].exp(), half_vector)
+    if gaussians.shading == "view":
+        sun_dir = gaussians.static_sun if len(gaussians.static_sun) else None
+    cosine = (brightest_axes(directions, sun_dir) * axis).sum(dim=-1)
+    share = lobe(cosine, gaussians.gloss[0].exp(), sun_dir is not None)
     share = share * gaussians.lobes[:, 3].exp()
     if sunlit is not None:
         share = share * sunlit.to(share)

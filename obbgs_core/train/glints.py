@@ -13,7 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from obbgs_core.frames import TrainingFrame
 from obbgs_core.misfit import mean_light2
+from obbgs_core.model.cameras import stacked_suns
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import from_radiance, radiance
 from obbgs_core.render import render
@@ -35,6 +37,7 @@ AXES = 250  # directions that a lobe is tried in, 13 degrees apart
 LEAST_GAIN = 3.0  # nats: a Gaussian whose lobe gains less starts with the weight FAINT
 FAINT = 0.05
 SURE = 2.0  # standard errors by which the gain on the other half must exceed zero
+STILL_DEG = 5.0  # a Sun that is known and never further than this from its mean direction stands still
 AT_ONCE = 16  # Gaussians whose axes are searched together, for memory's sake
 
 
@@ -60,12 +63,13 @@ class _Seen:
     axes: Tensor  # [N, V, 3] unit, of a lobe that is seen at its brightest
     sunlit: Tensor  # [N, V] share of the Sun that reaches it, where the model knows it; else 1
     half_vector: bool  # whether these axes are half vectors
+    static_sun: Tensor  # [3], or [0], as in `Gaussians`
 
     def of(self, gaussians: Tensor, views: Tensor) -> "_Seen":
         """Return a part of it; indices or masks."""
         parts = (self.slope, self.information, self.axes, self.sunlit)
         slope, information, axes, sunlit = (part[gaussians][:, views] for part in parts)
-        return _Seen(slope, information, axes, sunlit, self.half_vector)
+        return _Seen(slope, information, axes, sunlit, self.half_vector, self.static_sun)
 
     def shares(self, axes: Tensor, alpha: float) -> Tensor:
         """Return the share of its peak [N, V, M] at which a lobe along each of some axes [M, 3] is seen."""
@@ -160,7 +164,7 @@ def _with_lobes(model: Gaussians, seen: _Seen, axes: Tensor, alpha: float, stren
     sh[:, 0] = from_radiance((before + change).clamp(min=0.02 * before.mean()))
     lobes = torch.cat([axis, weight.log()[:, None]], dim=1)
     gloss = torch.cat([torch.tensor([alpha]), strengths]).log()
-    return dataclasses.replace(model, sh=sh, lobes=lobes, gloss=gloss)
+    return dataclasses.replace(model, sh=sh, lobes=lobes, gloss=gloss, static_sun=seen.static_sun)
 
 
 def _seen(
@@ -174,6 +178,7 @@ def _seen(
 ) -> _Seen:
     """Return what some of the training frames say of the Gaussians, in both errors, the model's and the noise."""
     found = [[], [], [], []]
+    static_sun = _static_sun(batches.frames) if model.shading == "view" else None
     for index in range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS)):
         batch = batches.batch([index], scale)
         sunlit = shadows.sunlit(model, batch.cameras, step)
@@ -194,12 +199,24 @@ def _seen(
         (information,) = torch.autograd.grad(image, added, alike)
         lit = torch.ones(len(model)) if sunlit is None else sunlit[0].to(slope)
         directions = F.normalize(model.means - batch.cameras.centres[0], dim=1)
-        sun = None if model.shading == "view" else batch.cameras.known_suns()[0]
+        sun = static_sun if model.shading == "view" else batch.cameras.known_suns()[0]
         axes = brightest_axes(directions, sun)
         for values, more in zip(found, (slope[0], information[0], axes, lit), strict=True):
             values.append(more)
     slope, information, axes, sunlit = (torch.stack(values, dim=1) for values in found)
-    return _Seen(slope, information, axes, sunlit, model.shading != "view")
+    known = model.shading != "view" or static_sun is not None
+    return _Seen(
+        slope, information, axes, sunlit, known, torch.zeros(0) if static_sun is None else static_sun
+    )
+
+
+def _static_sun(frames: list[TrainingFrame]) -> Tensor | None:
+    """Return the direction [3] towards a Sun that stands still in the body frame; None if it moves or is not known."""
+    directions = stacked_suns([frame.sun_dir for frame in frames])
+    if directions is None:
+        return None
+    mean = F.normalize(directions.mean(dim=0), dim=0)
+    return mean if (directions @ mean).min() > math.cos(math.radians(STILL_DEG)) else None
 
 
 def first_lobes(means: Tensor, camera_centre: Tensor) -> Tensor:

@@ -71,7 +71,7 @@ def shown_px(gaussians: Gaussians, batches: Batches, scale: float) -> Tensor:
     )
     white.sh.requires_grad_()
     most = torch.zeros(len(gaussians))
-    for index in _chosen(batches):
+    for index in shown_frames(batches):
         image = render(white, batches.batch([index], scale).cameras).radiance
         (slope,) = torch.autograd.grad(image.sum(), white.sh)
         most = torch.maximum(most, slope[:, 0, 0] / C0)
@@ -92,9 +92,7 @@ def likelihood_gains(
     model.opacity_logits.requires_grad_()
     gains, values, times = torch.zeros(len(gaussians)), 0, 0.0
     for view in _views(model, batches, sensor, scale, rng):
-        (slope,) = torch.autograd.grad(
-            (view.predicted * view.weight * view.signs).sum(), model.opacity_logits
-        )
+        (slope,) = torch.autograd.grad(view.radiance, model.opacity_logits, view.weight * view.signs)
         # o·d/do, from the derivative by the logit
         change = slope / (1 - model.opacities.detach()).clamp(min=1e-6)
         gains += 0.5 * change**2
@@ -118,9 +116,8 @@ def next_degree_gain(
     values, times = 0, 0.0
     for view in _views(model, batches, sensor, scale, rng):
         residual = view.residual(sensor).clamp(-3, 3)  # robust, as the loss is
-        signal = view.predicted * view.weight
-        (g,) = torch.autograd.grad((signal * residual).sum(), model.sh, retain_graph=True)
-        (probe,) = torch.autograd.grad((signal * view.signs).sum(), model.sh)
+        (g,) = torch.autograd.grad(view.radiance, model.sh, view.weight * residual, retain_graph=True)
+        (probe,) = torch.autograd.grad(view.radiance, model.sh, view.weight * view.signs)
         slope += g
         curvature += probe**2
         shared += probe * probe[:, :1]
@@ -139,15 +136,15 @@ class _View:
     """One training frame as the model predicts it [1, H, W, C], with the random signs of Hutchinson's estimator."""
 
     batch: Batch
-    radiance: Tensor
-    predicted: Tensor  # DN, with its graph
-    weight: Tensor  # 1 / sigma; 0 where saturated, because the reading does not depend on the radiance there
+    radiance: Tensor  # with its graph
+    # of the radiance, in deviations of the reading; 0 where saturated, because the reading does not depend on it there
+    weight: Tensor
     signs: Tensor
     values: int  # sensor values that show the target above the noise
     times: float  # training frames for each frame that is rendered
 
     def residual(self, sensor: Sensor) -> Tensor:
-        """Return (read - expected) / deviation of the reading [1, H, W, C]: mean 0 where the model is true."""
+        """Return (read - expected) / deviation of the reading: mean 0 where the model is true."""
         batch = self.batch
         residual = sensor.normalised_residual(self.radiance.detach(), batch.exposure_time_s, batch.dn)
         return -residual * math.sqrt(batch.averaged_pixels)
@@ -157,23 +154,30 @@ def _views(
     model: Gaussians, batches: Batches, sensor: Sensor, scale: float, rng: torch.Generator
 ) -> Iterator[_View]:
     """Render some of the training frames, spread evenly."""
-    chosen = _chosen(batches)
+    chosen = shown_frames(batches)
     for index in chosen:
         batch = batches.batch([index], scale)
         radiance = render(model, batch.cameras).radiance
-        prediction = sensor.predicted(radiance, batch.exposure_time_s)
-        predicted = prediction.expected_dn
-        sigma = (prediction.variance_dn2 / batch.averaged_pixels).sqrt()
-        weight = torch.where(batch.dn < sensor.white_dn, 1 / sigma, 0.0)
-        signs = torch.randint(0, 2, predicted.shape, generator=rng) * 2.0 - 1
+        prediction = sensor.predicted(radiance.detach(), batch.exposure_time_s)
+        sigma_dn = prediction.sigma_dn / math.sqrt(batch.averaged_pixels)
+        dn_per_radiance = sensor.dn_per_radiance_s * batch.exposure_time_s
+        weight = torch.where(batch.dn < sensor.white_dn, dn_per_radiance / sigma_dn, 0.0)
+        signs = torch.randint(0, 2, radiance.shape, generator=rng) * 2.0 - 1
         empty_dn = sensor.expected_dn(torch.tensor(batch.cameras.background), batch.exposure_time_s)
-        values = int(((predicted.detach() - empty_dn).abs() > sigma).sum()) * batch.averaged_pixels
-        yield _View(batch, radiance, predicted, weight, signs, values, len(batches.frames) / len(chosen))
+        values = int(((prediction.expected_dn - empty_dn).abs() > sigma_dn).sum()) * batch.averaged_pixels
+        yield _View(batch, radiance, weight, signs, values, len(batches.frames) / len(chosen))
 
 
-def _chosen(batches: Batches) -> range:
-    """Return the indices of the frames that are rendered, spread evenly."""
-    return range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS))
+def shown_frames(batches: Batches) -> range:
+    """Return the indices of the frames that are rendered, spread evenly over time and over the exposure times.
+
+    Exposure times come in turns: a stride that shares a factor with their number would meet only some of them.
+    """
+    exposures = len({frame.exposure_time_s for frame in batches.frames})
+    stride = max(1, len(batches.frames) // VIEWS)
+    while math.gcd(stride, exposures) > 1:
+        stride += 1
+    return range(0, len(batches.frames), stride)
 
 
 def padded(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -1,8 +1,9 @@
 """Rendered targets for comparisons: true radiance of 120 views, exposed and read out by the benchmark itself.
 
 The folder (default ../shared/data, or OBBGS_TARGETS) holds NAME_400.npz: radiance [120, 400, 400, 3] (scene-linear),
-alpha [120, 400, 400] (255 = full), world_to_camera [120, 4, 4], K [3, 3] px and cloud [M, 3]; the target's largest
-dimension is 2 units, here 2 m. Nothing else of the project reads them. `ground compare` takes them as sessions:
+alpha [120, 400, 400] (255 = full), world_to_camera [120, 4, 4], K [3, 3] px, cloud [M, 3] and the unit vector sun_dir
+towards the Sun, [3] or [120, 3]; the target's largest dimension is 2 units, here 2 m. Nothing else of the project
+reads them. `ground compare` takes them as sessions; with --sun their frames tell the Sun, as those of a pass do:
 
     python -m tests.benchmarks.targets --size 200 --out sessions TDRS DSCOVR
 """
@@ -69,12 +70,15 @@ def names() -> list[str]:
     return sorted(path.name.removesuffix("_400.npz") for path in FOLDER.glob("*_400.npz"))
 
 
-def expose(name: str, size: int = 400, sigma: float = PAPER_SIGMA, seed: int = 0) -> Target:
+def expose(
+    name: str, size: int = 400, sigma: float = PAPER_SIGMA, seed: int = 0, with_sun: bool = False
+) -> Target:
     """Return a target's views by the paper's 8-bit camera (Gaussian noise, then clipped); view i has exposure i mod 3.
 
     Args:
         size: pixels along a side; 400, or 200 and 100 by averaging.
         sigma: of the noise, full scale 1.
+        with_sun: the frames tell the direction of the Sun.
 
     Raises:
         FileNotFoundError: no such target.
@@ -85,6 +89,10 @@ def expose(name: str, size: int = 400, sigma: float = PAPER_SIGMA, seed: int = 0
         poses = torch.from_numpy(arrays["world_to_camera"].astype(np.float32))
         K = torch.from_numpy(arrays["K"].astype(np.float32))
         cloud = arrays["cloud"].astype(np.float64)
+        suns = [None] * len(radiance)
+        if with_sun:
+            towards = torch.from_numpy(arrays["sun_dir"].astype(np.float32)).expand(len(radiance), 3)
+            suns = list(F.normalize(towards, dim=1))
     lit = radiance.mean(-1)[alpha >= 230 / 255]
     # full scale per radiance and second
     gain = MID_SIGNAL / (float(np.percentile(lit.numpy(), 97)) * BRACKET_S[1])
@@ -99,7 +107,9 @@ def expose(name: str, size: int = 400, sigma: float = PAPER_SIGMA, seed: int = 0
         exposure_s = BRACKET_S[i % len(BRACKET_S)]
         signal = radiance[i] * gain * exposure_s  # full scale = 1, not clipped yet
         dn = converted(255 * signal.double().numpy(), 255 * sigma, 255, noise)
-        frame = TrainingFrame(torch.from_numpy(dn.astype(np.float32)), exposure_s, poses[i], K, i)
+        frame = TrainingFrame(
+            torch.from_numpy(dn.astype(np.float32)), exposure_s, poses[i], K, i, sun_dir=suns[i]
+        )
         views.append(View(frame, radiance[i], alpha[i]))
     return Target(name, sensor, views, cloud)
 
@@ -226,7 +236,7 @@ def _frame(view: View, camera: CameraSection) -> Frame:
             quat_body_to_camera=matrix_to_quat(pose[:3, :3]),
             position_body_m=-pose[:3, :3].T @ pose[:3, 3],
             covariance=np.zeros((6, 6)),
-            sun_dir_body=np.zeros(3),
+            sun_dir_body=np.zeros(3) if frame.sun_dir is None else frame.sun_dir.double().numpy(),
             in_eclipse=False,
             valid=True,
             source="none",
@@ -257,15 +267,17 @@ def main() -> None:
         default="paper",
         help="spacecam: with its lens, its faults, blooming and stars",
     )
+    parser.add_argument("--sun", action="store_true", help="the frames tell the direction of the Sun")
     parser.add_argument("--out", type=Path, required=True, help="where to write NAME-SIZE")
     arguments = parser.parse_args()
     if wrong := set(arguments.targets).difference(names()):
         parser.error(f"no target {', '.join(sorted(wrong))} in {FOLDER}; there are {', '.join(names())}")
     for name in arguments.targets or names():
         other = arguments.sensor != "paper"
-        session = arguments.out / (f"{name}-{arguments.size}" + f"-{arguments.sensor}" * other)
+        suffix = f"-{arguments.sensor}" * other + "-sun" * arguments.sun
+        session = arguments.out / f"{name}-{arguments.size}{suffix}"
         if not session.exists():
-            target = expose(name, arguments.size)
+            target = expose(name, arguments.size, with_sun=arguments.sun)
             write(
                 exposed_by(target, replace(PRESETS[arguments.sensor], blooming=True)) if other else target,
                 session,

@@ -59,6 +59,8 @@ def model(shading: str, footprint: str, sh_count: int, channels: int) -> Gaussia
         rng = torch.Generator().manual_seed(1)
         lobes, peak = torch.randn(300, 4, generator=rng), torch.linspace(3.0, 1.5, channels)
         changes |= {"lobes": lobes, "gloss": torch.cat([torch.tensor([0.3]), peak]).log()}
+    if "Sun" in shining:  # of which the model knows where it stands still
+        changes |= {"static_sun": torch.tensor([0.48, -0.6, 0.64])}
     return dataclasses.replace(gaussians, means=means, log_scales=log_scales, sh=sh, **changes)
 
 
@@ -99,6 +101,7 @@ def still(page) -> None:
     [
         ("view", "camera", 1, 1),
         ("view, shining", "camera", 1, 3),
+        ("view, shining under a known Sun", "camera", 1, 3),
         ("lambert, shining", "camera", 1, 1),
         ("view", "kerbl", 16, 3),
         ("view", "mip-splatting", 4, 1),

@@ -10,12 +10,15 @@ from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
 from obbgs_core.train.batches import Batches
 from obbgs_core.train.parsimony import (
+    VIEWS,
     ParsimonySettings,
     justified,
     likelihood_gains,
     next_degree_gain,
+    shown_frames,
     shown_px,
 )
+from obbgs_core.train.poses import HELD_FROM
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
 from tests.scenes import QUICK, SENSOR, photographed, tagged, target
@@ -57,6 +60,16 @@ def test_the_pixels_that_show_a_gaussian_are_its_weights_in_the_reference_render
     torch.testing.assert_close(shown_px(model, batches, 1.0), most, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize("count", [12, 105, 117, 120, 231, 363])
+def test_the_frames_that_decide_are_spread_evenly_over_the_exposure_times_of_the_brackets(count):
+    frame = photographed(target(8, seed=2), count=1)[0]
+    frames = [dataclasses.replace(frame, exposure_time_s=(1.0, 2.0, 4.0)[i % 3]) for i in range(count)]
+    shown = [frames[i].exposure_time_s for i in shown_frames(Batches(frames, SENSOR.white_dn))]
+    of_each = [shown.count(seconds) for seconds in (1.0, 2.0, 4.0)]
+    assert max(of_each) - min(of_each) <= 1
+    assert min(count, 0.7 * VIEWS) <= len(shown) < 2 * VIEWS
+
+
 def test_opaque_gaussians_are_pruned_where_no_picture_shows_them_and_dark_ones_are_not():
     model = dataclasses.replace(target(8, seed=2).detach(), footprint="camera")
     frames = photographed(model, count=12)
@@ -96,7 +109,10 @@ def test_wrong_poses_are_refined_and_exact_ones_are_left_alone(wrong):
     while not trainer.state.poses_decided:
         assert trainer.state.order.validation_brackets == [[i] for i in range(3, 42, 7)]
         trainer.step()
-    assert trainer.state.order.validation_brackets == [] and trainer.state.steps_done == 161
+    assert trainer.state.order.validation_brackets == [] and trainer.state.history[-1].step == 161
+    assert trainer.state.steps_done == (
+        400 * HELD_FROM if wrong else 161
+    )  # a refinement sets the schedule back
     assert trainer.state.poses_decided.startswith("refined" if wrong else "as tagged")
     assert (trainer.state.poses is not None) == wrong
     assert trainer.result("").poses == trainer.state.poses_decided

@@ -54,11 +54,15 @@ def _highlights(g: Graph, gaussians: Gaussians, camera: View, sunlit: str | None
     """Return the radiance [N, C] of the lobes, as `render.highlights.highlights_along`."""
     towards = g.op("Neg", _directions(g, gaussians, camera))
     axis = to_numpy(F.normalize(gaussians.lobes[:, :3], dim=1))
-    if gaussians.shading == "view":
+    if gaussians.shading != "view":
+        sun = g.op("Reshape", "sun_dir", g.ints(1, 3))
+    else:
+        sun = to_numpy(gaussians.static_sun[None]) if len(gaussians.static_sun) else None
+    if sun is None:
         cosine = g.op("ReduceSum", g.op("Mul", towards, axis), g.ints(1), keepdims=1)
         cos2 = g.op("Mul", g.op("Add", cosine, 1.0), 0.5)
     else:
-        half = _unit(g, g.op("Add", towards, g.op("Reshape", "sun_dir", g.ints(1, 3))))
+        half = _unit(g, g.op("Add", towards, sun))
         cosine = g.op("Relu", g.op("ReduceSum", g.op("Mul", half, axis), g.ints(1), keepdims=1))
         cos2 = g.op("Mul", cosine, cosine)
     alpha2 = float(gaussians.gloss[0].exp() ** 2)
