@@ -29,7 +29,7 @@ from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 9  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 10  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
