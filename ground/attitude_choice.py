@@ -30,12 +30,7 @@ CERTAIN = 3.0
 
 # A wrong rotation must not be excused as the model's own error. With these weights of the priors, its held-out loss in
 # the test of a mirrored motion is 7 standard errors above that of the true one; with the method's own, 2.5.
-NOISE_ALONE = {
-    "loss.misfit": False,
-    "loss.flat_weight": 3.0,
-    "loss.plane_weight": 3.0,
-    "loss.sky_weight": 0.2,
-}
+NOISE_ALONE = {"loss.misfit": False, "loss.flat_weight": 3.0, "loss.sky_weight": 0.2}
 
 
 def chosen_by_training(

@@ -131,14 +131,14 @@ def change_number(
             threshold *= threshold_factor(batch.cameras)
         model = (state.gaussians, state.adam, state.growth, setup.unit_m, settings, moment.share, state.rng)
         state.gaussians = densify(*model, crossed, threshold)
-        state.growth, state.boxes, state.faces = Growth.of(len(state.gaussians)), [], None
+        state.growth, state.boxes = Growth.of(len(state.gaussians)), []
         smooth(setup, state)
     elif state.boxes and now % settings.obb_interval == 0:
         drop_not_finite(state)
         state.gaussians, state.growth = densify_boxes(
             state.gaussians, state.adam, state.growth, state.boxes, setup.unit_m, settings, state.rng
         )
-        state.boxes, state.faces = [], None
+        state.boxes = []
         smooth(setup, state)
     if settings.opacity_reset_interval and now % settings.opacity_reset_interval == 0:
         reset_opacities(state.gaussians, state.adam, state.log_lowering)
@@ -171,7 +171,7 @@ def prune_by_bic(setup: TrainingSetup, state: TrainingState, scale: float) -> No
     if kept.any():
         removed = len(state.gaussians) - int(kept.sum())
         state.gaussians = keep(state.gaussians, state.adam, kept)
-        state.growth, state.boxes, state.faces = Growth.of(len(state.gaussians)), [], None
+        state.growth, state.boxes = Growth.of(len(state.gaussians)), []
         smooth(setup, state)
         log.info("step %d: %d Gaussians are pruned by BIC", state.steps_done + 1, removed)
 
@@ -228,7 +228,7 @@ def drop_not_finite(state: TrainingState) -> None:
         raise Diverged(state.steps_done, math.nan, problem)
     if count:
         state.gaussians = keep(state.gaussians, state.adam, kept)
-        state.growth, state.faces = state.growth.select(kept), None
+        state.growth = state.growth.select(kept)
         if state.smoothing_m is not None:
             state.smoothing_m = state.smoothing_m[kept]
         state.removed_not_finite += count

@@ -82,7 +82,6 @@ def join(
     state.gaussians = Gaussians.concatenate([old, new]).trainable()
     state.adam.follow(kept, len(new))
     state.growth, state.boxes, state.shadows = Growth.of(len(state.gaussians)), [], fresh.shadows
-    state.faces = None
     if state.poses is not None:
         state.poses = state.poses.extended(joined.frames)
     elif state.poses_decided in UNTESTED or fresh.poses is not None:

@@ -31,8 +31,6 @@ class LossSettings:
     # of the mean shortest scale over the target's radius: flat Gaussians are surface
     flat_weight: float = 0.0
     sky_weight: float = 0.0  # of the mean alpha of pixels that show no light: space is empty
-    # of the mean distance of neighbours from a common plane over the target's radius: faces are even
-    plane_weight: float = 0.0
 
     def __post_init__(self):
         check(self, "loss")

@@ -76,7 +76,6 @@ PRESETS: dict[str, MethodConfig] = {
                 misfit=True,
                 sh_weight=1.0,
                 flat_weight=15.0,
-                plane_weight=15.0,
                 sky_weight=1.0,
             ),
             growth=GrowthSettings(

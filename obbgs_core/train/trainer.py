@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged
@@ -26,7 +25,6 @@ from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import outliers
 from obbgs_core.train.joining import check_joinable, join, release, withhold
 from obbgs_core.train.objective import image_loss, priors
-from obbgs_core.train.planarity import APPLIED_EVERY, FOUND_EVERY, faces, unevenness
 from obbgs_core.train.poses import HELD_AT, HELD_FROM
 from obbgs_core.train.result import Exposing, StepInfo, TrainResult
 from obbgs_core.train.setup import prepare
@@ -131,12 +129,6 @@ class Trainer:
         if not torch.isfinite(loss):
             raise Diverged(state.steps_done, loss.item())
         prior = priors(state.gaussians, rendered, batch, setup.radius_m, config.loss)
-        if (
-            config.loss.plane_weight
-            and share >= config.growth.begin
-            and state.steps_done % APPLIED_EVERY == 0
-        ):
-            prior = prior + APPLIED_EVERY * config.loss.plane_weight * self._unevenness()
         (loss + prior).backward()
         if decisions.is_recorded(setup, share):
             decisions.observe(setup, state, rendered, batch, residual, share)
@@ -155,13 +147,6 @@ class Trainer:
         info = self._recorded(loss.item())
         pose_rounds.hold(setup, state)
         return info
-
-    def _unevenness(self) -> Tensor:
-        """Return how far neighbours on one face are from a common plane; the faces are found anew when due."""
-        state, radius_m = self.state, self.setup.radius_m
-        if state.faces is None or state.steps_done % FOUND_EVERY == 0:
-            state.faces = faces(state.gaussians, radius_m)
-        return unevenness(state.gaussians.means, state.faces, radius_m)
 
     def _drops(self, share: float) -> bool:
         """Return whether Gaussians are left out of a step."""
