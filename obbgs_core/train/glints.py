@@ -30,13 +30,14 @@ HIGHLIGHTS_FROM = 0.15
 FEWEST_STEPS = 100
 MORE_FRAMES = 1.5  # times as many as at the last test: then they are tested again
 VIEWS = 120  # training frames that are rendered, spread evenly: few of them show the glint of one Gaussian
-SAMPLE = 192  # Gaussians that decide, spread evenly
+# Gaussians that decide, spread evenly: first so many, and more where those gain on average
+SAMPLES = (192, 768)
 ALPHAS = (0.2, 0.4)  # roughness of GGX that is tried
 STRENGTHS = (1.0, 2.0, 4.0, 8.0, 16.0)  # of a lobe's peak over the mean radiance: tried
 AXES = 250  # directions that a lobe is tried in, 13 degrees apart
 LEAST_GAIN = 3.0  # nats: a Gaussian whose lobe gains less starts with the weight FAINT
 FAINT = 0.05
-SURE = 2.0  # standard errors by which the gain on the other half must exceed zero
+SURE = 2.0  # standard errors by which the root of the gain on the other half must exceed zero on average
 STILL_DEG = 5.0  # a Sun that is known and never further than this from its mean direction stands still
 AT_ONCE = 16  # Gaussians whose axes are searched together, for memory's sake
 
@@ -46,12 +47,13 @@ class Lobes:
     """What highlights a training starts with, and what they gain.
 
     gaussians: with a lobe each; None where no gain on views that the lobes are not fitted to is sure.
-    gain, error: nats over all frames, and its standard error.
+    gain: nats over all frames.
+    sureness: the mean of the gains' signed square roots over its standard error.
     """
 
     gaussians: Gaussians | None
     gain: float
-    error: float
+    sureness: float
 
 
 @dataclass(frozen=True)
@@ -108,17 +110,22 @@ def lobed(
     seen = _seen(model, batches, sensor, scale, misfit, shadows, step)
     unit = radiance(model.sh[:, :1], torch.zeros_like(model.means)).mean().item()
     axes = _sphere(AXES)
-    sample = torch.arange(0, len(model), max(1, len(model) // SAMPLE))
-    times = len(model) / len(sample) * len(batches.frames) / seen.slope.shape[1]
-    gains = _gains_on_other_half(seen, sample, axes, unit)  # [alphas, strengths, sample]
-    gained = gains.flatten(0, 1) * times
-    totals, errors = gained.sum(dim=1), gained.std(dim=1, correction=0) * math.sqrt(len(sample))
-    best = int((totals - SURE * errors).argmax())
-    gain, error = totals[best].item(), errors[best].item()
-    if not gain > SURE * error:
-        return Lobes(None, gain, error)
+    sureness, best, gain = 0.0, 0, 0.0
+    for count in SAMPLES:
+        sample = torch.arange(0, len(model), max(1, len(model) // count))
+        gains = _gains_on_other_half(seen, sample, axes, unit).flatten(0, 1)  # [alphas * strengths, sample]
+        # roots: a few lobes that are far off in a view would outweigh all the others by their squares
+        roots = gains.sign() * gains.abs().sqrt()
+        means, errors = roots.mean(dim=1), roots.std(dim=1, correction=0) / math.sqrt(len(sample))
+        best = int((means - SURE * errors).argmax())
+        sureness = (means[best] / errors[best].clamp(min=1e-12)).item()
+        gain = gains[best].sum().item() * len(model) / len(sample) * len(batches.frames) / seen.slope.shape[1]
+        if sureness <= 0:
+            break
+    if not sureness > SURE:
+        return Lobes(None, gain, sureness)
     alpha, strength = ALPHAS[best // len(STRENGTHS)], STRENGTHS[best % len(STRENGTHS)] * unit
-    return Lobes(_with_lobes(model, seen, axes, alpha, strength), gain, error)
+    return Lobes(_with_lobes(model, seen, axes, alpha, strength), gain, sureness)
 
 
 def _gains_on_other_half(seen: _Seen, sample: Tensor, axes: Tensor, unit: float) -> Tensor:
