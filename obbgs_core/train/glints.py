@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import TrainingFrame, bracket_numbers
 from obbgs_core.misfit import mean_light2
 from obbgs_core.model.cameras import stacked_suns
 from obbgs_core.model.gaussians import Gaussians
@@ -96,8 +96,9 @@ def lobed(
 ) -> Lobes:
     """Return the Gaussians with a lobe each, if views that the lobes were not fitted to are explained better by them.
 
-    Every second view is one half. For each roughness and strength, the axes that gain most on one half are scored on
-    the other; what surely gains most there is chosen for all Gaussians and fitted to all views. Nothing is random.
+    Every second bracket is one half; the frames of a bracket show the same view and must not judge each other. For each
+    roughness and strength, the axes that gain most on one half are scored on the other; what surely gains most there is
+    chosen for all Gaussians and fitted to all views. Nothing is random.
 
     Args:
         scale: of the images.
@@ -110,7 +111,9 @@ def lobed(
     axes = _sphere(AXES)
     sample = torch.arange(0, len(model), max(1, len(model) // SAMPLE))
     times = len(model) / len(sample) * len(batches.frames) / seen.slope.shape[1]
-    gains = _gains_on_other_half(seen, sample, axes, unit)  # [alphas, strengths, sample]
+    brackets = bracket_numbers(batches.frames)
+    even = torch.tensor([brackets[index] % 2 == 0 for index in _views(batches)])
+    gains = _gains_on_other_half(seen, even, sample, axes, unit)  # [alphas, strengths, sample]
     gained = gains.flatten(0, 1) * times
     totals, errors = gained.sum(dim=1), gained.std(dim=1, correction=0) * math.sqrt(len(sample))
     best = int((totals - SURE * errors).argmax())
@@ -121,10 +124,13 @@ def lobed(
     return Lobes(_with_lobes(model, seen, axes, alpha, strength), gain, error)
 
 
-def _gains_on_other_half(seen: _Seen, sample: Tensor, axes: Tensor, unit: float) -> Tensor:
-    """Return what lobes fitted to one half of the views gain on the other [alphas, strengths, sample], nats."""
+def _gains_on_other_half(seen: _Seen, even: Tensor, sample: Tensor, axes: Tensor, unit: float) -> Tensor:
+    """Return what lobes fitted to one half of the views gain on the other [alphas, strengths, sample], nats.
+
+    Args:
+        even: [V] bool, which views are the first half.
+    """
     gains = torch.zeros(len(ALPHAS), len(STRENGTHS), len(sample))
-    even = torch.arange(seen.slope.shape[1]) % 2 == 0
     for fitted, other in ((even, ~even), (~even, even)):
         halves = [seen.of(sample, views) for views in (fitted, other)]
         for a, alpha in enumerate(ALPHAS):
@@ -179,7 +185,7 @@ def _seen(
     """Return what some of the training frames say of the Gaussians, in both errors, the model's and the noise."""
     found = [[], [], [], []]
     static_sun = _static_sun(batches.frames) if model.shading == "view" else None
-    for index in range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS)):
+    for index in _views(batches):
         batch = batches.batch([index], scale)
         sunlit = shadows.sunlit(model, batch.cameras, step)
         added = torch.zeros(1, len(model), model.sh.shape[2], requires_grad=True)
@@ -208,6 +214,11 @@ def _seen(
     return _Seen(
         slope, information, axes, sunlit, known, torch.zeros(0) if static_sun is None else static_sun
     )
+
+
+def _views(batches: Batches) -> range:
+    """Return the indices of the frames that are rendered, spread evenly."""
+    return range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS))
 
 
 def _static_sun(frames: list[TrainingFrame]) -> Tensor | None:
