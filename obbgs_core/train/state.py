@@ -28,7 +28,7 @@ from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 8  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 9  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class TrainingState:
     growth: Growth
     order: FrameOrder
     poses: PoseCorrections | None  # None: as tagged
-    poses_aligned: bool  # whether they were moved before the first step
+    poses_aligned: bool  # before the first step, or by rounds before the schedule was set back
     poses_decided: str  # whether the poses are refined, and why; empty: the validation brackets will decide
     holds: int  # how often the schedule will still be set back for the poses
     appearance_reason: str  # why the radiance depends on what it does
