@@ -44,6 +44,7 @@ class NormalEquations:
         brackets: list[int],
         root: Tensor,
         by_shared: Tensor,
+        cell_m: float,
         sigma_m: float,
     ) -> "ReducedEquations":
         """Return the equations that remain when every cell of the surface goes where the pictures want it.
@@ -54,7 +55,7 @@ class NormalEquations:
         Args:
             cells: of some frames; brackets: [F] of these frames.
             root: [F, 6, 6], motion of a frame by its bracket's parameters; by_shared: [F, 6, S], by the shared ones.
-            sigma_m: prior deviation of a cell's shift.
+            cell_m: their edge; sigma_m: prior deviation of a cell's shift.
         """
         count, size = len(self.own), 6 * len(self.own)
         numbers, places = torch.unique(torch.cat([c.numbers for c in cells]), return_inverse=True)
@@ -74,7 +75,7 @@ class NormalEquations:
         whole[:size, size:] = self.mixed.flatten(0, 1)
         whole[size:, :size] = self.mixed.flatten(0, 1).T
         right = torch.cat([self.own_right.flatten(), self.shared_right])
-        eliminated = EliminatedCells(numbers, factor, mixed, gradient, sigma_m)
+        eliminated = EliminatedCells(numbers, factor, mixed, gradient, cell_m)
         return ReducedEquations(whole - mixed.T @ mixed, right + mixed.T @ gradient, count, eliminated)
 
 

@@ -121,7 +121,7 @@ class PoseCorrections:
         self.cell_m = 0.0
 
     def step(
-        self, frames: list[TrainingFrame], extra: Tensor | None = None
+        self, frames: list[TrainingFrame], extra: Tensor | None = None, reach_m: float | None = None
     ) -> tuple[Tensor, CellShifts | None]:
         """Move all corrections to the minimum of what was gathered plus their priors.
 
@@ -130,11 +130,12 @@ class PoseCorrections:
 
         Args:
             extra: [F, 6, E] motions by further parameters of unit variance that are to be estimated along.
+            reach_m: prior deviation of the shift of a cell; None: its edge.
 
         Returns:
             The change of the further parameters [E] from zero, and where the surface's cells go.
         """
-        normal = self._normal_equations(extra)
+        normal = self._normal_equations(extra, reach_m)
         all_shared, own = normal.solution()
         shared, others = all_shared.split([self.by_shared.shape[2], 0 if extra is None else extra.shape[2]])
         if shared.numel():
@@ -144,7 +145,32 @@ class PoseCorrections:
         self.value = times(self.whitening.support, self.value + own.float())
         return others, normal.shifts(all_shared, own) if isinstance(normal, ReducedEquations) else None
 
-    def _normal_equations(self, extra: Tensor | None = None) -> NormalEquations | ReducedEquations:
+    def body_motions(self) -> Tensor:
+        """Return how frames see small motions of the whole body [F, 6, 7], as motions of their cameras.
+
+        Columns: a turn about each of the body's axes, a shift along each, and a logarithm of the size, in units in
+        which `after_motion` takes them.
+        """
+        poses = self.corrected(list(range(len(self.of_frame)))).double()
+        nearer = torch.cat([torch.zeros_like(poses[:, :3, 3:]), -poses[:, :3, 3:]], dim=1)
+        return torch.cat([adjoints(poses), nearer], dim=2) * self._body_units()
+
+    def after_motion(self, gaussians: Gaussians, change: Tensor) -> Gaussians:
+        """Return a model after a small motion [7] of the whole body, in the units of `body_motions`."""
+        motion = change * self._body_units()
+        similarity = rigid_motions(motion[None, :6])[0]
+        similarity[:3, :3] *= torch.exp(motion[6])
+        return _transformed(gaussians, similarity, float(motion[6]))
+
+    def _body_units(self) -> Tensor:
+        """Return 1 rad, the mean range and a logarithm of 1: prior deviations that hold nothing."""
+        units = torch.ones(7, dtype=torch.float64)
+        units[3:6] = self.tags[:, :3, 3].norm(dim=1).mean()
+        return units
+
+    def _normal_equations(
+        self, extra: Tensor | None = None, reach_m: float | None = None
+    ) -> NormalEquations | ReducedEquations:
         rows, count = torch.tensor(self.of_frame), len(self.value)
         root = self.whitening.root.double()[rows]
         curvature, gradient = self.curvature, self.gradient
@@ -167,7 +193,8 @@ class PoseCorrections:
             return normal
         seen, cells = list(self.cells), list(self.cells.values())
         brackets = [self.of_frame[i] for i in seen]
-        return normal.with_cells(cells, brackets, root[seen], by_shared[seen], self.cell_m)
+        reach_m = self.cell_m if reach_m is None else reach_m
+        return normal.with_cells(cells, brackets, root[seen], by_shared[seen], self.cell_m, reach_m)
 
     def estimate(self, frames: list[TrainingFrame]) -> PoseEstimate:
         """Return the corrected poses and their corrections, with prior and posterior deviations.
@@ -175,8 +202,9 @@ class PoseCorrections:
         The posterior deviations are those of the likelihood that was gathered last; where its pictures told of the
         surface's cells, what moves poses and surface together counts as not known.
         """
-        normal = self._normal_equations()
+        normal = self._normal_equations(self.body_motions() if self.cells else None)
         shared, own = normal.covariances()
+        shared = shared[: self.by_shared.shape[2], : self.by_shared.shape[2]]
         root, spread = self.whitening.root.double(), torch.zeros(SIZE, SIZE, dtype=torch.float64)
         sigmas = self.sigmas[self.free]
         chosen = torch.nonzero(self.free)[:, 0]
@@ -234,14 +262,7 @@ class PoseCorrections:
             self.value = times(self.whitening.inverse, self._bracket_means(left)).float()
             if max([*(self.value - before).abs().flatten(), *shared.abs()]) < SETTLED:
                 break
-        similarity = whole.float()
-        turn = motion_vectors(whole[None] / math.exp(log_scale))[0, :3].float()
-        return dataclasses.replace(  # a turn this small does not show in the radiance
-            gaussians,
-            means=gaussians.means @ similarity[:3, :3].T + similarity[:3, 3],
-            log_scales=gaussians.log_scales + log_scale,
-            quats=multiply(from_rotation_vectors(turn).expand(len(gaussians), 4), gaussians.quats),
-        )
+        return _transformed(gaussians, whole, log_scale)
 
     def _gauge(self, poses: Tensor) -> tuple[Tensor, Tensor]:
         """Return the change of the body that makes the corrections smallest, and that of the shared parameters [S].
@@ -286,6 +307,18 @@ def with_estimate(frames: list[TrainingFrame], estimate: PoseEstimate) -> list[T
         dataclasses.replace(f, world_to_camera=place, pose_covariance=own + shared, navigation=None)
         for f, place, own, shared in zip(frames, places, root @ root.mT, spread, strict=True)
     ]
+
+
+def _transformed(gaussians: Gaussians, similarity: Tensor, log_scale: float) -> Gaussians:
+    """Return a model after a similarity [4, 4], given with the logarithm of its size; radiance does not turn along."""
+    turn = motion_vectors(similarity[None] / math.exp(log_scale))[0, :3].to(gaussians.quats)
+    matrix = similarity.to(gaussians.means)
+    return dataclasses.replace(
+        gaussians,
+        means=gaussians.means @ matrix[:3, :3].T + matrix[:3, 3],
+        log_scales=gaussians.log_scales + log_scale,
+        quats=multiply(from_rotation_vectors(turn).expand(len(gaussians), 4), gaussians.quats),
+    )
 
 
 def motion_of(frames: list[TrainingFrame]) -> NominalMotion:

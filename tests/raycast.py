@@ -54,13 +54,14 @@ def cast(
     for sy in range(samples):
         for sx in range(samples):
             offset = (np.array([sx, sy]) + 0.5) / samples
-            radiance += _hit(boxes, world_to_camera, K, size_px, offset)[0] / samples**2
-    return radiance, _hit(boxes, world_to_camera, K, size_px, np.array([0.5, 0.5]))[1]
+            radiance += hit(boxes, world_to_camera, K, size_px, offset)[0] / samples**2
+    return radiance, hit(boxes, world_to_camera, K, size_px, np.array([0.5, 0.5]))[1]
 
 
-def _hit(
+def hit(
     boxes: list[Box], world_to_camera: np.ndarray, K: np.ndarray, size_px: int, offset: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Return radiance and depth, as `cast`, at one place [2] of each pixel, 0 to 1."""
     columns, rows = np.meshgrid(np.arange(size_px) + offset[0], np.arange(size_px) + offset[1])
     rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(K).T @ world_to_camera[:3, :3]
     origin = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
@@ -70,17 +71,17 @@ def _hit(
         with np.errstate(divide="ignore"):
             first, last = (-np.sign(d) * box.half_m - o) / d, (np.sign(d) * box.half_m - o) / d
         enter, leave = first.max(axis=-1), last.min(axis=-1)
-        hit = (enter < leave) & (enter > 0) & (enter < depth_m)
+        nearer = (enter < leave) & (enter > 0) & (enter < depth_m)
         axis = first.argmax(axis=-1)
         at = (o + enter[..., None] * d) / box.half_m
         for k in range(3):
             for side in (-1, 1):
-                on = hit & (axis == k) & (np.sign(d[..., k]) == -side)
+                on = nearer & (axis == k) & (np.sign(d[..., k]) == -side)
                 u, v = (0.5 + 0.5 * at[..., other][on] for other in range(3) if other != k)
                 # each face has its own light, as under a fixed Sun
                 light = 0.5 + 0.15 * (k + (side > 0))
                 radiance[on] = light * box.texture(2 * k + (side > 0), u, v)
-        depth_m[hit] = enter[hit]
+        depth_m[nearer] = enter[nearer]
     return radiance, np.where(np.isfinite(depth_m), depth_m, 0)
 
 

@@ -29,6 +29,7 @@ from obbgs_core.train.growth import (
 )
 from obbgs_core.train.multi_view import crossing_boxes, inside, threshold_factor
 from obbgs_core.train.parsimony import justified
+from obbgs_core.train.poses import HOLDS
 from obbgs_core.train.setup import TrainingSetup
 from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import TrainingState
@@ -95,6 +96,7 @@ def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> No
     if not refined and scale < config.image_scale(1):
         return
     state.poses = PoseCorrections(setup.frames) if refined else None
+    state.holds = HOLDS if refined else 0
     state.poses_decided = (
         f"{'refined' if refined else 'as tagged'} (step {state.steps_done + 1}: that a validation bracket's pose errs "
         f"has a log Bayes factor of {evidence:.1f} ± {error:.1f})"

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import TrainingFrame, bracket_numbers
 from obbgs_core.misfit import mean_light2
 from obbgs_core.model.cameras import stacked_suns
 from obbgs_core.model.gaussians import Gaussians
@@ -98,8 +98,9 @@ def lobed(
 ) -> Lobes:
     """Return the Gaussians with a lobe each, if views that the lobes were not fitted to are explained better by them.
 
-    Every second view is one half. For each roughness and strength, the axes that gain most on one half are scored on
-    the other; what surely gains most there is chosen for all Gaussians and fitted to all views. Nothing is random.
+    Every second bracket is one half; the frames of a bracket show the same view and must not judge each other. For each
+    roughness and strength, the axes that gain most on one half are scored on the other; what surely gains most there is
+    chosen for all Gaussians and fitted to all views. Nothing is random.
 
     Args:
         scale: of the images.
@@ -110,10 +111,14 @@ def lobed(
     seen = _seen(model, batches, sensor, scale, misfit, shadows, step)
     unit = radiance(model.sh[:, :1], torch.zeros_like(model.means)).mean().item()
     axes = _sphere(AXES)
+    brackets = bracket_numbers(batches.frames)
+    even = torch.tensor([brackets[index] % 2 == 0 for index in _views(batches)])
     sureness, best, gain = 0.0, 0, 0.0
     for count in SAMPLES:
         sample = torch.arange(0, len(model), max(1, len(model) // count))
-        gains = _gains_on_other_half(seen, sample, axes, unit).flatten(0, 1)  # [alphas * strengths, sample]
+        gains = _gains_on_other_half(seen, even, sample, axes, unit).flatten(
+            0, 1
+        )  # [alphas * strengths, sample]
         # roots: a few lobes that are far off in a view would outweigh all the others by their squares
         roots = gains.sign() * gains.abs().sqrt()
         means, errors = roots.mean(dim=1), roots.std(dim=1, correction=0) / math.sqrt(len(sample))
@@ -128,10 +133,13 @@ def lobed(
     return Lobes(_with_lobes(model, seen, axes, alpha, strength), gain, sureness)
 
 
-def _gains_on_other_half(seen: _Seen, sample: Tensor, axes: Tensor, unit: float) -> Tensor:
-    """Return what lobes fitted to one half of the views gain on the other [alphas, strengths, sample], nats."""
+def _gains_on_other_half(seen: _Seen, even: Tensor, sample: Tensor, axes: Tensor, unit: float) -> Tensor:
+    """Return what lobes fitted to one half of the views gain on the other [alphas, strengths, sample], nats.
+
+    Args:
+        even: [V] bool, which views are the first half.
+    """
     gains = torch.zeros(len(ALPHAS), len(STRENGTHS), len(sample))
-    even = torch.arange(seen.slope.shape[1]) % 2 == 0
     for fitted, other in ((even, ~even), (~even, even)):
         halves = [seen.of(sample, views) for views in (fitted, other)]
         for a, alpha in enumerate(ALPHAS):
@@ -186,7 +194,7 @@ def _seen(
     """Return what some of the training frames say of the Gaussians, in both errors, the model's and the noise."""
     found = [[], [], [], []]
     static_sun = _static_sun(batches.frames) if model.shading == "view" else None
-    for index in range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS)):
+    for index in _views(batches):
         batch = batches.batch([index], scale)
         sunlit = shadows.sunlit(model, batch.cameras, step)
         added = torch.zeros(1, len(model), model.sh.shape[2], requires_grad=True)
@@ -215,6 +223,11 @@ def _seen(
     return _Seen(
         slope, information, axes, sunlit, known, torch.zeros(0) if static_sun is None else static_sun
     )
+
+
+def _views(batches: Batches) -> range:
+    """Return the indices of the frames that are rendered, spread evenly."""
+    return range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS))
 
 
 def _static_sun(frames: list[TrainingFrame]) -> Tensor | None:

@@ -10,6 +10,7 @@ from obbgs_core.misfit import relative_misfit
 from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.registration import pose_information
 from obbgs_core.render.slopes import render_with_slopes
+from obbgs_core.train.adam import learning_rates
 from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.poses import ALIGNED_FROM, HELD_AT, HELD_FROM, SURFACE_UNTIL
 from obbgs_core.train.setup import TrainingSetup
@@ -35,13 +36,23 @@ def is_due(setup: TrainingSetup, state: TrainingState, share: float) -> bool:
 
 def is_turn(setup: TrainingSetup, state: TrainingState) -> bool:
     """Return whether it is the turn of a round."""
-    whole = setup.config.steps_until(1) - setup.config.steps_until(0)
-    return state.steps_done % max(1, round(whole / ROUNDS)) == 0
+    return state.steps_done % steps_between(setup) == 0
+
+
+def steps_between(setup: TrainingSetup) -> int:
+    """Return the number of steps from one round to the next."""
+    return max(1, round((setup.config.steps_until(1) - setup.config.steps_until(0)) / ROUNDS))
 
 
 def cell_m(setup: TrainingSetup) -> float:
     """Return the edge of the cells that the surface is divided into."""
     return setup.radius_m / CELLS
+
+
+def reach_m(setup: TrainingSetup, share: float) -> float:
+    """Return how far training moves a Gaussian from one round to the next: by about its rate in each step."""
+    rates = learning_rates(setup.config.rates, share, setup.unit_m, 1, setup.radiance_unit)
+    return float(rates["means"]) * steps_between(setup)
 
 
 def move(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
@@ -62,22 +73,26 @@ def move(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
             brackets[bracket].append(index)
     shown = [members for members in brackets if members]
     residuals = _gather(setup, state, [members[turn % len(members)] for members in shown], scale)
-    whole = setup.config.steps_until(1) - setup.config.steps_until(0)
     since = state.steps_done - setup.config.steps_until(MISFIT_FROM)
-    if 0 <= since < round(whole / ROUNDS):
+    if 0 <= since < steps_between(setup):
         _leave_out(setup, state, [shown[i] for i in torch.nonzero(standing_out(*residuals))[:, 0].tolist()])
-    _, shifts = poses.step(setup.frames)
+    share = setup.config.moment(turn).share
+    along = state.poses_aligned and share < SURFACE_UNTIL
+    motion, shifts = poses.step(
+        setup.frames, poses.body_motions(), cell_m(setup) if along else reach_m(setup, share)
+    )
     poses.clear()
     gaussians = state.gaussians.detach()
-    if shifts is not None and state.poses_aligned and setup.config.moment(turn).share < SURFACE_UNTIL:
+    if shifts is not None and along:
         gaussians = dataclasses.replace(gaussians, means=gaussians.means + shifts.of_points(gaussians.means))
-    state.gaussians = poses.fix_gauge(gaussians, setup.frames).trainable()
+    state.gaussians = poses.fix_gauge(poses.after_motion(gaussians, motion), setup.frames).trainable()
 
 
 def hold(setup: TrainingSetup, state: TrainingState) -> None:
-    """Set the schedule back, as often as poses that were aligned want it, when it reaches `HELD_AT`."""
+    """Set the schedule back, as often as poses that are refined want it, when it reaches `HELD_AT`."""
     if state.holds and state.steps_done >= round(setup.config.steps_until(HELD_AT)):
         state.holds -= 1
+        state.poses_aligned = True  # by the rounds so far
         state.steps_done = round(setup.config.steps_until(HELD_FROM))
 
 

@@ -8,7 +8,7 @@ from obbgs_core.settings import check, fraction
 # share of the steps after which poses that were aligned before the start are refined; the first pictures, a quarter as
 # large, would move exact poses by half a pixel
 ALIGNED_FROM = 0.15
-# Where poses were aligned, the schedule is set back from the first to the second share of the steps, so many times:
+# Where poses are refined, the schedule is set back from the first to the second share of the steps, so many times:
 # poses and surface settle together only while the rates are large.
 HELD_AT, HELD_FROM, HOLDS = 0.4, 0.16, 2
 SURFACE_UNTIL = 0.5  # share of the steps until which the Gaussians go along with the surface's cells then

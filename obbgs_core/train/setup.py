@@ -157,7 +157,7 @@ def prepare(
         poses=poses,
         poses_aligned=bool(why),
         poses_decided=poses_decided,
-        holds=HOLDS if why else 0,
+        holds=HOLDS if poses is not None else 0,
         appearance_reason="as configured" if config.light.sh_degree else "",
     )
     if config.smoothing_px2:

@@ -75,7 +75,7 @@ class TrainingState:
     growth: Growth
     order: FrameOrder
     poses: PoseCorrections | None  # None: as tagged
-    poses_aligned: bool  # whether they were moved before the first step
+    poses_aligned: bool  # before the first step, or by rounds before the schedule was set back
     poses_decided: str  # whether the poses are refined, and why; empty: the validation brackets will decide
     holds: int  # how often the schedule will still be set back for the poses
     appearance_reason: str  # why the radiance depends on what it does

@@ -18,6 +18,7 @@ from obbgs_core.train.parsimony import (
     shown_frames,
     shown_px,
 )
+from obbgs_core.train.poses import HELD_FROM
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
 from tests.scenes import QUICK, SENSOR, photographed, tagged, target
@@ -108,7 +109,10 @@ def test_wrong_poses_are_refined_and_exact_ones_are_left_alone(wrong):
     while not trainer.state.poses_decided:
         assert trainer.state.order.validation_brackets == [[i] for i in range(3, 42, 7)]
         trainer.step()
-    assert trainer.state.order.validation_brackets == [] and trainer.state.steps_done == 161
+    assert trainer.state.order.validation_brackets == [] and trainer.state.history[-1].step == 161
+    assert trainer.state.steps_done == (
+        400 * HELD_FROM if wrong else 161
+    )  # a refinement sets the schedule back
     assert trainer.state.poses_decided.startswith("refined" if wrong else "as tagged")
     assert (trainer.state.poses is not None) == wrong
     assert trainer.result("").poses == trainer.state.poses_decided

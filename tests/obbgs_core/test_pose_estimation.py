@@ -200,6 +200,58 @@ def test_eliminating_the_cells_solves_the_whole_system(erring):
     assert (of_shared.diagonal() >= fixed.diagonal() - 1e-12).all()
 
 
+def test_a_motion_of_the_body_is_seen_as_one_of_the_cameras(erring):
+    """Points that `after_motion` moves project to where the cameras' motions of `body_motions` bring them."""
+    _, frames = erring
+    poses, K = PoseCorrections(frames), frames[0].K.double()
+    at = poses.corrected(list(range(len(frames)))).double()
+
+    def projected(points: torch.Tensor, cameras: torch.Tensor) -> torch.Tensor:
+        seen = (points @ cameras[:, :3, :3].mT + cameras[:, None, :3, 3]) @ K.T
+        return seen[..., :2] / seen[..., 2:]
+
+    model = dataclasses.replace(MODEL, means=MODEL.means.double())
+    for k in range(7):
+        change = 1e-4 * torch.eye(7, dtype=torch.float64)[k]
+        after = poses.after_motion(model, change).means
+        moved_cameras = rigid_motions(poses.body_motions() @ change) @ at
+        before = projected(model.means, at)
+        by_body, by_cameras = projected(after, at) - before, projected(model.means, moved_cameras) - before
+        # of second order in the motion; the float32 of `after_motion` is 2e-6 m, 2e-5 px
+        torch.testing.assert_close(
+            by_body, by_cameras, rtol=0, atol=1e-4 + 2e-3 * float(by_cameras.abs().max())
+        )
+
+
+def test_a_body_that_is_off_as_a_whole_comes_back_in_two_steps(erring):
+    """Its cells would each be held by their prior, and all of them together much more than any."""
+    true, _ = erring
+    sigma = torch.diag(torch.tensor([1e-6] * 3 + [1e-6] * 3).double() ** 2)
+    frames = [dataclasses.replace(f, pose_covariance=sigma) for f in true]
+    off = rigid_motions(torch.tensor([[0.004, -0.006, 0.003, 0.01, 0.02, -0.015]]).double())[0]
+    model, poses, indices = moved(MODEL, off), PoseCorrections(frames), list(range(len(true)))
+    distance = (model.means - MODEL.means).norm(dim=1).mean()
+    for _ in range(2):
+        poses.gather(indices, seen_with_cells(model, true, indices, 0.3))
+        change, _ = poses.step(frames, poses.body_motions(), reach_m=1e-3)
+        model = poses.after_motion(model, change)
+    assert (model.means - MODEL.means).norm(dim=1).mean() < 0.1 * distance
+
+
+def test_a_surface_that_cannot_move_is_a_known_model(erring):
+    true, frames = erring
+    indices = [0, 3, 8, 15]
+    chosen, told = [frames[i] for i in indices], seen_with_cells(MODEL, true, indices, 0.3)
+    held, known = PoseCorrections(chosen), PoseCorrections(chosen)
+    held.gather([0, 1, 2, 3], told)
+    known.gather([0, 1, 2, 3], dataclasses.replace(told, cells=None))
+    _, shifts = held.step(chosen, reach_m=1e-9)
+    known.step(chosen)
+    assert shifts is not None and float(shifts.shifts.abs().max()) < 1e-9
+    torch.testing.assert_close(held.shared, known.shared, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(held.value, known.value, rtol=1e-4, atol=1e-6)
+
+
 def test_points_go_with_their_cell_but_no_farther_than_half_of_it():
     points = torch.tensor([[0.05, 0.05, 0.05], [0.15, 0.05, 0.05], [-0.05, 0.05, 0.05]])
     numbers, order = registration._cell_numbers(points[:2].double(), 0.1).sort()

@@ -327,7 +327,7 @@ def test_a_killed_training_with_correlated_tags_resumes_to_the_same_model(frames
         first.step()
     first.save(tmp_path / "checkpoint")
     resumed = train(doubted, SENSOR, config, 3, checkpoint=tmp_path / "checkpoint")
-    assert resumed.history[0].step == 1 and len(resumed.history) == 12
+    assert resumed.history[0].step == 1 and len(resumed.history) == len(whole.history) >= 12
     for name, tensor in whole.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
     other = [
