@@ -111,8 +111,7 @@ def lobed(
     seen = _seen(model, batches, sensor, scale, misfit, shadows, step)
     unit = radiance(model.sh[:, :1], torch.zeros_like(model.means)).mean().item()
     axes = _sphere(AXES)
-    brackets = bracket_numbers(batches.frames)
-    even = torch.tensor([brackets[index] % 2 == 0 for index in _views(batches)])
+    even = torch.tensor(bracket_numbers([batches.frames[index] for index in _views(batches)])) % 2 == 0
     sureness, best, gain = 0.0, 0, 0.0
     for count in SAMPLES:
         sample = torch.arange(0, len(model), max(1, len(model) // count))

@@ -20,7 +20,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import lit_from, native_kernels, render
 from obbgs_core.render.highlights import lobe
 from obbgs_core.render.lighting import radiance_along
-from obbgs_core.train import decisions
+from obbgs_core.train import decisions, glints
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.presets import preset
@@ -361,3 +361,11 @@ def test_highlights_that_few_frames_do_not_show_are_found_when_more_have_joined(
     trainer.join(shiny_frames[8:])
     trainer.step()
     assert trainer.state.highlights_frames == 90 and trainer.gaussians.has_highlights
+
+
+def test_a_sample_of_the_views_still_has_two_halves(shiny_frames, monkeypatch):
+    """Every second of the frames is rendered here, each of a bracket of its own."""
+    monkeypatch.setattr(glints, "VIEWS", len(shiny_frames) // 2)
+    trainer = _trainer(shiny_frames)
+    decisions.add_highlights(trainer.setup, trainer.state, 1.0)
+    assert trainer.state.gaussians.has_highlights
