@@ -21,6 +21,9 @@ from obbgs_core.registration import CellInformation, CellShifts, PoseInformation
 NULL = 1e-9  # a singular value of rows of unit length that is zero up to rounding
 LINEAR = 0.1  # prior deviations by which shared parameters move before their effect is linearised anew
 GAUGE_ROUNDS = 3  # of the linear problem that fixes the gauge; its error is of second order in the motion
+# by which deviations were too small where they could be compared with the truth: the model's errors are alike in many
+# pictures
+DOUBT = 2.0
 SETTLED = 0.01  # deviations: no further round follows one that moves no correction by more
 
 
@@ -39,6 +42,9 @@ class PoseCorrections:
     (weighting by inverse covariances would claim so). However they are correlated, the covariance of their mean is
     never larger than the mean of their covariances, and it is equal where the tags agree.
     """
+
+    # covariances as of `left_open`, when poses and surface last moved together; None: they did not yet
+    together: tuple[Tensor, Tensor] | None = None
 
     def __init__(self, frames: list[TrainingFrame]):
         self.of_frame = bracket_numbers(frames)  # the row of each frame
@@ -196,15 +202,23 @@ class PoseCorrections:
         reach_m = self.cell_m if reach_m is None else reach_m
         return normal.with_cells(cells, brackets, root[seen], by_shared[seen], self.cell_m, reach_m)
 
+    def left_open(self) -> tuple[Tensor, Tensor]:
+        """Return the covariances of the shared parameters [S, S] and of the brackets [P, 6, 6], in units of the prior.
+
+        They follow from what was gathered. Where its pictures told of the surface's cells, what moves poses and surface
+        together counts as not known.
+        """
+        shared, own = self._normal_equations(self.body_motions() if self.cells else None).covariances()
+        size = self.by_shared.shape[2]
+        return shared[:size, :size], own
+
     def estimate(self, frames: list[TrainingFrame]) -> PoseEstimate:
         """Return the corrected poses and their corrections, with prior and posterior deviations.
 
-        The posterior deviations are those of the likelihood that was gathered last; where its pictures told of the
-        surface's cells, what moves poses and surface together counts as not known.
+        The posterior deviations are those of the time when poses and surface last moved together, if they did, else
+        those of the likelihood that was gathered last; `DOUBT` times, as long as the prior allows it.
         """
-        normal = self._normal_equations(self.body_motions() if self.cells else None)
-        shared, own = normal.covariances()
-        shared = shared[: self.by_shared.shape[2], : self.by_shared.shape[2]]
+        shared, own = (_doubted(part) for part in self.together or self.left_open())
         root, spread = self.whitening.root.double(), torch.zeros(SIZE, SIZE, dtype=torch.float64)
         sigmas = self.sigmas[self.free]
         chosen = torch.nonzero(self.free)[:, 0]
@@ -307,6 +321,13 @@ def with_estimate(frames: list[TrainingFrame], estimate: PoseEstimate) -> list[T
         dataclasses.replace(f, world_to_camera=place, pose_covariance=own + shared, navigation=None)
         for f, place, own, shared in zip(frames, places, root @ root.mT, spread, strict=True)
     ]
+
+
+def _doubted(covariance: Tensor) -> Tensor:
+    """Return covariances [..., n, n], in units of the prior, with pictures that count `DOUBT` squared times less."""
+    unit = torch.eye(covariance.shape[-1], dtype=covariance.dtype)
+    told = torch.linalg.inv(covariance) - unit
+    return torch.linalg.inv(told / DOUBT**2 + unit)
 
 
 def _transformed(gaussians: Gaussians, similarity: Tensor, log_scale: float) -> Gaussians:

@@ -207,10 +207,10 @@ def add_highlights(setup: TrainingSetup, state: TrainingState, scale: float) -> 
         changed = {name: getattr(found.gaussians, name) for name in ("sh", "lobes", "gloss", "static_sun")}
         state.gaussians = dataclasses.replace(state.gaussians, **changed).trainable()
         state.adam.widen(state.gaussians)
-    gain = f"{found.gain:,.0f} ± {found.error:,.0f} nats"
     state.highlights_frames = len(setup.frames)
     state.highlights_reason = (
-        f"step {state.steps_done + 1}, highlights would gain {gain} on views that they are not fitted to"
+        f"step {state.steps_done + 1}, highlights would gain {found.gain:,.0f} nats on views that they are not fitted "
+        f"to, with {found.sureness:.1f} standard errors"
     )
     log.info("radiance %s", described(state.gaussians, state.highlights_reason))
 

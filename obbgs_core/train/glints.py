@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import TrainingFrame, bracket_numbers
 from obbgs_core.misfit import mean_light2
 from obbgs_core.model.cameras import stacked_suns
 from obbgs_core.model.gaussians import Gaussians
@@ -30,13 +30,14 @@ HIGHLIGHTS_FROM = 0.15
 FEWEST_STEPS = 100
 MORE_FRAMES = 1.5  # times as many as at the last test: then they are tested again
 VIEWS = 120  # training frames that are rendered, spread evenly: few of them show the glint of one Gaussian
-SAMPLE = 192  # Gaussians that decide, spread evenly
+# Gaussians that decide, spread evenly: first so many, and more where those gain on average
+SAMPLES = (192, 768)
 ALPHAS = (0.2, 0.4)  # roughness of GGX that is tried
 STRENGTHS = (1.0, 2.0, 4.0, 8.0, 16.0)  # of a lobe's peak over the mean radiance: tried
 AXES = 250  # directions that a lobe is tried in, 13 degrees apart
 LEAST_GAIN = 3.0  # nats: a Gaussian whose lobe gains less starts with the weight FAINT
 FAINT = 0.05
-SURE = 2.0  # standard errors by which the gain on the other half must exceed zero
+SURE = 2.0  # standard errors by which the root of the gain on the other half must exceed zero on average
 STILL_DEG = 5.0  # a Sun that is known and never further than this from its mean direction stands still
 AT_ONCE = 16  # Gaussians whose axes are searched together, for memory's sake
 
@@ -46,12 +47,13 @@ class Lobes:
     """What highlights a training starts with, and what they gain.
 
     gaussians: with a lobe each; None where no gain on views that the lobes are not fitted to is sure.
-    gain, error: nats over all frames, and its standard error.
+    gain: nats over all frames.
+    sureness: the mean of the gains' signed square roots over its standard error.
     """
 
     gaussians: Gaussians | None
     gain: float
-    error: float
+    sureness: float
 
 
 @dataclass(frozen=True)
@@ -96,8 +98,9 @@ def lobed(
 ) -> Lobes:
     """Return the Gaussians with a lobe each, if views that the lobes were not fitted to are explained better by them.
 
-    Every second view is one half. For each roughness and strength, the axes that gain most on one half are scored on
-    the other; what surely gains most there is chosen for all Gaussians and fitted to all views. Nothing is random.
+    Every second bracket is one half; the frames of a bracket show the same view and must not judge each other. For each
+    roughness and strength, the axes that gain most on one half are scored on the other; what surely gains most there is
+    chosen for all Gaussians and fitted to all views. Nothing is random.
 
     Args:
         scale: of the images.
@@ -108,23 +111,34 @@ def lobed(
     seen = _seen(model, batches, sensor, scale, misfit, shadows, step)
     unit = radiance(model.sh[:, :1], torch.zeros_like(model.means)).mean().item()
     axes = _sphere(AXES)
-    sample = torch.arange(0, len(model), max(1, len(model) // SAMPLE))
-    times = len(model) / len(sample) * len(batches.frames) / seen.slope.shape[1]
-    gains = _gains_on_other_half(seen, sample, axes, unit)  # [alphas, strengths, sample]
-    gained = gains.flatten(0, 1) * times
-    totals, errors = gained.sum(dim=1), gained.std(dim=1, correction=0) * math.sqrt(len(sample))
-    best = int((totals - SURE * errors).argmax())
-    gain, error = totals[best].item(), errors[best].item()
-    if not gain > SURE * error:
-        return Lobes(None, gain, error)
+    even = torch.tensor(bracket_numbers([batches.frames[index] for index in _views(batches)])) % 2 == 0
+    sureness, best, gain = 0.0, 0, 0.0
+    for count in SAMPLES:
+        sample = torch.arange(0, len(model), max(1, len(model) // count))
+        gains = _gains_on_other_half(seen, even, sample, axes, unit).flatten(
+            0, 1
+        )  # [alphas * strengths, sample]
+        # roots: a few lobes that are far off in a view would outweigh all the others by their squares
+        roots = gains.sign() * gains.abs().sqrt()
+        means, errors = roots.mean(dim=1), roots.std(dim=1, correction=0) / math.sqrt(len(sample))
+        best = int((means - SURE * errors).argmax())
+        sureness = (means[best] / errors[best].clamp(min=1e-12)).item()
+        gain = gains[best].sum().item() * len(model) / len(sample) * len(batches.frames) / seen.slope.shape[1]
+        if sureness <= 0:
+            break
+    if not sureness > SURE:
+        return Lobes(None, gain, sureness)
     alpha, strength = ALPHAS[best // len(STRENGTHS)], STRENGTHS[best % len(STRENGTHS)] * unit
-    return Lobes(_with_lobes(model, seen, axes, alpha, strength), gain, error)
+    return Lobes(_with_lobes(model, seen, axes, alpha, strength), gain, sureness)
 
 
-def _gains_on_other_half(seen: _Seen, sample: Tensor, axes: Tensor, unit: float) -> Tensor:
-    """Return what lobes fitted to one half of the views gain on the other [alphas, strengths, sample], nats."""
+def _gains_on_other_half(seen: _Seen, even: Tensor, sample: Tensor, axes: Tensor, unit: float) -> Tensor:
+    """Return what lobes fitted to one half of the views gain on the other [alphas, strengths, sample], nats.
+
+    Args:
+        even: [V] bool, which views are the first half.
+    """
     gains = torch.zeros(len(ALPHAS), len(STRENGTHS), len(sample))
-    even = torch.arange(seen.slope.shape[1]) % 2 == 0
     for fitted, other in ((even, ~even), (~even, even)):
         halves = [seen.of(sample, views) for views in (fitted, other)]
         for a, alpha in enumerate(ALPHAS):
@@ -179,7 +193,7 @@ def _seen(
     """Return what some of the training frames say of the Gaussians, in both errors, the model's and the noise."""
     found = [[], [], [], []]
     static_sun = _static_sun(batches.frames) if model.shading == "view" else None
-    for index in range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS)):
+    for index in _views(batches):
         batch = batches.batch([index], scale)
         sunlit = shadows.sunlit(model, batch.cameras, step)
         added = torch.zeros(1, len(model), model.sh.shape[2], requires_grad=True)
@@ -208,6 +222,11 @@ def _seen(
     return _Seen(
         slope, information, axes, sunlit, known, torch.zeros(0) if static_sun is None else static_sun
     )
+
+
+def _views(batches: Batches) -> range:
+    """Return the indices of the frames that are rendered, spread evenly."""
+    return range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS))
 
 
 def _static_sun(frames: list[TrainingFrame]) -> Tensor | None:

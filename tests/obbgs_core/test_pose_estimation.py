@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from skimage import transform
 
 from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displaced_motion
-from obbgs_core import registration
+from obbgs_core import pose_corrections, registration
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import Navigation, TrainingFrame, cameras_of, usable
 from obbgs_core.losses import likelihood_loss
@@ -465,6 +465,30 @@ def test_a_training_finds_what_the_pass_shares(erring):
     before = errors(torch.from_numpy(result.pose_estimate.tagged), true)
     after = errors(torch.from_numpy(result.pose_estimate.estimated), true)
     assert after.pixels < 0.3 * before.pixels
+    estimate, allowed = result.pose_estimate, SIGMAS.vector() > 0
+    prior, posterior = estimate.shared_prior.vector()[allowed], estimate.shared_posterior.vector()[allowed]
+    assert trainer.state.poses is not None and trainer.state.poses.together is not None
+    assert (posterior <= prior * (1 + 1e-6)).all() and posterior[9:].max() < 0.5 * prior[9:].max()
+    # what leads from the tags back to the true poses is -ERRORS but for products of errors, a hundredth of a deviation
+    off = (estimate.shared.vector() + ERRORS.vector())[allowed] / posterior
+    assert (np.abs(off) < 3).mean() > 0.75, off
+    trainer.state.poses.together = None  # the deviations of the likelihood of the finished model alone
+    assert (
+        posterior > trainer.result("").pose_estimate.shared_posterior.vector()[allowed] * (1 - 1e-6)
+    ).all()
+
+
+@given(st.integers(0, 10_000), st.integers(1, 6))
+def test_pictures_that_count_less_leave_more_open_but_no_more_than_the_prior(seed, size):
+    """An eigenvalue t of the information, beside the prior of 1, becomes t / DOUBT squared in the same direction."""
+    rng = np.random.default_rng(seed)
+    turn, told = (
+        np.linalg.qr(rng.normal(size=(size, size)))[0],
+        rng.exponential(size=size) * 10 ** rng.uniform(-3, 4),
+    )
+    covariance = torch.from_numpy(turn / (1 + told) @ turn.T)
+    expected = turn / (1 + told / pose_corrections.DOUBT**2) @ turn.T
+    np.testing.assert_allclose(pose_corrections._doubted(covariance), expected, atol=1e-8)
 
 
 def test_frames_of_two_passes_are_refused(erring):
