@@ -25,14 +25,16 @@ CHUNK = 30_000  # nodes at a time, such that their distances stay in the process
 MAX_NODES = 2_000_000  # wider voxels are used if there would be more
 BAND_VOXELS = 1.5  # a view says nothing of what lies deeper than this behind the surface that it sees
 # of each Gaussian in the depth maps: the Gaussians of a face lie in layers, of which the outer ones are nearest to it
-COPIES = 3
+COPIES = 5
 SEEN_THROUGH = 0.15  # of the views that see a place; if so many see past it, it is empty
-THICKER_VOXELS = 0.5  # on each side, so that a plate thinner than a voxel is not lost between two nodes
-DRAWN_BACK_VOXELS = 0.3  # of that, when triangles are made; what is left keeps the two sides of a plate apart
+THICKER_VOXELS = 0.7  # on each side, so that a plate thinner than a voxel is not lost between two nodes
+DRAWN_BACK_VOXELS = 0.4  # of that, when triangles are made; what is left keeps the two sides of a plate apart
 AT_LEAST_SEEING = 2  # views; what fewer see is taken for solid
 BLOCK = 8  # nodes along a side that are decided on together first
 FEWEST_NODES = 8  # of a piece that is kept
 FIRST_TOLERANCE_VOXELS = 0.1  # of the simplification
+TOLERANCE_GROWTH = 1.25
+BISECTIONS = 3  # of the last step of that tolerance
 SAME_DEPTH_VOXELS = 2.0  # within which a vertex counts as seen
 
 
@@ -177,16 +179,26 @@ def _simplified(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a mesh of at most so many triangles, which stays closed.
 
-    The distance by which vertices may move grows until that is reached.
+    The distance by which vertices may move grows until that is reached; the step that reaches it is then made as small
+    as a few bisections find, so that no more triangles are merged than necessary.
     """
     mesh = manifold3d.Mesh64(vertices.astype(np.float64), triangles.astype(np.uint64))
     solid = manifold3d.Manifold(mesh)
     if solid.status() != manifold3d.Error.NoError:
         raise ExportError(f"the surface is not closed ({solid.status()}), which should not happen")
-    tolerance_m = FIRST_TOLERANCE_VOXELS * voxel_m
+    finer, tolerance_m = solid, FIRST_TOLERANCE_VOXELS * voxel_m
     while solid.num_tri() > max_triangles:
-        solid = solid.simplify(tolerance_m)
-        tolerance_m *= 1.25
+        finer, solid = solid, solid.simplify(tolerance_m)
+        tolerance_m *= TOLERANCE_GROWTH
+    enough_m = tolerance_m / TOLERANCE_GROWTH
+    too_fine_m = enough_m / TOLERANCE_GROWTH
+    for _ in range(BISECTIONS if finer is not solid else 0):
+        middle_m = (too_fine_m + enough_m) / 2
+        tried = finer.simplify(middle_m)
+        if tried.num_tri() > max_triangles:
+            finer, too_fine_m = tried, middle_m
+        else:
+            solid, enough_m = tried, middle_m
     if solid.num_tri() == 0:
         raise ExportError(
             f"nothing is left of the surface with at most {max_triangles} triangles; allow more"

@@ -115,9 +115,8 @@ def lobed(
     sureness, best, gain = 0.0, 0, 0.0
     for count in SAMPLES:
         sample = torch.arange(0, len(model), max(1, len(model) // count))
-        gains = _gains_on_other_half(seen, even, sample, axes, unit).flatten(
-            0, 1
-        )  # [alphas * strengths, sample]
+        # [alphas * strengths, sample]
+        gains = _gains_on_other_half(seen, even, sample, axes, unit).flatten(0, 1)
         # roots: a few lobes that are far off in a view would outweigh all the others by their squares
         roots = gains.sign() * gains.abs().sqrt()
         means, errors = roots.mean(dim=1), roots.std(dim=1, correction=0) / math.sqrt(len(sample))

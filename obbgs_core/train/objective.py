@@ -13,9 +13,6 @@ from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check
 from obbgs_core.train.batches import Batch
 
-# share of the weight of empty sky where the radiance turns with the Sun: what is dark in one frame is lit in another
-MOVING_SUN_SKY = 0.5
-
 
 @dataclass(frozen=True)
 class LossSettings:
@@ -61,8 +58,7 @@ def priors(
     if settings.sh_weight and gaussians.sh.shape[1] > 1 and gaussians.shading == "view":
         total = total + settings.sh_weight * gaussians.sh[:, 1:].square().mean()
     if batch.sky is not None:
-        sky_weight = settings.sky_weight * (1 if gaussians.shading == "view" else MOVING_SUN_SKY)
-        total = total + sky_weight * (rendered.alpha * batch.sky).mean()
+        total = total + settings.sky_weight * (rendered.alpha * batch.sky).mean()
     if settings.flat_weight:
         total = total + settings.flat_weight * gaussians.scales.amin(dim=1).mean() / radius_m
     return total

@@ -76,7 +76,7 @@ PRESETS: dict[str, MethodConfig] = {
                 misfit=True,
                 sh_weight=1.0,
                 flat_weight=15.0,
-                sky_weight=2.0,
+                sky_weight=1.0,
             ),
             growth=GrowthSettings(
                 max_gaussians=10_000,

@@ -37,7 +37,7 @@ def test_a_sphere_of_discs_gives_a_closed_sphere_of_few_triangles(ball):
     assert shape.is_watertight and shape.is_winding_consistent and shape.body_count == 1
     assert 1000 < len(ball.triangles) <= 6000
     radii = np.linalg.norm(ball.vertices, axis=1)
-    thickened_m = 0.2 * 1.5 * PIXEL_M * 4 / 3  # voxels are as wide as 1.5 pixels at the median depth
+    thickened_m = 0.3 * 1.5 * PIXEL_M * 4 / 3  # voxels are as wide as 1.5 pixels at the median depth
     assert abs(np.median(radii) - 1 - thickened_m) < 0.5 * PIXEL_M
     assert shape.volume == pytest.approx(4 / 3 * math.pi * np.mean(radii) ** 3, rel=0.03)
     assert (ball.seen_by > 0).all() and ball.seen_by.max() <= ball.views == 20
