@@ -1,5 +1,6 @@
 """The frames of each step: which are drawn, and their images at the scale of the step."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -37,6 +38,12 @@ class Batches:
         self.frames, self.white_dn, self.sky = frames, white_dn, sky or {}
         self._images: dict[int, list[Tensor]] = {}
         self._sky_shares: dict[int, list[Tensor]] = {}
+
+    def posed(self, frames: list[TrainingFrame]) -> "Batches":
+        """Return the same images with the poses of other frames, such as refined ones."""
+        other = copy.copy(self)
+        other.frames = frames
+        return other
 
     def batch(self, indices: list[int], scale: float) -> Batch:
         """Return given frames, averaged to `scale` (1 / whole number) of their size."""

@@ -13,7 +13,7 @@ from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.render import Rendered
 from obbgs_core.train import pose_rounds
 from obbgs_core.train.appearance import SUN_FROM, described, raised_degree
-from obbgs_core.train.batches import Batch, FrameOrder
+from obbgs_core.train.batches import Batch, Batches, FrameOrder
 from obbgs_core.train.config import Moment
 from obbgs_core.train.glints import FEWEST_STEPS, HIGHLIGHTS_FROM, MORE_FRAMES, lobed
 from obbgs_core.train.growth import (
@@ -42,8 +42,13 @@ def smooth(setup: TrainingSetup, state: TrainingState) -> None:
     """Find the widths of the 3D filter anew, where the method has one, because Gaussians have moved or are others."""
     if setup.config.smoothing_px2:
         state.smoothing_m = sampling_deviation_m(
-            state.gaussians.means, setup.frames, setup.config.smoothing_px2
+            state.gaussians.means, batches_at(setup, state).frames, setup.config.smoothing_px2
         )
+
+
+def batches_at(setup: TrainingSetup, state: TrainingState) -> Batches:
+    """Return the training's images with the poses as they are estimated so far."""
+    return setup.batches if state.poses is None else setup.batches.posed(state.poses.frames(setup.frames))
 
 
 def is_recorded(setup: TrainingSetup, share: float) -> bool:
@@ -167,7 +172,9 @@ def select_model(setup: TrainingSetup, state: TrainingState, scale: float) -> No
 def prune_by_bic(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
     """Remove the Gaussians whose likelihood gain is below their BIC penalty, unless that were all of them."""
     drop_not_finite(state)
-    kept = justified(state.model, setup.batches, setup.sensor, scale, setup.config.parsimony, state.rng)
+    kept = justified(
+        state.model, batches_at(setup, state), setup.sensor, scale, setup.config.parsimony, state.rng
+    )
     if kept.any():
         removed = len(state.gaussians) - int(kept.sum())
         state.gaussians = keep(state.gaussians, state.adam, kept)
@@ -181,7 +188,13 @@ def raise_degree(
 ) -> None:
     """Let the radiance turn with view or Sun, or raise its degree, if the likelihood gain exceeds the BIC penalty."""
     raised, reason = raised_degree(
-        state.gaussians, setup.batches, setup.sensor, scale, directions, setup.config.light, state.rng
+        state.gaussians,
+        batches_at(setup, state),
+        setup.sensor,
+        scale,
+        directions,
+        setup.config.light,
+        state.rng,
     )
     if raised is not None:
         state.gaussians = raised
@@ -196,7 +209,7 @@ def add_highlights(setup: TrainingSetup, state: TrainingState, scale: float) -> 
     drop_not_finite(state)
     found = lobed(
         state.model,
-        setup.batches,
+        batches_at(setup, state),
         setup.sensor,
         scale,
         state.misfit,

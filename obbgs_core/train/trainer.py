@@ -122,7 +122,9 @@ class Trainer:
         share, scale = moment.share, moment.image_scale
         drawn = state.order.draw(min(moment.frames, len(setup.frames)), state.rng)
         batch = setup.batches.batch(drawn, scale)
-        cameras = batch.cameras if state.poses is None else state.poses.cameras(drawn, batch.cameras)
+        if state.poses is not None:
+            batch = dataclasses.replace(batch, cameras=state.poses.cameras(drawn, batch.cameras))
+        cameras = batch.cameras
         sunlit = state.shadows.sunlit(state.gaussians, cameras, state.steps_done)
         seen = rendered = self._compensated(render(self._drawn(share), cameras, sunlit=sunlit), batch)
         loss, residual = image_loss(rendered, batch, setup.sensor, config.loss, state.misfit)

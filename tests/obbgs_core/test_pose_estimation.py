@@ -26,6 +26,8 @@ from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.score.poses import best_motion, moved, pose_errors, seen_after, settled_poses, size_of
 from obbgs_core.start.alignment import settled
 from obbgs_core.start.initialisation import silhouettes
+from obbgs_core.train import decisions
+from obbgs_core.train.parsimony import justified
 from obbgs_core.train.poses import HELD_AT, HELD_FROM, HOLDS
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
@@ -496,6 +498,34 @@ def test_frames_of_two_passes_are_refused(erring):
     other = Navigation(dataclasses.replace(SIGMAS, clock_s=np.ones(1)))
     with pytest.raises(ReconstructionError, match="the same navigation"):
         usable([*wrong[:5], dataclasses.replace(wrong[5], navigation=other)], True)
+
+
+def test_pruning_sees_the_target_from_the_refined_poses(erring):
+    """From the tags, ten pixels off, most Gaussians of the true model would explain nothing that a picture shows."""
+    true, wrong = erring
+    settings = preset("obbgs", QUICK | {"poses.refine": "auto"})
+    trainer, exact = (Trainer(frames, SENSOR, settings) for frames in (wrong, true))
+    trainer.state.poses._move_shared(wrong, -torch.from_numpy(ERRORS.vector()))
+    trainer.state.poses.value.zero_()
+    for one in (trainer, exact):
+        one.state.gaussians = MODEL.trainable()
+    poses = torch.stack(
+        [f.world_to_camera for f in decisions.batches_at(trainer.setup, trainer.state).frames]
+    )
+    assert errors(poses, true).pixels < 0.3
+    kept = [
+        justified(
+            one.state.model,
+            decisions.batches_at(one.setup, one.state),
+            SENSOR,
+            1.0,
+            dataclasses.replace(settings.parsimony, keep_above_opacity=1.0),
+            torch.Generator().manual_seed(0),
+        )
+        for one in (trainer, exact)
+    ]
+    # a Gaussian near the limit may fall to either side
+    assert (kept[0] != kept[1]).sum() <= 1 and kept[1].sum() > 0.8 * len(kept[1])
 
 
 def test_the_schedule_is_set_back_for_aligned_poses_as_often_as_it_says(erring):
