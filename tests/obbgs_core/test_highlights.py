@@ -20,7 +20,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import lit_from, native_kernels, render
 from obbgs_core.render.highlights import lobe
 from obbgs_core.render.lighting import radiance_along
-from obbgs_core.train import decisions, glints
+from obbgs_core.train import decisions
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.presets import preset
@@ -291,24 +291,6 @@ def test_the_true_shapes_get_highlights_where_the_frames_show_them(shiny_frames,
     assert bright.sum() > 8 and cosine[bright].median() > 0.8
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_frames_of_one_bracket_do_not_judge_each_other(told):
-    """What is special about each view is in all frames of its bracket; only those of other views can contradict it."""
-    changing = torch.Generator().manual_seed(0)
-    plain, frames = target(30), []
-    for view in range(30):
-        darker = plain.sh - 2.0 * torch.rand(plain.sh.shape[:1], generator=changing)[:, None, None]
-        light = dataclasses.replace(plain, sh=darker)
-        frame = photographed(light, 30, seed=3, size_px=32, focal_px=65.0, exposures_s=(1e-4,))[view]
-        frames += [
-            dataclasses.replace(frame, id=3 * view + i, bracket=view if told else 3 * view + i)
-            for i in range(3)
-        ]
-    trainer = _trainer(frames)
-    decisions.add_highlights(trainer.setup, trainer.state, 1.0)
-    assert trainer.state.gaussians.has_highlights == (not told)
-
-
 @pytest.mark.parametrize("moves", [False, True])
 def test_under_a_told_sun_that_stands_still_an_axis_is_the_normal_of_a_mirror(moves):
     truth = dataclasses.replace(shining(target(30), alpha=0.3, peak=4.0), static_sun=STATIC_SUN)
@@ -361,11 +343,3 @@ def test_highlights_that_few_frames_do_not_show_are_found_when_more_have_joined(
     trainer.join(shiny_frames[8:])
     trainer.step()
     assert trainer.state.highlights_frames == 90 and trainer.gaussians.has_highlights
-
-
-def test_a_sample_of_the_views_still_has_two_halves(shiny_frames, monkeypatch):
-    """Every second of the frames is rendered here, each of a bracket of its own."""
-    monkeypatch.setattr(glints, "VIEWS", len(shiny_frames) // 2)
-    trainer = _trainer(shiny_frames)
-    decisions.add_highlights(trainer.setup, trainer.state, 1.0)
-    assert trainer.state.gaussians.has_highlights
