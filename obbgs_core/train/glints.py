@@ -23,6 +23,7 @@ from obbgs_core.render.highlights import brightest_axes, lobe
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.appearance import Shadows
 from obbgs_core.train.batches import Batches
+from obbgs_core.train.parsimony import shown_frames
 
 # share of the steps at which highlights are tested; later they gain less (experiment 042)
 HIGHLIGHTS_FROM = 0.15
@@ -112,7 +113,7 @@ def lobed(
     seen = _seen(model, batches, sensor, scale, misfit, shadows, step)
     unit = radiance(model.sh[:, :1], torch.zeros_like(model.means)).mean().item()
     axes = _sphere(AXES)
-    even = torch.arange(len(_views(batches))) % 2 == 0
+    even = torch.arange(seen.slope.shape[1]) % 2 == 0
     sureness, best, gain = 0.0, 0, 0.0
     for count in SAMPLES:
         sample = torch.arange(0, len(model), max(1, len(model) // count))
@@ -193,7 +194,7 @@ def _seen(
     """Return what some of the training frames say of the Gaussians, in both errors, the model's and the noise."""
     found = [[], [], [], []]
     static_sun = _static_sun(batches.frames) if model.shading == "view" else None
-    for index in _views(batches):
+    for index in shown_frames(batches, VIEWS):
         batch = batches.batch([index], scale)
         sunlit = shadows.sunlit(model, batch.cameras, step)
         added = torch.zeros(1, len(model), model.sh.shape[2], requires_grad=True)
@@ -222,11 +223,6 @@ def _seen(
     return _Seen(
         slope, information, axes, sunlit, known, torch.zeros(0) if static_sun is None else static_sun
     )
-
-
-def _views(batches: Batches) -> range:
-    """Return the indices of the frames that are rendered, spread evenly."""
-    return range(0, len(batches.frames), max(1, len(batches.frames) // VIEWS))
 
 
 def _static_sun(frames: list[TrainingFrame]) -> Tensor | None:

@@ -168,13 +168,13 @@ def _views(
         yield _View(batch, radiance, weight, signs, values, len(batches.frames) / len(chosen))
 
 
-def shown_frames(batches: Batches) -> range:
+def shown_frames(batches: Batches, most: int = VIEWS) -> range:
     """Return the indices of the frames that are rendered, spread evenly over time and over the exposure times.
 
     Exposure times come in turns: a stride that shares a factor with their number would meet only some of them.
     """
     exposures = len({frame.exposure_time_s for frame in batches.frames})
-    stride = max(1, len(batches.frames) // VIEWS)
+    stride = max(1, len(batches.frames) // most)
     while math.gcd(stride, exposures) > 1:
         stride += 1
     return range(0, len(batches.frames), stride)
