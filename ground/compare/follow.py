@@ -1,4 +1,4 @@
-"""Follows one piece of work: its curve of held-out scores, its energy, how far it is, and whether it should stop."""
+"""Follows one piece of work: its curve of held-out scores, its time and energy, how far it is, and whether to stop."""
 
 import json
 import os
@@ -47,12 +47,19 @@ class Follower:
         )
         self._looked_s = self._told_s = -1e9
         self._share, self._meter, self._joules_before = 0.0, EnergyMeter(), 0.0
+        told = _read(folder / PROGRESS)
+        self.cpu_seconds = 0.0 if told is None else told.get("cpu_seconds", 0.0)
+        self._worked_s = time.process_time()
         kept = _read(folder / CURVE)
         if kept is not None:
             self.points, self._joules_before = kept["points"], kept["joules"]
 
     def on_step(self, share: float, seconds: float, snapshot: Callable[[], Reconstruction]) -> None:
-        """Note that a share of the work is done, and measure the reconstruction as it stands where that is due."""
+        """Note that a share of the work is done, and measure the reconstruction as it stands where that is due.
+
+        `cpu_seconds` is the processor time of the work until now, over all its interrupted parts, without measuring.
+        """
+        self.cpu_seconds += time.process_time() - self._worked_s
         if share < self._share or self._share == 0.0:  # the work began, or went on, behind what was measured
             self.points = [point for point in self.points if point["share"] <= share]
         self._share = share
@@ -63,12 +70,13 @@ class Follower:
         if now_s - self._told_s > TELL_EVERY_S:
             self._told_s = now_s
             self._meter.sample()
-            told = {"share": share, "seconds": seconds, "pid": os.getpid()}
-            (self._folder / PROGRESS).write_text(json.dumps(told))
+            self._tell(seconds)
+        self._worked_s = time.process_time()
 
     def finish(self, reconstruction: Reconstruction) -> list[dict[str, float]]:
         """Return the curve with the finished reconstruction as its last point; [] of work that was never followed."""
         if self._share:
+            self._tell(reconstruction.seconds)
             self._add(self._share, reconstruction.seconds, reconstruction)
         return self.points
 
@@ -103,6 +111,10 @@ class Follower:
         point = {"share": round(share, 5), "seconds": round(seconds, 2)} | self._measured(reconstruction)
         self.points = [earlier for earlier in self.points if earlier["share"] < point["share"]] + [point]
         self._keep()
+
+    def _tell(self, seconds: float) -> None:
+        told = {"share": self._share, "seconds": seconds, "cpu_seconds": self.cpu_seconds, "pid": os.getpid()}
+        (self._folder / PROGRESS).write_text(json.dumps(told))
 
     def _measured(self, reconstruction: Reconstruction) -> dict[str, float]:
         figures: dict[str, float] = {}

@@ -41,6 +41,7 @@ METRICS = (
     Metric("interval_90_clean", "90 % intervals hold, share", "{:.2f}", None),
     Metric("gaussians", "Gaussians", "{:,.0f}", None),
     Metric("bytes", "kB", "{:,.0f}", None),
+    Metric("cpu_seconds", "processor time, s", "{:,.0f}", None),
     Metric("seconds", "seconds", "{:,.0f}", None),
     Metric("energy_j", "energy, J", "{:,.0f}", None),
 )

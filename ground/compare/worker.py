@@ -87,6 +87,7 @@ def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict
             )
         if curve := follower.finish(outcome.reconstruction):
             row["curve"] = curve
+            row["cpu_seconds"] = round(follower.cpu_seconds, 2)
         if outcome.reconstruction.seconds and (joules := follower.joules) is not None:
             row["energy_j"] = round(joules, 1)
     except (ReconstructionError, CompareError) as error:

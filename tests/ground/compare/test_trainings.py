@@ -97,7 +97,9 @@ def test_the_curve_is_measured_on_the_way_and_goes_on_after_an_interruption(case
         abs=1e-3,
     )
     again = Follower(case, tmp_path, tmp_path / "stop")
+    assert again.cpu_seconds == followed.cpu_seconds > 0
     again.on_step(0.5, 1.0, lambda: result)  # resumed from a checkpoint in the middle
+    assert again.cpu_seconds > followed.cpu_seconds
     assert max(point["share"] for point in again.points) <= 0.5 and len(again.points) >= 9
 
 
