@@ -13,7 +13,7 @@ from torch import Tensor
 
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import C0
-from obbgs_core.render import render
+from obbgs_core.render import render, weighted_gradient
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check, fraction
 from obbgs_core.train.batches import Batch, Batches
@@ -65,6 +65,7 @@ def shown_px(gaussians: Gaussians, batches: Batches, scale: float) -> Tensor:
     """Return on how many pixels each Gaussian [N] shows in the picture that shows most of it: its summed weights.
 
     The weight of a Gaussian in a pixel is the share of the pixel's light that is its own where all are equally bright.
+    Pictures of half the scale are rendered, of which each pixel stands for four.
     """
     white = dataclasses.replace(
         gaussians.detach().matt(), sh=torch.full((len(gaussians), 1, 1), 1 / C0), shading="view"
@@ -72,9 +73,9 @@ def shown_px(gaussians: Gaussians, batches: Batches, scale: float) -> Tensor:
     white.sh.requires_grad_()
     most = torch.zeros(len(gaussians))
     for index in shown_frames(batches):
-        image = render(white, batches.batch([index], scale).cameras).radiance
+        image = render(white, batches.batch([index], scale).cameras.scaled(0.5)).radiance
         (slope,) = torch.autograd.grad(image.sum(), white.sh)
-        most = torch.maximum(most, slope[:, 0, 0] / C0)
+        most = torch.maximum(most, 4 * slope[:, 0, 0] / C0)
     return most
 
 
@@ -92,7 +93,7 @@ def likelihood_gains(
     model.opacity_logits.requires_grad_()
     gains, values, times = torch.zeros(len(gaussians)), 0, 0.0
     for view in _views(model, batches, sensor, scale, rng):
-        (slope,) = torch.autograd.grad(view.radiance, model.opacity_logits, view.weight * view.signs)
+        slope = weighted_gradient(view.radiance, view.weight * view.signs, model.opacity_logits)
         # o·d/do, from the derivative by the logit
         change = slope / (1 - model.opacities.detach()).clamp(min=1e-6)
         gains += 0.5 * change**2
@@ -116,8 +117,8 @@ def next_degree_gain(
     values, times = 0, 0.0
     for view in _views(model, batches, sensor, scale, rng):
         residual = view.residual(sensor).clamp(-3, 3)  # robust, as the loss is
-        (g,) = torch.autograd.grad(view.radiance, model.sh, view.weight * residual, retain_graph=True)
-        (probe,) = torch.autograd.grad(view.radiance, model.sh, view.weight * view.signs)
+        g = weighted_gradient(view.radiance, view.weight * residual, model.sh, keep_graph=True)
+        probe = weighted_gradient(view.radiance, view.weight * view.signs, model.sh)
         slope += g
         curvature += probe**2
         shared += probe * probe[:, :1]
