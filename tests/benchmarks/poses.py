@@ -257,6 +257,8 @@ def main() -> None:
 
     def show(condition: str, scenario: str, target: int, seed: int, figures: dict) -> None:
         row = {"condition": condition, "scenario": scenario, "target": f"boxes-{target}", "seed": seed}
+        if not arguments.quick:
+            row["size_px"] = size_px
         print(shown(row | figures, "poses", arguments.json), flush=True)
 
     for target, scenario, seed in itertools.product(
