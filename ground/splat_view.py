@@ -15,6 +15,7 @@ from ground.turntable import VIEWS, circle, extent, metres_per_pixel, moving_png
 from obbgs_core.model.footprint import KERBL_PX2, MIP_SPLATTING_PX2, PIXEL_PX2, lowers_peak
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import sunlit_shares
+from obbgs_core.render.highlights import lobe_axes
 
 WEB = Path(__file__).with_name("web")
 MOST_SPLATS = 200_000  # more make a page of over 30 MB; the faintest are left out
@@ -69,7 +70,7 @@ def packed(run: Run, gaussians: Gaussians) -> tuple[dict, dict[str, np.ndarray]]
     quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
     lobes = gaussians.lobes.clone()  # a texel at the end: the axis and the weight itself
     if gaussians.has_highlights:
-        lobes = torch.cat([torch.nn.functional.normalize(lobes[:, :3], dim=1), lobes[:, 3:].exp()], dim=1)
+        lobes = torch.cat([lobe_axes(gaussians), lobes[:, -1:].exp()], dim=1)
     params = torch.cat([quats, shape, colours, padding, lobes], dim=1)
     centre, radius_m = extent(gaussians)
     middle = session.frames[len(session.frames) // 2].position_body_m - centre.numpy()

@@ -79,17 +79,25 @@ def photographed(
     size_px: int = SIZE_PX,
     focal_px: float = FOCAL_PX,
     exposures_s: Sequence[float] = EXPOSURES_S,
+    suns: Tensor | None = None,
 ) -> list[TrainingFrame]:
-    """Return frames of a model from all around, with shot and read noise, the exposures in turn."""
+    """Return frames of a model from all around, with shot and read noise, the exposures in turn.
+
+    Args:
+        suns: [count, 3], the direction to the Sun of each frame, which the frames then tell.
+    """
     rng, K = np.random.default_rng(seed), intrinsics(size_px, focal_px)
     frames = []
     for i, rotation in enumerate(Rotation.random(count, rng=rng).as_matrix()):
         exposure_s = exposures_s[i % len(exposures_s)]
-        cameras = Cameras(pose(rotation)[None], K[None], size_px, size_px)
+        sun = None if suns is None else suns[i]
+        cameras = Cameras(
+            pose(rotation)[None], K[None], size_px, size_px, sun_dir=None if sun is None else sun[None]
+        )
         expected = SENSOR.expected_dn(render(gaussians, cameras).radiance[0], exposure_s)
         sigma_dn = SENSOR.variance_dn2(expected).sqrt().numpy()
         dn = torch.from_numpy(converted(expected.numpy(), sigma_dn, SENSOR.white_dn, rng).astype(np.float32))
-        frames.append(TrainingFrame(dn, exposure_s, cameras.world_to_camera[0], K, i))
+        frames.append(TrainingFrame(dn, exposure_s, cameras.world_to_camera[0], K, i, sun_dir=sun))
     return frames
 
 

@@ -48,7 +48,7 @@ const SHADE = `
       bool mirrors = shading != 0 || dot(staticSun, staticSun) > 0.0; // the axis is the normal of a mirror
       vec3 source = shading == 0 ? staticSun : sun;
       float cosine = dot(lobe.xyz, mirrors ? normalize(source - direction) : -direction);
-      float cos2 = mirrors ? pow(max(cosine, 0.0), 2.0) : 0.5 + 0.5 * cosine;
+      float cos2 = mirrors ? cosine * cosine : 0.5 + 0.5 * cosine;
       float root = alpha * alpha / max(1.0 - cos2 * (1.0 - alpha * alpha), 1e-9);
       radiance += lit * lobe.w * root * root * shine;
     }

@@ -8,8 +8,9 @@ ignore. Everything else means the same there and here: metres, logarithms of sig
 If our radiance depends on the Sun's direction instead of the viewing direction, a comment of the header says so, and
 f_dc and f_rest hold the colours with the Sun in the direction that the comment names.
 
-A model with highlights has lobe_x, lobe_y, lobe_z and lobe_log_weight (`Gaussians.lobes`) and the material that they
-share in a comment. Viewers show them as harmonics of degree 3 in f_dc and f_rest, wider and fainter than they are.
+A model with highlights has lobe_log_weight, before it lobe_x, lobe_y and lobe_z where lobes have axes of their own
+(`Gaussians.lobes`), and the material that they share in a comment. Viewers show them as harmonics of degree 3 in f_dc
+and f_rest, wider and fainter than they are.
 
 Most viewers widen every Gaussian by 0.3 px² of their screen and keep its peak, the footprint `kerbl`. Another footprint
 stands in a comment, and `opacity` is then made for such viewers: the model's own, which follows as fitted_opacity,
@@ -109,7 +110,9 @@ def save_ply(
     for k in range(coefficients):
         table |= {f"radiance_sh_{k}_{c}": gaussians.sh[:, k, c] for c in range(channels)}
     if gaussians.has_highlights:
-        table |= {name: gaussians.lobes[:, i] for i, name in enumerate(LOBE_NAMES)}
+        table |= {
+            name: gaussians.lobes[:, i] for i, name in enumerate(LOBE_NAMES[-gaussians.lobes.shape[1] :])
+        }
     if for_viewers is not None:
         table["fitted_opacity"] = gaussians.opacity_logits
     comments = [
@@ -197,7 +200,7 @@ def load_ply(path: Path) -> Gaussians:
             alpha, _, peak = material.partition(", peak radiance ")
             fitted["gloss"] = torch.tensor([float(value) for value in (alpha, *peak.split())]).log()
             fitted["static_sun"] = torch.tensor([float(value) for value in sun.split()])
-            fitted["lobes"] = torch.stack([table[name] for name in LOBE_NAMES], 1)
+            fitted["lobes"] = torch.stack([table[name] for name in LOBE_NAMES if name in table], 1)
         if line.startswith(TURNS_WITH_SUN):
             shading = "sun"
         elif line.startswith(LAMBERT):

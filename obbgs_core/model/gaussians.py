@@ -14,7 +14,8 @@ Footprint = Literal["kerbl", "mip-splatting", "camera"]
 # With the pixel's own 1/12 px² it makes 0.15 px², the best of several on rendered pictures.
 DEFAULT_PSF_SIGMA_PX = 0.26
 TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh")
-LOBE = 4  # numbers of a Gaussian's lobe: three for its axis, then the logarithm of its weight
+# numbers of a Gaussian's lobe, the last of them the logarithm of its weight: along its normal, or three for an axis too
+LOBES = (1, 4)
 
 
 @dataclass
@@ -31,12 +32,12 @@ class Gaussians:
       units of the Sun's. The maximum is as soft as `sh.radiance`, and ambient [] is one number for all.
 
     A model may have highlights (`render.highlights`): each Gaussian then mirrors the Sun in one more lobe, which is
-    added to that radiance. lobes [N, 4]: its axis (normalised on use) and the logarithm of its weight; the axis is
-    the normal of the mirror where the Sun is known, which it is with the shadings `sun` and `lambert` and where
-    static_sun [3] holds its direction (unit, body frame), because it stands still; where static_sun is [0], the
-    direction in which the lobe is seen at its brightest. gloss [1 + C]: the logarithms of the roughness alpha of GGX
-    and of the peak radiance of a weight of 1, shared by all as one material is. A model without highlights has lobes
-    [N, 0] and gloss [0].
+    added to that radiance. lobes [N, 1]: the logarithm of its weight, the Gaussian being a mirror across its shortest
+    axis; or [N, 4]: before it an axis of the lobe's own (normalised on use). That is the normal of the mirror where the
+    Sun is known, which it is with the shadings `sun` and `lambert` and where static_sun [3] holds its direction (unit,
+    body frame), because it stands still; where static_sun is [0], the direction in which the lobe is seen at its
+    brightest. gloss [1 + C]: the logarithms of the roughness alpha of GGX and of the peak radiance of a weight of 1,
+    shared by all as one material is. A model without highlights has lobes [N, 0] and gloss [0].
 
     Projected Gaussians are widened by what each pixel averages over, the `footprint`. It belongs to the model, because
     opacities and scales were fitted with it:
@@ -74,9 +75,13 @@ class Gaussians:
             raise ValueError(f"sh must be [{n}, K, 1 or 3], got {list(self.sh.shape)}")
         if not self.has_highlights:
             self.lobes = self.means.new_zeros(n, 0)
-        elif tuple(self.lobes.shape) != (n, LOBE) or len(self.gloss) != 1 + self.sh.shape[2]:
+        elif (
+            self.lobes.shape[0] != n
+            or self.lobes.shape[1] not in LOBES
+            or len(self.gloss) != 1 + self.sh.shape[2]
+        ):
             raise ValueError(
-                f"lobes must be [{n}, {LOBE}] with gloss [{1 + self.sh.shape[2]}], or both empty, got "
+                f"lobes must be [{n}, 1 or 4] with gloss [{1 + self.sh.shape[2]}], or both empty, got "
                 f"{list(self.lobes.shape)} with {list(self.gloss.shape)}"
             )
         if tuple(self.static_sun.shape) not in ((0,), (3,)):

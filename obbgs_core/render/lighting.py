@@ -8,9 +8,8 @@ from torch import Tensor
 
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.model.rotations import quats_to_matrices
 from obbgs_core.model.sh import C0, fit, from_radiance, radiance, sh_basis, softplus
-from obbgs_core.render.highlights import highlights_along
+from obbgs_core.render.highlights import highlights_along, shortest_axes
 
 INITIAL_ALBEDO = 2.0  # over a Gaussian's mean radiance: half of the Suns, about, shine on its other side
 INITIAL_AMBIENT = 0.02  # in units of the Sun's light
@@ -50,13 +49,6 @@ def normals_towards(gaussians: Gaussians, directions: Tensor) -> Tensor:
     """Return each Gaussian's shortest axis [N, 3], its sign such that it points against `directions` [N, 3]."""
     normal = shortest_axes(gaussians)
     return -normal * torch.sign((normal * directions).sum(-1, keepdim=True))
-
-
-def shortest_axes(gaussians: Gaussians) -> Tensor:
-    """Return the unit axis of each Gaussian's smallest scale [N, 3]; its sign is arbitrary."""
-    axes = quats_to_matrices(gaussians.quats)
-    shortest = gaussians.log_scales.argmin(dim=1)
-    return axes.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
 
 
 def mean_radiance(gaussians: Gaussians, cameras: Cameras) -> Tensor:

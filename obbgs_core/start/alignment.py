@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame
+from obbgs_core.model.motions import cross_matrices
 from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.registration import PoseInformation, point_flow
 from obbgs_core.start import hull
@@ -20,6 +21,7 @@ ROUNDS = 12  # of aligning the silhouettes' centres; the problem is nearly linea
 BETTER = 0.7
 OFFSET = 0.3  # of the silhouettes' radius: deviation of their common point from the body's origin
 HOLD = 0.3  # of the median distance of the centres from the point, which is added to their deviation
+NEAREST = 0.3  # of the median range: no target is taken to be nearer than that while poses are aligned
 FAR = 3.0  # times the median distance of the centres from the point, beyond which they count less
 
 
@@ -119,13 +121,12 @@ def _aligned(
     poses, point = PoseCorrections(frames), torch.zeros(3, dtype=torch.float64)
     lit, K, centres_px, radii_px = _centres(frames, outlines)
     sigma_px = CENTRE_SIGMA * radii_px
-    ranges_m = torch.stack([frames[i].world_to_camera[2, 3] for i in lit]).clamp(min=1e-6)
+    ranges_m = torch.stack([frames[i].world_to_camera[:3, 3] for i in lit]).norm(dim=1)
     # the prior deviation of the point from the origin
     offset_m = offset * float((radii_px * ranges_m / K[:, 0, 0]).median())
     by_offset = torch.zeros(len(frames), 6, 3, dtype=torch.float64)
     for _ in range(ROUNDS):
-        at, turn, away_px = _seen(poses, lit, point, K, centres_px)
-        flow = point_flow(at, K)  # [L, 2, 6]
+        flow, turn, away_px = _seen(poses, lit, point, K, centres_px)
         # a centre far off counts less, as one of a picture that shows something else
         distance = away_px.norm(dim=1)
         far = (distance / (FAR * distance.median()).clamp(min=1e-9)).clamp(min=1)
@@ -152,12 +153,23 @@ def _centres(
 def _seen(
     poses: PoseCorrections, lit: list[int], point: Tensor, K: Tensor, centres_px: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a point of the body in camera axes [L, 3], the poses' rotations, and how far the centres are off, px."""
+    """Return how the picture of a point of the body moves with its pose, the poses' rotations, and what is left, px.
+
+    What is left [L, 2] is how far the point is from the silhouette's centre, and its derivative by the motion is
+    [L, 2, 6]. Where tags, which err, have the target beside or behind the camera, both are those of the distance from
+    the ray through that centre instead, over a depth that stays, which is linear in the pose.
+    """
     world_to_camera = poses.corrected(lit).double()
     at = world_to_camera[:, :3, :3] @ point + world_to_camera[:, :3, 3]
-    at[:, 2] = at[:, 2].clamp(min=1e-6)
-    projected = at[:, :2] / at[:, 2:] * K[:, [0, 1], [0, 1]] + K[:, :2, 2]
-    return at, world_to_camera[:, :3, :3], centres_px - projected
+    focal_px, z = K[:, [0, 1], [0, 1]], at[:, 2:]
+    depth = z.clamp(min=NEAREST * float(at.norm(dim=1).median()))
+    rays = (centres_px - K[:, :2, 2]) / focal_px
+    towards = torch.where(z < depth, rays, at[:, :2] / depth)
+    eye = torch.eye(3, dtype=torch.float64).expand(len(lit), 3, 3)
+    across = torch.cat([eye[:, :2, :2], -towards[..., None]], dim=2)  # [L, 2, 3]
+    by_motion = torch.cat([-cross_matrices(at), eye], dim=2)
+    flow = (focal_px / depth)[..., None] * across @ by_motion
+    return flow, world_to_camera[:, :3, :3], focal_px / depth * (rays * z - at[:, :2])
 
 
 def _centre(mask: Tensor) -> tuple[Tensor, float]:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from obbgs_core import compiled
-from obbgs_core.model.gaussians import TENSORS, Gaussians
+from obbgs_core.model.gaussians import LOBES, TENSORS, Gaussians
 from obbgs_core.settings import check
 
 OPACITY_RATE = 0.05  # of opacity logits a step (Kerbl et al. 2023)
@@ -36,14 +36,20 @@ class RateSettings:
 
 
 def learning_rates(
-    rates: RateSettings, share: float, unit_m: float, coefficients: int, radiance_unit: float = 1.0
+    rates: RateSettings,
+    share: float,
+    unit_m: float,
+    coefficients: int,
+    radiance_unit: float = 1.0,
+    lobe: int = LOBES[-1],
 ) -> dict[str, float | Tensor]:
-    """Return each parameter's rate after a share of the steps: of `sh` [1, K, 1] if they differ, of `lobes` [1, 4].
+    """Return each parameter's rate after a share of the steps: of `sh` [1, K, 1] if they differ, of `lobes` [1, lobe].
 
     Args:
         unit_m: the method's unit of length.
         coefficients: K, of the radiance.
         radiance_unit: the method's unit of radiance.
+        lobe: numbers of a Gaussian's lobe.
     """
     decay = rates.final_share**share
     sh: float | Tensor = rates.sh * decay * radiance_unit
@@ -57,7 +63,7 @@ def learning_rates(
         "log_scales": rates.log_scales * decay,
         "opacity_logits": OPACITY_RATE * decay,
         "sh": sh,
-        "lobes": torch.tensor([[AXIS_RATE, AXIS_RATE, AXIS_RATE, WEIGHT_RATE]]) * decay,
+        "lobes": torch.tensor([[AXIS_RATE, AXIS_RATE, AXIS_RATE, WEIGHT_RATE][-lobe:]]) * decay,
         "gloss": GLOSS_RATE * decay,
         "ambient": AMBIENT_RATE * decay,
         "psf_sigma_px": PSF_RATE * decay,

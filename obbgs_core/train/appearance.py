@@ -34,7 +34,7 @@ class LightSettings:
     sun_span_deg: float = 0.0  # above 0: the Sun is tested too where its direction spans more than this
     # albedo, normal and cast shadows | harmonics towards the Sun
     sun_shading: Literal["lambert", "linear"] = "lambert"
-    # tested on withheld views, and given to all Gaussians where these are explained better
+    # given to all Gaussians where withheld frames are explained better, and where the Sun moves
     highlights: bool = False
 
     def __post_init__(self):

@@ -15,7 +15,7 @@ from obbgs_core.train import pose_rounds
 from obbgs_core.train.appearance import SUN_FROM, described, raised_degree
 from obbgs_core.train.batches import Batch, Batches, FrameOrder
 from obbgs_core.train.config import Moment
-from obbgs_core.train.glints import FEWEST_STEPS, HIGHLIGHTS_FROM, MORE_FRAMES, lobed
+from obbgs_core.train.glints import FEWEST_STEPS, HIGHLIGHTS_FROM, MORE_FRAMES, along_normals, lobed
 from obbgs_core.train.growth import (
     GRADIENT_THRESHOLD,
     Growth,
@@ -206,7 +206,10 @@ def raise_degree(
 
 
 def add_highlights(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
-    """Give every Gaussian a highlight, if views that are withheld from the choice are explained better by them."""
+    """Give every Gaussian a highlight, if frames that are withheld from the choice are explained better by them.
+
+    Where the Sun moves they get one in any case: along their normals if withheld brackets are not explained better.
+    """
     drop_not_finite(state)
     found = lobed(
         state.model,
@@ -217,14 +220,17 @@ def add_highlights(setup: TrainingSetup, state: TrainingState, scale: float) -> 
         state.shadows,
         state.steps_done,
     )
-    if found.gaussians is not None:
-        changed = {name: getattr(found.gaussians, name) for name in ("sh", "lobes", "gloss", "static_sun")}
+    shiny, along = found.gaussians, ""
+    if shiny is None and state.gaussians.shading != "view":
+        shiny, along = along_normals(state.gaussians), "; they lie along the normals"
+    if shiny is not None:
+        changed = {name: getattr(shiny, name) for name in ("sh", "lobes", "gloss", "static_sun")}
         state.gaussians = dataclasses.replace(state.gaussians, **changed).trainable()
         state.adam.widen(state.gaussians)
     state.highlights_frames = len(setup.frames)
     state.highlights_reason = (
-        f"step {state.steps_done + 1}, highlights would gain {found.gain:,.0f} nats on views that they are not fitted "
-        f"to, with {found.sureness:.1f} standard errors"
+        f"step {state.steps_done + 1}, highlights would gain {found.gain:,.0f} nats on frames that they are not "
+        f"fitted to, with {found.sureness:.1f} standard errors{along}"
     )
     log.info("radiance %s", described(state.gaussians, state.highlights_reason))
 

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import TrainingFrame, bracket_numbers, cameras_of
 from obbgs_core.misfit import mean_light2
 from obbgs_core.model.cameras import stacked_suns
 from obbgs_core.model.gaussians import Gaussians
@@ -33,11 +33,15 @@ MORE_FRAMES = 1.5  # times as many as at the last test: then they are tested aga
 VIEWS = 120  # training frames that are rendered, spread evenly: few of them show the glint of one Gaussian
 # Gaussians that decide, spread evenly: first so many, and more where those gain on average
 SAMPLES = (192, 768)
-ALPHAS = (0.2, 0.4)  # roughness of GGX that is tried
+ALPHAS, SHARP_ALPHAS = (0.2, 0.4), (0.12,)  # roughness of GGX that is tried; the latter where the Sun moves
 STRENGTHS = (1.0, 2.0, 4.0, 8.0, 16.0)  # of a lobe's peak over the mean radiance: tried
 AXES = 250  # directions that a lobe is tried in, 13 degrees apart
 LEAST_GAIN = 3.0  # nats: a Gaussian whose lobe gains less starts with the weight FAINT
 FAINT = 0.05
+NORMAL_ALPHA, NORMAL_STRENGTH = (
+    0.2,
+    8.0,
+)  # of lobes along normals at first: roughness; peak over the mean radiance
 SURE = 2.0  # standard errors by which the root of the gain on the other half must exceed zero on average
 STILL_DEG = 5.0  # a Sun that is known and never further than this from its mean direction stands still
 AT_ONCE = 16  # Gaussians whose axes are searched together, for memory's sake
@@ -47,7 +51,7 @@ AT_ONCE = 16  # Gaussians whose axes are searched together, for memory's sake
 class Lobes:
     """What highlights a training starts with, and what they gain.
 
-    gaussians: with a lobe each; None where no gain on views that the lobes are not fitted to is sure.
+    gaussians: with a lobe each; None where no gain on frames that the lobes are not fitted to is sure.
     gain: nats over all frames.
     sureness: the mean of the gains' signed square roots over its standard error.
     """
@@ -97,10 +101,11 @@ def lobed(
     shadows: Shadows,
     step: int,
 ) -> Lobes:
-    """Return the Gaussians with a lobe each, if views that the lobes were not fitted to are explained better by them.
+    """Return the Gaussians with a lobe each, if frames that the lobes were not fitted to are explained better by them.
 
-    Every second frame is one half. Frames of a bracket show the same view, which makes the test lenient; judged by
-    other brackets, lobes that gain 2 dB were turned down (experiment 051). For each roughness and strength, the axes
+    Where the Sun stands still every second frame is one half: frames of a bracket show the same view, which makes the
+    test lenient. Where it moves it is every second bracket, so that lobes are not judged by the view and the Sun that
+    they were fitted to (experiment 057). For each roughness and strength, the axes
     that gain most on one half are scored on the other; what surely gains most there is chosen for all Gaussians and
     fitted to all frames. Nothing is random.
 
@@ -113,12 +118,13 @@ def lobed(
     seen = _seen(model, batches, sensor, scale, misfit, shadows, step)
     unit = radiance(model.sh[:, :1], torch.zeros_like(model.means)).mean().item()
     axes = _sphere(AXES)
-    even = torch.arange(seen.slope.shape[1]) % 2 == 0
+    moves = model.shading != "view"
+    alphas, first = SHARP_ALPHAS if moves else ALPHAS, _first_half(batches, moves)
     sureness, best, gain = 0.0, 0, 0.0
     for count in SAMPLES:
         sample = torch.arange(0, len(model), max(1, len(model) // count))
         # [alphas * strengths, sample]
-        gains = _gains_on_other_half(seen, even, sample, axes, unit).flatten(0, 1)
+        gains = _gains_on_other_half(seen, first, sample, axes, alphas, unit).flatten(0, 1)
         # roots: a few lobes that are far off in a view would outweigh all the others by their squares
         roots = gains.sign() * gains.abs().sqrt()
         means, errors = roots.mean(dim=1), roots.std(dim=1, correction=0) / math.sqrt(len(sample))
@@ -129,20 +135,45 @@ def lobed(
             break
     if not sureness > SURE:
         return Lobes(None, gain, sureness)
-    alpha, strength = ALPHAS[best // len(STRENGTHS)], STRENGTHS[best % len(STRENGTHS)] * unit
+    alpha, strength = alphas[best // len(STRENGTHS)], STRENGTHS[best % len(STRENGTHS)] * unit
     return Lobes(_with_lobes(model, seen, axes, alpha, strength), gain, sureness)
 
 
-def _gains_on_other_half(seen: _Seen, even: Tensor, sample: Tensor, axes: Tensor, unit: float) -> Tensor:
+def along_normals(gaussians: Gaussians) -> Gaussians:
+    """Return the Gaussians with a faint lobe each, along its normal; the training finds how bright it is.
+
+    A lobe with an axis of its own can explain what else is special about the few frames that show it. One along the
+    normal has to agree with the shading of all the others (experiment 057).
+    """
+    means = gaussians.means.detach()
+    unit = radiance(gaussians.sh.detach()[:, :1], torch.zeros_like(means)).mean().item()
+    gloss = torch.tensor([NORMAL_ALPHA, *[NORMAL_STRENGTH * unit] * gaussians.sh.shape[2]]).log()
+    return dataclasses.replace(
+        gaussians, lobes=torch.full((len(means), 1), math.log(FAINT)), gloss=gloss, static_sun=torch.zeros(0)
+    )
+
+
+def _first_half(batches: Batches, by_bracket: bool) -> Tensor:
+    """Return which of the frames that are rendered [V] are the first half."""
+    shown = shown_frames(batches, VIEWS)
+    if not by_bracket:
+        return torch.arange(len(shown)) % 2 == 0
+    numbers = bracket_numbers(batches.frames)
+    return torch.tensor([numbers[index] % 2 == 0 for index in shown])
+
+
+def _gains_on_other_half(
+    seen: _Seen, first: Tensor, sample: Tensor, axes: Tensor, alphas: tuple[float, ...], unit: float
+) -> Tensor:
     """Return what lobes fitted to one half of the views gain on the other [alphas, strengths, sample], nats.
 
     Args:
-        even: [V] bool, which views are the first half.
+        first: [V] bool, which views are the first half.
     """
-    gains = torch.zeros(len(ALPHAS), len(STRENGTHS), len(sample))
-    for fitted, other in ((even, ~even), (~even, even)):
+    gains = torch.zeros(len(alphas), len(STRENGTHS), len(sample))
+    for fitted, other in ((first, ~first), (~first, first)):
         halves = [seen.of(sample, views) for views in (fitted, other)]
-        for a, alpha in enumerate(ALPHAS):
+        for a, alpha in enumerate(alphas):
             (slope, curvature), (slope_there, curvature_there) = (
                 half.parabolas(half.shares(axes, alpha)) for half in halves
             )
@@ -234,10 +265,16 @@ def _static_sun(frames: list[TrainingFrame]) -> Tensor | None:
     return mean if (directions @ mean).min() > math.cos(math.radians(STILL_DEG)) else None
 
 
-def first_lobes(means: Tensor, camera_centre: Tensor) -> Tensor:
-    """Return faint lobes [N, 4] for Gaussians that join a model with highlights, each towards a camera."""
-    axis = F.normalize(camera_centre - means, dim=1)
-    return torch.cat([axis, torch.full((len(means), 1), math.log(FAINT))], dim=1)
+def first_lobes(means: Tensor, frame: TrainingFrame, model: Gaussians) -> Tensor:
+    """Return faint lobes [N, 1 or 4] for Gaussians that join a model; those with axes are brightest in a frame."""
+    weights = torch.full((len(means), 1), math.log(FAINT))
+    if model.lobes.shape[1] == 1:
+        return weights
+    sun = frame.sun_dir if model.shading != "view" else model.static_sun
+    directions = F.normalize(means - cameras_of([frame]).centres[0], dim=1)
+    return torch.cat(
+        [brightest_axes(directions, None if sun is None or not len(sun) else sun), weights], dim=1
+    )
 
 
 def _sphere(count: int) -> Tensor:

@@ -7,7 +7,6 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from obbgs_core.frames import cameras_of
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.start import hull
 from obbgs_core.train.adam import Adam
@@ -73,8 +72,9 @@ def join(
         sh=padded_to(start.sh[added], gaussians.sh.shape[1]),
     )
     if gaussians.has_highlights:
-        centre = cameras_of(joined.frames[:1]).centres[0]
-        new = dataclasses.replace(new, lobes=first_lobes(new.means, centre), gloss=gaussians.gloss)
+        new = dataclasses.replace(
+            new, lobes=first_lobes(new.means, joined.frames[0], gaussians), gloss=gaussians.gloss
+        )
     log.info(
         "%d frames: %d of %d Gaussians stay on the hull, %d join them",
         *(len(joined.frames), len(kept), len(gaussians), len(new)),

@@ -28,6 +28,8 @@ class LossSettings:
     misfit: bool = False
     # of the mean square of the coefficients that turn with the view: a prior for matt surface
     sh_weight: float = 0.0
+    # of the mean peak radiance of highlights along normals: a prior for matt surface too
+    gloss_weight: float = 0.0
     # of the mean shortest scale over the target's radius: flat Gaussians are surface
     flat_weight: float = 0.0
     sky_weight: float = 0.0  # of the mean alpha of pixels that show no light: space is empty
@@ -68,6 +70,10 @@ def priors(
     total = torch.zeros(())
     if settings.sh_weight and gaussians.sh.shape[1] > 1 and gaussians.shading == "view":
         total = total + settings.sh_weight * gaussians.sh[:, 1:].square().mean()
+    if settings.gloss_weight and gaussians.lobes.shape[1] == 1:
+        total = (
+            total + settings.gloss_weight * gaussians.lobes.exp().mean() * gaussians.gloss[1:].exp().mean()
+        )
     if batch.sky is not None:
         total = total + settings.sky_weight * batch.share * (rendered.alpha * batch.sky).mean()
     if settings.flat_weight:

@@ -76,6 +76,7 @@ PRESETS: dict[str, MethodConfig] = {
                 edge_weight=0.05,
                 misfit=True,
                 sh_weight=1.0,
+                gloss_weight=0.02,
                 flat_weight=15.0,
                 sky_weight=1.0,
             ),

@@ -175,7 +175,10 @@ class Trainer:
         state, config = self.state, self.setup.config
         freeze_later_degrees(state.gaussians, state.steps_done + 1, config.light)
         coefficients = state.gaussians.sh.shape[1]
-        rates = learning_rates(config.rates, share, self.setup.unit_m, coefficients, self.setup.radiance_unit)
+        lobe = state.gaussians.lobes.shape[1]
+        rates = learning_rates(
+            config.rates, share, self.setup.unit_m, coefficients, self.setup.radiance_unit, lobe
+        )
         state.adam.step(state.gaussians, rates)
         state.gaussians.ambient.detach().clamp_(min=0)
         state.gaussians.psf_sigma_px.detach().clamp_(min=LEAST_PSF_SIGMA_PX)

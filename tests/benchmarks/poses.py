@@ -9,6 +9,7 @@ a scenario, with sensor noise, and the tags err as each condition says. A scenar
 import argparse
 import dataclasses
 import itertools
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -164,8 +165,9 @@ def scored(seen: Pass, condition: str, config: MethodConfig, seed: int) -> dict:
     """Return the scores of a training on all brackets but every eighth, on which it is scored."""
     trained, _ = divided(seen)
     frames = CONDITIONS[condition](seen, seed)
+    began = time.process_time()
     result = train([frames[i] for i in trained], SENSOR, config, seed)
-    figures = scores(seen, frames, result)
+    figures = {"cpu_seconds": time.process_time() - began} | scores(seen, frames, result)
     if condition in FACTORS and result.pose_estimate is not None:
         errors, _ = shared_errors(seen, FACTORS[condition], seed)
         figures |= errors_in_deviations(seen, errors, result.pose_estimate)
@@ -251,27 +253,33 @@ def main() -> None:
     size_px, brackets, steps, seeds = (100, 49, 600, [0]) if arguments.quick else (200, 121, 1500, range(5))
     config = preset("obbgs", {"steps": steps, "light.max_sh_degree": 0})
     conditions = arguments.conditions or known
-    for target, seed in itertools.product(arguments.targets, arguments.seeds or seeds):
+    seeds = arguments.seeds or seeds
 
-        def show(condition: str, scenario: str, figures: dict, of=(target, seed)) -> None:
-            row = {"condition": condition, "scenario": scenario, "target": f"boxes-{of[0]}", "seed": of[1]}
-            print(shown(row | figures, "poses", arguments.json), flush=True)
+    def show(condition: str, scenario: str, target: int, seed: int, figures: dict) -> None:
+        row = {"condition": condition, "scenario": scenario, "target": f"boxes-{target}", "seed": seed}
+        if not arguments.quick:
+            row["size_px"] = size_px
+        print(shown(row | figures, "poses", arguments.json), flush=True)
 
-        for scenario in arguments.scenarios or SCENARIOS:
-            chosen = [condition for condition in CONDITIONS if condition in conditions]
-            if arguments.quick and not arguments.conditions and scenario != SCENARIOS[0]:
-                chosen = ["correlated_1"]
-            if not chosen:
-                continue
-            seen = photographed(target, load_scenario(scenario), brackets, size_px, seed)
-            exact_db = float("nan")
-            for condition in dict.fromkeys(["exact", *chosen]):
-                figures = scored(seen, condition, config, seed)
-                if condition == "exact":
-                    exact_db = figures["psnr_clean_db"]
-                show(condition, scenario, figures | {"psnr_exact_db": exact_db})
+    for target, scenario, seed in itertools.product(
+        arguments.targets, arguments.scenarios or SCENARIOS, seeds
+    ):
+        chosen = [condition for condition in CONDITIONS if condition in conditions]
+        if arguments.quick and not arguments.conditions and scenario != SCENARIOS[0]:
+            chosen = ["correlated_1"]
+        if not chosen:
+            continue
+        seen = photographed(target, load_scenario(scenario), brackets, size_px, seed)
+        exact_db = float("nan")
+        for condition in dict.fromkeys(["exact", *chosen]):
+            figures = scored(seen, condition, config, seed)
+            if condition == "exact":
+                exact_db = figures["psnr_clean_db"]
+            show(condition, scenario, target, seed, figures | {"psnr_exact_db": exact_db})
+    for target, seed in itertools.product(arguments.targets, seeds):
         for condition in (c for c in unknown_attitude.CONDITIONS if c in conditions):
-            show(condition, "tumbling", unknown_attitude.row(condition, target, size_px, config, seed))
+            figures = unknown_attitude.row(condition, target, size_px, config, seed)
+            show(condition, "tumbling", target, seed, figures)
 
 
 if __name__ == "__main__":

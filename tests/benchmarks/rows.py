@@ -18,7 +18,11 @@ FOLDER = ROOT / "results"
 # what a line of a table is called by, where a row has it
 NAMES = ("method", "ablation", "condition", "scenario", "target")
 # and these where rows differ in them
-BUDGETS = {"steps_share": "share of the steps", "largest": "at most Gaussians"}
+BUDGETS = {
+    "steps_share": "share of the steps",
+    "largest": "at most Gaussians",
+    "size_px": "pixels along a side, where not the usual number",
+}
 FIGURES = {  # key of a row: column title and format
     "psnr_clean_db": ("clean PSNR", "{:.2f} dB"),
     "psnr_settled_db": ("from settled poses", "{:.2f} dB"),

@@ -51,13 +51,15 @@ def row(condition: str, target: int, size_px: int, config: MethodConfig, seed: i
     frames = in_found_axes(seen, found, times_s)
     always = dataclasses.replace(config, poses=dataclasses.replace(config.poses, refine="always"))
     result = train([frames[i] for i in trained], passes.SENSOR, always, seed)
+    cpu_s = time.process_time() - began  # of search and training
     assert result.pose_estimate is not None
     refined = found.refined(result.pose_estimate)
     figures = poses.scores(turned(seen, found.inertial_to_body(times_s)), frames, result)
     errors = {"": rotation_errors(refined, seen.motion, epoch_s)}
     errors["outlines_"] = rotation_errors(found, seen.motion, epoch_s)
     named = {f"{prefix}{key}": value for prefix, of in errors.items() for key, value in of.items()}
-    return figures | named | {"psnr_exact_db": exact_db, "search_seconds": searched_s}
+    seconds = {"search_seconds": searched_s, "cpu_seconds": cpu_s}
+    return figures | named | {"psnr_exact_db": exact_db} | seconds
 
 
 def inertial(seen: passes.Pass) -> list[TrainingFrame]:

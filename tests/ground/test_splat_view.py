@@ -57,7 +57,8 @@ def model(shading: str, footprint: str, sh_count: int, channels: int) -> Gaussia
     changes = {"shading": shading, "ambient": ambient, "footprint": footprint, "psf_sigma_px": psf}
     if shining:  # each mirrors the Sun as well
         rng = torch.Generator().manual_seed(1)
-        lobes, peak = torch.randn(300, 4, generator=rng), torch.linspace(3.0, 1.5, channels)
+        own = 4 if shading == "view" else 1  # numbers of a lobe: with an axis of its own, or along the normal
+        lobes, peak = torch.randn(300, own, generator=rng), torch.linspace(3.0, 1.5, channels)
         changes |= {"lobes": lobes, "gloss": torch.cat([torch.tensor([0.3]), peak]).log()}
     if "Sun" in shining:  # of which the model knows where it stands still
         changes |= {"static_sun": torch.tensor([0.48, -0.6, 0.64])}

@@ -12,16 +12,18 @@ import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from obbgs_core.frames import cameras_of
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.io.ply import display_sh, load_ply, save_ply
 from obbgs_core.io.spz import load_spz, save_spz
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import lit_from, native_kernels, render
-from obbgs_core.render.highlights import lobe
+from obbgs_core.render.highlights import highlights_along, lobe, shortest_axes
 from obbgs_core.render.lighting import radiance_along
 from obbgs_core.train import decisions
 from obbgs_core.train.adam import Adam
+from obbgs_core.train.glints import first_lobes
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
@@ -35,26 +37,39 @@ from tests.scenes import SENSOR, ball, photographed, target
 from tests.scenes import random_gaussians as any_gaussians
 
 needs_native = pytest.mark.skipif(not native_kernels(), reason="the compiled rasterizer is not installed")
-# static: of the view, with lobes under a Sun that is known and stands still
-SHADINGS = [("view", 1, 1), ("view", 4, 3), ("static", 4, 3), ("sun", 4, 3), ("lambert", 1, 3)]
+# static: of the view, with lobes under a Sun that is known and stands still; normals: Lambert's, with lobes along them
+SHADINGS = [
+    ("view", 1, 1),
+    ("view", 4, 3),
+    ("static", 4, 3),
+    ("sun", 4, 3),
+    ("lambert", 1, 3),
+    ("normals", 1, 3),
+]
 STATIC_SUN = torch.tensor([-0.48, 0.6, -0.64])
 SHINY = {"steps": 120, "start.count": 150, "growth.max_gaussians": 200, "pyramid": ((0.0, 1.0),)}
 
 
-def shining(gaussians: Gaussians, alpha: float = 0.4, peak: float = 0.8, seed: int = 3) -> Gaussians:
-    """Return the Gaussians with random lobes of one material."""
+def shining(
+    gaussians: Gaussians, alpha: float = 0.4, peak: float = 0.8, seed: int = 3, own_axes: bool = True
+) -> Gaussians:
+    """Return the Gaussians with random lobes of one material, of random axes or along their normals."""
     g = torch.Generator().manual_seed(seed)
     lobes = torch.randn(len(gaussians), 4, generator=g).to(gaussians.means)
     lobes[:, 3] *= 0.3
     gloss = torch.tensor([alpha, *torch.linspace(1, 0.6, gaussians.sh.shape[2]).mul(peak).tolist()]).log()
-    return dataclasses.replace(gaussians, lobes=lobes, gloss=gloss.to(gaussians.means))
+    return dataclasses.replace(
+        gaussians, lobes=lobes if own_axes else lobes[:, 3:], gloss=gloss.to(gaussians.means)
+    )
 
 
 def lit(gaussians: Gaussians, cameras: Cameras, shading: str) -> tuple[Gaussians, Cameras]:
     """Return both under the illumination that a shading of `SHADINGS` needs."""
     if shading == "static":
         return dataclasses.replace(gaussians, static_sun=STATIC_SUN.to(gaussians.means)), cameras
-    return (gaussians, cameras) if shading == "view" else under_the_sun(gaussians, cameras, shading)
+    if shading == "view":
+        return gaussians, cameras
+    return under_the_sun(gaussians, cameras, "lambert" if shading == "normals" else shading)
 
 
 @given(st.floats(0.02, 1.0), st.floats(0.0, math.pi / 2 - 0.01))
@@ -105,8 +120,9 @@ def test_kernels_match_the_reference_in_float64(kernel, shading, sh_count, chann
     single.log_scales += 1.0  # flat tops: hardly a pixel lies within float32 rounding of the 1/255 cutoff
     cameras = looking_at_origin(3, 48)
     single, cameras = lit(single, cameras, shading)
-    single = shining(single)
-    sunlit = torch.rand(3, 60, generator=torch.Generator().manual_seed(2)) if shading == "lambert" else None
+    single = shining(single, own_axes=shading != "normals")
+    shadowed = single.shading == "lambert"
+    sunlit = torch.rand(3, 60, generator=torch.Generator().manual_seed(2)) if shadowed else None
     double = dataclasses.replace(
         single, **{name: value.double() for name, value in single.parameters().items()}
     )
@@ -125,22 +141,25 @@ def test_kernels_match_the_reference_in_float64(kernel, shading, sh_count, chann
         torch.testing.assert_close(found.double(), gradient, rtol=0, atol=within, msg=name)
 
 
-@pytest.mark.parametrize(("shading", "sh_count"), [("view", 1), ("static", 1), ("sun", 4), ("lambert", 1)])
+@pytest.mark.parametrize(
+    ("shading", "sh_count"), [("view", 1), ("static", 1), ("sun", 4), ("lambert", 1), ("normals", 1)]
+)
 def test_the_reference_gradient_matches_finite_differences(shading, sh_count):
     gaussians = random_gaussians(3, 1, seed=3, dtype=torch.float64, sh_count=sh_count)
     gaussians.log_scales += 1.5  # wide and faint: no pixel near the cutoff
     gaussians.opacity_logits = torch.full_like(gaussians.opacity_logits, 0.5)
     cameras = looking_at_origin(2, 4, dtype=torch.float64)
     gaussians, cameras = lit(gaussians, cameras, shading)
-    gaussians = shining(gaussians)
+    gaussians = shining(gaussians, own_axes=shading != "normals")
     sunlit = torch.tensor([[0.2, 1.0, 0.7], [1.0, 0.4, 0.6]], dtype=torch.float64)
 
-    def image(means, lobes, gloss, pose):
-        model = dataclasses.replace(gaussians, means=means, lobes=lobes, gloss=gloss)
+    def image(means, quats, lobes, gloss, pose):
+        model = dataclasses.replace(gaussians, means=means, quats=quats, lobes=lobes, gloss=gloss)
         moved = dataclasses.replace(cameras, world_to_camera=pose)
-        return render(model, moved, "reference", sunlit=sunlit if shading == "lambert" else None).radiance
+        return render(model, moved, "reference", sunlit=shadows).radiance
 
-    leaves = (gaussians.means, gaussians.lobes, gaussians.gloss, cameras.world_to_camera)
+    shadows = sunlit if gaussians.shading == "lambert" else None
+    leaves = (gaussians.means, gaussians.quats, gaussians.lobes, gaussians.gloss, cameras.world_to_camera)
     assert torch.autograd.gradcheck(image, [t.clone().requires_grad_() for t in leaves], eps=1e-6, atol=1e-5)
 
 
@@ -153,7 +172,7 @@ def test_a_lobe_that_is_not_finite_leaves_the_others_as_they_are():
 
 
 def test_highlights_without_their_material_are_refused():
-    with pytest.raises(ValueError, match=r"lobes must be \[5, 4\] with gloss \[2\], or both empty"):
+    with pytest.raises(ValueError, match=r"lobes must be \[5, 1 or 4\] with gloss \[2\], or both empty"):
         dataclasses.replace(random_gaussians(5, channels=1), lobes=torch.zeros(5, 4))
 
 
@@ -161,11 +180,12 @@ def test_highlights_without_their_material_are_refused():
 def test_a_model_survives_a_ply_and_viewers_see_its_highlights_as_harmonics(
     tmp_path, shading, sh_count, channels
 ):
-    gaussians, sun = shining(any_gaussians(40, sh_count, channels)), torch.tensor([0.0, 0.6, 0.8])
+    gaussians = shining(any_gaussians(40, sh_count, channels), own_axes=shading != "normals")
+    sun = torch.tensor([0.0, 0.6, 0.8])
     if shading == "static":
         gaussians = dataclasses.replace(gaussians, static_sun=STATIC_SUN)
     else:
-        gaussians = dataclasses.replace(gaussians, shading=shading)
+        gaussians = dataclasses.replace(gaussians, shading="lambert" if shading == "normals" else shading)
     save_ply(gaussians, tmp_path / "m.ply", 1.5, sun)
     again = load_ply(tmp_path / "m.ply")
     for name, value in gaussians.tensors().items():
@@ -196,7 +216,9 @@ def test_onnxruntime_agrees_with_our_renderer(tmp_path, shading, sh_count, chann
     gaussians.log_scales += 0.5
     cameras = looking_at_origin(3, 48)
     gaussians, cameras = lit(gaussians, cameras, shading)
-    gaussians = dataclasses.replace(shining(gaussians, alpha=0.2), footprint="camera")
+    gaussians = dataclasses.replace(
+        shining(gaussians, alpha=0.2, own_axes=shading != "normals"), footprint="camera"
+    )
     export_onnx(gaussians, SENSOR, tmp_path / "m.onnx", 48, 48, [1e-4])
     session = onnxruntime.InferenceSession(str(tmp_path / "m.onnx"), providers=["CPUExecutionProvider"])
     for c in range(3):
@@ -245,7 +267,7 @@ def test_highlights_are_found_and_explain_views_that_were_not_trained_on(shiny_f
     shiny, matt = _trained(training), _trained(training, {"light.highlights": False})
     appearance = shiny.result("").appearance
     assert shiny.gaussians.has_highlights and "with highlights of roughness" in appearance
-    assert "on views that they are not fitted to" in appearance
+    assert "on frames that they are not fitted to" in appearance
     assert not matt.gaussians.has_highlights and "highlight" not in matt.result("").appearance
     errors = [_squared_error(trainer.gaussians, held_out) for trainer in (shiny, matt)]
     assert errors[0] < 0.9 * errors[1]  # 0.39 was seen
@@ -311,7 +333,49 @@ def test_under_a_told_sun_that_stands_still_an_axis_is_the_normal_of_a_mirror(mo
     )
     if not moves:
         cosine = (F.normalize(after.lobes[:, :3], dim=1) * F.normalize(truth.lobes[:, :3], dim=1)).sum(dim=1)
-        assert cosine.median() > 0.8  # 0.98 was seen
+        assert cosine.abs().median() > 0.8  # 0.98 was seen; a mirror has two sides
+        means = torch.tensor([[0.3, 0.1, 0.0]])
+        joining = first_lobes(means, frames[7], after)
+        brightest = highlights_along(
+            dataclasses.replace(after.select(torch.tensor([0])), means=means, lobes=joining),
+            F.normalize(means - cameras_of(frames[7:8]).centres[0], dim=1),
+            None,
+            None,
+        )
+        # along the half vector, it shows its peak to the camera of the frame
+        torch.testing.assert_close(brightest, 0.05 * after.gloss[1:].exp()[None])
+
+
+def test_under_a_moving_sun_lobes_that_other_brackets_do_not_confirm_lie_along_the_normals():
+    truth = dataclasses.replace(target(30), shading="sun", footprint="camera")
+    rng = torch.Generator().manual_seed(4)
+    suns = F.normalize(torch.randn(90, 3, generator=rng), dim=1)
+    frames = photographed(truth, 90, size_px=32, focal_px=65.0, suns=suns)
+    trainer = _trainer(frames, {"light.sun_shading": "linear"})
+    trainer.state.gaussians = dataclasses.replace(trainer.state.gaussians, shading="sun").trainable()
+    decisions.add_highlights(trainer.setup, trainer.state, 1.0)
+    after = trainer.state.gaussians
+    assert after.lobes.shape == (30, 1) and "along the normals" in trainer.state.highlights_reason
+    weights = after.lobes.detach().exp().mean()
+    for _ in range(10):
+        trainer.step()
+    assert trainer.gaussians.lobes.exp().mean() < weights  # nothing glints here, so the prior dims them
+    joining = first_lobes(torch.zeros(2, 3), frames[0], trainer.gaussians)
+    assert torch.equal(joining, torch.full((2, 1), 0.05).log())
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 10**6))
+def test_a_lobe_along_the_normal_is_one_whose_axis_is_the_shortest_on_either_side(seed):
+    rng = torch.Generator().manual_seed(seed)
+    thin = dataclasses.replace(any_gaussians(6, 4, seed=seed), shading="sun")
+    thin = shining(thin, own_axes=False)
+    for side in (1.0, -1.0):
+        axed = dataclasses.replace(thin, lobes=torch.cat([side * shortest_axes(thin), thin.lobes], dim=1))
+        directions, sun = (F.normalize(torch.randn(n, 3, generator=rng), dim=1) for n in (6, 1))
+        ours, theirs = (radiance_along(model, directions, sun[0]) for model in (thin, axed))
+        torch.testing.assert_close(ours, theirs)
+        assert not torch.equal(ours, radiance_along(thin.matt(), directions, sun[0]))
 
 
 def test_short_trainings_do_not_test_for_highlights(shiny_frames):

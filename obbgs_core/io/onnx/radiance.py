@@ -1,7 +1,6 @@
 """The radiance of `render.lighting` in an ONNX graph."""
 
 import numpy as np
-import torch.nn.functional as F
 
 from obbgs_core.io.onnx.graph import Graph, to_numpy
 from obbgs_core.io.onnx.projection import View
@@ -20,7 +19,7 @@ from obbgs_core.model.sh import (
     C3_ZZZ,
     SOFTNESS,
 )
-from obbgs_core.render.lighting import shortest_axes
+from obbgs_core.render.highlights import lobe_axes, shortest_axes
 
 # The harmonics of `sh.sh_basis` as polynomials of the direction: terms (coefficient, powers of x, y and z).
 SH_TERMS = [
@@ -53,7 +52,7 @@ def radiance_towards(g: Graph, gaussians: Gaussians, camera: View) -> str:
 def _highlights(g: Graph, gaussians: Gaussians, camera: View, sunlit: str | None) -> str:
     """Return the radiance [N, C] of the lobes, as `render.highlights.highlights_along`."""
     towards = g.op("Neg", _directions(g, gaussians, camera))
-    axis = to_numpy(F.normalize(gaussians.lobes[:, :3], dim=1))
+    axis = to_numpy(lobe_axes(gaussians))
     if gaussians.shading != "view":
         sun = g.op("Reshape", "sun_dir", g.ints(1, 3))
     else:
@@ -63,12 +62,12 @@ def _highlights(g: Graph, gaussians: Gaussians, camera: View, sunlit: str | None
         cos2 = g.op("Mul", g.op("Add", cosine, 1.0), 0.5)
     else:
         half = _unit(g, g.op("Add", towards, sun))
-        cosine = g.op("Relu", g.op("ReduceSum", g.op("Mul", half, axis), g.ints(1), keepdims=1))
+        cosine = g.op("ReduceSum", g.op("Mul", half, axis), g.ints(1), keepdims=1)
         cos2 = g.op("Mul", cosine, cosine)
     alpha2 = float(gaussians.gloss[0].exp() ** 2)
     below = g.op("Max", g.op("Sub", 1.0, g.op("Mul", cos2, 1 - alpha2)), 1e-12)
     root = g.op("Div", alpha2, below)
-    peak = to_numpy(gaussians.lobes[:, 3:].exp() * gaussians.gloss[1:].exp())
+    peak = to_numpy(gaussians.lobes[:, -1:].exp() * gaussians.gloss[1:].exp())
     light = g.op("Mul", g.op("Mul", root, root), peak)
     return light if sunlit is None else g.op("Mul", light, g.op("Unsqueeze", sunlit, g.ints(1)))
 
