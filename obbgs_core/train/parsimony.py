@@ -65,7 +65,6 @@ def shown_px(gaussians: Gaussians, batches: Batches, scale: float) -> Tensor:
     """Return on how many pixels each Gaussian [N] shows in the picture that shows most of it: its summed weights.
 
     The weight of a Gaussian in a pixel is the share of the pixel's light that is its own where all are equally bright.
-    Pictures of half the scale are rendered, of which each pixel stands for four.
     """
     white = dataclasses.replace(
         gaussians.detach().matt(), sh=torch.full((len(gaussians), 1, 1), 1 / C0), shading="view"
@@ -73,9 +72,9 @@ def shown_px(gaussians: Gaussians, batches: Batches, scale: float) -> Tensor:
     white.sh.requires_grad_()
     most = torch.zeros(len(gaussians))
     for index in shown_frames(batches):
-        image = render(white, batches.batch([index], scale).cameras.scaled(0.5)).radiance
+        image = render(white, batches.batch([index], scale).cameras).radiance
         (slope,) = torch.autograd.grad(image.sum(), white.sh)
-        most = torch.maximum(most, 4 * slope[:, 0, 0] / C0)
+        most = torch.maximum(most, slope[:, 0, 0] / C0)
     return most
 
 
