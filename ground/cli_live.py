@@ -155,14 +155,13 @@ def _follow(
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning threads slow each other down
     stop, show = Stop(), Lines(stderr)
     with stop.on_signals():
-        import torch
-
         from ground.evaluate import evaluate
         from ground.live import reconstruct_live
         from ground.report import write_report
         from ground.settings import mission_changes
+        from obbgs_core.process import prepare_process
 
-        torch.set_num_threads(threads or os.cpu_count() or 1)
+        prepare_process(threads)
         section = load_mission(mission).reconstruct if mission else ReconstructSection()
         if section.method != "obbgs":
             raise ConfigError("mission.reconstruct.method", f"live it must be obbgs, got {section.method!r}")

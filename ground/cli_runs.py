@@ -66,17 +66,16 @@ def reconstruct_command(
     stop, folder = Stop(), None
     try:
         with stop.on_signals(), steps_shown(stderr) as show:
-            import torch
-
             from ground.evaluate import evaluate
             from ground.reconstruct import Progress, reconstruct
             from ground.report import write_report
             from ground.settings import all_changes
+            from obbgs_core.process import prepare_process
 
             section = load_mission(mission).reconstruct if mission else ReconstructSection()
             chosen = method or section.method
             changes = all_changes(section, chosen, quality, budget, steps, settings or [])
-            torch.set_num_threads(threads or os.cpu_count() or 1)
+            prepare_process(threads)
             stop.raise_at_once()
 
             def on_progress(progress: Progress) -> None:

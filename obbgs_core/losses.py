@@ -29,6 +29,7 @@ def likelihood_loss(
     averaged_pixels: int = 1,
     edge_weight: float = 0.0,
     misfit: float | None = None,
+    drawn: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return the robust negative log likelihood of readings plus weighted edges, and the normalised residual.
 
@@ -44,6 +45,8 @@ def likelihood_loss(
             residual is then over both errors together (`model_error`), and the penalty Cauchy's: what the model cannot
             explain, such as the glint of a mirror, loses its pull. It is weighted so that what pulls on average pulls
             as before. None: only the noise is known, and the penalty is `charbonnier`.
+        drawn: [B, H, W]; where it is zero the radiance depends on nothing, and no gradient is needed. Such pixels may
+            be left out of the sum, though not of the number that it is divided by; their residual is then zero.
 
     Returns:
         loss: scalar; residual: [B, H, W, C], `Sensor.deviance_residual` over its deviation, without gradient.
@@ -60,7 +63,8 @@ def likelihood_loss(
     if misfit is not None:
         error = model_error(radiance, exposure_time_s, dn, sensor, averaged_pixels, misfit)
     model = _sensor_model(native, sensor, averaged_pixels, None if misfit is None else error.by_light)
-    settings = (model, error.floor_dn2.float(), error.weight, edge_weight)
+    drawn = None if drawn is None else drawn.detach().contiguous()
+    settings = (model, error.floor_dn2.float(), error.weight, edge_weight, drawn)
     return _swept(native.likelihood, radiance, exposure_time_s, dn, sensor, *settings)
 
 
@@ -285,4 +289,4 @@ class _KnownGradient(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         (gradient,) = ctx.saved_tensors
-        return gradient * grad_outputs[0], None, None
+        return gradient if grad_outputs[0] == 1 else gradient * grad_outputs[0], None, None

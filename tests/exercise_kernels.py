@@ -175,10 +175,16 @@ def exercise_losses(module: ModuleType) -> None:
                         -1e9,
                     ]
                 results = []
+                drawn = (rng.random(shape[:3]) > 0.99).astype(np.float32)
                 for threads in THREADS:
+                    results.append([])
+                    for part in (None, drawn):
+                        residual, gradient = np.empty_like(dn), np.empty_like(dn)
+                        value = module.likelihood(
+                            radiance, dn, gains, *weighted, part, residual, gradient, threads
+                        )
+                        results[-1] += [np.float64(value), residual, gradient]
                     residual, gradient = np.empty_like(dn), np.empty_like(dn)
-                    value = module.likelihood(radiance, dn, gains, *weighted, residual, gradient, threads)
-                    results.append([np.float64(value), residual.copy(), gradient.copy()])
                     value = module.published(
                         radiance, dn, gains, sensor, 0.2, 0.1, True, residual, gradient, threads
                     )
@@ -186,7 +192,7 @@ def exercise_losses(module: ModuleType) -> None:
                     alpha = rng.random(shape[:3], dtype=np.float32)
                     module.fit(radiance, alpha, dn, gains, sensor, 0.05, threads)
                     residual = np.empty_like(dn)
-                    module.likelihood(radiance, dn, gains, *weighted, residual, None, threads)
+                    module.likelihood(radiance, dn, gains, *weighted, drawn, residual, None, threads)
                     module.published(radiance, dn, gains, sensor, 0.2, 0.1, False, residual, None, threads)
                 assert same(results)
 

@@ -4,8 +4,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from ground.baselines.reconstruction import Work
 from ground.compare.case import Case, load_case
 from ground.compare.conditions import given
@@ -19,6 +17,7 @@ from ground.compare.trainings import MODEL
 from ground.compare.views import write_views
 from ground.scores import of_similarity
 from obbgs_core.errors import ReconstructionError
+from obbgs_core.process import prepare_process
 
 BENCH = "compare"
 WORK, VIEWS = "work", "views"  # folders below the comparison's
@@ -39,7 +38,7 @@ def run_cell(cell: Cell, out: Path, stop: Path, command: str) -> dict[str, Any]:
         Interrupted: the file `stop` appeared; the work is saved.
         SessionError: the session cannot be used any more.
     """
-    torch.set_num_threads(1)
+    prepare_process(threads=1)
     commit()  # as it is now: files may change while the work goes on
     folder = out / WORK / cell.digest
     with locked(folder, wait=True):  # a worker that was thought dead may still be at it

@@ -21,7 +21,7 @@ from ground.viewer.source import Shown
 from obbgs_core.frames import cameras_of as cameras_of_frames
 from obbgs_core.model.footprint import variance_px2
 from obbgs_core.model.sh import C0
-from obbgs_core.render import project, render, sunlit_shares
+from obbgs_core.render import project, render, sunlit_shares, weighted_gradient
 from obbgs_core.render.lighting import radiance_along
 from obbgs_core.score.uncertainty import parameter_deviations
 
@@ -120,8 +120,7 @@ def _spread(records: list[FrameRecord], count: int) -> list[FrameRecord]:
 
 
 def _gradient(image: Tensor, weights: Tensor, sh: Tensor, keep: bool) -> Tensor:
-    (gradient,) = torch.autograd.grad((image * weights).sum(), sh, retain_graph=keep)
-    return gradient[:, 0, 0] / C0
+    return weighted_gradient(image, weights, sh, keep)[:, 0, 0] / C0
 
 
 def _ramp(values: Tensor, known: Tensor, limits: tuple[float, float]) -> np.ndarray:

@@ -7,7 +7,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.backends import rasterize
 from obbgs_core.render.native import native_kernels
 from obbgs_core.render.projection import Projected, project
-from obbgs_core.render.rendered import Rendered, ScreenGradients
+from obbgs_core.render.rendered import Rendered, ScreenGradients, weighted_gradient
 from obbgs_core.render.shadows import lit_from, shadow_map, sunlit_shares
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "render",
     "shadow_map",
     "sunlit_shares",
+    "weighted_gradient",
 ]
 
 

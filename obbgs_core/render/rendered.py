@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+import torch
 from torch import Tensor
 
 
@@ -39,3 +40,12 @@ class Rendered:
     means2d: Tensor  # [C, N, 2] px
     radii: Tensor  # [C, N] px
     screen: ScreenGradients = field(default_factory=ScreenGradients)
+
+
+def weighted_gradient(image: Tensor, weights: Tensor, parameter: Tensor, keep_graph: bool = False) -> Tensor:
+    """Return the gradient of the sum of an image times weights of its shape by a parameter, in the parameter's shape.
+
+    PyTorch takes the weights as `grad_outputs` too, but then imports its symbolic shapes first, for a second.
+    """
+    (gradient,) = torch.autograd.grad((image * weights).sum(), parameter, retain_graph=keep_graph)
+    return gradient

@@ -1,6 +1,7 @@
 """The frames of each step: which are drawn, and their images at the scale of the step."""
 
 import copy
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame, averaged, cameras_of
 from obbgs_core.model.cameras import Cameras
+from obbgs_core.train.windows import GRID_PX, common
 
 MOST_AT_ONCE = 3
 
@@ -23,6 +25,7 @@ class Batch:
     dn: Tensor  # [B, H, W, C]
     exposure_time_s: Tensor  # [B, 1, 1, 1]
     averaged_pixels: int  # sensor pixels in one pixel of dn
+    share: float = 1.0  # of the pixels of the whole frames that these images show
     # [B, H, W] share of each pixel that a silhouette shows to be empty, 0 where it has none
     sky: Tensor | None = None
 
@@ -32,10 +35,18 @@ class Batches:
 
     white_dn: the sensor's full scale.
     sky: where silhouettes show empty sky [H, W] bool, by the frame's index; frames without a silhouette are not in it.
+    windows: the part of each frame [F, 4] that is shown, see `windows.windows`; None: all of it.
     """
 
-    def __init__(self, frames: list[TrainingFrame], white_dn: float, sky: dict[int, Tensor] | None = None):
+    def __init__(
+        self,
+        frames: list[TrainingFrame],
+        white_dn: float,
+        sky: dict[int, Tensor] | None = None,
+        windows: Tensor | None = None,
+    ):
         self.frames, self.white_dn, self.sky = frames, white_dn, sky or {}
+        self._windows = windows
         self._images: dict[int, list[Tensor]] = {}
         self._sky_shares: dict[int, list[Tensor]] = {}
 
@@ -46,21 +57,39 @@ class Batches:
         return other
 
     def batch(self, indices: list[int], scale: float) -> Batch:
-        """Return given frames, averaged to `scale` (1 / whole number) of their size."""
+        """Return given frames, averaged to `scale` (1 / whole number) of their size, or windows of one size of them."""
         factor = round(1 / scale)
         if factor not in self._images:
             self._images[factor] = [averaged(f.dn, factor, self.white_dn) for f in self.frames]
             self._sky_shares[factor] = self._sky_shares_at(factor)
-        frames = [self.frames[i] for i in indices]
-        cameras = cameras_of(frames)
+        cameras, share, shown = self._shown(indices, factor)
+
+        def stacked(images: list[Tensor]) -> Tensor:
+            return torch.stack([images[i][part] for i, part in zip(indices, shown, strict=True)])
+
         return Batch(
             indices,
             cameras.scaled(1 / factor) if factor > 1 else cameras,
-            torch.stack([self._images[factor][i] for i in indices]),
-            torch.tensor([f.exposure_time_s for f in frames]).view(-1, 1, 1, 1),
+            stacked(self._images[factor]),
+            torch.tensor([self.frames[i].exposure_time_s for i in indices]).view(-1, 1, 1, 1),
             factor * factor,
-            torch.stack([self._sky_shares[factor][i] for i in indices]) if self.sky else None,
+            share,
+            stacked(self._sky_shares[factor]) if self.sky else None,
         )
+
+    def _shown(self, indices: list[int], factor: int) -> tuple[Cameras, float, list[tuple[slice, slice]]]:
+        """Return the cameras of what is shown of some frames, its share of their pixels, and where it lies."""
+        cameras = cameras_of([self.frames[i] for i in indices])
+        if self._windows is None or GRID_PX % factor:
+            return cameras, 1.0, [(slice(None), slice(None))] * len(indices)
+        parts = common(self._windows[indices], cameras.width, cameras.height)
+        K = cameras.K.clone()
+        K[:, :2, 2] -= parts[:, :2]
+        width, height = (parts[0, 2:] - parts[0, :2]).tolist()
+        share = width * height / (cameras.width * cameras.height)
+        ends = (parts // factor + (parts % factor > 0)).tolist()  # rounded up, as averaging does at the edge
+        shown = [(slice(top, bottom), slice(left, right)) for left, top, right, bottom in ends]
+        return dataclasses.replace(cameras, K=K, width=width, height=height), share, shown
 
     def _sky_shares_at(self, factor: int) -> list[Tensor]:
         """Return each frame's share of empty sky [H, W]; frames without a silhouette share one image of zeros."""

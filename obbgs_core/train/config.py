@@ -46,6 +46,7 @@ class MethodConfig:
     radiance_unit: Literal["one", "full_scale"] = "one"
     frames_per_step: int = at_least_one(1)
     bracket_steps: bool = False  # the frames of a step are one of each exposure time
+    windows: bool = False  # only the part of each frame that the target lies in is rendered and compared
     steps: int = at_least_one(30_000)
     pyramid: tuple[tuple[float, float], ...] = ((0.0, 1.0),)  # (from this share of the steps on, image scale)
     footprint: Footprint = "kerbl"  # what a pixel averages over, see `Gaussians`

@@ -75,7 +75,8 @@ def observe(
     growth, cameras, depth_weight = setup.config.growth, batch.cameras, None
     if growth.depth_scale:
         depth_weight = near_camera_weight(state.gaussians.means, cameras, growth.depth_scale * setup.unit_m)
-    half_x_px, half_y_px = cameras.width / 2, cameras.height / 2  # the unit of the published threshold
+    height, width = setup.frames[0].dn.shape[:2]  # half of it is the unit of the published threshold
+    half_x_px, half_y_px = 0.5 * cameras.scale * width, 0.5 * cameras.scale * height
     if growth.share:  # ranks by the gradient itself
         half_x_px = half_y_px = max(half_x_px, half_y_px)
     half_size_px = half_x_px, half_y_px

@@ -18,7 +18,7 @@ from obbgs_core.misfit import mean_light2
 from obbgs_core.model.cameras import stacked_suns
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import from_radiance, radiance
-from obbgs_core.render import render
+from obbgs_core.render import render, weighted_gradient
 from obbgs_core.render.highlights import brightest_axes, lobe
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.appearance import Shadows
@@ -240,9 +240,9 @@ def _seen(
         known = (batch.dn < sensor.white_dn) | (expected < sensor.white_dn)  # saturated: at least this much
         weight = known * gain / variance
         image = rendered.radiance
-        (slope,) = torch.autograd.grad(image, added, weight * (batch.dn - expected), retain_graph=True)
+        slope = weighted_gradient(image, weight * (batch.dn - expected), added, keep_graph=True)
         alike = weight * gain * rendered.alpha.detach()[..., None]
-        (information,) = torch.autograd.grad(image, added, alike)
+        information = weighted_gradient(image, alike, added)
         lit = torch.ones(len(model)) if sunlit is None else sunlit[0].to(slope)
         directions = F.normalize(model.means - batch.cameras.centres[0], dim=1)
         sun = static_sun if model.shading == "view" else batch.cameras.known_suns()[0]

@@ -39,17 +39,28 @@ class LossSettings:
 
 
 def image_loss(
-    rendered: Rendered, batch: Batch, sensor: Sensor, settings: LossSettings, misfit: float | None = None
+    rendered: Rendered,
+    batch: Batch,
+    sensor: Sensor,
+    settings: LossSettings,
+    misfit: float | None = None,
+    everywhere: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Return the loss of a step's images and the residual [B, H, W, C], in sigmas or in full scales.
 
+    The loss is a mean over the pixels of the whole frames, to which those outside of their windows add nothing, nor
+    need those that no Gaussian reaches.
+
     misfit: the model's own error as far as it is known, see `likelihood_loss`.
+    everywhere: more than the Gaussians is learnt, and each pixel depends on it.
     """
     images = (rendered.radiance, batch.exposure_time_s, batch.dn, sensor)
     if settings.kind == "likelihood":
-        return likelihood_loss(*images, batch.averaged_pixels, settings.edge_weight, misfit)
+        drawn = None if everywhere else rendered.alpha
+        loss, residual = likelihood_loss(*images, batch.averaged_pixels, settings.edge_weight, misfit, drawn)
+        return loss * batch.share, residual
     loss, residual = published_loss(*images, settings.ssim_weight, settings.edge_weight, settings.clamped)
-    return loss * len(batch.cameras), residual  # a sum over the step's frames, as published
+    return loss * (batch.share * len(batch.cameras)), residual  # a sum over the step's frames, as published
 
 
 def priors(
@@ -64,7 +75,7 @@ def priors(
             total + settings.gloss_weight * gaussians.lobes.exp().mean() * gaussians.gloss[1:].exp().mean()
         )
     if batch.sky is not None:
-        total = total + settings.sky_weight * (rendered.alpha * batch.sky).mean()
+        total = total + settings.sky_weight * batch.share * (rendered.alpha * batch.sky).mean()
     if settings.flat_weight:
         total = total + settings.flat_weight * gaussians.scales.amin(dim=1).mean() / radius_m
     return total

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import C0
-from obbgs_core.render import render
+from obbgs_core.render import render, weighted_gradient
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check, fraction
 from obbgs_core.train.batches import Batch, Batches
@@ -92,7 +92,7 @@ def likelihood_gains(
     model.opacity_logits.requires_grad_()
     gains, values, times = torch.zeros(len(gaussians)), 0, 0.0
     for view in _views(model, batches, sensor, scale, rng):
-        (slope,) = torch.autograd.grad(view.radiance, model.opacity_logits, view.weight * view.signs)
+        slope = weighted_gradient(view.radiance, view.weight * view.signs, model.opacity_logits)
         # o·d/do, from the derivative by the logit
         change = slope / (1 - model.opacities.detach()).clamp(min=1e-6)
         gains += 0.5 * change**2
@@ -116,8 +116,8 @@ def next_degree_gain(
     values, times = 0, 0.0
     for view in _views(model, batches, sensor, scale, rng):
         residual = view.residual(sensor).clamp(-3, 3)  # robust, as the loss is
-        (g,) = torch.autograd.grad(view.radiance, model.sh, view.weight * residual, retain_graph=True)
-        (probe,) = torch.autograd.grad(view.radiance, model.sh, view.weight * view.signs)
+        g = weighted_gradient(view.radiance, view.weight * residual, model.sh, keep_graph=True)
+        probe = weighted_gradient(view.radiance, view.weight * view.signs, model.sh)
         slope += g
         curvature += probe**2
         shared += probe * probe[:, :1]

@@ -63,6 +63,7 @@ PRESETS: dict[str, MethodConfig] = {
             exposure_aware=True,
             frames_per_step=3,
             bracket_steps=True,
+            windows=True,
             steps=1000,
             pyramid=((0.0, 0.25), (0.1, 0.5), (0.25, 1.0)),
             footprint="camera",

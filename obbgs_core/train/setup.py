@@ -35,6 +35,7 @@ from obbgs_core.train.poses import HOLDS
 from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import Identity, TrainingState
 from obbgs_core.train.validation import validation_brackets
+from obbgs_core.train.windows import windows
 
 log = logging.getLogger(__name__)
 EXACT_TAGS = "as tagged (the tags are exact)"
@@ -123,12 +124,13 @@ def prepare(
     )
     gaussians = dataclasses.replace(gaussians, footprint=config.footprint)
     sky = {i: outline.sky for i, outline in outlines.items()} if config.loss.sky_weight else None
+    shown_part = windows(posed, gaussians.means.detach(), outlines) if config.windows else None
     setup = TrainingSetup(
         frames=lit,
         sensor=sensor,
         config=config,
         seed=seed,
-        batches=Batches(lit, sensor.white_dn, sky),
+        batches=Batches(lit, sensor.white_dn, sky, shown_part),
         radius_m=radius_m,
         unit_m=camera_extent_m(lit) if config.length_unit == "cameras" else radius_m,
         radiance_unit=sensor.full_scale_radiance(mean_exposure_s(lit))

@@ -127,7 +127,9 @@ class Trainer:
         cameras = batch.cameras
         sunlit = state.shadows.sunlit(state.gaussians, cameras, state.steps_done)
         seen = rendered = self._compensated(render(self._drawn(share), cameras, sunlit=sunlit), batch)
-        loss, residual = image_loss(rendered, batch, setup.sensor, config.loss, state.misfit)
+        loss, residual = image_loss(
+            rendered, batch, setup.sensor, config.loss, state.misfit, config.compensation
+        )
         if not torch.isfinite(loss):
             raise Diverged(state.steps_done, loss.item())
         prior = priors(state.gaussians, rendered, batch, setup.radius_m, config.loss)

@@ -159,6 +159,28 @@ def test_the_compiled_likelihood_is_the_readable_one(sensor, channels, averaged_
 
 
 @needs_native
+@pytest.mark.parametrize("edge_weight", [0.0, 0.05])
+@pytest.mark.parametrize("averaged_pixels", [1, 4])
+def test_where_nothing_is_drawn_may_be_left_out(edge_weight, averaged_pixels):
+    sensor = SENSORS["clipped at zero"]
+    radiance, exposures_s, dn = bracket(sensor, channels=3)
+    drawn = torch.zeros(radiance.shape[:3])
+    drawn[0, 3:20, 7:19], drawn[1, 30, 52], drawn[1, 46, 0] = 0.5, 1e-6, 1.0  # nothing in the third
+    settings = (sensor, averaged_pixels, edge_weight, 0.2)
+    (whole, gradient), (part, of_part) = (
+        value_and_gradient(lambda r, d=d: likelihood_loss(r, exposures_s, dn, *settings, d)[0], radiance)
+        for d in (None, drawn)
+    )
+    assert torch.equal(of_part[drawn > 0], gradient[drawn > 0])  # bit for bit
+    assert of_part[2].abs().max() == 0 and 0 < part < whole
+    residual = likelihood_loss(radiance, exposures_s, dn, *settings, drawn)[1]
+    assert torch.equal(
+        residual[drawn > 0], likelihood_loss(radiance, exposures_s, dn, *settings)[1][drawn > 0]
+    )
+    assert residual[2].abs().max() == 0
+
+
+@needs_native
 def test_the_compiled_likelihood_follows_the_clipped_normal_far_below_zero():
     sensor = SENSORS["clipped at zero"]
     radiance = torch.linspace(-0.5, 0.5, 3 * 1000).view(1, 3, 1000, 1)  # -21 to 9 sigma

@@ -30,6 +30,7 @@ namespace {
 const RowLoops* loops = &portable::row_loops;  // of the instruction set in use
 
 constexpr int kBandRows = 40;
+constexpr int kLikelihoodBandRows = 16;  // each band is as wide as what is drawn in it
 constexpr size_t kBlockParameters = 1 << 15;
 constexpr size_t kRepeatedRates = 1 << 10;  // a table that stays in the first cache
 
@@ -49,17 +50,35 @@ struct Band {
 
 // Returns the sum of work(band) over all bands of all images, added in their order.
 template <typename Sum = double, typename Work>
-Sum sum_over_bands(const Shape& shape, int threads, Work work) {
-  const int per_image = (shape.height + kBandRows - 1) / kBandRows;
+Sum sum_over_bands(const Shape& shape, int threads, Work work, int band_rows = kBandRows) {
+  const int per_image = (shape.height + band_rows - 1) / band_rows;
   std::vector<Sum> parts(size_t(shape.count) * per_image);
   parallel_for(int(parts.size()), threads, [&](int i) {
-    const int begin = i % per_image * kBandRows;
-    parts[i] = work(Band{i / per_image, begin, std::min(begin + kBandRows, shape.height)});
+    const int begin = i % per_image * band_rows;
+    parts[i] = work(Band{i / per_image, begin, std::min(begin + band_rows, shape.height)});
   });
   return std::accumulate(parts.begin(), parts.end(), Sum{});
 }
 
 double total(const std::vector<float>& sums) { return std::accumulate(sums.begin(), sums.end(), 0.0); }
+
+struct Span {
+  int begin, end;
+};  // columns begin .. end - 1
+
+// Returns the columns of an image [height, width] that hold the values above zero (or NaN) of some rows, as far as
+// these lie in it; empty where there are none.
+Span drawn_columns(const Shape& shape, const float* image, int first, int last) {
+  Span found{shape.width, 0};
+  for (int y = std::max(first, 0); y < std::min(last, shape.height); ++y) {
+    const float* row = image + size_t(y) * shape.width;
+    for (int x = 0; x < found.begin; ++x)
+      if (!(row[x] <= 0)) found.begin = x;
+    for (int x = shape.width; x > found.end; --x)
+      if (!(row[x - 1] <= 0)) found.end = x;
+  }
+  return found;
+}
 
 // A few rows of a padded image, kept by row number.
 class Rows {
@@ -74,10 +93,11 @@ class Rows {
 };
 
 // Adds scale * d (|Sx| + |Sy|) / d radiance to the band's rows of `gradient` (when there is one) and returns the sum of
-// |Sx| + |Sy| over the band. fill(row, difference, slope) makes a row of differences and their slopes by radiance.
+// |Sx| + |Sy| over the band. fill(row, difference, slope) makes a row of differences and their slopes by radiance. Only
+// `n` values of each row are looked at, and `gradient` begins with the first of them.
 template <typename Fill>
-double edge_band(const Shape& shape, const Band& band, float scale, float* gradient, Fill fill) {
-  const int n = shape.row(), c = shape.channels;
+double edge_band(const Shape& shape, const Band& band, int n, float scale, float* gradient, Fill fill) {
+  const int c = shape.channels;
   const int first = std::max(band.begin - 2, 0), last = std::min(band.end + 2, shape.height);
   Rows difference(first, last, n), slope(first, last, n);
   for (int y = first; y < last; ++y) fill(y, difference[y], slope[y]);
@@ -91,7 +111,7 @@ double edge_band(const Shape& shape, const Band& band, float scale, float* gradi
   }
   for (int y = band.begin; gradient && y < band.end; ++y)
     loops->sobel_gradient_row(n, c, scale, sign_x[y - 1], sign_x[y], sign_x[y + 1], sign_y[y - 1], sign_y[y + 1],
-                              slope[y], gradient + size_t(y) * n);
+                              slope[y], gradient + size_t(y) * shape.row());
   return total(inside);
 }
 
@@ -156,29 +176,45 @@ void expect(const Array& array, const char* name, size_t count) {
 }
 
 // weight * mean robust penalty of the deviance residual + edge_weight * mean Sobel difference, stabilised scale.
-// misfit_floors: of each image, see SensorModel.
+// misfit_floors: of each image, see SensorModel. drawn: where it is zero no gradient is asked for; rows are cut to what
+// is drawn in their band (and what its edges need), beyond which residual and gradient are 0 and nothing is added.
 double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, Array misfit_floors, double weight,
-                  double edge_weight, Array residual, std::optional<Array> gradient, int threads) {
+                  double edge_weight, std::optional<Array> drawn, Array residual, std::optional<Array> gradient,
+                  int threads) {
   const Shape shape = shape_of(radiance, "radiance");
   expect(dn, "dn", radiance.size());
   expect(gains, "gains", shape.count);
   expect(misfit_floors, "misfit_floors", shape.count);
+  if (drawn) expect(*drawn, "drawn", radiance.size() / std::max(shape.channels, 1));
   expect(residual, "residual", radiance.size());
   if (gradient) expect(*gradient, "gradient", radiance.size());
   const float *r = radiance.data(), *d = dn.data(), *gain = gains.data(), *floors = misfit_floors.data();
+  const float* opaque = drawn ? drawn->data() : nullptr;
   float *out = residual.data(), *g = gradient ? gradient->data() : nullptr;
   const double scale = weight / shape.values(), edge_scale = edge_weight / shape.edges();
   const auto at_a_clip = [&](float reading) { return reading <= 0 || reading >= s.white; };
   nb::gil_scoped_release release;
-  return sum_over_bands(shape, threads, [&](const Band& band) {
-    const int n = shape.row();
+  const auto work = [&](const Band& band) {
     const size_t image = band.image * shape.image();
     const float t = gain[band.image];
+    const int reach = edge_weight != 0 ? 2 : 0;  // of edges
+    Span shown{0, shape.width};
+    if (opaque) {
+      shown = drawn_columns(shape, opaque + image / shape.channels, band.begin, band.end);
+      const size_t from = image + size_t(band.begin) * shape.row(),
+                   values = size_t(band.end - band.begin) * shape.row();
+      std::fill_n(out + from, values, 0.0f);
+      if (g) std::fill_n(g + from, values, 0.0f);
+      if (shown.begin >= shown.end) return 0.0;
+      shown = {std::max(shown.begin - reach, 0), std::min(shown.end + reach, shape.width)};
+    }
+    const int n = (shown.end - shown.begin) * shape.channels;
+    const size_t first = image + size_t(shown.begin) * shape.channels;  // value of the image's first row
     SensorModel of_image = s;
     of_image.misfit_floor = floors[band.image];
     std::vector<float> penalty(n, 0.0f), unwanted(n);
     for (int y = band.begin; y < band.end; ++y) {
-      const size_t at = image + size_t(y) * n;
+      const size_t at = first + size_t(y) * shape.row();
       float* slope = g ? g + at : unwanted.data();
       const bool clipped = std::any_of(d + at, d + at + n, at_a_clip);
       const auto row = s.root_averaged > 1 ? loops->averaged_likelihood_row
@@ -189,13 +225,14 @@ double likelihood(Array radiance, Array dn, Array gains, const SensorModel& s, A
     }
     double sum = scale * total(penalty);
     if (edge_weight != 0)
-      sum += edge_scale * edge_band(shape, band, float(edge_scale), g ? g + image : nullptr,
+      sum += edge_scale * edge_band(shape, band, n, float(edge_scale), g ? g + first : nullptr,
                                     [&](int y, float* difference, float* slope) {
-                                      const size_t at = image + size_t(y) * n;
+                                      const size_t at = first + size_t(y) * shape.row();
                                       loops->stabilised_row(n, r + at, d + at, t, s, difference, slope);
                                     });
     return sum;
-  });
+  };
+  return sum_over_bands(shape, threads, work, kLikelihoodBandRows);
 }
 
 // (1 - ssim_weight) * mean |a - b| + ssim_weight * (1 - mean SSIM) + edge_weight * mean Sobel difference, where a is
@@ -233,7 +270,7 @@ double published(Array radiance, Array dn, Array gains, const SensorModel& s, do
     double sum = l1_scale * total(sums);
     if (ssim_weight != 0) sum += ssim_scale * ssim_band(shape, band, float(-ssim_scale), a, slope, b, image_gradient);
     if (edge_weight != 0)
-      sum += edge_scale * edge_band(shape, band, float(edge_scale), image_gradient,
+      sum += edge_scale * edge_band(shape, band, n, float(edge_scale), image_gradient,
                                     [&](int y, float* difference, float* by_radiance) {
                                       loops->difference_row(n, a[y], b[y], difference);
                                       std::copy_n(slope[y], n, by_radiance);
@@ -330,7 +367,7 @@ void bind_training(nb::module_& m) {
       });
   // arrays that are filled in place must not be converted: the result would go into a copy
   m.def("likelihood", &obbgs::likelihood, "radiance"_a, "dn"_a, "gains"_a, "sensor"_a, "misfit_floors"_a, "weight"_a,
-        "edge_weight"_a, "residual"_a.noconvert(), "gradient"_a.none().noconvert(), "threads"_a);
+        "edge_weight"_a, "drawn"_a.none(), "residual"_a.noconvert(), "gradient"_a.none().noconvert(), "threads"_a);
   m.def("published", &obbgs::published, "radiance"_a, "dn"_a, "gains"_a, "sensor"_a, "ssim_weight"_a, "edge_weight"_a,
         "clamped"_a, "residual"_a.noconvert(), "gradient"_a.none().noconvert(), "threads"_a);
   m.def("fit", &obbgs::fit, "radiance"_a, "alpha"_a, "dn"_a, "gains"_a, "sensor"_a, "least_alpha"_a, "threads"_a);
