@@ -4,9 +4,12 @@ import math
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 HALF_DN = 0.5  # a reading of 0 means a signal below this, since signals are rounded
+# edge of the blocks by which noise is measured, and the share of them that is surely sky
+BLOCK_PX, SKY_BLOCKS = 8, 0.25
 
 
 @dataclass(frozen=True)
@@ -139,3 +142,17 @@ def dark_reading(sensor: Sensor) -> tuple[float, float]:
     first = mean * share + sigma * density
     second = (mean**2 + sigma**2) * share + mean * sigma * density
     return first, math.sqrt(second - first**2)
+
+
+def noise_excess(dn: Tensor, sensor: Sensor) -> float:
+    """Return the deviation of readings dn [H, W, C] of empty sky over the one that the sensor model states for them.
+
+    Differences of neighbouring readings have twice the variance of a reading. Of blocks of 8x8 pixels those with the
+    smaller differences are empty sky, also where the target fills half of the picture or stars are in it. A picture
+    that was smoothed, or has no empty sky, has less or more than 1 for other reasons: only a clear excess says
+    something.
+    """
+    squares = dn.diff(dim=1).square().mean(dim=2)[None]
+    blocks = F.avg_pool2d(squares, min(BLOCK_PX, *squares.shape[1:]))
+    variance = 0.5 * blocks.flatten().quantile(SKY_BLOCKS).item()
+    return math.sqrt(variance) / dark_reading(sensor)[1]

@@ -4,6 +4,8 @@ import dataclasses
 import functools
 import hashlib
 import logging
+import math
+import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -21,7 +23,7 @@ from obbgs_core.frames import (
     usable,
 )
 from obbgs_core.pose_corrections import PoseCorrections
-from obbgs_core.sensor import Sensor
+from obbgs_core.sensor import Sensor, noise_excess
 from obbgs_core.settings import flat
 from obbgs_core.start.alignment import settled
 from obbgs_core.start.hull import Silhouette, light, shows_light
@@ -38,6 +40,11 @@ from obbgs_core.train.validation import validation_brackets
 from obbgs_core.train.windows import windows
 
 log = logging.getLogger(__name__)
+NOISE_FRAMES = 12  # about so many, spread evenly, by which the noise is measured
+CLEAR_EXCESS = (
+    1.3  # of the scatter of empty sky over that of the sensor model; frames that fit it have 0.93 to 0.97
+)
+QUANTISATION_DN = math.sqrt(1 / 12)
 EXACT_TAGS = "as tagged (the tags are exact)"
 TOO_FEW_BRACKETS = "as tagged (too few brackets for validation)"
 UNTESTED = ("", EXACT_TAGS, TOO_FEW_BRACKETS)  # of poses whose refinement no validation brackets have decided
@@ -104,6 +111,7 @@ def prepare(
         TooFewFrames, ReconstructionError: as in `train`.
     """
     checked, reference_exposure_s = usable(frames, config.exposure_aware)
+    sensor, noise = _with_noise_seen(checked, sensor)
     shown = [shows_light(light(f.dn, sensor, f.background, f.exposure_time_s), sensor) for f in checked]
     lit = [f for f, shows in zip(checked, shown, strict=True) if shows]
     dark = len(checked) - len(lit)
@@ -137,7 +145,7 @@ def prepare(
         if config.radiance_unit == "full_scale"
         else 1.0,
         sun_span_deg=sun_span_deg(lit),
-        start=start,
+        start=start + noise,
         budget=budget,
         reference_exposure_s=reference_exposure_s,
         dark_frames=dark,
@@ -167,6 +175,26 @@ def prepare(
     if config.compensation:
         state.compensation = Compensation(len(lit), lit[0].dn.shape[2])
     return setup, state
+
+
+def _with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Sensor, str]:
+    """Return the sensor with no less read noise than empty sky shows, and in words what was changed, if anything.
+
+    With less than there is, noise would count as light: there would be no empty sky, and no hull.
+    """
+    shown = frames[:: max(1, len(frames) // NOISE_FRAMES)]
+    excess = statistics.median(noise_excess(frame.dn, sensor) for frame in shown)
+    if not excess > CLEAR_EXCESS:
+        return sensor, ""
+    seen = dataclasses.replace(
+        sensor, read_noise_dn=excess * math.hypot(sensor.read_noise_dn, QUANTISATION_DN)
+    )
+    changed = (
+        f"read noise taken as {seen.read_noise_dn:.2f} DN instead of the stated {sensor.read_noise_dn:.2f} DN: "
+        f"empty sky scatters {excess:.1f} times as much as that"
+    )
+    log.warning(changed)
+    return seen, f"; {changed}"
 
 
 def _limited(config: MethodConfig, lit_pixels: int) -> tuple[MethodConfig, str]:

@@ -1,12 +1,17 @@
 """The image model against simulated sensors and its own invariances."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from obbgs_core.sensor import Sensor, clipped_mean
+from obbgs_core.sensor import Sensor, clipped_mean, noise_excess
+from obbgs_core.train.presets import preset
+from obbgs_core.train.trainer import Trainer
+from tests import scenes
 
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=2e7, electrons_per_dn=4, read_noise_dn=8)
 radiances = st.floats(0, 50)
@@ -74,3 +79,28 @@ def test_the_stabilised_scale_keeps_its_digits_however_small_the_shot_noise(elec
     floor = 3 / 8 + (8.0 * electrons_per_dn) ** 2
     exact = 2 * (((dn.double() - 64) * electrons_per_dn + floor).sqrt() - floor**0.5)
     torch.testing.assert_close(sensor.stabilised(dn).double(), exact, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("black_dn", [0, 64])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_the_scatter_of_empty_sky_says_by_how_much_stated_noise_is_too_small(black_dn, channels):
+    rng = np.random.default_rng(7)
+    signal = np.zeros((128, 120, channels))
+    signal[20:90, 30:80] = rng.uniform(0, 3000, (70, 50, channels))  # the target, with the strongest texture
+    read = np.clip(np.round(black_dn + signal + rng.normal(0, 8, signal.shape)), 0, 4095)
+    dn = torch.from_numpy(read.astype(np.float32))
+    for stated, expected in ((8.0, 1.0), (4.0, 2.0), (16.0, 0.5)):
+        sensor = dataclasses.replace(SENSOR, black_dn=black_dn, read_noise_dn=stated)
+        assert noise_excess(dn, sensor) == pytest.approx(expected, rel=0.12)
+
+
+@pytest.mark.parametrize(("stated_dn", "changed"), [(3.0, False), (1.0, True), (6.0, False)])
+def test_a_training_takes_no_less_noise_than_empty_sky_shows(stated_dn, changed, caplog):
+    frames = scenes.photographed(scenes.target(40), 12)
+    stated = dataclasses.replace(scenes.SENSOR, read_noise_dn=stated_dn)
+    setup = Trainer(frames, stated, preset("obbgs", {"steps": 10})).setup
+    assert ("read noise taken as" in setup.start) == ("read noise taken as" in caplog.text) == changed
+    if changed:
+        assert setup.sensor.read_noise_dn == pytest.approx(scenes.SENSOR.read_noise_dn, rel=0.15)
+    else:
+        assert setup.sensor == stated
