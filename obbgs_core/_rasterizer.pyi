@@ -96,6 +96,7 @@ def likelihood(
     misfit_floors: Array,
     weight: float,
     edge_weight: float,
+    drawn: Array | None,
     residual: Array,
     gradient: Array | None,
     threads: int,
