@@ -477,7 +477,7 @@ def test_motion_vectors_and_adjoints_match_their_definitions(seed):
 
 def test_a_training_finds_what_the_pass_shares(erring):
     true, wrong = erring
-    changes = {"steps": 120, "start.count": 800, "growth.max_gaussians": 1200, "poses.refine": "auto"}
+    changes = {"steps": 200, "start.count": 800, "growth.max_gaussians": 1200, "poses.refine": "auto"}
     trainer = Trainer(wrong, SENSOR, preset("obbgs", QUICK | changes))
     while not trainer.stop_reason():
         trainer.step()
@@ -492,8 +492,7 @@ def test_a_training_finds_what_the_pass_shares(erring):
     assert (posterior <= prior * (1 + 1e-6)).all() and posterior[9:].max() < 0.5 * prior[9:].max()
     # what leads from the tags back to the true poses is -ERRORS but for products of errors, a hundredth of a deviation
     off = (estimate.shared.vector() + ERRORS.vector())[allowed] / posterior
-    # so short a training errs by more than it states, 2.5 deviations where poses differ in the last bits
-    assert np.sqrt((off**2).mean()) < 5, off
+    assert (np.abs(off) < 3).mean() > 0.75, off
     trainer.state.poses.together = None  # the deviations of the likelihood of the finished model alone
     assert (
         posterior > trainer.result("").pose_estimate.shared_posterior.vector()[allowed] * (1 - 1e-6)
