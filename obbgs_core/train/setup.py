@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import hashlib
 import logging
-import math
 import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -41,10 +40,8 @@ from obbgs_core.train.windows import windows
 
 log = logging.getLogger(__name__)
 NOISE_FRAMES = 12  # about so many, spread evenly, by which the noise is measured
-CLEAR_EXCESS = (
-    1.3  # of the scatter of empty sky over that of the sensor model; frames that fit it have 0.93 to 0.97
-)
-QUANTISATION_DN = math.sqrt(1 / 12)
+# of the scatter of empty sky over that of the sensor model; frames that fit it have 0.93 to 0.97
+CLEAR_EXCESS = 1.3
 EXACT_TAGS = "as tagged (the tags are exact)"
 TOO_FEW_BRACKETS = "as tagged (too few brackets for validation)"
 UNTESTED = ("", EXACT_TAGS, TOO_FEW_BRACKETS)  # of poses whose refinement no validation brackets have decided
@@ -187,7 +184,7 @@ def _with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Senso
     if not excess > CLEAR_EXCESS:
         return sensor, ""
     seen = dataclasses.replace(
-        sensor, read_noise_dn=excess * math.hypot(sensor.read_noise_dn, QUANTISATION_DN)
+        sensor, read_noise_dn=excess * sensor.variance_dn2(torch.tensor(sensor.black_dn)).sqrt().item()
     )
     changed = (
         f"read noise taken as {seen.read_noise_dn:.2f} DN instead of the stated {sensor.read_noise_dn:.2f} DN: "

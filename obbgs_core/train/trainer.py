@@ -106,7 +106,7 @@ class Trainer:
 
     def __init__(self, frames: list[TrainingFrame], sensor: Sensor, config: MethodConfig, seed: int = 0):
         began = time.monotonic()
-        self._given, self._asked = frames, config
+        self._given, self._stated, self._asked = frames, sensor, config
         self.setup, self.state = prepare(frames, sensor, config, seed)
         self.state.seconds = time.monotonic() - began
 
@@ -241,9 +241,7 @@ class Trainer:
         check_joinable(self.setup.config)
         began = time.monotonic()
         every = self._given + frames
-        joined, fresh = prepare(
-            every, self.setup.sensor, self._asked, self.setup.seed, self.setup.silhouettes
-        )
+        joined, fresh = prepare(every, self._stated, self._asked, self.setup.seed, self.setup.silhouettes)
         join(self.setup, self.state, joined, fresh, HOLD)
         self.setup, self._given = joined, every
         self.state.seconds += time.monotonic() - began

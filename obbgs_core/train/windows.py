@@ -8,9 +8,8 @@ from torch import Tensor
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.start.hull import Silhouette
 
-GRID_PX = (
-    16  # windows begin at multiples of it, so that the pixels averaged for a coarse image lie in one window
-)
+# windows begin at multiples of it, so that the pixels averaged for a coarse image lie in one window
+GRID_PX = 16
 MARGIN_PX = 8.0  # around the start, besides what silhouettes show beyond it
 
 
