@@ -5,14 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
 
+from hil.sky import SHIPPED
 from hil.world.scenario import load_scenario
 from obbgs_base.navigation_errors import SharedParameters
+from obbgs_core.frames import sun_span_deg
 from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.score.poses import best_motion, pose_errors
 from tests import raycast
-from tests.benchmarks import passes, poses
+from tests.benchmarks import passes, poses, unknown_attitude
 
 SIZE_PX, BRACKETS = 32, 6
 
@@ -69,3 +72,21 @@ def test_the_true_parameters_are_no_deviations_off_and_those_of_the_tags_are(see
     assert (
         left.rotation_deg < 0.05
     )  # each bracket's own error, 0.01 degrees about each axis, and products of errors
+
+
+def test_a_mesh_is_photographed_where_its_points_are_and_its_sun_stands_still():
+    scenario = unknown_attitude.scenario("unknown_attitude_tumbling", seed=0)
+    seen = passes.photographed(SHIPPED, scenario, 3, SIZE_PX, 0)
+    assert np.ptp(seen.cloud_m, axis=0).max() == pytest.approx(seen.size_m, rel=0.1)
+    for i in (0, 8):
+        pose, K = seen.motion.world_to_camera[i], seen.frames[i].K.double().numpy()
+        at = (seen.cloud_m @ pose[:3, :3].T + pose[:3, 3]) @ K.T
+        columns, rows = (at[:, :2] / at[:, 2:]).astype(int).T
+        shown = np.zeros((SIZE_PX, SIZE_PX), dtype=bool)
+        shown[rows, columns] = True
+        covered = seen.alpha[i].numpy() > 0
+        assert binary_dilation(covered)[shown].all()
+        assert shown[seen.alpha[i].numpy() > 0.9].mean() > 0.9  # points no view of nine shows are left out
+        assert (seen.radiance[i, ..., 0].numpy()[covered] > 0).mean() > 0.9
+    assert sun_span_deg(unknown_attitude.inertial(seen)) < 0.1  # in half an hour
+    assert sun_span_deg(seen.frames) > 30

@@ -1,11 +1,12 @@
-"""Simulated passes about a spacecraft of textured boxes; no code of the product makes their pictures.
+"""Simulated passes about a spacecraft of textured boxes, or a mesh; neither the product nor its renderer makes them.
 
-The body depends on a seed alone, so that figures of two versions of the code are figures of the same pictures.
+The boxes depend on a seed alone, so that figures of two versions of the code are figures of the same pictures.
 """
 
 import dataclasses
 import functools
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from hil.world.scenario import Scenario, Scene
 from obbgs_base.navigation_errors import NominalMotion
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
+from tests.benchmarks.mesh_pictures import pictures
 from tests.benchmarks.targets import LARGEST_DIMENSION, MID_SIGNAL
 from tests.raycast import Box, hit, spacecraft
 
@@ -133,18 +135,33 @@ def motion_of(scenario: Scenario, brackets: int) -> NominalMotion:
     return motion
 
 
-def photographed(target: int, scenario: Scenario, brackets: int, size_px: int, seed: int) -> Pass:
+def suns_of(scenario: Scenario, motion: NominalMotion) -> np.ndarray:
+    """Return the directions [F, 3] towards the Sun in the frames of a motion, body frame."""
+    scene, start_ns = Scene(scenario), scenario.orbit.start_utc_ns
+    return np.array([scene.state(start_ns + round(t * 1e9)).pose.sun_dir_body for t in motion.times_s])
+
+
+def photographed(target: int | Path, scenario: Scenario, brackets: int, size_px: int, seed: int) -> Pass:
     """Return the frames of a scenario about a body, with exact poses.
 
     Args:
-        target: seed of the body; seed: of the noise.
+        target: seed of a body of boxes, which have their own light; or a mesh, on which the scenario's Sun shines.
+        seed: of the noise.
     """
     motion = motion_of(scenario, brackets)
     range_m = float(np.linalg.norm(motion.position_m, axis=1).mean())
     focal_px = size_px / 2 / np.tan(np.radians(scenario.fov_deg) / 2)
-    scale = FILLS * size_px * range_m / focal_px / LARGEST_DIMENSION
+    size_m = FILLS * size_px * range_m / focal_px
     K = np.array([[focal_px, 0, size_px / 2], [0, focal_px, size_px / 2], [0, 0, 1]])
-    light, alpha = _pictures(target, scale, motion.world_to_camera.tobytes(), K.tobytes(), size_px)
+    suns: list[torch.Tensor | None] = [None] * len(motion.times_s)
+    if isinstance(target, Path):
+        towards = suns_of(scenario, motion)
+        light, alpha, cloud_m = pictures(target, size_m, motion.world_to_camera, towards, K, size_px)
+        suns = list(torch.from_numpy(towards).float())
+    else:
+        scale = size_m / LARGEST_DIMENSION
+        light, alpha = _pictures(target, scale, motion.world_to_camera.tobytes(), K.tobytes(), size_px)
+        cloud_m = surface_points(scaled(body(target), scale))
     # radiance at full scale of the middle exposure
     white = np.percentile(light[alpha > 0.9], 97) / MID_SIGNAL
     radiance = torch.from_numpy(light * SENSOR.full_scale_radiance(EXPOSURES_S[1]) / white)[..., None].float()
@@ -155,7 +172,10 @@ def photographed(target: int, scenario: Scenario, brackets: int, size_px: int, s
         sigma = SENSOR.variance_dn2(expected).sqrt().numpy()
         dn = torch.from_numpy(converted(expected.numpy(), sigma, SENSOR.white_dn, rng).astype(np.float32))
         world_to_camera, bracket = torch.from_numpy(pose).float(), i // len(EXPOSURES_S)
-        frames.append(TrainingFrame(dn, exposure_s, world_to_camera, torch.from_numpy(K).float(), i, bracket))
-    cloud_m, size_m = surface_points(scaled(body(target), scale)), LARGEST_DIMENSION * scale
+        frames.append(
+            TrainingFrame(
+                dn, exposure_s, world_to_camera, torch.from_numpy(K).float(), i, bracket, sun_dir=suns[i]
+            )
+        )
     coverage = torch.from_numpy(alpha).float()
     return Pass(frames, motion, radiance, coverage, cloud_m, size_m, range_m, scenario.duration_s)

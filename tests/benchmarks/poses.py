@@ -1,9 +1,11 @@
 """How well trainings recover from errors of navigation: passes of the simulator's scenarios about a rendered target.
 
 The target is a spacecraft of textured boxes that is cast ray by ray (`tests.benchmarks.passes`) from the true poses of
-a scenario, with sensor noise, and the tags err as each condition says. A scenario's Sun is left out.
+a scenario, with sensor noise, and the tags err as each condition says. A scenario's Sun is left out. Meshes are
+rendered by Blender, with the Sun.
 
     python -m tests.benchmarks.poses --quick --json
+    python -m tests.benchmarks.poses --quick --json --targets Aura.glb --conditions unknown_attitude_tumbling
 """
 
 import argparse
@@ -11,6 +13,7 @@ import dataclasses
 import itertools
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -41,7 +44,7 @@ from tests.benchmarks.targets import LARGEST_DIMENSION
 
 SCENARIOS = ("fly-around", "tumbling", "v-bar")
 HELD_OUT = 8  # every eighth bracket
-TARGETS = range(3)  # seeds of bodies
+TARGETS_HELP = "seeds of bodies of boxes, or meshes, which Blender renders under the scenario's Sun"
 FACTORS = {"correlated_1": 1.0, "correlated_3": 3.0, "correlated_10": 10.0}
 
 
@@ -231,6 +234,11 @@ def scores(seen: Pass, frames: list[TrainingFrame], result: TrainResult) -> dict
     }
 
 
+def target_of(argument: str) -> int | Path:
+    """Return the seed of a body or the path of a mesh."""
+    return int(argument) if argument.isdigit() else Path(argument)
+
+
 def main() -> None:
     from tests.benchmarks import unknown_attitude  # which builds on this module
 
@@ -241,7 +249,7 @@ def main() -> None:
         "--quick", action="store_true", help="one seed, 100x100 pixels, 49 brackets, 600 steps"
     )
     parser.add_argument(
-        "--targets", nargs="+", type=int, choices=TARGETS, default=[0], help="bodies; default: 0"
+        "--targets", nargs="+", type=target_of, default=[0], help=f"{TARGETS_HELP}; default: 0"
     )
     parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, help="default: all, one with --quick")
     known = [*CONDITIONS, *unknown_attitude.CONDITIONS]
@@ -255,8 +263,9 @@ def main() -> None:
     conditions = arguments.conditions or known
     seeds = arguments.seeds or seeds
 
-    def show(condition: str, scenario: str, target: int, seed: int, figures: dict) -> None:
-        row = {"condition": condition, "scenario": scenario, "target": f"boxes-{target}", "seed": seed}
+    def show(condition: str, scenario: str, target: int | Path, seed: int, figures: dict) -> None:
+        name = target.stem if isinstance(target, Path) else f"boxes-{target}"
+        row = {"condition": condition, "scenario": scenario, "target": name, "seed": seed}
         if not arguments.quick:
             row["size_px"] = size_px
         print(shown(row | figures, "poses", arguments.json), flush=True)

@@ -65,12 +65,12 @@ def render(
     metres = worker.facts["largest_dimension_m"] / LARGEST_DIMENSION
     poses, suns = views
     K = np.array([[FOCAL * size, 0, size / 2], [0, FOCAL * size, size / 2], [0, 0, 1]])
-    for number, (pose, sun) in enumerate(zip(poses, suns, strict=True)):
+    in_metres = poses.copy()
+    in_metres[:, :3, 3] *= metres
+    for number, (pose, sun) in enumerate(zip(in_metres, suns, strict=True)):
         path, part = kept / f"{number}.npz", kept / "part.npz"
         if not path.exists():
-            scaled = pose.copy()
-            scaled[:3, 3] *= metres
-            camera = {"world_to_camera": scaled.tolist(), "K": K.tolist(), "width": size, "height": size}
+            camera = {"world_to_camera": pose.tolist(), "K": K.tolist(), "width": size, "height": size}
             light = {"sun_dir_body": sun.tolist(), "in_eclipse": False}
             worker.ask(op="render", **camera, channels=3, **light, out=str(part))
             part.rename(path)
@@ -82,17 +82,21 @@ def render(
         "world_to_camera": poses,
         "K": K,
         "sun_dir": suns if np.ptp(suns, axis=0).any() else suns[0],
-        "cloud": (_shown(worker, poses, metres, kept) / metres).astype(np.float32),
+        "cloud": (shown_points(worker, in_metres, kept) / metres).astype(np.float32),
     }
 
 
-def _shown(worker: Worker, poses: np.ndarray, metres: float, kept: Path) -> np.ndarray:
-    """Return points of the surface [M, 3] m that some of the views see."""
+def shown_points(worker: Worker, poses: np.ndarray, kept: Path) -> np.ndarray:
+    """Return points of the surface [M, 3] m that some of the views with poses [V, 4, 4] (m) see.
+
+    Args:
+        kept: folder for what Blender reads and writes.
+    """
     worker.ask(op="surface", out=str(kept / "surface.npz"))
     with np.load(kept / "surface.npz") as surface:
         mesh = trimesh.Trimesh(surface["vertices"], surface["faces"], process=False)
     points = np.asarray(trimesh.sample.sample_surface(mesh, CLOUD, seed=0)[0])
-    centres = -metres * np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    centres = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
     np.savez(kept / "points.npz", points=points, centres=centres[:SEEN_FROM])
     worker.ask(op="visible", points=str(kept / "points.npz"), out=str(kept / "seen.npz"))
     with np.load(kept / "seen.npz") as seen:

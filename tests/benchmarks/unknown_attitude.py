@@ -6,6 +6,7 @@ position are exact, as is everything that `psnr_exact_db` is trained with.
 
 import dataclasses
 import time
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -35,7 +36,9 @@ def scenario(condition: str, seed: int) -> Scenario:
     return dataclasses.replace(stock, duration_s=DURATION_S, attitude=turned)
 
 
-def row(condition: str, target: int, size_px: int, config: MethodConfig, seed: int) -> dict[str, float | str]:
+def row(
+    condition: str, target: int | Path, size_px: int, config: MethodConfig, seed: int
+) -> dict[str, float | str]:
     """Return the scores of a condition, with those of exact poses and the errors of axis and rate."""
     seen = passes.photographed(target, scenario(condition, seed), BRACKETS, size_px, seed)
     exact_db = poses.scored(seen, "exact", config, seed)["psnr_clean_db"]
@@ -63,28 +66,37 @@ def row(condition: str, target: int, size_px: int, config: MethodConfig, seed: i
 
 
 def inertial(seen: passes.Pass) -> list[TrainingFrame]:
-    """Return the frames with poses relative to inertial axes."""
-    still = dataclasses.replace(seen.motion, inertial_to_body=np.tile(np.eye(3), (len(seen.frames), 1, 1)))
-    return [
-        dataclasses.replace(f, world_to_camera=torch.from_numpy(pose).float())
-        for f, pose in zip(seen.frames, still.world_to_camera, strict=True)
-    ]
+    """Return the frames with poses and Suns relative to inertial axes."""
+    still = np.tile(np.eye(3), (len(seen.frames), 1, 1))
+    return in_axes(seen, still)
 
 
 def in_found_axes(seen: passes.Pass, found: TargetMotion, times_s: np.ndarray) -> list[TrainingFrame]:
     """Return the frames in the target's axes as found, with how far its rotation may err."""
     attitudes = found.inertial_to_body(times_s)
-    at = dataclasses.replace(seen.motion, inertial_to_body=attitudes)
     navigation = Navigation(found.sigmas(), rate_rad_s=found.rate_body_rad_s, inertia=found.moments)
     return [
         dataclasses.replace(
             f,
-            world_to_camera=torch.from_numpy(pose).float(),
             navigation=navigation,
             time_s=float(time_s),
             inertial_to_body=torch.from_numpy(attitude),
         )
-        for f, pose, time_s, attitude in zip(seen.frames, at.world_to_camera, times_s, attitudes, strict=True)
+        for f, time_s, attitude in zip(in_axes(seen, attitudes), times_s, attitudes, strict=True)
+    ]
+
+
+def in_axes(seen: passes.Pass, attitudes: np.ndarray) -> list[TrainingFrame]:
+    """Return the frames in the axes of a body with attitudes [N, 3, 3] (inertial to body), their Suns along."""
+    poses_of = dataclasses.replace(seen.motion, inertial_to_body=attitudes).world_to_camera
+    turns = torch.from_numpy(attitudes @ seen.motion.inertial_to_body.transpose(0, 2, 1)).float()
+    return [
+        dataclasses.replace(
+            f,
+            world_to_camera=torch.from_numpy(pose).float(),
+            sun_dir=None if f.sun_dir is None else turn @ f.sun_dir,
+        )
+        for f, pose, turn in zip(seen.frames, poses_of, turns, strict=True)
     ]
 
 
@@ -93,11 +105,9 @@ def turned(seen: passes.Pass, attitudes: np.ndarray) -> passes.Pass:
     u, _, v = np.linalg.svd((attitudes @ seen.motion.inertial_to_body.transpose(0, 2, 1)).sum(axis=0))
     turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
     motion = dataclasses.replace(seen.motion, inertial_to_body=turn @ seen.motion.inertial_to_body)
-    frames = [
-        dataclasses.replace(f, world_to_camera=torch.from_numpy(pose).float())
-        for f, pose in zip(seen.frames, motion.world_to_camera, strict=True)
-    ]
-    return dataclasses.replace(seen, frames=frames, motion=motion, cloud_m=seen.cloud_m @ turn.T)
+    return dataclasses.replace(
+        seen, frames=in_axes(seen, motion.inertial_to_body), motion=motion, cloud_m=seen.cloud_m @ turn.T
+    )
 
 
 def rotation_errors(motion: TargetMotion, true: NominalMotion, epoch_s: float) -> dict[str, float]:
