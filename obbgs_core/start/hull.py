@@ -33,6 +33,7 @@ INSIDE = 0.9995  # share of all certain pixels that the target's radius encloses
 AGREEMENT = 0.95  # share of views that must see light where a voxel projects
 COARSE_VOXELS = 64  # along each axis of the first grid
 SUBDIVISIONS = 2  # of the first grid, at most; each halves the voxels
+VIEWS_AT_ONCE = 4  # between two looks for points that are out of the hull already
 FINEST_PX = 0.7  # smallest width of a voxel in the image
 VOXELS_AT_ONCE = 1_000_000  # bounds the memory
 
@@ -103,9 +104,7 @@ def _mean(image: Tensor, window: int) -> Tensor:
 
 def _dilated(mask: Tensor, reach_px: int) -> Tensor:
     """Return where a mask [1, 1, H, W] is set within `reach_px` rows and columns of each pixel."""
-    size = 2 * reach_px + 1
-    rows = F.max_pool2d(mask.float(), (1, size), 1, (0, reach_px))
-    return F.max_pool2d(rows, (size, 1), 1, (reach_px, 0)) > 0
+    return _mean(mask.float(), 2 * reach_px + 1) > 0  # sums of zeros and ones are exact
 
 
 def shows_light(dn: Tensor, sensor: Sensor) -> bool:
@@ -150,7 +149,8 @@ def hull_points(silhouettes: list[Silhouette], radius: float) -> tuple[Tensor, f
         # a coarse voxel survives when light falls anywhere near its projection, a final one when at its centre
         reach_m = 0.87 * voxel_m * (level < subdivisions)
         points = _centres(inside, voxel_m, radius).split(VOXELS_AT_ONCE)
-        inside[inside.clone()] = torch.cat([agreement(silhouettes, p, reach_m) for p in points]) >= AGREEMENT
+        shares = torch.cat([agreement(silhouettes, p, reach_m, AGREEMENT) for p in points])
+        inside[inside.clone()] = shares >= AGREEMENT
         if not inside.any():
             break
     return _centres(inside & ~_eroded(inside), voxel_m, radius), voxel_m
@@ -205,14 +205,18 @@ def _centres(grid: Tensor, voxel_m: float, radius: float) -> Tensor:
     return (torch.nonzero(grid) + 0.5) * voxel_m - radius
 
 
-def agreement(silhouettes: list[Silhouette], points: Tensor, reach_m: float) -> Tensor:
+def agreement(silhouettes: list[Silhouette], points: Tensor, reach_m: float, least: float = 0.0) -> Tensor:
     """Return the share [M] of views that see light within `reach_m` of each point, of those with the point in view.
 
     Points in view of less than a third of the views have a share of 0.
+
+    Args:
+        least: points whose share is below this may have a share of 0 instead, which takes less time.
     """
+    shares, left = torch.zeros(len(points)), torch.arange(len(points))
     votes, seen = torch.zeros(len(points)), torch.zeros(len(points))
-    for s in silhouettes:
-        p = points @ s.world_to_camera[:3, :3].T + s.world_to_camera[:3, 3]
+    for number, s in enumerate(silhouettes, 1):
+        p = torch.addmm(s.world_to_camera[:3, 3], points, s.world_to_camera[:3, :3].T)
         z = p[:, 2].clamp(min=1e-6)
         u, v = s.K[0, 0] * p[:, 0] / z + s.K[0, 2], s.K[1, 1] * p[:, 1] / z + s.K[1, 2]
         height, width = s.likely.shape
@@ -223,6 +227,11 @@ def agreement(silhouettes: list[Silhouette], points: Tensor, reach_m: float) -> 
             pixels = min(pixels, min(height, width) // 4)
             mask = _dilated(mask[None, None], pixels)[0, 0]
         lit = mask[v.long().clamp(0, height - 1), u.long().clamp(0, width - 1)]
-        votes += (lit & inside).float()
-        seen += inside.float()
-    return torch.where(seen >= max(1, len(silhouettes) // 3), votes / seen.clamp(min=1), 0.0)
+        votes += lit & inside
+        seen += inside
+        if number % VIEWS_AT_ONCE == 0:
+            possible = seen - votes <= (1 - least) * len(silhouettes)
+            points, left, votes, seen = points[possible], left[possible], votes[possible], seen[possible]
+    enough = seen >= max(1, len(silhouettes) // 3)
+    shares[left[enough]] = (votes / seen.clamp(min=1))[enough]
+    return shares

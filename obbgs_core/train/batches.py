@@ -95,7 +95,8 @@ class Batches:
         """Return each frame's share of empty sky [H, W]; frames without a silhouette share one image of zeros."""
         unknown = torch.zeros(self._images[factor][0].shape[:2])
         shares = {
-            i: F.avg_pool2d(sky[None].float(), factor, ceil_mode=True)[0] for i, sky in self.sky.items()
+            i: F.avg_pool2d(sky[None].float(), factor, ceil_mode=True)[0] if factor > 1 else sky.float()
+            for i, sky in self.sky.items()
         }
         return [shares.get(i, unknown) for i in range(len(self.frames))]
 

@@ -86,7 +86,7 @@ def observe(
 
 
 def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> None:
-    """Refine the poses if the validation brackets say that they err: their log Bayes factor exceeds its standard error.
+    """Refine the poses if the validation brackets say that they err.
 
     They are asked before each round of refinement, until they say so or pictures have their full size: a model of
     coarse pictures shows large errors only. They are trained on from then on.
@@ -97,16 +97,13 @@ def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> No
     scale = config.image_scale(share)
     brackets = [setup.batches.batch(b, scale) for b in state.order.validation_brackets]
     cell_m = pose_rounds.cell_m(setup)
-    evidence, error = correction_evidence(state.model.detach(), setup.frames, brackets, setup.sensor, cell_m)
-    refined = evidence > error
+    evidence = correction_evidence(state.model.detach(), setup.frames, brackets, setup.sensor, cell_m)
+    refined = evidence.says_so
     if not refined and scale < config.image_scale(1):
         return
     state.poses = PoseCorrections(setup.frames) if refined else None
     state.holds = HOLDS if refined else 0
-    state.poses_decided = (
-        f"{'refined' if refined else 'as tagged'} (step {state.steps_done + 1}: that a validation bracket's pose errs "
-        f"has a log Bayes factor of {evidence:.1f} ± {error:.1f})"
-    )
+    state.poses_decided = f"{'refined' if refined else 'as tagged'} (step {state.steps_done + 1}: {evidence})"
     log.info("poses %s", state.poses_decided)
     state.order = FrameOrder.of(setup.frames, config.bracket_steps, [], state.order.turn)
 

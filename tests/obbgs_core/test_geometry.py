@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import maximum_filter
 from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import Rotation
 
@@ -124,6 +125,31 @@ def test_views_that_disagree_leave_no_hull():
         silhouettes.append(hull.Silhouette(mask, mask, ~mask, pose, K))
     points, _ = hull.hull_points(silhouettes, 2.0)
     assert len(points) == 0
+
+
+@given(st.integers(0, 2**31), st.integers(1, 24), st.sampled_from([0.0, 0.3]), st.floats(0.05, 1))
+def test_points_that_cannot_agree_any_more_are_left_out_of_the_vote_without_changing_it(
+    seed, views, reach_m, least
+):
+    rng, silhouettes = np.random.default_rng(seed), []
+    K = torch.tensor([[20.0, 0, 10], [0, 20, 10], [0, 0, 1]])
+    for rotation in Rotation.random(views, rng=rng).as_matrix():
+        pose = torch.eye(4)
+        pose[:3, :3], pose[2, 3] = torch.tensor(rotation, dtype=torch.float32), 5.0
+        mask = torch.from_numpy(rng.random((20, 20)) < rng.uniform(0.5, 1))
+        silhouettes.append(hull.Silhouette(mask, mask, ~mask, pose, K))
+    points = torch.from_numpy(rng.normal(size=(200, 3)) * 2).float()  # some lie beyond the picture
+    whole = hull.agreement(silhouettes, points, reach_m)
+    early = hull.agreement(silhouettes, points, reach_m, least)
+    torch.testing.assert_close(early >= least, whole >= least)
+    assert (early[whole >= least] == whole[whole >= least]).all()
+
+
+@given(st.integers(0, 2**31), st.integers(1, 9), st.floats(0, 0.2))
+def test_a_silhouette_grows_as_by_a_maximum_filter(seed, reach_px, share):
+    mask = np.random.default_rng(seed).random((17, 23)) < share
+    grown = hull._dilated(torch.from_numpy(mask)[None, None], reach_px)[0, 0]
+    np.testing.assert_array_equal(grown, maximum_filter(mask, 2 * reach_px + 1, mode="constant"))
 
 
 def test_growth_clones_the_small_splits_the_large_and_carries_the_moments():

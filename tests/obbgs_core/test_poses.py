@@ -27,7 +27,7 @@ from obbgs_core.start.initialisation import silhouettes
 from obbgs_core.train.batches import Batches
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
-from obbgs_core.train.validation import correction_evidence
+from obbgs_core.train.validation import CorrectionEvidence, correction_evidence
 from tests import scenes
 from tests.scenes import QUICK, RANGE_M, SENSOR, intrinsics, target
 
@@ -190,7 +190,7 @@ def test_an_error_of_a_pose_has_evidence_and_a_doubt_without_error_its_price(fra
         doubted = tagged(shown, axes @ torch.diag(variances) @ axes.T)
         batches = Batches(doubted, SENSOR.white_dn)
         brackets = [batches.batch([i], 1.0) for i in range(len(doubted))]
-        return correction_evidence(model(), doubted, brackets, SENSOR, 0.05)[0]
+        return correction_evidence(model(), doubted, brackets, SENSOR, 0.05).mean
 
     erring = evidence(wrong, deviations**2)
     assert erring > 10
@@ -198,6 +198,22 @@ def test_an_error_of_a_pose_has_evidence_and_a_doubt_without_error_its_price(fra
     exact, doubtful = evidence(frames, deviations**2), evidence(frames, 100 * deviations**2)
     assert exact < -1
     assert exact - doubtful == pytest.approx(2 * math.log(10), rel=0.1)  # of two directions
+
+
+def test_one_bracket_of_many_that_errs_for_certain_is_enough_and_a_doubtful_one_is_not(frames):
+    """Of a set of photographs a few cameras may err where the others are exact."""
+    tags = tagged(frames, torch.full((6,), 5e-3**2).double().diag())
+    batches = Batches(tags, SENSOR.white_dn)
+    exact = correction_evidence(model(), tags, [batches.batch([i], 1.0) for i in range(12)], SENSOR, 0.05)
+    assert not exact.says_so
+    motion = torch.tensor([[0.03, -0.03, 0.03, 0, 0, 0]])
+    tags[7] = dataclasses.replace(tags[7], world_to_camera=rigid_motions(motion)[0] @ tags[7].world_to_camera)
+    batches = Batches(tags, SENSOR.white_dn)
+    found = correction_evidence(model(), tags, [batches.batch([i], 1.0) for i in range(12)], SENSOR, 0.05)
+    assert found.factors.argmax() == 7 and found.mean < found.error
+    assert found.says_so and "in one of them" in str(found)
+    doubtful = CorrectionEvidence(found.factors.clamp(max=10))
+    assert not doubtful.says_so and "in one of them" not in str(doubtful)
 
 
 def test_a_bracket_is_corrected_by_the_mean_of_its_frames_covariances(frames):
