@@ -18,7 +18,7 @@ from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check, fraction
 from obbgs_core.train.batches import Batch, Batches
 
-VIEWS = 36  # training frames that are rendered, spread evenly; gains are scaled to all frames
+VIEWS = 36  # training frames that are rendered at most, spread evenly; gains are scaled to all frames
 # An opaque Gaussian that shows on less than this in every picture hides nothing that its neighbours do not hide too.
 SHOWN_PX = 0.25
 
@@ -174,7 +174,7 @@ def shown_frames(batches: Batches, most: int = VIEWS) -> range:
     Exposure times come in turns: a stride that shares a factor with their number would meet only some of them.
     """
     exposures = len({frame.exposure_time_s for frame in batches.frames})
-    stride = max(1, len(batches.frames) // most)
+    stride = max(1, math.ceil(len(batches.frames) / most))
     while math.gcd(stride, exposures) > 1:
         stride += 1
     return range(0, len(batches.frames), stride)
