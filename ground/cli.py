@@ -39,10 +39,10 @@ def listen_command(
         "mission.yaml"
     ),
     exit_after: Annotated[
-        int | None, typer.Option(help="Stop when the session holds this many frames.")
+        int | None, typer.Option(min=1, help="Stop when the session holds this many frames.")
     ] = None,
     idle_timeout: Annotated[
-        float | None, typer.Option(help="Stop after this many seconds without a packet.")
+        float | None, typer.Option(min=0, help="Stop after this many seconds without a packet.")
     ] = None,
     forward: Annotated[
         str | None,

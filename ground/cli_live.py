@@ -45,13 +45,15 @@ def live_command(
         Path, typer.Option("--key", help="The file of the mission's key; read with --triage only.")
     ] = Path("mission.key"),
     exit_after: Annotated[
-        int | None, typer.Option(help="With --link: stop receiving when the session holds this many frames.")
+        int | None,
+        typer.Option(min=1, help="With --link: stop receiving when the session holds this many frames."),
     ] = None,
     idle_timeout: Annotated[
         float | None,
         typer.Option(
+            min=0,
             help="With --link: stop receiving after this many seconds without a packet, default: never. Without: the "
-            "pass is over after this many seconds without a frame while no process receives, default: 30."
+            "pass is over after this many seconds without a frame while no process receives, default: 30.",
         ),
     ] = None,
     seed: Seed = None,

@@ -165,5 +165,7 @@ def averaged(dn: Tensor, factor: int, white_dn: float) -> Tensor:
         return dn
     image = dn.movedim(-1, 0)[None]
     mean = F.avg_pool2d(image, factor, ceil_mode=True)
+    if dn.max() < white_dn:
+        return mean[0].movedim(0, -1)
     largest = F.max_pool2d(image, factor, ceil_mode=True)
     return torch.where(largest >= white_dn, largest, mean)[0].movedim(0, -1)

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from typer.testing import CliRunner
 
 import ground.live
 from flightsw.icd.mission import ConfigError
+from ground import cli
 from ground.evaluate import evaluate
 from ground.listing import find_sessions
 from ground.live import LiveReconstruction, PassEnd, reconstruct_live
@@ -250,3 +252,10 @@ def test_a_training_that_fails_by_itself_is_not_started_again_and_its_message_is
             training.finish(lambda: False, lambda facts: None)
         training.tend()
     assert len(said) == 1 and "receiving goes on" in said[0]
+
+
+@pytest.mark.parametrize("option", [("--idle-timeout", "-3"), ("--exit-after", "0")])
+def test_an_ending_that_cannot_be_is_refused_before_anything_is_written(tmp_path, option):
+    folder = tmp_path / "session"
+    result = CliRunner().invoke(cli.app, ["live", "--session", str(folder), *option])
+    assert result.exit_code == 2 and option[0] in result.output and not folder.exists()
