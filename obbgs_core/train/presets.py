@@ -69,7 +69,7 @@ PRESETS: dict[str, MethodConfig] = {
             footprint="camera",
             outlier_filter=False,  # few Gaussians stray from the hull; with it the demo lost 0.4 dB
             chi2_end=1.0,
-            start=StartSettings(kind="hull", count=6000),
+            start=StartSettings(kind="hull", count=3000),
             loss=LossSettings(
                 kind="likelihood",
                 ssim_weight=0.0,
@@ -85,11 +85,11 @@ PRESETS: dict[str, MethodConfig] = {
                 pixels_per_gaussian=7,
                 begin=0.08,
                 end=0.6,
-                interval=16,
+                interval=24,
                 share=0.08,
                 split="long_axis",
                 pixel_weighted=True,
-                obb_interval=8,
+                obb_interval=12,
                 prune_opacity=0.02,
                 opacity_reset_interval=0,
             ),

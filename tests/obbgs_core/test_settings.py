@@ -72,7 +72,7 @@ def test_variants_are_added_to_a_methods_name_in_any_order():
 def test_a_group_is_changed_setting_by_setting_and_keeps_the_others():
     config = preset("obbgs", {"growth.interval": 33, "light.sun_shading": "linear"})
     assert (config.growth.interval, config.light.sun_shading) == (33, "linear")
-    assert config.growth.share == preset("obbgs").growth.share and preset("obbgs").growth.interval == 16
+    assert config.growth.share == preset("obbgs").growth.share and preset("obbgs").growth.interval == 24
     for wrong in ("growth", "growth.magic", "steps.magic"):
         with pytest.raises(ValueError, match=f"no setting {wrong}; expected one of .*growth.begin"):
             preset("obbgs", {wrong: 1})
