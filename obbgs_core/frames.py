@@ -165,7 +165,7 @@ def averaged(dn: Tensor, factor: int, white_dn: float) -> Tensor:
         return dn
     image = dn.movedim(-1, 0)[None]
     mean = F.avg_pool2d(image, factor, ceil_mode=True)
-    if dn.max() < white_dn:
-        return mean[0].movedim(0, -1)
-    largest = F.max_pool2d(image, factor, ceil_mode=True)
-    return torch.where(largest >= white_dn, largest, mean)[0].movedim(0, -1)
+    if dn.max() >= white_dn:
+        largest = F.max_pool2d(image, factor, ceil_mode=True)
+        mean = torch.where(largest >= white_dn, largest, mean)
+    return mean[0].movedim(0, -1)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from hil.sky.blender import Worker
-from tests.benchmarks.rendered import shown_points
+from tests.benchmarks.rendered import ask_for_view, shown_points
 
 
 def pictures(
@@ -26,14 +26,7 @@ def pictures(
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "picture.npz"
             for pose, sun in zip(scaled, suns, strict=True):
-                camera = {
-                    "world_to_camera": pose.tolist(),
-                    "K": K.tolist(),
-                    "width": size_px,
-                    "height": size_px,
-                }
-                lit = {"sun_dir_body": sun.tolist(), "in_eclipse": False}
-                worker.ask(op="render", **camera, channels=1, **lit, out=str(out))
+                ask_for_view(worker, pose, sun, K, size_px, 1, out)
                 with np.load(out) as picture:
                     light.append(picture["radiance"][..., 0].astype(float))
                     alpha.append(picture["alpha"] / 255)

@@ -107,8 +107,11 @@ def _pictures(seed: int, scale: float, poses: bytes, K: bytes, size_px: int) -> 
     return stacked[:, 0], stacked[:, 1]
 
 
-def motion_of(scenario: Scenario, brackets: int) -> NominalMotion:
-    """Return the true motion of a scenario's first brackets as they are spread over its whole duration."""
+def motion_and_suns(scenario: Scenario, brackets: int) -> tuple[NominalMotion, np.ndarray]:
+    """Return the true motion of a scenario's first brackets as they are spread over its whole duration, and its Sun.
+
+    The second are the directions [F, 3] towards the Sun in the frames, unit, body frame.
+    """
     scene, start_ns = Scene(scenario), scenario.orbit.start_utc_ns
     times_s = np.repeat(np.linspace(0, scenario.duration_s, brackets), len(EXPOSURES_S))
     times_s += np.tile(np.arange(len(EXPOSURES_S)) * FRAME_SPACING_S, brackets)
@@ -132,13 +135,7 @@ def motion_of(scenario: Scenario, brackets: int) -> NominalMotion:
     np.testing.assert_allclose(
         motion.world_to_camera[-1][:3, :3], quat_to_matrix(states[-1].pose.quat_body_to_camera), atol=1e-9
     )
-    return motion
-
-
-def suns_of(scenario: Scenario, motion: NominalMotion) -> np.ndarray:
-    """Return the directions [F, 3] towards the Sun in the frames of a motion, body frame."""
-    scene, start_ns = Scene(scenario), scenario.orbit.start_utc_ns
-    return np.array([scene.state(start_ns + round(t * 1e9)).pose.sun_dir_body for t in motion.times_s])
+    return motion, np.array([s.pose.sun_dir_body for s in states])
 
 
 def photographed(target: int | Path, scenario: Scenario, brackets: int, size_px: int, seed: int) -> Pass:
@@ -148,14 +145,13 @@ def photographed(target: int | Path, scenario: Scenario, brackets: int, size_px:
         target: seed of a body of boxes, which have their own light; or a mesh, on which the scenario's Sun shines.
         seed: of the noise.
     """
-    motion = motion_of(scenario, brackets)
+    motion, towards = motion_and_suns(scenario, brackets)
     range_m = float(np.linalg.norm(motion.position_m, axis=1).mean())
     focal_px = size_px / 2 / np.tan(np.radians(scenario.fov_deg) / 2)
     size_m = FILLS * size_px * range_m / focal_px
     K = np.array([[focal_px, 0, size_px / 2], [0, focal_px, size_px / 2], [0, 0, 1]])
     suns: list[torch.Tensor | None] = [None] * len(motion.times_s)
     if isinstance(target, Path):
-        towards = suns_of(scenario, motion)
         light, alpha, cloud_m = pictures(target, size_m, motion.world_to_camera, towards, K, size_px)
         suns = list(torch.from_numpy(towards).float())
     else:

@@ -235,8 +235,18 @@ def scores(seen: Pass, frames: list[TrainingFrame], result: TrainResult) -> dict
 
 
 def target_of(argument: str) -> int | Path:
-    """Return the seed of a body or the path of a mesh."""
-    return int(argument) if argument.isdigit() else Path(argument)
+    """Return the seed of a body or the path of a mesh.
+
+    Raises:
+        argparse.ArgumentTypeError: it is neither a number nor a file.
+    """
+    if argument.isdigit():
+        return int(argument)
+    if not Path(argument).is_file():
+        raise argparse.ArgumentTypeError(
+            f"expected the seed of a body or the file of a mesh, got {argument!r}"
+        )
+    return Path(argument)
 
 
 def main() -> None:

@@ -70,9 +70,7 @@ def render(
     for number, (pose, sun) in enumerate(zip(in_metres, suns, strict=True)):
         path, part = kept / f"{number}.npz", kept / "part.npz"
         if not path.exists():
-            camera = {"world_to_camera": pose.tolist(), "K": K.tolist(), "width": size, "height": size}
-            light = {"sun_dir_body": sun.tolist(), "in_eclipse": False}
-            worker.ask(op="render", **camera, channels=3, **light, out=str(part))
+            ask_for_view(worker, pose, sun, K, size, 3, part)
             part.rename(path)
             print(f"{kept.name}: {number + 1} of {len(poses)}", flush=True)
     pictures = [np.load(kept / f"{number}.npz") for number in range(len(poses))]
@@ -84,6 +82,20 @@ def render(
         "sun_dir": suns if np.ptp(suns, axis=0).any() else suns[0],
         "cloud": (shown_points(worker, in_metres, kept) / metres).astype(np.float32),
     }
+
+
+def ask_for_view(
+    worker: Worker, pose: np.ndarray, sun: np.ndarray, K: np.ndarray, size: int, channels: int, out: Path
+) -> None:
+    """Let a view in sunlight be written, see `render` in `hil/sky/blender_worker.py`.
+
+    Args:
+        pose: [4, 4] body to camera, m; sun: [3] towards the Sun, unit, body frame; K: [3, 3] px.
+        size: pixels along a side.
+    """
+    camera = {"world_to_camera": pose.tolist(), "K": K.tolist(), "width": size, "height": size}
+    light = {"sun_dir_body": sun.tolist(), "in_eclipse": False}
+    worker.ask(op="render", **camera, channels=channels, **light, out=str(out))
 
 
 def shown_points(worker: Worker, poses: np.ndarray, kept: Path) -> np.ndarray:

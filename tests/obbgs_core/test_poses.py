@@ -187,10 +187,7 @@ def test_an_error_of_a_pose_has_evidence_and_a_doubt_without_error_its_price(fra
     ]
 
     def evidence(shown: list[TrainingFrame], variances: Tensor) -> float:
-        doubted = tagged(shown, axes @ torch.diag(variances) @ axes.T)
-        batches = Batches(doubted, SENSOR.white_dn)
-        brackets = [batches.batch([i], 1.0) for i in range(len(doubted))]
-        return correction_evidence(model(), doubted, brackets, SENSOR, 0.05).mean
+        return evidence_of(tagged(shown, axes @ torch.diag(variances) @ axes.T)).mean
 
     erring = evidence(wrong, deviations**2)
     assert erring > 10
@@ -200,16 +197,20 @@ def test_an_error_of_a_pose_has_evidence_and_a_doubt_without_error_its_price(fra
     assert exact - doubtful == pytest.approx(2 * math.log(10), rel=0.1)  # of two directions
 
 
+def evidence_of(tags: list[TrainingFrame]) -> CorrectionEvidence:
+    """Return what frames, each a bracket, say by the true model of whether their poses err."""
+    batches = Batches(tags, SENSOR.white_dn)
+    brackets = [batches.batch([i], 1.0) for i in range(len(tags))]
+    return correction_evidence(model(), tags, brackets, SENSOR, 0.05)
+
+
 def test_one_bracket_of_many_that_errs_for_certain_is_enough_and_a_doubtful_one_is_not(frames):
     """Of a set of photographs a few cameras may err where the others are exact."""
     tags = tagged(frames, torch.full((6,), 5e-3**2).double().diag())
-    batches = Batches(tags, SENSOR.white_dn)
-    exact = correction_evidence(model(), tags, [batches.batch([i], 1.0) for i in range(12)], SENSOR, 0.05)
-    assert not exact.says_so
+    assert not evidence_of(tags).says_so
     motion = torch.tensor([[0.03, -0.03, 0.03, 0, 0, 0]])
     tags[7] = dataclasses.replace(tags[7], world_to_camera=rigid_motions(motion)[0] @ tags[7].world_to_camera)
-    batches = Batches(tags, SENSOR.white_dn)
-    found = correction_evidence(model(), tags, [batches.batch([i], 1.0) for i in range(12)], SENSOR, 0.05)
+    found = evidence_of(tags)
     assert found.factors.argmax() == 7 and found.mean < found.error
     assert found.says_so and "in one of them" in str(found)
     doubtful = CorrectionEvidence(found.factors.clamp(max=10))
