@@ -268,8 +268,8 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print rows as JSON lines")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    size_px, brackets, steps, seeds = (100, 49, 600, [0]) if arguments.quick else (200, 121, 1500, range(5))
-    config = preset("obbgs", {"steps": steps, "light.max_sh_degree": 0})
+    size_px, brackets, seeds = (100, 49, [0]) if arguments.quick else (200, 121, range(5))
+    config = preset("obbgs", {"steps": 600} if arguments.quick else {})
     conditions = arguments.conditions or known
     seeds = arguments.seeds or seeds
 
