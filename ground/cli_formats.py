@@ -105,6 +105,8 @@ def import_command(
     print(f"{count} frames in {session}")
     if registration and registration["left_out"]:
         print(f"left out, because they could not be registered: {', '.join(registration['left_out'])}")
+    if registration and registration["turned"]:
+        print(f"turned by 180 degrees against the others: {', '.join(registration['turned'])}")
 
 
 def _checked_poses(

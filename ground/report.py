@@ -192,6 +192,8 @@ def _registration(run: Run) -> str:
         ("photographs registered", f"{len(run.session.frames):,}"),
         ("left out, because they could not be", html.escape(left_out)),
     ]
+    if turned := found.get("turned"):
+        rows.append(("turned by 180 degrees against the others", html.escape(", ".join(map(str, turned)))))
     note = (
         "Structure from motion found the cameras of these photographs. Their scale is unknown: one metre is the radius "
         "that holds nine tenths of the points."

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ground.formats.epipolar import turned
+from ground.formats.turned_pictures import turned_back
 from ground.formats.views import FormatError, Intrinsics, PoseSigmas, View, image_size
 from obbgs_base.errors import Interrupted
 
@@ -33,12 +35,14 @@ class Registered:
     views: the registered pictures. Origin: the points' median; one metre: the radius that holds nine tenths of them, as
         the true scale cannot be known.
     left_out: names of the pictures that were not registered.
+    turned: names of those that were turned by 180 degrees against the others, which told the principal point.
     reprojection_px: mean distance of the features from where their points are projected to.
     sigmas: how far the poses can err: that distance as an angle, and at the median range.
     """
 
     views: list[View]
     left_out: tuple[str, ...]
+    turned: tuple[str, ...]
     reprojection_px: float
     sigmas: PoseSigmas
 
@@ -47,6 +51,7 @@ class Registered:
         return {
             "registered": len(self.views),
             "left_out": list(self.left_out),
+            "turned": list(self.turned),
             "reprojection_px": self.reprojection_px,
             "scale": "unknown: one metre is the radius that holds nine tenths of the points",
         }
@@ -62,8 +67,8 @@ def read_photographs(
     """Return the photographs of a folder, in the order of their names, with the cameras that took them.
 
     One camera with one focal length is assumed to have taken them all; its focal length and a radial distortion are
-    estimated. Its line of sight is taken to meet the pictures' middle: from a distance that cannot be told from a turn
-    of all cameras, and estimating it made them worse.
+    estimated. Its line of sight is taken to meet the pictures' middle, which from a distance cannot be told from a turn
+    of all cameras, unless some pictures were turned by 180 degrees (`turned_back`).
 
     Args:
         work: keeps features and matches, so that the same call goes on after an interruption; removed at the end.
@@ -123,12 +128,13 @@ def read_photographs(
         )
         step(0.7)
         model = _mapped(database, folder, work / "models", len(names), step)
-    if model is None:
-        raise FormatError(
-            f"{folder}: no {FEWEST} of {len(names)} photographs have enough features in common to find their cameras; "
-            "take more of them, with more overlap, of a textured object"
-        )
-    registered = _registered(model, folder, names)
+        if model is None:
+            raise FormatError(
+                f"{folder}: no {FEWEST} of {len(names)} photographs have enough features in common to find their "
+                "cameras; take more of them, with more overlap, of a textured object"
+            )
+        model, upside_down = turned_back(model, lambda: step(0.95))
+    registered = _registered(model, folder, names, upside_down)
     shutil.rmtree(work)
     return registered
 
@@ -150,7 +156,7 @@ def _mapped(
         nonlocal done, asked
         done += 1
         try:
-            step(min(0.99, 0.7 + 0.3 * done / count))
+            step(min(0.9, 0.7 + 0.2 * done / count))
         except Interrupted as error:  # it must not pass through the library
             asked = error
             stop.cancel()
@@ -163,7 +169,9 @@ def _mapped(
     return max(found.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
 
 
-def _registered(model: "pycolmap.Reconstruction", folder: Path, names: list[str]) -> Registered:
+def _registered(
+    model: "pycolmap.Reconstruction", folder: Path, names: list[str], upside_down: frozenset[str]
+) -> Registered:
     points = np.array([point.xyz for point in model.points3D.values()])
     centre = np.median(points, axis=0)
     metre = float(np.quantile(np.linalg.norm(points - centre, axis=1), RADIUS_SHARE))
@@ -172,7 +180,8 @@ def _registered(model: "pycolmap.Reconstruction", folder: Path, names: list[str]
         if image.has_pose:
             pose = np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
             pose[:3, 3] = (pose[:3, 3] + pose[:3, :3] @ centre) / metre
-            views[image.name] = View(folder / image.name, pose, _intrinsics(model.cameras[image.camera_id]))
+            view = View(folder / image.name, pose, _intrinsics(model.cameras[image.camera_id]))
+            views[image.name] = turned(view) if image.name in upside_down else view
             ranges_m.append(np.linalg.norm(pose[:3, 3]))
     reprojection_px = model.compute_mean_reprojection_error()
     focal_px = next(iter(views.values())).intrinsics.fx_px
@@ -180,7 +189,7 @@ def _registered(model: "pycolmap.Reconstruction", folder: Path, names: list[str]
     left_out = tuple(name for name in names if name not in views)
     in_order = [views[name] for name in names if name in views]
     sigmas = PoseSigmas(sigma_rad, sigma_rad * float(np.median(ranges_m)))
-    return Registered(in_order, left_out, reprojection_px, sigmas)
+    return Registered(in_order, left_out, tuple(sorted(upside_down)), reprojection_px, sigmas)
 
 
 def _intrinsics(camera: "pycolmap.Camera") -> Intrinsics:

@@ -26,10 +26,17 @@ def test_settings_that_no_training_can_have_are_refused(name, value, message):
         preset("obbgs", {name: value})
 
 
-def test_quality_scales_steps_and_size_and_unknown_ones_are_refused():
+def test_quality_scales_steps_and_what_goes_with_them_and_unknown_ones_are_refused():
     standard = preset("obbgs")
     assert changed(standard, quality_changes(standard, "standard")) == standard
-    assert quality_changes(standard, "draft")["steps"] == round(standard.steps / 3)
+    draft = changed(standard, quality_changes(standard, "draft"))
+    assert draft.steps == round(standard.steps / 3)
+    assert draft.growth.max_gaussians == standard.growth.max_gaussians
+    assert draft.steps // draft.growth.interval == standard.steps // standard.growth.interval
+    assert draft.steps // draft.growth.obb_interval == standard.steps // standard.growth.obb_interval
+    assert draft.start.count > standard.start.count
+    published = quality_changes(preset("3dgs"), "draft")
+    assert "growth.obb_interval" not in published  # it does not grow in boxes, and does not begin to
     assert quality_changes(standard, "best")["growth.max_gaussians"] == 3 * standard.growth.max_gaussians
     with pytest.raises(ValueError, match="quality must be one of draft, standard, best"):
         quality_changes(standard, "ultra")
