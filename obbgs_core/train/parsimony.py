@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.model.sh import C0
 from obbgs_core.render import render, weighted_gradient
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check, fraction
@@ -55,49 +54,37 @@ def justified(
     rng: torch.Generator,
 ) -> Tensor:
     """Return which Gaussians [N] gain more likelihood than their BIC penalty, or are opaque and shown by a picture."""
-    gains, values = likelihood_gains(gaussians, batches, sensor, scale, rng)
+    gains, shown_px, values = likelihood_gains(gaussians, batches, sensor, scale, rng)
     kept = gains >= settings.bic_factor * bic_penalty(gaussians, values)
     surface = gaussians.opacities.detach() > settings.keep_above_opacity
-    return kept | (surface & (shown_px(gaussians, batches, scale) > SHOWN_PX))
-
-
-def shown_px(gaussians: Gaussians, batches: Batches, scale: float) -> Tensor:
-    """Return on how many pixels each Gaussian [N] shows in the picture that shows most of it: its summed weights.
-
-    The weight of a Gaussian in a pixel is the share of the pixel's light that is its own where all are equally bright.
-    """
-    white = dataclasses.replace(
-        gaussians.detach().matt(), sh=torch.full((len(gaussians), 1, 1), 1 / C0), shading="view"
-    )
-    white.sh.requires_grad_()
-    most = torch.zeros(len(gaussians))
-    for index in shown_frames(batches):
-        image = render(white, batches.batch([index], scale).cameras).radiance
-        (slope,) = torch.autograd.grad(image.sum(), white.sh)
-        most = torch.maximum(most, slope[:, 0, 0] / C0)
-    return most
+    return kept | (surface & (shown_px > SHOWN_PX))
 
 
 def likelihood_gains(
     gaussians: Gaussians, batches: Batches, sensor: Sensor, scale: float, rng: torch.Generator
-) -> tuple[Tensor, int]:
-    """Return the likelihood gain of each Gaussian [N], nats over all frames, and the number of values above noise.
+) -> tuple[Tensor, Tensor, int]:
+    """Return each Gaussian's likelihood gain and the pixels that show it, and the number of values above noise.
 
-    The gain is what the log-likelihood would lose without the Gaussian. Without Gaussian j the prediction changes by
-    exactly -o_j d(prediction)/d(o_j), because compositing is linear in each opacity; at the optimum the log-likelihood
-    falls by half the sum of that change squared over the noise variance. The sum of squares over pixels is estimated
-    without bias by back-propagating random signs (Hutchinson 1989), one draw a frame.
+    The gain [N], in nats over all frames, is what the log-likelihood would lose without the Gaussian. Without Gaussian
+    j the prediction changes by exactly -o_j d(prediction)/d(o_j), because compositing is linear in each opacity; at the
+    optimum the log-likelihood falls by half the sum of that change squared over the noise variance. The sum of squares
+    over pixels is estimated without bias by back-propagating random signs (Hutchinson 1989), one draw a frame.
+
+    The pixels [N] are those of the picture that shows most of it: the sum of its weights there. Its weight in a pixel
+    is the share of the pixel's light that is its own where all are equally bright.
     """
     model = gaussians.detach()
     model.opacity_logits.requires_grad_()
-    gains, values, times = torch.zeros(len(gaussians)), 0, 0.0
+    gains, shown_px, values, times = torch.zeros(len(model)), torch.zeros(len(model)), 0, 0.0
     for view in _views(model, batches, sensor, scale, rng):
+        (weights,) = torch.autograd.grad(view.radiance[..., 0].sum(), view.added, retain_graph=True)
+        shown_px = torch.maximum(shown_px, weights[0, :, 0])
         slope = weighted_gradient(view.radiance, view.weight * view.signs, model.opacity_logits)
         # o·d/do, from the derivative by the logit
         change = slope / (1 - model.opacities.detach()).clamp(min=1e-6)
         gains += 0.5 * change**2
         values, times = values + view.values, view.times
-    return gains * times, round(values * times)
+    return gains * times, shown_px, round(values * times)
 
 
 def next_degree_gain(
@@ -137,6 +124,7 @@ class _View:
 
     batch: Batch
     radiance: Tensor  # with its graph
+    added: Tensor  # [1, N, C] zero: light of each Gaussian on top of the model's own, to ask what shows it
     # of the radiance, in deviations of the reading; 0 where saturated, because the reading does not depend on it there
     weight: Tensor
     signs: Tensor
@@ -157,7 +145,8 @@ def _views(
     chosen = shown_frames(batches)
     for index in chosen:
         batch = batches.batch([index], scale)
-        radiance = render(model, batch.cameras).radiance
+        added = torch.zeros(1, len(model), model.sh.shape[2], requires_grad=True)
+        radiance = render(model, batch.cameras, added=added).radiance
         prediction = sensor.predicted(radiance.detach(), batch.exposure_time_s)
         sigma_dn = prediction.sigma_dn / math.sqrt(batch.averaged_pixels)
         dn_per_radiance = sensor.dn_per_radiance_s * batch.exposure_time_s
@@ -165,7 +154,7 @@ def _views(
         signs = torch.randint(0, 2, radiance.shape, generator=rng) * 2.0 - 1
         empty_dn = sensor.expected_dn(torch.tensor(batch.cameras.background), batch.exposure_time_s)
         values = int(((prediction.expected_dn - empty_dn).abs() > sigma_dn).sum()) * batch.averaged_pixels
-        yield _View(batch, radiance, weight, signs, values, len(batches.frames) / len(chosen))
+        yield _View(batch, radiance, added, weight, signs, values, len(batches.frames) / len(chosen))
 
 
 def shown_frames(batches: Batches, most: int = VIEWS) -> range:

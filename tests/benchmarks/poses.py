@@ -148,12 +148,20 @@ def independent(seen: Pass, degrees: float, seed: int) -> list[TrainingFrame]:
     return frames
 
 
+def focal(seen: Pass, percent: float) -> list[TrainingFrame]:
+    """Return the frames with exact poses and a focal length that is stated too long."""
+    lens = seen.frames[0].K.clone()
+    lens[[0, 1], [0, 1]] *= 1 + percent / 100
+    return [dataclasses.replace(f, K=lens) for f in seen.frames]
+
+
 CONDITIONS: dict[str, Callable[[Pass, int], list[TrainingFrame]]] = {
     "exact": lambda seen, seed: seen.frames,
     "stated_0.1": lambda seen, seed: stated(seen, 0.1),
     "stated_0.3": lambda seen, seed: stated(seen, 0.3),
     "stated_1": lambda seen, seed: stated(seen, 1.0),
     "stated_3": lambda seen, seed: stated(seen, 3.0),
+    "focal_2": lambda seen, seed: focal(seen, 2.0),
     **{
         name: lambda seen, seed, factor=factor: correlated(seen, factor, seed)
         for name, factor in FACTORS.items()
@@ -206,7 +214,7 @@ def scores(seen: Pass, frames: list[TrainingFrame], result: TrainResult) -> dict
     def clean_db(poses: torch.Tensor) -> float:
         views = []
         for i, pose in zip(held_out, poses, strict=True):
-            frame = dataclasses.replace(seen.frames[i], world_to_camera=pose)
+            frame = dataclasses.replace(seen.frames[i], world_to_camera=pose, K=frames[i].K)
             with torch.no_grad():
                 radiance = render(result.gaussians, cameras_of([frame])).radiance[0]
             pair = (exposed(r, SENSOR, frame.exposure_time_s) for r in (radiance, seen.radiance[i]))

@@ -169,7 +169,7 @@ def test_budget_and_quality_shape_the_training_and_nonsense_is_refused():
     standard = PRESETS["obbgs"]
     assert changes_for("obbgs", "standard", "auto", None)["steps"] == standard.steps
     draft = changes_for("obbgs", "draft", "auto", None)
-    assert draft["steps"] == round(standard.steps / 3) and draft["growth.interval"] < standard.growth.interval
+    assert draft["steps"] < standard.steps / 3 and draft["growth.interval"] < standard.growth.interval
     assert changes_for("obbgs", "draft", "900", None)["start.count"] == 900
     tight = changes_for("obbgs", "best", "900", 50)
     assert tight["growth.max_gaussians"] == tight["start.count"] == 900 and tight["steps"] == 50

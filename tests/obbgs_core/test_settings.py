@@ -30,7 +30,7 @@ def test_quality_scales_steps_and_what_goes_with_them_and_unknown_ones_are_refus
     standard = preset("obbgs")
     assert changed(standard, quality_changes(standard, "standard")) == standard
     draft = changed(standard, quality_changes(standard, "draft"))
-    assert draft.steps == round(standard.steps / 3)
+    assert 0.3 * standard.steps < draft.steps < standard.steps / 3
     assert draft.growth.max_gaussians == standard.growth.max_gaussians
     assert draft.steps // draft.growth.interval == standard.steps // standard.growth.interval
     assert draft.steps // draft.growth.obb_interval == standard.steps // standard.growth.obb_interval
