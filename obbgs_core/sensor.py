@@ -144,15 +144,19 @@ def dark_reading(sensor: Sensor) -> tuple[float, float]:
     return first, math.sqrt(second - first**2)
 
 
-def noise_excess(dn: Tensor, sensor: Sensor) -> float:
-    """Return the deviation of readings dn [H, W, C] of empty sky over the one that the sensor model states for them.
+def noise_excess(dn: Tensor, sensor: Sensor) -> tuple[float, float]:
+    """Return the deviation of readings of empty sky over the stated one, and how much farther readings differ more.
 
-    Differences of neighbouring readings have twice the variance of a reading. Of blocks of 8x8 pixels those with the
-    smaller differences are empty sky, also where the target fills half of the picture or stars are in it. A picture
-    that was smoothed, or has no empty sky, has less or more than 1 for other reasons: only a clear excess says
-    something.
+    Differences of neighbouring readings dn [H, W, C] have twice the variance of a reading. Of blocks of 8x8 pixels
+    those with the smaller differences are empty sky, also where the target fills half of the picture or stars are in
+    it. The second figure is the deviation of readings two pixels apart over that of neighbours in these blocks: 1.03
+    for noise, more where the picture was smoothed or compressed, infinite where it has no noise.
     """
-    squares = dn.diff(dim=1).square().mean(dim=2)[None]
-    blocks = F.avg_pool2d(squares, min(BLOCK_PX, *squares.shape[1:]))
-    variance = 0.5 * blocks.flatten().quantile(SKY_BLOCKS).item()
-    return math.sqrt(variance) / dark_reading(sensor)[1]
+    squares = [
+        (dn[:, lag:] - dn[:, :-lag])[:, : dn.shape[1] - 2].square().mean(dim=2)[None] for lag in (1, 2)
+    ]
+    near, far = (F.avg_pool2d(s, min(BLOCK_PX, *s.shape[1:])).flatten() for s in squares)
+    quietest = near.quantile(SKY_BLOCKS)
+    sky = near <= quietest
+    farther = (far[sky].mean() / near[sky].mean()).sqrt().nan_to_num(nan=torch.inf).item()
+    return math.sqrt(0.5 * quietest.item()) / dark_reading(sensor)[1], farther

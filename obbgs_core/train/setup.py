@@ -40,8 +40,9 @@ from obbgs_core.train.windows import windows
 
 log = logging.getLogger(__name__)
 NOISE_FRAMES = 12  # about so many, spread evenly, by which the noise is measured
-# of the scatter of empty sky over that of the sensor model; frames that fit it have 0.93 to 0.97
+# of the scatter of empty sky over that of the sensor model, or the reverse; frames that fit it have 0.93 to 0.97
 CLEAR_EXCESS = 1.3
+UNSMOOTHED = 1.1  # ratio of the scatter of pixels two apart to that of neighbours; noise has 1.02 to 1.05
 EXACT_TAGS = "as tagged (the tags are exact)"
 TOO_FEW_BRACKETS = "as tagged (too few brackets for validation)"
 UNTESTED = ("", EXACT_TAGS, TOO_FEW_BRACKETS)  # of poses whose refinement no validation brackets have decided
@@ -175,20 +176,23 @@ def prepare(
 
 
 def _with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Sensor, str]:
-    """Return the sensor with no less read noise than empty sky shows, and in words what was changed, if anything.
+    """Return the sensor with the read noise that empty sky shows, and in words what was changed, if anything.
 
-    With less than there is, noise would count as light: there would be no empty sky, and no hull.
+    With less than there is, noise would count as light: there would be no empty sky, and no hull. With more, faint
+    parts of the target would count as noise. Smoothed pictures scatter less too, but their nearest neighbours most.
     """
     shown = frames[:: max(1, len(frames) // NOISE_FRAMES)]
-    excess = statistics.median(noise_excess(frame.dn, sensor) for frame in shown)
-    if not excess > CLEAR_EXCESS:
+    ratios, farther = zip(*(noise_excess(frame.dn, sensor) for frame in shown), strict=True)
+    excess = statistics.median(ratios)
+    too_much = excess < 1 / CLEAR_EXCESS and statistics.median(farther) < UNSMOOTHED
+    if not (excess > CLEAR_EXCESS or too_much):
         return sensor, ""
     seen = dataclasses.replace(
         sensor, read_noise_dn=excess * sensor.variance_dn2(torch.tensor(sensor.black_dn)).sqrt().item()
     )
     changed = (
         f"read noise taken as {seen.read_noise_dn:.2f} DN instead of the stated {sensor.read_noise_dn:.2f} DN: "
-        f"empty sky scatters {excess:.1f} times as much as that"
+        f"empty sky scatters {excess:.2g} times as much as that"
     )
     log.warning(changed)
     return seen, f"; {changed}"

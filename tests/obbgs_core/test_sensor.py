@@ -7,9 +7,11 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import uniform_filter
 
 from obbgs_core.sensor import Sensor, clipped_mean, noise_excess
 from obbgs_core.train.presets import preset
+from obbgs_core.train.setup import UNSMOOTHED
 from obbgs_core.train.trainer import Trainer
 from tests import scenes
 
@@ -91,11 +93,16 @@ def test_the_scatter_of_empty_sky_says_by_how_much_stated_noise_is_too_small(bla
     dn = torch.from_numpy(read.astype(np.float32))
     for stated, expected in ((8.0, 1.0), (4.0, 2.0), (16.0, 0.5)):
         sensor = dataclasses.replace(SENSOR, black_dn=black_dn, read_noise_dn=stated)
-        assert noise_excess(dn, sensor) == pytest.approx(expected, rel=0.12)
+        excess, farther = noise_excess(dn, sensor)
+        assert excess == pytest.approx(expected, rel=0.12)
+        assert farther < UNSMOOTHED - 0.03
+    smoothed = torch.from_numpy(uniform_filter(read, (2, 2, 1)).astype(np.float32))
+    assert noise_excess(smoothed, sensor)[1] > UNSMOOTHED + 0.1
+    assert noise_excess(torch.from_numpy(black_dn + signal).float(), sensor)[1] == torch.inf
 
 
-@pytest.mark.parametrize(("stated_dn", "changed"), [(3.0, False), (1.0, True), (6.0, False)])
-def test_a_training_takes_no_less_noise_than_empty_sky_shows(stated_dn, changed, caplog):
+@pytest.mark.parametrize(("stated_dn", "changed"), [(3.0, False), (1.0, True), (6.0, True)])
+def test_a_training_takes_the_noise_that_empty_sky_shows(stated_dn, changed, caplog):
     frames = scenes.photographed(scenes.target(40), 18)
     stated = dataclasses.replace(scenes.SENSOR, read_noise_dn=stated_dn)
     trainer = Trainer(frames[:12], stated, preset("obbgs", {"steps": 10}))
@@ -106,3 +113,12 @@ def test_a_training_takes_no_less_noise_than_empty_sky_shows(stated_dn, changed,
         assert setup.sensor.read_noise_dn == pytest.approx(scenes.SENSOR.read_noise_dn, rel=0.15)
     else:
         assert setup.sensor == stated
+
+
+def test_pictures_that_were_smoothed_do_not_say_how_much_noise_there_was():
+    frames = [
+        dataclasses.replace(f, dn=torch.from_numpy(uniform_filter(f.dn.numpy(), (2, 2, 1))))
+        for f in scenes.photographed(scenes.target(40), 12)
+    ]
+    setup = Trainer(frames, scenes.SENSOR, preset("obbgs", {"steps": 10})).setup
+    assert setup.sensor == scenes.SENSOR and "read noise" not in setup.start
