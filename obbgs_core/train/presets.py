@@ -151,7 +151,7 @@ def preset(name: str, changes: dict[str, Any] | None = None) -> MethodConfig:
     return changed(config, changes or {})
 
 
-QUALITIES = {"draft": 0.32, "standard": 1.0, "best": 3.0}  # factor on the method's own steps
+QUALITIES = {"draft": 0.33, "standard": 1.0, "best": 3.0}  # factor on the method's own steps
 DRAFT_POINTS = 2  # times as many first points in a draft, which has no time to grow (experiment 062)
 
 
