@@ -145,11 +145,11 @@ def dark_reading(sensor: Sensor) -> tuple[float, float]:
 
 
 def noise_excess(dn: Tensor, sensor: Sensor) -> tuple[float, float]:
-    """Return the deviation of readings of empty sky over the stated one, and how much farther readings differ more.
+    """Return the scatter of empty sky over the stated one, and that of readings two apart over that of neighbours.
 
     Differences of neighbouring readings dn [H, W, C] have twice the variance of a reading. Of blocks of 8x8 pixels
     those with the smaller differences are empty sky, also where the target fills half of the picture or stars are in
-    it. The second figure is the deviation of readings two pixels apart over that of neighbours in these blocks: 1.03
+    it. The second figure is the deviation of differences two pixels apart over that of neighbours in these blocks: 1.03
     for noise, more where the picture was smoothed or compressed, infinite where it has no noise.
     """
     squares = [
