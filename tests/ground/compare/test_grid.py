@@ -20,6 +20,7 @@ from ground.compare.grid import Budget, cells_of, parse_budgets, session_facts
 from ground.compare.methods import method
 from ground.compare.rows import Rows, locked
 from obbgs_core.sensor import Sensor
+from obbgs_core.train.presets import preset, quality_changes
 from tests.benchmarks import targets
 from tests.small_sessions import small_session
 
@@ -262,6 +263,11 @@ def test_the_grids_of_the_benchmarks_are_conditions(path):
     assert next(iter(conditions.values())) == Condition()  # what the others are compared with stands first
     for condition in conditions.values():
         assert dataclasses.replace(method("obbgs")).settable or not condition.set
+
+
+def test_the_grid_of_qualities_has_the_settings_of_a_draft():
+    draft = load_conditions(GRIDS / "quality.yaml")["draft"]
+    assert dict(draft.set) == quality_changes(preset("obbgs"), "draft")
 
 
 def test_rows_are_whole_and_a_half_line_is_cut_off(tmp_path):
