@@ -39,3 +39,9 @@ def test_budgets_stand_on_lines_of_their_own_where_rows_differ_in_them(tmp_path)
 def test_the_committed_page_is_made_of_the_committed_rows():
     page = rows.FOLDER / "RESULTS.md"
     assert page.read_text() == rows.page(sorted(rows.FOLDER.glob("*.jsonl")))
+
+
+def test_no_row_stands_twice():
+    for file in rows.FOLDER.glob("*.jsonl"):
+        lines = file.read_text().splitlines()
+        assert len(set(lines)) == len(lines), f"{file.name} has a row twice"
