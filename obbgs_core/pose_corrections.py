@@ -1,5 +1,6 @@
 """Corrections of the poses of a pass: few parameters that all frames share, and six small numbers for each bracket."""
 
+import copy
 import dataclasses
 import math
 
@@ -144,12 +145,15 @@ class PoseCorrections:
         normal = self._normal_equations(extra, reach_m)
         all_shared, own = normal.solution()
         shared, others = all_shared.split([self.by_shared.shape[2], 0 if extra is None else extra.shape[2]])
-        if shared.numel():
-            change = torch.zeros(SIZE, dtype=torch.float64)
-            change[self.free] = self.sigmas[self.free] * shared
-            self._move_shared(frames, self.shared + change)
+        self._change_shared(frames, shared)
         self.value = times(self.whitening.support, self.value + own.float())
         return others, normal.shifts(all_shared, own) if isinstance(normal, ReducedEquations) else None
+
+    def changed(self, frames: list[TrainingFrame], by: Tensor) -> "PoseCorrections":
+        """Return the corrections with the free shared parameters [S] changed by so many prior deviations."""
+        other = copy.copy(self)
+        other._change_shared(frames, by)
+        return other
 
     def body_motions(self) -> Tensor:
         """Return how frames see small motions of the whole body [F, 6, 7], as motions of their cameras.
@@ -241,6 +245,13 @@ class PoseCorrections:
             own_posterior=(root @ own @ root.mT).diagonal(dim1=1, dim2=2).clamp(min=0).sqrt().numpy(),
         )
 
+    def _change_shared(self, frames: list[TrainingFrame], deviations: Tensor) -> None:
+        """Change the shared parameters that are free by [S] prior deviations."""
+        if deviations.numel():
+            change = torch.zeros(SIZE, dtype=torch.float64)
+            change[self.free] = self.sigmas[self.free] * deviations
+            self._move_shared(frames, self.shared + change)
+
     def _move_shared(self, frames: list[TrainingFrame], shared: Tensor) -> None:
         """Set the shared parameters, and what they make of the tags."""
         motion, at = motion_of(frames), SharedParameters.of(shared.numpy())
@@ -268,10 +279,7 @@ class PoseCorrections:
             log_scale += float(motion[6])
             whole = rigid @ whole
             target = target @ torch.linalg.inv(rigid)
-            if shared.numel():
-                change = torch.zeros(SIZE, dtype=torch.float64)
-                change[self.free] = self.sigmas[self.free] * shared
-                self._move_shared(frames, self.shared + change)
+            self._change_shared(frames, shared)
             left, before = motion_vectors(target @ torch.linalg.inv(self.moved)), self.value
             self.value = times(self.whitening.inverse, self._bracket_means(left)).float()
             if max([*(self.value - before).abs().flatten(), *shared.abs()]) < SETTLED:

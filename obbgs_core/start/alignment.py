@@ -1,6 +1,5 @@
 """The first poses: as tagged where the silhouettes agree with the tags, else moved to where the silhouettes agree."""
 
-import dataclasses
 import logging
 import math
 
@@ -12,11 +11,14 @@ from obbgs_core.model.motions import cross_matrices
 from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.registration import PoseInformation, point_flow
 from obbgs_core.start import hull
+from obbgs_core.start.silhouette_coherence import coherence, most_coherent, seen_from
 
 log = logging.getLogger(__name__)
 MOST_DILATION_PX = 8  # of a silhouette, for pose errors
 CENTRE_SIGMA = 0.1  # of a silhouette's centre about the projection of one point of the body, over its radius
 ROUNDS = 12  # of aligning the silhouettes' centres; the problem is nearly linear
+# for the most coherent hull, each from where the last one ended; what is linear there is not so far away
+SEARCHES = 3
 # the aligned poses are taken if they leave at most this share of the light that is not covered as tagged
 BETTER = 0.7
 OFFSET = 0.3  # of the silhouettes' radius: deviation of their common point from the body's origin
@@ -43,20 +45,24 @@ def settled(
     errors_px = {i: _error_px(frames[i], poses.covariances[i]) for i in outlines}
     if max(errors_px.values()) == 0 or not any(o.certain.any() for o in outlines.values()):
         return outlines, None, ""
-    tagged = _coherence(outlines)
+    tagged = coherence(outlines)
     if tagged >= hull.AGREEMENT:
         return outlines, None, ""
     if may_move:
         moved, left_px = _aligned(frames, outlines)
-        at = moved.corrected(list(outlines))
-        aligned = {
-            i: dataclasses.replace(o, world_to_camera=p)
-            for (i, o), p in zip(outlines.items(), at, strict=True)
-        }
-        coherence = _coherence(aligned)
-        why = f"the hull covers {tagged:.3f} of the light as tagged, {coherence:.3f} with aligned silhouettes"
+        aligned = seen_from(outlines, moved)
+        reached = coherence(aligned)
+        for _ in range(SEARCHES):
+            if reached >= hull.AGREEMENT:
+                break
+            searched = most_coherent(frames, outlines, moved)
+            again = seen_from(outlines, searched)
+            if (better := coherence(again)) <= reached:
+                break
+            moved, aligned, reached = searched, again, better
+        why = f"the hull covers {tagged:.3f} of the light as tagged, {reached:.3f} with aligned silhouettes"
         log.info(why)
-        if 1 - coherence < BETTER * (1 - tagged):
+        if 1 - reached < BETTER * (1 - tagged):
             most = min(MOST_DILATION_PX, max(1, round(left_px)))
             return grown(aligned, dict.fromkeys(aligned, most)), moved, why
     return grown(outlines, errors_px), None, ""
@@ -91,23 +97,11 @@ def grown(outlines: dict[int, hull.Silhouette], errors_px: dict[int, int]) -> di
     most = max(errors_px.values())
     for reach_px in [r for r in (0, 1, 2, 4) if r < most]:
         reached = {i: s.dilated(min(reach_px, errors_px[i])) for i, s in outlines.items()}
-        coherence = _coherence(outlines, reached)
-        log.info("silhouettes grown by %d px of at most %d: coherence %.3f", reach_px, most, coherence)
-        if coherence >= hull.AGREEMENT:
+        agreement = coherence(outlines, reached)
+        log.info("silhouettes grown by %d px of at most %d: coherence %.3f", reach_px, most, agreement)
+        if agreement >= hull.AGREEMENT:
             return reached
     return {i: s.dilated(errors_px[i]) for i, s in outlines.items()}
-
-
-def _coherence(
-    outlines: dict[int, hull.Silhouette], reached: dict[int, hull.Silhouette] | None = None
-) -> float:
-    """Return the coherence of the hull of silhouettes, grown or as they are, with the silhouettes as they are."""
-    carving = list((reached or outlines).values())
-    radius = hull.radius_m(list(outlines.values()))
-    if radius == 0:
-        return 0.0
-    points, voxel_m = hull.hull_points(carving, radius)
-    return hull.coherence(list(outlines.values()), points, voxel_m)
 
 
 def _aligned(

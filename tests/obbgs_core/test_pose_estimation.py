@@ -24,8 +24,9 @@ from obbgs_core.registration import CellShifts, pose_information
 from obbgs_core.render import render
 from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.score.poses import best_motion, moved, pose_errors, seen_after, settled_poses, size_of
-from obbgs_core.start.alignment import settled
+from obbgs_core.start.alignment import _aligned, settled
 from obbgs_core.start.initialisation import silhouettes
+from obbgs_core.start.silhouette_coherence import coherence, most_coherent, seen_from
 from obbgs_core.train import decisions
 from obbgs_core.train.parsimony import justified
 from obbgs_core.train.poses import HELD_AT, HELD_FROM, HOLDS
@@ -375,6 +376,26 @@ def test_silhouettes_are_aligned_also_where_tags_have_the_target_behind_the_came
     assert poses is not None, why
     aligned = errors(poses.corrected(list(range(len(true)))), true)
     assert aligned.pixels < 1  # where a silhouette's centre lies about the one point that is taken for it
+
+
+def _times(by: SharedParameters, factor: float) -> SharedParameters:
+    return SharedParameters.of(factor * by.vector())
+
+
+@pytest.mark.parametrize("factor, searched", [(1, False), (10, True)])
+def test_what_the_silhouettes_centres_leave_open_is_where_the_hull_is_most_coherent(factor, searched):
+    true, motion = a_pass()
+    wrong = tagged(true, displaced_motion(motion, _times(ERRORS, factor)))
+    stated = [dataclasses.replace(f.navigation, sigmas=_times(SIGMAS, factor)) for f in wrong]
+    wrong = [dataclasses.replace(f, navigation=n) for f, n in zip(wrong, stated, strict=True)]
+    outlines = silhouettes(wrong, SENSOR)
+    aligned, _ = _aligned(wrong, outlines)
+    found = most_coherent(wrong, outlines, aligned)
+    assert (found is not aligned) == searched
+    before, after = (errors(p.corrected(list(range(len(true)))), true) for p in (aligned, found))
+    if searched:
+        assert coherence(seen_from(outlines, found)) > coherence(seen_from(outlines, aligned))
+        assert after.pixels < 0.75 * before.pixels and after.rotation_deg < 0.75 * before.rotation_deg
 
 
 def test_frames_that_were_not_trained_on_follow_the_estimate(erring):
