@@ -21,7 +21,7 @@ FEWEST_PX = (
 )
 VIEWS = 24  # about so many silhouettes, spread evenly, by which the search compares hulls
 TRIALS = 40  # hulls of a search
-FIRST_STEP = 0.5  # deviations
+FIRST_STEP, LAST_STEP = 0.5, 0.05  # deviations
 
 
 def coherence(
@@ -72,7 +72,7 @@ def most_coherent(
         return 1 - coherence(seen_from(compared, moved(by)))
 
     corners = np.concatenate([np.zeros((1, count)), FIRST_STEP * np.eye(count)])
-    options = {"initial_simplex": corners, "maxfev": TRIALS}
+    options = {"initial_simplex": corners, "maxfev": TRIALS, "xatol": LAST_STEP, "fatol": math.inf}
     found = minimize(incoherence, corners[0], method="Nelder-Mead", options=options)
     log.info(
         "moved by %s deviations of what the silhouettes' centres leave open",
