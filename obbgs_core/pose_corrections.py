@@ -128,7 +128,11 @@ class PoseCorrections:
         self.cell_m = 0.0
 
     def step(
-        self, frames: list[TrainingFrame], extra: Tensor | None = None, reach_m: float | None = None
+        self,
+        frames: list[TrainingFrame],
+        extra: Tensor | None = None,
+        reach_m: float | None = None,
+        together: bool = False,
     ) -> tuple[Tensor, CellShifts | None]:
         """Move all corrections to the minimum of what was gathered plus their priors.
 
@@ -138,11 +142,14 @@ class PoseCorrections:
         Args:
             extra: [F, 6, E] motions by further parameters of unit variance that are to be estimated along.
             reach_m: prior deviation of the shift of a cell; None: its edge.
+            together: whether the surface will follow, so that `together` is what this step leaves open.
 
         Returns:
             The change of the further parameters [E] from zero, and where the surface's cells go.
         """
         normal = self._normal_equations(extra, reach_m)
+        if together:
+            self.together = self._covariances(normal)
         all_shared, own = normal.solution()
         shared, others = all_shared.split([self.by_shared.shape[2], 0 if extra is None else extra.shape[2]])
         self._change_shared(frames, shared)
@@ -212,7 +219,10 @@ class PoseCorrections:
         They follow from what was gathered. Where its pictures told of the surface's cells, what moves poses and surface
         together counts as not known.
         """
-        shared, own = self._normal_equations(self.body_motions() if self.cells else None).covariances()
+        return self._covariances(self._normal_equations(self.body_motions() if self.cells else None))
+
+    def _covariances(self, normal: NormalEquations | ReducedEquations) -> tuple[Tensor, Tensor]:
+        shared, own = normal.covariances()
         size = self.by_shared.shape[2]
         return shared[:size, :size], own
 

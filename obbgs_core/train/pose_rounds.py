@@ -78,11 +78,8 @@ def move(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
         _leave_out(setup, state, [shown[i] for i in torch.nonzero(standing_out(*residuals))[:, 0].tolist()])
     share = setup.config.moment(turn).share
     along = state.poses_aligned and share < SURFACE_UNTIL
-    if along:
-        poses.together = poses.left_open()
-    motion, shifts = poses.step(
-        setup.frames, poses.body_motions(), cell_m(setup) if along else reach_m(setup, share)
-    )
+    reach = cell_m(setup) if along else reach_m(setup, share)
+    motion, shifts = poses.step(setup.frames, poses.body_motions(), reach, together=along)
     poses.clear()
     gaussians = state.gaussians.detach()
     if shifts is not None and along:

@@ -390,7 +390,7 @@ def lambertian_session(folder, mission: Mission, brackets: int) -> list[Frame]:
     for i, (pose, sun) in enumerate(views(3 * brackets, brackets_of=3)):
         dn = read_out(lambertian_ellipsoids(pose, sun), EXPOSURES_S[i % 3], rng).astype(np.uint16)
         position = -pose[:3, :3].T @ pose[:3, 3]
-        tag = PoseTag(matrix_to_quat(pose[:3, :3]), position, np.eye(6) * 1e-12, sun, False, True)
+        tag = PoseTag(matrix_to_quat(pose[:3, :3]), position, np.zeros((6, 6)), sun, False, True)
         time_ns = 1_784_631_150_000_000_000 + i * 10**9
         frame = Frame(i, i // 3, i % 3, 3, EXPOSURES_S[i % 3], time_ns, tag, dn, 12, 64.0, 0)
         writer.add(frame, encode_frame(frame))
