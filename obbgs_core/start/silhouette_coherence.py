@@ -17,7 +17,7 @@ from obbgs_core.start import hull
 log = logging.getLogger(__name__)
 DIRECTIONS = 3  # at most, of the shared parameters, in which the most coherent hull is searched
 FEWEST_PX = (
-    1.0  # by which a direction moves the target's image (root mean square, one deviation) to be searched
+    1.0  # root mean square by which a deviation along a direction moves the image, for it to be searched
 )
 VIEWS = 24  # about so many silhouettes, spread evenly, by which the search compares hulls
 TRIALS = 40  # hulls of a search
@@ -90,9 +90,11 @@ def _open_directions(
     points = radius_m * torch.cat([torch.eye(3), -torch.eye(3)]).double()
     at = poses.corrected(list(range(len(frames)))).double()
     seen = points @ at[:, :3, :3].mT + at[:, None, :3, 3]
-    K = torch.stack([frame.K for frame in frames]).double()
-    flow = torch.cat([point_flow(point, K) for point in seen.unbind(1)], dim=1)  # [F, 2 * 6, 6] px
-    by_shared, by_body = ((flow @ motion).flatten(0, 1) for motion in (poses.by_shared, poses.body_motions()))
+    ahead = (seen[..., 2] > 0).all(dim=1)  # poses that err may have the target beside or behind the camera
+    K = torch.stack([frame.K for frame in frames]).double()[ahead]
+    flow = torch.cat([point_flow(point, K) for point in seen[ahead].unbind(1)], dim=1)  # [A, 2 * 6, 6] px
+    motions = poses.by_shared[ahead], poses.body_motions()[ahead]
+    by_shared, by_body = ((flow @ motion).flatten(0, 1) for motion in motions)
     body, _ = torch.linalg.qr(by_body)
     root = torch.linalg.cholesky(covariance)
     by_deviation = by_shared @ root

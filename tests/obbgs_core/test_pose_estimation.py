@@ -372,7 +372,10 @@ def test_silhouettes_are_aligned_also_where_tags_have_the_target_behind_the_came
     ]
     depths_m = torch.stack([f.world_to_camera[2, 3] for f in wrong])
     assert depths_m.min() < -20 and depths_m.max() > 20
-    _, poses, why = settled(wrong, silhouettes(wrong, SENSOR), may_move=True)
+    outlines = silhouettes(wrong, SENSOR)
+    as_tagged = most_coherent(wrong, outlines, PoseCorrections(wrong))  # and no hull is searched for nothing
+    assert as_tagged.corrected(list(range(len(wrong)))).isfinite().all()
+    _, poses, why = settled(wrong, outlines, may_move=True)
     assert poses is not None, why
     aligned = errors(poses.corrected(list(range(len(true)))), true)
     assert aligned.pixels < 1  # where a silhouette's centre lies about the one point that is taken for it
