@@ -142,7 +142,7 @@ class PoseCorrections:
         Args:
             extra: [F, 6, E] motions by further parameters of unit variance that are to be estimated along.
             reach_m: prior deviation of the shift of a cell; None: its edge.
-            together: whether the surface will follow, so that `together` is what this step leaves open.
+            together: whether the surface goes along; what this step leaves open is kept as `together` then.
 
         Returns:
             The change of the further parameters [E] from zero, and where the surface's cells go.
@@ -222,6 +222,7 @@ class PoseCorrections:
         return self._covariances(self._normal_equations(self.body_motions() if self.cells else None))
 
     def _covariances(self, normal: NormalEquations | ReducedEquations) -> tuple[Tensor, Tensor]:
+        """Return the covariances as `left_open` does, without those of further parameters."""
         shared, own = normal.covariances()
         size = self.by_shared.shape[2]
         return shared[:size, :size], own

@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 MOST_DILATION_PX = 8  # of a silhouette, for pose errors
 CENTRE_SIGMA = 0.1  # of a silhouette's centre about the projection of one point of the body, over its radius
 ROUNDS = 12  # of aligning the silhouettes' centres; the problem is nearly linear
-# for the most coherent hull, each from where the last one ended; what is linear there is not so far away
+# for the most coherent hull, each from where the last one ended, with directions that are right there
 SEARCHES = 3
 # the aligned poses are taken if they leave at most this share of the light that is not covered as tagged
 BETTER = 0.7
@@ -50,22 +50,33 @@ def settled(
         return outlines, None, ""
     if may_move:
         moved, left_px = _aligned(frames, outlines)
-        aligned = seen_from(outlines, moved)
-        reached = coherence(aligned)
-        for _ in range(SEARCHES):
-            if reached >= hull.AGREEMENT:
-                break
-            searched = most_coherent(frames, outlines, moved)
-            again = seen_from(outlines, searched)
-            if (better := coherence(again)) <= reached:
-                break
-            moved, aligned, reached = searched, again, better
+        moved, aligned, reached = _searched(frames, outlines, moved)
         why = f"the hull covers {tagged:.3f} of the light as tagged, {reached:.3f} with aligned silhouettes"
         log.info(why)
         if 1 - reached < BETTER * (1 - tagged):
             most = min(MOST_DILATION_PX, max(1, round(left_px)))
             return grown(aligned, dict.fromkeys(aligned, most)), moved, why
     return grown(outlines, errors_px), None, ""
+
+
+def _searched(
+    frames: list[TrainingFrame], outlines: dict[int, hull.Silhouette], poses: PoseCorrections
+) -> tuple[PoseCorrections, dict[int, hull.Silhouette], float]:
+    """Return aligned poses, or ones of a more coherent hull if theirs is not coherent, silhouettes and coherence."""
+    aligned = seen_from(outlines, poses)
+    reached = coherence(aligned)
+    for _ in range(SEARCHES):
+        if reached >= hull.AGREEMENT:
+            break
+        found = most_coherent(frames, outlines, poses)
+        if found is poses:  # the centres leave nothing open
+            break
+        again = seen_from(outlines, found)
+        better = coherence(again)
+        if better <= reached:
+            break
+        poses, aligned, reached = found, again, better
+    return poses, aligned, reached
 
 
 def centred(frames: list[TrainingFrame], outlines: dict[int, hull.Silhouette]) -> list[TrainingFrame]:

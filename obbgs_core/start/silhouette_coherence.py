@@ -16,9 +16,7 @@ from obbgs_core.start import hull
 
 log = logging.getLogger(__name__)
 DIRECTIONS = 3  # at most, of the shared parameters, in which the most coherent hull is searched
-FEWEST_PX = (
-    1.0  # root mean square by which a deviation along a direction moves the image, for it to be searched
-)
+FEWEST_PX = 1.0  # root mean square motion of the image, per deviation, that makes a direction worth it
 VIEWS = 24  # about so many silhouettes, spread evenly, by which the search compares hulls
 TRIALS = 40  # hulls of a search
 FIRST_STEP, LAST_STEP = 0.5, 0.05  # deviations
@@ -58,6 +56,9 @@ def most_coherent(
     Args:
         outlines: silhouettes of some of the frames, by index.
         poses: aligned by the silhouettes' centres, with what was gathered of these.
+
+    Returns:
+        Other corrections, or `poses` itself where the centres leave nothing open.
     """
     directions = _open_directions(frames, outlines, poses)  # [S, D]
     count = directions.shape[1]

@@ -26,7 +26,7 @@ from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.score.poses import best_motion, moved, pose_errors, seen_after, settled_poses, size_of
 from obbgs_core.start.alignment import _aligned, settled
 from obbgs_core.start.initialisation import silhouettes
-from obbgs_core.start.silhouette_coherence import coherence, most_coherent, seen_from
+from obbgs_core.start.silhouette_coherence import _open_directions, coherence, most_coherent, seen_from
 from obbgs_core.train import decisions
 from obbgs_core.train.parsimony import justified
 from obbgs_core.train.poses import HELD_AT, HELD_FROM, HOLDS
@@ -372,10 +372,7 @@ def test_silhouettes_are_aligned_also_where_tags_have_the_target_behind_the_came
     ]
     depths_m = torch.stack([f.world_to_camera[2, 3] for f in wrong])
     assert depths_m.min() < -20 and depths_m.max() > 20
-    outlines = silhouettes(wrong, SENSOR)
-    as_tagged = most_coherent(wrong, outlines, PoseCorrections(wrong))  # and no hull is searched for nothing
-    assert as_tagged.corrected(list(range(len(wrong)))).isfinite().all()
-    _, poses, why = settled(wrong, outlines, may_move=True)
+    _, poses, why = settled(wrong, silhouettes(wrong, SENSOR), may_move=True)
     assert poses is not None, why
     aligned = errors(poses.corrected(list(range(len(true)))), true)
     assert aligned.pixels < 1  # where a silhouette's centre lies about the one point that is taken for it
@@ -399,6 +396,15 @@ def test_what_the_silhouettes_centres_leave_open_is_where_the_hull_is_most_coher
     if searched:
         assert coherence(seen_from(outlines, found)) > coherence(seen_from(outlines, aligned))
         assert after.pixels < 0.75 * before.pixels and after.rotation_deg < 0.75 * before.rotation_deg
+
+
+def test_a_target_beside_the_camera_says_nothing_of_what_the_centres_leave_open(erring):
+    _, wrong = erring
+    poses, outlines = PoseCorrections(wrong), silhouettes(wrong, SENSOR)
+    assert _open_directions(wrong, outlines, poses).shape[1] > 0
+    poses.moved[0] = torch.eye(4)
+    poses.moved[0, 0, 3] = 5.0  # in the plane of the camera, where the flow of a point has a pole
+    assert _open_directions(wrong, outlines, poses).isfinite().all()
 
 
 def test_frames_that_were_not_trained_on_follow_the_estimate(erring):
