@@ -1,6 +1,7 @@
 """What several packages' tests need: a mission and frames for it."""
 
 import fcntl
+import gc
 import importlib.util
 import os
 import tempfile
@@ -23,6 +24,20 @@ os.environ.setdefault(
 )  # before torch: threads that spin are 20 times slower on busy cores
 hypothesis.settings.register_profile("obbgs", deadline=None)  # timings live in benchmarks
 hypothesis.settings.load_profile("obbgs")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Import everything without the garbage collector, and let it pass over all that in the tests.
+
+    Imports make objects by the million and hardly any garbage, and looking through them took seconds in each worker.
+    """
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.fixture

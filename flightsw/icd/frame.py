@@ -306,6 +306,8 @@ def _frame_from(fields: tuple, codestream: bytes, pixel_crc: int) -> Frame:
     dn = decode_pixels(codestream, (height, width, channels))
     if _pixel_crc(dn) != pixel_crc:
         raise CrcMismatch("the decoded pixels do not fit their CRC-32")
+    if not np.isfinite(numbers).all():  # before any sum: NumPy warns of a signalling NaN
+        raise PacketError(f"frame {frame_id}: a number of the pose is not finite")
     covariance = np.zeros((6, 6))
     covariance[TRIANGLE] = numbers[10:31]
     covariance = covariance + np.tril(covariance, -1).T

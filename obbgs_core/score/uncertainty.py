@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy import optimize, stats
+from scipy import optimize, special  # not scipy.stats: importing it takes half a second
 from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame, cameras_of
@@ -80,7 +80,7 @@ class Calibration:
 
     def half_width(self, deviation: Tensor, share: float = 0.9) -> Tensor:
         """Return half the width of the interval about a prediction that holds the true value with this probability."""
-        return float(stats.t.ppf((1 + share) / 2, self.degrees)) * self.scale * deviation
+        return float(special.stdtrit(self.degrees, (1 + share) / 2)) * self.scale * deviation
 
     def half_width_read(self, deviation: Tensor, noise: Tensor, share: float = 0.9) -> Tensor:
         """Return the same of an interval that holds a reading: the model's error and the sensor's noise together."""
@@ -96,9 +96,12 @@ class Calibration:
         return longest
 
     def variances(self) -> Tensor:
-        """Return the variances of normal distributions whose mean is the Student distribution of scale 1, float64."""
+        """Return the variances of normal distributions whose mean is the Student distribution of scale 1, float64.
+
+        They are quantiles of the inverse gamma distribution.
+        """
         quantiles, half = (np.arange(MIXTURE) + 0.5) / MIXTURE, self.degrees / 2
-        return torch.from_numpy(stats.invgamma.ppf(quantiles, half, scale=half))
+        return torch.from_numpy(half * (1 / special.gammainccinv(half, quantiles)))
 
 
 def parameter_deviations(

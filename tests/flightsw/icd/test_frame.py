@@ -1,5 +1,6 @@
 """The frame container: exact both ways, and nothing damaged or hostile accepted."""
 
+import contextlib
 import dataclasses
 import struct
 import zlib
@@ -115,6 +116,19 @@ def test_hostile_container_with_fitting_crc_decodes_or_raises_packet_error(make_
     except PacketError:
         return
     assert frame.dn.shape == (12, 12)
+
+
+@pytest.mark.parametrize(
+    "pattern", ["7ff0000000000001", "7ff8000000000000", "7ff0000000000000", "7fefffffffffffff"]
+)
+def test_no_number_of_a_container_is_too_strange(make_frame, pattern):
+    """A signalling NaN, a quiet one, infinity and the largest number, of which NumPy would warn in a sum or square."""
+    container = encode_frame(make_frame(2, size_px=12))
+    first = HEADER.size - 8 - 36 * 8
+    for place in range(first, HEADER.size - 8, 8):
+        body = container[:place] + bytes.fromhex(pattern) + container[place + 8 : -4]
+        with contextlib.suppress(PacketError):
+            decode_frame(sealed(body))
 
 
 @given(st.binary(max_size=600))
