@@ -144,7 +144,8 @@ def set_up(samples, ambient):
     """Set up Cycles, the Sun, Earthshine and the camera of the scene."""
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
-    scene.render.threads_mode, scene.render.threads = "FIXED", 1
+    # not 1: then a thread of TBB (2021) spins from the first picture on, also while nothing is asked for
+    scene.render.threads_mode, scene.render.threads = "FIXED", 2
     scene.render.film_transparent = True
     scene.render.use_compositing = scene.render.use_sequencer = False
     scene.render.use_persistent_data = True  # the ray tracing tree of the mesh is built once
@@ -327,13 +328,12 @@ def visible(request):
         points, centres = given["points"], given["centres"]
     lift_m = 1e-4 * float(np.ptp(v, axis=0).max())
     seen = np.zeros(len(points), dtype=bool)
-    for i, point in enumerate(points):
-        directions = centres - point
+    for centre in centres:
+        hidden = np.flatnonzero(~seen)
+        directions = centre - points[hidden]
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        for direction in directions:
-            if tree.ray_cast(Vector(point + lift_m * direction), Vector(direction))[0] is None:
-                seen[i] = True
-                break
+        rays = zip((points[hidden] + lift_m * directions).tolist(), directions.tolist(), strict=True)
+        seen[hidden] = [tree.ray_cast(origin, direction)[0] is None for origin, direction in rays]
     write_whole(request["out"], seen=seen)
 
 

@@ -102,12 +102,19 @@ def tumble(
     Crassidis, Fundamentals of Spacecraft Attitude Determination and Control, 2014).
     """
 
-    def derivative(_: float, state: np.ndarray) -> np.ndarray:
-        (w, x, y, z), (p, q, r) = state[:4], state[4:]
-        turn = 0.5 * np.array(
-            [-x * p - y * q - z * r, w * p + y * r - z * q, w * q + z * p - x * r, w * r + x * q - y * p]
-        )
-        return np.concatenate([turn, np.cross(inertia * state[4:], state[4:]) / inertia])
+    a, b, c = inertia.tolist()
+
+    def derivative(_: float, state: np.ndarray) -> list[float]:  # called ten thousand times: no arrays
+        w, x, y, z, p, q, r = state.tolist()
+        return [
+            0.5 * (-x * p - y * q - z * r),
+            0.5 * (w * p + y * r - z * q),
+            0.5 * (w * q + z * p - x * r),
+            0.5 * (w * r + x * q - y * p),
+            ((b * q) * r - (c * r) * q) / a,
+            ((c * r) * p - (a * p) * r) / b,
+            ((a * p) * q - (b * q) * p) / c,
+        ]
 
     start = np.concatenate([quat_body_to_gcrs, rates_rad_s])
     # The dense output is of lower order than the steps; with steps this short its error stays below 1e-8 rad.

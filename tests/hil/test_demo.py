@@ -102,14 +102,20 @@ def plate(pose) -> np.ndarray:
     return picture
 
 
+def noise(pose) -> np.ndarray:
+    """A picture that does not compress: every frame is several packets of the link."""
+    return np.random.default_rng(1).uniform(0, 0.4, (48, 48, 1))
+
+
 def test_every_frame_crosses_a_faulty_can_bus_from_a_gige_camera(
-    quick, tmp_path, the_only_camera_on_loopback
+    mission, tmp_path, monkeypatch, the_only_camera_on_loopback
 ):
-    config = PassConfig(camera="gige", link="slcan", faults="standard")
-    world = load_world(load_mission(quick))
-    figures = fly(tmp_path, world, quick, plate, config, Console(stderr=True))
-    assert figures["frames"] == {"captured": 4, "received": 4, "without_valid_pose": 0}
-    assert figures["camera"]["exposures"] == 4
+    monkeypatch.setattr("hil.simulated_pass.STANDARD_CUT_S", 2.0)  # five timer intervals of the link
+    config = PassConfig(camera="gige", link="slcan-fd", faults="standard")
+    world = load_world(load_mission(mission))
+    figures = fly(tmp_path, world, mission, noise, config, Console(stderr=True))
+    assert figures["frames"] == {"captured": 15, "received": 15, "without_valid_pose": 0}
+    assert figures["camera"]["exposures"] == 15
     assert figures["camera"]["packets_lost"] == figures["camera"]["failures"] == 0
     link = figures["link"]
     assert link["cuts"] == 1
@@ -128,9 +134,7 @@ def test_a_pass_that_stalls_is_an_error(quick, tmp_path, monkeypatch):
 
 def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_path):
     out = tmp_path / "demo"
-    config = PassConfig(
-        link="slcan-fd", scenario="tumbling", navigation="realistic", real_time=3000.0, seed=3
-    )
+    config = PassConfig(link="slcan", scenario="tumbling", navigation="realistic", real_time=3000.0, seed=3)
     simulation = simulate_pass(out, quick, SHIPPED, config, Console(stderr=True))
     assert simulation["frames"] == {"captured": 4, "received": 4, "without_valid_pose": 0}
     link = simulation["link"]  # without faults, a CAN bus
