@@ -21,6 +21,7 @@ from hil.simulated_pass import PassConfig, PassError, fly
 from hil.sky import SHIPPED
 from hil.world.scenario import Scene, load_scenario
 from hil.world.world import load_world
+from tests.commands import call
 
 ROOT = Path(__file__).parents[2]
 
@@ -39,19 +40,6 @@ def mission(tmp_path_factory) -> Path:
 def hil(*arguments: str) -> subprocess.CompletedProcess:
     command = [str(Path(sys.executable).with_name("hil")), *arguments]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=280)
-
-
-@pytest.fixture
-def refused(monkeypatch, capsys):
-    """Runs `hil` in this process, which must end it with an exit code and a message; anything else is no refusal."""
-
-    def run(*arguments: str | Path) -> tuple[object, str]:
-        monkeypatch.setattr(sys, "argv", ["hil", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        return ended.value.code, capsys.readouterr().err
-
-    return run
 
 
 def test_demo_ends_in_a_report_with_every_frame_across(mission, tmp_path):
@@ -187,10 +175,10 @@ def test_impossible_options_are_refused_before_anything_is_written(mission, tmp_
     assert not (tmp_path / "d").exists()
 
 
-def test_a_session_that_no_demo_made_is_never_overwritten(mission, tmp_path, refused):
+def test_a_session_that_no_demo_made_is_never_overwritten(mission, tmp_path):
     (tmp_path / "session").mkdir()
-    code, told = refused("demo", "--out", tmp_path, "--mission", mission)
-    assert code == 1 and "was not made by a demo" in told
+    done = call("hil", "demo", "--out", tmp_path, "--mission", mission)
+    assert done.returncode == 1 and "was not made by a demo" in done.stderr
 
 
 def test_a_demo_that_cannot_start_leaves_no_files_and_an_earlier_one_as_it_was(
@@ -223,13 +211,14 @@ def test_a_pass_that_cannot_start_leaves_only_rendered_frames(quick, tmp_path, t
     assert [path.name for path in out.iterdir()] == ["renders"]
 
 
-def test_a_file_that_is_no_mesh_and_a_missing_mission_are_refused_in_one_line(mission, tmp_path, refused):
+def test_a_file_that_is_no_mesh_and_a_missing_mission_are_refused_in_one_line(mission, tmp_path):
     (tmp_path / "bad.glb").write_bytes(b"not a mesh")
     here = ("--out", tmp_path / "d", "--mission", mission)
-    code, told = refused("demo", *here, "--mesh", tmp_path / "bad.glb")
-    assert code == 2 and "not a mesh that Blender can load" in told
-    assert "Traceback" not in told and not (tmp_path / "d").exists()
-    code, told = refused("demo", *here, "--mesh", tmp_path / "nowhere.glb")
-    assert code == 2 and "no such file" in told and not (tmp_path / "d").exists()
-    code, told = refused("demo", "--out", tmp_path / "d", "--mission", "nowhere.yaml")
-    assert code == 2 and "cannot read the mission file" in told and not (tmp_path / "d").exists()
+    done = call("hil", "demo", *here, "--mesh", tmp_path / "bad.glb")
+    assert done.returncode == 2 and "not a mesh that Blender can load" in done.stderr
+    assert "Traceback" not in done.stderr and not (tmp_path / "d").exists()
+    done = call("hil", "demo", *here, "--mesh", tmp_path / "nowhere.glb")
+    assert done.returncode == 2 and "no such file" in done.stderr and not (tmp_path / "d").exists()
+    done = call("hil", "demo", "--out", tmp_path / "d", "--mission", "nowhere.yaml")
+    assert done.returncode == 2 and "cannot read the mission file" in done.stderr
+    assert not (tmp_path / "d").exists()
