@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from ground.cli_options import AsJson
 from ground.progress import Stop, say
+from obbgs_base.imports import quick_imports
 
 if TYPE_CHECKING:  # both take seconds to import
     from ground.compare.command import State
@@ -63,12 +64,13 @@ def compare_command(
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning threads slow each other down
     stop = Stop()
     with stop.on_signals():
-        from ground.compare.command import run_grid
-        from ground.compare.conditions import AS_TAKEN, Condition, load_conditions
-        from ground.compare.figures import write_figures
-        from ground.compare.grid import cells_of, parse_budgets, session_facts
-        from ground.compare.origin import this_command
-        from ground.compare.page import write_page
+        with quick_imports():
+            from ground.compare.command import run_grid
+            from ground.compare.conditions import AS_TAKEN, Condition, load_conditions
+            from ground.compare.figures import write_figures
+            from ground.compare.grid import cells_of, parse_budgets, session_facts
+            from ground.compare.origin import this_command
+            from ground.compare.page import write_page
 
         os.nice(nice)
         say(stderr, "reading the sessions")

@@ -17,6 +17,7 @@ from ground.live_process import LiveProcess
 from ground.live_status import LiveStatus, line
 from ground.progress import Lines, Stop, say
 from ground.summary import frames_row, model_rows, table
+from obbgs_base.imports import quick_imports
 
 stderr = Console(stderr=True)
 
@@ -157,11 +158,12 @@ def _follow(
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning threads slow each other down
     stop, show = Stop(), Lines(stderr)
     with stop.on_signals():
-        from ground.evaluate import evaluate
-        from ground.live import reconstruct_live
-        from ground.report import write_report
-        from ground.settings import mission_changes
-        from obbgs_core.process import prepare_process
+        with quick_imports():
+            from ground.evaluate import evaluate
+            from ground.live import reconstruct_live
+            from ground.report import write_report
+            from ground.settings import mission_changes
+            from obbgs_core.process import prepare_process
 
         prepare_process(threads)
         section = load_mission(mission).reconstruct if mission else ReconstructSection()

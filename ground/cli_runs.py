@@ -33,6 +33,7 @@ from ground.cli_options import (
 from ground.progress import Stop, say, shares_shown, steps_shown
 from ground.summary import frames_row, model_rows, table
 from obbgs_base.errors import Interrupted
+from obbgs_base.imports import quick_imports
 
 stderr = Console(stderr=True)
 
@@ -66,11 +67,12 @@ def reconstruct_command(
     stop, folder = Stop(), None
     try:
         with stop.on_signals(), steps_shown(stderr) as show:
-            from ground.evaluate import evaluate
-            from ground.reconstruct import Progress, reconstruct
-            from ground.report import write_report
-            from ground.settings import all_changes
-            from obbgs_core.process import prepare_process
+            with quick_imports():
+                from ground.evaluate import evaluate
+                from ground.reconstruct import Progress, reconstruct
+                from ground.report import write_report
+                from ground.settings import all_changes
+                from obbgs_core.process import prepare_process
 
             section = load_mission(mission).reconstruct if mission else ReconstructSection()
             chosen = method or section.method
@@ -116,7 +118,8 @@ def evaluate_command(
 
     Example: ground evaluate --session demo/session --name demo --json
     """
-    from ground.evaluate import evaluate
+    with quick_imports():
+        from ground.evaluate import evaluate
 
     _print_metrics(evaluate(session, name, out), json_)
 
@@ -128,7 +131,8 @@ def report_command(
 
     Example: ground report --session demo/session --name demo
     """
-    from ground.report import write_report
+    with quick_imports():
+        from ground.report import write_report
 
     path = write_report(session, name, out)
     print(json.dumps({"report": str(path)}) if json_ else path)

@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from obbgs_base.imports import quick_imports
+
 stderr = Console(stderr=True)
 
 
@@ -25,9 +27,10 @@ def view_command(
 
     Example: ground view pass-12/runs/first
     """
-    from ground.viewer.door import is_loopback
-    from ground.viewer.source import Source
-    from ground.viewer.viewer import view
+    with quick_imports():
+        from ground.viewer.door import is_loopback
+        from ground.viewer.source import Source
+        from ground.viewer.viewer import view
 
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

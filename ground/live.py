@@ -158,6 +158,8 @@ class LiveReconstruction:
         """Do what is due, then train a step, or wait a moment; return False when pass and schedule have ended."""
         if self._looks.due():
             self._look(end)
+            if self._uplink is not None:
+                self._uplink.tend()  # sooner than at the next model
         if self.trainer is not None and not self.trainer.stop_reason():
             self.trainer.step()
         elif self._over:

@@ -46,8 +46,24 @@ class LiveUplink:
         self._is_ordered = False  # the spacecraft has taken the order by triage
         self._not_before_s = -math.inf
 
+    def tend(self) -> bool:
+        """Note what became of what was sent, ask for the order by triage after a model; tell whether one may be sent.
+
+        Raises:
+            ConfigError: the key cannot be used any more.
+            SessionError: the session folder cannot be written.
+        """
+        if self._under_way is not None:
+            self._note_result(*self._under_way)
+        if self._under_way is not None or time.monotonic() < self._not_before_s:
+            return False
+        if self._sent is not None and not self._is_ordered:
+            self._under_way = submit(self._session_dir, self._key_file, TRIAGE, None, EXPIRES_S), "priority"
+            return False
+        return True
+
     def follow(self, shown: ShownModel, session: Session, training: list[FrameRecord], folder: Path) -> None:
-        """Send the shown model if it has improved enough; note what became of what was sent before.
+        """Send the shown model if it has improved enough and nothing else is under way.
 
         Args:
             folder: where the model's file is made.
@@ -56,14 +72,7 @@ class LiveUplink:
             ConfigError: the key cannot be used any more, or the spacecraft accepts no model of this size.
             SessionError: the session folder cannot be written.
         """
-        if self._under_way is not None:
-            self._note_result(*self._under_way)
-        if self._under_way is not None or time.monotonic() < self._not_before_s:
-            return
-        if self._sent is not None and not self._is_ordered:
-            self._under_way = submit(self._session_dir, self._key_file, TRIAGE, None, EXPIRES_S), "priority"
-            return
-        if shown.gaussians is None or math.isnan(shown.held_out_db):
+        if not self.tend() or shown.gaussians is None or math.isnan(shown.held_out_db):
             return
         gain_db = math.inf if self._sent is None else shown.held_out_db - shown.score_db(self._sent)
         if gain_db >= GAIN_DB:

@@ -87,4 +87,4 @@ def moving_png(images: np.ndarray) -> bytes:
     """Return pictures, bytes [views, H, W, 3], as an animated PNG that repeats; grey ones take a third of the room."""
     if (images[..., :1] == images).all():
         images = images[..., 0]
-    return bytes(imagecodecs.apng_encode(np.ascontiguousarray(images), level=9, delay=FRAME_MS))
+    return bytes(imagecodecs.apng_encode(np.ascontiguousarray(images), level=6, delay=FRAME_MS))

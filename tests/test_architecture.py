@@ -1,5 +1,6 @@
 """The arrows between the parts, and what flight may never need."""
 
+import functools
 import json
 import subprocess
 import sys
@@ -25,7 +26,9 @@ def modules_of(part: str) -> list[str]:
     return [n.removesuffix(".__init__") for n in names if n not in BLENDER_ONLY]
 
 
-def loaded_after_importing(modules: list[str]) -> set[str]:
+@functools.cache
+def loaded_after_importing(part: str) -> set[str]:
+    modules = modules_of(part)
     code = f"import importlib, json, sys\nfor m in {modules!r}: importlib.import_module(m)\n"
     code += "print(json.dumps(sorted(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
@@ -34,19 +37,19 @@ def loaded_after_importing(modules: list[str]) -> set[str]:
 
 @pytest.mark.parametrize("part", FORBIDDEN)
 def test_part_imports_only_what_it_may(part):
-    loaded = loaded_after_importing(modules_of(part))
+    loaded = loaded_after_importing(part)
     assert not {name for name in loaded if name.partition(".")[0] in FORBIDDEN[part]}
 
 
 @pytest.mark.parametrize("part", ["ground", "flightsw.ports"])
 def test_ground_and_the_ports_use_only_the_icd_and_the_ports_of_flight(part):
-    loaded = loaded_after_importing(modules_of(part))
+    loaded = loaded_after_importing(part)
     flight = {name for name in loaded if name.startswith("flightsw.")}
     assert flight and all(name.startswith(("flightsw.icd", "flightsw.ports")) for name in flight)
 
 
 def test_the_icd_needs_nothing_else_of_flight():
-    loaded = loaded_after_importing(modules_of("flightsw.icd"))
+    loaded = loaded_after_importing("flightsw.icd")
     assert {n for n in loaded if n.startswith("flightsw.") and not n.startswith("flightsw.icd")} == set()
 
 

@@ -1,7 +1,15 @@
-"""Loaded by each worker of a comparison's own cluster: Ctrl-C is for the command, which asks its workers to save."""
+"""Loaded by each worker of a comparison's own cluster: it is ready for its first cell, and Ctrl-C is not for it.
+
+The command, which gets the signal too, asks its workers to save.
+"""
 
 import signal
 from typing import Any
+
+from obbgs_base.imports import quick_imports
+
+with quick_imports():
+    import ground.compare.worker  # noqa: F401 (what the cells need)
 
 
 def dask_setup(worker: Any) -> None:

@@ -28,6 +28,7 @@ from hil.world.clock import SimulatedClock
 
 log = logging.getLogger(__name__)
 MAX_SOCKET_PATH_BYTES = 107  # sun_path of Linux
+POLL_S = 0.02  # how soon it notices that it is closed
 
 
 class CameraServer:
@@ -79,7 +80,7 @@ class CameraServer:
             host, port = self._server.server_address[:2]
             self.url = f"hil://{host}:{port}"
         self._socket_file = address if isinstance(address, str) else None
-        self._thread = WatchedThread("camera server", self._server.serve_forever)
+        self._thread = WatchedThread("camera server", lambda: self._server.serve_forever(POLL_S))
         self._thread.start()
 
     def __enter__(self) -> "CameraServer":

@@ -8,14 +8,16 @@ from pathlib import Path
 import pytest
 
 from flightsw.cli import log_dead_thread
+from tests.commands import call
 
-ROOT = Path(__file__).parents[2]
 NOWHERE = ("--camera", "hil:///nowhere.sock")
 
 
-def run(*arguments: str, tool: str = "flightsw") -> subprocess.CompletedProcess:
-    command = [str(Path(sys.executable).with_name(tool)), *arguments]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+@pytest.mark.parametrize("tool", ["flightsw", "ground", "hil"])
+def test_each_tool_is_installed_and_says_its_version(tool):
+    command = [str(Path(sys.executable).with_name(tool)), "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and done.stdout.startswith("obbgs ")
 
 
 @pytest.mark.parametrize(
@@ -25,7 +27,7 @@ def run(*arguments: str, tool: str = "flightsw") -> subprocess.CompletedProcess:
     + [("hil", c) for c in ("demo", "camera", "link", "target")],
 )
 def test_every_command_has_help_with_an_example(tool, command):
-    done = run(command, "--help", tool=tool)
+    done = call(tool, command, "--help")
     assert done.returncode == 0 and f"Example: {tool} {command}" in done.stdout
 
 
@@ -64,7 +66,7 @@ def test_every_command_has_help_with_an_example(tool, command):
     ],
 )
 def test_what_goes_wrong_is_one_clear_line_and_an_exit_code(tmp_path, arguments, code, message):
-    done = run(*[a.replace("{tmp}", str(tmp_path / "store")) for a in arguments])
+    done = call("flightsw", *[a.replace("{tmp}", str(tmp_path / "store")) for a in arguments])
     assert done.returncode == code, done.stderr
     assert message in done.stderr and "Traceback" not in done.stderr
     assert not (tmp_path / "store").exists(), "a command that cannot start leaves no store behind"

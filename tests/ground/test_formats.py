@@ -2,8 +2,6 @@
 
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -30,6 +28,7 @@ from ground.formats.views import (
 )
 from ground.session import SessionError, open_session
 from ground.session_writer import SessionWriter
+from tests.commands import call
 
 RNG = np.random.default_rng(3)
 unit_quats = st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1)
@@ -398,12 +397,8 @@ def test_a_damaged_transforms_file_is_one_named_error(tmp_path, content):
 
 def test_the_commands_import_and_export(tmp_path):
     nerf_folder(tmp_path / "lego")
-    ground = str(Path(sys.executable).with_name("ground"))
-
-    def run(*arguments: str) -> subprocess.CompletedProcess:
-        return subprocess.run([ground, *arguments], capture_output=True, text=True)
-
-    done = run(
+    done = call(
+        "ground",
         "import",
         "--format",
         "nerf",
@@ -414,10 +409,16 @@ def test_the_commands_import_and_export(tmp_path):
         "--json",
     )
     assert json.loads(done.stdout)["frames"] == 6
-    done = run("export", "--session", str(tmp_path / "s"), "--out", str(tmp_path / "out"), "--json")
+    done = call(
+        "ground", "export", "--session", str(tmp_path / "s"), "--out", str(tmp_path / "out"), "--json"
+    )
     assert sum(json.loads(done.stdout).values()) == 6
-    wrong = run("import", "--format", "obj", "--from", str(tmp_path), "--session", str(tmp_path / "t"))
+    wrong = call(
+        "ground", "import", "--format", "obj", "--from", str(tmp_path), "--session", str(tmp_path / "t")
+    )
     said = " ".join(wrong.stderr.replace("│", " ").split())
     assert wrong.returncode == 2 and "not one of 'nerf', 'nerfstudio', 'colmap', 'shirt'" in said
-    empty = run("import", "--format", "colmap", "--from", str(tmp_path), "--session", str(tmp_path / "t"))
+    empty = call(
+        "ground", "import", "--format", "colmap", "--from", str(tmp_path), "--session", str(tmp_path / "t")
+    )
     assert empty.returncode == 1 and "no cameras" in empty.stderr

@@ -21,10 +21,8 @@ def passes(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("passes")
     session = folder / "2026" / "pass-12"
     shutil.copytree(GOLDEN, session)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ground.model_files.SURFACE_POINTS", 500)
-        reconstruct(session, "first", "obbgs", TINY)
-        reconstruct(session, "second", "3dgs", TINY | {"growth.interval": 10})
+    reconstruct(session, "first", "obbgs", TINY)
+    reconstruct(session, "second", "3dgs", TINY | {"growth.interval": 10})
     (session / "runs" / ".third.part").mkdir()
     (session / "runs" / "fourth").mkdir()
     (session / "runs" / "fourth" / "metrics.json").write_text("{")

@@ -55,8 +55,7 @@ class Writer:
 
 @pytest.fixture(autouse=True)
 def fast(monkeypatch) -> None:
-    """What is due at intervals is due at every step, but for the shown model; the surface has few points."""
-    monkeypatch.setattr("ground.model_files.SURFACE_POINTS", 2_000)
+    """What is due at intervals is due at every step, but for the shown model."""
     for name in ("LOOK_S", "STATUS_S", "WAIT_S", "JOIN_PAUSE"):
         monkeypatch.setattr(ground.live, name, 0.0)
     monkeypatch.setattr(ground.live, "JOIN_STEPS", 20)

@@ -202,14 +202,14 @@ def test_under_a_moving_sun_the_model_turns_with_it_and_beats_the_static_one_on_
 
 def test_parts_that_shade_one_another_are_understood_by_lamberts_law_and_not_by_the_linear_one():
     frames, unseen = photographed(views(60), bodies=TOGETHER), views(12, seed=99)
-    longer = QUICK | {"steps": 960}
+    longer = QUICK | {"steps": 640}
     linear = train(frames, SENSOR, preset("obbgs", longer | {"light.sun_shading": "linear"}), seed=1)
     cast = train(frames, SENSOR, preset("obbgs", longer), seed=1)
     assert linear.gaussians.shading == "sun" and linear.appearance.startswith("turns with the sun")
-    assert "(step 48, degree 1: with the sun" in linear.appearance
-    # 1.6 to 2.8 dB over trainings whose starts differ by a millionth, as rounding makes them
+    assert "(step 32, degree 1: with the sun" in linear.appearance
+    # seeds 1 to 3: 2.4 to 3.2 dB
     assert clean_db(cast.gaussians, unseen, TOGETHER) > clean_db(linear.gaussians, unseen, TOGETHER) + 0.3
-    # seeds 1 and 2: 34.1 dB; black 17.2, mean image 19.1, untrained 18.2
+    # seeds 1 to 3: 34.0 to 34.8 dB; black 17.2, mean image 19.1, untrained 18.2
     assert clean_db(cast.gaussians, unseen, TOGETHER) > baselines_db(frames, unseen, longer, TOGETHER) + 6
     without = []
     for pose, sun in unseen:  # the same model with nothing in the Sun's way
@@ -410,8 +410,7 @@ def lambertian_session(folder, mission: Mission, brackets: int) -> list[Frame]:
     return frames
 
 
-def test_a_session_under_a_moving_sun_gives_outputs_that_know_it(tmp_path, small_mission, monkeypatch):
-    monkeypatch.setattr("ground.model_files.SURFACE_POINTS", 2_000)  # nothing is asked of the surface here
+def test_a_session_under_a_moving_sun_gives_outputs_that_know_it(tmp_path, small_mission):
     frames = lambertian_session(tmp_path / "session", small_mission, 32)
     session = open_session(tmp_path / "session")
     np.testing.assert_allclose(

@@ -51,14 +51,10 @@ def keep_frames(session: Path, wanted) -> None:
 def trained(tmp_path_factory) -> tuple[Path, dict]:
     """One real, short training of the default method, with its blind twin."""
     session = copy_session(tmp_path_factory.mktemp("trained"))
-    reconstruct(session, "run", "obbgs", TRAINED, blind_reference=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ground.model_files.SURFACE_POINTS", 100_000)  # as everywhere but in these tests
+        reconstruct(session, "run", "obbgs", TRAINED, blind_reference=True)
     return session, evaluate(session, "run")
-
-
-@pytest.fixture(autouse=True)
-def few_surface_points(monkeypatch) -> None:
-    """The surface's 100,000 points cost half of a short run: only `trained`, made before this, has them all."""
-    monkeypatch.setattr("ground.model_files.SURFACE_POINTS", 2_000)
 
 
 def test_the_model_exceeds_every_baseline_and_knowing_the_exposure_is_worth_decibels(trained):

@@ -42,14 +42,6 @@ QUICK = {"steps": 8, "start.count": 600, "growth.max_gaussians": 800, "light.sh_
 FILES = {"model.ply", "model.spz", "splats.glb", "model.glb", "surface.ply", "model.onnx"}
 
 
-@pytest.fixture(autouse=True, scope="module")
-def few_surface_points():
-    """100,000 points take seconds, and no test here measures how good they are."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ground.model_files.SURFACE_POINTS", 1000)
-        yield
-
-
 @pytest.fixture
 def session(tmp_path) -> Path:
     return Path(shutil.copytree(GOLDEN / "session", tmp_path / "session"))

@@ -21,6 +21,7 @@ from hil.simulated_pass import PassConfig, PassError, fly
 from hil.sky import SHIPPED
 from hil.world.scenario import Scene, load_scenario
 from hil.world.world import load_world
+from tests.commands import call
 
 ROOT = Path(__file__).parents[2]
 
@@ -176,7 +177,7 @@ def test_impossible_options_are_refused_before_anything_is_written(mission, tmp_
 
 def test_a_session_that_no_demo_made_is_never_overwritten(mission, tmp_path):
     (tmp_path / "session").mkdir()
-    done = hil("demo", "--out", str(tmp_path), "--mission", str(mission))
+    done = call("hil", "demo", "--out", tmp_path, "--mission", mission)
     assert done.returncode == 1 and "was not made by a demo" in done.stderr
 
 
@@ -212,17 +213,12 @@ def test_a_pass_that_cannot_start_leaves_only_rendered_frames(quick, tmp_path, t
 
 def test_a_file_that_is_no_mesh_and_a_missing_mission_are_refused_in_one_line(mission, tmp_path):
     (tmp_path / "bad.glb").write_bytes(b"not a mesh")
-    done = hil(
-        "demo", "--out", str(tmp_path / "d"), "--mission", str(mission), "--mesh", str(tmp_path / "bad.glb")
-    )
+    here = ("--out", tmp_path / "d", "--mission", mission)
+    done = call("hil", "demo", *here, "--mesh", tmp_path / "bad.glb")
     assert done.returncode == 2 and "not a mesh that Blender can load" in done.stderr
     assert "Traceback" not in done.stderr and not (tmp_path / "d").exists()
-    missing = ("--mission", str(mission), "--mesh", str(tmp_path / "nowhere.glb"))
-    done = hil("demo", "--out", str(tmp_path / "f"), *missing)
-    assert done.returncode == 2 and "no such file" in done.stderr and not (tmp_path / "f").exists()
-    done = hil("demo", "--out", str(tmp_path / "e"), "--mission", "nowhere.yaml")
-    assert (
-        done.returncode == 2
-        and "cannot read the mission file" in done.stderr
-        and not (tmp_path / "e").exists()
-    )
+    done = call("hil", "demo", *here, "--mesh", tmp_path / "nowhere.glb")
+    assert done.returncode == 2 and "no such file" in done.stderr and not (tmp_path / "d").exists()
+    done = call("hil", "demo", "--out", tmp_path / "d", "--mission", "nowhere.yaml")
+    assert done.returncode == 2 and "cannot read the mission file" in done.stderr
+    assert not (tmp_path / "d").exists()

@@ -14,8 +14,9 @@ ALL = {"cut_s": 2.0, "kills": 3, "full_disks": True, "seed": 5}
 
 
 @pytest.fixture
-def trial(tmp_path, small_mission):
-    """Runs a pass of a few frames of 5 kB."""
+def trial(tmp_path, small_mission, monkeypatch):
+    """Runs a pass of a few frames of 5 kB, in which a disk stays full for half as long as in the whole matrix."""
+    monkeypatch.setattr("tests.link_trial.FULL_S", 1.5)
 
     def run(trial: Trial, frames: int, limit_s: float = 120) -> TrialResult:
         result = run_trial(
@@ -90,4 +91,4 @@ def test_a_can_bus_without_faults_carries_a_pass_without_a_loss_or_a_repetition(
 
 def test_a_pass_that_cannot_end_is_an_error(trial):
     with pytest.raises(TrialError, match="0 of 2 frames"):
-        trial(Trial("serial", Faults(loss=1.0)), 2, limit_s=4)
+        trial(Trial("serial", Faults(loss=1.0)), 2, limit_s=2)

@@ -83,7 +83,8 @@ def test_a_model_while_the_frames_arrive_goes_up_by_itself_and_outlives_kills(tm
         assert (run / "model.ply").exists() and read_status(run)["held_out_db"] > 25
 
         first = child_of(ground.pid)
-        assert first is not None and os.getpriority(os.PRIO_PROCESS, first) == 10
+        lower = min(19, os.getpriority(os.PRIO_PROCESS, 0) + 10)
+        assert first is not None and os.getpriority(os.PRIO_PROCESS, first) == lower
         os.kill(first, signal.SIGKILL)
         wait_for(lambda: child_of(ground.pid) not in (None, first), LIMIT_S)
         log = session / "runs" / ".live.part" / "log"

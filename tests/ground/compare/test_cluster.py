@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from ground import cli
 from ground.compare.cluster import share_memory
 from ground.compare.errors import CompareError
 from tests.small_sessions import small_session
@@ -114,10 +116,9 @@ def test_a_grid_survives_a_killed_worker_and_is_not_made_twice(sessions, schedul
     assert all(row["seconds"] > 0 and row["curve"][-1]["share"] == 1 for row in trained)
     assert not list(out.glob("work/*/training.checkpoint"))  # finished trainings need none
 
-    again = compare(*grid, "--json", "--workers", "1")
-    result, told = again.communicate()
-    assert again.returncode == 0, told
-    assert json.loads(result) | {"page": ""} == {
+    again = CliRunner().invoke(cli.app, ["compare", *map(str, grid), "--json", "--workers", "1"])
+    assert again.exit_code == 0, again.output
+    assert json.loads(again.stdout) | {"page": ""} == {
         "rows": str(out / "rows.jsonl"), "page": "", "made": 0, "were_done": 8, "failed": {}
     }  # fmt: skip
 

@@ -2,7 +2,6 @@
 
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from ground.compare.references import black, noise
 from ground.compare.results import Results, pareto
 from ground.compare.rows import Rows
 from ground.compare.views import SHOWN, WORST, read_views, write_views
+from tests.commands import call
 from tests.small_sessions import small_session
 
 CHROMIUM = shutil.which("chromium")
@@ -187,6 +187,5 @@ def test_figures_are_written_as_png(comparison):
 
 def test_the_command_says_what_is_wrong_with_its_arguments(tmp_path):
     arguments = ["compare", "--sessions", str(tmp_path / "no"), "--out", str(tmp_path)]
-    command = [sys.executable, "-m", "ground.cli", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    done = call("ground", *arguments)
     assert done.returncode == 1 and "is not a session" in done.stderr and "Traceback" not in done.stderr
