@@ -12,6 +12,7 @@ from obbgs_core.render import Rendered
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check
 from obbgs_core.train.batches import Batch
+from obbgs_core.train.neighbours import normals_apart
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class LossSettings:
     sh_weight: float = 0.0
     # of the mean peak radiance of highlights along normals: a prior for matt surface too
     gloss_weight: float = 0.0
+    # of how far the normals of neighbours are apart, under Lambert's law: faces are smooth
+    normal_weight: float = 0.0
     # of the mean shortest scale over the target's radius: flat Gaussians are surface
     flat_weight: float = 0.0
     sky_weight: float = 0.0  # of the mean alpha of pixels that show no light: space is empty
@@ -64,9 +67,17 @@ def image_loss(
 
 
 def priors(
-    gaussians: Gaussians, rendered: Rendered, batch: Batch, radius_m: float, settings: LossSettings
+    gaussians: Gaussians,
+    rendered: Rendered,
+    batch: Batch,
+    radius_m: float,
+    settings: LossSettings,
+    nearest: Tensor | None = None,
 ) -> Tensor:
-    """Return the weighted sum of the priors on the Gaussians: matt, flat, and not in front of the empty sky."""
+    """Return the weighted sum of the priors on the Gaussians: matt, flat, smooth, and not in front of the empty sky.
+
+    nearest: [N, K], the neighbours of each Gaussian whose normals are compared; None: they are not.
+    """
     total = torch.zeros(())
     if settings.sh_weight and gaussians.sh.shape[1] > 1 and gaussians.shading == "view":
         total = total + settings.sh_weight * gaussians.sh[:, 1:].square().mean()
@@ -78,4 +89,6 @@ def priors(
         total = total + settings.sky_weight * batch.share * (rendered.alpha * batch.sky).mean()
     if settings.flat_weight:
         total = total + settings.flat_weight * gaussians.scales.amin(dim=1).mean() / radius_m
+    if nearest is not None:
+        total = total + settings.normal_weight * normals_apart(gaussians, nearest)
     return total

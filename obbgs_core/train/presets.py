@@ -77,6 +77,7 @@ PRESETS: dict[str, MethodConfig] = {
                 misfit=True,
                 sh_weight=1.0,
                 gloss_weight=0.02,
+                normal_weight=0.02,
                 flat_weight=15.0,
                 sky_weight=1.0,
             ),

@@ -24,11 +24,12 @@ from obbgs_core.train.appearance import Shadows
 from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.growth import Growth
+from obbgs_core.train.neighbours import Neighbours
 from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 9  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 10  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,7 @@ class TrainingState:
     )  # frames that are left out: they fit no pose that their tags allow
     boxes: list[Obb] = field(default_factory=list)  # behind the worst tiles since the last growth inside them
     shadows: Shadows = field(default_factory=Shadows)
+    neighbours: Neighbours = field(default_factory=Neighbours)
     chi2: float = math.nan  # running mean
     misfit: float | None = None  # running mean of the model's own error; None: not learnt, or not yet
     psnr_db: float = math.nan  # of the last step's frames
@@ -164,6 +166,7 @@ SAVED = [
     Obb,
     Shadows,
     ShadowMap,
+    Neighbours,
     Cameras,
     StepInfo,
 ]

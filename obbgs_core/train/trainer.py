@@ -132,7 +132,9 @@ class Trainer:
         )
         if not torch.isfinite(loss):
             raise Diverged(state.steps_done, loss.item())
-        prior = priors(state.gaussians, rendered, batch, setup.radius_m, config.loss)
+        smooth = config.loss.normal_weight > 0 and state.gaussians.shading == "lambert"
+        nearest = state.neighbours.of(state.gaussians, state.steps_done) if smooth else None
+        prior = priors(state.gaussians, rendered, batch, setup.radius_m, config.loss, nearest)
         (loss + prior).backward()
         if decisions.is_recorded(setup, share):
             decisions.observe(setup, state, rendered, batch, residual, share)

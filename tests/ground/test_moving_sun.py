@@ -36,6 +36,7 @@ from obbgs_core.score.metrics import psnr_db
 from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.batches import Batches
+from obbgs_core.train.neighbours import Neighbours, normals_apart
 from obbgs_core.train.parsimony import next_degree_gain
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
@@ -274,6 +275,16 @@ def test_light_that_follows_the_sun_asks_for_its_harmonics_and_constant_light_do
         batches = Batches(shown(truth, spread_deg), SENSOR.white_dn)
         gain, penalty = next_degree_gain(plain, batches, SENSOR, 1.0, torch.Generator().manual_seed(0))
         assert (gain > penalty) == justified, (gain, penalty)
+
+
+def test_under_the_sun_neighbours_are_as_smooth_as_asked_for(moving):
+    """A heavy prior shows that the training obeys it; that the weight of the preset pays is measured in results/."""
+    heavy, free = (
+        train(moving, SENSOR, preset("obbgs", QUICK | {"loss.normal_weight": weight}), seed=1).gaussians
+        for weight in (10.0, 0.0)
+    )
+    apart, free_apart = (normals_apart(model, Neighbours().of(model, 0)) for model in (heavy, free))
+    assert apart < 0.8 * free_apart
 
 
 def test_a_killed_training_under_the_sun_resumes_to_the_same_bits(moving, under_the_sun, tmp_path):
