@@ -22,6 +22,9 @@ SIZE_PX = 48
 os.environ.setdefault(
     "OMP_WAIT_POLICY", "passive"
 )  # before torch: threads that spin are 20 times slower on busy cores
+WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+if WORKERS > 1:  # they share the cores: tests of several threads ask for them
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // WORKERS)))
 hypothesis.settings.register_profile("obbgs", deadline=None)  # timings live in benchmarks
 hypothesis.settings.load_profile("obbgs")
 

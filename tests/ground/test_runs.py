@@ -237,7 +237,9 @@ def test_runs_go_to_another_folder_and_are_scored_there(session, tmp_path):
 TRAINS_UNTIL_TOLD = """
 import sys
 from pathlib import Path
+import ground.model_files
 from ground.reconstruct import reconstruct
+ground.model_files.SURFACE_POINTS = 1000
 def told(progress):
     if progress.info.step == 3:
         print("training", flush=True)
