@@ -15,7 +15,7 @@ test: setup
 	.venv/bin/ruff check .
 	.venv/bin/clang-format --dry-run --Werror obbgs_core/render/kernels/*.cpp obbgs_core/render/kernels/*.h
 	.venv/bin/pyright
-	.venv/bin/pytest -n 2 --dist loadfile $(ARGS)
+	.venv/bin/pytest -n 3 --dist loadfile $(ARGS)
 
 test-portable: setup
 	.venv/bin/python -m tests.other_processors $(ARGS)
@@ -24,7 +24,7 @@ sanitize: setup
 	.venv/bin/python -m tests.sanitize $(ARGS)
 
 coverage: setup
-	.venv/bin/pytest -n 2 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:build/coverage $(ARGS)
+	.venv/bin/pytest -n 3 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:build/coverage $(ARGS)
 
 docs: .venv-docs/.ready
 	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --strict --site-dir build/docs
