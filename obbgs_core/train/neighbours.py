@@ -22,9 +22,8 @@ EDGE_SINE_SQUARED = 0.02  # of the angle, 8 degrees, beyond which two normals ar
 class Neighbours:
     """The nearest neighbours of each Gaussian; Gaussians move slowly, so they are kept for some steps."""
 
-    nearest: Tensor | None = (
-        None  # [N, 8] indices, fewer where there are fewer Gaussians; None: not searched yet
-    )
+    # [N, 8] indices, fewer where there are fewer Gaussians; None: not searched yet
+    nearest: Tensor | None = None
 
     def of(self, gaussians: Gaussians, step: int) -> Tensor:
         """Return the indices [N, 8] of the Gaussians whose centres are nearest to each one's."""
