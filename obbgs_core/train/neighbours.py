@@ -15,7 +15,7 @@ from obbgs_core.render.highlights import shortest_axes
 
 COUNT = 8  # neighbours of a Gaussian
 INTERVAL = 20  # steps between two searches for them
-EDGE_SINE_SQUARED = 0.02  # of the angle, 8 degrees, beyond which two normals are ever less drawn together
+EDGE_SINE_SQUARED = 0.02  # of the angle, 8 degrees, at which the cost is half of the largest
 
 
 @dataclass
@@ -37,8 +37,8 @@ class Neighbours:
 def normals_apart(gaussians: Gaussians, nearest: Tensor) -> Tensor:
     """Return how far neighbours' normals are apart, 0 to 1: the mean of s² / (s² + 0.02), s the sine of their angle.
 
-    The pull falls beyond 8 degrees, so that edges stay. The normal is the shortest axis and has no sign: the two sides
-    of a plate agree.
+    The pull is strongest at 5 degrees and falls beyond, so that edges stay. The normal is the shortest axis and has no
+    sign: the two sides of a plate agree.
 
     Args:
         nearest: [N, K], the neighbours of each Gaussian.

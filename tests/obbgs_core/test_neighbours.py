@@ -20,11 +20,11 @@ def about_x(degrees: list[float]) -> Rotation:
 
 
 def leaning(degrees: list[float]) -> Gaussians:
-    """Return flat Gaussians whose normals lie in one plane, at these angles from z."""
+    """Return flat Gaussians whose normals lie in one plane, at these angles from z, in double precision."""
     turned = about_x(degrees).as_quat(scalar_first=True)
     gaussians = random_gaussians(len(degrees))
     flat = torch.tensor([0.0, 0.0, -3.0]).expand(len(degrees), 3)
-    return dataclasses.replace(gaussians, quats=torch.from_numpy(turned).float(), log_scales=flat.clone())
+    return dataclasses.replace(gaussians, quats=torch.from_numpy(turned), log_scales=flat.clone())
 
 
 @settings(max_examples=30, deadline=None)
