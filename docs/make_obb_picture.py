@@ -32,7 +32,7 @@ def main(session_dir: Path) -> None:
     session = open_session(session_dir)
     sensor = sensor_of(session.camera)
     frames = [training_frame(session, record) for record in split(session)[0]]
-    trainer = Trainer(frames, sensor, preset("obbgs", {"pyramid": ((0.0, 1.0),)}))
+    trainer = Trainer(frames, sensor, preset("obbgs"))
     for _ in range(STEPS):
         trainer.step()
     gaussians = trainer.state.gaussians.detach()

@@ -142,7 +142,7 @@ MethodName = Annotated[
 QualityName = Annotated[
     Quality | None,
     typer.Option(
-        help="draft has a third of the steps of standard, best three times its steps and Gaussians; default: standard."
+        help="draft has three tenths of the steps of standard, best three times its steps and Gaussians; default: standard."
     ),
 ]
 Budget = Annotated[

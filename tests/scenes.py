@@ -20,7 +20,7 @@ from obbgs_core.sensor import Sensor
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=2.0, read_noise_dn=3.0)
 SIZE_PX, FOCAL_PX, RANGE_M = 64, 130.0, 8.0
 EXPOSURES_S = (5e-5, 1e-4, 2e-4)
-QUICK = {"steps": 40, "start.count": 400, "growth.max_gaussians": 600, "pyramid": ((0.0, 1.0),)}
+QUICK = {"steps": 40, "start.count": 400, "growth.max_gaussians": 600}
 
 
 def target(count: int = 60, seed: int = 0) -> Gaussians:

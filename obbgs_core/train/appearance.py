@@ -74,7 +74,6 @@ def raised_degree(
     gaussians: Gaussians,
     batches: Batches,
     sensor: Sensor,
-    scale: float,
     directions: tuple[Literal["view", "sun"], ...],
     settings: LightSettings,
     rng: torch.Generator,
@@ -96,7 +95,7 @@ def raised_degree(
     tested, raised = [], None
     for direction in directions if degree == 1 else (gaussians.shading,):
         turning = dataclasses.replace(gaussians, shading=direction)
-        gain, penalty = next_degree_gain(turning, batches, sensor, scale, rng)
+        gain, penalty = next_degree_gain(turning, batches, sensor, rng)
         tested.append(
             f"with the {direction} it would gain {gain:,.0f} nats at a BIC penalty of {penalty:,.0f}"
         )

@@ -56,7 +56,7 @@ class Batches:
         other.frames = frames
         return other
 
-    def batch(self, indices: list[int], scale: float) -> Batch:
+    def batch(self, indices: list[int], scale: float = 1.0) -> Batch:
         """Return given frames, averaged to `scale` (1 / whole number) of their size, or windows of one size of them."""
         factor = round(1 / scale)
         if factor not in self._images:

@@ -48,7 +48,6 @@ class MethodConfig:
     bracket_steps: bool = False  # the frames of a step are one of each exposure time
     windows: bool = False  # only the part of each frame that the target lies in is rendered and compared
     steps: int = at_least_one(30_000)
-    pyramid: tuple[tuple[float, float], ...] = ((0.0, 1.0),)  # (from this share of the steps on, image scale)
     footprint: Footprint = "kerbl"  # what a pixel averages over, see `Gaussians`
     # (image scale, frames of a step, share of the steps) of trainings that come first and hand over their model; each
     # counts its steps from 0, so that the rate of the means and growth begin again (MVGS)
@@ -71,17 +70,6 @@ class MethodConfig:
 
     def __post_init__(self):
         check(self)
-        starts = [level[0] for level in self.pyramid]
-        if not (
-            all(len(level) == 2 and 0 < level[1] <= 1 for level in self.pyramid)
-            and starts == sorted(set(starts))
-            and starts[:1] == [0]
-        ):
-            raise ValueError(
-                "pyramid must be pairs of a share of the steps, from 0 upwards, and an image scale of 0 to 1, got "
-                f"{self.pyramid}"
-            )
-
         if not all(len(stage) == 3 and 0 < stage[0] <= 1 and stage[1] >= 1 for stage in self.coarse) or not (
             sum(stage[2] for stage in self.coarse) < 1
         ):
@@ -103,29 +91,22 @@ class MethodConfig:
     def stages(self) -> list[tuple[int, float, int]]:
         """Return the stages of the training: the first step, counted from 0, the image scale and the frames of a step.
 
-        The last one is the training itself, its image scale the first of the pyramid.
+        The last one is the training itself, on whole pictures.
         """
         stages, first = [], 0
         for scale, frames, share in self.coarse:
             stages.append((first, scale, frames))
             first += round(share * self.steps)
-        return [*stages, (first, self.pyramid[0][1], self.frames_per_step)]
+        return [*stages, (first, 1.0, self.frames_per_step)]
 
     def moment(self, steps_done: int) -> Moment:
         """Return where in its schedule a training stands after some steps."""
         stages = self.stages()
         main, _, _ = stages[-1]
         first, scale, frames = next(stage for stage in reversed(stages) if steps_done >= stage[0])
-        share = (steps_done - first) / max(1, self.steps - main)
-        if first == main:
-            scale = self.image_scale(share)
-        return Moment(steps_done - first + 1, share, scale, frames)
+        return Moment(steps_done - first + 1, (steps_done - first) / max(1, self.steps - main), scale, frames)
 
     def steps_until(self, share: float) -> float:
         """Return how many steps are done when a share of the training, coarse stages left out, is."""
         main = self.stages()[-1][0]
         return main + share * (self.steps - main)
-
-    def image_scale(self, share: float) -> float:
-        """Return the scale of the images after a share of the steps."""
-        return next(scale for start, scale in reversed(self.pyramid) if share >= start)

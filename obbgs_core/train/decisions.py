@@ -88,19 +88,15 @@ def observe(
 def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> None:
     """Refine the poses if the validation brackets say that they err.
 
-    They are asked before each round of refinement, until they say so or pictures have their full size: a model of
-    coarse pictures shows large errors only. They are trained on from then on.
+    They are asked before the first round of refinement, and trained on from then on.
     """
     config = setup.config
     if state.poses_decided or share < config.poses.refine_from or not pose_rounds.is_turn(setup, state):
         return
-    scale = config.image_scale(share)
-    brackets = [setup.batches.batch(b, scale) for b in state.order.validation_brackets]
+    brackets = [setup.batches.batch(b) for b in state.order.validation_brackets]
     cell_m = pose_rounds.cell_m(setup)
     evidence = correction_evidence(state.model.detach(), setup.frames, brackets, setup.sensor, cell_m)
     refined = evidence.says_so
-    if not refined and scale < config.image_scale(1):
-        return
     state.poses = PoseCorrections(setup.frames) if refined else None
     state.holds = HOLDS if refined else 0
     state.poses_decided = f"{'refined' if refined else 'as tagged'} (step {state.steps_done + 1}: {evidence})"
@@ -147,32 +143,27 @@ def change_number(
         reset_opacities(state.gaussians, state.adam, state.log_lowering)
 
 
-def select_model(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
+def select_model(setup: TrainingSetup, state: TrainingState) -> None:
     """Prune by BIC and test a higher harmonic degree, when due; a moving Sun and highlights are tested before.
 
     Where no highlights were found they are tested again once half as many frames again have joined.
-
-    Args:
-        scale: of the images that the likelihood is taken of.
     """
     config, now = setup.config, state.steps_done + 1
     settled = now >= round(config.steps_until(HIGHLIGHTS_FROM)) >= FEWEST_STEPS
     untested = len(setup.frames) >= MORE_FRAMES * state.highlights_frames
     if settled and untested and config.light.highlights and not state.gaussians.has_highlights:
-        add_highlights(setup, state, scale)
+        add_highlights(setup, state)
     if any(now == round(config.steps_until(at)) for at in config.parsimony.prune_at):
-        prune_by_bic(setup, state, scale)
-        raise_degree(setup, state, scale, ("sun", "view") if setup.sun_moves else ("view",))
+        prune_by_bic(setup, state)
+        raise_degree(setup, state, ("sun", "view") if setup.sun_moves else ("view",))
     elif setup.sun_moves and now == round(config.steps_until(SUN_FROM)):
-        raise_degree(setup, state, scale, ("sun",))
+        raise_degree(setup, state, ("sun",))
 
 
-def prune_by_bic(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
+def prune_by_bic(setup: TrainingSetup, state: TrainingState) -> None:
     """Remove the Gaussians whose likelihood gain is below their BIC penalty, unless that were all of them."""
     drop_not_finite(state)
-    kept = justified(
-        state.model, batches_at(setup, state), setup.sensor, scale, setup.config.parsimony, state.rng
-    )
+    kept = justified(state.model, batches_at(setup, state), setup.sensor, setup.config.parsimony, state.rng)
     if kept.any():
         removed = len(state.gaussians) - int(kept.sum())
         state.gaussians = keep(state.gaussians, state.adam, kept)
@@ -182,14 +173,13 @@ def prune_by_bic(setup: TrainingSetup, state: TrainingState, scale: float) -> No
 
 
 def raise_degree(
-    setup: TrainingSetup, state: TrainingState, scale: float, directions: tuple[Literal["view", "sun"], ...]
+    setup: TrainingSetup, state: TrainingState, directions: tuple[Literal["view", "sun"], ...]
 ) -> None:
     """Let the radiance turn with view or Sun, or raise its degree, if the likelihood gain exceeds the BIC penalty."""
     raised, reason = raised_degree(
         state.gaussians,
         batches_at(setup, state),
         setup.sensor,
-        scale,
         directions,
         setup.config.light,
         state.rng,
@@ -202,7 +192,7 @@ def raise_degree(
         log.info("radiance %s", described(state.gaussians, state.appearance_reason))
 
 
-def add_highlights(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
+def add_highlights(setup: TrainingSetup, state: TrainingState) -> None:
     """Give every Gaussian a highlight, if frames that are withheld from the choice are explained better by them.
 
     Where the Sun moves they get one in any case: along their normals if withheld brackets are not explained better.
@@ -212,7 +202,6 @@ def add_highlights(setup: TrainingSetup, state: TrainingState, scale: float) -> 
         state.model,
         batches_at(setup, state),
         setup.sensor,
-        scale,
         state.misfit,
         state.shadows,
         state.steps_done,

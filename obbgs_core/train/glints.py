@@ -96,7 +96,6 @@ def lobed(
     gaussians: Gaussians,
     batches: Batches,
     sensor: Sensor,
-    scale: float,
     misfit: float | None,
     shadows: Shadows,
     step: int,
@@ -110,12 +109,11 @@ def lobed(
     fitted to all frames. Nothing is random.
 
     Args:
-        scale: of the images.
         misfit: the model's own error, see `likelihood_loss`.
         shadows: of the model at this step.
     """
     model = gaussians.detach()
-    seen = _seen(model, batches, sensor, scale, misfit, shadows, step)
+    seen = _seen(model, batches, sensor, misfit, shadows, step)
     unit = radiance(model.sh[:, :1], torch.zeros_like(model.means)).mean().item()
     axes = _sphere(AXES)
     moves = model.shading != "view"
@@ -217,7 +215,6 @@ def _seen(
     model: Gaussians,
     batches: Batches,
     sensor: Sensor,
-    scale: float,
     misfit: float | None,
     shadows: Shadows,
     step: int,
@@ -226,7 +223,7 @@ def _seen(
     found = [[], [], [], []]
     static_sun = _static_sun(batches.frames) if model.shading == "view" else None
     for index in shown_frames(batches, VIEWS):
-        batch = batches.batch([index], scale)
+        batch = batches.batch([index])
         sunlit = shadows.sunlit(model, batch.cameras, step)
         added = torch.zeros(1, len(model), model.sh.shape[2], requires_grad=True)
         rendered = render(model, batch.cameras, sunlit=sunlit, added=added)

@@ -49,19 +49,18 @@ def justified(
     gaussians: Gaussians,
     batches: Batches,
     sensor: Sensor,
-    scale: float,
     settings: ParsimonySettings,
     rng: torch.Generator,
 ) -> Tensor:
     """Return which Gaussians [N] gain more likelihood than their BIC penalty, or are opaque and shown by a picture."""
-    gains, shown_px, values = likelihood_gains(gaussians, batches, sensor, scale, rng)
+    gains, shown_px, values = likelihood_gains(gaussians, batches, sensor, rng)
     kept = gains >= settings.bic_factor * bic_penalty(gaussians, values)
     surface = gaussians.opacities.detach() > settings.keep_above_opacity
     return kept | (surface & (shown_px > SHOWN_PX))
 
 
 def likelihood_gains(
-    gaussians: Gaussians, batches: Batches, sensor: Sensor, scale: float, rng: torch.Generator
+    gaussians: Gaussians, batches: Batches, sensor: Sensor, rng: torch.Generator
 ) -> tuple[Tensor, Tensor, int]:
     """Return each Gaussian's likelihood gain and the pixels that show it, and the number of values above noise.
 
@@ -76,7 +75,7 @@ def likelihood_gains(
     model = gaussians.detach()
     model.opacity_logits.requires_grad_()
     gains, shown_px, values, times = torch.zeros(len(model)), torch.zeros(len(model)), 0, 0.0
-    for view in _views(model, batches, sensor, scale, rng):
+    for view in _views(model, batches, sensor, rng):
         (weights,) = torch.autograd.grad(view.radiance[..., 0].sum(), view.added, retain_graph=True)
         shown_px = torch.maximum(shown_px, weights[0, :, 0])
         slope = weighted_gradient(view.radiance, view.weight * view.signs, model.opacity_logits)
@@ -88,7 +87,7 @@ def likelihood_gains(
 
 
 def next_degree_gain(
-    gaussians: Gaussians, batches: Batches, sensor: Sensor, scale: float, rng: torch.Generator
+    gaussians: Gaussians, batches: Batches, sensor: Sensor, rng: torch.Generator
 ) -> tuple[float, float]:
     """Return the likelihood gain of the next spherical-harmonic degree and its BIC penalty, both in nats.
 
@@ -101,7 +100,7 @@ def next_degree_gain(
     model.sh.requires_grad_()
     slope, curvature, shared = (torch.zeros_like(model.sh) for _ in range(3))
     values, times = 0, 0.0
-    for view in _views(model, batches, sensor, scale, rng):
+    for view in _views(model, batches, sensor, rng):
         residual = view.residual(sensor).clamp(-3, 3)  # robust, as the loss is
         g = weighted_gradient(view.radiance, view.weight * residual, model.sh, keep_graph=True)
         probe = weighted_gradient(view.radiance, view.weight * view.signs, model.sh)
@@ -138,13 +137,11 @@ class _View:
         return -residual * math.sqrt(batch.averaged_pixels)
 
 
-def _views(
-    model: Gaussians, batches: Batches, sensor: Sensor, scale: float, rng: torch.Generator
-) -> Iterator[_View]:
+def _views(model: Gaussians, batches: Batches, sensor: Sensor, rng: torch.Generator) -> Iterator[_View]:
     """Render some of the training frames, spread evenly."""
     chosen = shown_frames(batches)
     for index in chosen:
-        batch = batches.batch([index], scale)
+        batch = batches.batch([index])
         added = torch.zeros(1, len(model), model.sh.shape[2], requires_grad=True)
         radiance = render(model, batch.cameras, added=added).radiance
         prediction = sensor.predicted(radiance.detach(), batch.exposure_time_s)

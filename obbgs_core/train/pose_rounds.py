@@ -55,15 +55,12 @@ def reach_m(setup: TrainingSetup, share: float) -> float:
     return float(rates["means"]) * steps_between(setup)
 
 
-def move(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
+def move(setup: TrainingSetup, state: TrainingState) -> None:
     """Move the poses to where one frame of each bracket wants them if the surface goes along; settle the gauge.
 
     The frames of a bracket take turns. Where poses were aligned and Gaussians are still added, these go along with the
     surface. At the first round after `MISFIT_FROM` of the steps, brackets whose residuals stand out are left out of the
     training for good.
-
-    Args:
-        scale: of the images.
     """
     poses = state.poses
     assert poses is not None
@@ -72,7 +69,7 @@ def move(setup: TrainingSetup, state: TrainingState, scale: float) -> None:
         if index not in left_out:
             brackets[bracket].append(index)
     shown = [members for members in brackets if members]
-    residuals = _gather(setup, state, [members[turn % len(members)] for members in shown], scale)
+    residuals = _gather(setup, state, [members[turn % len(members)] for members in shown])
     since = state.steps_done - setup.config.steps_until(MISFIT_FROM)
     if 0 <= since < steps_between(setup):
         _leave_out(setup, state, [shown[i] for i in torch.nonzero(standing_out(*residuals))[:, 0].tolist()])
@@ -134,21 +131,19 @@ def _leave_out(setup: TrainingSetup, state: TrainingState, brackets: list[list[i
     )
 
 
-def estimate(setup: TrainingSetup, state: TrainingState, scale: float) -> PoseEstimate | None:
+def estimate(setup: TrainingSetup, state: TrainingState) -> PoseEstimate | None:
     """Return what all frames say of the poses by the model as it stands; None where they are as tagged."""
     if state.poses is None:
         return None
     fitting = [i for i in range(len(setup.frames)) if i not in set(state.misfits)]
-    _gather(setup, state, fitting, scale)
+    _gather(setup, state, fitting)
     found = state.poses.estimate(setup.frames).of_frames(fitting)
     state.poses.clear()
     return found
 
 
 @torch.no_grad()
-def _gather(
-    setup: TrainingSetup, state: TrainingState, indices: list[int], scale: float
-) -> tuple[Tensor, Tensor]:
+def _gather(setup: TrainingSetup, state: TrainingState, indices: list[int]) -> tuple[Tensor, Tensor]:
     """Let pictures of the model as it stands say what the frames tell of their poses and of the surface.
 
     Returns the residual of each [len(indices)]: its mean square in deviations of the noise, and its share of the light.
@@ -157,7 +152,7 @@ def _gather(
     assert poses is not None
     dispersions, shares = [], []
     for first in range(0, len(indices), RENDERED):
-        batch = setup.batches.batch(indices[first : first + RENDERED], scale)
+        batch = setup.batches.batch(indices[first : first + RENDERED])
         cameras = poses.cameras(batch.indices, batch.cameras)
         rendered, slopes = render_with_slopes(model, cameras)
         images = (rendered.radiance, slopes, rendered.alpha, rendered.depth)

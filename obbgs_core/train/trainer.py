@@ -119,9 +119,9 @@ class Trainer:
         began = time.monotonic()
         setup, state, config = self.setup, self.state, self.setup.config
         moment = config.moment(state.steps_done)
-        share, scale = moment.share, moment.image_scale
+        share = moment.share
         drawn = state.order.draw(min(moment.frames, len(setup.frames)), state.rng)
-        batch = setup.batches.batch(drawn, scale)
+        batch = setup.batches.batch(drawn, moment.image_scale)
         if state.poses is not None:
             batch = dataclasses.replace(batch, cameras=state.poses.cameras(drawn, batch.cameras))
         cameras = batch.cameras
@@ -144,9 +144,9 @@ class Trainer:
         self._descend(share)
         decisions.decide_poses(setup, state, share)
         if pose_rounds.is_due(setup, state, share):
-            pose_rounds.move(setup, state, scale)
+            pose_rounds.move(setup, state)
         decisions.change_number(setup, state, batch, residual, moment)
-        decisions.select_model(setup, state, scale)
+        decisions.select_model(setup, state)
         self._measure(seen, batch)
         state.steps_done += 1
         state.seconds += time.monotonic() - began
@@ -263,10 +263,9 @@ class Trainer:
 
     @property
     def is_past_growth(self) -> bool:
-        """Whether growth and resets of opacities are over and the pictures have their full size for good."""
+        """Whether growth and resets of opacities are over."""
         config = self.setup.config
-        last_change = max(config.growth.end, config.pyramid[-1][0])
-        return self.state.steps_done >= config.steps_until(last_change)
+        return self.state.steps_done >= config.steps_until(config.growth.end)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -303,7 +302,7 @@ class Trainer:
             appearance=described(state.gaussians, state.appearance_reason, state.highlights_reason),
             growth=f"until step {min(state.steps_done, round(setup.config.steps_until(setup.config.growth.end)))}",
             poses=state.poses_decided or "as tagged (training ended before this was decided)",
-            pose_estimate=pose_rounds.estimate(setup, state, setup.config.image_scale(self.share)),
+            pose_estimate=pose_rounds.estimate(setup, state),
             exposing=self.exposing,
             misfit=state.misfit,
             sun_span_deg=setup.sun_span_deg,
@@ -328,18 +327,13 @@ class Trainer:
 
 def _seconds_left(state: TrainingState, config: MethodConfig) -> float:
     """Return the time that the remaining steps will take: their work at the pace of the last steps."""
-
-    *coarse, (_, _, frames) = config.stages()
-    levels = [
-        *coarse,
-        *((round(config.steps_until(share)), scale, frames) for share, scale in config.pyramid),
-    ]
+    stages = config.stages()
 
     def work(first: int, last: int) -> float:
-        ends = [*(start for start, _, _ in levels[1:]), config.steps]
+        ends = [*(start for start, _, _ in stages[1:]), config.steps]
         return sum(
             max(0, min(last, until) - max(first, start)) * (FIXED_COST + scale**2) * frames
-            for (start, scale, frames), until in zip(levels, ends, strict=True)
+            for (start, scale, frames), until in zip(stages, ends, strict=True)
         )
 
     held = state.holds * work(*(round(config.steps_until(share)) for share in (HELD_FROM, HELD_AT)))

@@ -144,7 +144,6 @@ def measure(name: str, threads: int, distance: float, steps: int) -> dict:
     torch.set_num_threads(threads)
     changes = {
         "steps": WARM_UP_STEPS + steps,
-        "pyramid": ((0.0, 1.0),),
         "growth.max_gaussians": GAUSSIANS,
         "growth.begin": 0.0,
         "growth.end": 1.0,

@@ -48,7 +48,7 @@ TOGETHER = (*ALONE, (np.array([0.2, 0.3, 1.5]), np.array([0.6, 0.6, 0.3])))
 K = np.array([[600.0, 0, SIZE_PX / 2], [0, 600.0, SIZE_PX / 2], [0, 0, 1]])
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=4.0, read_noise_dn=8.0)
 EXPOSURES_S = (5e-5, 1e-4, 2e-4)
-QUICK = {"steps": 240, "start.count": 800, "growth.max_gaussians": 1200, "pyramid": ((0.0, 0.5), (0.3, 1.0))}
+QUICK = {"steps": 240, "start.count": 800, "growth.max_gaussians": 1200}
 
 
 def hits(origin: np.ndarray, towards: np.ndarray) -> np.ndarray:
@@ -273,7 +273,7 @@ def test_light_that_follows_the_sun_asks_for_its_harmonics_and_constant_light_do
     plain = dataclasses.replace(lit, sh=lit.sh[:, :1])
     for truth, spread_deg, justified in ((lit, 60, True), (plain, 60, False), (plain, 8, False)):
         batches = Batches(shown(truth, spread_deg), SENSOR.white_dn)
-        gain, penalty = next_degree_gain(plain, batches, SENSOR, 1.0, torch.Generator().manual_seed(0))
+        gain, penalty = next_degree_gain(plain, batches, SENSOR, torch.Generator().manual_seed(0))
         assert (gain > penalty) == justified, (gain, penalty)
 
 

@@ -444,12 +444,10 @@ def test_a_setting_that_is_not_there_or_of_the_wrong_kind_is_named(assignments, 
 
 
 def test_settings_have_the_types_that_the_method_wants():
-    assert set_changes(
-        ["rates.means=2e-3", "parsimony.prune_at=[0.5, 1]", "pyramid=[[0, 0.5], [0.5, 1]]"]
-    ) == {
+    assert set_changes(["rates.means=2e-3", "parsimony.prune_at=[0.5, 1]", "coarse=[[0.5, 12, 0.1]]"]) == {
         "rates.means": 0.002,
         "parsimony.prune_at": (0.5, 1.0),
-        "pyramid": ((0.0, 0.5), (0.5, 1.0)),
+        "coarse": ((0.5, 12.0, 0.1),),
     }
 
 

@@ -28,7 +28,7 @@ def test_the_likelihood_gain_of_a_gaussian_matches_removing_it():
     frames = photographed(model, count=12)
     batches = Batches(frames, SENSOR.white_dn)
     rng = torch.Generator().manual_seed(1)
-    estimates = torch.stack([likelihood_gains(model, batches, SENSOR, 1.0, rng)[0] for _ in range(60)])
+    estimates = torch.stack([likelihood_gains(model, batches, SENSOR, rng)[0] for _ in range(60)])
     exact = torch.zeros(len(model))
     for j in range(len(model)):
         fewer = model.select(torch.arange(len(model)) != j)
@@ -56,7 +56,7 @@ def test_the_pixels_that_show_a_gaussian_are_its_weights_in_the_reference_render
             alone = dataclasses.replace(model.detach(), sh=sh)
             weights = render(alone, cameras, backend="reference").radiance / 1e4
             most[j] = torch.maximum(most[j], weights.sum())
-    _, shown_px, _ = likelihood_gains(model, batches, SENSOR, 1.0, torch.Generator().manual_seed(0))
+    _, shown_px, _ = likelihood_gains(model, batches, SENSOR, torch.Generator().manual_seed(0))
     torch.testing.assert_close(shown_px, most, rtol=1e-3, atol=1e-3)
 
 
@@ -79,7 +79,7 @@ def test_opaque_gaussians_are_pruned_where_no_picture_shows_them_and_dark_ones_a
     both.opacity_logits[:] = 3.0
     rng = torch.Generator().manual_seed(0)
     settings = ParsimonySettings(keep_above_opacity=0.65)
-    kept = justified(both, Batches(frames, SENSOR.white_dn), SENSOR, 1.0, settings, rng)
+    kept = justified(both, Batches(frames, SENSOR.white_dn), SENSOR, settings, rng)
     assert kept.tolist() == [True] * 8 + [False] * 8
 
 
@@ -91,7 +91,7 @@ def test_colour_that_turns_with_the_view_justifies_harmonics_and_plain_colour_do
     gains = []
     for seen in (plain, turning):
         batches = Batches(photographed(seen, 24), SENSOR.white_dn)
-        gains.append(next_degree_gain(plain, batches, SENSOR, 1.0, torch.Generator().manual_seed(0)))
+        gains.append(next_degree_gain(plain, batches, SENSOR, torch.Generator().manual_seed(0)))
     assert gains[0][0] < gains[0][1]
     assert gains[1][0] > gains[1][1]
 

@@ -97,7 +97,7 @@ def test_kept_peaks_make_a_distant_boom_too_bright():
 
 @pytest.mark.parametrize("factor", [2, 4])
 def test_images_at_a_smaller_scale_are_those_of_averaged_pixels(factor):
-    """A pyramid's level holds means of blocks of pixels; the model, rendered at that scale, must show the same."""
+    """A reduced picture holds means of blocks of pixels; the model, rendered at that scale, must show the same."""
     gaussians = random_gaussians(40, 1, seed=3, sh_count=1)
     gaussians = dataclasses.replace(gaussians, opacity_logits=torch.full((40,), -2.0), footprint="camera")
     cameras = dataclasses.replace(looking_at_origin(2, 96), psf_sigma_px=0.8)

@@ -47,7 +47,7 @@ SHADINGS = [
     ("normals", 1, 3),
 ]
 STATIC_SUN = torch.tensor([-0.48, 0.6, -0.64])
-SHINY = {"steps": 120, "start.count": 150, "growth.max_gaussians": 200, "pyramid": ((0.0, 1.0),)}
+SHINY = {"steps": 120, "start.count": 150, "growth.max_gaussians": 200}
 
 
 def shining(
@@ -297,7 +297,7 @@ def test_the_true_shapes_get_highlights_where_the_frames_show_them(shiny_frames,
     frames = shiny_frames if shiny else photographed(target(30), 90, size_px=32, focal_px=65.0)
     trainer = _trainer(frames)
     before, random = trainer.state.gaussians, trainer.state.rng.get_state()
-    decisions.add_highlights(trainer.setup, trainer.state, 1.0)
+    decisions.add_highlights(trainer.setup, trainer.state)
     after = trainer.state.gaussians
     assert after.has_highlights == shiny and trainer.state.highlights_reason
     assert torch.equal(
@@ -323,7 +323,7 @@ def test_under_a_told_sun_that_stands_still_an_axis_is_the_normal_of_a_mirror(mo
     other = torch.tensor([0.0, 0.6, 0.8]) if moves else STATIC_SUN
     frames = [dataclasses.replace(f, sun_dir=other if i == 50 else STATIC_SUN) for i, f in enumerate(frames)]
     trainer = _trainer(frames)
-    decisions.add_highlights(trainer.setup, trainer.state, 1.0)
+    decisions.add_highlights(trainer.setup, trainer.state)
     after = trainer.state.gaussians
     assert after.has_highlights
     assert (
@@ -353,7 +353,7 @@ def test_under_a_moving_sun_lobes_that_other_brackets_do_not_confirm_lie_along_t
     frames = photographed(truth, 90, size_px=32, focal_px=65.0, suns=suns)
     trainer = _trainer(frames, {"light.sun_shading": "linear"})
     trainer.state.gaussians = dataclasses.replace(trainer.state.gaussians, shading="sun").trainable()
-    decisions.add_highlights(trainer.setup, trainer.state, 1.0)
+    decisions.add_highlights(trainer.setup, trainer.state)
     after = trainer.state.gaussians
     assert after.lobes.shape == (30, 1) and "along the normals" in trainer.state.highlights_reason
     weights = after.lobes.detach().exp().mean()

@@ -32,7 +32,7 @@ def trained(frames: list[TrainingFrame]) -> Trainer:
     state.adam, state.growth = Adam(state.gaussians), Growth.of(len(state.gaussians))
     for share in (0.3, 0.5, MISFIT_FROM):
         state.steps_done = round(share * CONFIG.steps)
-        pose_rounds.move(trainer.setup, state, 1.0)
+        pose_rounds.move(trainer.setup, state)
     return trainer
 
 

@@ -567,7 +567,6 @@ def test_pruning_sees_the_target_from_the_refined_poses(erring):
             one.state.model,
             decisions.batches_at(one.setup, one.state),
             SENSOR,
-            1.0,
             dataclasses.replace(settings.parsimony, keep_above_opacity=1.0),
             torch.Generator().manual_seed(0),
         )

@@ -334,7 +334,6 @@ def test_a_killed_training_with_correlated_tags_resumes_to_the_same_model(frames
         "steps": 12,
         "start.count": 200,
         "growth.max_gaussians": 300,
-        "pyramid": ((0.0, 1.0),),
         "poses.refine_from": 0.2,
     }
     config = preset("obbgs", changes | {"poses.refine": "always"})

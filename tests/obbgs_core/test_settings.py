@@ -11,13 +11,12 @@ from obbgs_core.train.presets import PRESETS, preset, quality_changes
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("pyramid", ((0.1, 1.0),), "pairs of a share of the steps, from 0"),
-        ("pyramid", ((0.0, 1.0, 2.0),), "pairs"),
-        ("pyramid", (), "pairs"),
         ("rates.means", -1.0, "0 or more, got -1.0"),
         ("rates.means", math.nan, "0 or more, got nan"),
         ("growth.interval", 0, "at least 1, got 0"),
         ("parsimony.prune_at", (0.5, 1.5), "from 0 to 1, got 1.5"),
+        ("coarse", ((0.5, 12),), "triples of an image scale"),
+        ("coarse", ((0.5, 12, 0.6), (0.5, 12, 0.5)), "less than 1 in all"),
         ("light.sh_degree", 4, "from 0 to 3, got 4"),
     ],
 )
@@ -30,7 +29,7 @@ def test_quality_scales_steps_and_what_goes_with_them_and_unknown_ones_are_refus
     standard = preset("obbgs")
     assert changed(standard, quality_changes(standard, "standard")) == standard
     draft = changed(standard, quality_changes(standard, "draft"))
-    assert 0.3 * standard.steps < draft.steps < standard.steps / 3
+    assert 0.25 * standard.steps < draft.steps < standard.steps / 3
     assert draft.growth.max_gaussians == standard.growth.max_gaussians
     for interval in ("interval", "obb_interval"):  # as often in the whole training
         times = [c.steps / getattr(c.growth, interval) for c in (draft, standard)]
