@@ -142,7 +142,7 @@ MethodName = Annotated[
 QualityName = Annotated[
     Quality | None,
     typer.Option(
-        help="draft has three tenths of the steps of standard, best three times its steps and Gaussians; default: standard."
+        help="draft: 0.3 of the steps of standard; best: three times its steps and Gaussians; default: standard."
     ),
 ]
 Budget = Annotated[
