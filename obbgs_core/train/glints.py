@@ -25,8 +25,8 @@ from obbgs_core.train.appearance import Shadows
 from obbgs_core.train.batches import Batches
 from obbgs_core.train.parsimony import shown_frames
 
-# share of the steps at which highlights are tested; later they gain less (experiment 042)
-HIGHLIGHTS_FROM = 0.15
+# share of the steps at which highlights are tested; later they gain less (experiment 069)
+HIGHLIGHTS_FROM = 0.1
 # before that a model has not settled, and parallax that it does not have yet looks like highlights
 FEWEST_STEPS = 100
 MORE_FRAMES = 1.5  # times as many as at the last test: then they are tested again
