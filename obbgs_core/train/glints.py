@@ -38,10 +38,8 @@ STRENGTHS = (1.0, 2.0, 4.0, 8.0, 16.0)  # of a lobe's peak over the mean radianc
 AXES = 250  # directions that a lobe is tried in, 13 degrees apart
 LEAST_GAIN = 3.0  # nats: a Gaussian whose lobe gains less starts with the weight FAINT
 FAINT = 0.05
-NORMAL_ALPHA, NORMAL_STRENGTH = (
-    0.2,
-    8.0,
-)  # of lobes along normals at first: roughness; peak over the mean radiance
+# of lobes along normals at first: roughness; peak over the mean radiance
+NORMAL_ALPHA, NORMAL_STRENGTH = 0.2, 8.0
 SURE = 2.0  # standard errors by which the root of the gain on the other half must exceed zero on average
 STILL_DEG = 5.0  # a Sun that is known and never further than this from its mean direction stands still
 AT_ONCE = 16  # Gaussians whose axes are searched together, for memory's sake

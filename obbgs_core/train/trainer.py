@@ -36,7 +36,7 @@ CHI2_MEMORY = 0.98  # share of the running chi² that a step keeps; the rest is 
 CHECKPOINT_EVERY_S = 20.0
 LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
 FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
-# share of the steps that the schedule is set back to when frames join: pictures have full size from there on
+# share of the steps that the schedule is set back to when frames join
 HOLD = 0.25
 PACE_STEPS = 50  # the time left is estimated from the pace of so many steps
 
@@ -224,8 +224,7 @@ class Trainer:
         if state.seconds >= time_limit_s:
             untrained = ", before the first step: the model is its untrained start"
             return f"time limit of {time_limit_s:g} s" + (untrained if state.steps_done == 0 else "")
-        grown = state.steps_done >= config.steps_until(config.growth.end)
-        if config.chi2_end and state.chi2 <= config.chi2_end and grown:
+        if config.chi2_end and state.chi2 <= config.chi2_end and self.is_past_growth:
             return f"residual chi² reached the noise ({state.chi2:.3f})"
         if state.steps_done >= config.steps:
             return f"all {config.steps} steps done (residual chi² {state.chi2:.2f})"
