@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import KDTree
 
+from ground import evaluate as scoring
 from ground.card import chi2_explained, model_card
 from ground.compare.case import load_case
 from ground.compare.trainings import imaging
@@ -179,9 +181,18 @@ def test_the_mesh_is_scored_by_points_on_its_area_and_what_the_frames_show_apart
     share = mesh.area_faces[half].sum() / mesh.area_faces.sum()
     on_half = (y_up[:, 0] > np.median(mesh.triangles_center[:, 0])).mean()
     assert abs(on_half - share) < 0.1  # four deviations of 500 points
+    case = load_case(session)
+    clouds = {
+        "": load_ply(session / "runs/run/model.ply").means,
+        "_mesh": read_mesh_points(path, scoring.SURFACE_POINTS),
+    }
+    assert metrics["surface_shown"] == pytest.approx(100 * case.shown.mean(), abs=1e-4)
     assert 0 < metrics["surface_shown"] < 100
-    for name in ("", "_surface", "_mesh"):
-        assert metrics[f"completeness_shown{name}"] >= metrics[f"completeness{name}"] * 0.9
+    for name, cloud_m in clouds.items():
+        distances = case.units_per_m * KDTree(cloud_m).query(case.cloud_m[case.shown])[0]
+        assert metrics[f"completeness_shown{name}"] == pytest.approx(
+            100 * (distances < 0.01).mean(), abs=0.05
+        )
     page = write_report(session, "run").read_text()
     assert "of the part that the frames show" in page and "within 0.01 of model.glb" in page
     path.rename(path.with_suffix(".kept"))
