@@ -260,8 +260,8 @@ class LiveReconstruction:
         """Renew the shown model if it is better now, and send it up if that is asked for and worth it."""
         if self.steps and self.shown.offered_step != self.steps:
             self.shown.offer(trainer.gaussians, self.steps)
-        arrivals, at_full_size = self.arrivals, trainer.share >= HOLD
-        if self._uplink is not None and at_full_size and arrivals.session is not None:
+        arrivals, is_past_start = self.arrivals, trainer.share >= HOLD
+        if self._uplink is not None and is_past_start and arrivals.session is not None:
             self._uplink.follow(self.shown, arrivals.session, arrivals.training, self._part)
 
     def report(self, state: State, message: str) -> None:
