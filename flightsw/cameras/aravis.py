@@ -26,7 +26,7 @@ PIXEL_FORMATS = {
     "BayerGB16": (0x01100030, 16, "GB"),
     "BayerBG16": (0x01100031, 16, "BG"),
 }
-BUFFER_SUCCESS = 0
+BUFFER_SUCCESS, BUFFER_CLEARED = 0, 1
 BUFFER_STATUS = {
     1: "cleared",
     2: "timeout",

@@ -9,7 +9,14 @@ from urllib.parse import parse_qs
 
 import numpy as np
 
-from flightsw.cameras.aravis import BUFFER_STATUS, BUFFER_SUCCESS, PIXEL_FORMATS, AravisError, aravis
+from flightsw.cameras.aravis import (
+    BUFFER_CLEARED,
+    BUFFER_STATUS,
+    BUFFER_SUCCESS,
+    PIXEL_FORMATS,
+    AravisError,
+    aravis,
+)
 from flightsw.cameras.camera import OWN_CLOCK_ANSWER_S, Exposure
 from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.mission import CameraSection
@@ -160,7 +167,7 @@ class GigeCamera:
         triggered_utc_ns = time.time_ns()
         call("arv_camera_software_trigger", self._camera)
         wait_s = exposure_time_s + (OWN_CLOCK_ANSWER_S if self.has_own_clock else ANSWER_S)
-        buffer = call("arv_stream_timeout_pop_buffer", self._stream, round(wait_s * 1e6))
+        buffer = self._next_filled(wait_s)
         if not buffer:
             raise CaptureError(f"no picture within {wait_s:.1f} s")
         try:
@@ -177,6 +184,20 @@ class GigeCamera:
         keeps_utc = self.has_own_clock or abs(stamp_ns - triggered_utc_ns) < CLOCK_S * NS
         opened_utc_ns = stamp_ns if keeps_utc else triggered_utc_ns
         return Exposure(dn, taken_s, opened_utc_ns + round(taken_s * NS / 2))
+
+    def _next_filled(self, wait_s: float) -> int | None:
+        """Return the next buffer that a picture began to fill; None if none came in time.
+
+        On a busy computer Aravis sometimes hands out a buffer that it has only cleared; the picture comes after it.
+        """
+        deadline_s = time.monotonic() + wait_s
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            buffer = self._aravis.call("arv_stream_timeout_pop_buffer", self._stream, round(left_s * 1e6))
+            if not buffer or self._aravis.call("arv_buffer_get_status", buffer) != BUFFER_CLEARED:
+                return buffer
+            log.warning("%s: an empty buffer came; waiting for the picture", self._url)
+            self._aravis.call("arv_stream_push_buffer", self._stream, buffer)
+        return None
 
     def _pixels(self, buffer: int) -> np.ndarray:
         call = self._aravis.call
