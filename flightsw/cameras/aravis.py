@@ -28,7 +28,6 @@ PIXEL_FORMATS = {
 }
 BUFFER_SUCCESS, BUFFER_CLEARED = 0, 1
 BUFFER_STATUS = {
-    1: "cleared",
     2: "timeout",
     3: "missing packets",
     4: "wrong packet",

@@ -167,7 +167,7 @@ class GigeCamera:
         triggered_utc_ns = time.time_ns()
         call("arv_camera_software_trigger", self._camera)
         wait_s = exposure_time_s + (OWN_CLOCK_ANSWER_S if self.has_own_clock else ANSWER_S)
-        buffer = self._next_filled(wait_s)
+        buffer = self._next_buffer(wait_s)
         if not buffer:
             raise CaptureError(f"no picture within {wait_s:.1f} s")
         try:
@@ -185,17 +185,17 @@ class GigeCamera:
         opened_utc_ns = stamp_ns if keeps_utc else triggered_utc_ns
         return Exposure(dn, taken_s, opened_utc_ns + round(taken_s * NS / 2))
 
-    def _next_filled(self, wait_s: float) -> int | None:
-        """Return the next buffer that a picture began to fill; None if none came in time.
+    def _next_buffer(self, wait_s: float) -> int | None:
+        """Return the next buffer that is not empty; None if none came in time.
 
-        On a busy computer Aravis sometimes hands out a buffer that it has only cleared; the picture comes after it.
+        On busy computers Aravis has handed out buffers that it had only cleared; they are given back to it.
         """
         deadline_s = time.monotonic() + wait_s
         while (left_s := deadline_s - time.monotonic()) > 0:
             buffer = self._aravis.call("arv_stream_timeout_pop_buffer", self._stream, round(left_s * 1e6))
             if not buffer or self._aravis.call("arv_buffer_get_status", buffer) != BUFFER_CLEARED:
                 return buffer
-            log.warning("%s: an empty buffer came; waiting for the picture", self._url)
+            log.warning("%s: Aravis handed out an empty buffer; still waiting for the picture", self._url)
             self._aravis.call("arv_stream_push_buffer", self._stream, buffer)
         return None
 
