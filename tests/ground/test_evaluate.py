@@ -20,6 +20,7 @@ from ground.mesh_files import read_mesh_points
 from ground.reconstruct import reconstruct
 from ground.report import write_report
 from ground.session import SessionError
+from ground.truth import read_points
 from obbgs_core.frames import cameras_of
 from obbgs_core.io.ply import load_ply
 from obbgs_core.score.metrics import foreground_psnr_db, psnr_db
@@ -184,6 +185,7 @@ def test_the_mesh_is_scored_by_points_on_its_area_and_what_the_frames_show_apart
     case = load_case(session)
     clouds = {
         "": load_ply(session / "runs/run/model.ply").means,
+        "_surface": read_points(session / "runs/run/surface.ply"),
         "_mesh": read_mesh_points(path, scoring.SURFACE_POINTS),
     }
     assert metrics["surface_shown"] == pytest.approx(100 * case.shown.mean(), abs=1e-4)
