@@ -27,8 +27,8 @@ BAND_VOXELS = 1.5  # a view says nothing of what lies deeper than this behind th
 # of each Gaussian in the depth maps: the Gaussians of a face lie in layers, of which the outer ones are nearest to it
 COPIES = 5
 SEEN_THROUGH = 0.15  # of the views that see a place; if so many see past it, it is empty
-THICKER_VOXELS = 0.9  # on each side, so that a plate thinner than a voxel is not lost between two nodes
-DRAWN_BACK_VOXELS = 0.7  # of that, when triangles are made; what is left keeps the two sides of a plate apart
+THICKER_VOXELS = 0.8  # on each side, so that a plate thinner than a voxel is not lost between two nodes
+DRAWN_BACK_VOXELS = 0.6  # of that, when triangles are made; what is left keeps the two sides of a plate apart
 AT_LEAST_SEEING = 2  # views; what fewer see is taken for solid
 BLOCK = 8  # nodes along a side that are decided on together first
 FEWEST_NODES = 8  # of a piece that is kept

@@ -64,10 +64,7 @@ def test_the_side_that_no_view_sees_is_marked_and_closed():
     assert solid(mesh).is_watertight
     heights = mesh.vertices[:, 2]
     below = heights < heights.min() + PIXEL_M  # the flat end of what is known
-    assert (mesh.seen_by[heights > 0.7] > 0).all()
-    assert (
-        mesh.seen_by[below] == 0
-    ).mean() > 0.99  # where it meets the sphere, a vertex may be near what a view sees
+    assert (mesh.seen_by[heights > 0.7] > 0).all() and (mesh.seen_by[below] == 0).all()
 
 
 def test_what_no_view_shows_has_no_mesh():
