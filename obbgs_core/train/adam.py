@@ -8,8 +8,9 @@ from torch import Tensor
 
 from obbgs_core import compiled
 from obbgs_core.model.gaussians import LOBES, TENSORS, Gaussians
-from obbgs_core.settings import check
+from obbgs_core.settings import check, number
 
+FIRST_MEMORY, SECOND_MEMORY = 0.9, 0.999  # shares of the moments that a step keeps (Kingma and Ba 2015)
 OPACITY_RATE = 0.05  # of opacity logits a step (Kerbl et al. 2023)
 AXIS_RATE = 0.01  # of the axes of highlights a step
 WEIGHT_RATE = 0.03  # of the logarithms of their weights a step
@@ -30,6 +31,9 @@ class RateSettings:
     sh_rest: float = 1.0  # factor on the rate of the coefficients above degree 0
     # all rates but that of the means decay exponentially to this share of themselves
     final_share: float = 1.0
+    # share of the second moments that a step keeps: the smaller, the sooner steps follow gradients that become smaller
+    # where the Sun moves it stays the default: what the next Sun asks of a Gaussian is new
+    second_memory: float = number(SECOND_MEMORY, most=0.9999)
 
     def __post_init__(self):
         check(self, "rates")
@@ -73,7 +77,12 @@ def learning_rates(
 class Adam:
     """Adam (Kingma and Ba 2015) whose moments follow the Gaussians when they are split or removed."""
 
-    def __init__(self, gaussians: Gaussians, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        betas: tuple[float, float] = (FIRST_MEMORY, SECOND_MEMORY),
+        eps: float = 1e-15,
+    ):
         self.betas, self.eps, self.steps = betas, eps, 0
         self.first = {name: torch.zeros_like(t) for name, t in gaussians.parameters().items()}
         self.second = {name: torch.zeros_like(t) for name, t in gaussians.parameters().items()}

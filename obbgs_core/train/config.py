@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from obbgs_core.model.gaussians import Footprint
-from obbgs_core.settings import at_least_one, check, number
+from obbgs_core.settings import at_least_one, check, fraction, number
 from obbgs_core.start.initialisation import StartSettings
 from obbgs_core.train.adam import RateSettings
 from obbgs_core.train.appearance import LightSettings
@@ -57,6 +57,8 @@ class MethodConfig:
     # an affine map of the colours of each training frame is learnt with the model (later 3DGS)
     compensation: bool = False
     dropout: float = number(0.0, most=0.9)  # share of the Gaussians that each step leaves out (DropGaussian)
+    # share of the steps from which on the models after each step are averaged; 1: the model is that of the last step
+    averaged_from: float = fraction(1.0)
     outlier_filter: bool = False  # remove Gaussians far from the centre from the finished model
     chi2_end: float = 0.0  # above 0: stop after growth when the running chi² falls to this; 1 is pure noise
     start: StartSettings = field(default_factory=StartSettings)

@@ -235,6 +235,8 @@ def drop_not_finite(state: TrainingState) -> None:
     if count:
         state.gaussians = keep(state.gaussians, state.adam, kept)
         state.growth = state.growth.select(kept)
+        if state.average is not None:
+            state.average = state.average.select(kept)
         if state.smoothing_m is not None:
             state.smoothing_m = state.smoothing_m[kept]
         state.removed_not_finite += count

@@ -81,6 +81,7 @@ def join(
     )
     state.gaussians = Gaussians.concatenate([old, new]).trainable()
     state.adam.follow(kept, len(new))
+    state.adam.betas = fresh.adam.betas  # they are others where only now the Sun is known to move
     state.growth, state.boxes, state.shadows = Growth.of(len(state.gaussians)), [], fresh.shadows
     if state.poses is not None:
         state.poses = state.poses.extended(joined.frames)
@@ -93,7 +94,7 @@ def join(
         )
     withhold(joined, state)
     smooth(joined, state)
-    state.steps_done = position
+    state.steps_done, state.average = position, None
 
 
 def withhold(setup: TrainingSetup, state: TrainingState) -> None:

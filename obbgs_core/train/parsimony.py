@@ -19,7 +19,7 @@ from obbgs_core.train.batches import Batch, Batches
 
 VIEWS = 36  # training frames that are rendered at most, spread evenly; gains are scaled to all frames
 # An opaque Gaussian that shows on less than this in every picture hides nothing that its neighbours do not hide too.
-SHOWN_PX = 0.25
+SHOWN_PX = 0.4
 
 
 @dataclass(frozen=True)

@@ -66,6 +66,7 @@ PRESETS: dict[str, MethodConfig] = {
             windows=True,
             steps=1000,
             footprint="camera",
+            averaged_from=0.88,
             outlier_filter=False,  # few Gaussians stray from the hull; with it the demo lost 0.4 dB
             chi2_end=1.0,
             start=StartSettings(kind="hull", count=3000),
@@ -94,7 +95,13 @@ PRESETS: dict[str, MethodConfig] = {
                 opacity_reset_interval=0,
             ),
             rates=RateSettings(
-                means=4e-3, means_end=2e-5, quats=0.01, log_scales=0.02, sh=0.04, final_share=0.2
+                means=4e-3,
+                means_end=2e-5,
+                quats=0.01,
+                log_scales=0.02,
+                sh=0.04,
+                final_share=0.4,
+                second_memory=0.99,
             ),
             parsimony=ParsimonySettings(prune_at=(0.3, 0.45, 0.6, 0.72, 0.85), keep_above_opacity=0.65),
             light=LightSettings(sh_degree=0, max_sh_degree=1, sun_span_deg=5.0, highlights=True),

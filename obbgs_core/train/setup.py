@@ -27,7 +27,7 @@ from obbgs_core.settings import flat
 from obbgs_core.start.alignment import settled
 from obbgs_core.start.hull import Silhouette, light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
-from obbgs_core.train.adam import Adam
+from obbgs_core.train.adam import FIRST_MEMORY, SECOND_MEMORY, Adam
 from obbgs_core.train.batches import Batches, FrameOrder
 from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.config import MethodConfig
@@ -74,6 +74,11 @@ class TrainingSetup:
     def sun_moves(self) -> bool:
         """Whether the Sun moves by enough to be tested as what the radiance depends on."""
         return 0 < self.config.light.sun_span_deg < self.sun_span_deg
+
+    @property
+    def second_memory(self) -> float:
+        """The share of Adam's second moments that a step keeps."""
+        return SECOND_MEMORY if self.sun_moves else self.config.rates.second_memory
 
     @functools.cached_property
     def identity(self) -> Identity:
@@ -159,7 +164,7 @@ def prepare(
     state = TrainingState(
         rng=rng,
         gaussians=gaussians,
-        adam=Adam(gaussians),
+        adam=Adam(gaussians, (FIRST_MEMORY, setup.second_memory)),
         growth=Growth.of(len(gaussians)),
         order=FrameOrder.of(lit, config.bracket_steps, [] if poses_decided else brackets),
         poses=poses,

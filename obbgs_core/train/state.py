@@ -21,6 +21,7 @@ from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.render.shadows import ShadowMap
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.appearance import Shadows
+from obbgs_core.train.averaging import Average
 from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.growth import Growth
@@ -29,7 +30,7 @@ from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 10  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 11  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,7 @@ class TrainingState:
     appearance_reason: str  # why the radiance depends on what it does
     highlights_reason: str = ""  # why it has highlights or not; empty: not tested
     highlights_frames: int = 0  # how many there were when they were tested
+    average: Average | None = None  # of the models of the last steps; None: not averaged yet
     smoothing_m: Tensor | None = None  # [N] deviations of the 3D filter; None: the method has none
     compensation: Compensation | None = None  # None: the colours of all frames are the model's
     misfits: list[int] = field(
@@ -101,7 +103,15 @@ class TrainingState:
     @property
     def model(self) -> Gaussians:
         """The Gaussians as they are rendered; gradients reach those that are trained."""
-        return self.gaussians if self.smoothing_m is None else smoothed(self.gaussians, self.smoothing_m)
+        return self._filtered(self.gaussians)
+
+    @property
+    def averaged_model(self) -> Gaussians:
+        """The mean of the models of the last steps where they are averaged, else the model, without gradients."""
+        return self._filtered(self.gaussians if self.average is None else self.average.gaussians).detach()
+
+    def _filtered(self, gaussians: Gaussians) -> Gaussians:
+        return gaussians if self.smoothing_m is None else smoothed(gaussians, self.smoothing_m)
 
     @property
     def log_lowering(self) -> Tensor | None:
@@ -158,6 +168,7 @@ SAVED = [
     TrainingState,
     Gaussians,
     Adam,
+    Average,
     Growth,
     Compensation,
     FrameOrder,

@@ -20,6 +20,7 @@ from obbgs_core.sensor import Sensor
 from obbgs_core.train import decisions, pose_rounds
 from obbgs_core.train.adam import learning_rates
 from obbgs_core.train.appearance import described, freeze_later_degrees
+from obbgs_core.train.averaging import Average
 from obbgs_core.train.batches import Batch
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import outliers
@@ -147,6 +148,8 @@ class Trainer:
             pose_rounds.move(setup, state)
         decisions.change_number(setup, state, batch, residual, moment)
         decisions.select_model(setup, state)
+        averaged = share >= config.averaged_from
+        state.average = Average.of(state.gaussians, state.average) if averaged else None
         self._measure(seen, batch)
         state.steps_done += 1
         state.seconds += time.monotonic() - began
@@ -268,8 +271,8 @@ class Trainer:
 
     @property
     def gaussians(self) -> Gaussians:
-        """The model as it stands, without gradients, with the 3D filter in its scales and opacities."""
-        return self.state.model.detach()
+        """The model as it stands, averaged in the last steps, without gradients, with the 3D filter in it."""
+        return self.state.averaged_model
 
     @property
     def exposing(self) -> Exposing:

@@ -28,18 +28,21 @@ def with_gradients(model: Gaussians, step: int) -> Gaussians:
     return model
 
 
-def after(steps: int, model: Gaussians, rates: dict = RATES) -> dict[str, torch.Tensor]:
-    adam = Adam(model)
+def after(
+    steps: int, model: Gaussians, rates: dict = RATES, memory: float = 0.999
+) -> dict[str, torch.Tensor]:
+    adam = Adam(model, (0.9, memory))
     for step in range(steps):
         adam.step(with_gradients(model, step), rates)
     return {name: tensor.detach() for name, tensor in model.tensors().items()}
 
 
+@pytest.mark.parametrize("memory", [0.999, 0.99])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_twenty_steps_end_where_torch_optim_ends(dtype):
-    ours, theirs = after(20, gaussians(dtype=dtype)), gaussians(dtype=dtype)
+def test_twenty_steps_end_where_torch_optim_ends(dtype, memory):
+    ours, theirs = after(20, gaussians(dtype=dtype), memory=memory), gaussians(dtype=dtype)
     groups = [{"params": [t], "lr": RATES[n]} for n, t in theirs.tensors().items()]
-    optimiser = torch.optim.Adam(groups, eps=1e-15)
+    optimiser = torch.optim.Adam(groups, betas=(0.9, memory), eps=1e-15)
     for step in range(20):
         with_gradients(theirs, step)
         optimiser.step()

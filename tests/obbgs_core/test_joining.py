@@ -197,9 +197,10 @@ def test_a_sun_that_moves_only_later_is_tested_then(frames):
     view.sh = torch.cat([view.sh, torch.full((len(view), 3, 1), 0.1)], dim=1)  # as if it turned with the view
     trainer.state.gaussians = view.trainable()
     trainer.state.adam.widen(trainer.state.gaussians)
-    assert not trainer.setup.sun_moves
+    assert not trainer.setup.sun_moves and trainer.state.adam.betas == (0.9, 0.99)
     trainer.join(lit(frames[18:], (1.0, 0.0, 0.0)))
-    assert trainer.setup.sun_moves and trainer.gaussians.sh.shape[1] == 1
+    assert trainer.setup.sun_moves and trainer.state.adam.betas == (0.9, 0.999)
+    assert trainer.gaussians.sh.shape[1] == 1
     trainer.step()
     assert "with the sun it would gain" in trainer.result("").appearance
 

@@ -26,13 +26,14 @@ def frames() -> list[TrainingFrame]:
     return photographed(target())
 
 
-def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path, monkeypatch):
+@pytest.mark.parametrize("killed_at", [23, 38], ids=["before averaging", "while models are averaged"])
+def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path, monkeypatch, killed_at):
     monkeypatch.setattr("obbgs_core.train.pose_rounds.ROUNDS", 8)  # else poses move in each of so few steps
     config = preset("obbgs", QUICK | {"poses.refine": "always", "parsimony.prune_at": (0.5,)})
     tagged = [dataclasses.replace(f, pose_covariance=1e-6 * torch.eye(6).double()) for f in frames]
     whole = train(tagged, SENSOR, config, seed=3)
     first = Trainer(tagged, SENSOR, config, seed=3)
-    for _ in range(23):
+    for _ in range(killed_at):
         first.step()
     first.save(tmp_path / "training.checkpoint")
     steps = []
@@ -45,10 +46,48 @@ def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path, monkeypat
         checkpoint=tmp_path / "training.checkpoint",
     )
     every = [info.step for info in whole.history]
-    assert every[-1] == 40 and steps == every[23:]
+    assert every[-1] == 40 and steps == every[killed_at:]
     assert [info.step for info in resumed.history] == every
     for name, tensor in whole.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
+
+
+def test_the_result_is_the_mean_of_the_models_of_the_last_steps(frames):
+    config = preset("obbgs", QUICK | {"averaged_from": 0.8, "parsimony.prune_at": ()})
+    trainer, models = Trainer(frames, SENSOR, config, seed=3), []
+    while not (reason := trainer.stop_reason()):
+        trainer.step()
+        now = trainer.state.gaussians.parameters()
+        models.append({name: tensor.detach().double().numpy() for name, tensor in now.items()})
+        if trainer.state.steps_done <= 32:  # of 40
+            assert torch.equal(trainer.gaussians.means, trainer.state.gaussians.means)
+    result = trainer.result(reason).gaussians.parameters()
+    for name, last in models[-1].items():
+        expected = np.mean([model[name] for model in models[32:]], axis=0)
+        np.testing.assert_allclose(result[name].numpy(), expected, rtol=1e-5, atol=1e-6, err_msg=name)
+        if name in TENSORS:
+            assert np.abs(expected - last).max() > 1e-5, name
+
+
+def test_a_gaussian_that_is_not_finite_leaves_the_mean_as_well(frames):
+    trainer = Trainer(frames, SENSOR, preset("obbgs", QUICK | {"averaged_from": 0.8}), seed=3)
+    while not (reason := trainer.stop_reason()):
+        trainer.step()
+    averaged = trainer.gaussians
+    with torch.no_grad():
+        trainer.state.gaussians.means[5] = torch.nan
+    result = trainer.result(reason)
+    kept = torch.arange(len(averaged)) != 5
+    assert result.removed_not_finite == 1 and torch.equal(result.gaussians.means, averaged.means[kept])
+
+
+def test_the_mean_begins_anew_when_frames_join(frames):
+    trainer = Trainer(frames[:-3], SENSOR, preset("obbgs", QUICK | {"averaged_from": 0.8}), seed=3)
+    while not trainer.stop_reason():
+        trainer.step()
+    assert not torch.equal(trainer.gaussians.means, trainer.state.gaussians.means)
+    trainer.join(frames[-3:])
+    assert torch.equal(trainer.gaussians.means, trainer.state.gaussians.means)
 
 
 def test_a_checkpoint_of_another_training_is_not_used(frames, tmp_path):
