@@ -32,7 +32,7 @@ class RateSettings:
     # all rates but that of the means decay exponentially to this share of themselves
     final_share: float = 1.0
     # share of the second moments that a step keeps: the smaller, the sooner steps follow gradients that become smaller
-    # where the Sun moves it stays the default: what the next Sun asks of a Gaussian is new
+    # where the Sun moves or poses may, it stays the default: what the next Sun asks of a Gaussian is new
     second_memory: float = number(SECOND_MEMORY, most=0.9999)
 
     def __post_init__(self):

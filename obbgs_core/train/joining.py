@@ -81,7 +81,7 @@ def join(
     )
     state.gaussians = Gaussians.concatenate([old, new]).trainable()
     state.adam.follow(kept, len(new))
-    state.adam.betas = fresh.adam.betas  # they are others where only now the Sun is known to move
+    state.adam.betas = fresh.adam.betas  # others where only now the Sun is known to move
     state.growth, state.boxes, state.shadows = Growth.of(len(state.gaussians)), [], fresh.shadows
     if state.poses is not None:
         state.poses = state.poses.extended(joined.frames)

@@ -64,6 +64,7 @@ def move(setup: TrainingSetup, state: TrainingState) -> None:
     """
     poses = state.poses
     assert poses is not None
+    state.average = None  # of models at other poses, which may have moved as a whole since
     turn, brackets, left_out = state.steps_done, [[] for _ in range(len(poses.value))], set(state.misfits)
     for index, bracket in enumerate(poses.of_frame):
         if index not in left_out:

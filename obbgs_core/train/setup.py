@@ -75,11 +75,6 @@ class TrainingSetup:
         """Whether the Sun moves by enough to be tested as what the radiance depends on."""
         return 0 < self.config.light.sun_span_deg < self.sun_span_deg
 
-    @property
-    def second_memory(self) -> float:
-        """The share of Adam's second moments that a step keeps."""
-        return SECOND_MEMORY if self.sun_moves else self.config.rates.second_memory
-
     @functools.cached_property
     def identity(self) -> Identity:
         """What decides the result of a training: the method's settings, the seed, the sensor and the frames."""
@@ -161,10 +156,11 @@ def prepare(
     poses_decided = _decided_at_once(config, lit, brackets) if poses is None else f"refined ({why})"
     if poses is None and config.poses.refine == "always":
         poses = PoseCorrections(lit)
+    still = poses is None and poses_decided != "" and not setup.sun_moves
     state = TrainingState(
         rng=rng,
         gaussians=gaussians,
-        adam=Adam(gaussians, (FIRST_MEMORY, setup.second_memory)),
+        adam=Adam(gaussians, (FIRST_MEMORY, config.rates.second_memory if still else SECOND_MEMORY)),
         growth=Growth.of(len(gaussians)),
         order=FrameOrder.of(lit, config.bracket_steps, [] if poses_decided else brackets),
         poses=poses,

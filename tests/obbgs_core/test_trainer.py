@@ -81,6 +81,17 @@ def test_a_gaussian_that_is_not_finite_leaves_the_mean_as_well(frames):
     assert result.removed_not_finite == 1 and torch.equal(result.gaussians.means, averaged.means[kept])
 
 
+def test_the_mean_begins_anew_when_poses_move(frames, monkeypatch):
+    monkeypatch.setattr("obbgs_core.train.pose_rounds.ROUNDS", 8)  # the last round is in the 36th of 40 steps
+    tagged = [dataclasses.replace(f, pose_covariance=1e-6 * torch.eye(6).double()) for f in frames]
+    config = preset("obbgs", QUICK | {"poses.refine": "always", "averaged_from": 0.8})
+    trainer = Trainer(tagged, SENSOR, config, seed=3)
+    assert trainer.state.adam.betas == (0.9, 0.999)
+    while not trainer.stop_reason():
+        trainer.step()
+    assert trainer.state.average is not None and trainer.state.average.steps == 5
+
+
 def test_the_mean_begins_anew_when_frames_join(frames):
     trainer = Trainer(frames[:-3], SENSOR, preset("obbgs", QUICK | {"averaged_from": 0.8}), seed=3)
     while not trainer.stop_reason():
