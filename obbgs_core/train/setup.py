@@ -21,6 +21,7 @@ from obbgs_core.frames import (
     sun_span_deg,
     usable,
 )
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.sensor import Sensor, noise_excess
 from obbgs_core.settings import flat
@@ -156,11 +157,10 @@ def prepare(
     poses_decided = _decided_at_once(config, lit, brackets) if poses is None else f"refined ({why})"
     if poses is None and config.poses.refine == "always":
         poses = PoseCorrections(lit)
-    still = poses is None and poses_decided != "" and not setup.sun_moves
     state = TrainingState(
         rng=rng,
         gaussians=gaussians,
-        adam=Adam(gaussians, (FIRST_MEMORY, config.rates.second_memory if still else SECOND_MEMORY)),
+        adam=_adam(setup, gaussians, exact_tags=poses is None and poses_decided != ""),
         growth=Growth.of(len(gaussians)),
         order=FrameOrder.of(lit, config.bracket_steps, [] if poses_decided else brackets),
         poses=poses,
@@ -174,6 +174,12 @@ def prepare(
     if config.compensation:
         state.compensation = Compensation(len(lit), lit[0].dn.shape[2])
     return setup, state
+
+
+def _adam(setup: TrainingSetup, gaussians: Gaussians, exact_tags: bool) -> Adam:
+    """Return the optimizer; with the method's own memory only where neither the Sun nor the poses can move."""
+    still = exact_tags and not setup.sun_moves
+    return Adam(gaussians, (FIRST_MEMORY, setup.config.rates.second_memory if still else SECOND_MEMORY))
 
 
 def _with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Sensor, str]:
