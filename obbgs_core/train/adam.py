@@ -31,8 +31,9 @@ class RateSettings:
     sh_rest: float = 1.0  # factor on the rate of the coefficients above degree 0
     # all rates but that of the means decay exponentially to this share of themselves
     final_share: float = 1.0
-    # share of the second moments that a step keeps: the smaller, the sooner steps follow gradients that become smaller
-    # where the Sun moves or poses may, it stays the default: what the next Sun asks of a Gaussian is new
+    # Share of the second moments that a step keeps: the smaller it is, the sooner steps follow gradients that shrink.
+    # Where the Sun or the poses may move, the default is taken instead: a step that has forgotten the gradients of
+    # another Sun is too large for it, and refined poses lose accuracy.
     second_memory: float = number(SECOND_MEMORY, most=0.9999)
 
     def __post_init__(self):
