@@ -19,6 +19,7 @@ from obbgs_core.train.batches import Batches
 from obbgs_core.train.parsimony import next_degree_gain, padded
 
 SHADOW_INTERVAL = 120  # steps between two computations of the shadow maps
+SUN_DEGREE = 1  # of harmonics towards the Sun, at most: a face is as bright as the cosine of the Sun's angle
 SUN_FROM = 0.05  # share of the steps at which a moving Sun is first tested, before any growth
 
 
@@ -89,8 +90,11 @@ def raised_degree(
     Returns:
         The reason is empty where nothing was tested, because the degree may not rise further.
     """
-    degree = math.isqrt(gaussians.sh.shape[1])
-    if degree > settings.max_sh_degree or gaussians.shading == "lambert":
+    degree = math.isqrt(gaussians.sh.shape[1])  # the next one
+    highest = (
+        min(settings.max_sh_degree, SUN_DEGREE) if gaussians.shading == "sun" else settings.max_sh_degree
+    )
+    if degree > highest or gaussians.shading == "lambert":
         return None, ""
     tested, raised = [], None
     for direction in directions if degree == 1 else (gaussians.shading,):

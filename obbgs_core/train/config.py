@@ -13,7 +13,7 @@ from obbgs_core.train.growth import GrowthSettings
 from obbgs_core.train.objective import LossSettings
 from obbgs_core.train.parsimony import ParsimonySettings
 from obbgs_core.train.poses import PoseSettings
-from obbgs_core.train.sparsity import SparseSettings, few_share
+from obbgs_core.train.sparsity import FEW_SH_DEGREE, SparseSettings, few_share
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,10 @@ class MethodConfig:
         """Return the settings as they are for so many frames."""
         few = few_share(count)
         sky_weight = max(self.loss.sky_weight, few * self.sparse.sky_weight)
+        sh_degree = min(self.light.max_sh_degree, FEW_SH_DEGREE) if few else self.light.max_sh_degree
         return dataclasses.replace(
             self,
+            light=dataclasses.replace(self.light, max_sh_degree=sh_degree),
             dropout=max(self.dropout, few * self.sparse.dropout),
             loss=dataclasses.replace(self.loss, sky_weight=sky_weight),
         )

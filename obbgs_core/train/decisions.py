@@ -163,7 +163,8 @@ def select_model(setup: TrainingSetup, state: TrainingState) -> None:
 def prune_by_bic(setup: TrainingSetup, state: TrainingState) -> None:
     """Remove the Gaussians whose likelihood gain is below their BIC penalty, unless that were all of them."""
     drop_not_finite(state)
-    kept = justified(state.model, batches_at(setup, state), setup.sensor, setup.config.parsimony, state.rng)
+    batches, settings = batches_at(setup, state), setup.config.parsimony
+    kept = justified(state.model, batches, setup.sensor, settings, setup.radius_m, state.rng)
     if kept.any():
         removed = len(state.gaussians) - int(kept.sum())
         state.gaussians = keep(state.gaussians, state.adam, kept)

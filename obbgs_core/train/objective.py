@@ -27,9 +27,7 @@ class LossSettings:
     clamped: bool = True
     # of the likelihood: the model's own error is learnt beside the noise, and what it cannot explain loses its pull
     misfit: bool = False
-    # of the mean square of the coefficients that turn with the view: a prior for matt surface
-    sh_weight: float = 0.0
-    # of the mean peak radiance of highlights along normals: a prior for matt surface too
+    # of the mean peak radiance of highlights along normals: a prior for matt surface
     gloss_weight: float = 0.0
     # of how far the normals of neighbours are apart, under Lambert's law: faces are smooth
     normal_weight: float = 0.0
@@ -79,8 +77,6 @@ def priors(
     nearest: [N, K], the neighbours of each Gaussian whose normals are compared; None: they are not.
     """
     total = torch.zeros(())
-    if settings.sh_weight and gaussians.sh.shape[1] > 1 and gaussians.shading == "view":
-        total = total + settings.sh_weight * gaussians.sh[:, 1:].square().mean()
     if settings.gloss_weight and gaussians.lobes.shape[1] == 1:
         total = (
             total + settings.gloss_weight * gaussians.lobes.exp().mean() * gaussians.gloss[1:].exp().mean()

@@ -205,7 +205,8 @@ def test_parts_that_shade_one_another_are_understood_by_lamberts_law_and_not_by_
     longer = QUICK | {"steps": 640}
     linear = train(frames, SENSOR, preset("obbgs", longer | {"light.sun_shading": "linear"}), seed=1)
     cast = train(frames, SENSOR, preset("obbgs", longer), seed=1)
-    assert linear.gaussians.shading == "sun" and linear.appearance.startswith("turns with the sun")
+    assert linear.gaussians.shading == "sun" and linear.gaussians.sh.shape[1] == 4  # a cosine, no more
+    assert linear.appearance.startswith("turns with the sun")
     assert "(step 32, degree 1: with the sun" in linear.appearance
     # seeds 1 to 3: 2.4 to 3.2 dB
     assert clean_db(cast.gaussians, unseen, TOGETHER) > clean_db(linear.gaussians, unseen, TOGETHER) + 0.3

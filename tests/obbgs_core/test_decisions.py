@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -10,9 +12,12 @@ from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
 from obbgs_core.train.batches import Batches
 from obbgs_core.train.parsimony import (
+    SHOWN_RADII,
+    SHOWN_RADII_LAMBERT,
     VIEWS,
     ParsimonySettings,
     justified,
+    largest_scale,
     likelihood_gains,
     next_degree_gain,
     shown_frames,
@@ -79,8 +84,47 @@ def test_opaque_gaussians_are_pruned_where_no_picture_shows_them_and_dark_ones_a
     both.opacity_logits[:] = 3.0
     rng = torch.Generator().manual_seed(0)
     settings = ParsimonySettings(keep_above_opacity=0.65)
-    kept = justified(both, Batches(frames, SENSOR.white_dn), SENSOR, settings, rng)
+    kept = justified(both, Batches(frames, SENSOR.white_dn), SENSOR, settings, 1.0, rng)
     assert kept.tolist() == [True] * 8 + [False] * 8
+
+
+def test_opaque_gaussians_are_pruned_by_what_they_show_of_the_target_and_sooner_under_a_moving_sun():
+    """The same picture of a larger target: what was more than a strip of it is less."""
+    model = dataclasses.replace(target(8, seed=2).detach(), footprint="camera")
+    model.opacity_logits[:] = 3.0
+    sun = torch.tensor([0.0, 0.0, 1.0])
+    frames = [dataclasses.replace(f, sun_dir=sun) for f in photographed(model, count=12)]
+    batches = Batches(frames, SENSOR.white_dn)
+    # no likelihood is enough
+    settings = ParsimonySettings(keep_above_opacity=0.65, bic_factor=1e12)
+    _, shown_px, _ = likelihood_gains(model, batches, SENSOR, torch.Generator().manual_seed(0))
+    per_m = largest_scale(model, frames)
+    for shading, radii in (("view", SHOWN_RADII), ("lambert", SHOWN_RADII_LAMBERT)):
+        gaussians = dataclasses.replace(model, shading=shading)
+        for least_px, shown in ((0.8 * shown_px.min().item(), True), (1.2 * shown_px.max().item(), False)):
+            rng = torch.Generator().manual_seed(0)
+            kept = justified(gaussians, batches, SENSOR, settings, least_px / radii / per_m, rng)
+            assert kept.tolist() == [shown] * len(model)
+
+
+def test_the_largest_scale_is_that_of_points_projected_by_opencv():
+    model = target(9, seed=2)
+    frames = photographed(model, count=5)
+    middle = model.means.detach().median(dim=0).values.double().numpy()
+    scales = []
+    for frame in frames:
+        pose, K = frame.world_to_camera.double().numpy(), frame.K.double().numpy()
+        beside = middle + 1e-3 * pose[0, :3]  # a millimetre along the camera's x axis
+        rotation, shift_m = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3]
+        pixels, _ = cv2.projectPoints(np.stack([middle, beside]), rotation, shift_m, K, None)
+        scales.append(1e3 * np.linalg.norm(pixels[1] - pixels[0]))
+    # poses are in single precision
+    assert largest_scale(model, frames) == pytest.approx(max(scales), rel=1e-5)
+    behind = [
+        dataclasses.replace(f, world_to_camera=torch.diag(torch.tensor([1.0, 1, -1, 1])) @ f.world_to_camera)
+        for f in frames
+    ]
+    assert largest_scale(model, behind) == 0
 
 
 def test_colour_that_turns_with_the_view_justifies_harmonics_and_plain_colour_does_not():

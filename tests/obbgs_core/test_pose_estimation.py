@@ -568,6 +568,7 @@ def test_pruning_sees_the_target_from_the_refined_poses(erring):
             decisions.batches_at(one.setup, one.state),
             SENSOR,
             dataclasses.replace(settings.parsimony, keep_above_opacity=1.0),
+            one.setup.radius_m,
             torch.Generator().manual_seed(0),
         )
         for one in (trainer, exact)

@@ -24,6 +24,7 @@ def test_many_frames_change_no_setting_and_few_change_them_once():
     few = config.for_frames(FEW)
     assert few.dropout == config.sparse.dropout > 0
     assert few.loss.sky_weight == config.sparse.sky_weight > config.loss.sky_weight
+    assert few.light.max_sh_degree == 1 < config.light.max_sh_degree
     assert few.for_frames(FEW) == few
     assert preset("3dgs").for_frames(3) == preset("3dgs")
     asked = preset("obbgs", {"dropout": 0.7}).for_frames(FEW)
