@@ -11,17 +11,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render, weighted_gradient
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check, fraction
 from obbgs_core.train.batches import Batch, Batches
+from obbgs_core.train.smoothing import sampling_rates
 
 VIEWS = 36  # training frames that are rendered at most, spread evenly; gains are scaled to all frames
 # An opaque Gaussian that no picture shows on as much as a strip, one pixel wide and so many of the target's radii long,
 # hides nothing that its neighbours do not hide too. Detail lies along edges: the limit grows with the target's width in
-# the picture. Where the Sun moves, smaller ones bring nothing (experiment 073).
+# the picture. Under Lambert's law smaller ones bring no decibels (experiment 073).
 SHOWN_RADII, SHOWN_RADII_LAMBERT = 1 / 450, 1 / 150
 
 
@@ -64,19 +64,9 @@ def justified(
     kept = gains >= settings.bic_factor * bic_penalty(gaussians, values)
     surface = gaussians.opacities.detach() > settings.keep_above_opacity
     least_radii = SHOWN_RADII_LAMBERT if gaussians.shading == "lambert" else SHOWN_RADII
-    least_px = least_radii * radius_m * largest_scale(gaussians, batches.frames)
-    return kept | (surface & (shown_px > least_px))
-
-
-def largest_scale(gaussians: Gaussians, frames: list[TrainingFrame]) -> float:
-    """Return the largest scale at which a frame shows the middle of a model, px/m; 0 where none has it in front."""
     middle = gaussians.means.detach().median(dim=0).values
-    scales = [0.0]
-    for frame in frames:
-        depth_m = (frame.world_to_camera[2, :3] @ middle + frame.world_to_camera[2, 3]).item()
-        if depth_m > 0:
-            scales.append(frame.K[0, 0].item() / depth_m)
-    return max(scales)
+    least_px = least_radii * radius_m * sampling_rates(middle[None], batches.frames)
+    return kept | (surface & (shown_px > least_px))
 
 
 def likelihood_gains(

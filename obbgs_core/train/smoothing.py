@@ -18,12 +18,24 @@ FULL_LOG_OPACITY = -1e-6  # opacities stay below 1, where the logit is infinite
 def sampling_deviation_m(means: Tensor, frames: list[TrainingFrame], variance_px2: float) -> Tensor:
     """Return the deviation [N], m, of the filter of each Gaussian: that many pixels where it is seen largest.
 
-    The sampling rate of a Gaussian is the largest focal length over depth, px/m, of the frames that have it in view.
-    Gaussians in no view take the smallest rate of all others.
+    Gaussians in no view take the smallest sampling rate of all others.
 
     Args:
         means: [N, 3] m.
         variance_px2: of the filter, where the sampling rate is that of the pixels.
+    """
+    rate = sampling_rates(means, frames)
+    seen = rate > 0
+    if seen.any():
+        rate = torch.where(seen, rate, rate[seen].min())
+    return math.sqrt(variance_px2) / rate
+
+
+@torch.no_grad()
+def sampling_rates(means: Tensor, frames: list[TrainingFrame]) -> Tensor:
+    """Return how finely pictures sample points [N, 3] m: pixels for a metre [N] where each point is seen largest.
+
+    That is the largest focal length over depth of the frames that have it in view; 0 where none has.
     """
     rate = torch.zeros(len(means))
     for frame in frames:
@@ -35,10 +47,7 @@ def sampling_deviation_m(means: Tensor, frames: list[TrainingFrame], variance_px
         in_view = (z > 1e-6) & ((u / width - 0.5).abs() <= 0.5 + MARGIN)
         in_view &= (v / height - 0.5).abs() <= 0.5 + MARGIN
         rate = torch.where(in_view, torch.maximum(rate, frame.K[0, 0] / depth), rate)
-    seen = rate > 0
-    if seen.any():
-        rate = torch.where(seen, rate, rate[seen].min())
-    return math.sqrt(variance_px2) / rate
+    return rate
 
 
 def smoothed(gaussians: Gaussians, deviation_m: Tensor) -> Gaussians:

@@ -14,9 +14,8 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.settings import check, fraction
 
 FEW, MANY = 12, 48  # frames: up to the first everything below holds in full, from the second on nothing
-FEW_SH_DEGREE = (
-    1  # of the harmonics, at most, where frames are fewer than `MANY`: they leave more of them open
-)
+# of the harmonics, at most, where frames are fewer than `MANY`: few views leave higher ones open
+FEW_SH_DEGREE = 1
 DROPPED_UNTIL = 0.85  # share of the steps; in the rest all Gaussians settle together
 MOST_OPACITY, LEAST_OPACITY = 0.999, 1e-5  # of a Gaussian in a step; the least is not drawn
 

@@ -2,8 +2,6 @@
 
 import dataclasses
 
-import cv2
-import numpy as np
 import pytest
 import torch
 
@@ -17,13 +15,13 @@ from obbgs_core.train.parsimony import (
     VIEWS,
     ParsimonySettings,
     justified,
-    largest_scale,
     likelihood_gains,
     next_degree_gain,
     shown_frames,
 )
 from obbgs_core.train.poses import HELD_FROM
 from obbgs_core.train.presets import preset
+from obbgs_core.train.smoothing import sampling_rates
 from obbgs_core.train.trainer import Trainer, train
 from tests.scenes import QUICK, SENSOR, photographed, tagged, target
 
@@ -98,33 +96,13 @@ def test_opaque_gaussians_are_pruned_by_what_they_show_of_the_target_and_sooner_
     # no likelihood is enough
     settings = ParsimonySettings(keep_above_opacity=0.65, bic_factor=1e12)
     _, shown_px, _ = likelihood_gains(model, batches, SENSOR, torch.Generator().manual_seed(0))
-    per_m = largest_scale(model, frames)
+    per_m = sampling_rates(model.means.median(dim=0).values[None], frames).item()
     for shading, radii in (("view", SHOWN_RADII), ("lambert", SHOWN_RADII_LAMBERT)):
         gaussians = dataclasses.replace(model, shading=shading)
         for least_px, shown in ((0.8 * shown_px.min().item(), True), (1.2 * shown_px.max().item(), False)):
             rng = torch.Generator().manual_seed(0)
             kept = justified(gaussians, batches, SENSOR, settings, least_px / radii / per_m, rng)
             assert kept.tolist() == [shown] * len(model)
-
-
-def test_the_largest_scale_is_that_of_points_projected_by_opencv():
-    model = target(9, seed=2)
-    frames = photographed(model, count=5)
-    middle = model.means.detach().median(dim=0).values.double().numpy()
-    scales = []
-    for frame in frames:
-        pose, K = frame.world_to_camera.double().numpy(), frame.K.double().numpy()
-        beside = middle + 1e-3 * pose[0, :3]  # a millimetre along the camera's x axis
-        rotation, shift_m = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3]
-        pixels, _ = cv2.projectPoints(np.stack([middle, beside]), rotation, shift_m, K, None)
-        scales.append(1e3 * np.linalg.norm(pixels[1] - pixels[0]))
-    # poses are in single precision
-    assert largest_scale(model, frames) == pytest.approx(max(scales), rel=1e-5)
-    behind = [
-        dataclasses.replace(f, world_to_camera=torch.diag(torch.tensor([1.0, 1, -1, 1])) @ f.world_to_camera)
-        for f in frames
-    ]
-    assert largest_scale(model, behind) == 0
 
 
 def test_colour_that_turns_with_the_view_justifies_harmonics_and_plain_colour_does_not():

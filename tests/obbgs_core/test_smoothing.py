@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -13,7 +14,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.growth import reset_opacities
 from obbgs_core.train.presets import preset
-from obbgs_core.train.smoothing import log_lowering, sampling_deviation_m, smoothed
+from obbgs_core.train.smoothing import log_lowering, sampling_deviation_m, sampling_rates, smoothed
 from obbgs_core.train.trainer import Trainer
 from tests.scenes import SENSOR, intrinsics, photographed, pose, random_gaussians, target
 
@@ -34,6 +35,27 @@ def test_the_width_is_that_of_the_finest_picture_with_the_gaussian_in_view():
     widths_m = sampling_deviation_m(means, frames, 0.2)
     rates = np.array([40.0, 20, 20, 20, 100])  # the fourth is in no view: the smallest rate of the others
     np.testing.assert_allclose(widths_m.numpy(), np.sqrt(0.2) / rates, rtol=1e-5)
+
+
+def test_the_sampling_rate_is_that_of_points_projected_by_opencv():
+    model = target(9, seed=2)
+    frames = photographed(model, count=5)
+    points = model.means.detach().median(dim=0).values[None]
+    middle = points[0].double().numpy()
+    scales = []
+    for frame in frames:
+        pose, K = frame.world_to_camera.double().numpy(), frame.K.double().numpy()
+        beside = middle + 1e-3 * pose[0, :3]  # a millimetre along the camera's x axis
+        rotation, shift_m = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3]
+        pixels, _ = cv2.projectPoints(np.stack([middle, beside]), rotation, shift_m, K, None)
+        scales.append(1e3 * np.linalg.norm(pixels[1] - pixels[0]))
+    # poses are in single precision
+    assert sampling_rates(points, frames).item() == pytest.approx(max(scales), rel=1e-5)
+    behind = [
+        dataclasses.replace(f, world_to_camera=torch.diag(torch.tensor([1.0, 1, -1, 1])) @ f.world_to_camera)
+        for f in frames
+    ]
+    assert sampling_rates(points, behind).item() == 0
 
 
 @settings(max_examples=30, deadline=None)
