@@ -85,7 +85,6 @@ class SensorModel:
         electrons_per_dn: float,
         read_noise_dn: float,
         averaged_pixels: float,
-        misfit: float | None,
     ) -> None: ...
 
 def likelihood(
@@ -93,8 +92,10 @@ def likelihood(
     dn: Array,
     gains: Array,
     sensor: SensorModel,
-    misfit_floors: Array,
-    weight: float,
+    misfit: float | None,
+    own: float,
+    stride: int,
+    factor: float,
     edge_weight: float,
     drawn: Array | None,
     residual: Array,
@@ -121,7 +122,7 @@ def fit(
     sensor: SensorModel,
     least_alpha: float,
     threads: int,
-) -> tuple[float, float]: ...
+) -> tuple[float, float, float]: ...
 def adam_step(
     parameter: Array,
     gradient: Array,

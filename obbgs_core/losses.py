@@ -1,11 +1,11 @@
 """Image losses: robust likelihood, L1, SSIM and Sobel edges. Images are [B, H, W, C].
 
-`likelihood_loss`, `published_loss` and `fit_figures` run in our C++ (kernels/training.cpp) on float32 CPU tensors,
+`likelihood_loss`, `published_loss` and `fit_figures` run in our C++ (render/kernels) on float32 CPU tensors,
 value and gradient in one sweep. The readable PyTorch beside them is the reference in tests, and runs everywhere else.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -13,12 +13,20 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from obbgs_core import compiled
-from obbgs_core.misfit import ModelError, model_error
+from obbgs_core.misfit import OWN, model_error, relative_misfit, sampling_stride
 from obbgs_core.sensor import Sensor
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Wang et al. 2004
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 ON_TARGET_ALPHA = 0.05  # pixels with more alpha than this count as target in the figures of a fit
+
+
+class Fit(NamedTuple):
+    """How well a step's frames fit, see `fit_figures`; NaN where nothing is seen."""
+
+    chi2: float
+    psnr_db: float
+    misfit: float  # a share of the light
 
 
 def likelihood_loss(
@@ -30,6 +38,7 @@ def likelihood_loss(
     edge_weight: float = 0.0,
     misfit: float | None = None,
     drawn: Tensor | None = None,
+    factor: float = 1.0,
 ) -> tuple[Tensor, Tensor]:
     """Return the robust negative log likelihood of readings plus weighted edges, and the normalised residual.
 
@@ -47,6 +56,7 @@ def likelihood_loss(
             as before. None: only the noise is known, and the penalty is `charbonnier`.
         drawn: [B, H, W]; where it is zero the radiance depends on nothing, and no gradient is needed. Such pixels may
             be left out of the sum, though not of the number that it is divided by; their residual is then zero.
+        factor: on the loss; multiplying it afterwards costs a pass over its gradient.
 
     Returns:
         loss: scalar; residual: [B, H, W, C], `Sensor.deviance_residual` over its deviation, without gradient.
@@ -58,13 +68,11 @@ def likelihood_loss(
     native = compiled.module_for(radiance, exposure_time_s, dn)
     if native is None:
         settings = (averaged_pixels, edge_weight, misfit)
-        return likelihood_loss_reference(radiance, exposure_time_s, dn, sensor, *settings)
-    error = ModelError(0.0, torch.zeros(len(dn)), 1.0)
-    if misfit is not None:
-        error = model_error(radiance, exposure_time_s, dn, sensor, averaged_pixels, misfit)
-    model = _sensor_model(native, sensor, averaged_pixels, None if misfit is None else error.by_light)
+        loss, residual = likelihood_loss_reference(radiance, exposure_time_s, dn, sensor, *settings)
+        return factor * loss, residual
+    model, stride = _sensor_model(native, sensor, averaged_pixels), sampling_stride(radiance)
     drawn = None if drawn is None else drawn.detach().contiguous()
-    settings = (model, error.floor_dn2.float(), error.weight, edge_weight, drawn)
+    settings = (model, misfit, OWN, stride, factor, edge_weight, drawn)
     return _swept(native.likelihood, radiance, exposure_time_s, dn, sensor, *settings)
 
 
@@ -82,7 +90,7 @@ def likelihood_loss_reference(
     if misfit is None:
         loss = charbonnier(residual)
     else:
-        error = model_error(radiance, exposure_time_s, dn, sensor, averaged_pixels, misfit)
+        error = model_error(radiance, exposure_time_s, sensor, averaged_pixels, misfit)
         prediction = sensor.predicted(radiance.detach(), exposure_time_s)
         residual = residual / (1 + error.variance_dn2(prediction, sensor) / prediction.variance_dn2).sqrt()
         loss = error.weight * cauchy(residual)
@@ -160,20 +168,22 @@ def fit_figures(
     dn: Tensor,
     sensor: Sensor,
     averaged_pixels: int = 1,
-) -> tuple[float, float]:
-    """Return how well a step's frames fit: chi² on the target, and PSNR in dB of the prediction clamped at full scale.
+) -> Fit:
+    """Return how well a step's frames fit: chi² on the target, PSNR, and the model's own error (`relative_misfit`).
 
     chi² is the squared difference of readings and their expectation over the variance that noise gives them, both
     summed where alpha [B, H, W] exceeds 0.05: 1 when the model is true, above where it errs, NaN where nothing is seen.
     Mean and variance are those of clipped readings, which vary less than others and so have less weight; a saturated
-    mean of several pixels has none, since some of its pixels need not be saturated. The other arguments are as for
-    `likelihood_loss`.
+    mean of several pixels has none, since some of its pixels need not be saturated. PSNR is that of the prediction
+    clamped at full scale. The other arguments are as for `likelihood_loss`.
     """
     native = compiled.module_for(radiance, alpha, exposure_time_s, dn)
     if native is not None:
         model, gains = _sensor_model(native, sensor, averaged_pixels), _gains(sensor, exposure_time_s)
         light, opaque, read = (image.detach().contiguous() for image in (radiance, alpha, dn))
-        chi2, mse = native.fit(light, opaque, read, gains, model, ON_TARGET_ALPHA, torch.get_num_threads())
+        threads = torch.get_num_threads()
+        chi2, mse, misfit2 = native.fit(light, opaque, read, gains, model, ON_TARGET_ALPHA, threads)
+        misfit = math.sqrt(misfit2)
     else:
         prediction = sensor.predicted(radiance, exposure_time_s)
         noise = prediction.variance_dn2
@@ -183,7 +193,8 @@ def fit_figures(
         chi2 = (squares / (variance / noise)[seen].sum()).item()
         visible = prediction.expected_dn.clamp(max=sensor.white_dn)
         mse = ((visible - dn) / sensor.white_dn).square().mean().item()
-    return chi2, -10 * math.log10(max(mse, 1e-12))
+        misfit = relative_misfit(radiance, exposure_time_s, dn, sensor, averaged_pixels)
+    return Fit(chi2, -10 * math.log10(max(mse, 1e-12)), misfit)
 
 
 def charbonnier(normalised_residual: Tensor, knee: float = 2.0) -> Tensor:
@@ -246,7 +257,7 @@ def _check(radiance: Tensor, exposure_time_s: Tensor, dn: Tensor) -> None:
         )
 
 
-def _sensor_model(native, sensor: Sensor, averaged_pixels: int = 1, misfit: float | None = None):
+def _sensor_model(native, sensor: Sensor, averaged_pixels: int = 1):
     """Return the sensor as the compiled module takes it."""
     return native.SensorModel(
         sensor.black_dn,
@@ -254,7 +265,6 @@ def _sensor_model(native, sensor: Sensor, averaged_pixels: int = 1, misfit: floa
         sensor.electrons_per_dn,
         sensor.read_noise_dn,
         averaged_pixels,
-        misfit,
     )
 
 

@@ -26,16 +26,17 @@ class ModelError:
 
 @torch.no_grad()
 def model_error(
-    radiance: Tensor, exposure_time_s: Tensor, dn: Tensor, sensor: Sensor, averaged_pixels: int, misfit: float
+    radiance: Tensor, exposure_time_s: Tensor, sensor: Sensor, averaged_pixels: int, misfit: float
 ) -> ModelError:
     """Return how the model's own error spreads over some pictures, where it is a share `misfit` of the light.
 
     Most of its variance goes with the squared light of each pixel, since albedo, normals and glints err by a share of
     it, and the rest (1 - `OWN`) with the mean square over the lit pixels of the picture, since misplaced edges and
     shadows err by the light of other pixels. Over the lit pixels that adds up to the squared share of the light. The
-    other arguments are as for `likelihood_loss`; of large images, every so many pixels are taken.
+    other arguments are as for `likelihood_loss`, whose compiled sweep does the same (kernels/likelihood.cpp). Of large
+    images, every so many pixels are taken.
     """
-    radiance, dn = _sampled(radiance, dn)
+    (radiance,) = sampled(radiance)
     prediction = sensor.predicted(radiance, exposure_time_s)
     squares = _light_dn(prediction, sensor).square()
     variance = prediction.variance_dn2 / averaged_pixels
@@ -54,18 +55,17 @@ def model_error(
 def relative_misfit(
     radiance: Tensor, exposure_time_s: Tensor, dn: Tensor, sensor: Sensor, averaged_pixels: int = 1
 ) -> float:
-    """Return the model's own error as a share of the light, by the method of moments; NaN where nothing is seen.
+    """Return the model's own error as a share of the light, by the method of moments; NaN where nothing is lit.
 
     Its square is the mean square by which readings differ from their expectation, less the noise, over the mean square
     of the light; 0 where noise explains the difference. Values that are lit above twice the noise count, saturated ones
-    do not. The arguments are as for `likelihood_loss`; of large images, every so many pixels are taken.
+    do not. The arguments are as for `likelihood_loss`.
     """
-    radiance, dn = _sampled(radiance, dn)
     prediction = sensor.predicted(radiance, exposure_time_s)
     light_dn, variance = prediction.expected_dn - sensor.black_dn, prediction.variance_dn2 / averaged_pixels
     seen = (light_dn > 2 * variance.sqrt()) & (dn < sensor.white_dn)
-    excess = ((prediction.expected_dn - dn).square() - variance)[seen].sum()
-    return (excess / light_dn.square()[seen].sum()).clamp(min=0).sqrt().item()
+    excess = torch.where(seen, (prediction.expected_dn - dn).square() - variance, 0.0).sum()
+    return (excess / torch.where(seen, light_dn.square(), 0.0).sum()).clamp(min=0).sqrt().item()
 
 
 @torch.no_grad()
@@ -77,10 +77,15 @@ def mean_light2(prediction: Prediction, sensor: Sensor, averaged_pixels: int) ->
     return (squares * lit).sum(dim=(1, 2, 3), keepdim=True) / count
 
 
-def _sampled(*images: Tensor) -> tuple[Tensor, ...]:
-    """Return about 50 rows of each image and as many columns."""
-    step = max(1, images[0].shape[1] // ROWS)
+def sampled(*images: Tensor) -> tuple[Tensor, ...]:
+    """Return about 50 rows of each image [B, H, W, ...], and columns as far apart."""
+    step = sampling_stride(images[0])
     return tuple(image[:, ::step, ::step] for image in images)
+
+
+def sampling_stride(images: Tensor) -> int:
+    """Return how many pixels apart the samples of images [B, H, ...] lie."""
+    return max(1, images.shape[1] // ROWS)
 
 
 def _light_dn(prediction: Prediction, sensor: Sensor) -> Tensor:

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 TILE_ROWS, TILE_COLUMNS = 20, 40  # px, the paper's window and stride
@@ -47,13 +46,13 @@ def fit(points: Tensor, centre: Literal["middle", "mean"] = "middle") -> Obb:
 
 
 def worst_tile(error: Tensor) -> tuple[int, int]:
-    """Return the top row and left column, px, of the tile with the largest mean error in error [H, W, C]."""
-    height, width, channels = error.shape
+    """Return the top row and left column, px, of the whole tile with the largest mean |error| in error [H, W, C]."""
+    height, width, _ = error.shape
     rows, columns = min(TILE_ROWS, height), min(TILE_COLUMNS, width)
-    tile = (rows, columns * channels)  # channels are interleaved
-    means = F.avg_pool2d(error.reshape(1, 1, height, width * channels), tile, tile)[0, 0]
-    index = int(means.argmax())
-    return index // means.shape[1] * rows, index % means.shape[1] * columns
+    down, across = height // rows, width // columns
+    tiles = error[: down * rows, : across * columns].reshape(down, rows, across, -1)
+    index = int(tiles.abs().sum(dim=(1, 3)).argmax())
+    return index // across * rows, index % across * columns
 
 
 def behind_tile(

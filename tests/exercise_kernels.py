@@ -154,11 +154,11 @@ def exercise_losses(module: ModuleType) -> None:
     """Call the losses on images with clipped and invalid readings."""
     rng = np.random.default_rng(1)
     for averaged_pixels, misfit in ((1.0, None), (4.0, None), (4.0, 0.1)):
-        sensor = module.SensorModel(64.0, 4095.0, 2.0, 3.0, averaged_pixels, misfit)
+        sensor = module.SensorModel(64.0, 4095.0, 2.0, 3.0, averaged_pixels)
         for shape in [(2, 53, 37, 3), (1, 3, 3, 1), (1, 1, 1, 3), (2, 2, 5, 1), (3, 130, 20, 1)]:
             dn = np.round(np.clip(rng.uniform(-200, 4500, shape), 0, 4095)).astype(np.float32)
-            gains, floors = np.full(shape[0], 4e3, dtype=np.float32), np.full(shape[0], 50, dtype=np.float32)
-            weighted = sensor, floors, 3.0, 0.2
+            gains = np.full(shape[0], 4e3, dtype=np.float32)
+            weighted = sensor, misfit, 0.8, 2, 3.0, 0.2
             radiance = ((dn - 64) / 4e3 * rng.uniform(0.8, 1.2, shape)).astype(np.float32)
             for invalid in (False, True):
                 if invalid:

@@ -38,7 +38,7 @@ def test_chi2_of_the_true_radiance_is_1_at_every_exposure_of_a_benchmark(folder,
     for frame in [*target.training, *target.held_out]:
         exposure_s = torch.full((1, 1, 1, 1), frame.exposure_time_s)
         alpha = torch.ones(radiance.shape[:3])
-        chi2, _ = fit_figures(radiance, alpha, exposure_s, frame.dn[None], target.sensor)
+        chi2, *_ = fit_figures(radiance, alpha, exposure_s, frame.dn[None], target.sensor)
         by_exposure.setdefault(frame.exposure_time_s, []).append(chi2)
     assert set(by_exposure) == set(targets.BRACKET_S)
     for exposure_s, values in by_exposure.items():  # 20,000 to 60,000 readings each: deviations up to 0.01

@@ -42,7 +42,7 @@ FAINT = 0.05
 NORMAL_ALPHA, NORMAL_STRENGTH = 0.2, 8.0
 SURE = 2.0  # standard errors by which the root of the gain on the other half must exceed zero on average
 STILL_DEG = 5.0  # a Sun that is known and never further than this from its mean direction stands still
-AT_ONCE = 16  # Gaussians whose axes are searched together, for memory's sake
+AT_ONCE = 16  # Gaussians whose axes are searched together: the cache holds their shares
 
 
 @dataclass(frozen=True)
@@ -166,13 +166,20 @@ def _gains_on_other_half(
     Args:
         first: [V] bool, which views are the first half.
     """
-    gains = torch.zeros(len(alphas), len(STRENGTHS), len(sample))
-    for fitted, other in ((first, ~first), (~first, first)):
-        halves = [seen.of(sample, views) for views in (fitted, other)]
-        for a, alpha in enumerate(alphas):
-            (slope, curvature), (slope_there, curvature_there) = (
-                half.parabolas(half.shares(axes, alpha)) for half in halves
-            )
+    return torch.cat(
+        [_gains_of_few(seen, first, few, axes, alphas, unit) for few in sample.split(AT_ONCE)], dim=2
+    )
+
+
+def _gains_of_few(
+    seen: _Seen, first: Tensor, few: Tensor, axes: Tensor, alphas: tuple[float, ...], unit: float
+) -> Tensor:
+    """Return what `_gains_on_other_half` does, for so few Gaussians that the processor's cache holds their shares."""
+    gains = torch.zeros(len(alphas), len(STRENGTHS), len(few))
+    halves = [seen.of(few, views) for views in (first, ~first)]
+    for a, alpha in enumerate(alphas):
+        parabolas = [half.parabolas(half.shares(axes, alpha)) for half in halves]
+        for (slope, curvature), (slope_there, curvature_there) in (parabolas, parabolas[::-1]):
             for k, strength in enumerate(STRENGTHS):
                 s = strength * unit
                 here, at = (s * slope - 0.5 * s * s * curvature).max(dim=1)

@@ -152,9 +152,9 @@ def worst_boxes(
     Args:
         residual: [C, H, W, channels].
     """
-    error, means, boxes = residual.abs(), gaussians.means.detach(), []
+    means, boxes = gaussians.means.detach(), []
     for i in range(len(cameras)):
-        tile = obb.worst_tile(error[i])
+        tile = obb.worst_tile(residual[i])
         members = obb.behind_tile(
             means, rendered.means2d[i], rendered.depth[i], cameras.world_to_camera[i], tile
         )

@@ -58,8 +58,8 @@ def image_loss(
     images = (rendered.radiance, batch.exposure_time_s, batch.dn, sensor)
     if settings.kind == "likelihood":
         drawn = None if everywhere else rendered.alpha
-        loss, residual = likelihood_loss(*images, batch.averaged_pixels, settings.edge_weight, misfit, drawn)
-        return loss * batch.share, residual
+        known = (batch.averaged_pixels, settings.edge_weight, misfit, drawn)
+        return likelihood_loss(*images, *known, factor=batch.share)
     loss, residual = published_loss(*images, settings.ssim_weight, settings.edge_weight, settings.clamped)
     return loss * (batch.share * len(batch.cameras)), residual  # a sum over the step's frames, as published
 

@@ -13,7 +13,7 @@ from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.losses import fit_figures
-from obbgs_core.misfit import relative_misfit
+from obbgs_core.misfit import sampled
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
@@ -33,7 +33,7 @@ from obbgs_core.train.sparsity import DROPPED_UNTIL, dropped
 from obbgs_core.train.state import TrainingState
 
 log = logging.getLogger(__name__)
-CHI2_MEMORY = 0.98  # share of the running chi² that a step keeps; the rest is the step's own
+MEMORY = 0.98  # share of the running figures that a step keeps; the rest is the step's own
 CHECKPOINT_EVERY_S = 20.0
 LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
 FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
@@ -191,19 +191,17 @@ class Trainer:
             state.compensation.step(share)
 
     def _measure(self, rendered: Rendered, batch: Batch) -> None:
-        """Keep the running chi² on the target, the model's own error, and the PSNR of this step's frames."""
-        state = self.state
-        images = (rendered.radiance, rendered.alpha, batch.exposure_time_s, batch.dn)
-        chi2, state.psnr_db = fit_figures(*images, self.setup.sensor, batch.averaged_pixels)
-        if not math.isnan(chi2):
-            known = not math.isnan(state.chi2)
-            state.chi2 = CHI2_MEMORY * state.chi2 + (1 - CHI2_MEMORY) * chi2 if known else chi2
-        settings = self.setup.config.loss
-        if settings.misfit and settings.kind == "likelihood":
-            misfit = relative_misfit(images[0], *images[2:], self.setup.sensor, batch.averaged_pixels)
-            if not math.isnan(misfit):
-                last = misfit if state.misfit is None else state.misfit
-                state.misfit = CHI2_MEMORY * last + (1 - CHI2_MEMORY) * misfit
+        """Keep the running chi² on the target and misfit, and the PSNR of this step's frames, all of sampled pixels."""
+        state, settings = self.state, self.setup.config.loss
+        radiance, alpha, dn = sampled(rendered.radiance, rendered.alpha, batch.dn)
+        fit = fit_figures(
+            radiance, alpha, batch.exposure_time_s, dn, self.setup.sensor, batch.averaged_pixels
+        )
+        state.psnr_db = fit.psnr_db
+        if not math.isnan(fit.chi2):
+            state.chi2 = fit.chi2 if math.isnan(state.chi2) else _running(state.chi2, fit.chi2)
+        if settings.misfit and settings.kind == "likelihood" and not math.isnan(fit.misfit):
+            state.misfit = _running(fit.misfit if state.misfit is None else state.misfit, fit.misfit)
 
     def _recorded(self, loss: float) -> StepInfo:
         """Return how the training stands, and keep it in the history."""
@@ -325,6 +323,11 @@ class Trainer:
         if state is not None:
             self.state = state
         return state is not None
+
+
+def _running(mean: float, value: float) -> float:
+    """Return a running mean after one more value."""
+    return MEMORY * mean + (1 - MEMORY) * value
 
 
 def _seconds_left(state: TrainingState, config: MethodConfig) -> float:

@@ -151,11 +151,24 @@ def test_the_compiled_likelihood_is_the_readable_one(sensor, channels, averaged_
     )
     assert loss.item() == pytest.approx(truth.item(), rel=1e-6)
     assert_gradients_agree(gradient, true_gradient)
+    halved, _ = likelihood_loss(radiance, exposures_s, dn, *settings, factor=0.5)
+    assert halved.item() == pytest.approx(0.5 * loss.item(), rel=1e-6)
     residual = likelihood_loss(radiance, exposures_s, dn, *settings)[1]
     _, true_residual = likelihood_loss_reference(
         radiance.double(), exposures_s.double(), dn.double(), *settings
     )
     torch.testing.assert_close(residual.double(), true_residual, rtol=1e-5, atol=1e-4)  # 4095 DN in float32
+
+
+@needs_native
+def test_the_error_of_a_large_picture_is_taken_of_the_same_samples():
+    sensor = SENSORS["black level"]
+    radiance, exposures_s, dn = bracket(sensor, height=170, width=130)
+    losses = [
+        f(radiance, exposures_s, dn, sensor, misfit=0.2)[0]
+        for f in (likelihood_loss, likelihood_loss_reference)
+    ]
+    assert losses[0].item() == pytest.approx(losses[1].item(), rel=1e-5)
 
 
 @needs_native
@@ -293,7 +306,7 @@ def test_the_figures_of_a_fit_are_chi2_on_the_target_and_psnr(either_module):
     radiance, exposures_s, dn = bracket(sensor, height=24, width=30)
     alpha = torch.rand(radiance.shape[:3], generator=torch.Generator().manual_seed(1)) * 0.1
     alpha[:, :10] = 0
-    chi2, fit_psnr_db = fit_figures(radiance, alpha, exposures_s, dn, sensor, averaged_pixels=4)
+    chi2, fit_psnr_db, misfit = fit_figures(radiance, alpha, exposures_s, dn, sensor, averaged_pixels=4)
     seen = np.minimum(64 + 2e7 * exposures_s.numpy() * radiance.numpy(), 4095) / 4095
     assert fit_psnr_db == pytest.approx(
         peak_signal_noise_ratio(dn.numpy() / 4095, seen.astype(np.float32), data_range=1.0), abs=1e-4
@@ -310,6 +323,10 @@ def test_the_figures_of_a_fit_are_chi2_on_the_target_and_psnr(either_module):
     )  # of four pixels some may be saturated
     squares = 4 * (dn.numpy() - mean) ** 2 / noise
     assert chi2 == pytest.approx(squares[on_target].sum() / (variance / noise)[on_target].sum(), rel=1e-4)
+    light, of_four = expected - 64, noise / 4
+    lit = (light > 2 * np.sqrt(of_four)) & (dn.numpy() < 4095)
+    excess = ((expected - dn.numpy()) ** 2 - of_four)[lit].sum()
+    assert misfit == pytest.approx(np.sqrt(max(excess, 0) / (light[lit] ** 2).sum()), rel=1e-3)
     no_target = fit_figures(radiance, torch.zeros_like(alpha), exposures_s, dn, sensor)
     assert np.isnan(no_target[0]) and no_target[1] == fit_psnr_db
 
@@ -322,7 +339,7 @@ def test_chi2_of_the_true_radiance_is_1_at_every_exposure(sensor, either_module)
         brightest = min(2.5, 1.5 * sensor.white_dn / (sensor.dn_per_radiance_s * exposure_s))
         radiance = torch.linspace(0, brightest, 200).view(1, 1, 200, 1).repeat(1, 300, 1, 1)
         dn = read_out(radiance, exposures_s, sensor, seed=round(1e6 * exposure_s))
-        chi2, _ = fit_figures(radiance, alpha, exposures_s, dn, sensor)
+        chi2, *_ = fit_figures(radiance, alpha, exposures_s, dn, sensor)
         assert chi2 == pytest.approx(1, abs=0.03), exposure_s  # of 40,000 readings it deviates by 0.007
 
 
@@ -438,6 +455,6 @@ def test_at_the_ends_of_a_pass_a_better_prediction_has_a_smaller_loss(seed, name
     assert likelihood(right, one_lit) < likelihood(black, one_lit) < likelihood(bright, one_lit)
     for dn, radiance in ((dark, black), (saturated, bright), (one_lit, right)):
         for alpha in (0.0, 1.0):  # of no target there is no chi²
-            chi2, psnr_db = fit_figures(radiance, torch.full(dn.shape[:3], alpha), exposures_s, dn, sensor)
+            chi2, psnr_db, _ = fit_figures(radiance, torch.full(dn.shape[:3], alpha), exposures_s, dn, sensor)
             assert np.isnan(chi2) if alpha == 0 else not np.isinf(chi2)
             assert np.isfinite(psnr_db)

@@ -83,7 +83,7 @@ def test_the_error_is_spread_over_a_picture_as_the_formula_says(averaged_pixels)
     radiance = np.where(rng.random((2, 40, 30, 1)) < 0.5, 0, rng.uniform(0.3, 1.2, (2, 40, 30, 1)))
     times_s = np.array([1e-4, 2e-4]).reshape(2, 1, 1, 1)
     seen, exposures_s = torch.from_numpy(radiance), torch.from_numpy(times_s)
-    error = model_error(seen, exposures_s, seen, SENSOR, averaged_pixels, misfit=0.3)
+    error = model_error(seen, exposures_s, SENSOR, averaged_pixels, misfit=0.3)
     light_dn = 1e7 * times_s * radiance
     noise = light_dn / 4 + 5**2 + 1 / 12
     lit, floors = radiance > 0, error.floor_dn2.numpy()
@@ -117,6 +117,6 @@ def test_a_model_that_is_far_off_pulls_as_hard_against_the_priors_as_without_the
 def test_a_dark_prediction_has_no_misfit_and_the_loss_is_finite():
     radiance = torch.zeros(1, 8, 8, 1)
     dn = torch.full_like(radiance, 500.0)
-    error = model_error(radiance, EXPOSURES_S, dn, SENSOR, 1, misfit=0.5)
+    error = model_error(radiance, EXPOSURES_S, SENSOR, 1, misfit=0.5)
     assert error.floor_dn2.item() == 0 and error.weight == 1
     assert torch.isfinite(likelihood_loss(radiance, EXPOSURES_S, dn, SENSOR, misfit=0.5)[0])

@@ -192,7 +192,8 @@ class Rasterization {
 
 }  // namespace
 
-void bind_training(nb::module_& m);  // training.cpp
+void bind_likelihood(nb::module_& m);  // likelihood.cpp
+void bind_training(nb::module_& m);    // training.cpp
 
 NB_MODULE(_rasterizer, m) {
   nb::set_leak_warnings(false);  // autograd graphs that live until Python ends keep their renderings; that is no leak
@@ -229,5 +230,6 @@ NB_MODULE(_rasterizer, m) {
            nb::arg("footprint_px2"), nb::arg("added").none(), nb::arg("screen_means2d"), nb::arg("pixels"))
       .def_prop_ro("pairs", &Rasterization::pairs)
       .def_prop_ro("bytes", &Rasterization::bytes);
+  bind_likelihood(m);
   bind_training(m);
 }
