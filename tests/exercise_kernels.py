@@ -16,7 +16,7 @@ THREADS = (1, 2, 4)
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 SIZES = [(33, 70), (1, 1), (97, 31)]  # height and width, px: neither is a multiple of a block or tile
 # coefficients, channels, what lights them
-KINDS = [(1, 1, "view"), (4, 3, "view"), (16, 3, "view"), (9, 1, "sun"), (1, 3, "lambert")]
+KINDS = [(1, 1, "view"), (4, 3, "view"), (16, 3, "view"), (9, 1, "sun"), (1, 3, "lambert"), (4, 3, "lambert")]
 # Images that the loss depends on, each with those before it: each choice has loops of its own.
 ASKED = ("radiance", "depth")
 CROWD = 20_000  # Gaussians in two views: enough work for four threads in every loop of the rasterizer

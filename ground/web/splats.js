@@ -29,7 +29,7 @@ const SHADE = `
   }
   vec3 radianceOf(int i, vec3 direction, mat3 turned, vec3 scales) {
     float b[16];
-    basis(shading == 1 ? sun : direction, b);
+    basis(shading > 0 ? sun : direction, b);
     vec3 sum = vec3(0.0);
     for (int k = 0; k < coefficients; k++)
       for (int c = 0; c < 3; c++) sum[c] += b[k] * coefficient(i, k, channels == 3 ? c : 0);

@@ -27,9 +27,10 @@ class Gaussians:
 
     - `view`: radiance (see `sh.radiance`), the harmonics taken along the line from the camera to the Gaussian;
     - `sun`: radiance, the harmonics taken towards the Sun: of degree 1, softly, max(0, b0 + B·s);
-    - `lambert`: K = 1, an albedo. Radiance is albedo·(max(0, n·s)·V(s) + ambient): n the shortest axis on the camera's
+    - `lambert`: an albedo. Radiance is albedo·(max(0, n·s)·V(s) + ambient): n the shortest axis on the camera's
       side, s the Sun, V the share of it that other Gaussians let through (`render.sunlit_shares`), all of the light in
-      units of the Sun's. The maximum is as soft as `sh.radiance`, and ambient [] is one number for all.
+      units of the Sun's. The maximum is as soft as `sh.radiance`, and ambient [] is one number for all. Where K > 1 the
+      harmonics are taken towards the Sun, and correct the albedo for what else changes with it.
 
     A model may have highlights (`render.highlights`): each Gaussian then mirrors the Sun in one more lobe, which is
     added to that radiance. lobes [N, 1]: the logarithm of its weight, the Gaussian being a mirror across its shortest
@@ -94,8 +95,6 @@ class Gaussians:
             raise ValueError(
                 f"footprint must be one of {', '.join(get_args(Footprint))}, got {self.footprint!r}"
             )
-        if self.shading == "lambert" and self.sh.shape[1] != 1:
-            raise ValueError(f"an albedo is sh [{n}, 1, 1 or 3], got {list(self.sh.shape)}")
 
     @property
     def has_highlights(self) -> bool:

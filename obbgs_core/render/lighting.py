@@ -35,7 +35,8 @@ def radiance_along(
         return radiance(gaussians.sh, sun_dir.expand(len(gaussians), 3))
     assert sunlit is not None
     light = softplus((normals_towards(gaussians, directions) * sun_dir).sum(dim=1)) * sunlit.to(directions)
-    return radiance(gaussians.sh, directions) * (light + gaussians.ambient)[:, None]
+    albedo = radiance(gaussians.sh, sun_dir.expand(len(gaussians), 3))
+    return albedo * (light + gaussians.ambient)[:, None]
 
 
 def lambertian(gaussians: Gaussians) -> Gaussians:

@@ -216,10 +216,10 @@ def _appearance(
     voxel_m: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return colours [V, C] and the number of views that see each vertex [V]."""
-    if gaussians.shading == "lambert":
-        shown = dataclasses.replace(gaussians.matt(), shading="view")  # its harmonics are albedos
-    else:
-        shown = lit_from(gaussians, sun_dir)
+    shown = gaussians
+    if gaussians.shading == "lambert":  # the albedos alone
+        shown = dataclasses.replace(gaussians.matt(), shading="view" if sun_dir is None else "sun")
+    shown = lit_from(shown, sun_dir)
     total, seen_by = torch.zeros(len(vertices), gaussians.sh.shape[2]), torch.zeros(len(vertices))
     for c, depth in enumerate(depths):
         camera = cameras.one(c)

@@ -20,6 +20,9 @@ from obbgs_core.train.parsimony import next_degree_gain, padded
 
 SHADOW_INTERVAL = 120  # steps between two computations of the shadow maps
 SUN_DEGREE = 1  # of harmonics towards the Sun, at most: a face is as bright as the cosine of the Sun's angle
+# Under Lambert's law harmonics correct the albedo where no two Suns are further apart: over part of the sphere they
+# describe what light from other parts and coarse shadows do, all round it they do not (experiment 075).
+CORRECTED_SPAN_DEG = 90.0
 SUN_FROM = 0.05  # share of the steps at which a moving Sun is first tested, before any growth
 
 
@@ -77,6 +80,7 @@ def raised_degree(
     sensor: Sensor,
     directions: tuple[Literal["view", "sun"], ...],
     settings: LightSettings,
+    sun_span_deg: float,
     rng: torch.Generator,
 ) -> tuple[Gaussians | None, str]:
     """Return the Gaussians with the next harmonic degree, None if its gain is below the BIC penalty, and the reason.
@@ -86,6 +90,9 @@ def raised_degree(
     gains is no guide: each frame has one view and one Sun, so either explains much of the other, and neighbouring
     Gaussians count the same light twice (on a tumbling target the view gained 1.66 and the Sun 1.52 Mnats, but held-out
     views reached 30.6 dB with the view and 33.9 dB with the Sun).
+
+    Args:
+        sun_span_deg: the largest angle between two frames' Suns.
 
     Returns:
         The reason is empty where nothing was tested, because the degree may not rise further.
@@ -105,16 +112,21 @@ def raised_degree(
         )
         if gain > penalty:
             lambert = direction == "sun" and settings.sun_shading == "lambert"
-            raised = (lambertian(gaussians) if lambert else padded(turning, degree)).trainable()
+            raised = lambertian(gaussians) if lambert else padded(turning, degree)
+            if lambert and sun_span_deg <= CORRECTED_SPAN_DEG:
+                raised = padded(raised, SUN_DEGREE)
+            raised = raised.trainable()
             break
     return raised, f"degree {degree}: {'; '.join(tested)}"
 
 
 def described(gaussians: Gaussians, *reasons: str) -> str:
     """Return what the radiance depends on, in words, with the reasons where there are some."""
-    what = "constant" if gaussians.sh.shape[1] == 1 else f"turns with the {gaussians.shading}"
+    turns = gaussians.sh.shape[1] > 1
+    what = f"turns with the {gaussians.shading}" if turns else "constant"
     if gaussians.shading == "lambert":
         what = f"follows Lambert's law with cast shadows, ambient {gaussians.ambient.item():.3f} of the Sun"
+        what += ", albedos corrected towards the Sun" if turns else ""
     if gaussians.has_highlights:
         what += f", with highlights of roughness {gaussians.gloss[0].exp().item():.2f}"
     why = "; ".join(reason for reason in reasons if reason)

@@ -183,6 +183,7 @@ def raise_degree(
         setup.sensor,
         directions,
         setup.config.light,
+        setup.sun_span_deg,
         state.rng,
     )
     if raised is not None:

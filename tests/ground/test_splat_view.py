@@ -108,6 +108,7 @@ def still(page) -> None:
         ("view", "mip-splatting", 4, 1),
         ("sun", "camera", 4, 3),
         ("lambert", "camera", 1, 1),
+        ("lambert", "camera", 4, 3),
     ],
 )
 def test_the_page_draws_what_our_renderer_draws(

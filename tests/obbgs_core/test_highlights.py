@@ -43,7 +43,7 @@ SHADINGS = [
     ("view", 4, 3),
     ("static", 4, 3),
     ("sun", 4, 3),
-    ("lambert", 1, 3),
+    ("lambert", 4, 3),
     ("normals", 1, 3),
 ]
 STATIC_SUN = torch.tensor([-0.48, 0.6, -0.64])
@@ -142,7 +142,7 @@ def test_kernels_match_the_reference_in_float64(kernel, shading, sh_count, chann
 
 
 @pytest.mark.parametrize(
-    ("shading", "sh_count"), [("view", 1), ("static", 1), ("sun", 4), ("lambert", 1), ("normals", 1)]
+    ("shading", "sh_count"), [("view", 1), ("static", 1), ("sun", 4), ("lambert", 4), ("normals", 1)]
 )
 def test_the_reference_gradient_matches_finite_differences(shading, sh_count):
     gaussians = random_gaussians(3, 1, seed=3, dtype=torch.float64, sh_count=sh_count)

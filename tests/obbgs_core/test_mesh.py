@@ -1,5 +1,6 @@
 """Meshes of models whose surface is known, and their files as other software reads them."""
 
+import dataclasses
 import json
 import math
 import subprocess
@@ -86,10 +87,17 @@ def test_the_colour_is_the_radiance_and_under_lamberts_law_the_albedo(ball):
     lit = Gaussians(**one.tensors(), shading="lambert", ambient=torch.tensor(0.1))
     cameras = cameras_around(20)
     suns = torch.tensor([[0.0, 0.0, 1.0]]).expand(20, 3)
-    mesh = surface_mesh(lit, type(cameras)(cameras.world_to_camera, cameras.K, SIZE, SIZE, sun_dir=suns))
+    views_of_it = type(cameras)(cameras.world_to_camera, cameras.K, SIZE, SIZE, sun_dir=suns)
+    mesh = surface_mesh(lit, views_of_it)
     assert mesh.is_albedo
     dark_side = mesh.vertices[:, 2] < -0.5  # the same albedo as the lit one
     np.testing.assert_allclose(mesh.colours[dark_side].mean(), ball.colours.mean(), rtol=0.02)
+    corrected = dataclasses.replace(lit, sh=torch.cat([lit.sh, torch.zeros(len(lit), 3, 1)], dim=1))
+    corrected.sh[:, 2] = -0.5  # darker towards the Sun of +z
+    darker = surface_mesh(corrected, views_of_it, sun_dir=suns[0])
+    raw = torch.tensor([0.2820948 - 0.5 * 0.4886025, 0.2820948])
+    expected, before = torch.nn.functional.softplus(10 * raw).tolist()
+    np.testing.assert_allclose(darker.colours.mean() / mesh.colours.mean(), expected / before, rtol=0.02)
 
 
 @pytest.mark.parametrize("file_type", ["glb", "obj", "stl", "ply"])

@@ -74,13 +74,18 @@ def _highlights(g: Graph, gaussians: Gaussians, camera: View, sunlit: str | None
 
 def _matt(g: Graph, gaussians: Gaussians, camera: View, sunlit: str | None) -> str:
     """Return the radiance [N, C] towards the camera without highlights."""
+    harmonics = _harmonics(g, gaussians, camera)
+    if sunlit is None:
+        return harmonics
+    return g.op("Mul", harmonics, g.op("Unsqueeze", _light(g, gaussians, camera, sunlit), g.ints(1)))
+
+
+def _harmonics(g: Graph, gaussians: Gaussians, camera: View) -> str:
+    """Return what the harmonics say [N, C]: radiance, or under Lambert's law the albedo."""
     sh = to_numpy(gaussians.sh)
-    constant = (np.logaddexp(0, SOFTNESS * C0 * sh[:, 0]) / SOFTNESS).astype(np.float32)
-    if sunlit is not None:
-        return g.op("Mul", constant, g.op("Unsqueeze", _light(g, gaussians, camera, sunlit), g.ints(1)))
     if sh.shape[1] == 1:
-        return g.value(constant)
-    if gaussians.shading == "sun":
+        return g.value((np.logaddexp(0, SOFTNESS * C0 * sh[:, 0]) / SOFTNESS).astype(np.float32))
+    if gaussians.shading != "view":
         direction = g.op("Reshape", "sun_dir", g.ints(1, 3))
     else:
         direction = _directions(g, gaussians, camera)
