@@ -86,14 +86,18 @@ def without_sun(gaussians: Gaussians, sun_dir: Tensor | None, sunlit: Tensor | N
     if gaussians.shading != "view" and sun_dir is None:
         raise ValueError("the model's radiance turns with the Sun: give sun_dir, the Sun's direction")
     if sun_dir is not None and gaussians.shading == "sun" and not gaussians.has_highlights:
-        basis = sh_basis(sun_dir.reshape(1, 3).to(gaussians.sh), gaussians.sh.shape[1])
-        constant = (basis[0, :, None] * gaussians.sh).sum(dim=1, keepdim=True) / C0
-        return dataclasses.replace(gaussians, sh=constant, shading="view")
+        return dataclasses.replace(gaussians, sh=constant_towards(gaussians, sun_dir), shading="view")
     directions, to_coefficients = fit(16 if gaussians.has_highlights else 4)
     seen = [radiance_along(gaussians, d.expand(len(gaussians), 3), sun_dir, sunlit) for d in directions]
     before_softplus = C0 * from_radiance(torch.stack(seen, dim=1))
     fitted = torch.einsum("kd,ndc->nkc", to_coefficients, before_softplus)
     return dataclasses.replace(gaussians.matt(), sh=fitted, shading="view")
+
+
+def constant_towards(gaussians: Gaussians, sun_dir: Tensor) -> Tensor:
+    """Return the coefficients [N, 1, C] of the constant that harmonics of the Sun's direction are at `sun_dir` [3]."""
+    basis = sh_basis(sun_dir.reshape(1, 3).to(gaussians.sh), gaussians.sh.shape[1])
+    return (basis[0, :, None] * gaussians.sh).sum(dim=1, keepdim=True) / C0
 
 
 def constant_radiance(gaussians: Gaussians) -> Gaussians:

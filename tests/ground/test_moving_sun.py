@@ -302,6 +302,10 @@ def test_a_sun_that_moves_over_part_of_the_sphere_corrects_the_albedos():
     assert result.gaussians.shading == "lambert" and result.gaussians.sh.shape[1] == 4
     assert "albedos corrected towards the Sun" in result.appearance
     assert result.gaussians.sh[:, 1:].abs().max() > 0
+    trainer.join(photographed(views(20, seed=3)))  # the Sun goes all round
+    assert trainer.setup.sun_span_deg > CORRECTED_SPAN_DEG
+    trainer.step()
+    assert trainer.gaussians.shading == "lambert" and trainer.gaussians.sh.shape[1] == 1
 
 
 def test_a_killed_training_under_the_sun_resumes_to_the_same_bits(moving, under_the_sun, tmp_path):
