@@ -40,7 +40,7 @@ def main(session_dir: Path) -> None:
     batch = trainer.setup.batches.batch([int(np.argmax(areas))], 1.0)
     rendered = render(gaussians, batch.cameras)
     _, residual = likelihood_loss(rendered.radiance, batch.exposure_time_s, batch.dn, sensor)
-    tile = obb.worst_tile(residual[0].abs())
+    tile = obb.worst_tile(residual[0])
     pose = batch.cameras.world_to_camera[0]
     behind = obb.behind_tile(gaussians.means, rendered.means2d[0], rendered.depth[0], pose, tile)
     box = obb.fit(gaussians.means[behind])

@@ -45,12 +45,12 @@ def fit(points: Tensor, centre: Literal["middle", "mean"] = "middle") -> Obb:
     return Obb(middle if centre == "middle" else mean, axes, (high - low) / 2)
 
 
-def worst_tile(error: Tensor) -> tuple[int, int]:
-    """Return the top row and left column, px, of the whole tile with the largest mean |error| in error [H, W, C]."""
-    height, width, _ = error.shape
+def worst_tile(residual: Tensor) -> tuple[int, int]:
+    """Return the top row and left column, px, of the whole tile with the largest mean |residual|, of [H, W, C]."""
+    height, width, _ = residual.shape
     rows, columns = min(TILE_ROWS, height), min(TILE_COLUMNS, width)
     down, across = height // rows, width // columns
-    tiles = error[: down * rows, : across * columns].reshape(down, rows, across, -1)
+    tiles = residual[: down * rows, : across * columns].reshape(down, rows, across, -1)
     index = int(tiles.abs().sum(dim=(1, 3)).argmax())
     return index // across * rows, index % across * columns
 

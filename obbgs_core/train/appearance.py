@@ -20,9 +20,9 @@ from obbgs_core.train.parsimony import next_degree_gain, padded
 
 SHADOW_INTERVAL = 120  # steps between two computations of the shadow maps
 SUN_DEGREE = 1  # of harmonics towards the Sun, at most: a face is as bright as the cosine of the Sun's angle
-# Under Lambert's law harmonics correct the albedo where no two Suns are further apart: over part of the sphere they
+# Albedos under Lambert's law turn with the Sun where no two Suns are further apart: over part of the sphere harmonics
 # describe what light from other parts and coarse shadows do, all round it they do not (experiment 075).
-CORRECTED_SPAN_DEG = 90.0
+TURNING_SPAN_DEG = 90.0
 SUN_FROM = 0.05  # share of the steps at which a moving Sun is first tested, before any growth
 
 
@@ -80,7 +80,7 @@ def raised_degree(
     sensor: Sensor,
     directions: tuple[Literal["view", "sun"], ...],
     settings: LightSettings,
-    sun_span_deg: float,
+    albedos_turn: bool,
     rng: torch.Generator,
 ) -> tuple[Gaussians | None, str]:
     """Return the Gaussians with the next harmonic degree, None if its gain is below the BIC penalty, and the reason.
@@ -92,7 +92,7 @@ def raised_degree(
     views reached 30.6 dB with the view and 33.9 dB with the Sun).
 
     Args:
-        sun_span_deg: the largest angle between two frames' Suns.
+        albedos_turn: under Lambert's law, see `TrainingSetup.albedos_turn`.
 
     Returns:
         The reason is empty where nothing was tested, because the degree may not rise further.
@@ -111,10 +111,10 @@ def raised_degree(
             f"with the {direction} it would gain {gain:,.0f} nats at a BIC penalty of {penalty:,.0f}"
         )
         if gain > penalty:
-            lambert = direction == "sun" and settings.sun_shading == "lambert"
-            raised = lambertian(gaussians) if lambert else padded(turning, degree)
-            if lambert and sun_span_deg <= CORRECTED_SPAN_DEG:
-                raised = padded(raised, SUN_DEGREE)
+            if direction == "sun" and settings.sun_shading == "lambert":
+                raised = padded(lambertian(gaussians), SUN_DEGREE if albedos_turn else 0)
+            else:
+                raised = padded(turning, degree)
             raised = raised.trainable()
             break
     return raised, f"degree {degree}: {'; '.join(tested)}"
@@ -126,7 +126,7 @@ def described(gaussians: Gaussians, *reasons: str) -> str:
     what = f"turns with the {gaussians.shading}" if turns else "constant"
     if gaussians.shading == "lambert":
         what = f"follows Lambert's law with cast shadows, ambient {gaussians.ambient.item():.3f} of the Sun"
-        what += ", albedos corrected towards the Sun" if turns else ""
+        what += ", albedos that turn with the Sun" if turns else ""
     if gaussians.has_highlights:
         what += f", with highlights of roughness {gaussians.gloss[0].exp().item():.2f}"
     why = "; ".join(reason for reason in reasons if reason)

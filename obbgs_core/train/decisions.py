@@ -183,7 +183,7 @@ def raise_degree(
         setup.sensor,
         directions,
         setup.config.light,
-        setup.sun_span_deg,
+        setup.albedos_turn,
         state.rng,
     )
     if raised is not None:

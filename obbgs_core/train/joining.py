@@ -13,7 +13,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.lighting import constant_towards
 from obbgs_core.start import hull
 from obbgs_core.train.adam import Adam
-from obbgs_core.train.appearance import CORRECTED_SPAN_DEG, SUN_FROM
+from obbgs_core.train.appearance import SUN_FROM
 from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.decisions import smooth
@@ -66,10 +66,8 @@ def join(
         constant = gaussians.sh[:, :1].contiguous()
         gaussians = dataclasses.replace(gaussians.matt(), sh=constant, shading="view")
         state.adam = Adam(gaussians)
-    corrected = gaussians.shading == "lambert" and gaussians.sh.shape[1] > 1
-    if (
-        corrected and joined.sun_span_deg > CORRECTED_SPAN_DEG
-    ):  # the Sun goes further round than it was known to
+    turning = gaussians.shading == "lambert" and gaussians.sh.shape[1] > 1
+    if turning and not joined.albedos_turn:  # the Sun goes further round than it was known to
         suns = stacked_suns([frame.sun_dir for frame in setup.frames])
         assert suns is not None
         mean = F.normalize(suns.mean(dim=0), dim=0)

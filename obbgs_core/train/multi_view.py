@@ -30,7 +30,7 @@ def crossing_boxes(cameras: Cameras, residual: Tensor) -> Tensor:
         residual: [C, H, W, channels] of the cameras' images.
     """
     origins = cameras.centres
-    directions = torch.stack([corner_rays(cameras, i, residual[i].abs()) for i in range(len(cameras))])
+    directions = torch.stack([corner_rays(cameras, i, residual[i]) for i in range(len(cameras))])
     boxes = []
     for i, j in itertools.combinations(range(len(cameras)), 2):
         normal = torch.linalg.cross(directions[i], directions[j])
@@ -45,9 +45,9 @@ def crossing_boxes(cameras: Cameras, residual: Tensor) -> Tensor:
     return torch.stack(boxes) if boxes else torch.zeros(0, 2, 3)
 
 
-def corner_rays(cameras: Cameras, index: int, error: Tensor) -> Tensor:
-    """Return unit directions [4, 3], body frame, through the corners of the worst tile of an error [H, W, C]."""
-    top, left = obb.worst_tile(error)
+def corner_rays(cameras: Cameras, index: int, residual: Tensor) -> Tensor:
+    """Return unit directions [4, 3], body frame, through the corners of the worst tile of a residual [H, W, C]."""
+    top, left = obb.worst_tile(residual)
     rows = torch.tensor([top, top, top + obb.TILE_ROWS, top + obb.TILE_ROWS]) + 0.5
     columns = torch.tensor([left, left + obb.TILE_COLUMNS, left, left + obb.TILE_COLUMNS]) + 0.5
     K, R = cameras.K[index], cameras.world_to_camera[index, :3, :3]

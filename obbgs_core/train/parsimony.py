@@ -45,10 +45,8 @@ def bic_penalty(gaussians: Gaussians, values: int) -> float:
         values: sensor values that show the target above the noise, over all frames.
     """
     parameters = sum(tensor[0].numel() for tensor in gaussians.tensors().values()) - 1  # a quaternion has 3
-    if gaussians.shading == "lambert":
-        parameters -= gaussians.sh[
-            0, 1:
-        ].numel()  # corrections of the light, not of what is there (experiment 075)
+    if gaussians.shading == "lambert":  # how albedos turn with the Sun corrects the light, not what is there
+        parameters -= gaussians.sh[0, 1:].numel()
     return 0.5 * parameters * math.log(max(2, values))
 
 

@@ -6,7 +6,7 @@ import logging
 import torch
 from torch import Tensor
 
-from obbgs_core.misfit import relative_misfit
+from obbgs_core.misfit import relative_misfit, sampled
 from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.registration import pose_information
 from obbgs_core.render.slopes import render_with_slopes
@@ -161,8 +161,9 @@ def _gather(setup: TrainingSetup, state: TrainingState, indices: list[int]) -> t
         told = pose_information(*images, cameras, *readings, cell_m=cell_m(setup))
         poses.gather(batch.indices, told)
         dispersions.append(told.dispersion)
+        radiance, dn = sampled(rendered.radiance, batch.dn)
         for one in range(len(cameras)):
             at = slice(one, one + 1)
-            seen = (rendered.radiance[at], batch.exposure_time_s[at], batch.dn[at])
+            seen = (radiance[at], batch.exposure_time_s[at], dn[at])
             shares.append(relative_misfit(*seen, setup.sensor, batch.averaged_pixels))
     return torch.cat(dispersions), torch.tensor(shares)

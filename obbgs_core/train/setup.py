@@ -29,6 +29,7 @@ from obbgs_core.start.alignment import settled
 from obbgs_core.start.hull import Silhouette, light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
 from obbgs_core.train.adam import FIRST_MEMORY, SECOND_MEMORY, Adam
+from obbgs_core.train.appearance import TURNING_SPAN_DEG
 from obbgs_core.train.batches import Batches, FrameOrder
 from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.config import MethodConfig
@@ -75,6 +76,11 @@ class TrainingSetup:
     def sun_moves(self) -> bool:
         """Whether the Sun moves by enough to be tested as what the radiance depends on."""
         return 0 < self.config.light.sun_span_deg < self.sun_span_deg
+
+    @property
+    def albedos_turn(self) -> bool:
+        """Whether albedos under Lambert's law turn with the Sun, which is where it does not go all round."""
+        return self.sun_span_deg <= TURNING_SPAN_DEG
 
     @functools.cached_property
     def identity(self) -> Identity:

@@ -35,7 +35,7 @@ from obbgs_core.render import lit_from, render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.appearance import CORRECTED_SPAN_DEG
+from obbgs_core.train.appearance import TURNING_SPAN_DEG
 from obbgs_core.train.batches import Batches
 from obbgs_core.train.neighbours import Neighbours, normals_apart
 from obbgs_core.train.parsimony import next_degree_gain
@@ -289,21 +289,21 @@ def test_under_the_sun_neighbours_are_as_smooth_as_asked_for(moving):
     assert apart < 0.8 * free_apart
 
 
-def test_a_sun_that_moves_over_part_of_the_sphere_corrects_the_albedos():
+def test_under_a_sun_that_moves_over_part_of_the_sphere_albedos_turn_with_it():
     seen = []
     for pose, sun in views(40, still=True):
         leaning = sun + np.array([0.5 * math.sin(len(seen)), 0.0, 0.3 * math.cos(len(seen))])
         seen.append((pose, leaning / np.linalg.norm(leaning)))
     trainer = Trainer(photographed(seen), SENSOR, preset("obbgs", QUICK), seed=1)
-    assert 5 < trainer.setup.sun_span_deg < CORRECTED_SPAN_DEG
+    assert 5 < trainer.setup.sun_span_deg < TURNING_SPAN_DEG
     for _ in range(60):
         trainer.step()
     result = trainer.result("enough")
     assert result.gaussians.shading == "lambert" and result.gaussians.sh.shape[1] == 4
-    assert "albedos corrected towards the Sun" in result.appearance
+    assert "albedos that turn with the Sun" in result.appearance
     assert result.gaussians.sh[:, 1:].abs().max() > 0
     trainer.join(photographed(views(20, seed=3)))  # the Sun goes all round
-    assert trainer.setup.sun_span_deg > CORRECTED_SPAN_DEG
+    assert trainer.setup.sun_span_deg > TURNING_SPAN_DEG
     trainer.step()
     assert trainer.gaussians.shading == "lambert" and trainer.gaussians.sh.shape[1] == 1
 

@@ -38,7 +38,8 @@ Span drawn_columns(const Shape& shape, const float* image, int first, int last) 
 
 // The model's own error over some images: what SensorModel says of it, the floor of each image, and the weight by which
 // the mean pull on the lit values stays that of the noise alone. It is that of `model_error` in misfit.py, on every so
-// many pixels, `stride` apart; `own` of its variance goes with a value's own light.
+// many pixels, `stride` apart; `own` of its variance goes with a value's own light. misfit: its share of the light, if
+// it is known.
 struct ModelError {
   float by_light = -1;
   std::vector<float> floors;
@@ -46,9 +47,12 @@ struct ModelError {
 };
 
 ModelError model_error(const Shape& shape, const float* radiance, const float* gains, const SensorModel& s,
-                       double misfit, double own, int stride) {
-  const double averaged = double(s.root_averaged) * s.root_averaged, share = averaged * misfit * misfit;
-  ModelError error{float(share * own), std::vector<float>(shape.count, 0.0f), 1};
+                       std::optional<double> misfit, double own, int stride) {
+  ModelError error;
+  error.floors.resize(shape.count);
+  if (!misfit) return error;
+  const double averaged = double(s.root_averaged) * s.root_averaged, share = averaged * *misfit * *misfit;
+  error.by_light = float(share * own);
   struct Lit {
     double light2, variance;  // DN^2, the latter of the noise of a sensor pixel
   };
@@ -98,8 +102,7 @@ double likelihood(Array radiance, Array dn, Array gains, const SensorModel& sens
   float *out = residual.data(), *g = gradient ? gradient->data() : nullptr;
   nb::gil_scoped_release release;
   SensorModel s = sensor;
-  ModelError error{-1, std::vector<float>(shape.count, 0.0f), 1};
-  if (misfit) error = model_error(shape, r, gain, s, *misfit, own, stride);
+  const ModelError error = model_error(shape, r, gain, s, misfit, own, stride);
   s.misfit = error.by_light;
   const double scale = factor * error.weight / shape.values(), edge_scale = factor * edge_weight / shape.edges();
   const auto at_a_clip = [&](float reading) { return reading <= 0 || reading >= s.white; };

@@ -1,9 +1,9 @@
 // Loops over one row of an image (or one block of parameters) that the compiler vectorises: losses, gradients, Adam;
 // those of readings are in likelihood_rows.h.
 // Rows hold width * channels values, channels interleaved: a pixel's neighbour is `c` (channels) values away.
-// Compiled once for each instruction set, in rows.cpp; training.cpp calls them through RowLoops. No loop adds up across
-// lanes and a*b + c is never contracted, so every instruction set gives the same bits. Compile with -fno-math-errno
-// -fno-trapping-math: square roots and conditions are scalar without them.
+// Compiled once for each instruction set, in rows.cpp; likelihood.cpp and training.cpp call them through RowLoops. No
+// loop adds up across lanes and a*b + c is never contracted, so every instruction set gives the same bits. Compile with
+// -fno-math-errno -fno-trapping-math: square roots and conditions are scalar without them.
 #pragma once
 #include <cmath>
 #include <cstddef>
