@@ -218,7 +218,8 @@ def _appearance(
     """Return colours [V, C] and the number of views that see each vertex [V]."""
     shown = gaussians
     if gaussians.shading == "lambert":  # the albedos alone
-        shown = dataclasses.replace(gaussians.matt(), shading="view" if sun_dir is None else "sun")
+        turn = gaussians.sh.shape[1] > 1
+        shown = dataclasses.replace(gaussians.matt(), shading="sun" if turn else "view")
     shown = lit_from(shown, sun_dir)
     total, seen_by = torch.zeros(len(vertices), gaussians.sh.shape[2]), torch.zeros(len(vertices))
     for c, depth in enumerate(depths):

@@ -94,6 +94,8 @@ def test_the_colour_is_the_radiance_and_under_lamberts_law_the_albedo(ball):
     np.testing.assert_allclose(mesh.colours[dark_side].mean(), ball.colours.mean(), rtol=0.02)
     corrected = dataclasses.replace(lit, sh=torch.cat([lit.sh, torch.zeros(len(lit), 3, 1)], dim=1))
     corrected.sh[:, 2] = -0.5  # darker towards the Sun of +z
+    with pytest.raises(ValueError, match="give sun_dir"):
+        surface_mesh(corrected, views_of_it)
     darker = surface_mesh(corrected, views_of_it, sun_dir=suns[0])
     raw = torch.tensor([0.2820948 - 0.5 * 0.4886025, 0.2820948])
     expected, before = torch.nn.functional.softplus(10 * raw).tolist()
