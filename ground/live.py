@@ -37,7 +37,7 @@ JOIN_STEPS = 60  # at least, from frames that join to the next
 # at least so many times what the last joining took, from one to the next while frames arrive
 JOIN_PAUSE = 3.0
 LOOK_S, STATUS_S, SHOW_S, SAVE_S = 0.5, 1.0, 5.0, 20.0  # between two looks, statuses, models and checkpoints
-LAST_SHOW_S = 2.0  # between two models once the pass is over: they improve fastest then, and operators wait for them
+LAST_SHOW_S = 2.0  # between two models once the pass is over, when operators wait for them
 WAIT_S = 0.1  # where there is nothing to train
 CHECKPOINT = re.compile(r"live-(\d+)\.checkpoint", re.ASCII)  # with the number of frames that have joined
 

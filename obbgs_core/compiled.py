@@ -5,8 +5,10 @@ and takes the best that the processor runs; the environment variable OBBGS_KERNE
 portable.
 """
 
+import contextlib
 import functools
 import os
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -47,3 +49,31 @@ def kernels() -> tuple[str, ...]:
         )
     _rasterizer.use_kernel(chosen)
     return (chosen, *(name for name in best_first if name != chosen))
+
+
+_threads = 0  # of the compiled module; 0: as many as PyTorch's
+
+
+def threads() -> int:
+    """Return on how many threads the compiled module runs: PyTorch's number, outside of the block below."""
+    return _threads or torch.get_num_threads()
+
+
+@contextlib.contextmanager
+def torch_on_one_thread() -> Iterator[None]:
+    """Let PyTorch's operations run on one thread in a block, the compiled module on as many as PyTorch had before.
+
+    A step of a training takes hundreds of operations on some ten thousand numbers each, which are over before another
+    thread is awake: with two threads waking them a step took up to a third longer than with one. The compiled module
+    decides loop by loop whether there is enough for another thread. PyTorch keeps its number for a whole process, so
+    that only one block may be open at a time.
+    """
+    global _threads
+    outer, torch_threads = _threads, torch.get_num_threads()
+    _threads = threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(torch_threads)
+        _threads = outer

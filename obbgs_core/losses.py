@@ -181,7 +181,7 @@ def fit_figures(
     if native is not None:
         model, gains = _sensor_model(native, sensor, averaged_pixels), _gains(sensor, exposure_time_s)
         light, opaque, read = (image.detach().contiguous() for image in (radiance, alpha, dn))
-        threads = torch.get_num_threads()
+        threads = compiled.threads()
         chi2, mse, misfit2 = native.fit(light, opaque, read, gains, model, ON_TARGET_ALPHA, threads)
         misfit = math.sqrt(misfit2)
     else:
@@ -280,7 +280,7 @@ def _swept(
     values = radiance.detach().contiguous()
     residual = torch.empty_like(values)
     gradient = torch.empty_like(values) if radiance.requires_grad else None
-    gains, threads = _gains(sensor, exposure_time_s), torch.get_num_threads()
+    gains, threads = _gains(sensor, exposure_time_s), compiled.threads()
     loss = sweep(values, dn.contiguous(), gains, *settings, residual, gradient, threads)
     if gradient is None:
         return radiance.new_tensor(loss), residual

@@ -99,7 +99,7 @@ class _Rasterize(torch.autograd.Function):
         alpha, depth, median_depth = (torch.empty(shape) for _ in range(3))
         means2d, radii = torch.empty(*splats, 2), torch.empty(splats)
         rasterization.forward(
-            torch.get_num_threads(),
+            compiled.threads(),
             radiance,
             alpha,
             depth,
@@ -124,7 +124,7 @@ class _Rasterize(torch.autograd.Function):
         count, n = inputs[5].shape[0], inputs[0].shape[0]
         screen_means2d, pixels = torch.empty(count, n, 2), torch.empty(count, n)
         ctx.rasterization.backward(
-            torch.get_num_threads(),
+            compiled.threads(),
             radiance_image,
             depth_image,
             *(None if g is None else g.float() for g in (radiance, alpha, depth)),

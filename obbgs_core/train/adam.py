@@ -104,7 +104,7 @@ class Adam:
             if native is not None:  # the same in one pass over memory
                 if rate.ndim:  # one for each number of a Gaussian
                     rate = rate[0].expand(values.shape[1:])
-                each, threads = rate.reshape(-1), torch.get_num_threads()
+                each, threads = rate.reshape(-1), compiled.threads()
                 native.adam_step(values, gradient, first, second, each, b1, b2, self.eps, threads)
             else:
                 first.lerp_(gradient, 1 - b1)

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from obbgs_base.errors import Interrupted
+from obbgs_core.compiled import torch_on_one_thread
 from obbgs_core.errors import Diverged
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.losses import fit_figures
@@ -105,12 +106,14 @@ class Trainer:
         TooFewFrames, ReconstructionError: as in `train`.
     """
 
+    @torch_on_one_thread()
     def __init__(self, frames: list[TrainingFrame], sensor: Sensor, config: MethodConfig, seed: int = 0):
         began = time.monotonic()
         self._given, self._stated, self._asked = frames, sensor, config
         self.setup, self.state = prepare(frames, sensor, config, seed)
         self.state.seconds = time.monotonic() - began
 
+    @torch_on_one_thread()
     def step(self) -> StepInfo:
         """Render some frames, move Gaussians and poses down the gradient, and take the decisions that are due.
 
@@ -231,6 +234,7 @@ class Trainer:
             return f"all {config.steps} steps done (residual chi² {state.chi2:.2f})"
         return ""
 
+    @torch_on_one_thread()
     def join(self, frames: list[TrainingFrame]) -> None:
         """Go on with more frames: the model is kept, and the start is carved again of all frames.
 
