@@ -179,10 +179,10 @@ class LiveReconstruction:
 
     def _look(self, end: PassEnd) -> None:
         """Take what has arrived: a training begins with it, or it joins the one that is under way."""
-        was_over = self._over
-        self._over = end.reason()  # first, so that what came before the end is taken
-        if self._over and not was_over:
+        reason = end.reason()  # first, so that what came before the end is taken
+        if reason and not self._over:
             self._shows = _Every(LAST_SHOW_S)
+        self._over = reason
         if self.arrivals.look():
             end.arrived()
         if self.trainer is None:

@@ -55,7 +55,7 @@ _threads = 0  # of the compiled module; 0: as many as PyTorch's
 
 
 def threads() -> int:
-    """Return on how many threads the compiled module runs: PyTorch's number, outside of the block below."""
+    """Return on how many threads the compiled module runs: as many as PyTorch, but for `torch_on_one_thread`."""
     return _threads or torch.get_num_threads()
 
 
@@ -65,8 +65,8 @@ def torch_on_one_thread() -> Iterator[None]:
 
     A step of a training takes hundreds of operations on some ten thousand numbers each, which are over before another
     thread is awake: with two threads waking them a step took up to a third longer than with one. The compiled module
-    decides loop by loop whether there is enough for another thread. PyTorch keeps its number for a whole process, so
-    that only one block may be open at a time.
+    decides loop by loop whether there is enough for another thread. Both numbers are those of the whole process: where
+    two of its threads train at once, one may set back what the other needs, which costs time and changes no result.
     """
     global _threads
     outer, torch_threads = _threads, torch.get_num_threads()

@@ -89,6 +89,16 @@ def make_frame() -> Callable[..., Frame]:
     return make
 
 
+@pytest.fixture
+def use_threads() -> Iterator[Callable[[int], None]]:
+    """Sets PyTorch's number of threads, which is set back after the test."""
+    import torch  # here, since tests of the flight software do without
+
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="session")
 def skyfield_oracle():
     """Skyfield's time scale and the whole DE421, of which flight carries an excerpt."""

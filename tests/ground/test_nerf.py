@@ -136,12 +136,12 @@ def test_the_learning_rate_rises_then_falls_near_the_end():
 
 
 @pytest.fixture
-def small(monkeypatch):
+def small(monkeypatch, use_threads):
     for name, value in SMALL.items():
         monkeypatch.setattr(nerf, name, value)
     monkeypatch.setattr(nerf_pictures, "SURFACE_VIEWS", 8)
     monkeypatch.setattr(nerf_rays, "GRID_CELLS", 24)
-    torch.set_num_threads(1)
+    use_threads(1)
 
 
 def psnr(frames, image) -> float:

@@ -63,12 +63,11 @@ def test_the_compiled_step_is_the_readable_step(monkeypatch, sh):
 
 
 @needs_native
-def test_the_step_does_not_depend_on_the_number_of_threads():
-    before, results = torch.get_num_threads(), []
+def test_the_step_does_not_depend_on_the_number_of_threads(use_threads):
+    results = []
     for threads in (1, 2, 5):
-        torch.set_num_threads(threads)
+        use_threads(threads)
         results.append(after(3, gaussians()))
-    torch.set_num_threads(before)
     for other in results[1:]:
         assert all(torch.equal(other[name], value) for name, value in results[0].items())
 

@@ -126,16 +126,12 @@ def test_the_stub_names_everything_in_the_module_and_nothing_else():
             assert [a.arg for a in node.args.args] == re.findall(r"(\w+):", signature), node.name
 
 
-def test_in_a_block_only_the_compiled_module_keeps_the_threads():
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(3)
-        with pytest.raises(RuntimeError), compiled.torch_on_one_thread():
+def test_in_a_block_only_the_compiled_module_keeps_the_threads(use_threads):
+    use_threads(3)
+    with pytest.raises(RuntimeError), compiled.torch_on_one_thread():
+        assert (torch.get_num_threads(), compiled.threads()) == (1, 3)
+        with compiled.torch_on_one_thread():
             assert (torch.get_num_threads(), compiled.threads()) == (1, 3)
-            with compiled.torch_on_one_thread():
-                assert (torch.get_num_threads(), compiled.threads()) == (1, 3)
-            assert (torch.get_num_threads(), compiled.threads()) == (1, 3)
-            raise RuntimeError
-        assert (torch.get_num_threads(), compiled.threads()) == (3, 3)
-    finally:
-        torch.set_num_threads(before)
+        assert (torch.get_num_threads(), compiled.threads()) == (1, 3)
+        raise RuntimeError
+    assert (torch.get_num_threads(), compiled.threads()) == (3, 3)

@@ -247,12 +247,12 @@ def test_the_published_loss_holds_scikit_images_ssim():
 
 
 @needs_native
-def test_losses_do_not_depend_on_the_number_of_threads():
+def test_losses_do_not_depend_on_the_number_of_threads(use_threads):
     sensor = SENSORS["black level"]
     radiance, exposures_s, dn = bracket(sensor, height=150)
-    before, results = torch.get_num_threads(), []
+    results = []
     for threads in (1, 2, 5):
-        torch.set_num_threads(threads)
+        use_threads(threads)
         results.append(
             (
                 *value_and_gradient(
@@ -263,7 +263,6 @@ def test_losses_do_not_depend_on_the_number_of_threads():
                 ),
             )
         )
-    torch.set_num_threads(before)
     for other in results[1:]:
         assert all(torch.equal(ours, first) for ours, first in zip(other, results[0], strict=True))
 

@@ -304,17 +304,13 @@ def test_all_kernels_agree():
 
 
 @needs_native
-def test_results_repeat_bit_for_bit_with_any_number_of_threads():
+def test_results_repeat_bit_for_bit_with_any_number_of_threads(use_threads):
     gaussians, cameras = random_gaussians(1500), looking_at_origin(3, 96)
-    before = torch.get_num_threads()
     results = []
-    try:
-        for threads in (1, 1, 2, 5):
-            torch.set_num_threads(threads)
-            out, gradients = outputs_and_gradients(gaussians, cameras, "native")
-            results.append([out.radiance, out.depth, out.screen.means2d[2], *gradients.values()])
-    finally:
-        torch.set_num_threads(before)
+    for threads in (1, 1, 2, 5):
+        use_threads(threads)
+        out, gradients = outputs_and_gradients(gaussians, cameras, "native")
+        results.append([out.radiance, out.depth, out.screen.means2d[2], *gradients.values()])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 

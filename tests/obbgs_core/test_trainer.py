@@ -14,8 +14,8 @@ from obbgs_core import compiled
 from obbgs_core.errors import Diverged, ReconstructionError, TooFewFrames
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.gaussians import TENSORS
+from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
-from obbgs_core.train import trainer as trainer_module
 from obbgs_core.train.growth import finite
 from obbgs_core.train.presets import preset
 from obbgs_core.train.state import SAVED
@@ -54,22 +54,17 @@ def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path, monkeypat
         assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
 
 
-def test_a_step_wakes_threads_for_the_compiled_module_alone(frames, monkeypatch):
-    seen, rendered = [], trainer_module.render
+def test_a_step_wakes_threads_for_the_compiled_module_alone(frames, monkeypatch, use_threads):
+    seen = []
 
     def watched(*args, **kwargs):
         seen.append((torch.get_num_threads(), compiled.threads()))
-        return rendered(*args, **kwargs)
+        return render(*args, **kwargs)
 
-    monkeypatch.setattr(trainer_module, "render", watched)
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(3)
-        trainer = Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=3)
-        trainer.step()
-        assert set(seen) == {(1, 3)} and (torch.get_num_threads(), compiled.threads()) == (3, 3)
-    finally:
-        torch.set_num_threads(before)
+    monkeypatch.setattr("obbgs_core.train.trainer.render", watched)
+    use_threads(3)
+    Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=3).step()
+    assert set(seen) == {(1, 3)} and (torch.get_num_threads(), compiled.threads()) == (3, 3)
 
 
 def test_the_result_is_the_mean_of_the_models_of_the_last_steps(frames):
