@@ -17,7 +17,8 @@ from obbgs_base.files import write_whole
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.pose_corrections import with_estimate
 from obbgs_core.pose_estimate import PoseEstimate
-from obbgs_core.score.poses import PoseErrors, best_motion, pose_errors, settled_poses, size_of
+from obbgs_core.pose_gauge import best_motion, size_of
+from obbgs_core.score.poses import PoseErrors, pose_errors, settled_poses
 from obbgs_core.sensor import Sensor
 
 FILE = "poses_estimated.json"

@@ -29,7 +29,7 @@ from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import HOLD, Trainer
 
 log = logging.getLogger(__name__)
-STEPS = 1000  # of the schedule; 75 % of it is left when the last frames have joined: 13 to 15 s of a core at 256x256
+STEPS = 1000  # of the schedule, which begins again when the last frames have joined
 # what helps few frames alone would shape the model that the many frames to come inherit
 MANY_EXPECTED = {"sparse.dropout": 0.0, "sparse.sky_weight": 0.0}
 FEWEST_BRACKETS = 4  # that the first hull is carved of, while more may come
@@ -194,10 +194,12 @@ class LiveReconstruction:
             paused = now_s - self._joined_s >= JOIN_PAUSE * self._joining_s
             if self._over or trainer.stop_reason() or (learnt and paused):
                 trainer.join(self.arrivals.frames[self._joined :])
+                if self._over:
+                    trainer.end_joining()
                 self._note_joined(now_s)
                 self.save()
         elif self._over:
-            trainer.release()
+            trainer.end_joining()
 
     def _begin(self) -> None:
         """Go on from a checkpoint, or begin with the frames that are there, if they allow a training.
@@ -263,7 +265,7 @@ class LiveReconstruction:
     def _show(self, trainer: Trainer) -> None:
         """Renew the shown model if it is better now, and send it up if that is asked for and worth it."""
         if self.steps and self.shown.offered_step != self.steps:
-            self.shown.offer(trainer.gaussians, self.steps)
+            self.shown.offer(trainer.gaussians, self.steps, trainer.pose_estimate)
         arrivals, is_past_start = self.arrivals, trainer.share >= HOLD
         if self._uplink is not None and is_past_start and arrivals.session is not None:
             self._uplink.follow(self.shown, arrivals.session, arrivals.training, self._part)
@@ -320,7 +322,7 @@ class LiveReconstruction:
         trainer, session = self.trainer, self.arrivals.session
         assert trainer is not None and session is not None  # the pass has ended with a training
         result = trainer.result(f"{self._over}; {self.steps} steps while {self._joined} frames came")
-        self.shown.offer(result.gaussians, self.steps)
+        self.shown.offer(result.gaussians, self.steps, result.pose_estimate)
         self.report("finished", self._over)
         outputs, records = Outputs(self._part, should_stop), (self.arrivals.training, self.arrivals.held_out)
         finish_run(outputs, self._folder, {KNOWN: result}, session, *records, self._seed)

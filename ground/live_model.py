@@ -1,5 +1,6 @@
 """The model that a live reconstruction shows: the best so far by the held-out frames that have come."""
 
+import dataclasses
 import logging
 import math
 import shutil
@@ -9,10 +10,12 @@ import torch
 
 from ground.arrivals import Arrivals
 from ground.cameras import cameras_of, median_sun_direction, predicted_image, sensor_of
+from ground.estimated_poses import as_estimated, write_estimate
 from ground.model_files import exposure_times_s
 from ground.runs import is_live
 from obbgs_core.io.ply import save_ply
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.score.metrics import psnr_db
 
 log = logging.getLogger(__name__)
@@ -32,34 +35,44 @@ class ShownModel:
         self.held_out_db = math.nan
         self._folder, self._arrivals = folder, arrivals
         self._scored_frames = 0  # held-out frames that had come when held_out_db was found
+        self.estimate: PoseEstimate | None = None  # of the poses that the shown model was trained with
         self._images: dict[int, torch.Tensor] = {}  # held-out frames [H, W, C] as fractions of full scale
 
-    def offer(self, gaussians: Gaussians, step: int) -> bool:
-        """Show a model, unless the shown one is better by the same held-out frames; return whether it was shown."""
-        self.offered_step, offered_db = step, self.score_db(gaussians)
+    def offer(self, gaussians: Gaussians, step: int, estimate: PoseEstimate | None = None) -> bool:
+        """Show a model, unless the shown one is better by the same held-out frames; return whether it was shown.
+
+        estimate: of the poses that the model was trained with; None: they are as tagged.
+        """
+        self.offered_step, offered_db = step, self.score_db(gaussians, estimate)
         if self.gaussians is not None:
             if len(self._arrivals.held_out) != self._scored_frames:
-                self.held_out_db = self.score_db(self.gaussians)
+                self.held_out_db = self.score_db(self.gaussians, self.estimate)
             self._scored_frames = len(self._arrivals.held_out)
             if self.held_out_db > offered_db:
                 return False
         gaussians = gaussians.trainable().detach()  # a copy: training goes on in place
         try:
-            self._write(gaussians)
+            self._write(gaussians, estimate)
         except OSError as error:  # a full disk must not end the training
             log.warning("step %d: %s cannot be renewed: %s", step, self._folder / "model.ply", error)
             return False
         self.gaussians, self.step, self.held_out_db = gaussians, step, offered_db
+        self.estimate = estimate
         self._scored_frames = len(self._arrivals.held_out)
         return True
 
-    def score_db(self, gaussians: Gaussians) -> float:
-        """Return the mean PSNR of a model against held-out frames, noisy as they came; NaN without such frames."""
+    def score_db(self, gaussians: Gaussians, estimate: PoseEstimate | None) -> float:
+        """Return the mean PSNR of a model against held-out frames, noisy as they came; NaN without such frames.
+
+        They are seen from where the errors that the pass shares, as estimated with the model, put their tags.
+        """
         session, held_out = self._arrivals.session, self._arrivals.held_out
         if session is None or not held_out:
             return math.nan
+        scored = held_out[:: math.ceil(len(held_out) / SCORED)]
+        posed = as_estimated(dataclasses.replace(session, frames=tuple(scored)), estimate)
         sensor, values = sensor_of(session.camera), []
-        for record in held_out[:: math.ceil(len(held_out) / SCORED)]:
+        for record in posed.frames:
             if record.id not in self._images:
                 dn = torch.from_numpy(session.dn(record).astype("float32"))
                 self._images[record.id] = dn.reshape(*dn.shape[:2], -1) / sensor.white_dn
@@ -67,13 +80,14 @@ class ShownModel:
             values.append(psnr_db(predicted, self._images[record.id]))
         return math.fsum(values) / len(values)
 
-    def _write(self, gaussians: Gaussians) -> None:
+    def _write(self, gaussians: Gaussians, estimate: PoseEstimate | None) -> None:
         session, training = self._arrivals.session, self._arrivals.training
         assert session is not None
         if self._folder.exists() and not is_live(self._folder):
             shutil.rmtree(self._folder)  # a finished run that may be replaced
         self._folder.mkdir(parents=True, exist_ok=True)
         sensor = sensor_of(session.camera)
+        write_estimate(self._folder, estimate)
         white_radiance = sensor.full_scale_radiance(exposure_times_s(training)[0])
         sun_dir, cameras = median_sun_direction(training), cameras_of(session, training)
         save_ply(gaussians, self._folder / "model.ply", white_radiance, sun_dir, cameras)

@@ -15,6 +15,7 @@ from ground.session import FrameRecord, Session
 from ground.uplink import outcome, submit
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.pose_estimate import PoseEstimate
 
 log = logging.getLogger(__name__)
 GAIN_DB = 1.0  # over the model on board, on held-out frames: less is not worth the time of the uplink
@@ -39,7 +40,8 @@ class LiveUplink:
             raise ConfigError(str(key_file), f"cannot read the key: {error}") from error
         self.state = ""
         self._session_dir, self._key_file = session_dir, key_file
-        self._sent: Gaussians | None = None  # the model on board or on its way there
+        # the model on board or on its way there, with the poses that it was trained with
+        self._sent: tuple[Gaussians, PoseEstimate | None] | None = None
         self._sent_text = ""
         # counter and name of the command that has no result yet
         self._under_way: tuple[int, str] | None = None
@@ -74,9 +76,10 @@ class LiveUplink:
         """
         if not self.tend() or shown.gaussians is None or math.isnan(shown.held_out_db):
             return
-        gain_db = math.inf if self._sent is None else shown.held_out_db - shown.score_db(self._sent)
+        gain_db = math.inf if self._sent is None else shown.held_out_db - shown.score_db(*self._sent)
         if gain_db >= GAIN_DB:
             self._send(shown.gaussians, session, training, folder / "uplink.onnx")
+            self._sent = shown.gaussians, shown.estimate
             self._sent_text = f"step {shown.step}, held out {shown.held_out_db:.1f} dB"
             self.state = f"{self._sent_text}: waiting"
             log.info("a model goes up: %s", self._sent_text)
@@ -97,7 +100,7 @@ class LiveUplink:
             counter = submit(self._session_dir, self._key_file, Command("model", {}), path, EXPIRES_S)
         finally:
             path.unlink(missing_ok=True)
-        self._sent, self._under_way = gaussians, (counter, "model")
+        self._under_way = counter, "model"
 
     def _note_result(self, counter: int, name: str) -> None:
         result = outcome(self._session_dir, counter)

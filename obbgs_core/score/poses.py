@@ -15,14 +15,14 @@ from torch import Tensor
 from obbgs_core.frames import TrainingFrame, averaged, cameras_of
 from obbgs_core.losses import likelihood_loss
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
+from obbgs_core.model.motions import motion_vectors
 from obbgs_core.model.rotations import from_rotation_vectors, multiply
 from obbgs_core.pose_corrections import PoseCorrections
-from obbgs_core.registration import point_flow, pose_information
+from obbgs_core.pose_gauge import seen_after, seen_points
+from obbgs_core.registration import pose_information
 from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.sensor import Sensor
 
-ROUNDS = 8  # of aligning, Gauss-Newton
 SCALES = (
     4,
     2,
@@ -45,52 +45,6 @@ class PoseErrors:
     pixels: float
 
 
-def best_motion(estimated: Tensor, true: Tensor, radius_m: float, with_size: bool = False) -> Tensor:
-    """Return the motion [4, 4] of the body after which estimated poses see it most nearly as the true ones do.
-
-    The sum of the squared angles between the projections of seven points, the body's origin and six at `radius_m` from
-    it, is least: what pictures show counts, and an error along the line of sight counts as little as it shows.
-
-    Args:
-        estimated, true: [N, 4, 4] world_to_camera; a point x of the model is at motion · x in the true body frame.
-        with_size: a similarity, its upper left block size times a rotation, instead of a rigid motion.
-    """
-    estimated, true = estimated.double(), true.double()
-    motion = torch.eye(4, dtype=torch.float64)
-    for _ in range(ROUNDS):
-        now = seen_after(true, motion)
-        flow, left = _views(now, estimated, radius_m)
-        nearer = torch.cat(
-            [torch.zeros_like(now[:, :3, 3:]), -now[:, :3, 3:]], dim=1
-        )  # by the logarithm of size
-        columns = torch.cat([adjoints(now), nearer], dim=2) if with_size else adjoints(now)
-        change = torch.linalg.pinv((flow @ columns[:, None]).flatten(0, 2)) @ left.flatten()
-        motion = motion @ rigid_motions(change[None, :6])[0]
-        if with_size:
-            motion[:3, :3] *= torch.exp(change[6])
-    return motion
-
-
-def size_of(motion: Tensor) -> float:
-    """Return the factor by which a rigid motion (1) or a similarity [4, 4] makes the body larger."""
-    return torch.linalg.det(motion[:3, :3].double()).item() ** (1 / 3)
-
-
-def seen_after(poses: Tensor, motion: Tensor) -> Tensor:
-    """Return the poses [N, 4, 4] that see the body before a motion [4, 4] as given ones see it after: rigid again."""
-    seen = poses @ motion
-    seen[:, :3] /= size_of(motion)
-    return seen
-
-
-def _views(now: Tensor, wanted: Tensor, radius_m: float) -> tuple[Tensor, Tensor]:
-    """Return how seven points' projections (focal length 1) move with poses [N, 7, 2, 6], and how far they should."""
-    points = torch.cat([torch.zeros(1, 3), torch.eye(3), -torch.eye(3)]).double() * radius_m
-    at, goal = (points @ poses[:, :3, :3].mT + poses[:, None, :3, 3] for poses in (now, wanted))
-    flow = point_flow(at.flatten(0, 1), torch.eye(3).double().expand(at.shape[0] * at.shape[1], 3, 3))
-    return flow.unflatten(0, at.shape[:2]), goal[..., :2] / goal[..., 2:] - at[..., :2] / at[..., 2:]
-
-
 def pose_errors(
     estimated: Tensor, true: Tensor, motion: Tensor, radius_m: float, focal_px: float
 ) -> PoseErrors:
@@ -99,7 +53,7 @@ def pose_errors(
     errors = motion_vectors(estimated @ torch.linalg.inv(moved))
     centres = [-(p[:, :3, :3].mT @ p[:, :3, 3:])[..., 0] for p in (estimated, moved)]
     ranges = moved[:, :3, 3].norm(dim=1)
-    _, away = _views(moved, estimated, radius_m)
+    _, away = seen_points(moved, estimated, radius_m)
 
     def root_mean_square(values: Tensor) -> float:
         return values.square().mean().sqrt().item()

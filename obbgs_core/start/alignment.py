@@ -9,12 +9,14 @@ from torch import Tensor
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.motions import cross_matrices
 from obbgs_core.pose_corrections import PoseCorrections
+from obbgs_core.pose_gauge import joined
 from obbgs_core.registration import PoseInformation, point_flow
 from obbgs_core.start import hull
 from obbgs_core.start.silhouette_coherence import coherence, most_coherent, seen_from
 
 log = logging.getLogger(__name__)
 MOST_DILATION_PX = 8  # of a silhouette, for pose errors
+REFINED_DILATION_PX = 2  # the same where poses are refined
 CENTRE_SIGMA = 0.1  # of a silhouette's centre about the projection of one point of the body, over its radius
 ROUNDS = 12  # of aligning the silhouettes' centres; the problem is nearly linear
 # for the most coherent hull, each from where the last one ended, with directions that are right there
@@ -28,7 +30,10 @@ FAR = 3.0  # times the median distance of the centres from the point, beyond whi
 
 
 def settled(
-    frames: list[TrainingFrame], outlines: dict[int, hull.Silhouette], may_move: bool
+    frames: list[TrainingFrame],
+    outlines: dict[int, hull.Silhouette],
+    may_move: bool,
+    refined: PoseCorrections | None = None,
 ) -> tuple[dict[int, hull.Silhouette], PoseCorrections | None, str]:
     """Return silhouettes grown by as much as the poses err, the poses if they were moved, and why they were or not.
 
@@ -40,7 +45,10 @@ def settled(
     Args:
         outlines: silhouettes of some of the frames, by index, with tagged poses.
         may_move: whether the poses may be moved at all.
+        refined: poses of the first of the frames, or of all, that a training has refined; they stay.
     """
+    if refined is not None:
+        return _resettled(frames, outlines, refined)
     poses = PoseCorrections(frames)
     errors_px = {i: _error_px(frames[i], poses.covariances[i]) for i in outlines}
     if max(errors_px.values()) == 0 or not any(o.certain.any() for o in outlines.values()):
@@ -57,6 +65,23 @@ def settled(
             most = min(MOST_DILATION_PX, max(1, round(left_px)))
             return grown(aligned, dict.fromkeys(aligned, most)), moved, why
     return grown(outlines, errors_px), None, ""
+
+
+def _resettled(
+    frames: list[TrainingFrame], outlines: dict[int, hull.Silhouette], refined: PoseCorrections
+) -> tuple[dict[int, hull.Silhouette], PoseCorrections, str]:
+    """Return what `settled` does where the first of the frames, or all, have refined poses."""
+    poses = refined
+    if len(frames) > len(refined.of_frame):
+        moved, aligned, _ = settled(frames, outlines, may_move=True)
+        if aligned is None:
+            poses = refined.extended(frames)
+        else:
+            poses = joined(refined, aligned, frames, hull.radius_m(list(moved.values())))
+    posed = seen_from(outlines, poses)
+    if any(o.certain.any() for o in posed.values()):
+        posed = grown(posed, dict.fromkeys(posed, REFINED_DILATION_PX))
+    return posed, poses, "by a training that frames joined"
 
 
 def _searched(

@@ -20,6 +20,7 @@ from obbgs_core.train.decisions import smooth
 from obbgs_core.train.glints import first_lobes
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.parsimony import padded_to
+from obbgs_core.train.poses import HELD_FROM, HOLDS
 from obbgs_core.train.setup import TOO_FEW_BRACKETS, UNTESTED, TrainingSetup
 from obbgs_core.train.state import TrainingState
 from obbgs_core.train.validation import every_seventh_bracket
@@ -28,6 +29,8 @@ log = logging.getLogger(__name__)
 # A Gaussian stays while so many of the silhouettes see light near its centre: fewer than carve the hull, because
 # training has moved it to where it explains the pictures.
 STAYING_AGREEMENT = 0.7
+# rounds in which a frame's pose has moved, in the mean, after which no schedule is held for the poses again
+SETTLED_ROUNDS = 10.0
 NEW_SPACINGS = 2.0  # a new point of the hull becomes a Gaussian where none is within so many of its spacings
 
 
@@ -59,6 +62,8 @@ def join(
         fresh: the state in which a training of `joined` would start.
     """
     config, gaussians = joined.config, state.gaussians.detach()
+    if state.poses is not None:  # poses and surface settle together only while the rates are large
+        hold = min(hold, HELD_FROM)
     position = min(state.steps_done, round(config.steps_until(hold)))
     if joined.sun_moves and not setup.sun_moves and config.light.sh_degree == 0:
         position = min(position, max(0, round(config.steps_until(SUN_FROM)) - 1))
@@ -94,7 +99,8 @@ def join(
     state.adam.betas = fresh.adam.betas  # others where only now the Sun is known to move
     state.growth, state.boxes, state.shadows = Growth.of(len(state.gaussians)), [], fresh.shadows
     if state.poses is not None:
-        state.poses = state.poses.extended(joined.frames)
+        state.poses = fresh.poses
+        state.pose_rounds *= len(setup.frames) / len(joined.frames)
     elif state.poses_decided in UNTESTED or fresh.poses is not None:
         state.poses, state.poses_aligned, state.poses_decided, state.holds = (
             fresh.poses,
@@ -104,7 +110,7 @@ def join(
         )
     withhold(joined, state)
     smooth(joined, state)
-    state.steps_done, state.average = position, None
+    state.steps_done, state.average, state.has_joined = position, None, True
 
 
 def withhold(setup: TrainingSetup, state: TrainingState) -> None:
@@ -131,6 +137,24 @@ def release(setup: TrainingSetup, state: TrainingState, hold: float) -> None:
             setup.frames, setup.config.bracket_steps, [], order.turn, visits=order.visits
         )
         state.steps_done = min(state.steps_done, round(setup.config.steps_until(hold)))
+
+
+def begun_again(state: TrainingState, fresh: TrainingState) -> TrainingState:
+    """Return a state before the first step, with the refined poses of a training that frames joined.
+
+    Args:
+        fresh: the state in which a training of all frames from these poses would start.
+    """
+    again = dataclasses.replace(
+        fresh,
+        history=state.history,
+        seconds=state.seconds,
+        removed_not_finite=state.removed_not_finite,
+    )
+    if state.poses is not None:
+        again.poses_decided, again.poses_aligned = state.poses_decided, True
+        again.holds = 0 if state.pose_rounds >= SETTLED_ROUNDS else HOLDS
+    return again
 
 
 def _stays(gaussians: Gaussians, setup: TrainingSetup) -> Tensor:

@@ -64,6 +64,7 @@ def move(setup: TrainingSetup, state: TrainingState) -> None:
     """
     poses = state.poses
     assert poses is not None
+    state.pose_rounds += 1
     state.average = None  # of models at other poses, which may have moved as a whole since
     turn, brackets, left_out = state.steps_done, [[] for _ in range(len(poses.value))], set(state.misfits)
     for index, bracket in enumerate(poses.of_frame):
@@ -132,13 +133,18 @@ def _leave_out(setup: TrainingSetup, state: TrainingState, brackets: list[list[i
     )
 
 
+def fitting(setup: TrainingSetup, state: TrainingState) -> list[int]:
+    """Return the indices of the frames that are trained on because they fit some pose that their tags allow."""
+    return [i for i in range(len(setup.frames)) if i not in set(state.misfits)]
+
+
 def estimate(setup: TrainingSetup, state: TrainingState) -> PoseEstimate | None:
     """Return what all frames say of the poses by the model as it stands; None where they are as tagged."""
     if state.poses is None:
         return None
-    fitting = [i for i in range(len(setup.frames)) if i not in set(state.misfits)]
-    _gather(setup, state, fitting)
-    found = state.poses.estimate(setup.frames).of_frames(fitting)
+    shown = fitting(setup, state)
+    _gather(setup, state, shown)
+    found = state.poses.estimate(setup.frames).of_frames(shown)
     state.poses.clear()
     return found
 

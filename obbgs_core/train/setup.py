@@ -106,11 +106,13 @@ def prepare(
     config: MethodConfig,
     seed: int,
     known: Mapping[int, Silhouette] = MappingProxyType({}),
+    refined: PoseCorrections | None = None,
 ) -> tuple[TrainingSetup, TrainingState]:
     """Return the setup of a training and its state before the first step.
 
     Args:
         known: silhouettes of a setup of the first of these frames, which are not made again.
+        refined: poses of the first of these frames, or of all, that a training has refined; they stay.
 
     Raises:
         TooFewFrames, ReconstructionError: as in `train`.
@@ -128,10 +130,9 @@ def prepare(
     config = config.for_frames(len(lit))
     rng = torch.Generator().manual_seed(seed)
     seen = silhouettes(lit, sensor, known)
-    outlines, poses, why = settled(lit, seen, config.poses.refine != "never")
+    outlines, poses, why = settled(lit, seen, config.poses.refine != "never", refined)
     posed = lit if poses is None else poses.frames(lit)
     config, budget = _limited(config, sum(int(outline.certain.sum()) for outline in outlines.values()))
-    log.info("budget: %s", budget)
     gaussians, radius_m, start = first_gaussians(
         posed, list(outlines.values()), sensor, config.start, config.light.sh_degree, rng
     )
@@ -174,11 +175,10 @@ def prepare(
         poses_decided=poses_decided,
         holds=HOLDS if poses is not None else 0,
         appearance_reason="as configured" if config.light.sh_degree else "",
+        compensation=Compensation(len(lit), lit[0].dn.shape[2]) if config.compensation else None,
     )
     if config.smoothing_px2:
         state.smoothing_m = sampling_deviation_m(gaussians.means, lit, config.smoothing_px2)
-    if config.compensation:
-        state.compensation = Compensation(len(lit), lit[0].dn.shape[2])
     return setup, state
 
 
@@ -221,6 +221,7 @@ def _limited(config: MethodConfig, lit_pixels: int) -> tuple[MethodConfig, str]:
             f"at most {most:,} Gaussians instead of {config.growth.max_gaussians:,}: one for each "
             f"{per_gaussian} of the {lit_pixels:,} pixels that are lit in the long exposures"
         )
+    log.info("budget: %s", budget)
     growth = dataclasses.replace(config.growth, max_gaussians=most)
     start = dataclasses.replace(config.start, count=min(config.start.count, most))
     return dataclasses.replace(config, growth=growth, start=start), budget

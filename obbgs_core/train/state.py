@@ -30,7 +30,7 @@ from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 11  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 12  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,8 @@ class TrainingState:
     appearance_reason: str  # why the radiance depends on what it does
     highlights_reason: str = ""  # why it has highlights or not; empty: not tested
     highlights_frames: int = 0  # how many there were when they were tested
+    has_joined: bool = False  # frames have, since the first Gaussians were placed
+    pose_rounds: float = 0.0  # in which the pose of a frame has moved, mean of the frames
     average: Average | None = None  # of the models of the last steps; None: not averaged yet
     smoothing_m: Tensor | None = None  # [N] deviations of the 3D filter; None: the method has none
     compensation: Compensation | None = None  # None: the colours of all frames are the model's

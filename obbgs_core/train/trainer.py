@@ -16,6 +16,7 @@ from obbgs_core.frames import TrainingFrame
 from obbgs_core.losses import fit_figures
 from obbgs_core.misfit import sampled
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train import decisions, pose_rounds
@@ -25,11 +26,11 @@ from obbgs_core.train.averaging import Average
 from obbgs_core.train.batches import Batch
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import outliers
-from obbgs_core.train.joining import check_joinable, join, release, withhold
+from obbgs_core.train.joining import begun_again, check_joinable, join, release, withhold
 from obbgs_core.train.objective import image_loss, priors
 from obbgs_core.train.poses import HELD_AT, HELD_FROM
 from obbgs_core.train.result import Exposing, StepInfo, TrainResult
-from obbgs_core.train.setup import prepare
+from obbgs_core.train.setup import TrainingSetup, prepare
 from obbgs_core.train.sparsity import DROPPED_UNTIL, dropped
 from obbgs_core.train.state import TrainingState
 
@@ -247,7 +248,7 @@ class Trainer:
         check_joinable(self.setup.config)
         began = time.monotonic()
         every = self._given + frames
-        joined, fresh = prepare(every, self._stated, self._asked, self.setup.seed, self.setup.silhouettes)
+        joined, fresh = self._prepared(every)
         join(self.setup, self.state, joined, fresh, HOLD)
         self.setup, self._given = joined, every
         self.state.seconds += time.monotonic() - began
@@ -256,9 +257,37 @@ class Trainer:
         """Keep back the brackets that will decide on the poses, however few there are yet, because frames will join."""
         withhold(self.setup, self.state)
 
-    def release(self) -> None:
-        """Train on the brackets that were kept back too if they are too few to decide, because no more frames join."""
+    @torch_on_one_thread()
+    def end_joining(self) -> None:
+        """Complete the training of all frames, because no more will join; nothing where that is already under way.
+
+        Brackets that were kept back are trained on too if they are too few to decide. If frames have joined, the start
+        is carved once more, with the poses that were refined meanwhile, and the schedule begins again: what the first
+        few frames taught about shapes and highlights, and what was learnt while poses still erred, holds a model back
+        for good (docs/experiments/078).
+        """
+        began = time.monotonic()
         release(self.setup, self.state, HOLD)
+        if self.state.has_joined:
+            self.setup, fresh = self._prepared(self._given)
+            self.state = begun_again(self.state, fresh)
+            log.info("%d frames: the schedule begins again", len(self.setup.frames))
+        self.state.seconds += time.monotonic() - began
+
+    def _prepared(self, frames: list[TrainingFrame]) -> tuple[TrainingSetup, TrainingState]:
+        """Return setup and first state of a training of frames that begin with those of this one."""
+        given = (self._stated, self._asked, self.setup.seed, self.setup.silhouettes)
+        return prepare(frames, *given, self.state.poses)
+
+    @property
+    def pose_estimate(self) -> PoseEstimate | None:
+        """What was found of the poses so far, by the last pictures that were asked; None where they are as tagged."""
+        poses = self.state.poses
+        return (
+            None
+            if poses is None
+            else poses.estimate(self.setup.frames).of_frames(pose_rounds.fitting(self.setup, self.state))
+        )
 
     @property
     def share(self) -> float:

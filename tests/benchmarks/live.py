@@ -1,8 +1,9 @@
 """A timed pass with a model while it goes on: python -m tests.benchmarks.live --session demo/session --mission FILE
 
-The frames of a recorded session, with a simulator's truth and exact tags, are taken once more over `--seconds`. They go
-through the flight software, a simulated serial line at the mission's baud rate and `ground live`, each a process of its
-own. The models that `ground live` shows are kept as they come and scored afterwards. The same pass is repeated with
+The frames of a recorded session with a simulator's truth are taken once more over `--seconds`. They go through the
+flight software, a simulated serial line at the mission's baud rate and `ground live`, each a process of its own. The
+models that `ground live` shows are kept as they come and scored afterwards from true poses; where the tags err, after
+the rigid motion that brings the poses of their training nearest to the true ones. The same pass is repeated with
 `ground listen`, which trains nothing: what the link loses and how late frames come must not depend on the training.
 
 `latency` is the time from the shutter to the session; `seconds_to_half_db` that from the last frame's arrival until the
@@ -28,6 +29,8 @@ from flightsw.icd.frame import Frame
 from flightsw.icd.mission import load_mission
 from flightsw.store import FrameStore
 from ground.cameras import exposed, predicted_image, sensor_of
+from ground.estimated_poses import FILE as POSES
+from ground.estimated_poses import Alignment, read_estimate
 from ground.session import Session, open_session
 from ground.training_frames import split
 from ground.truth import Truth
@@ -57,7 +60,7 @@ class Flown:
 
     taken_s: dict[int, float] = field(default_factory=dict)  # by frame
     arrived_s: dict[int, float] = field(default_factory=dict)
-    # shown from then on, the training's processor time until then, s, and the file
+    # shown from then on, the training's processor time until then, s, and the folder with the file
     models: list[tuple[float, float, Path]] = field(default_factory=list)
     last_cpu_s: float = 0.0  # processor time of the training when the last frame had come
     losses: dict[str, int] = field(default_factory=dict)
@@ -123,8 +126,11 @@ def _watch(
             flown.arrived_s[record["id"]] = time.monotonic() - began_s
             flown.last_cpu_s = _cpu_s(ground)
         if model.exists() and (stamp_ns := model.stat().st_mtime_ns) != renewed_ns:
-            renewed_ns, kept = stamp_ns, store.folder.with_name(f"model-{len(flown.models)}.ply")
-            shutil.copy(model, kept)
+            renewed_ns, kept = stamp_ns, store.folder.with_name(f"model-{len(flown.models)}")
+            kept.mkdir()
+            for path in (model, model.with_name(POSES)):
+                if path.exists():
+                    shutil.copy(path, kept)
             flown.models.append((time.monotonic() - began_s, _cpu_s(ground), kept))
         if now_s > LIMIT_S:
             raise SystemExit(f"the pass has not ended after {LIMIT_S:g} s")
@@ -146,11 +152,17 @@ def _lines(path: Path) -> list[dict]:
     return [json.loads(line) for line in text.split(b"\n")[:-1]]
 
 
-def clean_psnr_db(path: Path, session: Session) -> float:
-    """Return the mean PSNR of a model's images against noiseless exposures of the held-out frames."""
-    gaussians, truth, sensor = load_ply(path), Truth(session), sensor_of(session.camera)
+def clean_psnr_db(folder: Path, session: Session) -> float:
+    """Return the mean PSNR of the images of a folder's model against noiseless exposures of the held-out frames.
+
+    They are compared from true poses, after the motion that brings the poses estimated with the model nearest to them.
+    """
+    gaussians, truth, sensor = load_ply(folder / "model.ply"), Truth(session), sensor_of(session.camera)
+    estimate = read_estimate(folder)
+    motion = None if estimate is None else Alignment.of(estimate, session, truth).motion.numpy()
     scores = []
-    for record in split(session)[1]:
+    for held_out in split(session)[1]:
+        record = truth.posed(held_out, motion)
         image = predicted_image(gaussians, session, record, sensor, record.exposure_time_s)
         true = exposed(torch.from_numpy(truth.radiance(record)[0]), sensor, record.exposure_time_s)
         scores.append(psnr_db(image, true))
@@ -168,7 +180,7 @@ def measure(session_dir: Path, mission: Path, seconds: float, folder: Path) -> d
     began_s = time.monotonic()
     subprocess.run([installed("ground"), *reconstruct], check=True, stdout=subprocess.DEVNULL)
     afterwards_s = time.monotonic() - began_s
-    afterwards_db = clean_psnr_db(folder / "runs" / "afterwards" / "model.ply", session)
+    afterwards_db = clean_psnr_db(folder / "runs" / "afterwards", session)
     scored = [(when_s, cpu_s, clean_psnr_db(path, session)) for when_s, cpu_s, path in live.models]
     last_s = max(live.arrived_s.values())
     close = next(((s, cpu_s) for s, cpu_s, db in scored if db >= afterwards_db - CLOSE_DB), None)
@@ -208,7 +220,7 @@ def _link_figures(name: str, flown: Flown) -> dict:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="A timed pass with a model while it goes on.")
-    parser.add_argument("--session", type=Path, required=True, help="a session with truth and exact tags")
+    parser.add_argument("--session", type=Path, required=True, help="a session with truth")
     parser.add_argument("--mission", type=Path, required=True, help="the mission file of its camera")
     parser.add_argument("--seconds", type=float, default=120.0, help="from the first to the last bracket")
     parser.add_argument("--json", action="store_true", help="print the row as JSON")

@@ -12,7 +12,8 @@ from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.model.gaussians import TENSORS, Gaussians
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
-from obbgs_core.train.joining import NEW_SPACINGS
+from obbgs_core.train.joining import NEW_SPACINGS, SETTLED_ROUNDS
+from obbgs_core.train.poses import HOLDS
 from obbgs_core.train.presets import preset
 from obbgs_core.train.setup import TOO_FEW_BRACKETS
 from obbgs_core.train.trainer import HOLD, Trainer
@@ -81,6 +82,27 @@ def test_joining_keeps_what_was_learnt_and_sets_the_schedule_back(frames):
     early = trained(frames, [18], 10)
     early.join(frames[18:])
     assert early.state.steps_done == 10  # nothing to set back
+
+
+def test_when_no_more_join_the_training_ends_as_one_that_had_all_frames_from_the_start(frames, tmp_path):
+    trainer, whole = trained(frames, [12, 36], 20), Trainer(frames, SENSOR, CONFIG, seed=3)
+    steps, seconds = len(trainer.state.history), trainer.state.seconds
+    trainer.end_joining()
+    assert trainer.state.steps_done == 0 and len(trainer.state.history) == steps
+    assert trainer.state.seconds > seconds
+    for each in (trainer, whole):
+        for _ in range(10):
+            each.step()
+    trainer.save(tmp_path / "checkpoint")
+    resumed = Trainer(frames, SENSOR, CONFIG, seed=3)
+    assert resumed.resume(tmp_path / "checkpoint")
+    for each in (trainer, resumed, whole):
+        each.end_joining()  # it has begun again already, or nothing has joined
+        assert each.state.steps_done == 10
+        each.step()
+    for name, tensor in whole.gaussians.tensors().items():
+        for each in (trainer, resumed):
+            assert torch.equal(tensor, getattr(each.gaussians, name)), name
 
 
 def test_silhouettes_that_were_made_before_a_joining_are_those_of_a_training_of_all_frames(frames):
@@ -176,12 +198,30 @@ def test_corrections_of_brackets_are_kept_when_others_join(frames):
     trainer.step()
 
 
+def test_refined_poses_are_what_the_training_begins_again_with(frames):
+    doubted = tagged(frames, True)
+    trainer = Trainer(doubted[:30], SENSOR, preset("obbgs", QUICK | {"poses.refine": "always"}))
+    for _ in range(24):
+        trainer.step()
+    rounds = trainer.state.pose_rounds
+    assert rounds > 1
+    trainer.join(doubted[30:])
+    assert trainer.state.pose_rounds == pytest.approx(rounds * 30 / 36)
+    before = trainer.state.poses.value.clone()
+    for many, holds in ((SETTLED_ROUNDS, 0), (SETTLED_ROUNDS - 1, HOLDS)):
+        trainer.state.pose_rounds, trainer.state.has_joined = many, True
+        trainer.end_joining()
+        assert torch.equal(trainer.state.poses.value, before) and before.any()
+        assert trainer.state.steps_done == 0 and trainer.state.holds == holds
+    trainer.step()
+
+
 def test_too_few_brackets_to_decide_are_trained_on_when_no_more_come(frames):
     doubted = tagged(frames[:18], True)
     trainer = Trainer(doubted, SENSOR, preset("obbgs", QUICK | {"poses.refine": "auto"}))
     trainer.withhold()
     assert trainer.state.order.validation_brackets == [[3], [10], [17]]
-    trainer.release()
+    trainer.end_joining()
     assert sorted(index for group in trainer.state.order.groups for index in group) == list(range(18))
     assert trainer.state.poses_decided == TOO_FEW_BRACKETS
 

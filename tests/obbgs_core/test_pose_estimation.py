@@ -20,10 +20,11 @@ from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
 from obbgs_core.model.sh import from_radiance
 from obbgs_core.normal_equations import NormalEquations, ReducedEquations
 from obbgs_core.pose_corrections import PoseCorrections, with_estimate
+from obbgs_core.pose_gauge import best_motion, joined, seen_after, size_of
 from obbgs_core.registration import CellShifts, pose_information
 from obbgs_core.render import render
 from obbgs_core.render.slopes import render_with_slopes
-from obbgs_core.score.poses import best_motion, moved, pose_errors, seen_after, settled_poses, size_of
+from obbgs_core.score.poses import moved, pose_errors, settled_poses
 from obbgs_core.start.alignment import _aligned, settled
 from obbgs_core.start.initialisation import silhouettes
 from obbgs_core.start.silhouette_coherence import _open_directions, coherence, most_coherent, seen_from
@@ -480,6 +481,27 @@ def test_a_model_of_another_size_is_undone_by_the_similarity_alone(draw):
     assert size_of(rigid) == pytest.approx(1)
     if abs(draw[6]) > 0.01:
         assert pose_errors(estimated, true, rigid, 1.0, FOCAL_PX).range_share > 0.005
+
+
+def test_frames_that_join_are_where_silhouettes_say_as_the_model_sees_them(erring):
+    """What the first third of a pass says of the shared parameters leads the rest of it astray."""
+    true, tags = erring
+    drift = SharedParameters(velocity_m_s=[6e-4, -4e-4, 6e-4])  # 1.3 m at the end of the pass
+    refined, aligned = PoseCorrections(tags[:8]), PoseCorrections(tags)
+    wrong = torch.from_numpy(drift.vector() - ERRORS.vector())[refined.free] / refined.sigmas[refined.free]
+    refined = refined.changed(tags[:8], wrong)
+    turn = rigid_motions(torch.tensor([[0.05, -0.08, 0.03, 0.1, -0.2, 0.1]]).double())[0]
+    # the silhouettes' body lies in another way
+    aligned.corrected = lambda indices: seen_after(_poses(true).double()[indices], turn).float()
+    extended = refined.extended(tags)
+    found = joined(refined, aligned, tags, 1.0)
+    everything, known = list(range(24)), list(range(8))
+    now, before = (errors(poses.corrected(everything), true).pixels for poses in (found, extended))
+    assert before > 5 and now < 2  # 7.0 and 1.5 px, of the first eight alone 1.8
+    left = pose_errors(found.corrected(known), refined.corrected(known), torch.eye(4).double(), 1.0, FOCAL_PX)
+    print(left)
+    assert left.pixels < 1.5  # the model stays where it is
+    assert not found.cells and not found.gradient.any()
 
 
 def test_moving_model_and_poses_changes_no_picture(erring):
