@@ -38,6 +38,7 @@ JOIN_STEPS = 60  # at least, from frames that join to the next
 JOIN_PAUSE = 3.0
 LOOK_S, STATUS_S, SHOW_S, SAVE_S = 0.5, 1.0, 5.0, 20.0  # between two looks, statuses, models and checkpoints
 LAST_SHOW_S = 2.0  # between two models once the pass is over, when operators wait for them
+SHOW_PAUSE = 10.0  # at least so many times what comparing the last one took, from one model to the next
 WAIT_S = 0.1  # where there is nothing to train
 CHECKPOINT = re.compile(r"live-(\d+)\.checkpoint", re.ASCII)  # with the number of frames that have joined
 
@@ -265,7 +266,9 @@ class LiveReconstruction:
     def _show(self, trainer: Trainer) -> None:
         """Renew the shown model if it is better now, and send it up if that is asked for and worth it."""
         if self.steps and self.shown.offered_step != self.steps:
+            began_s = time.monotonic()
             self.shown.offer(trainer.gaussians, self.steps, trainer.pose_estimate)
+            self._shows.pause(SHOW_PAUSE * (time.monotonic() - began_s))
         arrivals, is_past_start = self.arrivals, trainer.share >= HOLD
         if self._uplink is not None and is_past_start and arrivals.session is not None:
             self._uplink.follow(self.shown, arrivals.session, arrivals.training, self._part)
@@ -343,6 +346,10 @@ class _Every:
             return False
         self._next_s = now_s + self._seconds
         return True
+
+    def pause(self, seconds: float) -> None:
+        """Let nothing be due for so long at least."""
+        self._next_s = max(self._next_s, time.monotonic() + seconds)
 
 
 def _known(value: float) -> float | None:

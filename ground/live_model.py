@@ -1,6 +1,5 @@
 """The model that a live reconstruction shows: the best so far by the held-out frames that have come."""
 
-import dataclasses
 import logging
 import math
 import shutil
@@ -10,7 +9,8 @@ import torch
 
 from ground.arrivals import Arrivals
 from ground.cameras import cameras_of, median_sun_direction, predicted_image, sensor_of
-from ground.estimated_poses import as_estimated, write_estimate
+from ground.estimated_poses import FILE as POSES
+from ground.estimated_poses import settled_records, write_estimate
 from ground.model_files import exposure_times_s
 from ground.runs import is_live
 from obbgs_core.io.ply import save_ply
@@ -20,6 +20,7 @@ from obbgs_core.score.metrics import psnr_db
 
 log = logging.getLogger(__name__)
 SCORED = 16  # held-out frames at most, spread evenly over those that have come
+SETTLED = 3  # the same where poses have to settle, which takes as long as some 50 pictures
 
 
 class ShownModel:
@@ -64,15 +65,16 @@ class ShownModel:
     def score_db(self, gaussians: Gaussians, estimate: PoseEstimate | None) -> float:
         """Return the mean PSNR of a model against held-out frames, noisy as they came; NaN without such frames.
 
-        They are seen from where the errors that the pass shares, as estimated with the model, put their tags.
+        Where poses are estimated with the model, a few of them are seen from where their own pictures settle.
         """
         session, held_out = self._arrivals.session, self._arrivals.held_out
         if session is None or not held_out:
             return math.nan
-        scored = held_out[:: math.ceil(len(held_out) / SCORED)]
-        posed = as_estimated(dataclasses.replace(session, frames=tuple(scored)), estimate)
         sensor, values = sensor_of(session.camera), []
-        for record in posed.frames:
+        scored = held_out[:: math.ceil(len(held_out) / (SCORED if estimate is None else SETTLED))]
+        if estimate is not None:
+            scored = settled_records(gaussians, session, scored, sensor, estimate)
+        for record in scored:
             if record.id not in self._images:
                 dn = torch.from_numpy(session.dn(record).astype("float32"))
                 self._images[record.id] = dn.reshape(*dn.shape[:2], -1) / sensor.white_dn
@@ -87,6 +89,7 @@ class ShownModel:
             shutil.rmtree(self._folder)  # a finished run that may be replaced
         self._folder.mkdir(parents=True, exist_ok=True)
         sensor = sensor_of(session.camera)
+        (self._folder / POSES).unlink(missing_ok=True)
         write_estimate(self._folder, estimate)
         white_radiance = sensor.full_scale_radiance(exposure_times_s(training)[0])
         sun_dir, cameras = median_sun_direction(training), cameras_of(session, training)

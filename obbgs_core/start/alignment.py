@@ -70,17 +70,26 @@ def settled(
 def _resettled(
     frames: list[TrainingFrame], outlines: dict[int, hull.Silhouette], refined: PoseCorrections
 ) -> tuple[dict[int, hull.Silhouette], PoseCorrections, str]:
-    """Return what `settled` does where the first of the frames, or all, have refined poses."""
-    poses = refined
-    if len(frames) > len(refined.of_frame):
-        moved, aligned, _ = settled(frames, outlines, may_move=True)
-        if aligned is None:
-            poses = refined.extended(frames)
-        else:
-            poses = joined(refined, aligned, frames, hull.radius_m(list(moved.values())))
+    """Return what `settled` does where the first of the frames, or all, have refined poses.
+
+    Where the hull of the tagged poses is not coherent, the others are where the silhouettes' centres put them, else where
+    the shared parameters do. Where all are refined, aligned poses are taken instead if those are more coherent: then
+    the training went astray.
+    """
+    poses = refined if len(frames) == len(refined.of_frame) else refined.extended(frames)
     posed = seen_from(outlines, poses)
-    if any(o.certain.any() for o in posed.values()):
-        posed = grown(posed, dict.fromkeys(posed, REFINED_DILATION_PX))
+    if not any(o.certain.any() for o in outlines.values()):
+        return posed, poses, ""
+    if poses is refined:
+        moved, aligned, why = settled(frames, outlines, may_move=True)
+        if aligned is not None and coherence(seen_from(outlines, aligned)) > coherence(posed):
+            return moved, aligned, why
+    elif coherence(outlines) < hull.AGREEMENT:
+        aligned, _ = _aligned(frames, outlines)
+        radius_m = hull.radius_m(list(seen_from(outlines, aligned).values()))
+        poses = joined(refined, aligned, frames, radius_m)
+        posed = seen_from(outlines, poses)
+    posed = grown(posed, dict.fromkeys(posed, REFINED_DILATION_PX))
     return posed, poses, "by a training that frames joined"
 
 

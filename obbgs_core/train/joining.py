@@ -64,6 +64,10 @@ def join(
     config, gaussians = joined.config, state.gaussians.detach()
     if state.poses is not None:  # poses and surface settle together only while the rates are large
         hold = min(hold, HELD_FROM)
+        if gaussians.shading == "view":  # what turns with the view would explain what the poses should
+            coefficients = (config.light.sh_degree + 1) ** 2
+            gaussians = dataclasses.replace(gaussians.matt(), sh=gaussians.sh[:, :coefficients].contiguous())
+            state.adam, state.highlights_frames = Adam(gaussians), 0
     position = min(state.steps_done, round(config.steps_until(hold)))
     if joined.sun_moves and not setup.sun_moves and config.light.sh_degree == 0:
         position = min(position, max(0, round(config.steps_until(SUN_FROM)) - 1))
@@ -140,7 +144,7 @@ def release(setup: TrainingSetup, state: TrainingState, hold: float) -> None:
 
 
 def begun_again(state: TrainingState, fresh: TrainingState) -> TrainingState:
-    """Return a state before the first step, with the refined poses of a training that frames joined.
+    """Return a state before the first step, with the refined poses of a training that frames joined, if they hold.
 
     Args:
         fresh: the state in which a training of all frames from these poses would start.
@@ -151,7 +155,7 @@ def begun_again(state: TrainingState, fresh: TrainingState) -> TrainingState:
         seconds=state.seconds,
         removed_not_finite=state.removed_not_finite,
     )
-    if state.poses is not None:
+    if state.poses is not None and fresh.poses is state.poses:
         again.poses_decided, again.poses_aligned = state.poses_decided, True
         again.holds = 0 if state.pose_rounds >= SETTLED_ROUNDS else HOLDS
     return again

@@ -7,13 +7,17 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import ground.live
 from flightsw.icd.mission import ConfigError
+from flightsw.icd.quaternion import matrix_to_quat
 from ground import cli
+from ground.estimated_poses import read_estimate
 from ground.listing import find_sessions
 from ground.live import MANY_EXPECTED, LiveReconstruction, PassEnd, reconstruct_live
 from ground.live_process import LiveProcess, TrainingFailed
@@ -60,12 +64,15 @@ def fast(monkeypatch) -> None:
     monkeypatch.setattr(ground.live, "JOIN_STEPS", 20)
 
 
-def begun(session: Path, statuses: list[LiveStatus] | None = None) -> LiveReconstruction:
+def begun(
+    session: Path, statuses: list[LiveStatus] | None = None, changes: dict | None = None
+) -> LiveReconstruction:
     folder = session / "runs" / "live"
     part = session / "runs" / ".live.part"
     part.mkdir(parents=True, exist_ok=True)
     on_status = (lambda status: None) if statuses is None else statuses.append
-    return LiveReconstruction(session, folder, part, preset("obbgs", CHANGES), 7, None, on_status)
+    config = preset("obbgs", CHANGES | (changes or {}))
+    return LiveReconstruction(session, folder, part, config, 7, None, on_status)
 
 
 def turns(live: LiveReconstruction, end: PassEnd, steps: int) -> None:
@@ -178,6 +185,34 @@ def test_a_worse_model_is_not_shown(tmp_path):
     assert good is not None and live.shown.held_out_db > 25
     assert not live.shown.offer(dataclasses.replace(good, sh=good.sh + 2), 41)
     assert (writer.folder / "runs" / "live" / "model.ply").read_bytes() == model
+
+
+def test_where_tags_err_models_are_compared_and_shown_with_the_poses_that_they_were_trained_with(tmp_path):
+    writer, end = Writer(tmp_path / "s"), PassEnd(tmp_path / "s", 1e9, False)
+    for i, text in enumerate(writer.lines):
+        record = json.loads(text)
+        turn = Rotation.from_rotvec(
+            2e-3 * np.random.default_rng(record["bracket"]).normal(size=3)
+        ).as_matrix()
+        pose = np.array(record["world_to_camera"])
+        pose[:3] = turn @ pose[:3]
+        covariance = np.array(record["covariance"]) + np.diag([0, 0, 0, 4e-6, 4e-6, 4e-6])
+        quat = matrix_to_quat(pose[:3, :3]).tolist()
+        changed = {"world_to_camera": pose.tolist(), "quat_body_to_camera": quat}
+        writer.lines[i] = json.dumps(record | changed | {"covariance": covariance.tolist()})
+    writer.add(48)
+    live = begun(writer.folder, changes={"poses.refine": "always"})
+    turns(live, end, 120)
+    trainer, folder = live.trainer, writer.folder / "runs" / "live"
+    assert trainer is not None and trainer.pose_estimate is not None
+    live.shown.offer(trainer.gaussians, live.steps, trainer.pose_estimate)
+    shown = read_estimate(folder)
+    assert shown is not None and len(shown.frame_ids) == 42
+    if live.shown.step == live.steps:
+        np.testing.assert_allclose(shown.estimated, trainer.pose_estimate.estimated, atol=1e-6)
+    as_tagged = live.shown.score_db(trainer.gaussians, None)
+
+    assert live.shown.score_db(trainer.gaussians, trainer.pose_estimate) > as_tagged + 1
 
 
 def test_a_full_disk_is_said_and_does_not_end_the_training(tmp_path, monkeypatch, caplog):
