@@ -22,6 +22,7 @@ def frames_of(session: Session) -> list[Frame]:
                 r.sun_dir_body,
                 r.in_eclipse,
                 r.pose_valid,
+                quat_inertial_to_body=r.quat_inertial_to_body,
             ),
             dn=session.dn(r),
             bit_depth=r.bit_depth,

@@ -72,9 +72,9 @@ def _resettled(
 ) -> tuple[dict[int, hull.Silhouette], PoseCorrections, str]:
     """Return what `settled` does where the first of the frames, or all, have refined poses.
 
-    Where the hull of the tagged poses is not coherent, the others are where the silhouettes' centres put them, else where
-    the shared parameters do. Where all are refined, aligned poses are taken instead if those are more coherent: then
-    the training went astray.
+    Where the hull of the tagged poses is not coherent, the others are where the silhouettes' centres put them, else
+    where the shared parameters do. Where all are refined, aligned poses are taken instead if those are more coherent:
+    then the training went astray.
     """
     poses = refined if len(frames) == len(refined.of_frame) else refined.extended(frames)
     posed = seen_from(outlines, poses)
