@@ -25,8 +25,10 @@ FILE = "poses_estimated.json"
 
 
 def write_estimate(folder: Path, estimate: PoseEstimate | None) -> None:
-    """Write what a training found of its poses into a run folder; nothing where they are as tagged."""
-    if estimate is not None:
+    """Write what a training found of its poses into a run folder; where they are as tagged there is no file."""
+    if estimate is None:
+        (folder / FILE).unlink(missing_ok=True)
+    else:
         write_whole(folder / FILE, (json.dumps(estimate.tree()) + "\n").encode())
 
 

@@ -195,11 +195,9 @@ class LiveReconstruction:
             paused = now_s - self._joined_s >= JOIN_PAUSE * self._joining_s
             if self._over or trainer.stop_reason() or (learnt and paused):
                 trainer.join(self.arrivals.frames[self._joined :])
-                if self._over:
-                    trainer.end_joining()
                 self._note_joined(now_s)
                 self.save()
-        elif self._over:
+        if self._over:
             trainer.end_joining()
 
     def _begin(self) -> None:

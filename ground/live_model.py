@@ -9,7 +9,6 @@ import torch
 
 from ground.arrivals import Arrivals
 from ground.cameras import cameras_of, median_sun_direction, predicted_image, sensor_of
-from ground.estimated_poses import FILE as POSES
 from ground.estimated_poses import settled_records, write_estimate
 from ground.model_files import exposure_times_s
 from ground.runs import is_live
@@ -27,6 +26,7 @@ class ShownModel:
     """Renews model.ply in a run's folder when a model is better than the one that is there.
 
     held_out_db: mean PSNR of that one against held-out frames; NaN before the first of them.
+    estimate: of the poses that it was trained with; None: they are as tagged.
     """
 
     def __init__(self, folder: Path, arrivals: Arrivals):
@@ -34,9 +34,9 @@ class ShownModel:
         self.step: int | None = None  # of the training, that the shown model is of
         self.offered_step: int | None = None  # of the last model that was offered
         self.held_out_db = math.nan
+        self.estimate: PoseEstimate | None = None
         self._folder, self._arrivals = folder, arrivals
         self._scored_frames = 0  # held-out frames that had come when held_out_db was found
-        self.estimate: PoseEstimate | None = None  # of the poses that the shown model was trained with
         self._images: dict[int, torch.Tensor] = {}  # held-out frames [H, W, C] as fractions of full scale
 
     def offer(self, gaussians: Gaussians, step: int, estimate: PoseEstimate | None = None) -> bool:
@@ -89,7 +89,6 @@ class ShownModel:
             shutil.rmtree(self._folder)  # a finished run that may be replaced
         self._folder.mkdir(parents=True, exist_ok=True)
         sensor = sensor_of(session.camera)
-        (self._folder / POSES).unlink(missing_ok=True)
         write_estimate(self._folder, estimate)
         white_radiance = sensor.full_scale_radiance(exposure_times_s(training)[0])
         sun_dir, cameras = median_sun_direction(training), cameras_of(session, training)

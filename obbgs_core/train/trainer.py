@@ -282,11 +282,10 @@ class Trainer:
     @property
     def pose_estimate(self) -> PoseEstimate | None:
         """What was found of the poses so far, by the last pictures that were asked; None where they are as tagged."""
-        poses = self.state.poses
-        return (
-            None
-            if poses is None
-            else poses.estimate(self.setup.frames).of_frames(pose_rounds.fitting(self.setup, self.state))
+        if self.state.poses is None:
+            return None
+        return self.state.poses.estimate(self.setup.frames).of_frames(
+            pose_rounds.fitting(self.setup, self.state)
         )
 
     @property

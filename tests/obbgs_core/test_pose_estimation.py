@@ -499,7 +499,6 @@ def test_frames_that_join_are_where_silhouettes_say_as_the_model_sees_them(errin
     now, before = (errors(poses.corrected(everything), true).pixels for poses in (found, extended))
     assert before > 5 and now < 2  # 7.0 and 1.5 px, of the first eight alone 1.8
     left = pose_errors(found.corrected(known), refined.corrected(known), torch.eye(4).double(), 1.0, FOCAL_PX)
-    print(left)
     assert left.pixels < 1.5  # the model stays where it is
     assert not found.cells and not found.gradient.any()
 
