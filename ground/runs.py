@@ -17,6 +17,7 @@ from ground.cameras import sensor_of
 from ground.live_status import LIVE_STATUS
 from ground.session import FrameRecord, Session, SessionError, open_session
 from ground.training_frames import split
+from obbgs_base.files import UNUSED
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
@@ -164,7 +165,8 @@ def is_live(folder: Path) -> bool:
 def unfinished_run(folder: Path, overwrite: bool, kept: Sequence[str]) -> Iterator[Path]:
     """Give the hidden folder in which a run is made, locked against other processes and with its log open.
 
-    It holds the `kept` files (checkpoints) and the log of an interrupted run of the same name, nothing else of it. It
+    It holds the `kept` files (checkpoints, also those that were set aside) and the log of an interrupted run of the
+    same name, nothing else of it. It
     stays when the block is interrupted, so that the next run resumes from it, and is removed when the frames allow no
     model.
 
@@ -195,14 +197,14 @@ def unfinished_folder(folder: Path) -> Path:
 
 
 def publish(part: Path, folder: Path) -> None:
-    """Rename an unfinished run to its final folder, in place of a run that may be there, and drop its checkpoints."""
+    """Rename an unfinished run to its final folder, in place of a run that may be there, and drop all checkpoints."""
     replaced = folder.with_name(f".{folder.name}.replaced")
     shutil.rmtree(replaced, ignore_errors=True)
     if folder.exists():
         folder.rename(replaced)
     part.rename(folder)
     shutil.rmtree(replaced, ignore_errors=True)
-    for path in (folder / LOCK, *folder.glob("*.checkpoint")):
+    for path in (folder / LOCK, *folder.glob("*.checkpoint*")):
         path.unlink(missing_ok=True)
 
 
@@ -247,9 +249,9 @@ def _is_at(descriptor: int, path: Path) -> bool:
 
 
 def _clear(part: Path, kept: Sequence[str]) -> None:
-    """Remove everything from a folder but the kept names."""
+    """Remove everything from a folder but the kept names, and files of these names that were set aside."""
     for path in part.iterdir():
-        if path.name not in kept:
+        if path.name.partition(UNUSED)[0] not in kept:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 

@@ -1,7 +1,10 @@
 """Writes files whole or not at all, even through a power cut; every part writes with these functions."""
 
+import itertools
 import os
 from pathlib import Path
+
+UNUSED = ".unused-"  # between the name of a file that was set aside and a number
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -21,6 +24,15 @@ def write_whole(path: Path, content: bytes) -> None:
         part.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+def set_aside(path: Path) -> Path:
+    """Rename a file to a name beside it that nothing has, so that what is written next does not replace it."""
+    names = (path.with_name(f"{path.name}{UNUSED}{number}") for number in itertools.count(1))
+    kept = next(other for other in names if not other.exists())
+    os.replace(path, kept)
+    sync_folder(path.parent)
+    return kept
 
 
 def append_line(path: Path, line: bytes) -> None:

@@ -15,7 +15,7 @@ from ground.baselines.nerf_pictures import Nerf
 from ground.baselines.nerf_rays import Occupancy, rays_of
 from ground.baselines.reconstruction import Reconstruction, Work
 from obbgs_base.errors import Interrupted
-from obbgs_base.files import write_whole
+from obbgs_base.files import set_aside, write_whole
 from obbgs_core.errors import Diverged, ReconstructionError
 from obbgs_core.frames import TrainingFrame, cameras_of, mean_exposure_s, usable
 from obbgs_core.sensor import Sensor
@@ -213,10 +213,12 @@ class Training:
             saved = torch.load(path, weights_only=True)
             same = saved["fingerprint"] == self.fingerprint
         except (pickle.UnpicklingError, RuntimeError, OSError, EOFError, LookupError, TypeError) as error:
-            log.warning("%s is damaged or of another version, it is not used: %s", path, error)
+            why = f"is damaged or of another version ({error}), it is not used"
+            log.warning("%s %s; it is kept as %s", path, why, set_aside(path).name)
             return False
         if not same:
-            log.warning("%s belongs to another training: it is not used", path)
+            why = "belongs to another training or version, it is not used"
+            log.warning("%s %s; it is kept as %s", path, why, set_aside(path).name)
             return False
         self.model.field.load_state_dict(saved["field"])
         self.adam.load_state_dict(saved["adam"])

@@ -1,5 +1,6 @@
 """Prepares a training: checks and measures what it is given, and makes the state that it starts from."""
 
+import copy
 import dataclasses
 import functools
 import hashlib
@@ -56,7 +57,8 @@ class TrainingSetup:
 
     frames: list[TrainingFrame]  # those that show light
     sensor: Sensor
-    config: MethodConfig  # with no more Gaussians than the budget allows
+    asked: MethodConfig  # as it was given
+    config: MethodConfig  # the same, with no more Gaussians than the budget allows, and with what so many frames need
     seed: int
     batches: Batches
     radius_m: float  # of the target, as the silhouettes show it
@@ -97,13 +99,13 @@ class TrainingSetup:
                 attitude = None if f.inertial_to_body is None else f.inertial_to_body.tolist()
                 digest.update(repr((f.time_s, attitude, f.navigation.tree())).encode())
             digest.update(repr((f.exposure_time_s, f.bracket, known, f.psf_sigma_px)).encode())
-        return Identity(digest.hexdigest(), flat(self.config), flat(MethodConfig(self.config.name)))
+        return Identity(digest.hexdigest(), flat(self.asked), flat(MethodConfig(self.asked.name)))
 
 
 def prepare(
     frames: list[TrainingFrame],
     sensor: Sensor,
-    config: MethodConfig,
+    asked: MethodConfig,
     seed: int,
     known: Mapping[int, Silhouette] = MappingProxyType({}),
     refined: PoseCorrections | None = None,
@@ -117,17 +119,11 @@ def prepare(
     Raises:
         TooFewFrames, ReconstructionError: as in `train`.
     """
-    checked, reference_exposure_s = usable(frames, config.exposure_aware)
+    checked, reference_exposure_s = usable(frames, asked.exposure_aware)
     sensor, noise = _with_noise_seen(checked, sensor)
     shown = [shows_light(light(f.dn, sensor, f.background, f.exposure_time_s), sensor) for f in checked]
-    lit = [f for f, shows in zip(checked, shown, strict=True) if shows]
-    dark = len(checked) - len(lit)
-    if len(lit) < FEWEST_FRAMES:
-        raise ReconstructionError(
-            f"{dark} of {len(checked)} frames are black (eclipse, or exposures too short): only {len(lit)} rise above "
-            f"the noise, {FEWEST_FRAMES} are needed"
-        )
-    config = config.for_frames(len(lit))
+    lit = _lit(checked, shown)
+    config = asked.for_frames(len(lit))
     rng = torch.Generator().manual_seed(seed)
     seen = silhouettes(lit, sensor, known)
     outlines, poses, why = settled(lit, seen, config.poses.refine != "never", refined)
@@ -142,6 +138,7 @@ def prepare(
     setup = TrainingSetup(
         frames=lit,
         sensor=sensor,
+        asked=asked,
         config=config,
         seed=seed,
         batches=Batches(lit, sensor.white_dn, sky, shown_part),
@@ -154,7 +151,7 @@ def prepare(
         start=start + noise,
         budget=budget,
         reference_exposure_s=reference_exposure_s,
-        dark_frames=dark,
+        dark_frames=len(checked) - len(lit),
         tagged_exposures_s=[f.exposure_time_s for f, shows in zip(frames, shown, strict=True) if shows],
         silhouettes=seen,
         outlines=outlines,
@@ -174,12 +171,28 @@ def prepare(
         poses_aligned=bool(why),
         poses_decided=poses_decided,
         holds=HOLDS if poses is not None else 0,
+        placed_by=copy.deepcopy(refined),
         appearance_reason="as configured" if config.light.sh_degree else "",
         compensation=Compensation(len(lit), lit[0].dn.shape[2]) if config.compensation else None,
     )
     if config.smoothing_px2:
         state.smoothing_m = sampling_deviation_m(gaussians.means, lit, config.smoothing_px2)
     return setup, state
+
+
+def _lit(frames: list[TrainingFrame], shown: list[bool]) -> list[TrainingFrame]:
+    """Return the frames that show light.
+
+    Raises:
+        ReconstructionError: too few do.
+    """
+    lit = [f for f, shows in zip(frames, shown, strict=True) if shows]
+    if len(lit) < FEWEST_FRAMES:
+        raise ReconstructionError(
+            f"{len(frames) - len(lit)} of {len(frames)} frames are black (eclipse, or exposures too short): only "
+            f"{len(lit)} rise above the noise, {FEWEST_FRAMES} are needed"
+        )
+    return lit
 
 
 def _adam(setup: TrainingSetup, gaussians: Gaussians, exact_tags: bool) -> Adam:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from obbgs_base.files import write_whole
+from obbgs_base.files import set_aside, write_whole
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.pose_covariance import Whitening
@@ -30,7 +30,7 @@ from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 12  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 13  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,8 @@ class TrainingState:
     highlights_reason: str = ""  # why it has highlights or not; empty: not tested
     highlights_frames: int = 0  # how many there were when they were tested
     has_joined: bool = False  # frames have, since the first Gaussians were placed
+    # refined poses that the setup was made with, as they were then; None: it was made with the tags
+    placed_by: PoseCorrections | None = None
     pose_rounds: float = 0.0  # in which the pose of a frame has moved, mean of the frames
     average: Average | None = None  # of the models of the last steps; None: not averaged yet
     smoothing_m: Tensor | None = None  # [N] deviations of the 3D filter; None: the method has none
@@ -138,7 +140,11 @@ class TrainingState:
 
     @staticmethod
     def load(path: Path, identity: Identity) -> "TrainingState | None":
-        """Return the state in a file; None if there is none, or if it is damaged or of another training or version."""
+        """Return the state in a file; None if there is none that can be used.
+
+        A file that is damaged or of another training or version is set aside, not lost: it may hold the work of days,
+        which the version that saved it can complete.
+        """
         if not path.exists():
             return None
         try:
@@ -157,10 +163,16 @@ class TrainingState:
             ValueError,
         ) as error:
             # half a file, or one that another version of this program saved, with other classes
-            log.warning("%s is damaged or of another version, it is not used: %s", path, error)
+            why = f"is damaged or of another version ({error}), it is not used"
+            log.warning(
+                "%s %s; it is kept as %s, and the training begins anew", path, why, set_aside(path).name
+            )
             return None
         if difference:
-            log.warning("%s belongs to another training, which differs %s: it is not used", path, difference)
+            why = f"belongs to another training, which differs {difference}: it is not used"
+            log.warning(
+                "%s %s; it is kept as %s, and this training begins anew", path, why, set_aside(path).name
+            )
             return None
         return saved["state"]
 

@@ -16,6 +16,7 @@ from obbgs_core.frames import TrainingFrame
 from obbgs_core.losses import fit_figures
 from obbgs_core.misfit import sampled
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
@@ -248,7 +249,7 @@ class Trainer:
         check_joinable(self.setup.config)
         began = time.monotonic()
         every = self._given + frames
-        joined, fresh = self._prepared(every)
+        joined, fresh = self._prepared(every, self.state.poses)
         join(self.setup, self.state, joined, fresh, HOLD)
         self.setup, self._given = joined, every
         self.state.seconds += time.monotonic() - began
@@ -269,15 +270,17 @@ class Trainer:
         began = time.monotonic()
         release(self.setup, self.state, HOLD)
         if self.state.has_joined:
-            self.setup, fresh = self._prepared(self._given)
+            self.setup, fresh = self._prepared(self._given, self.state.poses)
             self.state = begun_again(self.state, fresh)
             log.info("%d frames: the schedule begins again", len(self.setup.frames))
         self.state.seconds += time.monotonic() - began
 
-    def _prepared(self, frames: list[TrainingFrame]) -> tuple[TrainingSetup, TrainingState]:
-        """Return setup and first state of a training of frames that begin with those of this one."""
+    def _prepared(
+        self, frames: list[TrainingFrame], poses: PoseCorrections | None
+    ) -> tuple[TrainingSetup, TrainingState]:
+        """Return setup and first state of a training of frames that begin with those of this one, with their poses."""
         given = (self._stated, self._asked, self.setup.seed, self.setup.silhouettes)
-        return prepare(frames, *given, self.state.poses)
+        return prepare(frames, *given, poses)
 
     @property
     def pose_estimate(self) -> PoseEstimate | None:
@@ -352,9 +355,12 @@ class Trainer:
     def resume(self, path: Path) -> bool:
         """Go on from a checkpoint of this very training; return False when there is none."""
         state = TrainingState.load(path, self.setup.identity)
-        if state is not None:
-            self.state = state
-        return state is not None
+        if state is None:
+            return False
+        self.state = state
+        if state.placed_by is not None:
+            self.setup, _ = self._prepared(self._given, state.placed_by)
+        return True
 
 
 def _running(mean: float, value: float) -> float:

@@ -36,6 +36,7 @@ from ground.training_frames import split
 from ground.truth import Truth
 from hil.links.virtual_serial import VirtualSerial
 from hil.processes import end, installed, tied, unwind_on_sigterm
+from obbgs_base.errors import ObbgsError
 from obbgs_core.io.ply import load_ply
 from obbgs_core.score.metrics import psnr_db
 from tests.benchmarks.rows import shown
@@ -227,7 +228,10 @@ def main() -> None:
     arguments = parser.parse_args()
     unwind_on_sigterm()
     with tempfile.TemporaryDirectory() as name:
-        row = measure(arguments.session, arguments.mission, arguments.seconds, Path(name))
+        try:
+            row = measure(arguments.session, arguments.mission, arguments.seconds, Path(name))
+        except ObbgsError as error:
+            parser.exit(1, f"live: {error}\n")
     print(shown(row, "live", arguments.json))
 
 

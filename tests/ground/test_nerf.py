@@ -193,13 +193,16 @@ def test_a_checkpoint_of_another_training_or_half_a_file_is_not_used(small, tmp_
     first = nerf.Training(frames, scenes.SENSOR, 0, 10, False)
     first.save(tmp_path / "a.ckpt")
     assert not nerf.Training(frames, scenes.SENSOR, 1, 10, False).resume(tmp_path / "a.ckpt")
-    assert "another training" in caplog.text
-    content = (tmp_path / "a.ckpt").read_bytes()
+    assert "another training" in caplog.text and not (tmp_path / "a.ckpt").exists()
+    content = (tmp_path / "a.ckpt.unused-1").read_bytes()  # not lost
     (tmp_path / "a.ckpt").write_bytes(content[: len(content) // 2])
     assert not first.resume(tmp_path / "a.ckpt")
-    assert "damaged" in caplog.text
+    assert "damaged" in caplog.text and (tmp_path / "a.ckpt.unused-2").exists()
+    assert first.resume(tmp_path / "a.ckpt.unused-1")
     assert not first.resume(tmp_path / "b.ckpt")
-    assert not first.save(tmp_path / "a.ckpt" / "c.ckpt")  # below a file there is no room for a folder
+    assert not first.save(
+        tmp_path / "a.ckpt.unused-1" / "c.ckpt"
+    )  # below a file there is no room for a folder
     assert "cannot be written" in caplog.text
 
 

@@ -28,6 +28,7 @@ from ground.report import write_report
 from ground.session import MissingFrames, SessionError, open_session
 from ground.settings import changes_for
 from ground.training_frames import split
+from obbgs_base.errors import Interrupted
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.io.ply import load_ply
 from obbgs_core.train.presets import PRESETS
@@ -157,8 +158,23 @@ reconstruct(Path({str(session)!r}), "killed", "obbgs", {QUICK!r}, on_progress=di
     steps = []
     reconstruct(session, "killed", "obbgs", QUICK, on_progress=lambda p: steps.append(p.info.step))
     assert steps[0] == 40 and steps[-1] == 60
+    assert not list((session / "runs" / "killed").glob("*.checkpoint*"))
     one, other = (load_ply(session / "runs" / name / "model.ply") for name in ("whole", "killed"))
     assert torch.equal(one.means, other.means) and torch.equal(one.sh, other.sh)
+
+
+def test_a_checkpoint_that_another_version_saved_outlives_interrupted_runs(tmp_path):
+    session = copy_session(tmp_path)
+    part = session / "runs" / ".run.part"
+    part.mkdir(parents=True)
+    torch.save({"format": 1}, part / "known-exposure.checkpoint")
+    saved, stops = (part / "known-exposure.checkpoint").read_bytes(), iter([False, True])
+    for _ in range(2):
+        with pytest.raises(Interrupted):
+            reconstruct(session, "run", "obbgs", QUICK, should_stop=lambda: next(stops, True))
+        assert (part / "known-exposure.checkpoint.unused-1").read_bytes() == saved
+    reconstruct(session, "run", "obbgs", QUICK)
+    assert not list((session / "runs" / "run").glob("*.checkpoint*"))
 
 
 def test_budget_and_quality_shape_the_training_and_nonsense_is_refused():

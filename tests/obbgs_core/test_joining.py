@@ -168,6 +168,38 @@ def test_a_killed_training_goes_on_to_the_same_model_after_frames_have_joined(fr
         assert torch.equal(tensor, getattr(resumed.gaussians, name)), name
 
 
+def test_a_killed_training_of_refined_poses_goes_on_to_the_same_model(frames, tmp_path):
+    """Windows and budget are those of the poses at the joining, which are not those of the tags."""
+    doubted = tagged(frames, True, sigma_rad=0.02)
+    config = preset("obbgs", QUICK | MANY_EXPECTED | {"poses.refine": "always"})
+    whole = Trainer(doubted[:24], SENSOR, config, seed=3)
+    for _ in range(24):
+        whole.step()
+    whole.join(doubted[24:30])
+    for _ in range(8):  # poses go on moving after what was carved with them
+        whole.step()
+    whole.save(tmp_path / "joined")
+    joined = Trainer(doubted[:30], SENSOR, config, seed=3)
+    carved_as_tagged = joined.setup.start_means
+    assert joined.resume(tmp_path / "joined")
+    assert torch.equal(joined.setup.start_means, whole.setup.start_means)
+    assert not torch.equal(joined.setup.start_means, carved_as_tagged)
+    for trainer in (whole, joined):
+        trainer.join(doubted[30:])
+        trainer.step()
+        trainer.end_joining()
+        trainer.step()
+    whole.save(tmp_path / "ended")
+    ended = Trainer(doubted, SENSOR, config, seed=3)
+    assert ended.resume(tmp_path / "ended")
+    for trainer in (whole, joined, ended):
+        for _ in range(3):
+            trainer.step()
+    for name, tensor in whole.gaussians.tensors().items():
+        for trainer in (joined, ended):
+            assert torch.equal(tensor, getattr(trainer.gaussians, name)), name
+
+
 def test_brackets_that_decide_on_the_poses_have_never_been_trained_on(frames):
     doubted = tagged(photographed(target(), 42), True, sigma_rad=0.01)
     config = preset("obbgs", QUICK | {"poses.refine": "auto"})

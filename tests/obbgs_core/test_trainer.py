@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -117,13 +118,21 @@ def test_the_mean_begins_anew_when_frames_join(frames):
 
 
 def test_a_checkpoint_of_another_training_is_not_used(frames, tmp_path):
-    Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=1).save(tmp_path / "c")
-    assert not Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=2).resume(tmp_path / "c")
-    assert not Trainer(frames[:-1], SENSOR, preset("obbgs", QUICK), seed=1).resume(tmp_path / "c")
+    Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=1).save(tmp_path / "saved")
     doubted = [dataclasses.replace(f, pose_covariance=1e-18 * torch.eye(6).double()) for f in frames]
-    assert not Trainer(doubted, SENSOR, preset("obbgs", QUICK), seed=1).resume(tmp_path / "c")
-    assert not Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=1).resume(tmp_path / "none")
-    assert Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=1).resume(tmp_path / "c")
+    others = [
+        Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=2),
+        Trainer(frames[:-1], SENSOR, preset("obbgs", QUICK), seed=1),
+        Trainer(doubted, SENSOR, preset("obbgs", QUICK), seed=1),
+        Trainer(frames, SENSOR, preset("obbgs", QUICK | {"growth.max_gaussians": 50}), seed=1),
+    ]
+    for number, other in enumerate(others, 1):
+        shutil.copy(tmp_path / "saved", tmp_path / "c")
+        assert not other.resume(tmp_path / "c")
+        other.save(tmp_path / "c")  # does not replace what was found there
+        assert (tmp_path / f"c.unused-{number}").read_bytes() == (tmp_path / "saved").read_bytes()
+    trainer = Trainer(frames, SENSOR, preset("obbgs", QUICK), seed=1)
+    assert not trainer.resume(tmp_path / "none") and trainer.resume(tmp_path / "c.unused-1")
 
 
 @pytest.mark.parametrize(
@@ -134,8 +143,11 @@ def test_a_checkpoint_of_another_version_is_not_used_and_nothing_else_in_it_is_b
     frames, tmp_path, caplog, content
 ):
     torch.save(content, tmp_path / "c")  # the sensor's class is not among those that a checkpoint may hold
-    trainer = Trainer(frames, SENSOR, preset("obbgs", QUICK))
-    assert not trainer.resume(tmp_path / "c") and "it is not used" in caplog.text
+    found, trainer = (tmp_path / "c").read_bytes(), Trainer(frames, SENSOR, preset("obbgs", QUICK))
+    assert not trainer.resume(tmp_path / "c")
+    assert "it is not used; it is kept as c.unused-1" in caplog.text
+    trainer.save(tmp_path / "c")
+    assert (tmp_path / "c.unused-1").read_bytes() == found and trainer.resume(tmp_path / "c")
 
 
 def test_a_checkpoint_outlives_settings_that_are_added_later(frames, tmp_path, caplog):
