@@ -96,25 +96,28 @@ def pose_information(
     gradients, curvatures, cells, dispersions = [], [], [], []
     for i in range(len(radiance)):
         seen = alpha[i] > ON_TARGET_ALPHA
-        near = F.max_pool2d(seen[None, None].float(), 3, 1, 1)[0, 0] > 0
+        lit, deep = (_of_nine(image) for image in (seen.float(), torch.where(seen, depth[i], 0.0)))
+        near = lit > 0
         slope = slopes[i][near]  # [n, C, 2]
-        points = _points(depth[i], seen, near, cameras.K[i])  # [n, 3]
+        # those beside the target are as deep as its edge
+        points = _points(torch.where(seen, depth[i], deep / lit.clamp(min=1)), near, cameras.K[i])  # [n, 3]
         flow = point_flow(points, cameras.K[i].expand(len(points), 3, 3))  # [n, 2, 6]
         residual, by_radiance = _residual(
             radiance[i][near], exposure_time_s[i, 0], dn[i][near], sensor, averaged_pixels
         )
-        rows = (
-            (by_radiance[..., None] * -(slope @ flow)).flatten(0, 1).double()
-        )  # [n C, 6] of the residual by motion
+        shift = slope[..., :1] * flow[:, None, 0] + slope[..., 1:] * flow[:, None, 1]  # [n, C, 6]
+        rows = (by_radiance[..., None] * -shift).flatten(0, 1).double()  # [n C, 6] of the residual by motion
         residual = residual.flatten().double()
         dispersion = residual.square().mean().clamp(min=1)
         weight = (1 + residual.square() / (KNEE**2 * dispersion)).rsqrt() / dispersion
         if cell_m:
             pose = cameras.world_to_camera[i].double()
             numbers = _cell_numbers((points.double() - pose[:3, 3]) @ pose[:3, :3], cell_m)
-            numbers = numbers.repeat_interleave(radiance.shape[-1])  # of each row
-            weight = weight * len(numbers.unique()) / max(1, len(numbers))
-            cells.append(_cell_information(numbers, rows, rows[:, 3:] @ pose[:3, :3], weight, residual))
+            numbers, place = numbers.unique(return_inverse=True)
+            place = place.repeat_interleave(radiance.shape[-1])  # of each row
+            weight = weight * len(numbers) / max(1, len(place))
+            told = rows, rows[:, 3:] @ pose[:3, :3], weight, residual
+            cells.append(_cell_information(numbers, place, *told))
         gradients.append(rows.T @ (weight * residual))
         curvatures.append(rows.T @ (weight[:, None] * rows))
         dispersions.append(residual.square().mean())
@@ -129,20 +132,29 @@ def _cell_numbers(points: Tensor, cell_m: float) -> Tensor:
 
 
 def _cell_information(
-    numbers: Tensor, by_motion: Tensor, by_point: Tensor, weight: Tensor, residual: Tensor
+    numbers: Tensor, place: Tensor, by_motion: Tensor, by_point: Tensor, weight: Tensor, residual: Tensor
 ) -> CellInformation:
-    """Return the sums over the rows [n] of each cell: residuals [n] with derivatives [n, 6] and [n, 3] and weights."""
-    cells, place = torch.unique(numbers, return_inverse=True)
+    """Return the sums over the rows [n] of each cell: residuals [n] with derivatives [n, 6] and [n, 3] and weights.
+
+    Args:
+        numbers: [k] of the cells; place: [n] of each row's cell among them.
+    """
     table = torch.cat([by_point, by_motion, residual[:, None]], dim=1)  # [n, 10]
     products = (weight[:, None] * by_point)[:, :, None] * table[:, None, :]
-    summed = torch.zeros(len(cells), 3, 10, dtype=torch.float64).index_add(0, place, products)
-    return CellInformation(cells, summed[..., 9], summed[..., :3], summed[..., 3:9])
+    summed = torch.zeros(len(numbers), 3, 10, dtype=torch.float64).index_add(0, place, products)
+    return CellInformation(numbers, summed[..., 9], summed[..., :3], summed[..., 3:9])
 
 
-def _points(depth: Tensor, seen: Tensor, at: Tensor, K: Tensor) -> Tensor:
-    """Return the points [n, 3] m, camera axes, of chosen pixels; those beside the target are as deep as its edge."""
-    sums = F.avg_pool2d(torch.stack([torch.where(seen, depth, 0.0), seen.float()])[:, None], 3, 1, 1)[:, 0]
-    z = torch.where(seen, depth, sums[0] / sums[1].clamp(min=1e-6))[at].clamp(min=1e-6)
+def _of_nine(image: Tensor) -> Tensor:
+    """Return the sums [H, W] of each pixel and its neighbours; what lies beyond the edges is 0."""
+    wide = F.pad(image, (1, 1, 1, 1))
+    rows = wide[:-2] + wide[1:-1] + wide[2:]
+    return rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
+
+
+def _points(depth: Tensor, at: Tensor, K: Tensor) -> Tensor:
+    """Return the points [n, 3] m, camera axes, of chosen pixels at these depths."""
+    z = depth[at].clamp(min=1e-6)
     rows, columns = torch.nonzero(at, as_tuple=True)
     x, y = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
     return torch.stack([x * z, y * z, z], dim=1)

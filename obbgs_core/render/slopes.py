@@ -8,6 +8,7 @@ from torch import Tensor
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
+from obbgs_core.render.highlights import highlights
 from obbgs_core.render.rendered import Rendered
 from obbgs_core.render.shadows import sunlit_shares
 
@@ -19,11 +20,13 @@ def render_with_slopes(gaussians: Gaussians, cameras: Cameras) -> tuple[Rendered
     A derivative is the difference of the radiance half a pixel to both sides, rendered there. Between the pixels of the
     picture itself, which are two apart, edges and structures as thin as a pixel are smoothed away.
     """
-    sunlit = sunlit_shares(gaussians, cameras.known_suns()) if gaussians.shading == "lambert" else None
+    suns = None if gaussians.shading == "view" else cameras.known_suns()
+    sunlit = None if suns is None or gaussians.shading != "lambert" else sunlit_shares(gaussians, suns)
+    shine, matt = highlights(gaussians, cameras, suns, sunlit), gaussians.matt()  # alike wherever the grid lies
     slopes = []
     for axis, name in enumerate(("width", "height")):
         K = cameras.K.clone()
         K[:, axis, 2] += 0.5
         shifted = dataclasses.replace(cameras, K=K, **{name: getattr(cameras, name) + 1})
-        slopes.append(render(gaussians, shifted, sunlit=sunlit).radiance.diff(dim=2 - axis))
-    return render(gaussians, cameras, sunlit=sunlit), torch.stack(slopes, dim=-1)
+        slopes.append(render(matt, shifted, sunlit=sunlit, added=shine).radiance.diff(dim=2 - axis))
+    return render(matt, cameras, sunlit=sunlit, added=shine), torch.stack(slopes, dim=-1)
