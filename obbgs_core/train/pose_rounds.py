@@ -12,11 +12,17 @@ from obbgs_core.registration import pose_information
 from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.train.adam import learning_rates
 from obbgs_core.train.batches import FrameOrder
-from obbgs_core.train.poses import ALIGNED_FROM, HELD_AT, HELD_FROM, SURFACE_UNTIL
+from obbgs_core.train.poses import (
+    ALIGNED_FROM,
+    EARLY_ROUNDS,
+    HELD_AT,
+    HELD_FROM,
+    LATE_ROUNDS,
+    SURFACE_UNTIL,
+)
 from obbgs_core.train.setup import TrainingSetup
 from obbgs_core.train.state import TrainingState
 
-ROUNDS = 25  # in which the poses would move if they did so during the whole training
 CELLS = 12  # of the surface along the target's radius
 RENDERED = 6  # frames at a time
 # share of the steps after which brackets that do not fit are left out: poses have mostly settled
@@ -36,12 +42,14 @@ def is_due(setup: TrainingSetup, state: TrainingState, share: float) -> bool:
 
 def is_turn(setup: TrainingSetup, state: TrainingState) -> bool:
     """Return whether it is the turn of a round."""
-    return state.steps_done % steps_between(setup) == 0
+    share = setup.config.moment(state.steps_done).share
+    return state.steps_done % steps_between(setup, share) == 0
 
 
-def steps_between(setup: TrainingSetup) -> int:
-    """Return the number of steps from one round to the next."""
-    return max(1, round((setup.config.steps_until(1) - setup.config.steps_until(0)) / ROUNDS))
+def steps_between(setup: TrainingSetup, share: float) -> int:
+    """Return the number of steps from one round to the next at a share of the steps."""
+    rounds = EARLY_ROUNDS if share < HELD_AT else LATE_ROUNDS
+    return max(1, round((setup.config.steps_until(1) - setup.config.steps_until(0)) / rounds))
 
 
 def cell_m(setup: TrainingSetup) -> float:
@@ -52,7 +60,7 @@ def cell_m(setup: TrainingSetup) -> float:
 def reach_m(setup: TrainingSetup, share: float) -> float:
     """Return how far training moves a Gaussian from one round to the next: by about its rate in each step."""
     rates = learning_rates(setup.config.rates, share, setup.unit_m, 1, setup.radiance_unit)
-    return float(rates["means"]) * steps_between(setup)
+    return float(rates["means"]) * steps_between(setup, share)
 
 
 def move(setup: TrainingSetup, state: TrainingState) -> None:
@@ -66,16 +74,17 @@ def move(setup: TrainingSetup, state: TrainingState) -> None:
     assert poses is not None
     state.pose_rounds += 1
     state.average = None  # of models at other poses, which may have moved as a whole since
-    turn, brackets, left_out = state.steps_done, [[] for _ in range(len(poses.value))], set(state.misfits)
+    share = setup.config.moment(state.steps_done).share
+    turn = state.steps_done // steps_between(setup, share)
+    brackets, left_out = [[] for _ in range(len(poses.value))], set(state.misfits)
     for index, bracket in enumerate(poses.of_frame):
         if index not in left_out:
             brackets[bracket].append(index)
     shown = [members for members in brackets if members]
     residuals = _gather(setup, state, [members[turn % len(members)] for members in shown])
     since = state.steps_done - setup.config.steps_until(MISFIT_FROM)
-    if 0 <= since < steps_between(setup):
+    if 0 <= since < steps_between(setup, MISFIT_FROM):
         _leave_out(setup, state, [shown[i] for i in torch.nonzero(standing_out(*residuals))[:, 0].tolist()])
-    share = setup.config.moment(turn).share
     along = state.poses_aligned and share < SURFACE_UNTIL
     reach = cell_m(setup) if along else reach_m(setup, share)
     motion, shifts = poses.step(setup.frames, poses.body_motions(), reach, together=along)

@@ -5,12 +5,13 @@ from typing import Literal
 
 from obbgs_core.settings import check, fraction
 
-# share of the steps after which poses that were aligned before the start are refined; the first pictures, a quarter as
-# large, would move exact poses by half a pixel
-ALIGNED_FROM = 0.15
+ALIGNED_FROM = 0.05  # share of the steps after which poses that were aligned before the start are refined
 # Where poses are refined, the schedule is set back from the first to the second share of the steps, so many times:
-# poses and surface settle together only while the rates are large.
-HELD_AT, HELD_FROM, HOLDS = 0.4, 0.16, 2
+# poses and surface settle together only while the rates are large (experiment 079).
+HELD_AT, HELD_FROM, HOLDS = 0.4, 0.16, 1
+# In how many rounds the poses would move if they did so during the whole training: as often as before `HELD_AT`, and as
+# after it.
+EARLY_ROUNDS, LATE_ROUNDS = 60, 25
 SURFACE_UNTIL = 0.5  # share of the steps until which the Gaussians go along with the surface's cells then
 
 

@@ -155,7 +155,8 @@ def test_with_exact_poses_or_few_frames_no_bracket_is_kept_for_validation():
 
 @pytest.mark.parametrize("killed_at", [12, 19, 35])
 def test_a_training_killed_about_its_decisions_resumes_to_the_same_model(tmp_path, monkeypatch, killed_at):
-    monkeypatch.setattr("obbgs_core.train.pose_rounds.ROUNDS", 8)  # else poses move in each of so few steps
+    for name in ("EARLY_ROUNDS", "LATE_ROUNDS"):  # else poses move in each of so few steps
+        monkeypatch.setattr(f"obbgs_core.train.pose_rounds.{name}", 8)
     frames = tagged(photographed(target(), 28), True)
     changes = {"poses.refine": "auto", "poses.refine_from": 0.35, "growth.interval": 5}
     config = preset("obbgs", QUICK | changes | {"parsimony.prune_at": (0.5,)})
