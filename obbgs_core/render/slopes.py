@@ -22,7 +22,10 @@ def render_with_slopes(gaussians: Gaussians, cameras: Cameras) -> tuple[Rendered
     """
     suns = None if gaussians.shading == "view" else cameras.known_suns()
     sunlit = None if suns is None or gaussians.shading != "lambert" else sunlit_shares(gaussians, suns)
-    shine, matt = highlights(gaussians, cameras, suns, sunlit), gaussians.matt()  # alike wherever the grid lies
+    shine, matt = (
+        highlights(gaussians, cameras, suns, sunlit),
+        gaussians.matt(),
+    )  # alike wherever the grid lies
     slopes = []
     for axis, name in enumerate(("width", "height")):
         K = cameras.K.clone()
