@@ -69,8 +69,8 @@ class NormalEquations:
             curvature[at] += cell.curvature
             gradient[at] += cell.gradient
         factor = torch.linalg.cholesky(curvature)
-        mixed = torch.linalg.solve_triangular(factor, mixed, upper=False).flatten(0, 1)
-        gradient = torch.linalg.solve_triangular(factor, gradient[..., None], upper=False).flatten()
+        mixed = _forward_substituted(factor, mixed).flatten(0, 1)
+        gradient = _forward_substituted(factor, gradient[..., None]).flatten()
         whole = torch.block_diag(*self.own, self.shared)
         whole[:size, size:] = self.mixed.flatten(0, 1)
         whole[size:, :size] = self.mixed.flatten(0, 1).T
@@ -119,6 +119,20 @@ class ReducedEquations:
         inverse, size = torch.linalg.inv(self.matrix), 6 * self.brackets
         own = inverse[:size, :size].view(self.brackets, 6, self.brackets, 6)
         return inverse[size:, size:], own.diagonal(dim1=0, dim2=2).movedim(-1, 0)
+
+
+def _forward_substituted(factor: Tensor, right: Tensor) -> Tensor:
+    """Return L⁻¹ R for lower triangles L [k, 3, 3] and R [k, 3, m]: all rows of one kind at once.
+
+    `torch.linalg.solve_triangular` calls BLAS for each of the thousands of triangles.
+    """
+    solved = torch.empty_like(right)
+    for row in range(3):
+        left = right[:, row]
+        for column in range(row):
+            left = left - factor[:, row, column, None] * solved[:, column]
+        torch.div(left, factor[:, row, row, None], out=solved[:, row])
+    return solved
 
 
 def times(matrices: Tensor, vectors: Tensor) -> Tensor:
