@@ -65,15 +65,15 @@ def gather_a_draw(poses: PoseCorrections, moving: bool, generator: torch.Generat
     told = []
     for i in range(FRAMES):
         rows = drawn(VALUES, 6) / UNITS
-        numbers = torch.arange(VALUES) % CUBES
+        numbers, place = torch.arange(CUBES), torch.arange(VALUES) % CUBES
         by_point = rows[:, 3:] @ poses.tags[i, :3, :3]
         motion = poses.whitening.root[i].double() @ own[i] + poses.by_shared[i] @ shared
         residual = drawn(VALUES)
         if moving:
             motion = motion + poses.body_motions()[i] @ body
-            residual = residual - (by_point * CELL_M * cubes[numbers]).sum(1)
+            residual = residual - (by_point * CELL_M * cubes[place]).sum(1)
         residual = residual - rows @ motion
-        cells = _cell_information(numbers, rows, by_point, torch.ones(VALUES).double(), residual)
+        cells = _cell_information(numbers, place, rows, by_point, torch.ones(VALUES).double(), residual)
         told.append((rows.T @ residual, rows.T @ rows, cells))
     gradients, curvatures, cells = zip(*told, strict=True)
     pictures = torch.stack(gradients), torch.stack(curvatures)
