@@ -166,9 +166,8 @@ def unfinished_run(folder: Path, overwrite: bool, kept: Sequence[str]) -> Iterat
     """Give the hidden folder in which a run is made, locked against other processes and with its log open.
 
     It holds the `kept` files (checkpoints, also those that were set aside) and the log of an interrupted run of the
-    same name, nothing else of it. It
-    stays when the block is interrupted, so that the next run resumes from it, and is removed when the frames allow no
-    model.
+    same name, nothing else of it. It stays when the block is interrupted, so that the next run resumes from it, and is
+    removed when the frames allow no model.
 
     Raises:
         SessionError: another process makes this run, there is a finished one, or the folder cannot be written.

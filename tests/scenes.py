@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -99,6 +100,12 @@ def photographed(
         dn = torch.from_numpy(converted(expected.numpy(), sigma_dn, SENSOR.white_dn, rng).astype(np.float32))
         frames.append(TrainingFrame(dn, exposure_s, cameras.world_to_camera[0], K, i, sun_dir=sun))
     return frames
+
+
+def move_poses_in(monkeypatch: pytest.MonkeyPatch, rounds: int) -> None:
+    """Let the poses of a training move in so many rounds, as often early as late."""
+    for name in ("EARLY_ROUNDS", "LATE_ROUNDS"):
+        monkeypatch.setattr(f"obbgs_core.train.pose_rounds.{name}", rounds)
 
 
 def tagged(frames: list[TrainingFrame], wrong: bool, sigma_rad: float = 0.005) -> list[TrainingFrame]:

@@ -211,14 +211,14 @@ class Training:
             return False
         try:
             saved = torch.load(path, weights_only=True)
-            same = saved["fingerprint"] == self.fingerprint
+            why = "" if saved["fingerprint"] == self.fingerprint else "belongs to another training or version"
         except (pickle.UnpicklingError, RuntimeError, OSError, EOFError, LookupError, TypeError) as error:
-            why = f"is damaged or of another version ({error}), it is not used"
-            log.warning("%s %s; it is kept as %s", path, why, set_aside(path).name)
-            return False
-        if not same:
-            why = "belongs to another training or version, it is not used"
-            log.warning("%s %s; it is kept as %s", path, why, set_aside(path).name)
+            saved, why = {}, f"is damaged or of another version ({error})"
+        if why:
+            kept = set_aside(path).name
+            log.warning(
+                "%s %s: it is not used; it is kept as %s, and this training begins anew", path, why, kept
+            )
             return False
         self.model.field.load_state_dict(saved["field"])
         self.adam.load_state_dict(saved["adam"])

@@ -21,11 +21,9 @@ def render_with_slopes(gaussians: Gaussians, cameras: Cameras) -> tuple[Rendered
     picture itself, which are two apart, edges and structures as thin as a pixel are smoothed away.
     """
     suns = None if gaussians.shading == "view" else cameras.known_suns()
-    sunlit = None if suns is None or gaussians.shading != "lambert" else sunlit_shares(gaussians, suns)
-    shine, matt = (
-        highlights(gaussians, cameras, suns, sunlit),
-        gaussians.matt(),
-    )  # alike wherever the grid lies
+    sunlit = sunlit_shares(gaussians, cameras.known_suns()) if gaussians.shading == "lambert" else None
+    # a highlight does not depend on where the grid lies
+    shine, matt = highlights(gaussians, cameras, suns, sunlit), gaussians.matt()
     slopes = []
     for axis, name in enumerate(("width", "height")):
         K = cameras.K.clone()

@@ -91,7 +91,11 @@ def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> No
     They are asked before the first round of refinement, and trained on from then on.
     """
     config = setup.config
-    if state.poses_decided or share < config.poses.refine_from or not pose_rounds.is_turn(setup, state):
+    if (
+        state.poses_decided
+        or share < config.poses.refine_from
+        or not pose_rounds.is_turn(setup, state, share)
+    ):
         return
     brackets = [setup.batches.batch(b) for b in state.order.validation_brackets]
     cell_m = pose_rounds.cell_m(setup)

@@ -37,12 +37,11 @@ log = logging.getLogger(__name__)
 def is_due(setup: TrainingSetup, state: TrainingState, share: float) -> bool:
     """Return whether the poses move in this step."""
     begin = ALIGNED_FROM if state.poses_aligned else setup.config.poses.refine_from
-    return state.poses is not None and share >= begin and is_turn(setup, state)
+    return state.poses is not None and share >= begin and is_turn(setup, state, share)
 
 
-def is_turn(setup: TrainingSetup, state: TrainingState) -> bool:
-    """Return whether it is the turn of a round."""
-    share = setup.config.moment(state.steps_done).share
+def is_turn(setup: TrainingSetup, state: TrainingState, share: float) -> bool:
+    """Return whether it is the turn of a round, at the share of the steps that are done."""
     return state.steps_done % steps_between(setup, share) == 0
 
 

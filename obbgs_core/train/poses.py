@@ -9,7 +9,7 @@ ALIGNED_FROM = 0.05  # share of the steps after which poses that were aligned be
 # Where poses are refined, the schedule is set back from the first to the second share of the steps, so many times:
 # poses and surface settle together only while the rates are large (experiment 079).
 HELD_AT, HELD_FROM, HOLDS = 0.4, 0.16, 1
-# In how many rounds the poses would move if they did so during the whole training: as often as before `HELD_AT`, and as
+# In so many rounds the poses would move during a whole training if they moved as often as before `HELD_AT`, or as
 # after it.
 EARLY_ROUNDS, LATE_ROUNDS = 60, 25
 SURFACE_UNTIL = 0.5  # share of the steps until which the Gaussians go along with the surface's cells then

@@ -153,6 +153,9 @@ class TrainingState:
             if saved["format"] != FORMAT:
                 raise ValueError(f"expected format {FORMAT}, got {saved['format']}")
             difference = identity.difference(saved["identity"])
+            if not difference:
+                return saved["state"]
+            why = f"belongs to another training, which differs {difference}"
         except (
             pickle.UnpicklingError,
             RuntimeError,
@@ -163,18 +166,10 @@ class TrainingState:
             ValueError,
         ) as error:
             # half a file, or one that another version of this program saved, with other classes
-            why = f"is damaged or of another version ({error}), it is not used"
-            log.warning(
-                "%s %s; it is kept as %s, and the training begins anew", path, why, set_aside(path).name
-            )
-            return None
-        if difference:
-            why = f"belongs to another training, which differs {difference}: it is not used"
-            log.warning(
-                "%s %s; it is kept as %s, and this training begins anew", path, why, set_aside(path).name
-            )
-            return None
-        return saved["state"]
+            why = f"is damaged or of another version ({error})"
+        kept = set_aside(path).name
+        log.warning("%s %s: it is not used; it is kept as %s, and this training begins anew", path, why, kept)
+        return None
 
 
 # the classes that a checkpoint may hold: nothing else in a file is ever built

@@ -111,7 +111,7 @@ class Trainer:
     @torch_on_one_thread()
     def __init__(self, frames: list[TrainingFrame], sensor: Sensor, config: MethodConfig, seed: int = 0):
         began = time.monotonic()
-        self._given, self._stated, self._asked = frames, sensor, config
+        self._given, self._stated = frames, sensor
         self.setup, self.state = prepare(frames, sensor, config, seed)
         self.state.seconds = time.monotonic() - began
 
@@ -279,7 +279,7 @@ class Trainer:
         self, frames: list[TrainingFrame], poses: PoseCorrections | None
     ) -> tuple[TrainingSetup, TrainingState]:
         """Return setup and first state of a training of frames that begin with those of this one, with their poses."""
-        given = (self._stated, self._asked, self.setup.seed, self.setup.silhouettes)
+        given = (self._stated, self.setup.asked, self.setup.seed, self.setup.silhouettes)
         return prepare(frames, *given, poses)
 
     @property

@@ -200,9 +200,8 @@ def test_a_checkpoint_of_another_training_or_half_a_file_is_not_used(small, tmp_
     assert "damaged" in caplog.text and (tmp_path / "a.ckpt.unused-2").exists()
     assert first.resume(tmp_path / "a.ckpt.unused-1")
     assert not first.resume(tmp_path / "b.ckpt")
-    assert not first.save(
-        tmp_path / "a.ckpt.unused-1" / "c.ckpt"
-    )  # below a file there is no room for a folder
+    # below a file there is no room for a folder
+    assert not first.save(tmp_path / "a.ckpt.unused-1" / "c.ckpt")
     assert "cannot be written" in caplog.text
 
 

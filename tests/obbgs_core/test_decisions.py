@@ -23,7 +23,7 @@ from obbgs_core.train.poses import HELD_FROM
 from obbgs_core.train.presets import preset
 from obbgs_core.train.smoothing import sampling_rates
 from obbgs_core.train.trainer import Trainer, train
-from tests.scenes import QUICK, SENSOR, photographed, tagged, target
+from tests.scenes import QUICK, SENSOR, move_poses_in, photographed, tagged, target
 
 
 def test_the_likelihood_gain_of_a_gaussian_matches_removing_it():
@@ -155,8 +155,7 @@ def test_with_exact_poses_or_few_frames_no_bracket_is_kept_for_validation():
 
 @pytest.mark.parametrize("killed_at", [12, 19, 35])
 def test_a_training_killed_about_its_decisions_resumes_to_the_same_model(tmp_path, monkeypatch, killed_at):
-    for name in ("EARLY_ROUNDS", "LATE_ROUNDS"):  # else poses move in each of so few steps
-        monkeypatch.setattr(f"obbgs_core.train.pose_rounds.{name}", 8)
+    move_poses_in(monkeypatch, 8)  # else poses move in each of so few steps
     frames = tagged(photographed(target(), 28), True)
     changes = {"poses.refine": "auto", "poses.refine_from": 0.35, "growth.interval": 5}
     config = preset("obbgs", QUICK | changes | {"parsimony.prune_at": (0.5,)})

@@ -21,7 +21,7 @@ from obbgs_core.train.growth import finite
 from obbgs_core.train.presets import preset
 from obbgs_core.train.state import SAVED
 from obbgs_core.train.trainer import Trainer, train
-from tests.scenes import QUICK, SENSOR, SIZE_PX, photographed, target
+from tests.scenes import QUICK, SENSOR, SIZE_PX, move_poses_in, photographed, target
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +31,7 @@ def frames() -> list[TrainingFrame]:
 
 @pytest.mark.parametrize("killed_at", [23, 38], ids=["before averaging", "while models are averaged"])
 def test_a_killed_training_resumes_to_the_same_model(frames, tmp_path, monkeypatch, killed_at):
-    for name in ("EARLY_ROUNDS", "LATE_ROUNDS"):  # else poses move in each of so few steps
-        monkeypatch.setattr(f"obbgs_core.train.pose_rounds.{name}", 8)
+    move_poses_in(monkeypatch, 8)  # else poses move in each of so few steps
     config = preset("obbgs", QUICK | {"poses.refine": "always", "parsimony.prune_at": (0.5,)})
     tagged = [dataclasses.replace(f, pose_covariance=1e-6 * torch.eye(6).double()) for f in frames]
     whole = train(tagged, SENSOR, config, seed=3)
@@ -99,8 +98,7 @@ def test_a_gaussian_that_is_not_finite_leaves_the_mean_as_well(frames):
 
 
 def test_the_mean_begins_anew_when_poses_move(frames, monkeypatch):
-    for name in ("EARLY_ROUNDS", "LATE_ROUNDS"):  # the last round is in the 36th of 40 steps
-        monkeypatch.setattr(f"obbgs_core.train.pose_rounds.{name}", 8)
+    move_poses_in(monkeypatch, 8)  # the last round is in the 36th of 40 steps
     tagged = [dataclasses.replace(f, pose_covariance=1e-6 * torch.eye(6).double()) for f in frames]
     config = preset("obbgs", QUICK | {"poses.refine": "always", "averaged_from": 0.8})
     trainer = Trainer(tagged, SENSOR, config, seed=3)
