@@ -40,9 +40,10 @@ h3 { font-size: 15px; margin: 18px 0 8px; }
 ul.notes { background: #fff7e6; border: 1px solid #f0d9a8; border-radius: 8px; margin: 0 0 14px;
   padding: 10px 14px 10px 30px; }
 pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px; overflow-x: auto; margin: 0 0 12px; }
+@media (max-width: 1170px) { .two { grid-template-columns: minmax(0, 1fr); } }
 @media (max-width: 760px) {
   main { padding: 16px 8px 40px; } section { padding: 14px 12px; } h1 { font-size: 21px; overflow-wrap: anywhere; }
-  .cards, .two { grid-template-columns: minmax(0, 1fr); } .two > * { min-width: 0; }
+  .cards { grid-template-columns: minmax(0, 1fr); } .two > * { min-width: 0; }
   .card b { font-size: 20px; } td { padding: 5px 4px; overflow-wrap: anywhere; }
   td.n { white-space: normal; } .grid { gap: 3px; }
   .grid .label, .grid figcaption { font-size: 10px; overflow-wrap: anywhere; }
