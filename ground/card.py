@@ -140,7 +140,13 @@ def _quality(metrics: dict) -> list[str]:
     if isinstance(chi2 := metrics.get("chi2"), int | float) and math.isfinite(chi2):
         lines.append(f"- Residual chi² {chi2:.2f}: {chi2_explained(chi2)}")
     if isinstance(misfit := metrics.get("misfit"), float):
-        lines.append(f"- The model's own error, beside the noise: {100 * misfit:.0f} % of the light.")
+        line = f"- The model's own error, beside the noise: {100 * misfit:.0f} % of the light"
+        if both := metrics.get("chi2_held_out_both"):
+            line += (
+                f"; held-out frames have a chi² of {metrics['chi2_held_out']:.2f} over the noise, {both:.2f} over "
+                "both, where 1 means that both explain them"
+            )
+        lines.append(line + ".")
     scored = scored_frames(metrics)
     for key, text in (
         ("psnr_noisy_db", f"PSNR of {scored} against their noisy readings: {{:.2f}} dB."),

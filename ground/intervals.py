@@ -1,4 +1,4 @@
-"""How sure a model is of its images: calibrated intervals, and how often they hold in views that it never saw."""
+"""How sure a model is of its images: calibrated intervals, stated errors, and how they hold in views it never saw."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.losses import ON_TARGET_ALPHA
+from obbgs_core.misfit import model_error
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.score.uncertainty import (
@@ -17,7 +18,7 @@ from obbgs_core.score.uncertainty import (
     parameter_deviations,
     rendered_deviation,
 )
-from obbgs_core.sensor import Sensor
+from obbgs_core.sensor import Sensor, clipped_moments
 
 
 @dataclass(frozen=True)
@@ -116,3 +117,34 @@ def _against_truth(view: View, radiance: Tensor, sensor: Sensor, fitted: Calibra
         for light in (view.radiance, radiance)
     )
     return {"clean": (expected - true).abs() <= half_width, "half_width": half_width}
+
+
+@torch.no_grad()
+def stated_error_scores(
+    gaussians: Gaussians, sensor: Sensor, scored: Sequence[TrainingFrame], misfit: float | None
+) -> dict[str, float]:
+    """Return how large the errors of the scored frames are beside those that the model states, on the target's pixels.
+
+    - chi2_held_out: Σ r² / σ² over Σ v / σ², r the difference of readings and their expectation, σ² the variance of the
+      noise and v that of the clipped reading, as the training's chi² has it.
+    - chi2_held_out_both: the same with the model's own error, the share `misfit` of the light as `model_error` spreads
+      it, in σ²: 1 where noise and the model's own error explain the readings. Missing where it was not learnt.
+
+    Both are missing where no scored frame shows the target.
+    """
+    shares = {"chi2_held_out": 0.0} | ({} if misfit is None else {"chi2_held_out_both": misfit})
+    squares, expected = dict.fromkeys(shares, 0.0), dict.fromkeys(shares, 0.0)
+    for frame in scored:
+        rendered = render(gaussians, cameras_of([frame]))
+        on_target = rendered.alpha[0].squeeze(-1) > ON_TARGET_ALPHA
+        exposure_s = torch.tensor(frame.exposure_time_s)
+        prediction = sensor.predicted(rendered.radiance, exposure_s)
+        for key, share in shares.items():
+            error = model_error(rendered.radiance, exposure_s, sensor, 1, share)
+            variance = (prediction.variance_dn2 + error.variance_dn2(prediction, sensor))[0][on_target]
+            mean, clipped = clipped_moments(
+                prediction.expected_dn[0][on_target], variance.sqrt(), sensor.white_dn
+            )
+            squares[key] += ((frame.dn[on_target] - mean).square() / variance).sum().item()
+            expected[key] += (clipped / variance).sum().item()
+    return {key: squares[key] / expected[key] for key in shares if expected[key] > 0}

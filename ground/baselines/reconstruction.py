@@ -35,8 +35,8 @@ class Reconstruction:
     size_bytes: of the file or the parameters that one would keep.
     seconds: of the method's own work, without scoring, over all interrupted parts.
     figures: further columns of its row, such as the number of registered frames.
-    intervals: from held-out frames, their true radiance (or none) and the frames that calibrate to how often stated
-        intervals hold, as `ground.intervals.interval_scores` has it; None where the method states no uncertainty.
+    stated_errors: from held-out frames, their true radiance (or none) and the frames that calibrate to how well the
+        intervals and errors hold that the method states (`ground.intervals`); None where it states none.
     poses: None where the method takes the poses as they are given.
     """
 
@@ -46,7 +46,7 @@ class Reconstruction:
     size_bytes: int
     seconds: float
     figures: dict[str, Any] = field(default_factory=dict)
-    intervals: (
+    stated_errors: (
         Callable[[list[TrainingFrame], list[Tensor], Sequence[TrainingFrame]], dict[str, float]] | None
     ) = None
     poses: EstimatedPoses | None = None

@@ -39,6 +39,7 @@ METRICS = (
     Metric("completeness_shown_surface", "complete of what is shown, %", "{:.1f}", True),
     Metric("accuracy_surface", "accuracy", "{:.4f}", False),
     Metric("interval_90_clean", "90 % intervals hold, share", "{:.2f}", None),
+    Metric("chi2_held_out_both", "chi² over noise and own error", "{:.2f}", None),
     Metric("gaussians", "Gaussians", "{:,.0f}", None),
     Metric("bytes", "kB", "{:,.0f}", None),
     Metric("cpu_seconds", "processor time, s", "{:,.0f}", None),

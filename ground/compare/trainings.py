@@ -1,16 +1,15 @@
 """Trainings of Gaussians as compared methods: resumable, followed on the way, ended early where they have converged."""
 
 import dataclasses
-import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from ground.baselines.reconstruction import EstimatedPoses, Reconstruction, Work
 from ground.compare.follow import MARKS
-from ground.intervals import interval_scores
+from ground.intervals import interval_scores, stated_error_scores
 from ground.model_files import SURFACE_POINTS
 from obbgs_base.errors import Interrupted
 from obbgs_core.frames import TrainingFrame, cameras_of
@@ -85,6 +84,13 @@ def reconstruct_gaussians(
     if work.folder is not None:
         save_ply(result.gaussians, work.folder / MODEL, sun_dir=frames[0].sun_dir)
     posed = _estimated(frames, result.pose_estimate)
+
+    def stated_errors(
+        scored: list[TrainingFrame], radiance: list[Tensor], calibration: Sequence[TrainingFrame]
+    ) -> dict[str, float]:
+        intervals = interval_scores(result.gaussians, posed, sensor, scored, radiance, calibration)
+        return intervals | stated_error_scores(result.gaussians, sensor, scored, result.misfit)
+
     return Reconstruction(
         points=result.gaussians.means,
         surface=surface_positions(result.gaussians, cameras_of(posed), SURFACE_POINTS, seed),
@@ -103,9 +109,7 @@ def reconstruct_gaussians(
             "poses": result.poses,
         },
         # the images of other methods need more than a radiance and an exposure time
-        intervals=functools.partial(interval_scores, result.gaussians, posed, sensor)
-        if config.exposure_aware and not config.compensation
-        else None,
+        stated_errors=stated_errors if config.exposure_aware and not config.compensation else None,
         poses=_poses(result.gaussians, sensor, result.pose_estimate),
     )
 

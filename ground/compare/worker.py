@@ -80,10 +80,8 @@ def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict
         row |= _rounded_all(pose_errors) | scores(seen, outcome, out / VIEWS / f"{cell.digest}.npz")
         if pose_errors:
             row |= _after_similarity(case.seen_by(outcome.reconstruction, with_size=True)[0], outcome)
-        if outcome.reconstruction.intervals is not None:
-            row |= _rounded_all(
-                outcome.reconstruction.intervals(seen.held_out, seen.radiance, seen.calibration)
-            )
+        if (stated_errors := outcome.reconstruction.stated_errors) is not None:
+            row |= _rounded_all(stated_errors(seen.held_out, seen.radiance, seen.calibration))
         if curve := follower.finish(outcome.reconstruction):
             row["curve"] = curve
             row["cpu_seconds"] = round(follower.cpu_seconds, 2)

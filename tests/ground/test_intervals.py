@@ -8,8 +8,9 @@ import torch
 
 from ground.compare.case import load_case
 from ground.compare.errors import CompareError
-from ground.intervals import interval_scores
+from ground.intervals import interval_scores, stated_error_scores
 from obbgs_core.frames import cameras_of
+from obbgs_core.misfit import relative_misfit
 from obbgs_core.render import render
 from obbgs_core.score.uncertainty import parameter_deviations
 from tests import scenes
@@ -43,6 +44,33 @@ def test_nothing_is_stated_where_no_reading_can_calibrate():
     frames = scenes.photographed(truth, 4)
     dark = [dataclasses.replace(frame, exposure_time_s=1e-12) for frame in frames]
     assert interval_scores(truth, frames, scenes.SENSOR, dark, []) == {}
+
+
+def test_both_errors_explain_what_a_model_of_too_bright_gaussians_gets_wrong():
+    """chi² is 1 for the truth; for a model that errs by a share of its light, with that share as its own error."""
+    truth, frames = scenes.target(), scenes.photographed(scenes.target(), 8, seed=2)
+    exact = stated_error_scores(truth, scenes.SENSOR, frames, 0.0)
+    assert exact["chi2_held_out"] == pytest.approx(1, abs=0.05)
+    assert exact["chi2_held_out_both"] == exact["chi2_held_out"]
+    draws = torch.Generator().manual_seed(0)
+    off = dataclasses.replace(truth, sh=truth.sh * (1 + 0.2 * torch.randn(truth.sh.shape, generator=draws)))
+    shares = [
+        relative_misfit(
+            render(off, cameras_of([f])).radiance, torch.tensor(f.exposure_time_s), f.dn[None], scenes.SENSOR
+        )
+        for f in frames
+    ]
+    misfit = float(np.sqrt(np.mean(np.square(shares))))
+    found = stated_error_scores(off, scenes.SENSOR, frames, misfit)
+    assert found["chi2_held_out"] > 2
+    assert found["chi2_held_out_both"] == pytest.approx(1, abs=0.3)
+    assert stated_error_scores(off, scenes.SENSOR, frames, None) == {"chi2_held_out": found["chi2_held_out"]}
+
+
+def test_no_error_is_stated_of_frames_that_show_nothing():
+    empty = scenes.target()
+    empty = dataclasses.replace(empty, opacity_logits=torch.full_like(empty.opacity_logits, -20.0))
+    assert stated_error_scores(empty, scenes.SENSOR, scenes.photographed(empty, 2), 0.1) == {}
 
 
 @pytest.fixture(scope="module")
