@@ -43,8 +43,8 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
       full scale 1), as most publications measure it, and of values that are linear in light.
 
     - interval_90_noisy, and with truth interval_90_clean and interval_90_half_width: how often the model's intervals
-      hold, as in `interval_scores`; chi2_held_out, chi2_held_out_both: as in `stated_error_scores`. These only where
-      frames are held out and exposure times are known.
+      hold, as in `interval_scores`; chi2_held_out, chi2_held_out_both: as in `stated_error_scores`, of the poses as
+      for psnr_noisy_db. These only where frames are held out and exposure times are known.
 
     Where the training refined its poses, the scored frames are compared from poses that are settled on each of them,
     with the model fixed, and not from their tags; `scored_poses` is then "settled".
@@ -74,6 +74,7 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     estimate, shown = read_estimate(run.folder), run.scored
     if estimate is not None:
         shown = settled_records(run.gaussians, run.session, run.scored, run.sensor, estimate)
+    compared = shown
     figures: dict[str, float] = {
         "psnr_noisy_db": noisy_psnr_db((_image(run, record), _noisy(run, record)) for record in shown)
     }
@@ -95,7 +96,9 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
         figures |= clean_scores([_scored(run, truth, record) for record in shown])
         figures |= _radiance_figures(run, truth, shown) | _cloud_figures(clouds, seen, truth, motion)
     if run.metrics["scored_frames"] == "held_out" and not run.metrics.get("reference_exposure_s"):
-        figures |= _stated_errors(run, truth, shown, estimate)
+        figures |= _interval_figures(run, truth, shown, estimate)
+        frames = [training_frame(run.session, record) for record in compared]
+        figures |= stated_error_scores(run.gaussians, run.sensor, frames, run.metrics.get("misfit"))
     metrics = {**run.metrics, **{key: round(value, 5) for key, value in figures.items()}}
     if estimate is not None:
         metrics["scored_poses"] = "settled"
@@ -127,16 +130,14 @@ def _cloud_figures(
     return cloud_scores(clouds, truth.cloud_m, 2 / truth.largest_dimension_m, shown)
 
 
-def _stated_errors(
+def _interval_figures(
     run: Run, truth: Truth | None, shown: list[FrameRecord], estimate: PoseEstimate | None
 ) -> dict[str, float]:
-    """Return how well the errors and intervals hold that the model states of the held-out frames."""
+    """Return how often the intervals hold that the model states of the held-out frames."""
     radiance = [] if truth is None else [torch.from_numpy(truth.radiance(record)[0]) for record in shown]
     training = estimated_records(split(run.session)[0], estimate)
     known, scored = ([training_frame(run.session, r) for r in records] for records in (training, shown))
-    return interval_scores(run.gaussians, known, run.sensor, scored, radiance) | stated_error_scores(
-        run.gaussians, run.sensor, scored, run.metrics.get("misfit")
-    )
+    return interval_scores(run.gaussians, known, run.sensor, scored, radiance)
 
 
 def _image(run: Run, record: FrameRecord) -> torch.Tensor:

@@ -46,6 +46,7 @@ FIGURES = {  # key of a row: column title and format
     "completeness_surface": ("surface complete", "{:.1f} %"),
     "completeness_shown_surface": ("complete of what is shown", "{:.1f} %"),
     "accuracy_surface": ("accuracy", "{:.4f}"),
+    "chi2_held_out_both": ("chi² over noise and own error", "{:.2f}"),
     "completeness_mesh": ("mesh complete", "{:.1f} %"),
     "completeness_shown_mesh": ("mesh complete of what is shown", "{:.1f} %"),
     "accuracy_mesh": ("accuracy of the mesh", "{:.4f}"),
