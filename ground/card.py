@@ -143,8 +143,8 @@ def _quality(metrics: dict) -> list[str]:
         line = f"- The model's own error, beside the noise: {100 * misfit:.0f} % of the light"
         if both := metrics.get("chi2_held_out_both"):
             line += (
-                f"; held-out frames have a chi² of {metrics['chi2_held_out']:.2f} over the noise, {both:.2f} over "
-                "both, where 1 means that both explain them"
+                f". Held-out frames have a chi² of {metrics['chi2_held_out']:.2f} over the noise and of {both:.2f} "
+                "over noise and own error together; 1 means that the errors are as large as stated"
             )
         lines.append(line + ".")
     scored = scored_frames(metrics)

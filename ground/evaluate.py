@@ -74,10 +74,13 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     estimate, shown = read_estimate(run.folder), run.scored
     if estimate is not None:
         shown = settled_records(run.gaussians, run.session, run.scored, run.sensor, estimate)
-    compared = shown
     figures: dict[str, float] = {
         "psnr_noisy_db": noisy_psnr_db((_image(run, record), _noisy(run, record)) for record in shown)
     }
+    states_errors = run.metrics["scored_frames"] == "held_out" and not run.metrics.get("reference_exposure_s")
+    if states_errors:
+        frames = (training_frame(run.session, record) for record in shown)
+        figures |= stated_error_scores(run.gaussians, run.sensor, frames, run.metrics.get("misfit"))
     if run.session.frames_imported is not None and run.session.camera.channels == 3:
         pairs = ((_image(run, record), _noisy(run, record)) for record in shown)
         figures |= display_scores(pairs, run.sensor, run.session.encoding)
@@ -95,10 +98,8 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
         shown = [truth.posed(record, motion) for record in run.scored]
         figures |= clean_scores([_scored(run, truth, record) for record in shown])
         figures |= _radiance_figures(run, truth, shown) | _cloud_figures(clouds, seen, truth, motion)
-    if run.metrics["scored_frames"] == "held_out" and not run.metrics.get("reference_exposure_s"):
+    if states_errors:
         figures |= _interval_figures(run, truth, shown, estimate)
-        frames = [training_frame(run.session, record) for record in compared]
-        figures |= stated_error_scores(run.gaussians, run.sensor, frames, run.metrics.get("misfit"))
     metrics = {**run.metrics, **{key: round(value, 5) for key, value in figures.items()}}
     if estimate is not None:
         metrics["scored_poses"] = "settled"

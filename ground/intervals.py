@@ -1,6 +1,6 @@
-"""How sure a model is of its images: calibrated intervals, stated errors, and how they hold in views it never saw."""
+"""How sure a model is of its images: calibrated intervals and stated errors, and how they hold in unseen views."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -121,30 +121,37 @@ def _against_truth(view: View, radiance: Tensor, sensor: Sensor, fitted: Calibra
 
 @torch.no_grad()
 def stated_error_scores(
-    gaussians: Gaussians, sensor: Sensor, scored: Sequence[TrainingFrame], misfit: float | None
+    gaussians: Gaussians, sensor: Sensor, scored: Iterable[TrainingFrame], misfit: float | None
 ) -> dict[str, float]:
-    """Return how large the errors of the scored frames are beside those that the model states, on the target's pixels.
+    """Return how large the errors of the scored frames are beside those that are stated, on the target's pixels.
 
-    - chi2_held_out: Σ r² / σ² over Σ v / σ², r the difference of readings and their expectation, σ² the variance of the
-      noise and v that of the clipped reading, as the training's chi² has it.
-    - chi2_held_out_both: the same with the model's own error, the share `misfit` of the light as `model_error` spreads
-      it, in σ²: 1 where noise and the model's own error explain the readings. Missing where it was not learnt.
+    - chi2_held_out: Σ (y - e)² / σ² over Σ v / σ², where y is read, σ² the variance of the noise, and e and v mean and
+      variance of the clipped reading, as `losses.fit_figures` has it in training.
+    - chi2_held_out_both: the same with the variance of the model's own error (`model_error`) added to σ²: 1 where the
+      two errors together are as large as stated, and spread so. Missing where that error was not learnt.
 
-    Both are missing where no scored frame shows the target.
+    Nothing is returned where no scored frame shows the target, or all of it is saturated.
+
+    Args:
+        misfit: the model's own error as a share of the light; None: not learnt.
     """
-    shares = {"chi2_held_out": 0.0} | ({} if misfit is None else {"chi2_held_out_both": misfit})
-    squares, expected = dict.fromkeys(shares, 0.0), dict.fromkeys(shares, 0.0)
+    keys = ("chi2_held_out",) if misfit is None else ("chi2_held_out", "chi2_held_out_both")
+    squares, expected = dict.fromkeys(keys, 0.0), dict.fromkeys(keys, 0.0)
     for frame in scored:
         rendered = render(gaussians, cameras_of([frame]))
         on_target = rendered.alpha[0].squeeze(-1) > ON_TARGET_ALPHA
         exposure_s = torch.tensor(frame.exposure_time_s)
         prediction = sensor.predicted(rendered.radiance, exposure_s)
-        for key, share in shares.items():
-            error = model_error(rendered.radiance, exposure_s, sensor, 1, share)
-            variance = (prediction.variance_dn2 + error.variance_dn2(prediction, sensor))[0][on_target]
+        variances = [prediction.variance_dn2]
+        if misfit is not None:
+            error = model_error(rendered.radiance, exposure_s, sensor, 1, misfit)
+            variances.append(prediction.variance_dn2 + error.variance_dn2(prediction, sensor))
+        for key, variance in zip(keys, (each[0][on_target] for each in variances), strict=True):
             mean, clipped = clipped_moments(
                 prediction.expected_dn[0][on_target], variance.sqrt(), sensor.white_dn
             )
             squares[key] += ((frame.dn[on_target] - mean).square() / variance).sum().item()
             expected[key] += (clipped / variance).sum().item()
-    return {key: squares[key] / expected[key] for key in shares if expected[key] > 0}
+    if not all(expected.values()):
+        return {}
+    return {key: squares[key] / expected[key] for key in keys}

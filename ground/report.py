@@ -151,8 +151,8 @@ def _details(m: dict) -> list[tuple[str, str]]:
         "completeness_mesh": f"true surface within {COMPLETENESS_RADIUS} of model.glb, %",
         "completeness_shown_mesh": "… of the part that the frames show, %",
         "accuracy_mesh": "mean distance from model.glb to the true surface",
-        "chi2_held_out": "chi² of held-out frames over the variance of their noise",
-        "chi2_held_out_both": "… of the noise and the model's own error, as it was learnt (1: both explain the frames)",
+        "chi2_held_out": "chi² of held-out frames: squared error over the variance of the noise",
+        "chi2_held_out_both": "… over that of noise and the model's own error together (1: errors as large as stated)",
         "surface_shown": "part of the true surface that the frames show: in view, and above their noise, %",
     }
     return [

@@ -19,7 +19,7 @@ Point = tuple[float, float, float]
 
 
 def truss() -> list[Trimesh]:
-    """Return a boom of 96 struts, 4 m long and 2 cm thin, between two boxes."""
+    """Return a boom of 96 struts, 4 m long, each 1.6 or 2.4 cm thin, between two boxes."""
     bays, length = 8, 4.0
     corners = ((0.15, 0.15), (0.15, -0.15), (-0.15, -0.15), (-0.15, 0.15))
     parts = []

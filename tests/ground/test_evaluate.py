@@ -92,8 +92,11 @@ def test_the_first_section_of_the_report_explains_chi2_and_shows_the_foreground(
     page = write_report(session, "run").read_text()
     cards = page[page.index('<div class="cards">') : page.index("<table>")]
     assert f"<b>{metrics['psnr_clean_foreground_db']:.2f} dB</b><span>clean PSNR of the foreground" in cards
-    explained = chi2_explained(metrics["chi2"])
-    assert explained in cards and explained in (session / "runs/run/model_card.md").read_text()
+    explained, card = chi2_explained(metrics["chi2"]), (session / "runs/run/model_card.md").read_text()
+    assert explained in cards and explained in card
+    assert 0 < metrics["chi2_held_out_both"] < metrics["chi2_held_out"]
+    assert f"{metrics['chi2_held_out_both']:.2f} over noise and own error together" in card
+    assert "<td>chi² of held-out frames: squared error" in page
 
 
 @pytest.mark.parametrize(

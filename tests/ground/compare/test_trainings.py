@@ -79,6 +79,17 @@ def test_a_training_that_estimates_its_poses_hands_them_on_and_its_curve_is_meas
         assert not torch.equal(before.world_to_camera, after.world_to_camera)
 
 
+def test_a_training_states_its_errors_where_it_knows_the_exposure(case):
+    ours = trained(case, OURS, Work()).stated_errors
+    assert ours is not None
+    assert {"interval_90_noisy", "interval_90_clean", "chi2_held_out", "chi2_held_out_both"} <= set(
+        ours(case.held_out, case.radiance, ())
+    )
+    theirs = trained(case, PUBLISHED, Work()).stated_errors
+    assert theirs is not None and "chi2_held_out_both" not in theirs(case.held_out, case.radiance, ())
+    assert trained(case, preset("3dgs", {"steps": 3, "start.count": 150}), Work()).stated_errors is None
+
+
 def test_a_time_limit_of_nothing_is_the_untrained_start(case):
     start = trained(case, OURS, Work(), time_limit_s=0.0)
     assert start.figures["steps"] == 0 and not start.figures["converged"]
