@@ -1,6 +1,7 @@
 """Trainings of Gaussians as compared methods: resumable, followed on the way, ended early where they have converged."""
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable, Sequence
 
@@ -23,7 +24,7 @@ from obbgs_core.score.poses import settled_poses
 from obbgs_core.score.surface import surface_positions
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.result import Exposing
+from obbgs_core.train.result import Exposing, TrainResult
 from obbgs_core.train.trainer import CHECKPOINT_EVERY_S, Trainer
 
 CHECKPOINT, MODEL = "training.checkpoint", "model.ply"
@@ -84,13 +85,6 @@ def reconstruct_gaussians(
     if work.folder is not None:
         save_ply(result.gaussians, work.folder / MODEL, sun_dir=frames[0].sun_dir)
     posed = _estimated(frames, result.pose_estimate)
-
-    def stated_errors(
-        scored: list[TrainingFrame], radiance: list[Tensor], calibration: Sequence[TrainingFrame]
-    ) -> dict[str, float]:
-        intervals = interval_scores(result.gaussians, posed, sensor, scored, radiance, calibration)
-        return intervals | stated_error_scores(result.gaussians, sensor, scored, result.misfit)
-
     return Reconstruction(
         points=result.gaussians.means,
         surface=surface_positions(result.gaussians, cameras_of(posed), SURFACE_POINTS, seed),
@@ -109,9 +103,23 @@ def reconstruct_gaussians(
             "poses": result.poses,
         },
         # the images of other methods need more than a radiance and an exposure time
-        stated_errors=stated_errors if config.exposure_aware and not config.compensation else None,
+        stated_errors=functools.partial(_stated_errors, result, posed, sensor)
+        if config.exposure_aware and not config.compensation
+        else None,
         poses=_poses(result.gaussians, sensor, result.pose_estimate),
     )
+
+
+def _stated_errors(
+    result: TrainResult,
+    training: list[TrainingFrame],
+    sensor: Sensor,
+    scored: list[TrainingFrame],
+    radiance: list[Tensor],
+    calibration: Sequence[TrainingFrame],
+) -> dict[str, float]:
+    intervals = interval_scores(result.gaussians, training, sensor, scored, radiance, calibration)
+    return intervals | stated_error_scores(result.gaussians, sensor, scored, result.misfit)
 
 
 def _estimated(frames: list[TrainingFrame], estimate: PoseEstimate | None) -> list[TrainingFrame]:
