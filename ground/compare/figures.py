@@ -64,13 +64,13 @@ def _plain(colour: str) -> str:
 
 
 def _speed(results: Results, target: str) -> Figure:
-    figure, colour, score = (
-        Figure(figsize=(11, 4.2), layout="constrained"),
-        _colour_of(results),
-        results.score,
-    )
-    left, right = figure.subplots(1, 2)
-    for axis, key, sign in ((left, score.key, 1.0), (right, "chamfer", -1.0)):
+    colour, score = _colour_of(results), results.score
+    rows = [row for label in results.trained for row in results.of(label, target, results.base)]
+    measured = any("chamfer" in row for row in rows)  # imported pictures have no true surface
+    figure = Figure(figsize=(11 if measured else 5.8, 4.2), layout="constrained")
+    drawn = ((score.key, 1.0), ("chamfer", -1.0)) if measured else ((score.key, 1.0),)
+    axes = figure.subplots(1, len(drawn), squeeze=False)[0]
+    for axis, (key, sign) in zip(axes, drawn, strict=True):
         ends = []
         for label in results.trained:
             for i, row in enumerate(results.of(label, target, results.base)):
@@ -85,8 +85,10 @@ def _speed(results: Results, target: str) -> Figure:
         axis.set(xscale="log", xlabel="seconds of training")
         _ticks_1_2_5(axis)
         axis.grid(alpha=0.3)
+    left = axes[0]
     left.set_title(f"{target}: {score.title}")
-    right.set(title="Chamfer distance of the centres", yscale="log")
+    if measured:
+        axes[1].set(title="Chamfer distance of the centres", yscale="log")
     shown = [label for label in results.labels if label not in results.trained]
     for i, label in enumerate(shown):
         value = results.mean(label, target, results.base, score.key)
@@ -94,7 +96,8 @@ def _speed(results: Results, target: str) -> Figure:
             left.axhline(value, color="0.6", ls="--", lw=0.8)
             place = (0.02 + 0.15 * i, value)  # side by side: black and mean are nearly alike
             left.annotate(label, place, xycoords=("axes fraction", "data"), va="bottom", fontsize=7)
-    left.legend(fontsize=8)
+    if left.get_legend_handles_labels()[0]:
+        left.legend(fontsize=8)
     return figure
 
 

@@ -185,6 +185,16 @@ def test_figures_are_written_as_png(comparison):
     assert all(path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" for path in paths)
 
 
+def test_figures_of_photographs_are_written_without_a_true_surface(tmp_path):
+    rows = Rows(tmp_path)
+    for made in ROWS:
+        figures = {key: value for key, value in made.items() if key not in ("psnr_clean_db", "chamfer")}
+        noisy = {"psnr_noisy_db": 30.0} if "error" not in made else {}
+        rows.add(figures | noisy)
+    rows.add(row("obbgs", target="B", psnr_clean_db=40.0, chamfer=0.02, seconds=60.0))
+    assert {"speed-A.png", "speed-B.png"} <= {path.name for path in write_figures(tmp_path)}
+
+
 def test_the_command_says_what_is_wrong_with_its_arguments(tmp_path):
     arguments = ["compare", "--sessions", str(tmp_path / "no"), "--out", str(tmp_path)]
     done = call("ground", *arguments)
