@@ -18,7 +18,7 @@ from obbgs_core.score.uncertainty import (
     parameter_deviations,
     rendered_deviation,
 )
-from obbgs_core.sensor import Sensor, clipped_moments
+from obbgs_core.sensor import Prediction, Sensor
 
 
 @dataclass(frozen=True)
@@ -139,19 +139,17 @@ def stated_error_scores(
     squares, expected = dict.fromkeys(keys, 0.0), dict.fromkeys(keys, 0.0)
     for frame in scored:
         rendered = render(gaussians, cameras_of([frame]))
-        on_target = rendered.alpha[0].squeeze(-1) > ON_TARGET_ALPHA
+        on_target = rendered.alpha > ON_TARGET_ALPHA
         exposure_s = torch.tensor(frame.exposure_time_s)
-        prediction = sensor.predicted(rendered.radiance, exposure_s)
-        variances = [prediction.variance_dn2]
+        predictions = [sensor.predicted(rendered.radiance, exposure_s)]
         if misfit is not None:
             error = model_error(rendered.radiance, exposure_s, sensor, 1, misfit)
-            variances.append(prediction.variance_dn2 + error.variance_dn2(prediction, sensor))
-        for key, variance in zip(keys, (each[0][on_target] for each in variances), strict=True):
-            mean, clipped = clipped_moments(
-                prediction.expected_dn[0][on_target], variance.sqrt(), sensor.white_dn
-            )
-            squares[key] += ((frame.dn[on_target] - mean).square() / variance).sum().item()
-            expected[key] += (clipped / variance).sum().item()
+            variance = predictions[0].variance_dn2 + error.variance_dn2(predictions[0], sensor)
+            predictions.append(Prediction(predictions[0].expected_dn, variance, variance.sqrt()))
+        for key, prediction in zip(keys, predictions, strict=True):
+            terms = prediction.chi2_terms(frame.dn[None], sensor.white_dn)
+            squares[key] += terms[0][on_target].sum().item()
+            expected[key] += terms[1][on_target].sum().item()
     if not all(expected.values()):
         return {}
     return {key: squares[key] / expected[key] for key in keys}

@@ -186,11 +186,9 @@ def fit_figures(
         misfit = math.sqrt(misfit2)
     else:
         prediction = sensor.predicted(radiance, exposure_time_s)
-        noise = prediction.variance_dn2
-        mean, variance = prediction.clipped_moments(sensor.white_dn)
+        squares, expected = prediction.chi2_terms(dn, sensor.white_dn)
         seen = (alpha > ON_TARGET_ALPHA)[..., None] & ((averaged_pixels == 1) | (dn < sensor.white_dn))
-        squares = averaged_pixels * ((mean - dn).square() / noise)[seen].sum()
-        chi2 = (squares / (variance / noise)[seen].sum()).item()
+        chi2 = (averaged_pixels * squares[seen].sum() / expected[seen].sum()).item()
         visible = prediction.expected_dn.clamp(max=sensor.white_dn)
         mse = ((visible - dn) / sensor.white_dn).square().mean().item()
         misfit = relative_misfit(radiance, exposure_time_s, dn, sensor, averaged_pixels)

@@ -24,6 +24,17 @@ class Prediction:
         """Return mean (DN) and variance (DN²) of the readings clipped at 0 and `white_dn`."""
         return clipped_moments(self.expected_dn, self.sigma_dn, white_dn)
 
+    def chi2_terms(self, dn: Tensor, white_dn: float) -> tuple[Tensor, Tensor]:
+        """Return squared errors of clipped readings and the variance of those readings, both over that of the noise.
+
+        chi² is the sum of the first over the sum of the second: readings near a clip vary less, and weigh less.
+
+        Args:
+            dn: what was read, of the prediction's shape.
+        """
+        mean, variance = self.clipped_moments(white_dn)
+        return (mean - dn).square() / self.variance_dn2, variance / self.variance_dn2
+
 
 @dataclass(frozen=True)
 class Sensor:

@@ -1,7 +1,9 @@
 """Bodies of what the other targets lack, as binary glTF: thin struts, near-black paint, a mirror, near symmetry.
 
-python -m tests.benchmarks.bodies --out bodies
-hil demo --mesh bodies/truss.glb --out demo-truss
+They are made, and the whole loop is flown about one of them, by
+
+    python -m tests.benchmarks.bodies --out bodies
+    hil demo --mesh bodies/truss.glb --out demo-truss
 """
 
 import argparse

@@ -47,7 +47,7 @@ def test_nothing_is_stated_where_no_reading_can_calibrate():
     assert interval_scores(truth, frames, scenes.SENSOR, dark, []) == {}
 
 
-SATURATING_S = 2e-3  # at which a third of the target's readings are full scale
+SATURATING_S = 2e-3  # at which some of the readings are full scale
 
 
 def test_readings_that_err_as_stated_have_a_chi2_of_one():
