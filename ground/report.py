@@ -141,6 +141,8 @@ def _details(m: dict) -> list[tuple[str, str]]:
         "psnr_linear_db": "… of values that are linear in light, dB",
         "psnr_radiance_db": "PSNR of scene-linear radiance (brightest pixel = 1), dB",
         "ssim_clean": "SSIM, clean (structural similarity, 1 is identical)",
+        "chi2_held_out": "chi² of held-out frames: squared error over the variance of the noise",
+        "chi2_held_out_both": "… over that of noise and the model's own error together (1: errors as large as stated)",
         "chamfer": "Chamfer distance of the centres",
         "chamfer_surface": "Chamfer distance of the points in surface.ply",
         "hausdorff": "Hausdorff distance of the centres (the largest error, both ways)",
@@ -151,8 +153,6 @@ def _details(m: dict) -> list[tuple[str, str]]:
         "completeness_mesh": f"true surface within {COMPLETENESS_RADIUS} of model.glb, %",
         "completeness_shown_mesh": "… of the part that the frames show, %",
         "accuracy_mesh": "mean distance from model.glb to the true surface",
-        "chi2_held_out": "chi² of held-out frames: squared error over the variance of the noise",
-        "chi2_held_out_both": "… over that of noise and the model's own error together (1: errors as large as stated)",
         "surface_shown": "part of the true surface that the frames show: in view, and above their noise, %",
     }
     return [
