@@ -8,7 +8,10 @@ import math
 import re
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+
+import torch
 
 from ground.arrivals import Arrivals
 from ground.cameras import sensor_of
@@ -23,6 +26,8 @@ from ground.uplink import is_listening
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.frames import FEWEST_FRAMES
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.joining import check_joinable
 from obbgs_core.train.presets import preset
@@ -38,7 +43,7 @@ JOIN_STEPS = 60  # at least, from frames that join to the next
 JOIN_PAUSE = 3.0
 LOOK_S, STATUS_S, SHOW_S, SAVE_S = 0.5, 1.0, 5.0, 20.0  # between two looks, statuses, models and checkpoints
 LAST_SHOW_S = 2.0  # between two models once the pass is over, when operators wait for them
-SHOW_PAUSE = 10.0  # at least so many times what comparing the last one took, from one model to the next
+SHOW_PAUSE = 3.0  # at least so many times what comparing the last one took, until the next is compared
 WAIT_S = 0.1  # where there is nothing to train
 CHECKPOINT = re.compile(r"live-(\d+)\.checkpoint", re.ASCII)  # with the number of frames that have joined
 
@@ -151,6 +156,10 @@ class LiveReconstruction:
         self._joined = self._joined_step = self._saved_step = 0
         self._joined_s = self._joining_s = 0.0
         self._looks, self._shows, self._reports, self._saves = map(_Every, (LOOK_S, SHOW_S, STATUS_S, SAVE_S))
+        self._comparing = ThreadPoolExecutor(1, "comparing", torch.set_num_threads, (1,))
+        self._offer: Future[float] | None = (
+            None  # of a model that is being compared, with the time that took, s
+        )
 
     @property
     def steps(self) -> int:
@@ -262,14 +271,33 @@ class LiveReconstruction:
         self._joining_s = self._joined_s - began_s
 
     def _show(self, trainer: Trainer) -> None:
-        """Renew the shown model if it is better now, and send it up if that is asked for and worth it."""
-        if self.steps and self.shown.offered_step != self.steps:
-            began_s = time.monotonic()
-            self.shown.offer(trainer.gaussians, self.steps, trainer.pose_estimate)
-            self._shows.pause(SHOW_PAUSE * (time.monotonic() - began_s))
+        """Renew the shown model if one of some steps ago is better; send it up if that is asked for and worth it.
+
+        Models are compared in a thread of their own, so that training does not wait for it where a core is free.
+        """
+        if self._offer is not None:
+            if not self._offer.done():
+                return
+            self._shows.pause(SHOW_PAUSE * self._offer.result())
+            self._offer = None
+        elif self.steps and self.shown.offered_step != self.steps:
+            model = trainer.gaussians.trainable().detach()  # a copy: training goes on in place
+            self._offer = self._comparing.submit(self._compared, model, self.steps, trainer.pose_estimate)
+            return
         arrivals, is_past_start = self.arrivals, trainer.share >= HOLD
         if self._uplink is not None and is_past_start and arrivals.session is not None:
             self._uplink.follow(self.shown, arrivals.session, arrivals.training, self._part)
+
+    def _compared(self, model: Gaussians, step: int, estimate: PoseEstimate | None) -> float:
+        """Show a model unless the shown one is better, and return the time that took, s."""
+        began_s = time.monotonic()
+        self.shown.offer(model, step, estimate)
+        return time.monotonic() - began_s
+
+    def end_comparing(self) -> None:
+        """Wait for the model that is being compared, if there is one."""
+        if self._offer is not None:
+            self._offer.result()
 
     def report(self, state: State, message: str) -> None:
         arrivals, shown, trainer = self.arrivals, self.shown, self.trainer
@@ -322,6 +350,7 @@ class LiveReconstruction:
         """
         trainer, session = self.trainer, self.arrivals.session
         assert trainer is not None and session is not None  # the pass has ended with a training
+        self.end_comparing()
         result = trainer.result(f"{self._over}; {self.steps} steps while {self._joined} frames came")
         self.shown.offer(result.gaussians, self.steps, result.pose_estimate)
         self.report("finished", self._over)

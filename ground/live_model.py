@@ -12,6 +12,7 @@ from ground.cameras import cameras_of, median_sun_direction, predicted_image, se
 from ground.estimated_poses import settled_records, write_estimate
 from ground.model_files import exposure_times_s
 from ground.runs import is_live
+from ground.session import FrameRecord
 from obbgs_core.io.ply import save_ply
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.pose_estimate import PoseEstimate
@@ -44,14 +45,14 @@ class ShownModel:
 
         estimate: of the poses that the model was trained with; None: they are as tagged.
         """
-        self.offered_step, offered_db = step, self.score_db(gaussians, estimate)
+        self.offered_step, held_out = step, self._arrivals.held_out  # the frames that have come by now
+        offered_db = self._score_db(gaussians, estimate, held_out)
         if self.gaussians is not None:
-            if len(self._arrivals.held_out) != self._scored_frames:
-                self.held_out_db = self.score_db(self.gaussians, self.estimate)
-            self._scored_frames = len(self._arrivals.held_out)
+            if len(held_out) != self._scored_frames:
+                self.held_out_db = self._score_db(self.gaussians, self.estimate, held_out)
+            self._scored_frames = len(held_out)
             if self.held_out_db > offered_db:
                 return False
-        gaussians = gaussians.trainable().detach()  # a copy: training goes on in place
         try:
             self._write(gaussians, estimate)
         except OSError as error:  # a full disk must not end the training
@@ -59,7 +60,7 @@ class ShownModel:
             return False
         self.gaussians, self.step, self.held_out_db = gaussians, step, offered_db
         self.estimate = estimate
-        self._scored_frames = len(self._arrivals.held_out)
+        self._scored_frames = len(held_out)
         return True
 
     def score_db(self, gaussians: Gaussians, estimate: PoseEstimate | None) -> float:
@@ -67,7 +68,12 @@ class ShownModel:
 
         Where poses are estimated with the model, a few of them are seen from where their own pictures settle.
         """
-        session, held_out = self._arrivals.session, self._arrivals.held_out
+        return self._score_db(gaussians, estimate, self._arrivals.held_out)
+
+    def _score_db(
+        self, gaussians: Gaussians, estimate: PoseEstimate | None, held_out: list[FrameRecord]
+    ) -> float:
+        session = self._arrivals.session
         if session is None or not held_out:
             return math.nan
         sensor, values = sensor_of(session.camera), []

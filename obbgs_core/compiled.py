@@ -8,6 +8,8 @@ portable.
 import contextlib
 import functools
 import os
+import threading
+import weakref
 from collections.abc import Iterator
 
 import torch
@@ -52,6 +54,9 @@ def kernels() -> tuple[str, ...]:
 
 
 _threads = 0  # of the compiled module; 0: as many as PyTorch's
+_outer = 0  # PyTorch's before it was held to one
+_held = 0  # by so many
+_lock = threading.RLock()
 
 
 def threads() -> int:
@@ -66,14 +71,38 @@ def torch_on_one_thread() -> Iterator[None]:
     A step of a training takes hundreds of operations on some ten thousand numbers each, which are over before another
     thread is awake: with two threads waking them a step took up to a third longer than with one. The compiled module
     decides loop by loop whether there is enough for another thread. Both numbers are those of the whole process: where
-    two of its threads train at once, one may set back what the other needs, which costs time and changes no result.
+    two of its threads train at once, one may keep the other's operations on one thread for longer, which costs time and
+    changes no result.
     """
-    global _threads
-    outer, torch_threads = _threads, torch.get_num_threads()
-    _threads = threads()
-    torch.set_num_threads(1)
+    _hold()
     try:
         yield
     finally:
-        torch.set_num_threads(torch_threads)
-        _threads = outer
+        _let_go()
+
+
+def keep_torch_on_one_thread(owner: object) -> None:
+    """Do as `torch_on_one_thread` for as long as an object exists.
+
+    For what another thread computes: a number of threads that changes meanwhile would change the order of its sums.
+    """
+    _hold()
+    weakref.finalize(owner, _let_go)
+
+
+def _hold() -> None:
+    global _threads, _outer, _held
+    with _lock:
+        if _held == 0:
+            _outer, _threads = torch.get_num_threads(), threads()
+        _held += 1
+    torch.set_num_threads(1)
+
+
+def _let_go() -> None:
+    global _threads, _held
+    with _lock:
+        _held -= 1
+        if _held == 0:
+            torch.set_num_threads(_outer)
+            _threads = 0

@@ -60,8 +60,9 @@ class Batches:
         """Return given frames, averaged to `scale` (1 / whole number) of their size, or windows of one size of them."""
         factor = round(1 / scale)
         if factor not in self._images:
-            self._images[factor] = [averaged(f.dn, factor, self.white_dn) for f in self.frames]
-            self._sky_shares[factor] = self._sky_shares_at(factor)
+            images = [averaged(f.dn, factor, self.white_dn) for f in self.frames]
+            self._sky_shares[factor] = self._sky_shares_at(images[0].shape[:2], factor)
+            self._images[factor] = images  # last: another thread may ask meanwhile
         cameras, share, shown = self._shown(indices, factor)
 
         def stacked(images: list[Tensor]) -> Tensor:
@@ -91,9 +92,9 @@ class Batches:
         shown = [(slice(top, bottom), slice(left, right)) for left, top, right, bottom in ends]
         return dataclasses.replace(cameras, K=K, width=width, height=height), share, shown
 
-    def _sky_shares_at(self, factor: int) -> list[Tensor]:
+    def _sky_shares_at(self, size: torch.Size, factor: int) -> list[Tensor]:
         """Return each frame's share of empty sky [H, W]; frames without a silhouette share one image of zeros."""
-        unknown = torch.zeros(self._images[factor][0].shape[:2])
+        unknown = torch.zeros(size)
         shares = {
             i: F.avg_pool2d(sky[None].float(), factor, ceil_mode=True)[0] if factor > 1 else sky.float()
             for i, sky in self.sky.items()

@@ -29,7 +29,7 @@ from obbgs_core.train.growth import (
 )
 from obbgs_core.train.multi_view import crossing_boxes, inside, threshold_factor
 from obbgs_core.train.parsimony import justified
-from obbgs_core.train.poses import HOLDS
+from obbgs_core.train.poses import HELD_AT, HOLDS
 from obbgs_core.train.setup import TrainingSetup
 from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import TrainingState
@@ -150,10 +150,12 @@ def change_number(
 def select_model(setup: TrainingSetup, state: TrainingState) -> None:
     """Prune by BIC and test a higher harmonic degree, when due; a moving Sun and highlights are tested before.
 
-    Where no highlights were found they are tested again once half as many frames again have joined.
+    Where no highlights were found they are tested again once half as many frames again have joined; where poses are
+    refined they are only tested once the poses have settled again.
     """
     config, now = setup.config, state.steps_done + 1
-    settled = now >= round(config.steps_until(HIGHLIGHTS_FROM)) >= FEWEST_STEPS
+    begin = HELD_AT if state.has_joined and state.poses is not None else HIGHLIGHTS_FROM
+    settled = now >= round(config.steps_until(begin)) >= FEWEST_STEPS
     untested = len(setup.frames) >= MORE_FRAMES * state.highlights_frames
     if settled and untested and config.light.highlights and not state.gaussians.has_highlights:
         add_highlights(setup, state)

@@ -112,7 +112,7 @@ def join(
             fresh.poses_decided,
             fresh.holds,
         )
-    state.placed_by = fresh.placed_by
+    state.placed_by, state.round = fresh.placed_by, None
     withhold(joined, state)
     smooth(joined, state)
     state.steps_done, state.average, state.has_joined = position, None, True

@@ -6,12 +6,10 @@ import logging
 import torch
 from torch import Tensor
 
-from obbgs_core.misfit import relative_misfit, sampled
 from obbgs_core.pose_estimate import PoseEstimate
-from obbgs_core.registration import pose_information
-from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.train.adam import learning_rates
 from obbgs_core.train.batches import FrameOrder
+from obbgs_core.train.pose_answers import PoseRound, Question
 from obbgs_core.train.poses import (
     ALIGNED_FROM,
     EARLY_ROUNDS,
@@ -24,7 +22,8 @@ from obbgs_core.train.setup import TrainingSetup
 from obbgs_core.train.state import TrainingState
 
 CELLS = 12  # of the surface along the target's radius
-RENDERED = 6  # frames at a time
+# after which the answer of a round is used, at most: about as many as it takes where a core is free
+ANSWER_STEPS = 16
 # share of the steps after which brackets that do not fit are left out: poses have mostly settled
 MISFIT_FROM = 0.6
 # of the logarithms of the brackets' residuals: median absolute deviations, scaled to those of a normal distribution,
@@ -34,10 +33,24 @@ MISFIT_FACTOR = 6.0  # and the residual as a share of the picture's light is abo
 log = logging.getLogger(__name__)
 
 
-def is_due(setup: TrainingSetup, state: TrainingState, share: float) -> bool:
-    """Return whether the poses move in this step."""
+def advance(setup: TrainingSetup, state: TrainingState, share: float) -> None:
+    """Begin a round where it is time for one, and move the poses by what the round before has found where that is due.
+
+    A round takes as long as some steps, in which training goes on. When its answer is used is counted in steps, not in
+    seconds, so that results do not depend on the machine; until it is there, the training waits for it.
+    """
+    if state.poses is None:
+        return
     begin = ALIGNED_FROM if state.poses_aligned else setup.config.poses.refine_from
-    return state.poses is not None and share >= begin and is_turn(setup, state, share)
+    steps = steps_between(setup, share)
+    delay = min(ANSWER_STEPS, steps - 1)
+    # models are averaged from one round to the next: a round near the end would leave none to average
+    in_time = setup.config.steps - state.steps_done > delay + steps // 2
+    if state.round is None and share >= begin and is_turn(setup, state, share) and in_time:
+        state.round = _begun(setup, state, share, delay)
+    if state.round is not None and len(state.history) >= state.round.answered_at:
+        _move(setup, state, state.round)
+        state.round = None
 
 
 def is_turn(setup: TrainingSetup, state: TrainingState, share: float) -> bool:
@@ -62,28 +75,43 @@ def reach_m(setup: TrainingSetup, share: float) -> float:
     return float(rates["means"]) * steps_between(setup, share)
 
 
-def move(setup: TrainingSetup, state: TrainingState) -> None:
-    """Move the poses to where one frame of each bracket wants them if the surface goes along; settle the gauge.
+def _begun(setup: TrainingSetup, state: TrainingState, share: float, delay: int) -> PoseRound:
+    """Return a round in which one frame of each bracket is asked; the frames of a bracket take turns.
 
-    The frames of a bracket take turns. Where poses were aligned and Gaussians are still added, these go along with the
-    surface. At the first round after `MISFIT_FROM` of the steps, brackets whose residuals stand out are left out of the
-    training for good.
+    delay: in steps, until it is answered.
     """
     poses = state.poses
     assert poses is not None
-    state.pose_rounds += 1
-    state.average = None  # of models at other poses, which may have moved as a whole since
-    share = setup.config.moment(state.steps_done).share
-    turn = state.steps_done // steps_between(setup, share)
     brackets, left_out = [[] for _ in range(len(poses.value))], set(state.misfits)
     for index, bracket in enumerate(poses.of_frame):
         if index not in left_out:
             brackets[bracket].append(index)
     shown = [members for members in brackets if members]
-    residuals = _gather(setup, state, [members[turn % len(members)] for members in shown])
+    turn = state.steps_done // steps_between(setup, share)
     since = state.steps_done - setup.config.steps_until(MISFIT_FROM)
-    if 0 <= since < steps_between(setup, MISFIT_FROM):
-        _leave_out(setup, state, [shown[i] for i in torch.nonzero(standing_out(*residuals))[:, 0].tolist()])
+    return PoseRound(
+        _question(setup, state, [members[turn % len(members)] for members in shown]),
+        shown,
+        answered_at=len(state.history) + delay,
+        judges=0 <= since < steps_between(setup, MISFIT_FROM),
+    )
+
+
+def _move(setup: TrainingSetup, state: TrainingState, asked: PoseRound) -> None:
+    """Move the poses to where one frame of each bracket wants them if the surface goes along; settle the gauge.
+
+    Where poses were aligned and Gaussians are still added, these go along with the surface. At the first round after
+    `MISFIT_FROM` of the steps, brackets whose residuals stand out are left out of the training for good.
+    """
+    poses, answer = state.poses, asked.answer()
+    assert poses is not None
+    state.pose_rounds += 1
+    state.average = None  # of models at other poses, which may have moved as a whole since
+    share = setup.config.moment(state.steps_done).share
+    poses.gather(answer.indices, answer.information)
+    if asked.judges:
+        far = torch.nonzero(standing_out(answer.dispersion, answer.shares))[:, 0]
+        _leave_out(setup, state, [asked.brackets[i] for i in far.tolist()])
     along = state.poses_aligned and share < SURFACE_UNTIL
     reach = cell_m(setup) if along else reach_m(setup, share)
     motion, shifts = poses.step(setup.frames, poses.body_motions(), reach, together=along)
@@ -151,33 +179,15 @@ def estimate(setup: TrainingSetup, state: TrainingState) -> PoseEstimate | None:
     if state.poses is None:
         return None
     shown = fitting(setup, state)
-    _gather(setup, state, shown)
+    state.poses.gather(shown, _question(setup, state, shown).answer().information)
     found = state.poses.estimate(setup.frames).of_frames(shown)
     state.poses.clear()
     return found
 
 
-@torch.no_grad()
-def _gather(setup: TrainingSetup, state: TrainingState, indices: list[int]) -> tuple[Tensor, Tensor]:
-    """Let pictures of the model as it stands say what the frames tell of their poses and of the surface.
-
-    Returns the residual of each [len(indices)]: its mean square in deviations of the noise, and its share of the light.
-    """
-    poses, model = state.poses, state.model.detach()
-    assert poses is not None
-    dispersions, shares = [], []
-    for first in range(0, len(indices), RENDERED):
-        batch = setup.batches.batch(indices[first : first + RENDERED])
-        cameras = poses.cameras(batch.indices, batch.cameras)
-        rendered, slopes = render_with_slopes(model, cameras)
-        images = (rendered.radiance, slopes, rendered.alpha, rendered.depth)
-        readings = (batch.exposure_time_s, batch.dn, setup.sensor, batch.averaged_pixels)
-        told = pose_information(*images, cameras, *readings, cell_m=cell_m(setup))
-        poses.gather(batch.indices, told)
-        dispersions.append(told.dispersion)
-        radiance, dn = sampled(rendered.radiance, batch.dn)
-        for one in range(len(cameras)):
-            at = slice(one, one + 1)
-            seen = (radiance[at], batch.exposure_time_s[at], dn[at])
-            shares.append(relative_misfit(*seen, setup.sensor, batch.averaged_pixels))
-    return torch.cat(dispersions), torch.tensor(shares)
+def _question(setup: TrainingSetup, state: TrainingState, indices: list[int]) -> Question:
+    """Return what frames are asked about the model and their poses as they stand; training may go on meanwhile."""
+    assert state.poses is not None
+    model = state.model.trainable().detach()  # a copy
+    poses = state.poses.corrected(indices)
+    return Question(model, setup.batches, indices, poses, setup.sensor, cell_m(setup))

@@ -26,11 +26,13 @@ from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.neighbours import Neighbours
+from obbgs_core.train.pose_answers import SAVED as ROUND_SAVED
+from obbgs_core.train.pose_answers import PoseRound
 from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 13  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 14  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,7 @@ class TrainingState:
     has_joined: bool = False  # frames have, since the first Gaussians were placed
     # refined poses that the setup was made with, as they were then; None: it was made with the tags
     placed_by: PoseCorrections | None = None
+    round: PoseRound | None = None  # of the poses, under way
     pose_rounds: float = 0.0  # in which the pose of a frame has moved, mean of the frames
     average: Average | None = None  # of the models of the last steps; None: not averaged yet
     smoothing_m: Tensor | None = None  # [N] deviations of the 3D filter; None: the method has none
@@ -189,4 +192,5 @@ SAVED = [
     Neighbours,
     Cameras,
     StepInfo,
+    *ROUND_SAVED,
 ]

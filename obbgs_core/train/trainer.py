@@ -149,8 +149,7 @@ class Trainer:
                 seen = self._compensated(render(state.model, cameras, sunlit=sunlit), batch)
         self._descend(share)
         decisions.decide_poses(setup, state, share)
-        if pose_rounds.is_due(setup, state, share):
-            pose_rounds.move(setup, state)
+        pose_rounds.advance(setup, state, share)
         decisions.change_number(setup, state, batch, residual, moment)
         decisions.select_model(setup, state)
         averaged = share >= config.averaged_from

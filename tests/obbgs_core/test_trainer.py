@@ -98,14 +98,14 @@ def test_a_gaussian_that_is_not_finite_leaves_the_mean_as_well(frames):
 
 
 def test_the_mean_begins_anew_when_poses_move(frames, monkeypatch):
-    move_poses_in(monkeypatch, 8)  # the last round is in the 36th of 40 steps
+    move_poses_in(monkeypatch, 8)  # the last round is answered in the 35th of 40 steps
     tagged = [dataclasses.replace(f, pose_covariance=1e-6 * torch.eye(6).double()) for f in frames]
     config = preset("obbgs", QUICK | {"poses.refine": "always", "averaged_from": 0.8})
     trainer = Trainer(tagged, SENSOR, config, seed=3)
     assert trainer.state.adam.betas == (0.9, 0.999)
     while not trainer.stop_reason():
         trainer.step()
-    assert trainer.state.average is not None and trainer.state.average.steps == 5
+    assert trainer.state.average is not None and trainer.state.average.steps == 6
 
 
 def test_the_mean_begins_anew_when_frames_join(frames):

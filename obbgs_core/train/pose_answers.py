@@ -1,0 +1,106 @@
+"""What pictures of a model say of the poses that they were taken from, asked while the training goes on."""
+
+import dataclasses
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from obbgs_core.compiled import keep_torch_on_one_thread
+from obbgs_core.misfit import relative_misfit, sampled
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.registration import CellInformation, PoseInformation, pose_information
+from obbgs_core.render.slopes import render_with_slopes
+from obbgs_core.sensor import Sensor
+from obbgs_core.train.batches import Batches
+
+RENDERED = 6  # frames at a time
+# of all trainings of this process; the number of threads of PyTorch's operations is one of each thread
+_asking = ThreadPoolExecutor(1, "poses", initializer=torch.set_num_threads, initargs=(1,))
+
+
+@dataclass(frozen=True)
+class Question:
+    """Frames that are asked, and the model and poses that they are asked about.
+
+    indices: of the frames; poses: [B, 4, 4] theirs, world to camera; cell_m: edge of the cells of the surface.
+    """
+
+    model: Gaussians
+    batches: Batches
+    indices: list[int]
+    poses: Tensor
+    sensor: Sensor
+    cell_m: float
+
+    @torch.no_grad()
+    def answer(self) -> "Answer":
+        """Render the model and compare it with the frames' readings."""
+        told, shares = [], []
+        for first in range(0, len(self.indices), RENDERED):
+            batch = self.batches.batch(self.indices[first : first + RENDERED])
+            poses = self.poses[first : first + RENDERED]
+            cameras = dataclasses.replace(batch.cameras, world_to_camera=poses)
+            rendered, slopes = render_with_slopes(self.model, cameras)
+            images = (rendered.radiance, slopes, rendered.alpha, rendered.depth)
+            readings = (batch.exposure_time_s, batch.dn, self.sensor, batch.averaged_pixels)
+            told.append(pose_information(*images, cameras, *readings, cell_m=self.cell_m))
+            radiance, dn = sampled(rendered.radiance, batch.dn)
+            for one in range(len(cameras)):
+                at = slice(one, one + 1)
+                seen = (radiance[at], batch.exposure_time_s[at], dn[at])
+                shares.append(relative_misfit(*seen, self.sensor, batch.averaged_pixels))
+        information = PoseInformation(
+            torch.cat([t.gradient for t in told]),
+            torch.cat([t.curvature for t in told]),
+            [cell for t in told for cell in t.cells or []],
+            self.cell_m,
+        )
+        dispersion = torch.cat([t.dispersion for t in told if t.dispersion is not None])
+        return Answer(self.indices, information, dispersion, torch.tensor(shares))
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What frames say of their poses and of the surface.
+
+    dispersion: [B] their residuals as mean squares in deviations of the noise; shares: [B] as shares of their light.
+    """
+
+    indices: list[int]
+    information: PoseInformation
+    dispersion: Tensor
+    shares: Tensor
+
+
+class PoseRound:
+    """A round of the poses under way: frames are asked in a thread of its own, and the training goes on meanwhile.
+
+    Where a core is free, a round costs no time. Its answer is that of the model at which it began, whenever it comes.
+
+    Args:
+        brackets: indices of the frames, by bracket; one frame of each is asked.
+        answered_at: steps of the training after which the answer is used.
+        judges: whether brackets whose residuals stand out are left out then.
+    """
+
+    def __init__(self, question: Question, brackets: list[list[int]], answered_at: int, judges: bool):
+        self.brackets, self.answered_at, self.judges = brackets, answered_at, judges
+        keep_torch_on_one_thread(self)
+        self._coming: Future[Answer] | Answer = _asking.submit(question.answer)
+
+    def answer(self) -> Answer:
+        """Return what the frames have said, as soon as they have."""
+        return self._coming.result() if isinstance(self._coming, Future) else self._coming
+
+    def __getstate__(self) -> dict:
+        return vars(self) | {"_coming": self.answer()}
+
+
+SAVED = [
+    PoseRound,
+    Answer,
+    PoseInformation,
+    CellInformation,
+]  # the classes that a checkpoint of a round may hold
