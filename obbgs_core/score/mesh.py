@@ -26,10 +26,13 @@ MAX_NODES = 2_000_000  # wider voxels are used if there would be more
 BAND_VOXELS = 1.5  # a view says nothing of what lies deeper than this behind the surface that it sees
 # of each Gaussian in the depth maps: the Gaussians of a face lie in layers, of which the outer ones are nearest to it
 COPIES = 5
-SEEN_THROUGH = 0.15  # of the views that see a place; if so many see past it, it is empty
+SEEN_THROUGH = 0.3  # of the views that see a place; if so many see past it, it is empty
 THICKER_VOXELS = 0.8  # on each side, so that a plate thinner than a voxel is not lost between two nodes
 DRAWN_BACK_VOXELS = 0.6  # of that, when triangles are made; what is left keeps the two sides of a plate apart
 AT_LEAST_SEEING = 2  # views; what fewer see is taken for solid
+IN_FRONT = (
+    0.3  # cosine of the angle between a vertex's normal and the way to a view that decides where it lies
+)
 BLOCK = 8  # nodes along a side that are decided on together first
 FEWEST_NODES = 8  # of a piece that is kept
 FIRST_TOLERANCE_VOXELS = 0.1  # of the simplification
@@ -47,8 +50,9 @@ def surface_mesh(
     Each place of a grid gets its distances from the planes that the views see there, positive in front, and far in
     front where a view sees past it. The distance that SEEN_THROUGH of them exceed is 0 on the surface, also of a thin
     plate, of which half of the views look at the other side. Marching cubes make triangles of the zeros, after hollows
-    that no view sees into were filled, and specks and pieces that no view sees were removed; the triangles are then
-    merged until there are few enough, such that the mesh stays closed.
+    that no view sees into were filled, and specks and pieces that no view sees were removed. Their vertices then go to
+    the middle of what the views in front of them see, and the triangles are merged until there are few enough, such
+    that the mesh stays closed.
 
     Args:
         gaussians: on the CPU, as the cameras.
@@ -84,6 +88,7 @@ def surface_mesh(
         raise ExportError("the views see through all that the model shows: no mesh can be made of it")
     vertices, triangles, inwards, _ = marching_cubes(volume, 0.0)
     vertices = (vertices + DRAWN_BACK_VOXELS * inwards) * voxel_m + (corner + first * voxel_m).numpy()
+    vertices = _where_seen(vertices, -inwards, maps, cameras, voxel_m)
     vertices, triangles = _simplified(vertices, triangles, max_triangles, voxel_m)
     colours, seen_by = _appearance(
         torch.from_numpy(vertices).float(), gaussians, depths, cameras, sun_dir, voxel_m
@@ -136,12 +141,8 @@ def _surely_empty(centres: Tensor, width_m: float, depths: list[Tensor], cameras
 def _fused(places: Tensor, maps: list[tuple[Tensor, Tensor]], cameras: Cameras, voxel_m: float) -> Tensor:
     """Return how far outside of the solid each place [P] is, m, and below 0 inside."""
     in_front = torch.full((len(places), len(cameras)), torch.inf)
-    for c, (depth, slope) in enumerate(maps):
-        z, index, within, from_centre = _on_image(places, cameras.one(c))
-        slope = slope.flatten(0, 1)[index]
-        tilt = slope * (cameras.K[c].diagonal()[:2] / z[:, None])  # of the surface against the image plane
-        along_sight = depth.flatten()[index] + (slope * from_centre).sum(dim=1) - z
-        distance = along_sight / (1 + tilt.square().sum(dim=1)).sqrt()
+    for c, depth_and_slope in enumerate(maps):
+        distance, within = _in_front(places, depth_and_slope, cameras.one(c))
         in_front[:, c] = torch.where(
             within & (distance > -BAND_VOXELS * voxel_m), distance.clamp(max=3 * voxel_m), torch.inf
         )
@@ -149,6 +150,42 @@ def _fused(places: Tensor, maps: list[tuple[Tensor, Tensor]], cameras: Cameras, 
     exceeded = ((seeing - 1).clamp(min=0) * (1 - SEEN_THROUGH)).round().long()
     value = in_front.sort(dim=1).values.gather(1, exceeded[:, None])[:, 0]
     return torch.where(seeing >= AT_LEAST_SEEING, value, -3 * voxel_m) - THICKER_VOXELS * voxel_m
+
+
+def _in_front(
+    places: Tensor, depth_and_slope: tuple[Tensor, Tensor], camera: Cameras
+) -> tuple[Tensor, Tensor]:
+    """Return how far in front of the plane that a camera sees there each place [P] is, m, and which it has in view."""
+    depth, slopes = depth_and_slope
+    z, index, within, from_centre = _on_image(places, camera)
+    slope = slopes.flatten(0, 1)[index]
+    tilt = slope * (camera.K[0].diagonal()[:2] / z[:, None])  # of the surface against the image plane
+    along_sight = depth.flatten()[index] + (slope * from_centre).sum(dim=1) - z
+    return along_sight / (1 + tilt.square().sum(dim=1)).sqrt(), within
+
+
+def _where_seen(
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    maps: list[tuple[Tensor, Tensor]],
+    cameras: Cameras,
+    voxel_m: float,
+) -> np.ndarray:
+    """Return the vertices [V, 3] m, moved along their normals to the middle one of the planes that views in front see.
+
+    What a share of the views exceeds is as deep as that share sees: where depths scatter, as on curved even faces, it
+    lies deeper than most of them say.
+    """
+    places, outwards = torch.from_numpy(vertices).float(), torch.from_numpy(normals).float()
+    in_front = torch.full((len(places), len(cameras)), torch.nan)
+    for c, depth_and_slope in enumerate(maps):
+        distance, within = _in_front(places, depth_and_slope, cameras.one(c))
+        cosine = (F.normalize(cameras.centres[c] - places, dim=1) * outwards).sum(dim=1)
+        near = within & (distance.abs() < BAND_VOXELS * voxel_m)
+        in_front[:, c] = torch.where(near & (cosine > IN_FRONT), distance, torch.nan)
+    seeing = in_front.isfinite().sum(dim=1)
+    inwards = torch.where(seeing >= AT_LEAST_SEEING, in_front.nanmedian(dim=1).values, 0.0)
+    return vertices - normals * inwards[:, None].double().numpy()
 
 
 def _without_specks(values: Tensor, nodes: Tensor, voxel_m: float) -> tuple[np.ndarray, Tensor]:
@@ -162,7 +199,8 @@ def _without_specks(values: Tensor, nodes: Tensor, voxel_m: float) -> tuple[np.n
     pieces = _pieces(volume < 0)
     sizes = np.bincount(pieces.ravel())
     # -3 voxels or less where all of a piece is taken for solid because no views say that it is not
-    greatest = ndimage.maximum(volume, pieces, np.arange(len(sizes)))
+    greatest = np.full(len(sizes), -np.inf)
+    np.maximum.at(greatest, pieces.ravel(), volume.ravel())
     volume[(pieces > 0) & ((sizes < FEWEST_NODES) | (greatest < -2 * voxel_m))[pieces]] = voxel_m
     return volume, first
 
@@ -222,15 +260,19 @@ def _appearance(
         shown = dataclasses.replace(gaussians.matt(), shading="sun" if turn else "view")
     shown = lit_from(shown, sun_dir)
     total, seen_by = torch.zeros(len(vertices), gaussians.sh.shape[2]), torch.zeros(len(vertices))
+    covered = torch.zeros(len(vertices))  # sum of the alphas of the pixels that they are seen in
     for c, depth in enumerate(depths):
         camera = cameras.one(c)
         z, index, within, _ = _on_image(vertices, camera)
         seen = within & ((depth.flatten()[index] - z).abs() < SAME_DEPTH_VOXELS * voxel_m)
-        radiance = render(shown, camera).radiance[0].flatten(0, 1)
-        total += torch.where(seen[:, None], radiance[index], 0)
+        picture = render(shown, camera)
+        alpha = picture.alpha.flatten()[index]
+        light = picture.radiance[0].flatten(0, 1)[index] - camera.background * (1 - alpha)[:, None]
+        total += torch.where(seen[:, None], light, 0)
+        covered += torch.where(seen, alpha, 0)
         seen_by += seen
-    known = seen_by > 0
-    colours = total / seen_by.clamp(min=1)[:, None]
+    known = covered > 0
+    colours = total / torch.where(known, covered, 1.0)[:, None]
     if known.any() and not known.all():
         _, nearest = KDTree(vertices[known].numpy()).query(vertices[~known].numpy())
         colours[~known] = colours[known][torch.from_numpy(nearest)]

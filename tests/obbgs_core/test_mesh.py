@@ -16,7 +16,8 @@ from obbgs_core.errors import ExportError
 from obbgs_core.io.mesh import save_mesh
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.mesh import SurfaceMesh
-from obbgs_core.score.mesh import surface_mesh
+from obbgs_core.render import render
+from obbgs_core.score.mesh import _where_seen, surface_mesh
 from tests import readers
 from tests.obbgs_core.test_surface import SIZE, cameras_around, discs, sphere
 
@@ -76,6 +77,38 @@ def test_what_no_view_shows_has_no_mesh():
             surface_mesh(gaussians, cameras_around(4))
     with pytest.raises(ValueError, match="at least 100 triangles"):
         surface_mesh(faint, cameras_around(4), max_triangles=3)
+
+
+def test_the_colour_is_that_of_the_body_and_not_of_what_is_behind_its_outline():
+    around = cameras_around(20)
+    expected = (
+        render(sphere(), around.one(0)).radiance.max().item()
+    )  # in its middle, where nothing shines through
+    for background in (0.0, 2.0):
+        mesh = surface_mesh(sphere(), dataclasses.replace(around, background=background))
+        np.testing.assert_allclose(mesh.colours, expected, rtol=1e-3)
+
+
+def test_vertices_go_to_the_middle_of_what_the_views_in_front_see():
+    above, voxel_m = cameras_around(20), 0.05
+    errors_m = 0.02 * torch.randn(
+        20, generator=torch.Generator().manual_seed(2)
+    )  # one for each view's whole depth
+    maps = []
+    for c, error_m in enumerate(errors_m.tolist()):  # each sees the plane z = 0 a little above or below it
+        R, t = above.world_to_camera[c, :3, :3], above.world_to_camera[c, :3, 3]
+        normal, offset = R[:, 2], (R[:, 2] * t).sum() + error_m  # normal . x = offset, in the camera's axes
+        v, u = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
+        K = above.K[c]
+        tangents = torch.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], torch.ones_like(u)], dim=-1)
+        depth = offset / (tangents @ normal)
+        slope = -(depth**2 / offset)[..., None] * normal[:2] / K[[0, 1], [0, 1]]
+        maps.append((depth, slope))
+    seen = torch.nonzero(above.centres[:, 2] > 0.3 * above.centres.norm(dim=1))[:, 0]
+    vertices = np.random.default_rng(1).uniform(-0.3, 0.3, (50, 3)) * [1, 1, 0] - [0, 0, 0.03]
+    moved = _where_seen(vertices, np.tile([0.0, 0.0, 1.0], (50, 1)), maps, above, voxel_m)
+    np.testing.assert_allclose(moved[:, :2], vertices[:, :2])
+    np.testing.assert_allclose(moved[:, 2], errors_m[seen].median().item(), atol=2e-3)
 
 
 def test_the_colour_is_the_radiance_and_under_lamberts_law_the_albedo(ball):
