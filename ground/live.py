@@ -43,7 +43,7 @@ JOIN_STEPS = 60  # at least, from frames that join to the next
 JOIN_PAUSE = 3.0
 LOOK_S, STATUS_S, SHOW_S, SAVE_S = 0.5, 1.0, 5.0, 20.0  # between two looks, statuses, models and checkpoints
 LAST_SHOW_S = 2.0  # between two models once the pass is over, when operators wait for them
-SHOW_PAUSE = 3.0  # at least so many times what comparing the last one took, until the next is compared
+SHOW_PAUSE = 2.0  # at least so many times what comparing the last one took, until the next is compared
 WAIT_S = 0.1  # where there is nothing to train
 CHECKPOINT = re.compile(r"live-(\d+)\.checkpoint", re.ASCII)  # with the number of frames that have joined
 
@@ -179,7 +179,7 @@ class LiveReconstruction:
             if self.steps != self._saved_step:
                 self.save()
             time.sleep(WAIT_S)
-        if self.trainer is not None and self._shows.due():
+        if self.trainer is not None:
             self._show(self.trainer)
         if self._reports.due():
             self.report("training" if self.trainer else "waiting", "" if self.trainer else self._missing)
@@ -280,6 +280,8 @@ class LiveReconstruction:
                 return
             self._shows.pause(SHOW_PAUSE * self._offer.result())
             self._offer = None
+        elif not self._shows.due():
+            return
         elif self.steps and self.shown.offered_step != self.steps:
             model = trainer.gaussians.trainable().detach()  # a copy: training goes on in place
             self._offer = self._comparing.submit(self._compared, model, self.steps, trainer.pose_estimate)

@@ -73,17 +73,19 @@ def _resettled(
     """Return what `settled` does where the first of the frames, or all, have refined poses.
 
     Where the hull of the tagged poses is not coherent, the others are where the silhouettes' centres put them, else
-    where the shared parameters do. Where all are refined, aligned poses are taken instead if those are more coherent:
-    then the training went astray.
+    where the shared parameters do. Where all are refined and their hull is not coherent, aligned poses are taken if
+    theirs is more so: then the training went astray.
     """
     poses = refined if len(frames) == len(refined.of_frame) else refined.extended(frames)
     posed = seen_from(outlines, poses)
     if not any(o.certain.any() for o in outlines.values()):
         return posed, poses, ""
     if poses is refined:
-        moved, aligned, why = settled(frames, outlines, may_move=True)
-        if aligned is not None and coherence(seen_from(outlines, aligned)) > coherence(posed):
-            return moved, aligned, why
+        reached = coherence(posed)
+        if reached < hull.AGREEMENT:
+            moved, aligned, why = settled(frames, outlines, may_move=True)
+            if aligned is not None and coherence(seen_from(outlines, aligned)) > reached:
+                return moved, aligned, why
     elif coherence(outlines) < hull.AGREEMENT:
         aligned, _ = _aligned(frames, outlines)
         radius_m = hull.radius_m(list(seen_from(outlines, aligned).values()))
