@@ -3,15 +3,14 @@
 This process only reads the session's frames, so that the one that receives them never waits for the training.
 """
 
+import functools
 import logging
 import math
 import re
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from pathlib import Path
-
-import torch
 
 from ground.arrivals import Arrivals
 from ground.cameras import sensor_of
@@ -24,6 +23,7 @@ from ground.runs import check_replaceable, run_folder, unfinished_folder, unfini
 from ground.session import SessionError
 from ground.uplink import is_listening
 from obbgs_base.errors import Interrupted
+from obbgs_core.compiled import Background
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.frames import FEWEST_FRAMES
 from obbgs_core.model.gaussians import Gaussians
@@ -99,6 +99,7 @@ def reconstruct_live(
                     )
         finally:
             live.save()
+            live.close()
         live.finish(should_stop)
     return folder
 
@@ -156,10 +157,9 @@ class LiveReconstruction:
         self._joined = self._joined_step = self._saved_step = 0
         self._joined_s = self._joining_s = 0.0
         self._looks, self._shows, self._reports, self._saves = map(_Every, (LOOK_S, SHOW_S, STATUS_S, SAVE_S))
-        self._comparing = ThreadPoolExecutor(1, "comparing", torch.set_num_threads, (1,))
-        self._offer: Future[float] | None = (
-            None  # of a model that is being compared, with the time that took, s
-        )
+        self._comparing = Background("comparing")
+        # of a model that is being compared, with the time that took, s
+        self._offer: Future[float] | None = None
 
     @property
     def steps(self) -> int:
@@ -284,7 +284,8 @@ class LiveReconstruction:
             return
         elif self.steps and self.shown.offered_step != self.steps:
             model = trainer.gaussians.trainable().detach()  # a copy: training goes on in place
-            self._offer = self._comparing.submit(self._compared, model, self.steps, trainer.pose_estimate)
+            compared = functools.partial(self._compared, model, self.steps, trainer.pose_estimate)
+            self._offer = self._comparing.submit(compared)
             return
         arrivals, is_past_start = self.arrivals, trainer.share >= HOLD
         if self._uplink is not None and is_past_start and arrivals.session is not None:
@@ -296,10 +297,12 @@ class LiveReconstruction:
         self.shown.offer(model, step, estimate)
         return time.monotonic() - began_s
 
-    def end_comparing(self) -> None:
-        """Wait for the model that is being compared, if there is one."""
+    def close(self) -> None:
+        """Wait for the model that is being compared, if there is one, and report what is shown then."""
+        self._comparing.close()
         if self._offer is not None:
             self._offer.result()
+            self.report("training", "")
 
     def report(self, state: State, message: str) -> None:
         arrivals, shown, trainer = self.arrivals, self.shown, self.trainer
@@ -352,7 +355,6 @@ class LiveReconstruction:
         """
         trainer, session = self.trainer, self.arrivals.session
         assert trainer is not None and session is not None  # the pass has ended with a training
-        self.end_comparing()
         result = trainer.result(f"{self._over}; {self.steps} steps while {self._joined} frames came")
         self.shown.offer(result.gaussians, self.steps, result.pose_estimate)
         self.report("finished", self._over)

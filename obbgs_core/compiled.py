@@ -8,13 +8,14 @@ portable.
 import contextlib
 import functools
 import os
-import threading
-import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+Result = TypeVar("Result")
 try:
     from obbgs_core import _rasterizer
 except ImportError:
@@ -54,9 +55,6 @@ def kernels() -> tuple[str, ...]:
 
 
 _threads = 0  # of the compiled module; 0: as many as PyTorch's
-_outer = 0  # PyTorch's before it was held to one
-_held = 0  # by so many
-_lock = threading.RLock()
 
 
 def threads() -> int:
@@ -71,38 +69,42 @@ def torch_on_one_thread() -> Iterator[None]:
     A step of a training takes hundreds of operations on some ten thousand numbers each, which are over before another
     thread is awake: with two threads waking them a step took up to a third longer than with one. The compiled module
     decides loop by loop whether there is enough for another thread. Both numbers are those of the whole process: where
-    two of its threads train at once, one may keep the other's operations on one thread for longer, which costs time and
-    changes no result.
+    two of its threads train at once, one may set back what the other needs, which costs time and changes no result.
     """
-    _hold()
+    global _threads
+    outer, torch_threads = _threads, torch.get_num_threads()
+    _threads = threads()
+    torch.set_num_threads(1)
     try:
         yield
     finally:
-        _let_go()
+        torch.set_num_threads(torch_threads)
+        _threads = outer
 
 
-def keep_torch_on_one_thread(owner: object) -> None:
-    """Do as `torch_on_one_thread` for as long as an object exists.
+class Background:
+    """A thread beside the caller's, for one piece of work at a time.
 
-    For what another thread computes: a number of threads that changes meanwhile would change the order of its sums.
+    PyTorch's operations run on one thread there, so that what they compute does not depend on their number. Where the
+    caller has one thread only, work is done at once, on that.
     """
-    _hold()
-    weakref.finalize(owner, _let_go)
+
+    def __init__(self, name: str):
+        self._executor = ThreadPoolExecutor(1, name, _start_on_one_thread)
+
+    def submit(self, work: Callable[[], Result]) -> Future[Result]:
+        """Begin with some work, or do it at once; its errors are raised with the result, or at once."""
+        if threads() > 1:
+            return self._executor.submit(work)
+        done: Future[Result] = Future()
+        done.set_result(work())
+        return done
+
+    def close(self) -> None:
+        """Wait for what is under way, and end the thread."""
+        self._executor.shutdown()
 
 
-def _hold() -> None:
-    global _threads, _outer, _held
-    with _lock:
-        if _held == 0:
-            _outer, _threads = torch.get_num_threads(), threads()
-        _held += 1
+def _start_on_one_thread() -> None:
+    torch.get_num_threads()  # PyTorch sets a thread's number when it is first asked for; this comes before ours
     torch.set_num_threads(1)
-
-
-def _let_go() -> None:
-    global _threads, _held
-    with _lock:
-        _held -= 1
-        if _held == 0:
-            torch.set_num_threads(_outer)
-            _threads = 0

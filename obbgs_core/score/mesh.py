@@ -28,11 +28,10 @@ BAND_VOXELS = 1.5  # a view says nothing of what lies deeper than this behind th
 COPIES = 5
 SEEN_THROUGH = 0.3  # of the views that see a place; if so many see past it, it is empty
 THICKER_VOXELS = 0.8  # on each side, so that a plate thinner than a voxel is not lost between two nodes
-DRAWN_BACK_VOXELS = 0.6  # of that, when triangles are made; what is left keeps the two sides of a plate apart
+DRAWN_BACK_VOXELS = 0.6  # of that, when triangles are made
 AT_LEAST_SEEING = 2  # views; what fewer see is taken for solid
-IN_FRONT = (
-    0.3  # cosine of the angle between a vertex's normal and the way to a view that decides where it lies
-)
+# cosine of the angle between a vertex's normal and the way to a view that decides where it lies, at least
+IN_FRONT = 0.3
 BLOCK = 8  # nodes along a side that are decided on together first
 FEWEST_NODES = 8  # of a piece that is kept
 FIRST_TOLERANCE_VOXELS = 0.1  # of the simplification

@@ -154,8 +154,9 @@ def select_model(setup: TrainingSetup, state: TrainingState) -> None:
     refined they are only tested once the poses have settled again.
     """
     config, now = setup.config, state.steps_done + 1
-    begin = HELD_AT if state.has_joined and state.poses is not None else HIGHLIGHTS_FROM
-    settled = now >= round(config.steps_until(begin)) >= FEWEST_STEPS
+    settling = state.has_joined and state.poses is not None
+    begin = HELD_AT if settling else HIGHLIGHTS_FROM
+    settled = now >= round(config.steps_until(begin)) >= FEWEST_STEPS and not (settling and state.holds)
     untested = len(setup.frames) >= MORE_FRAMES * state.highlights_frames
     if settled and untested and config.light.highlights and not state.gaussians.has_highlights:
         add_highlights(setup, state)

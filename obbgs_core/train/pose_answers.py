@@ -1,13 +1,13 @@
 """What pictures of a model say of the poses that they were taken from, asked while the training goes on."""
 
 import dataclasses
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from obbgs_core.compiled import keep_torch_on_one_thread
+from obbgs_core.compiled import Background
 from obbgs_core.misfit import relative_misfit, sampled
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.registration import CellInformation, PoseInformation, pose_information
@@ -16,8 +16,7 @@ from obbgs_core.sensor import Sensor
 from obbgs_core.train.batches import Batches
 
 RENDERED = 6  # frames at a time
-# of all trainings of this process; the number of threads of PyTorch's operations is one of each thread
-_asking = ThreadPoolExecutor(1, "poses", initializer=torch.set_num_threads, initargs=(1,))
+_asking = Background("poses")  # of all trainings of this process
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ class Answer:
 class PoseRound:
     """A round of the poses under way: frames are asked in a thread of its own, and the training goes on meanwhile.
 
-    Where a core is free, a round costs no time. Its answer is that of the model at which it began, whenever it comes.
+    Where a core is free, a round takes little time. Its answer is of the model at which it began, whenever it comes.
 
     Args:
         brackets: indices of the frames, by bracket; one frame of each is asked.
@@ -87,7 +86,6 @@ class PoseRound:
 
     def __init__(self, question: Question, brackets: list[list[int]], answered_at: int, judges: bool):
         self.brackets, self.answered_at, self.judges = brackets, answered_at, judges
-        keep_torch_on_one_thread(self)
         self._coming: Future[Answer] | Answer = _asking.submit(question.answer)
 
     def answer(self) -> Answer:

@@ -181,7 +181,7 @@ def test_a_worse_model_is_not_shown(tmp_path):
     writer.add(48)
     live = begun(writer.folder)
     turns(live, end, 40)
-    live.end_comparing()
+    live.close()
     good, model = live.shown.gaussians, (writer.folder / "runs" / "live" / "model.ply").read_bytes()
     assert good is not None and live.shown.held_out_db > 25
     assert not live.shown.offer(dataclasses.replace(good, sh=good.sh + 2), 41)
@@ -204,7 +204,7 @@ def test_where_tags_err_models_are_compared_and_shown_with_the_poses_that_they_w
     writer.add(48)
     live = begun(writer.folder, changes={"poses.refine": "always"})
     turns(live, end, 120)
-    live.end_comparing()
+    live.close()
     trainer, folder = live.trainer, writer.folder / "runs" / "live"
     assert trainer is not None and trainer.pose_estimate is not None
     live.shown.offer(trainer.gaussians, live.steps, trainer.pose_estimate)

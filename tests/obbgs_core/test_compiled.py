@@ -3,6 +3,7 @@
 import ast
 import math
 import re
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -135,3 +136,14 @@ def test_in_a_block_only_the_compiled_module_keeps_the_threads(use_threads):
         assert (torch.get_num_threads(), compiled.threads()) == (1, 3)
         raise RuntimeError
     assert (torch.get_num_threads(), compiled.threads()) == (3, 3)
+
+
+def test_work_beside_the_caller_runs_on_one_thread_of_pytorch_and_at_once_where_there_is_but_one(use_threads):
+    beside = compiled.Background("beside")
+    use_threads(1)
+    assert beside.submit(threading.get_ident).result() == threading.get_ident()
+    use_threads(3)
+    assert beside.submit(threading.get_ident).result() != threading.get_ident()
+    use_threads(4)  # before the thread's first operation
+    assert beside.submit(torch.get_num_threads).result() == 1
+    beside.close()

@@ -1,12 +1,11 @@
 """Rounds of the poses in the background: when they are answered, and that nothing depends on how long that takes."""
 
-import time
+import threading
 
 import numpy as np
 import pytest
 import torch
 
-from obbgs_core import compiled
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.train.pose_answers import Answer, Question
 from obbgs_core.train.presets import preset
@@ -23,40 +22,44 @@ def doubted(monkeypatch) -> list[TrainingFrame]:
 
 
 def test_models_do_not_depend_on_how_long_pictures_take_to_say_what_they_know_of_poses(
-    doubted, monkeypatch, tmp_path
+    doubted, monkeypatch, tmp_path, use_threads
 ):
-    answer, late = Question.answer, []
+    use_threads(1)  # each round is answered before the step goes on
     whole = train(doubted, SENSOR, CONFIG, seed=3)
+    use_threads(3)
+    may_answer, answer, answered = threading.Event(), Question.answer, []
 
-    def slow(question: Question) -> Answer:
-        time.sleep(0.2)
-        late.append(len(question.indices))
+    def held_back(question: Question) -> Answer:
+        assert may_answer.wait(60)
+        answered.append((len(question.indices), torch.get_num_threads()))
         return answer(question)
 
-    monkeypatch.setattr(Question, "answer", slow)
+    monkeypatch.setattr(Question, "answer", held_back)
     first = Trainer(doubted, SENSOR, CONFIG, seed=3)
     while first.state.round is None:
         first.step()
-    assert not late  # the step went on without the answer
-    first.step()
+    first.step()  # without the answer
+    assert not answered and first.state.pose_rounds == 0
+    may_answer.set()
     first.save(tmp_path / "checkpoint")  # which waits for it
-    assert late == [len(doubted)] and first.state.pose_rounds == 0
-    resumed = train(doubted, SENSOR, CONFIG, 3, checkpoint=tmp_path / "checkpoint")
-    while not first.stop_reason():
-        first.step()
-    for name, tensor in whole.gaussians.tensors().items():
-        for other in (first.gaussians, resumed.gaussians):
-            assert torch.equal(tensor, getattr(other, name)), name
-    assert whole.pose_estimate is not None and resumed.pose_estimate is not None
-    np.testing.assert_array_equal(whole.pose_estimate.estimated, resumed.pose_estimate.estimated)
+    assert answered == [(len(doubted), 1)]
+    resumed = Trainer(doubted, SENSOR, CONFIG, seed=3)
+    assert resumed.resume(tmp_path / "checkpoint") and resumed.state.round is not None
+    for trainer in (first, resumed):
+        while not trainer.stop_reason():
+            trainer.step()
+        result = trainer.result("")
+        for name, tensor in whole.gaussians.tensors().items():
+            assert torch.equal(tensor, getattr(result.gaussians, name)), name
+        assert whole.pose_estimate is not None and result.pose_estimate is not None
+        np.testing.assert_array_equal(whole.pose_estimate.estimated, result.pose_estimate.estimated)
 
 
-def test_pytorch_stays_on_one_thread_for_as_long_as_pictures_are_asked(doubted, use_threads):
+def test_an_error_in_the_background_ends_the_training(doubted, monkeypatch, use_threads):
+    def broken(question: Question) -> Answer:
+        raise MemoryError("no room for pictures")
+
     use_threads(3)
-    trainer = Trainer(doubted, SENSOR, CONFIG)
-    while trainer.state.round is None:
-        assert (torch.get_num_threads(), compiled.threads()) == (3, 3)
-        trainer.step()
-    assert (torch.get_num_threads(), compiled.threads()) == (1, 3)
-    del trainer
-    assert (torch.get_num_threads(), compiled.threads()) == (3, 3)
+    monkeypatch.setattr(Question, "answer", broken)
+    with pytest.raises(MemoryError, match="no room for pictures"):
+        train(doubted, SENSOR, CONFIG)
