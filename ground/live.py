@@ -283,8 +283,8 @@ class LiveReconstruction:
         elif not self._shows.due():
             return
         elif self.steps and self.shown.offered_step != self.steps:
-            model = trainer.gaussians.trainable().detach()  # a copy: training goes on in place
-            compared = functools.partial(self._compared, model, self.steps, trainer.pose_estimate)
+            offered = trainer.gaussians.copied(), self.steps, trainer.pose_estimate
+            compared = functools.partial(self._compared, *offered)
             self._offer = self._comparing.submit(compared)
             return
         arrivals, is_past_start = self.arrivals, trainer.share >= HOLD

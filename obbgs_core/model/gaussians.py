@@ -153,6 +153,10 @@ class Gaussians:
         leaves = {n: t.detach().clone().requires_grad_() for n, t in self.parameters().items()}
         return dataclasses.replace(self, **leaves)
 
+    def copied(self) -> "Gaussians":
+        """Return the same values without gradients, in memory of their own: a training changes its own in place."""
+        return self.trainable().detach()
+
     @staticmethod
     def concatenate(parts: "list[Gaussians]") -> "Gaussians":
         tensors = {name: torch.cat([getattr(p, name) for p in parts]) for name in parts[0].tensors()}

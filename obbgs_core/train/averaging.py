@@ -25,7 +25,7 @@ class Average:
         """Return the mean of an average and one more model; of that alone where it has other parameters."""
         now = gaussians.parameters()
         if earlier is None or not earlier.has_shapes_of(now):
-            return Average(gaussians.trainable().detach(), 1)
+            return Average(gaussians.copied(), 1)
         steps, before = earlier.steps + 1, earlier.gaussians.parameters()
         means = {name: before[name].lerp(value.detach(), 1 / steps) for name, value in now.items()}
         return Average(dataclasses.replace(gaussians, **means), steps)

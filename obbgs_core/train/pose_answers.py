@@ -96,9 +96,5 @@ class PoseRound:
         return vars(self) | {"_coming": self.answer()}
 
 
-SAVED = [
-    PoseRound,
-    Answer,
-    PoseInformation,
-    CellInformation,
-]  # the classes that a checkpoint of a round may hold
+# the classes that a checkpoint of a round may hold
+SAVED = [PoseRound, Answer, PoseInformation, CellInformation]

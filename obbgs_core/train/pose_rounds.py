@@ -188,6 +188,5 @@ def estimate(setup: TrainingSetup, state: TrainingState) -> PoseEstimate | None:
 def _question(setup: TrainingSetup, state: TrainingState, indices: list[int]) -> Question:
     """Return what frames are asked about the model and their poses as they stand; training may go on meanwhile."""
     assert state.poses is not None
-    model = state.model.trainable().detach()  # a copy
-    poses = state.poses.corrected(indices)
+    model, poses = state.model.copied(), state.poses.corrected(indices)
     return Question(model, setup.batches, indices, poses, setup.sensor, cell_m(setup))
