@@ -54,7 +54,7 @@ def changes_for(
             raise ValueError(f"--budget must be auto or a number of Gaussians, got {budget!r}")
         changes["growth.max_gaussians"] = int(budget)
         changes["start.count"] = min(changes.get("start.count", config.start.count), int(budget))
-        changes["growth.pixels_per_gaussian"] = 0
+        changes["growth.gaussians_per_root_pixel"] = 0
     if steps is not None:
         changes["steps"] = steps
     return changes

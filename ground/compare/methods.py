@@ -154,7 +154,7 @@ def _training(config: MethodConfig, name: str, time_limit_s: float = float("inf"
         changes = dict(task.settings)
         changes.setdefault("steps", max(1, round(config.steps * task.steps_share)))
         if task.largest is not None:
-            changes |= {"growth.max_gaussians": task.largest, "growth.pixels_per_gaussian": 0}
+            changes |= {"growth.max_gaussians": task.largest, "growth.gaussians_per_root_pixel": 0}
             changes["start.count"] = min(task.largest, changes.get("start.count", config.start.count))
         used = changed(config, changes)
         return Outcome(

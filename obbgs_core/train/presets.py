@@ -82,7 +82,7 @@ PRESETS: dict[str, MethodConfig] = {
             ),
             growth=GrowthSettings(
                 max_gaussians=10_000,
-                pixels_per_gaussian=7,
+                gaussians_per_root_pixel=12,  # detail lies along edges (experiment 084)
                 begin=0.08,
                 end=0.6,
                 interval=24,

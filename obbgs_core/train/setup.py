@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import hashlib
 import logging
+import math
 import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -226,13 +227,13 @@ def _with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Senso
 
 def _limited(config: MethodConfig, lit_pixels: int) -> tuple[MethodConfig, str]:
     """Return the method with no more Gaussians than its budget and the lit pixels allow, and the budget in words."""
-    most, per_gaussian = config.growth.max_gaussians, config.growth.pixels_per_gaussian
+    most, factor = config.growth.max_gaussians, config.growth.gaussians_per_root_pixel
     budget = f"at most {most:,} Gaussians"
-    if per_gaussian and lit_pixels // per_gaussian < most:
-        most = max(1, lit_pixels // per_gaussian)
+    if factor and factor * math.sqrt(lit_pixels) < most:
+        most = max(1, round(factor * math.sqrt(lit_pixels)))
         budget = (
-            f"at most {most:,} Gaussians instead of {config.growth.max_gaussians:,}: one for each "
-            f"{per_gaussian} of the {lit_pixels:,} pixels that are lit in the long exposures"
+            f"at most {most:,} Gaussians instead of {config.growth.max_gaussians:,}: {factor:g} times the square root "
+            f"of the {lit_pixels:,} pixels that are lit in the long exposures"
         )
     log.info("budget: %s", budget)
     growth = dataclasses.replace(config.growth, max_gaussians=most)

@@ -317,7 +317,7 @@ def test_a_budget_in_numbers_is_what_happens_and_a_cap_is_recorded(session):
     config = yaml.safe_load((folder / "config.yaml").read_text())["method"]
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["gaussians"] <= config["growth"]["max_gaussians"] == metrics["max_gaussians"] < asked_for
-    reason = f"at most {metrics['max_gaussians']:,} Gaussians instead of 30,000: one for each 7 of the "
+    reason = f"at most {metrics['max_gaussians']:,} Gaussians instead of 30,000: 12 times the square root of "
     assert metrics["budget"].startswith(reason) and f"budget: {reason}" in (folder / "log").read_text()
     assert dict(model_rows(metrics))["budget"].startswith(reason)
 

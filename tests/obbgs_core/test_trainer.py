@@ -276,19 +276,19 @@ def test_a_model_has_no_more_gaussians_than_the_lit_pixels_of_the_long_exposures
     dark_dn = SENSOR.black_dn + 3 * SENSOR.read_noise_dn
     lit = [uniform_filter(f.dn[..., 0].numpy(), 3) > dark_dn for f in frames if f.exposure_time_s in long_s]
     wanted = QUICK | {"start.count": 100_000, "growth.max_gaussians": 100_000}
-    few = Trainer(frames, SENSOR, preset("obbgs", wanted | {"growth.pixels_per_gaussian": 20}))
+    few = Trainer(frames, SENSOR, preset("obbgs", wanted | {"growth.gaussians_per_root_pixel": 2}))
     assert (
         len(few.state.gaussians)
         <= few.setup.config.growth.max_gaussians
-        == pytest.approx(np.sum(lit) / 20, rel=0.15)
+        == pytest.approx(2 * np.sqrt(np.sum(lit)), rel=0.08)
     )
     assert (
-        f"at most {few.setup.config.growth.max_gaussians:,} Gaussians instead of 100,000: one for each 20"
+        f"at most {few.setup.config.growth.max_gaussians:,} Gaussians instead of 100,000: 2 times the square root"
         in few.setup.budget
     )
     result = few.result("")
     assert result.config == few.setup.config and result.budget == few.setup.budget
-    many = Trainer(frames, SENSOR, preset("obbgs", wanted | {"growth.pixels_per_gaussian": 0}))
+    many = Trainer(frames, SENSOR, preset("obbgs", wanted | {"growth.gaussians_per_root_pixel": 0}))
     assert (
         many.setup.config.growth.max_gaussians == 100_000 and many.setup.budget == "at most 100,000 Gaussians"
     )
