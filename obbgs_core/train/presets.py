@@ -165,8 +165,8 @@ DRAFT_POINTS = 2  # times as many first points in a draft, which has no time to 
 def quality_changes(config: MethodConfig, quality: str) -> dict[str, int]:
     """Return the changes that make a training of a quality: three tenths of the method's steps, or three times as many.
 
-    With three times the steps the model may be three times as large. A draft is as large as ever: it starts with more
-    points, and as often as before in the whole training it grows.
+    With three times the steps the model may be three times as large where so many pixels are lit. A draft is as large
+    as ever: it starts with more points, and as often as before in the whole training it grows.
 
     Raises:
         ValueError: no such quality.

@@ -47,6 +47,7 @@ NOISE_FRAMES = 12  # about so many, spread evenly, by which the noise is measure
 # of the scatter of empty sky over that of the sensor model, or the reverse; frames that fit it have 0.93 to 0.97
 CLEAR_EXCESS = 1.3
 UNSMOOTHED = 1.1  # ratio of the scatter of pixels two apart to that of neighbours; noise has 1.02 to 1.05
+AS_MANY_PICTURES = 35  # long exposures: the lit pixels of fewer count as those of so many (experiment 084)
 EXACT_TAGS = "as tagged (the tags are exact)"
 TOO_FEW_BRACKETS = "as tagged (too few brackets for validation)"
 UNTESTED = ("", EXACT_TAGS, TOO_FEW_BRACKETS)  # of poses whose refinement no validation brackets have decided
@@ -129,7 +130,7 @@ def prepare(
     seen = silhouettes(lit, sensor, known)
     outlines, poses, why = settled(lit, seen, config.poses.refine != "never", refined)
     posed = lit if poses is None else poses.frames(lit)
-    config, budget = _limited(config, sum(int(outline.certain.sum()) for outline in outlines.values()))
+    config, budget = _limited(config, [int(outline.certain.sum()) for outline in outlines.values()])
     gaussians, radius_m, start = first_gaussians(
         posed, list(outlines.values()), sensor, config.start, config.light.sh_degree, rng
     )
@@ -225,15 +226,21 @@ def _with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Senso
     return seen, f"; {changed}"
 
 
-def _limited(config: MethodConfig, lit_pixels: int) -> tuple[MethodConfig, str]:
-    """Return the method with no more Gaussians than its budget and the lit pixels allow, and the budget in words."""
+def _limited(config: MethodConfig, lit_pixels: list[int]) -> tuple[MethodConfig, str]:
+    """Return the method with no more Gaussians than its budget and the lit pixels allow, and the budget in words.
+
+    lit_pixels: of each long exposure. Few pictures show as much detail as many: they count as if they were more.
+    """
     most, factor = config.growth.max_gaussians, config.growth.gaussians_per_root_pixel
     budget = f"at most {most:,} Gaussians"
-    if factor and factor * math.sqrt(lit_pixels) < most:
-        most = max(1, round(factor * math.sqrt(lit_pixels)))
+    pictures = max(len(lit_pixels), AS_MANY_PICTURES)
+    lit = sum(lit_pixels) * pictures // max(1, len(lit_pixels))
+    if factor and factor * math.sqrt(lit) < most:
+        most = max(1, round(factor * math.sqrt(lit)))
         budget = (
             f"at most {most:,} Gaussians instead of {config.growth.max_gaussians:,}: {factor:g} times the square root "
-            f"of the {lit_pixels:,} pixels that are lit in the long exposures"
+            f"of the {lit:,} pixels that {'are' if pictures == len(lit_pixels) else 'would be'} lit in {pictures} long "
+            "exposures"
         )
     log.info("budget: %s", budget)
     growth = dataclasses.replace(config.growth, max_gaussians=most)
