@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from flightsw.icd.mission import ConfigError, ReconstructSection, build, parse_yaml
 from obbgs_core.settings import known_names
 from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.presets import preset, quality_changes
+from obbgs_core.train.presets import budget_changes, preset, quality_changes
 
 
 def all_changes(
@@ -52,9 +52,7 @@ def changes_for(
     if budget != "auto":
         if not (budget.isascii() and budget.isdigit()) or int(budget) == 0:
             raise ValueError(f"--budget must be auto or a number of Gaussians, got {budget!r}")
-        changes["growth.max_gaussians"] = int(budget)
-        changes["start.count"] = min(changes.get("start.count", config.start.count), int(budget))
-        changes["growth.gaussians_per_root_pixel"] = 0
+        changes = budget_changes(config, changes, int(budget))
     if steps is not None:
         changes["steps"] = steps
     return changes

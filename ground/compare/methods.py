@@ -22,7 +22,7 @@ from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import changed, flat
 from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.presets import preset
+from obbgs_core.train.presets import budget_changes, preset
 
 
 @dataclass(frozen=True)
@@ -154,8 +154,7 @@ def _training(config: MethodConfig, name: str, time_limit_s: float = float("inf"
         changes = dict(task.settings)
         changes.setdefault("steps", max(1, round(config.steps * task.steps_share)))
         if task.largest is not None:
-            changes |= {"growth.max_gaussians": task.largest, "growth.gaussians_per_root_pixel": 0}
-            changes["start.count"] = min(task.largest, changes.get("start.count", config.start.count))
+            changes = budget_changes(config, changes, task.largest)
         used = changed(config, changes)
         return Outcome(
             reconstruct_gaussians(

@@ -32,8 +32,8 @@ class GrowthSettings:
     """When and where Gaussians are added, and which are removed; sizes are in the method's unit of length."""
 
     max_gaussians: int = at_least_one(500_000)
-    # above 0: no more Gaussians than so many times the square root of the lit pixels of the long exposures, of which
-    # few count as 35
+    # above 0: no more Gaussians than so many times the square root of the number of pixels that are lit in the long
+    # exposures; fewer than 35 exposures count as 35
     gaussians_per_root_pixel: float = 0.0
     begin: float = fraction(500 / 30_000)  # share of the steps
     # share of the steps from which gradients are recorded, where that is before `begin`

@@ -182,3 +182,10 @@ def quality_changes(config: MethodConfig, quality: str) -> dict[str, int]:
         changes |= {f"growth.{name}": max(1, round(n * factor)) for name, n in intervals.items() if n}
         changes["start.count"] = min(DRAFT_POINTS * config.start.count, growth.max_gaussians)
     return changes
+
+
+def budget_changes(config: MethodConfig, changes: dict[str, Any], gaussians: int) -> dict[str, Any]:
+    """Return changes to a method, and with them that a model has at most so many Gaussians, whatever is lit."""
+    start = min(gaussians, changes.get("start.count", config.start.count))
+    limits = {"growth.max_gaussians": gaussians, "growth.gaussians_per_root_pixel": 0, "start.count": start}
+    return changes | limits

@@ -229,12 +229,12 @@ def _with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Senso
 def _limited(config: MethodConfig, lit_pixels: list[int]) -> tuple[MethodConfig, str]:
     """Return the method with no more Gaussians than its budget and the lit pixels allow, and the budget in words.
 
-    lit_pixels: of each long exposure. Few pictures show as much detail as many: they count as if they were more.
+    lit_pixels: of each long exposure. A few of them show as much detail of the target as many, and count as so many.
     """
     most, factor = config.growth.max_gaussians, config.growth.gaussians_per_root_pixel
     budget = f"at most {most:,} Gaussians"
     pictures = max(len(lit_pixels), AS_MANY_PICTURES)
-    lit = sum(lit_pixels) * pictures // max(1, len(lit_pixels))
+    lit = sum(lit_pixels) * pictures // len(lit_pixels)
     if factor and factor * math.sqrt(lit) < most:
         most = max(1, round(factor * math.sqrt(lit)))
         budget = (

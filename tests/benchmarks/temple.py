@@ -13,40 +13,55 @@ from pathlib import Path
 
 import numpy as np
 
-OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV's camera axes: y up, looking along -z
+from ground.formats.axes import world_to_camera_to_opengl
+from ground.formats.views import Intrinsics, View, image_size
+
+
+def published_views(folder: Path) -> list[View]:
+    """Return the pictures of a folder with their published cameras, by name."""
+    stated = list(folder.glob("*_par.txt"))
+    if len(stated) != 1:
+        raise SystemExit(f"{folder}: expected one file NAME_par.txt, the cameras; found {len(stated)}")
+    views = []
+    for line in sorted(stated[0].read_text().splitlines()[1:]):
+        name, *numbers = line.split()
+        values = np.array(numbers, float)
+        K, pose = values[:9].reshape(3, 3), np.eye(4)
+        pose[:3, :3], pose[:3, 3] = values[9:18].reshape(3, 3), values[18:]
+        lens = Intrinsics(
+            *image_size(folder / name), K[0, 0], K[1, 1], cx_px=K[0, 2] + 0.5, cy_px=K[1, 2] + 0.5
+        )
+        views.append(View(folder / name, pose, lens))
+    return views
 
 
 def convert(folder: Path, out: Path) -> int:
     """Write the pictures and transforms.json to `out` and return how many pictures there are."""
-    (stated,) = folder.glob("*_par.txt")
+    views, frames = published_views(folder), []
     out.mkdir(parents=True, exist_ok=True)
-    frames = []
-    for line in stated.read_text().splitlines()[1:]:
-        name, *numbers = line.split()
-        values = np.array(numbers, float)
-        K, world_to_camera = values[:9].reshape(3, 3), np.eye(4)
-        world_to_camera[:3, :3], world_to_camera[:3, 3] = values[9:18].reshape(3, 3), values[18:]
-        shutil.copyfile(folder / name, out / name)
+    for view in views:
+        shutil.copyfile(view.image, out / view.image.name)
+        lens = view.intrinsics
         frames.append(
             {
-                "file_path": name,
-                "fl_x": K[0, 0],
-                "fl_y": K[1, 1],
-                "cx": K[0, 2] + 0.5,
-                "cy": K[1, 2] + 0.5,
-                "transform_matrix": (np.linalg.inv(world_to_camera) @ OPENGL_AXES).tolist(),
+                "file_path": view.image.name,
+                "w": lens.width,
+                "h": lens.height,
+                "fl_x": lens.fx_px,
+                "fl_y": lens.fy_px,
+                "cx": lens.cx_px,
+                "cy": lens.cy_px,
+                "transform_matrix": world_to_camera_to_opengl(view.world_to_camera).tolist(),
             }
         )
-    size = {"w": 640, "h": 480}
-    (out / "transforms.json").write_text(
-        json.dumps({"camera_model": "PINHOLE", **size, "frames": frames}) + "\n"
-    )
+    tree = {"camera_model": "PINHOLE", "frames": frames}
+    (out / "transforms.json").write_text(json.dumps(tree, indent=1) + "\n")
     return len(frames)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--from", dest="folder", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--from", dest="folder", type=Path, required=True, help="with NAME_par.txt")
+    parser.add_argument("--out", type=Path, required=True, help="the folder to make")
     given = parser.parse_args()
     print(f"{given.out}: {convert(given.folder, given.out)} pictures")

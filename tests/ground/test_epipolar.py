@@ -14,6 +14,7 @@ from ground.formats import epipolar
 from ground.formats.views import FormatError, Intrinsics, PoseSigmas, View
 from ground.session import open_session
 from tests import raycast
+from tests.benchmarks.temple import published_views
 
 SIZE_PX, FOCAL_PX = 200, 470.0
 TEMPLE = Path(__file__).parents[3] / "shared" / "real" / "templeRing"
@@ -151,15 +152,8 @@ def test_import_names_wrong_cameras_and_mends_them_when_told(views, tmp_path, ca
 @pytest.mark.skipif(not TEMPLE.is_dir(), reason="needs the photographs of templeRing")
 def test_some_published_cameras_of_a_real_ring_are_turned():
     """Pictures 6 to 10, 40 and 41, which stand near each other: the latter are turned against their cameras."""
-    given = []
-    lines = sorted((TEMPLE / "templeR_par.txt").read_text().splitlines()[1:])
-    for line in [*lines[5:10], *lines[39:41]]:
-        name, *numbers = line.split()
-        values = np.array(numbers, float)
-        K, pose = values[:9].reshape(3, 3), np.eye(4)
-        pose[:3, :3], pose[:3, 3] = values[9:18].reshape(3, 3), values[18:]
-        lens = Intrinsics(640, 480, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
-        given.append(View(TEMPLE / name, pose, lens))
+    views = published_views(TEMPLE)
+    given = [*views[5:10], *views[39:41]]
     check = epipolar.check_poses(given)
     names = [given[i].image.stem[-4:] for i in check.turned]
     assert names == ["0040", "0041"] and check.contradicting == ()
