@@ -1,16 +1,22 @@
-"""The baseline `nerf`: a neural radiance field, trained on the frames on a CPU (Mildenhall 2020, Müller 2022)."""
+"""The baselines `nerf` and `instant-ngp`: neural radiance fields (Mildenhall 2020, Müller 2022).
 
+`instant-ngp` is as large and trained as long as its authors' own, on a GPU if PyTorch finds one; `nerf` is the same
+method at a size that a CPU can train.
+"""
+
+import dataclasses
 import hashlib
 import io
 import logging
 import math
 import pickle
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from ground.baselines.nerf_field import Field
+from ground.baselines.nerf_field import EncodingSize, Field
 from ground.baselines.nerf_pictures import Nerf
 from ground.baselines.nerf_rays import Occupancy, rays_of
 from ground.baselines.reconstruction import Reconstruction, Work
@@ -23,10 +29,8 @@ from obbgs_core.start.hull import radius_m
 from obbgs_core.start.initialisation import silhouettes
 
 log = logging.getLogger(__name__)
-FORMAT = 1  # of checkpoints; raise it when what they hold changes
-STEPS = 8000
-SAMPLES_PER_STEP = 2**15  # about so many carry a gradient; the number of rays follows from it
-FIRST_RAYS, FEWEST_RAYS, MOST_RAYS = 256, 64, 4096  # of one step
+FORMAT = 2  # of checkpoints; raise it when what they hold changes
+FIRST_RAYS, FEWEST_RAYS = 256, 64  # of one step
 LEARNING_RATE, BETAS, EPSILON = 1e-2, (0.9, 0.99), 1e-15  # of Adam, as published
 NETWORK_DECAY = 1e-6  # L2 penalty on the networks' weights, as published
 WARM_UP_STEPS = 100  # from a hundredth of the rate
@@ -40,6 +44,25 @@ SURFACE_POINTS = 100_000
 FEWEST_PIXELS_ACROSS = 16.0  # of the target; less would leave the encoding no finer level
 
 
+@dataclass(frozen=True)
+class Size:
+    """How large a radiance field is, and how long it is trained.
+
+    samples_per_step: about so many carry a gradient; the number of rays follows from it, up to `most_rays`.
+    """
+
+    steps: int
+    samples_per_step: int
+    most_rays: int
+    encoding: EncodingSize
+
+
+# 16 levels of 2 features cost a CPU twice the time of 8 levels of 4 for the same 32 numbers
+FOR_A_CPU = Size(8000, 2**15, 4096, EncodingSize(levels=8, features=4, table_rows=2**17))
+# the encoding and the samples of a step as published; the steps are those of nerfacc's example for NeRF-synthetic
+AS_PUBLISHED = Size(20_000, 2**18, 32_768, EncodingSize(levels=16, features=2, table_rows=2**19))
+
+
 def reconstruct_nerf(
     frames: list[TrainingFrame],
     sensor: Sensor,
@@ -47,17 +70,20 @@ def reconstruct_nerf(
     work: Work,
     steps_share: float = 1.0,
     exposure_aware: bool = False,
+    size: Size = FOR_A_CPU,
+    device: str = "cpu",
 ) -> Reconstruction:
     """Train a radiance field on frames, and return its images and the surface that it shows the training views.
 
-    The same seed, thread count and machine give the same result bit for bit, also when the training was interrupted or
-    killed and called again with the same folder.
+    On a CPU the same seed, thread count and machine give the same result bit for bit, also when the training was
+    interrupted or killed and called again with the same folder. A GPU adds up in an order of its own.
 
     Args:
         steps_share: of the method's own number of steps.
         exposure_aware: False, as published: the field holds pixel values, and all frames count as exposed for the
             geometric mean of their times. True: it holds radiance, each frame's exposure time and the sensor's gain
             turn it into readings, and a reading at full scale only says "at least this much".
+        device: where it is trained and drawn, as PyTorch names it; frames, images and points are on the CPU.
 
     Raises:
         ValueError: steps_share is not positive and finite.
@@ -68,7 +94,8 @@ def reconstruct_nerf(
     """
     if not 0 < steps_share < math.inf:
         raise ValueError(f"steps_share must be a positive number, got {steps_share}")
-    training = Training(frames, sensor, seed, max(1, round(steps_share * STEPS)), exposure_aware)
+    steps = max(1, round(steps_share * size.steps))
+    training = Training(frames, sensor, seed, steps, exposure_aware, size, torch.device(device))
     checkpoint = None if work.folder is None else work.folder / "nerf.ckpt"
     if checkpoint is not None and training.resume(checkpoint):
         log.info("resumed at step %d of %d", training.steps_done, training.steps)
@@ -96,31 +123,40 @@ class Training:
     """
 
     def __init__(
-        self, frames: list[TrainingFrame], sensor: Sensor, seed: int, steps: int, exposure_aware: bool
+        self,
+        frames: list[TrainingFrame],
+        sensor: Sensor,
+        seed: int,
+        steps: int,
+        exposure_aware: bool,
+        size: Size,
+        device: torch.device,
     ):
         began = time.monotonic()
         usable(frames, exposure_aware)
-        self.steps, self.exposure_aware, self.sensor = steps, exposure_aware, sensor
+        self.steps, self.exposure_aware, self.sensor, self.size = steps, exposure_aware, sensor, size
         radius = radius_m(list(silhouettes(frames, sensor).values()))
         if radius == 0:
             raise ReconstructionError(
                 f"all {len(frames)} frames are black (eclipse, or exposures too short): nothing rises above the noise"
             )
         self.cameras = cameras_of(frames)
-        ranges_m = self.cameras.world_to_camera[:, :3, 3].norm(dim=1)
-        pixels_across = float((2 * radius * self.cameras.K[:, 0, 0] / ranges_m).median())
+        poses, K = self.cameras.world_to_camera, self.cameras.K
+        pixels_across = float((2 * radius * K[:, 0, 0] / poses[:, :3, 3].norm(dim=1)).median())
         pixels_across = max(pixels_across, FEWEST_PIXELS_ACROSS)
+        self.rays_from = dataclasses.replace(
+            self.cameras, world_to_camera=poses.to(device), K=K.to(device), sun_dir=None
+        )
         reference_s = mean_exposure_s(frames)
-        self.exposures = torch.tensor([f.exposure_time_s / reference_s for f in frames])
-        self.signals = torch.stack(
-            [(f.dn - sensor.black_dn) / (sensor.white_dn - sensor.black_dn) for f in frames]
-        )
-        self.saturated = torch.stack([f.dn >= sensor.white_dn for f in frames])
-        self.generator = torch.Generator().manual_seed(seed)
-        field = Field(frames[0].dn.shape[2], not exposure_aware, round(pixels_across), self.generator)
-        self.model = Nerf(
-            field, Occupancy(), radius, 1 / pixels_across, reference_s if exposure_aware else None, sensor
-        )
+        self.exposures = torch.tensor([f.exposure_time_s / reference_s for f in frames], device=device)
+        dn = torch.stack([f.dn for f in frames])
+        self.signals = ((dn - sensor.black_dn) / (sensor.white_dn - sensor.black_dn)).to(device)
+        self.saturated = (dn >= sensor.white_dn).to(device)
+        self.generator = torch.Generator(device).manual_seed(seed)
+        channels, finest_cells = dn.shape[3], round(pixels_across)
+        field = Field(channels, not exposure_aware, size.encoding, finest_cells, self.generator)
+        exposed_s = reference_s if exposure_aware else None
+        self.model = Nerf(field, Occupancy(device), radius, 1 / pixels_across, exposed_s, sensor)
         networks = {"params": field.networks(), "weight_decay": NETWORK_DECAY}
         self.adam = torch.optim.Adam(
             [{"params": [field.encoding.table]}, networks],
@@ -130,7 +166,7 @@ class Training:
             fused=True,
         )
         self.steps_done, self.rays = 0, FIRST_RAYS
-        self.fingerprint = _fingerprint(frames, sensor, seed, steps, exposure_aware)
+        self.fingerprint = _fingerprint(frames, (sensor, seed, steps, exposure_aware, size))
         self.seconds = time.monotonic() - began
 
     def step(self) -> None:
@@ -146,10 +182,11 @@ class Training:
                 self.model.density, self.model.step_length, self.generator, everywhere
             )
         count, height, width, _ = self.signals.shape
-        drawn = torch.randint(count * height * width, (self.rays,), generator=self.generator)
+        random = {"generator": self.generator, "device": self.generator.device}
+        drawn = torch.randint(count * height * width, (self.rays,), **random)
         camera, row, column = drawn // (height * width), drawn // width % height, drawn % width
-        rays = rays_of(self.cameras, camera, row, column, self.model.radius_m)
-        samples = self.model.visible(rays, torch.rand(self.rays, generator=self.generator))
+        rays = rays_of(self.rays_from, camera, row, column, self.model.radius_m)
+        samples = self.model.visible(rays, torch.rand(self.rays, **random))
         colours, _ = self.model.composited(rays, samples)
         true, saturated = self.signals[camera, row, column], self.saturated[camera, row, column]
         if self.exposure_aware:
@@ -164,8 +201,8 @@ class Training:
         if len(samples.ray):
             loss.backward()
             self.adam.step()
-        wanted = round(self.rays * SAMPLES_PER_STEP / max(1, len(samples.ray)))
-        self.rays = min(MOST_RAYS, max(FEWEST_RAYS, wanted, self.rays // 2), 2 * self.rays)
+        wanted = round(self.rays * self.size.samples_per_step / max(1, len(samples.ray)))
+        self.rays = min(self.size.most_rays, max(FEWEST_RAYS, wanted, self.rays // 2), 2 * self.rays)
         self.steps_done += 1
         self.seconds += time.monotonic() - began
 
@@ -210,7 +247,7 @@ class Training:
         if not path.exists():
             return False
         try:
-            saved = torch.load(path, weights_only=True)
+            saved = torch.load(path, map_location="cpu", weights_only=True)
             why = "" if saved["fingerprint"] == self.fingerprint else "belongs to another training or version"
         except (pickle.UnpicklingError, RuntimeError, OSError, EOFError, LookupError, TypeError) as error:
             saved, why = {}, f"is damaged or of another version ({error})"
@@ -222,7 +259,9 @@ class Training:
             return False
         self.model.field.load_state_dict(saved["field"])
         self.adam.load_state_dict(saved["adam"])
-        self.model.occupancy.density, self.model.occupancy.occupied = saved["occupancy"]
+        density, occupied = saved["occupancy"]
+        device = self.generator.device
+        self.model.occupancy.density, self.model.occupancy.occupied = density.to(device), occupied.to(device)
         self.generator.set_state(saved["generator"])
         self.steps_done, self.rays = saved["counts"]
         self.seconds = saved["seconds"]
@@ -235,11 +274,9 @@ def rate_factor(step: int, steps: int) -> float:
     return rise * RATE_DROP ** sum(step >= share * steps for share in RATE_DROPS)
 
 
-def _fingerprint(
-    frames: list[TrainingFrame], sensor: Sensor, seed: int, steps: int, exposure_aware: bool
-) -> str:
+def _fingerprint(frames: list[TrainingFrame], settings: tuple) -> str:
     """Return a digest of everything that a training is given."""
-    digest = hashlib.sha256(repr((FORMAT, sensor, seed, steps, exposure_aware)).encode())
+    digest = hashlib.sha256(repr((FORMAT, *settings)).encode())
     for frame in frames:
         digest.update(repr((frame.exposure_time_s, tuple(frame.dn.shape))).encode())
         for tensor in (frame.dn, frame.world_to_camera, frame.K):

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from obbgs_core.model.sh import sh_basis
 
-LEVELS, FEATURES = (
-    8,
-    4,
-)  # of the encoding; 16 levels of 2 features cost twice the time for the same 32 numbers
 COARSEST_CELLS = 16  # along each axis of the coarsest level, as published
-TABLE_ROWS = 2**17  # of one level, at most; finer levels share rows by hashing
 PRIMES = (1, 2_654_435_761, 805_459_861)  # of the published hash
 FIRST_FEATURE = 1e-4  # features start uniformly within plus and minus this, as published
 WIDTH, GEOMETRY = 64, 16  # neurons of a hidden layer; numbers that the first network passes on
@@ -26,11 +22,22 @@ DIRECTION_COEFFICIENTS = 16  # spherical harmonics up to degree 3, which the aut
 LARGEST_EXPONENT = 15.0  # keeps densities finite
 
 
+@dataclass(frozen=True)
+class EncodingSize:
+    """How many levels an encoding has, how many features each gives, and how many table rows each has at most.
+
+    Finer levels than the rows allow share rows by hashing.
+    """
+
+    levels: int
+    features: int
+    table_rows: int
+
+
 class _WeightedRows(torch.autograd.Function):
     """Sums of weighted table rows, [N, F] = sum over 8 of weights [N, 8] times table[rows [N, 8]].
 
-    The backward pass is a product with the transposed sparse matrix of the weights; PyTorch's own one takes ten times
-    as long on a CPU. There is no gradient by the weights, that is by the positions.
+    There is no gradient by the weights, that is by the positions.
     """
 
     @staticmethod
@@ -43,10 +50,28 @@ class _WeightedRows(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         rows, weights = ctx.saved_tensors
-        starts = np.arange(0, rows.numel() + 1, 8, dtype=np.int32)
-        entries = (weights.numpy().ravel(), rows.numpy().ravel(), starts)
-        matrix = csr_matrix(entries, shape=(len(rows), ctx.table_rows))
-        return torch.from_numpy(matrix.T @ grad_outputs[0].numpy()), None, None
+        gradient_of = scattered if rows.is_cuda else multiplied
+        return gradient_of(rows, weights, grad_outputs[0], ctx.table_rows), None, None
+
+
+def multiplied(rows: Tensor, weights: Tensor, gradient: Tensor, table_rows: int) -> Tensor:
+    """Return the gradient [table_rows, F] of a table as a product with the transposed sparse matrix of the weights.
+
+    PyTorch's own backward pass takes ten times as long on a CPU.
+
+    Args:
+        rows, weights: [N, 8]; gradient: [N, F] by the sums of weighted rows; all on the CPU.
+    """
+    starts = np.arange(0, rows.numel() + 1, 8, dtype=np.int32)
+    entries = (weights.numpy().ravel(), rows.numpy().ravel(), starts)
+    matrix = csr_matrix(entries, shape=(len(rows), table_rows))
+    return torch.from_numpy(matrix.T @ gradient.numpy())
+
+
+def scattered(rows: Tensor, weights: Tensor, gradient: Tensor, table_rows: int) -> Tensor:
+    """Return what `multiplied` does by adding row by row, fast on a GPU, where the order of the sums is by chance."""
+    parts = (weights[:, :, None] * gradient[:, None]).flatten(0, 1)
+    return gradient.new_zeros(table_rows, gradient.shape[1]).index_add_(0, rows.flatten(), parts)
 
 
 class HashEncoding(nn.Module):
@@ -57,25 +82,26 @@ class HashEncoding(nn.Module):
     Source: Müller et al., Instant Neural Graphics Primitives with a Multiresolution Hash Encoding, 2022.
     """
 
-    def __init__(self, finest_cells: int, generator: torch.Generator, table_rows: int = TABLE_ROWS):
+    def __init__(self, size: EncodingSize, finest_cells: int, generator: torch.Generator):
         super().__init__()
-        growth = (max(finest_cells, COARSEST_CELLS) / COARSEST_CELLS) ** (1 / (LEVELS - 1))
-        self.cells = [round(COARSEST_CELLS * growth**level) for level in range(LEVELS)]
-        self.rows = [min((n + 1) ** 3, table_rows) for n in self.cells]
-        features = 2 * torch.rand(sum(self.rows), FEATURES, generator=generator) - 1
+        growth = (max(finest_cells, COARSEST_CELLS) / COARSEST_CELLS) ** (1 / (size.levels - 1))
+        self.cells = [round(COARSEST_CELLS * growth**level) for level in range(size.levels)]
+        self.rows = [min((n + 1) ** 3, size.table_rows) for n in self.cells]
+        self.width = size.levels * size.features
+        features = 2 * _random((sum(self.rows), size.features), generator) - 1
         self.table = nn.Parameter(features * FIRST_FEATURE)
 
     def forward(self, positions: Tensor) -> Tensor:
-        """Return the features [N, LEVELS * FEATURES] at positions [N, 3] in 0..1, float32."""
-        rows = torch.empty(len(positions), LEVELS, 8, dtype=torch.int32)
-        weights = torch.empty(len(positions), LEVELS, 8)
+        """Return the features [N, width] at positions [N, 3] in 0..1, float32."""
+        rows = positions.new_empty(len(positions), len(self.cells), 8, dtype=torch.int32)
+        weights = positions.new_empty(len(positions), len(self.cells), 8)
         first_row = 0
         for level, (cells, count) in enumerate(zip(self.cells, self.rows, strict=True)):
             row, weight = corners(positions, cells, count)
             rows[:, level], weights[:, level] = (row + first_row).T, weight.T
             first_row += count
         features = _WeightedRows.apply(self.table, rows.view(-1, 8), weights.view(-1, 8))
-        return features.view(len(positions), LEVELS * FEATURES)  # pyright: ignore[reportAttributeAccessIssue]
+        return features.view(len(positions), self.width)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def corners(positions: Tensor, cells: int, rows: int) -> tuple[Tensor, Tensor]:
@@ -88,7 +114,8 @@ def corners(positions: Tensor, cells: int, rows: int) -> tuple[Tensor, Tensor]:
     """
     hashed = rows < (cells + 1) ** 3
     strides = PRIMES if hashed else (1, cells + 1, (cells + 1) ** 2)
-    row, weight = torch.zeros(1, len(positions), dtype=torch.int32), torch.ones(1, len(positions))
+    row = positions.new_zeros(1, len(positions), dtype=torch.int32)
+    weight = positions.new_ones(1, len(positions))
     for axis in range(3):
         scaled = positions[:, axis] * cells
         low = scaled.floor().clamp(0, cells - 1)
@@ -107,12 +134,18 @@ class Field(nn.Module):
     Colours lie in 0..1 (sigmoid), or are positive without a bound (exponential).
     """
 
-    def __init__(self, channels: int, bounded: bool, finest_cells: int, generator: torch.Generator):
+    def __init__(
+        self,
+        channels: int,
+        bounded: bool,
+        encoding: EncodingSize,
+        finest_cells: int,
+        generator: torch.Generator,
+    ):
         super().__init__()
         self.bounded = bounded
-        self.encoding = HashEncoding(finest_cells, generator)
-        inputs = LEVELS * FEATURES
-        self.density_layers = _layers((inputs, WIDTH, GEOMETRY), generator)
+        self.encoding = HashEncoding(encoding, finest_cells, generator)
+        self.density_layers = _layers((self.encoding.width, WIDTH, GEOMETRY), generator)
         self.colour_layers = _layers((GEOMETRY + DIRECTION_COEFFICIENTS, WIDTH, WIDTH, channels), generator)
 
     def geometry(self, positions: Tensor) -> tuple[Tensor, Tensor]:
@@ -131,12 +164,17 @@ class Field(nn.Module):
         return [*self.density_layers, *self.colour_layers]
 
 
+def _random(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+    """Return numbers in 0..1 on the generator's device."""
+    return torch.rand(shape, generator=generator, device=generator.device)
+
+
 def _layers(widths: tuple[int, ...], generator: torch.Generator) -> nn.ParameterList:
     """Return the matrices of a network without biases, Glorot-uniform at the start, as the authors have it."""
     matrices = []
     for inputs, outputs in itertools.pairwise(widths):
         limit = math.sqrt(6 / (inputs + outputs))
-        matrices.append(nn.Parameter((2 * torch.rand(inputs, outputs, generator=generator) - 1) * limit))
+        matrices.append(nn.Parameter((2 * _random((inputs, outputs), generator) - 1) * limit))
     return nn.ParameterList(matrices)
 
 

@@ -1,6 +1,7 @@
 """A trained radiance field as a model: its images, and the surface on which its rays end."""
 
 import copy
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -33,7 +34,7 @@ SURFACE_VIEWS = 40  # at most, spread evenly, whose depths are fused
 
 @dataclass(frozen=True)
 class Nerf:
-    """A radiance field in a cube that reaches `radius_m` from the body's origin.
+    """A radiance field in a cube that reaches `radius_m` from the body's origin; cameras and images are on the CPU.
 
     step_length: between samples, in sides of the cube.
     reference_s: None: colours are signals as a fraction of the range from black to full scale. Otherwise they are
@@ -79,7 +80,7 @@ class Nerf:
         pieces = [
             self.composited(rays, self.visible(rays, middle))[0] for rays, middle in self._pieces(camera)
         ]
-        signal = torch.cat(pieces).reshape(camera.height, camera.width, -1)
+        signal = torch.cat(pieces).cpu().reshape(camera.height, camera.width, -1)
         if self.reference_s is not None:
             signal = signal * (exposure_time_s / self.reference_s)
         black = self.sensor.black_dn / self.sensor.white_dn
@@ -87,11 +88,14 @@ class Nerf:
 
     def _pieces(self, camera: Cameras) -> list[tuple[Rays, Tensor]]:
         """Return the rays of all pixels of one camera, row by row, some at a time, and where their samples start."""
+        device = self.occupancy.density.device
+        pose, K = camera.world_to_camera.to(device), camera.K.to(device)
+        camera = dataclasses.replace(camera, world_to_camera=pose, K=K, sun_dir=None)
         pieces = []
-        for pixel in torch.arange(camera.height * camera.width).split(RAYS_AT_ONCE):
+        for pixel in torch.arange(camera.height * camera.width, device=device).split(RAYS_AT_ONCE):
             row, column = pixel // camera.width, pixel % camera.width
             rays = rays_of(camera, torch.zeros_like(pixel), row, column, self.radius_m)
-            pieces.append((rays, torch.full((len(pixel),), MIDDLE)))
+            pieces.append((rays, torch.full_like(row, MIDDLE, dtype=torch.float32)))
         return pieces
 
     @torch.no_grad()
@@ -101,7 +105,7 @@ class Nerf:
         A depth is infinite where a ray loses less, or where the pixel is as dark as the sky. Slopes [H, W, 2] are
         differences of the neighbours' depths.
         """
-        axis = camera.world_to_camera[0, 2, :3]
+        axis = camera.world_to_camera[0, 2, :3].to(self.occupancy.density.device)
         pieces = []
         for rays, middle in self._pieces(camera):
             samples = self.visible(rays, middle)
@@ -110,7 +114,7 @@ class Nerf:
             bright = colours.mean(dim=1) > FAINTEST_SURFACE
             depth = 2 * self.radius_m * distance * (rays.directions @ axis)
             pieces.append(torch.where(bright, depth, torch.inf))
-        depth = torch.cat(pieces).reshape(camera.height, camera.width)
+        depth = torch.cat(pieces).cpu().reshape(camera.height, camera.width)
         return depth, slopes(depth)
 
     def surface(self, cameras: Cameras, count: int, seed: int = 0) -> Tensor:
@@ -130,7 +134,7 @@ def half_depths(optical_depths: Tensor, samples: Samples, count: int, step_lengt
     after = before * torch.exp(-optical_depths)
     crossing = torch.nonzero((before > SURFACE_TRANSMITTANCE) & (after <= SURFACE_TRANSMITTANCE))[:, 0]
     share = (before[crossing] / SURFACE_TRANSMITTANCE).log() / optical_depths[crossing]
-    distance = torch.full((count,), torch.inf)
+    distance = optical_depths.new_full((count,), torch.inf)
     distance[samples.ray[crossing]] = samples.distance[crossing] + (share - MIDDLE) * step_length
     return distance
 

@@ -59,9 +59,9 @@ class Occupancy:
     Source: Müller et al., Instant Neural Graphics Primitives with a Multiresolution Hash Encoding, 2022, appendix C.
     """
 
-    def __init__(self) -> None:
-        self.density = torch.zeros(GRID_CELLS**3)
-        self.occupied = torch.ones(GRID_CELLS**3, dtype=torch.bool)
+    def __init__(self, device: torch.device) -> None:
+        self.density = torch.zeros(GRID_CELLS**3, device=device)
+        self.occupied = torch.ones(GRID_CELLS**3, dtype=torch.bool, device=device)
 
     def update(
         self,
@@ -71,19 +71,21 @@ class Occupancy:
         everywhere: bool,
     ) -> None:
         """Take the density at a random place of all cells, or of a quarter of them and as many occupied ones."""
+        device = generator.device
         if everywhere:
-            cells = torch.arange(len(self.density))
+            cells = torch.arange(len(self.density), device=device)
         else:
             quarter = len(self.density) // 4
-            anywhere = torch.randint(len(self.density), (quarter,), generator=generator)
+            anywhere = torch.randint(len(self.density), (quarter,), generator=generator, device=device)
             occupied = torch.nonzero(self.occupied)[:, 0]
             if len(occupied) > quarter:
-                occupied = occupied[torch.randint(len(occupied), (quarter,), generator=generator)]
+                drawn = torch.randint(len(occupied), (quarter,), generator=generator, device=device)
+                occupied = occupied[drawn]
             cells = torch.cat([anywhere, occupied]).unique()
         corner = torch.stack(
             [cells // GRID_CELLS**2, cells // GRID_CELLS % GRID_CELLS, cells % GRID_CELLS], dim=1
         )
-        positions = (corner + torch.rand(len(cells), 3, generator=generator)) / GRID_CELLS
+        positions = (corner + torch.rand(len(cells), 3, generator=generator, device=device)) / GRID_CELLS
         self.density *= GRID_DECAY
         self.density[cells] = torch.maximum(self.density[cells], density(positions))
         threshold = -math.log1p(-SOLID_ALPHA) / step_length
@@ -91,7 +93,7 @@ class Occupancy:
 
     def crossed(self, rays: Rays, distance: Tensor) -> Tensor:
         """Return which of the places [R, K] at some distances along rays lie in occupied cells."""
-        cell = torch.zeros(distance.shape, dtype=torch.int32)
+        cell = torch.zeros_like(distance, dtype=torch.int32)
         for axis in range(3):  # one axis at a time, since rows of three numbers are slow to work through
             origin, direction = rays.origins[:, axis, None], rays.directions[:, axis, None]
             along = torch.addcmul(origin * GRID_CELLS, distance, direction * GRID_CELLS)
@@ -107,10 +109,10 @@ def march(rays: Rays, occupancy: Occupancy, step_length: float, offset: Tensor) 
     far = torch.maximum(to_low, to_high).amin(dim=1)
     hit = torch.nonzero(far > near)[:, 0]
     if len(hit) == 0:
-        return Samples(hit, torch.zeros(0), torch.zeros(0, 3))
+        return Samples(hit, near[hit], rays.origins[hit])
     near, far, reached = near[hit], far[hit], Rays(rays.origins[hit], rays.directions[hit])
     steps = math.ceil(float((far - near).max()) / step_length)
-    distance = near[:, None] + (torch.arange(steps) + offset[hit, None]) * step_length
+    distance = near[:, None] + (torch.arange(steps, device=near.device) + offset[hit, None]) * step_length
     ray, place = torch.nonzero(
         occupancy.crossed(reached, distance) & (distance < far[:, None]), as_tuple=True
     )
@@ -127,7 +129,7 @@ def transmittances(optical_depths: Tensor, ray: Tensor) -> Tensor:
         ray: [M] index of each sample's ray; samples of a ray stand together, nearest first.
     """
     if len(ray) == 0:
-        return torch.zeros(0)
+        return optical_depths
     # in double precision, since the sums run over all rays
     before = optical_depths.double().cumsum(0) - optical_depths
     first = torch.searchsorted(ray, ray)
@@ -141,4 +143,4 @@ def weights_of(optical_depths: Tensor, ray: Tensor) -> Tensor:
 
 def composited(weights: Tensor, colours: Tensor, ray: Tensor, count: int) -> Tensor:
     """Return the colours [count, C] of rays in front of a black sky, from samples' weights [M] and colours [M, C]."""
-    return torch.zeros(count, colours.shape[1]).index_add(0, ray, weights[:, None] * colours)
+    return colours.new_zeros(count, colours.shape[1]).index_add(0, ray, weights[:, None] * colours)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ground.baselines.mvsnet import reconstruct_mvsnet
-from ground.baselines.nerf import reconstruct_nerf
+from ground.baselines.nerf import AS_PUBLISHED, FOR_A_CPU, Size, reconstruct_nerf
 from ground.baselines.plane_sweep import reconstruct_mvs
 from ground.baselines.reconstruction import Reconstruction, Work
 from ground.baselines.sfm import Pictures, reconstruct_sfm
@@ -116,8 +116,12 @@ MVSNET, UNTRAINED = "mvsnet", "untrained"  # the Gaussians that `obbgs` starts f
 _BASELINES: dict[str, Method] = {
     method.name: method
     for method in (
-        Method("nerf", lambda task: _nerf(task, exposure_aware=False), seeded=True, stepped=True),
-        Method("nerf+exposure", lambda task: _nerf(task, exposure_aware=True), seeded=True, stepped=True),
+        Method("nerf", lambda task: _nerf(task, FOR_A_CPU, False), seeded=True, stepped=True),
+        Method("nerf+exposure", lambda task: _nerf(task, FOR_A_CPU, True), seeded=True, stepped=True),
+        Method("instant-ngp", lambda task: _nerf(task, AS_PUBLISHED, False), seeded=True, stepped=True),
+        Method(
+            "instant-ngp+exposure", lambda task: _nerf(task, AS_PUBLISHED, True), seeded=True, stepped=True
+        ),
         Method("mvs", lambda task: _stereo(task, one_exposure=True)),
         Method("mvs+raw", lambda task: _stereo(task, one_exposure=False)),
         Method("sfm", lambda task: _motion(task, "raw")),
@@ -132,9 +136,12 @@ def _reference(task: Task, images: Callable[[Case, list[TrainingFrame]], list[Te
     return Outcome(Reconstruction(empty, empty, None, 0, 0.0), images(task.case, task.frames))
 
 
-def _nerf(task: Task, exposure_aware: bool) -> Outcome:
-    settings = (task.seed, task.work, task.steps_share, exposure_aware)
-    return Outcome(reconstruct_nerf(task.frames, task.sensor, *settings))
+def _nerf(task: Task, size: Size, exposure_aware: bool) -> Outcome:
+    settings = (task.seed, task.work, task.steps_share, exposure_aware, size)
+    on_gpu = size is AS_PUBLISHED and torch.cuda.is_available()
+    made = reconstruct_nerf(task.frames, task.sensor, *settings, device="cuda" if on_gpu else "cpu")
+    figures = made.figures | {"device": torch.cuda.get_device_name()} if on_gpu else made.figures
+    return Outcome(dataclasses.replace(made, figures=figures))
 
 
 def _stereo(task: Task, one_exposure: bool) -> Outcome:

@@ -12,7 +12,15 @@ from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
 from ground.baselines import nerf, nerf_pictures, nerf_rays
-from ground.baselines.nerf_field import FEATURES, LEVELS, Field, HashEncoding, corners
+from ground.baselines.nerf import AS_PUBLISHED, FOR_A_CPU
+from ground.baselines.nerf_field import (
+    EncodingSize,
+    Field,
+    HashEncoding,
+    corners,
+    multiplied,
+    scattered,
+)
 from ground.baselines.nerf_pictures import half_depths, slopes
 from ground.baselines.nerf_rays import Occupancy, Rays, Samples, composited, march, transmittances, weights_of
 from ground.baselines.reconstruction import Work
@@ -22,7 +30,7 @@ from obbgs_core.frames import cameras_of
 from obbgs_core.score.metrics import psnr_db
 from tests import scenes
 
-SMALL = {"SAMPLES_PER_STEP": 2**12, "MOST_RAYS": 512, "SURFACE_POINTS": 500}
+SMALL = dataclasses.replace(FOR_A_CPU, samples_per_step=2**12, most_rays=512)
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -57,9 +65,9 @@ def test_a_hashed_level_finds_the_rows_of_the_published_hash(cells, log2_rows, s
 
 
 def test_the_gradient_of_the_encoding_is_that_of_plain_indexing():
-    encoding = HashEncoding(60, seeded(), table_rows=2**10)
+    encoding = HashEncoding(EncodingSize(8, 4, 2**10), 60, seeded())
     positions = torch.rand(50, 3, generator=seeded(1))
-    wanted = torch.randn(50, LEVELS * FEATURES, generator=seeded(2))
+    wanted = torch.randn(50, 32, generator=seeded(2))
     encoding(positions).backward(wanted)
     table, first, features = encoding.table.detach().clone().requires_grad_(), 0, []
     for cells, count in zip(encoding.cells, encoding.rows, strict=True):
@@ -71,6 +79,14 @@ def test_the_gradient_of_the_encoding_is_that_of_plain_indexing():
     assert first == len(table)
     torch.testing.assert_close(encoding(positions), plain)
     torch.testing.assert_close(encoding.table.grad, table.grad, rtol=1e-4, atol=1e-5)
+
+
+def test_a_gpu_adds_up_the_gradient_that_a_cpu_multiplies_out():
+    rows = torch.randint(40, (300, 8), generator=seeded(), dtype=torch.int32)
+    weights, gradient = torch.rand(300, 8, generator=seeded(1)), torch.randn(300, 2, generator=seeded(2))
+    torch.testing.assert_close(
+        scattered(rows, weights, gradient, 40), multiplied(rows, weights, gradient, 40)
+    )
 
 
 @given(st.floats(0.0, 20.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.integers(1, 60))
@@ -102,7 +118,7 @@ def test_the_gradient_of_compositing_is_that_of_finite_differences():
 
 
 def test_steps_cover_the_chord_of_a_ray_and_skip_empty_cells():
-    occupancy = Occupancy()
+    occupancy = Occupancy(torch.device("cpu"))
     direction = torch.nn.functional.normalize(torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), dim=1)
     rays = Rays(torch.tensor([[-2.0, 0.5, 0.5], [3.0, -1.0, 0.5]]), direction)
     samples = march(rays, occupancy, 0.01, torch.tensor([0.5, 0.5]))
@@ -137,8 +153,7 @@ def test_the_learning_rate_rises_then_falls_near_the_end():
 
 @pytest.fixture
 def small(monkeypatch, use_threads):
-    for name, value in SMALL.items():
-        monkeypatch.setattr(nerf, name, value)
+    monkeypatch.setattr(nerf, "SURFACE_POINTS", 500)
     monkeypatch.setattr(nerf_pictures, "SURFACE_VIEWS", 8)
     monkeypatch.setattr(nerf_rays, "GRID_CELLS", 24)
     use_threads(1)
@@ -157,7 +172,7 @@ def test_a_field_learns_views_that_it_was_not_shown(small, exposure_aware):
     training, held_out = frames[:34], frames[34:]
     shares = []
     work = Work(on_step=lambda share, seconds, snapshot: shares.append(share))
-    made = nerf.reconstruct_nerf(training, scenes.SENSOR, 0, work, 120 / nerf.STEPS, exposure_aware)
+    made = nerf.reconstruct_nerf(training, scenes.SENSOR, 0, work, 120 / SMALL.steps, exposure_aware, SMALL)
     assert made.image is not None
     reached = psnr(held_out, lambda f: made.image(cameras_of([f]), f.exposure_time_s))
     mean = torch.stack([f.dn for f in training]).mean(0) / scenes.SENSOR.white_dn
@@ -170,17 +185,33 @@ def test_a_field_learns_views_that_it_was_not_shown(small, exposure_aware):
     )  # the target's own points lie about 0.6 m from the origin
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch finds no CUDA device")
+def test_a_gpu_learns_what_a_cpu_does(small):
+    frames = scenes.photographed(scenes.target(), 40, size_px=32, focal_px=60.0)
+    size = dataclasses.replace(AS_PUBLISHED, samples_per_step=2**12, most_rays=512)
+    reached = []
+    for device in ("cpu", "cuda"):
+        made = nerf.reconstruct_nerf(
+            frames[:34], scenes.SENSOR, 0, Work(), 120 / size.steps, True, size, device
+        )
+        assert made.image is not None
+        image = made.image
+        reached.append(psnr(frames[34:], lambda f, image=image: image(cameras_of([f]), f.exposure_time_s)))
+        assert len(made.surface) == 500
+    assert reached[1] == pytest.approx(reached[0], abs=2)
+
+
 def test_an_interrupted_training_goes_on_bit_for_bit(small, tmp_path):
     frames = scenes.photographed(scenes.target(), 12, size_px=24, focal_px=45.0)
-    share = 20 / nerf.STEPS
-    whole = nerf.reconstruct_nerf(frames, scenes.SENSOR, 3, Work(), share, True)
+    share = 20 / SMALL.steps
+    whole = nerf.reconstruct_nerf(frames, scenes.SENSOR, 3, Work(), share, True, SMALL)
     with pytest.raises(Interrupted, match=r"step 1 of 20.*saved"):
-        nerf.reconstruct_nerf(
-            frames, scenes.SENSOR, 3, Work(tmp_path / "work", should_stop=lambda: True), share, True
-        )
+        stopped = Work(tmp_path / "work", should_stop=lambda: True)
+        nerf.reconstruct_nerf(frames, scenes.SENSOR, 3, stopped, share, True, SMALL)
     steps = []
     work = Work(tmp_path / "work", lambda share, seconds, snapshot: steps.append(share))
-    resumed = nerf.reconstruct_nerf(frames, scenes.SENSOR, 3, work, share, True)
+    resumed = nerf.reconstruct_nerf(frames, scenes.SENSOR, 3, work, share, True, SMALL)
     assert len(steps) == 19
     assert whole.image is not None and resumed.image is not None
     camera = cameras_of(frames[:1])
@@ -188,11 +219,15 @@ def test_an_interrupted_training_goes_on_bit_for_bit(small, tmp_path):
     assert torch.equal(whole.surface, resumed.surface)
 
 
+def training_of(frames, seed: int, exposure_aware: bool) -> nerf.Training:
+    return nerf.Training(frames, scenes.SENSOR, seed, 10, exposure_aware, SMALL, torch.device("cpu"))
+
+
 def test_a_checkpoint_of_another_training_or_half_a_file_is_not_used(small, tmp_path, caplog):
     frames = scenes.photographed(scenes.target(), 6, size_px=24, focal_px=45.0)
-    first = nerf.Training(frames, scenes.SENSOR, 0, 10, False)
+    first = training_of(frames, 0, False)
     first.save(tmp_path / "a.ckpt")
-    assert not nerf.Training(frames, scenes.SENSOR, 1, 10, False).resume(tmp_path / "a.ckpt")
+    assert not training_of(frames, 1, False).resume(tmp_path / "a.ckpt")
     assert "another training" in caplog.text and not (tmp_path / "a.ckpt").exists()
     content = (tmp_path / "a.ckpt.unused-1").read_bytes()  # not lost
     (tmp_path / "a.ckpt").write_bytes(content[: len(content) // 2])
@@ -219,7 +254,7 @@ def test_frames_that_allow_no_field_are_refused(small):
 def test_colours_are_bounded_only_where_exposures_are_ignored():
     positions, directions = torch.rand(20, 3), torch.nn.functional.normalize(torch.randn(20, 3), dim=1)
     for bounded in (True, False):
-        field = Field(3, bounded, 40, seeded())
+        field = Field(3, bounded, FOR_A_CPU.encoding, 40, seeded())
         with torch.no_grad():
             field.colour_layers[-1] += 2.0
             colours = field.colour(field.geometry(positions)[1] + 5.0, directions)
@@ -230,7 +265,7 @@ def test_colours_are_bounded_only_where_exposures_are_ignored():
 @pytest.mark.parametrize("exposure_aware", [True, False])
 def test_rays_through_empty_space_only_are_black(small, exposure_aware):
     frames = scenes.photographed(scenes.target(), 4, size_px=24, focal_px=45.0)
-    training = nerf.Training(frames, scenes.SENSOR, 0, 10, exposure_aware)
+    training = training_of(frames, 0, exposure_aware)
     training.model.occupancy.occupied[:] = False
     image = training.model.image(cameras_of(frames[:1]), 1e-4)
     assert torch.equal(image, torch.full_like(image, scenes.SENSOR.black_dn / scenes.SENSOR.white_dn))
