@@ -26,7 +26,7 @@ MAX_NODES = 2_000_000  # wider voxels are used if there would be more
 BAND_VOXELS = 1.5  # a view says nothing of what lies deeper than this behind the surface that it sees
 # of each Gaussian in the depth maps: the Gaussians of a face lie in layers, of which the outer ones are nearest to it
 COPIES = 5
-SEEN_THROUGH = 0.15  # of the views that see a place; if so many see past it, it is empty
+SEEN_THROUGH = 0.2  # of the views that see a place; if so many see past it, it is empty
 THICKER_VOXELS = 0.8  # on each side, so that a plate thinner than a voxel is not lost between two nodes
 DRAWN_BACK_VOXELS = 0.6  # of that, when triangles are made
 AT_LEAST_SEEING = 2  # views; what fewer see is taken for solid
@@ -72,13 +72,13 @@ def surface_mesh(
         raise ExportError(
             "the model has no Gaussian that is brighter than the sky: there is nothing to make a mesh of"
         )
-    maps = [depth_map(solid, cameras.one(c), COPIES) for c in range(len(cameras))]
-    depths = [depth for depth, _ in maps]
-    if not any(depth.isfinite().any() for depth in depths):
+    seen = [depth_map(solid, cameras.one(c), COPIES) for c in range(len(cameras))]
+    maps = [_wider(*depth_and_slope) for depth_and_slope in seen]
+    if not any(depth.isfinite().any() for depth, _ in seen):
         raise ExportError(
             "the model has no opaque surface in any view, so there is nothing to make a mesh of"
         )
-    corner, nodes, voxel_m = _blocks(depths, cameras)
+    corner, nodes, voxel_m = _blocks([depth for depth, _ in maps], cameras)
     if len(nodes) == 0:
         raise ExportError("no surface lies in the images of half of the views: no mesh can be made of it")
     values = torch.cat([_fused(corner + n * voxel_m, maps, cameras, voxel_m) for n in nodes.split(CHUNK)])
@@ -90,7 +90,12 @@ def surface_mesh(
     vertices = _where_seen(vertices, -inwards, maps, cameras, voxel_m)
     vertices, triangles = _simplified(vertices, triangles, max_triangles, voxel_m)
     colours, seen_by = _appearance(
-        torch.from_numpy(vertices).float(), gaussians, depths, cameras, sun_dir, voxel_m
+        torch.from_numpy(vertices).float(),
+        gaussians,
+        [depth for depth, _ in seen],
+        cameras,
+        sun_dir,
+        voxel_m,
     )
     return SurfaceMesh(vertices, triangles, colours, seen_by, len(cameras), gaussians.shading == "lambert")
 
@@ -102,6 +107,23 @@ def _evenly_chosen(cameras: Cameras) -> Cameras:
     return dataclasses.replace(
         cameras, world_to_camera=cameras.world_to_camera[chosen], K=cameras.K[chosen], sun_dir=sun_dir
     )
+
+
+def _wider(depth: Tensor, slopes: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a depth map whose outlines reach one pixel further, at the least depth beside them.
+
+    A strut thinner than a pixel lies in the pixel beside the one it is looked up in for too many views to be kept.
+    What is wide keeps its place, since other views see its edge from the front.
+
+    Args:
+        depth: [H, W] m, infinite where nothing solid is seen; slopes: [H, W, 2] m/px.
+    """
+    around = F.pad(depth, (1, 1, 1, 1), value=torch.inf)
+    beside = torch.stack([around[1:-1, :-2], around[1:-1, 2:], around[:-2, 1:-1], around[2:, 1:-1]]).amin(
+        dim=0
+    )
+    sky = depth.isinf()
+    return torch.where(sky, beside, depth), torch.where(sky[:, :, None], 0.0, slopes)
 
 
 def _blocks(depths: list[Tensor], cameras: Cameras) -> tuple[Tensor, Tensor, float]:
