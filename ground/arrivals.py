@@ -52,6 +52,7 @@ class Arrivals:
             if error.ids:
                 raise
             return False  # the first line is being written
+        self.session.check_body_axes()
         self._bytes_seen = size_bytes
         self._take(self.session)
         return True

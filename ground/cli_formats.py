@@ -198,6 +198,8 @@ def export_command(
     from ground.session import open_session
 
     exporters = {ExportFormat.NERF: export_nerf, ExportFormat.NERFSTUDIO: export_nerfstudio}
-    counts = exporters[format_](open_session(session), out)
+    read = open_session(session)
+    read.check_body_axes()
+    counts = exporters[format_](read, out)
     text = ", ".join(f"{count} {split}" for split, count in counts.items())
     print(json.dumps(counts) if json_ else f"{text} in {out}")

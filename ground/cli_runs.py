@@ -155,10 +155,9 @@ def mesh_command(
     from ground.mesh_files import write_mesh
     from ground.model_files import white_radiance_of
     from ground.runs import open_run
-    from ground.training_frames import split
 
     run = open_run(session, name, out)
-    training = estimated_records(split(run.session)[0], read_estimate(run.folder))
+    training = estimated_records(run.training, read_estimate(run.folder))
     stem = "model" if format_ is MeshFormatName.GLB else "mesh"  # model.ply holds the Gaussians
     path = run.folder / f"{stem}.{format_.value}"
     facts = write_mesh(run.gaussians, run.session, training, path, white_radiance_of(run.session, training))

@@ -23,7 +23,7 @@ from ground.scores import (
     of_similarity,
 )
 from ground.session import FrameRecord
-from ground.training_frames import split, training_frame
+from ground.training_frames import training_frame
 from ground.truth import Truth, read_points
 from obbgs_base.files import write_whole
 from obbgs_core.pose_estimate import PoseEstimate
@@ -118,7 +118,7 @@ def _geometry(run: Run, truth: Truth) -> tuple[dict[str, np.ndarray], np.ndarray
         clouds["_mesh"] = read_mesh_points(run.folder / "model.glb", SURFACE_POINTS)
     if run.session.background:
         return clouds, None
-    training = [training_frame(run.session, truth.posed(record)) for record in split(run.session)[0]]
+    training = [training_frame(run.session, truth.posed(record)) for record in run.training]
     return clouds, shown_points(truth.cloud_m, training, run.sensor)
 
 
@@ -136,7 +136,7 @@ def _interval_figures(
 ) -> dict[str, float]:
     """Return how often the intervals hold that the model states of the held-out frames."""
     radiance = [] if truth is None else [torch.from_numpy(truth.radiance(record)[0]) for record in shown]
-    training = estimated_records(split(run.session)[0], estimate)
+    training = estimated_records(run.training, estimate)
     known, scored = ([training_frame(run.session, r) for r in records] for records in (training, shown))
     return interval_scores(run.gaussians, known, run.sensor, scored, radiance)
 

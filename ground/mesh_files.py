@@ -51,7 +51,15 @@ def read_mesh_points(path: Path, count: int, seed: int = 0) -> np.ndarray:
     try:
         mesh = trimesh.load_scene(path).to_mesh()
         points = trimesh.sample.sample_surface(mesh, count, seed=seed)[0]
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, NotImplementedError) as error:
+    except (
+        OSError,
+        ValueError,
+        LookupError,
+        NameError,
+        TypeError,
+        AttributeError,
+        NotImplementedError,
+    ) as error:
         raise SessionError(f"{path} is damaged: {error}") from error
     return np.asarray(points) @ Z_UP_TO_Y_UP[:3, :3]  # the inverse of a rotation is its transpose
 

@@ -12,13 +12,11 @@ from obbgs_core.sensor import Sensor
 
 POINTS_SHOWN = 15_000  # more make the page larger and the view no clearer
 LEAST_OPACITY = 0.2  # fainter Gaussians would hide the others like fog
-TRACK_RADIUS = 1.6  # of the model's radius: near enough to be seen together
 SMOOTHED = 10  # logged steps
 BINS = 128
 INK, SPACE, SUN = "#1c2733", "#10161e", "#f0b429"
 KNOWN_COLOUR, BLIND_COLOUR = "#1f6feb", "#d1652a"
 EXPOSURE_COLOURS = ("#1f6feb", "#2a9d8f", "#d1652a", "#8e44ad", "#c0392b")
-RADIANCE_SCALE = [[0.0, "#33465c"], [0.5, "#93a8bd"], [1.0, "#fff4d9"]]
 
 
 def training_figure(history: Sequence[dict]) -> go.Figure:
@@ -100,10 +98,6 @@ def running_mean(values: Sequence[float], window: int = SMOOTHED) -> list[float]
     ends = np.arange(1, len(values) + 1)
     starts = np.maximum(0, ends - window)
     return ((total[ends] - total[starts]) / (ends - starts)).tolist()
-
-
-def _xyz(points: np.ndarray) -> dict[str, np.ndarray]:
-    return dict(zip("xyz", points.T, strict=True))
 
 
 def _ticks_1_2_5(values: Iterable[float]) -> list[float]:

@@ -47,6 +47,7 @@ class Run:
 
     folder: Path
     session: Session
+    training: list[FrameRecord]  # the frames that it was trained on
     scored: list[FrameRecord]  # the held-out frames; the training frames where none was held out
     sensor: Sensor
     gaussians: Gaussians
@@ -95,6 +96,7 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
     return Run(
         folder,
         session,
+        training,
         held_out or training,
         sensor_of(session.camera),
         load_ply(folder / "model.ply"),

@@ -151,6 +151,18 @@ class Session:
     registration: Mapping[str, Any] | None  # of photographs: what structure from motion made of them
     attitude_estimated: bool = False  # poses are in axes of the target that were found
 
+    def check_body_axes(self) -> None:
+        """Check that poses are in axes of the target.
+
+        Raises:
+            SessionError: they are in inertial axes, since the target's attitude is unknown.
+        """
+        if self.navigation.attitude == "unknown":
+            raise SessionError(
+                f"{self.path}: the target's attitude is unknown, so its poses are in inertial axes, in which a target "
+                "that turns has no shape; `ground reconstruct` finds the attitude and makes a model"
+            )
+
     @property
     def frames_captured(self) -> int | None:
         """How many frames the spacecraft's last telemetry said were taken; None without telemetry.

@@ -166,7 +166,7 @@ class Training:
             fused=True,
         )
         self.steps_done, self.rays = 0, FIRST_RAYS
-        self.fingerprint = _fingerprint(frames, (sensor, seed, steps, exposure_aware, size))
+        self.fingerprint = _fingerprint(frames, (sensor, seed, steps, exposure_aware, size, device.type))
         self.seconds = time.monotonic() - began
 
     def step(self) -> None:

@@ -157,6 +157,7 @@ def load_case(folder: Path, sector_deg: float = 0.0) -> Case:
         CompareError: no frame is held out, or none is left.
     """
     session = open_session(folder)
+    session.check_body_axes()
     training, held_out = split(session)
     calibrating: list[FrameRecord] = []
     if sector_deg:

@@ -1,6 +1,6 @@
 """The figures of a comparison as PNG files, for papers and pages that cannot hold interactive ones."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +20,17 @@ DPI = 110
 TITLES = {metric.key: metric.title for metric in METRICS}
 
 
-def write_figures(out: Path) -> list[Path]:
+def write_figures(out: Path, asked: Collection[str] = ()) -> list[Path]:
     """Write the figures of a comparison's rows into its folder and return their paths.
+
+    Args:
+        asked: as for `Results`.
 
     Raises:
         CompareError: the rows are damaged.
         OSError: the folder cannot be written.
     """
-    results = Results(Rows(out).rows.values())
+    results = Results(Rows(out).rows.values(), asked)
     if not results.trained:
         return []
     figures: dict[str, Figure] = {

@@ -72,6 +72,7 @@ def session_facts(folder: Path) -> SessionFacts:
         SessionError: it cannot be used.
     """
     session = open_session(folder)
+    session.check_body_axes()
     camera = session.camera
     return SessionFacts(
         folder.resolve(),

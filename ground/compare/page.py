@@ -2,7 +2,7 @@
 
 import html
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
@@ -22,18 +22,25 @@ WORST_SHOWN = 6
 COLUMNS = 5  # pictures in a row
 
 
-def write_page(out: Path) -> Path:
+def write_page(out: Path, asked: Collection[str] = ()) -> Path:
     """Write compare.html into a comparison's folder and return its path.
+
+    Args:
+        asked: as for `Results`.
 
     Raises:
         CompareError: the rows are damaged.
         OSError: the folder cannot be written.
     """
-    results = Results(Rows(out).rows.values())
+    results = Results(Rows(out).rows.values(), asked)
+    replaced = (
+        f" {results.replaced} more of the same names are of other contents." if results.replaced else ""
+    )
     targets = f"{len(results.targets)} target{'s' if len(results.targets) != 1 else ''}"
     content = page(
         "Comparison of methods",
-        f"{len(results.rows)} rows: {len(results.labels)} methods, {targets}, {len(results.conditions)} conditions.",
+        f"{len(results.rows)} rows: {len(results.labels)} methods, {targets}, "
+        f"{len(results.conditions)} conditions.{replaced}",
         [
             _tables(results),
             _speed(results),

@@ -2,7 +2,7 @@
 
 import math
 import statistics
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,10 +61,25 @@ def with_best(row: dict[str, Any]) -> dict[str, Any]:
 
 
 class Results:
-    """The rows of a comparison; those of one method with several budgets are told apart by their label."""
+    """The rows of a comparison; those of one method with several budgets are told apart by their label.
 
-    def __init__(self, rows: Iterable[dict[str, Any]]):
-        self.rows = [with_best(row) for row in rows]
+    Where a condition, session or setting was changed under its old name, a folder holds several rows of one name and
+    seed: the row whose digest is asked for counts, otherwise the last, and `replaced` counts the others.
+
+    Args:
+        asked: digests of the cells of the grid that was asked for last.
+    """
+
+    def __init__(self, rows: Iterable[dict[str, Any]], asked: Collection[str] = ()):
+        named: dict[tuple, dict[str, Any]] = {}
+        given = 0
+        for row in rows:
+            given += 1
+            key = (row["method"], _budget(row), row["target"], row["condition"], row["seed"])
+            if key not in named or named[key]["digest"] not in asked:
+                named[key] = row
+        self.replaced = given - len(named)
+        self.rows = [with_best(row) for row in named.values()]
         budgets: dict[str, set[str]] = {}
         for row in self.rows:
             budgets.setdefault(row["method"], set()).add(_budget(row))

@@ -117,7 +117,13 @@ def _intrinsics(model: str, width: int, height: int, values: list[float]) -> Int
 
 
 def _world_to_camera(quat_world_to_camera: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(quat_world_to_camera)
+    if not (0.9 < length < 1.1 and np.isfinite(translation).all()):
+        raise ValueError(
+            f"expected a unit quaternion and a finite translation, got {quat_world_to_camera.tolist()} and "
+            f"{translation.tolist()}"
+        )
     matrix = np.eye(4)
-    matrix[:3, :3] = quat_to_matrix(quat_world_to_camera / np.linalg.norm(quat_world_to_camera))
+    matrix[:3, :3] = quat_to_matrix(quat_world_to_camera / length)
     matrix[:3, 3] = translation
     return matrix

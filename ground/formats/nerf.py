@@ -26,6 +26,8 @@ from ground.formats.views import (
 from ground.session import SPLITS, FrameRecord, Session
 from obbgs_base.files import write_whole
 
+PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 # Of eleven brackets six are for training, two for validation, three for testing; 121 brackets of three frames give
 # 198, 66 and 99 frames, the published split.
 SPLIT_PATTERN = (0, 1, 0, 2, 0, 2, 0, 1, 0, 2, 0)
@@ -215,6 +217,21 @@ def read_exported(tree: dict[str, Any], where: Path) -> Exported | None:
     return dataclasses.replace(exported, camera=dataclasses.replace(camera, read_noise_dn=noise_dn))
 
 
+def distortion_of(keys: dict[str, Any], where: Path) -> tuple[float, ...]:
+    """Return the coefficients of lens distortion in a frame's keys, as DISTORTION_KEYS names them.
+
+    Raises:
+        FormatError: the camera is not a perspective camera, or has another lens model.
+        ValueError, TypeError: one is no number.
+    """
+    model = keys.get("camera_model", "OPENCV")
+    if model not in PINHOLE_MODELS:
+        raise FormatError(f"{where}: expected a camera model of {', '.join(PINHOLE_MODELS)}, got {model!r}")
+    if keys.get("k4"):
+        raise FormatError(f"{where}: k4 belongs to a lens model that is not supported")
+    return tuple(float(keys.get(name, 0.0)) for name in DISTORTION_KEYS)
+
+
 def _intrinsics(tree: dict[str, Any], image: Path, where: Path) -> Intrinsics:
     """Return a frame's intrinsics; `tree` holds the file's keys, overridden by the frame's own."""
     try:
@@ -230,8 +247,9 @@ def _intrinsics(tree: dict[str, Any], image: Path, where: Path) -> Intrinsics:
             float(tree.get("fl_y", focal_px)),
             float(tree.get("cx", width / 2)),
             float(tree.get("cy", height / 2)),
+            distortion_of(tree, where),
         )
     except KeyError as error:
         raise FormatError(f"{where}: {error} is missing") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, ZeroDivisionError) as error:
         raise FormatError(f"{where}: {image.name}: the intrinsics are not valid: {error}") from error

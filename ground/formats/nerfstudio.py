@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from ground.formats.nerf import (
+    DISTORTION_KEYS,
     camera_keys,
+    distortion_of,
     frame_keys,
     image_path,
     load_transforms,
@@ -23,8 +25,6 @@ from ground.formats.views import Exported, FormatError, Intrinsics, View
 from ground.session import SPLITS, Session
 from obbgs_base.files import write_whole
 
-PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
-DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 log = logging.getLogger(__name__)
 
 
@@ -96,11 +96,6 @@ def _splits(folder: Path, tree: dict[str, Any], where: Path) -> dict[Path, str]:
 
 def _intrinsics(keys: dict[str, Any], where: Path) -> Intrinsics:
     """Return a frame's intrinsics; `keys` are the file's, overridden by the frame's own."""
-    model = keys.get("camera_model", "OPENCV")
-    if model not in PINHOLE_MODELS:
-        raise FormatError(f"{where}: expected a camera model of {', '.join(PINHOLE_MODELS)}, got {model!r}")
-    if keys.get("k4"):
-        raise FormatError(f"{where}: k4 belongs to a lens model that is not supported")
     try:
         return Intrinsics(
             int(keys["w"]),
@@ -109,7 +104,7 @@ def _intrinsics(keys: dict[str, Any], where: Path) -> Intrinsics:
             float(keys.get("fl_y", keys["fl_x"])),
             float(keys["cx"]),
             float(keys["cy"]),
-            tuple(float(keys.get(name, 0.0)) for name in DISTORTION_KEYS),
+            distortion_of(keys, where),
         )
     except KeyError as error:
         raise FormatError(f"{where}: {error} is missing") from error

@@ -4,9 +4,11 @@ Source: Schönberger and Frahm, Structure-from-Motion Revisited, 2016, through i
 """
 
 import contextlib
+import hashlib
+import logging
 import math
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +19,7 @@ from ground.formats.epipolar import turned
 from ground.formats.turned_pictures import turned_back
 from ground.formats.views import FormatError, Intrinsics, PoseSigmas, View, image_size
 from obbgs_base.errors import Interrupted
+from obbgs_base.files import write_whole
 
 if TYPE_CHECKING:
     import pycolmap
@@ -26,6 +29,8 @@ SEED = 0
 FEWEST = 3  # pictures that a model must register
 PICTURES_AT_ONCE = 8  # between looks at whether to stop
 RADIUS_SHARE = 0.9  # of the points lie within one metre of the origin
+PICTURES = "pictures.sha256"  # of the pictures that features and matches are of
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -55,6 +60,20 @@ class Registered:
             "reprojection_px": self.reprojection_px,
             "scale": "unknown: one metre is the radius that holds nine tenths of the points",
         }
+
+
+def _keep_only_of(work: Path, folder: Path, names: Sequence[str]) -> None:
+    """Make the folder of features and matches, without those of other pictures: COLMAP knows pictures by name alone."""
+    digest = hashlib.sha256()
+    for name in names:
+        content = (folder / name).read_bytes()
+        digest.update(f"{name}\0{len(content)}\0".encode() + content)
+    noted = work / PICTURES
+    if work.exists() and not (noted.is_file() and noted.read_text() == digest.hexdigest()):
+        log.warning("%s is of other pictures and begins anew", work)
+        shutil.rmtree(work)
+    work.mkdir(parents=True, exist_ok=True)
+    write_whole(noted, digest.hexdigest().encode())
 
 
 def read_photographs(
@@ -88,7 +107,7 @@ def read_photographs(
         raise FormatError(f"{folder}: expected at least {FEWEST} photographs, found {len(names)}")
     if len(sizes := {image_size(folder / name) for name in names}) > 1:
         raise FormatError(f"{folder}: the pictures of a session have one size, found {sorted(sizes)}")
-    work.mkdir(parents=True, exist_ok=True)
+    _keep_only_of(work, folder, names)
     database = work / "database.db"
 
     def step(share: float) -> None:

@@ -129,6 +129,8 @@ def _wider(depth: Tensor, slopes: Tensor) -> tuple[Tensor, Tensor]:
 def _blocks(depths: list[Tensor], cameras: Cameras) -> tuple[Tensor, Tensor, float]:
     """Return corner [3] m, nodes [P, 3] (integers) of blocks that are not surely empty, and the width of a voxel m."""
     seen = torch.cat([_back_projected(depth, cameras.one(c)) for c, depth in enumerate(depths)])
+    if len(seen) == 0:
+        raise ExportError("the target is a few pixels wide, too few to make a mesh of")
     lower, upper = seen.amin(dim=0), seen.amax(dim=0)
     z = torch.cat([depth[depth.isfinite()] for depth in depths])
     voxel_m = VOXEL_PX * float(z.median() / cameras.K[:, 0, 0].mean())

@@ -7,13 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from flightsw.icd.quaternion import matrix_to_quat
-from ground import attitude
+from ground import attitude, cli
 from ground.attitude import FoundAttitude, in_body_axes, refined_motion
 from ground.attitude_choice import chosen_by_training
 from ground.cameras import sensor_of
 from ground.evaluate import evaluate
+from ground.live import reconstruct_live
 from ground.reconstruct import reconstruct
 from ground.report_attitude import attitude_section
 from ground.runs import open_run
@@ -59,6 +61,20 @@ def tumbling_session(folder: Path) -> Session:
     header["navigation"] = {"attitude": "unknown"}
     (folder / "session.json").write_text(json.dumps(header))
     return open_session(folder)
+
+
+def test_commands_that_cannot_find_an_attitude_say_who_can(tmp_path):
+    folder = tumbling_session(tmp_path / "session").path
+    for command in (
+        ["compare", "--sessions", str(folder), "--methods", "black", "--out", str(tmp_path / "c")],
+        ["export", "--session", str(folder), "--out", str(tmp_path / "e")],
+    ):
+        done = CliRunner().invoke(cli.app, command, env={"COLUMNS": "200"})
+        assert done.exit_code == 1, done.output
+        assert "`ground reconstruct` finds the attitude" in str(done.exception)
+    assert not (tmp_path / "e").exists()
+    with pytest.raises(SessionError, match="`ground reconstruct` finds the attitude"):
+        reconstruct_live(folder, idle_timeout_s=0.0)
 
 
 def test_poses_and_truth_are_turned_into_the_axes_that_were_found(tmp_path):

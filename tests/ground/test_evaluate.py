@@ -173,6 +173,19 @@ def distance_to_triangles(point: np.ndarray, triangles: np.ndarray) -> float:
     return float(np.linalg.norm(left[over], axis=1).min(initial=np.inf))
 
 
+def test_a_damaged_mesh_is_named_whatever_its_reader_says(tmp_path, monkeypatch):
+    (tmp_path / "model.glb").write_bytes(b"glTF")
+    with pytest.raises(SessionError, match=r"model\.glb is damaged"):
+        read_mesh_points(tmp_path / "model.glb", 10)
+
+    def reader(path):
+        raise UnboundLocalError("cannot access local variable 'access'")  # trimesh, of an altered file
+
+    monkeypatch.setattr(trimesh, "load_scene", reader)
+    with pytest.raises(SessionError, match=r"model\.glb is damaged"):
+        read_mesh_points(tmp_path / "model.glb", 10)
+
+
 def test_the_mesh_is_scored_by_points_on_its_area_and_what_the_frames_show_apart(session):
     """The mesh's points lie on triangles of the file, and both halves of its area have their share of them."""
     metrics = evaluate(session, "run")

@@ -119,6 +119,22 @@ def test_nerf_synthetic_becomes_a_session(tmp_path, suffix):
         np.testing.assert_allclose(record.world_to_camera, expected, atol=1e-12)
 
 
+def test_the_lens_of_a_nerf_camera_is_read_and_another_is_refused(tmp_path):
+    nerf_folder(tmp_path / "lego")
+    path = tmp_path / "lego" / "transforms_train.json"
+    tree = json.loads(path.read_text())
+    path.write_text(json.dumps(tree | {"k1": 0.2, "k2": -0.1}))
+    trained = [view for view in read_nerf(tmp_path / "lego")[0] if view.split == "train"]
+    assert {view.intrinsics.distortion for view in trained} == {(0.2, -0.1, 0.0, 0.0, 0.0)}
+    for wrong, told in (
+        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+        ({"camera_angle_x": 0}, "the intrinsics are not valid"),
+    ):
+        path.write_text(json.dumps(tree | wrong))
+        with pytest.raises(FormatError, match=told):
+            read_nerf(tmp_path / "lego")
+
+
 def test_srgb_is_undone_on_request(tmp_path):
     nerf_folder(tmp_path / "lego")
     views, _ = read_nerf(tmp_path / "lego")
@@ -290,6 +306,16 @@ def test_a_damaged_or_unsupported_colmap_model_is_refused(tmp_path):
     content = (tmp_path / "sparse/0/images.bin").read_bytes()
     (tmp_path / "sparse/0/images.bin").write_bytes(content[:50])
     with pytest.raises(FormatError, match="damaged"):
+        read_colmap(tmp_path)
+
+
+@pytest.mark.parametrize("pose", ["0 0 0 0 0 0 4", "1 0 0 0 0 nan 4"])
+def test_a_colmap_pose_that_is_none_is_refused(tmp_path, pose):
+    colmap_model(tmp_path, "SIMPLE_PINHOLE", [50, 20, 15])
+    for path in (tmp_path / "sparse/0").glob("*.bin"):
+        path.unlink()
+    (tmp_path / "sparse/0/images.txt").write_text(f"1 {pose} 5 shot 1.png\n\n")
+    with pytest.raises(FormatError, match="expected a unit quaternion and a finite translation"):
         read_colmap(tmp_path)
 
 

@@ -172,8 +172,22 @@ def test_of_few_brackets_none_is_held_out_and_the_score_is_that_of_the_training_
     writer.add(12)
     reconstruct_live(writer.folder, changes=CHANGES | {"steps": 20}, idle_timeout_s=0.0)
     run = open_run(writer.folder, "live")
-    assert run.metrics["frames_trained"] == 12 and len(run.scored) == 12
+    assert run.metrics["frames_trained"] == len(run.training) == len(run.scored) == 12
     assert run.metrics["scored_frames"] == "training"
+
+
+def test_an_unfinished_live_run_is_not_lost_to_a_reconstruction_of_the_same_name(tmp_path):
+    writer = Writer(tmp_path / "s")
+    writer.add(24)
+    live = begun(writer.folder)
+    turns(live, PassEnd(tmp_path / "s", 1e9, False), 20)
+    live.save()
+    live.close()
+    part = writer.folder / "runs" / ".live.part"
+    assert list(part.glob("live-*.checkpoint"))
+    with pytest.raises(SessionError, match="`ground live --name live` goes on with it"):
+        reconstruct(writer.folder, "live", changes=CHANGES | {"steps": 20})
+    assert list(part.glob("live-*.checkpoint"))
 
 
 def test_a_worse_model_is_not_shown(tmp_path):

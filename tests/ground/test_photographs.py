@@ -142,6 +142,26 @@ def test_pictures_that_have_nothing_in_common_are_refused_in_one_sentence(photog
         read_photographs(tmp_path, tmp_path / "work")
 
 
+def test_features_of_other_pictures_of_the_same_names_are_not_used(tmp_path, caplog):
+    pictures, work = tmp_path / "pictures", tmp_path / "work"
+    pictures.mkdir()
+
+    def features_stay() -> bool:
+        for i in range(3):
+            cv2.imwrite(str(pictures / f"{i}.png"), np.full((64, 64), grey, np.uint8))
+        with pytest.raises(FormatError, match="features in common"):
+            read_photographs(pictures, work)
+        stay = (work / "mark").exists()
+        (work / "mark").touch()
+        return stay
+
+    grey = 50
+    assert not features_stay() and features_stay()
+    assert not caplog.messages
+    grey = 60
+    assert not features_stay() and "is of other pictures" in caplog.text
+
+
 def test_deviations_of_poses_are_numbers_of_at_least_0():
     with pytest.raises(ValueError, match="at least 0"):
         PoseSigmas(0.1, -1.0)

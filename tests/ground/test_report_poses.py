@@ -52,7 +52,7 @@ def example(tmp_path_factory):
         own_posterior=np.full((rows, 6), 0.003),
     )
     metrics = {"scored_frames": "held_out"}
-    run = Run(folder, session, held_out, sensor_of(session.camera), gaussians, None, metrics)
+    run = Run(folder, session, training, held_out, sensor_of(session.camera), gaussians, None, metrics)
     write_estimate(folder, estimate)
     return run, estimate, turns
 

@@ -76,6 +76,16 @@ def test_struts_thinner_than_a_pixel_stay_whole():
     assert beside.max() < 4 * PIXEL_M
 
 
+def test_a_target_of_very_few_pixels_has_no_mesh():
+    speck, cameras = sphere(100), cameras_around(6)
+    speck.means *= 0.001
+    speck.log_scales[:] = math.log(0.001)
+    K = cameras.K.clone()
+    K[:, :2, 2] = 10.5  # within three pixels beside every fourth one, which are looked at first
+    with pytest.raises(ExportError, match="a few pixels wide"):
+        surface_mesh(speck, dataclasses.replace(cameras, K=K))
+
+
 def test_the_side_that_no_view_sees_is_marked_and_closed():
     around = cameras_around(40)
     above = torch.nonzero(around.centres[:, 2] > 1.0)[:, 0]

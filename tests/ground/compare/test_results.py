@@ -105,6 +105,15 @@ def test_a_method_that_comes_to_fit_the_noise_is_shown_with_the_best_point_of_it
     assert results.mean("black", "A", "as taken", "psnr_best_db") is None
 
 
+def test_rows_of_other_contents_under_the_same_name_are_not_taken_for_seeds():
+    rows = [row("3dgs", psnr_clean_db=v) | {"digest": d} for v, d in ((30.0, "old"), (20.0, "new"))]
+    last = Results(rows)
+    assert last.mean("3dgs", "A", "as taken", "psnr_clean_db") == 20.0 and last.replaced == 1
+    assert last.spread("3dgs", "A", "as taken", "psnr_clean_db") is None
+    assert Results(rows, {"old"}).mean("3dgs", "A", "as taken", "psnr_clean_db") == 30.0
+    assert Results(ROWS).replaced == 0
+
+
 def test_trainings_of_several_budgets_are_told_apart():
     rows = [
         row("3dgs", psnr_clean_db=30.0),
