@@ -16,15 +16,14 @@ from ground.estimated_poses import estimated_records, write_estimate
 from ground.model_files import Outputs, model_sizes, write_models
 from ground.run_record import training_metrics, write_config, write_history
 from ground.runs import (
+    check_not_live,
     check_replaceable,
-    is_live,
     publish,
     run_folder,
-    unfinished_folder,
     unfinished_run,
     written_to,
 )
-from ground.session import FrameRecord, Session, SessionError, open_session
+from ground.session import FrameRecord, Session, open_session
 from ground.training_frames import split, training_frame
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.train.config import MethodConfig
@@ -90,11 +89,8 @@ def reconstruct(
     session = open_session(session_dir)
     folder = run_folder(session.path, name, out)
     check_replaceable(folder, overwrite)
-    if not overwrite and (is_live(folder) or any(unfinished_folder(folder).glob("live-*.checkpoint"))):
-        raise SessionError(
-            f"{folder} is a run of `ground live` that is not finished: `ground live --name {name}` goes on with it, "
-            "--name makes another run, --overwrite replaces it"
-        )
+    if not overwrite:
+        check_not_live(folder)
     training, held_out = split(session)
     sensor = sensor_of(session.camera)
     configs = {KNOWN: config}

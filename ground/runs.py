@@ -163,6 +163,19 @@ def is_live(folder: Path) -> bool:
     return (folder / LIVE_STATUS).is_file() and not (folder / "metrics.json").is_file()
 
 
+def check_not_live(folder: Path) -> None:
+    """Check that a folder is not that of a live run, whose checkpoints another run of its name would remove.
+
+    Raises:
+        SessionError: it is one that is not finished.
+    """
+    if is_live(folder) or any(unfinished_folder(folder).glob("live-*.checkpoint")):
+        raise SessionError(
+            f"{folder} is a run of `ground live` that is not finished: `ground live --name {folder.name}` goes on with "
+            "it, --name makes another run, --overwrite replaces it"
+        )
+
+
 @contextlib.contextmanager
 def unfinished_run(folder: Path, overwrite: bool, kept: Sequence[str]) -> Iterator[Path]:
     """Give the hidden folder in which a run is made, locked against other processes and with its log open.
