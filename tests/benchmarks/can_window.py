@@ -6,7 +6,6 @@ behind a terminal's buffer, the computers' time a CAN frame, and a ground that h
 """
 
 import argparse
-import json
 from collections import deque
 
 from isotp import CanMessage
@@ -18,6 +17,7 @@ from flightsw.icd.packet import APID_FILES, TELECOMMAND, TELEMETRY
 from flightsw.icd.transfer import Receiver, Sender, timer_s
 from hil.links.can_timing import frame_s
 from hil.links.slcan_adapter import QUEUE_FRAMES
+from tests.benchmarks.rows import shown
 from tests.link_trial import noise_containers
 
 BITRATE = 1_000_000
@@ -143,10 +143,7 @@ def main() -> None:
     for fd, packet_bytes in ((True, 1100), (True, 4096), (False, 1100)):
         for store_s in (0.0, 0.015, 0.03, 0.06):
             row = measure(fd, packet_bytes, store_s, containers)
-            print(
-                json.dumps(row) if arguments.json else "  ".join(f"{k} {v}" for k, v in row.items()),
-                flush=True,
-            )
+            print(shown(row, "can_window", arguments.json), flush=True)
 
 
 if __name__ == "__main__":

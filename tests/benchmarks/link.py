@@ -7,13 +7,13 @@ left the outbox.
 """
 
 import argparse
-import json
 import os
 import tempfile
 from pathlib import Path
 
 from hil.links.faults import STANDARD_CUT_S, STANDARD_FAULTS, Faults
 from hil.processes import unwind_on_sigterm
+from tests.benchmarks.rows import shown
 from tests.link_trial import (
     Trial,
     TrialResult,
@@ -124,10 +124,7 @@ def main() -> None:
                 continue
             size_px = CLEAN_SIZE_PX if case == "clean" else FAULT_SIZE_PX[link]
             row = measure(case, trial, frames, size_px, limit_s=1800)
-            print(
-                json.dumps(row) if arguments.json else "  ".join(f"{k} {v}" for k, v in row.items()),
-                flush=True,
-            )
+            print(shown(row, "link", arguments.json), flush=True)
 
 
 if __name__ == "__main__":

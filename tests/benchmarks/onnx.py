@@ -151,6 +151,7 @@ def main() -> None:
     from obbgs_core.errors import ReconstructionError
     from obbgs_core.io.ply import load_ply
     from tests.benchmarks.rasterizer import scene
+    from tests.benchmarks.rows import shown
 
     if arguments.model:
         try:
@@ -169,8 +170,7 @@ def main() -> None:
         row = measure(gaussians, distance)
         if math.isnan(row["parity_db"]):
             raise SystemExit("the exported renderer gives NaN")
-        line = json.dumps(row) if arguments.json else "  ".join(f"{k} {v}" for k, v in row.items())
-        print(line, flush=True)
+        print(shown(row, "onnx", arguments.json), flush=True)
 
 
 if __name__ == "__main__":

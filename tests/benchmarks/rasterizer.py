@@ -7,7 +7,6 @@ is the same for each. `bytes` is the kernels' own memory.
 """
 
 import argparse
-import json
 import multiprocessing
 import statistics
 import time
@@ -17,6 +16,7 @@ import torch
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import native_kernels, render
+from tests.benchmarks.rows import shown
 
 REPEATS = 25
 # Gaussians times pixels that the reference is measured on: seconds and about a gigabyte
@@ -154,8 +154,7 @@ def main() -> None:
             rows += measure("native", count, width, distance=2.7 * DISTANCE)
         for row in rows:
             row["reference_ms"] = reference_ms
-            line = json.dumps(row) if arguments.json else "  ".join(f"{k} {v}" for k, v in row.items())
-            print(line, flush=True)
+            print(shown(row, "rasterizer", arguments.json), flush=True)
 
 
 if __name__ == "__main__":

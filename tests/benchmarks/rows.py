@@ -54,6 +54,8 @@ FIGURES = {  # key of a row: column title and format
     "cpu_seconds": ("processor time", "{:.1f} s"),
     "gaussians": ("Gaussians", "{:,.0f}"),
     "seconds": ("seconds", "{:.0f}"),
+    "step_ms": ("one step", "{:.1f} ms"),
+    "step_over_rasterizer": ("over its rendering and gradient", "{:.2f}"),
     "psnr_after_a_third_db": ("after a third of the pass", "{:.1f} dB"),
     "psnr_live_db": ("live, at the end", "{:.2f} dB"),
     "psnr_afterwards_db": ("trained afterwards", "{:.2f} dB"),

@@ -3,7 +3,6 @@
 import argparse
 import functools
 import itertools
-import json
 import statistics
 import time
 from collections import defaultdict
@@ -28,6 +27,7 @@ from obbgs_core.train.adam import Adam
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests.benchmarks.rasterizer import camera, scene
+from tests.benchmarks.rows import shown
 
 GAUSSIANS, WIDTH_PX = 20_000, 400
 EXPOSURES_S = (0.5e-4, 1e-4, 2e-4)
@@ -170,7 +170,8 @@ def measure(name: str, threads: int, distance: float, steps: int) -> dict:
     rasterizer = parts["rasterizer_forward"] + parts["rasterizer_backward"]
     step = sum(parts.values())
     return {
-        "preset": name,
+        "method": name,
+        "condition": f"target {distance:g} m away, {threads} thread" + ("s" if threads > 1 else ""),
         "gaussians": GAUSSIANS,
         "width": WIDTH_PX,
         "frames": config.frames_per_step,
@@ -192,9 +193,7 @@ def main() -> None:
     )  # from 9 m the object fills 7 % of the pixels
     for distance, threads, name in cases:
         row = measure(name, threads, distance, arguments.steps)
-        print(
-            json.dumps(row) if arguments.json else "  ".join(f"{k} {v}" for k, v in row.items()), flush=True
-        )
+        print(shown(row, "step", arguments.json), flush=True)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ random and even need not begin with the oldest eighth, as triage must. Scores ar
 
 import argparse
 import dataclasses
-import json
 import tempfile
 import time
 from dataclasses import dataclass
@@ -43,6 +42,7 @@ from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import train
+from tests.benchmarks.rows import shown
 
 FIRST, BUDGET = 8, 4  # an eighth comes down before there is a model, a quarter in all
 RANKED_BY = ("triage", "residual", "novelty")
@@ -250,8 +250,8 @@ def main() -> None:
                 row |= {"in_eclipse": sum(i not in the_pass.training for i in frame_ids)}
                 row |= {name: round(value, 4) for name, value in figures(the_pass, gaussians).items()}
                 row |= {"gaussians": len(gaussians), "frame_ids": frame_ids}
-                text = "  ".join(f"{k} {v}" for k, v in row.items() if k != "frame_ids")
-                print(json.dumps(row) if arguments.json else text, flush=True)
+                told = row if arguments.json else {k: v for k, v in row.items() if k != "frame_ids"}
+                print(shown(told, "triage", arguments.json), flush=True)
 
 
 if __name__ == "__main__":
