@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ground.compare.origin import this_command, with_origin
-from ground.compare.results import with_best
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "results"
@@ -76,6 +75,10 @@ def shown(row: dict, bench: str, as_json: bool) -> str:
 
 def page(files: Iterable[Path]) -> str:
     """Return the page of some files of rows as Markdown."""
+    from ground.compare.results import (
+        with_best,
+    )  # loads every method, which the benchmarks of links do not need
+
     parts = [
         "# Results\n",
         "Made from `results/*.jsonl` by `python -m tests.benchmarks.rows`; do not edit.\n",
