@@ -75,9 +75,8 @@ def shown(row: dict, bench: str, as_json: bool) -> str:
 
 def page(files: Iterable[Path]) -> str:
     """Return the page of some files of rows as Markdown."""
-    from ground.compare.results import (
-        with_best,
-    )  # loads every method, which the benchmarks of links do not need
+    # not above, since it loads every method, which the benchmarks of links do not need
+    from ground.compare.results import with_best
 
     parts = [
         "# Results\n",
