@@ -26,7 +26,7 @@ MAX_NODES = 2_000_000  # wider voxels are used if there would be more
 BAND_VOXELS = 1.5  # a view says nothing of what lies deeper than this behind the surface that it sees
 # of each Gaussian in the depth maps: the Gaussians of a face lie in layers, of which the outer ones are nearest to it
 COPIES = 5
-SEEN_THROUGH = 0.2  # of the views that see a place; if so many see past it, it is empty
+SEEN_THROUGH = 0.3  # of the views that see a place; if so many see past it, it is empty
 THICKER_VOXELS = 0.8  # on each side, so that a plate thinner than a voxel is not lost between two nodes
 DRAWN_BACK_VOXELS = 0.6  # of that, when triangles are made
 AT_LEAST_SEEING = 2  # views; what fewer see is taken for solid
