@@ -152,6 +152,7 @@ def mesh_command(
     Example: ground mesh --session demo/session --name demo --format obj
     """
     from ground.estimated_poses import estimated_records, read_estimate
+    from ground.evaluate import keep_metrics
     from ground.mesh_files import write_mesh
     from ground.model_files import white_radiance_of
     from ground.runs import open_run
@@ -161,6 +162,8 @@ def mesh_command(
     stem = "model" if format_ is MeshFormatName.GLB else "mesh"  # model.ply holds the Gaussians
     path = run.folder / f"{stem}.{format_.value}"
     facts = write_mesh(run.gaussians, run.session, training, path, white_radiance_of(run.session, training))
+    if format_ is MeshFormatName.GLB:
+        keep_metrics(run, run.metrics | facts)
     if json_:
         print(json.dumps({"mesh": str(path)} | facts))
     else:

@@ -103,10 +103,19 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     metrics = {**run.metrics, **{key: round(value, 5) for key, value in figures.items()}}
     if estimate is not None:
         metrics["scored_poses"] = "settled"
+    keep_metrics(run, metrics)
+    return metrics
+
+
+def keep_metrics(run: Run, metrics: dict) -> None:
+    """Write a run's metrics and its card, which tells them.
+
+    Raises:
+        SessionError: the folder cannot be written.
+    """
     with written_to(run.folder):
         write_whole(run.folder / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
         write_whole(run.folder / "model_card.md", model_card(run.session.created_utc, metrics).encode())
-    return metrics
 
 
 def _geometry(run: Run, truth: Truth) -> tuple[dict[str, np.ndarray], np.ndarray | None]:

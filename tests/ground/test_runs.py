@@ -89,9 +89,17 @@ def test_what_cannot_be_made_of_a_model_is_named_and_the_rest_is_there(session, 
 def test_the_mesh_of_a_finished_run_is_written_in_the_format_asked_for(session, finished, format_, name):
     copy = Path(shutil.copytree(finished / "runs", session / "runs", dirs_exist_ok=True)) / "run" / name
     copy.unlink(missing_ok=True)
+    metrics = json.loads((copy.parent / "metrics.json").read_text())
+    (copy.parent / "metrics.json").write_text(
+        json.dumps(metrics | {"mesh_triangles": 12})
+    )  # of an older version
     done = CliRunner().invoke(cli.app, ["mesh", "--session", str(session), "--format", format_, "--json"])
     assert done.exit_code == 0, done.output
     facts = json.loads(done.stdout)
+    kept = json.loads((copy.parent / "metrics.json").read_text())
+    assert (kept["mesh_triangles"] == facts["mesh_triangles"]) == (name == "model.glb")
+    if name == "model.glb":
+        assert f"- Mesh: {facts['mesh_triangles']:,} triangles" in (copy.parent / "model_card.md").read_text()
     assert facts["mesh"] == str(copy) and 0 < facts["mesh_triangles"] <= 50_000
     read = trimesh.load_mesh(copy)
     read.merge_vertices(merge_norm=True)
