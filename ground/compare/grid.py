@@ -170,5 +170,5 @@ def _cell(
     digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
     frames_mb = 4e-6 * FRAME_COPIES * facts.frames * facts.pixels
     gaussians_mb = GAUSSIAN_MB * (wanted.gaussians if largest is None else largest)
-    memory_mb = BASE_MB + frames_mb + gaussians_mb
+    memory_mb = BASE_MB + frames_mb + gaussians_mb + wanted.working_mb
     return Cell(facts, wanted.name, seed, Budget(share, largest), name, condition, digest, memory_mb)
