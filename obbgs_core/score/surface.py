@@ -21,6 +21,8 @@ MAX_TANGENT = 4.0  # of the angle between the line of sight and a Gaussian's nor
 MAX_DEPTH_TANGENT = 24.0  # the same of the depth map itself; steeper is an edge
 SAME_DEPTH_PX = 2.0  # depths agree if they differ by no more than this many pixels' width
 AGREEING_VIEWS = 2  # that must confirm a point, besides its own
+# of each Gaussian, in pixels that are not solid: what covers three tenths of one counts, a strut thinner than a pixel
+THIN_COPIES = 2
 NORMAL_NEIGHBOURS = 64  # fewer follow the noise of the depth maps, more round off the edges
 CANDIDATES = 900_000  # pixels of all views together that are compared with every view
 OVERSAMPLING = 4  # points before they are thinned out, at least, for each that is returned
@@ -34,9 +36,9 @@ def surface_points(
 ) -> tuple[Tensor, Tensor]:
     """Return points [count, 3] m and unit normals [count, 3] towards the cameras, evenly spread over the seen surface.
 
-    A pixel of a depth map is used if it is solid, on no depth edge and not seen at a grazing angle, if two other views
-    see a surface at its depth, and if no more views see through it than see it. Each gives points at random places on
-    its patch of plane; of those, one is kept in every cell of a cubic grid that is as fine as the count allows. The
+    A pixel of a depth map is used if it is solid, or covered by three tenths by something thin, if it is on no depth
+    edge and not seen at a grazing angle, if two other views see a surface at its depth, and if no more views see
+    through it than see it. Each gives points at random places on its patch of plane; of those, one is kept in every cell of a cubic grid that is as fine as the count allows. The
     same seed gives the same points. Both are empty, [0, 3], if no pixel is left.
 
     Args:
@@ -50,7 +52,7 @@ def surface_points(
     gaussians = bright(gaussians, cameras)
     if len(gaussians) == 0:
         return torch.zeros(0, 3), torch.zeros(0, 3)
-    return fused_points(lambda c: depth_map(gaussians, cameras.one(c)), cameras, count, seed)
+    return fused_points(lambda c: _with_thin_parts(gaussians, cameras.one(c)), cameras, count, seed)
 
 
 @torch.no_grad()
@@ -63,7 +65,7 @@ def surface_positions(gaussians: Gaussians, cameras: Cameras, count: int = 100_0
     gaussians = bright(gaussians, cameras)
     if len(gaussians) == 0:
         return torch.zeros(0, 3)
-    return _fused(lambda c: depth_map(gaussians, cameras.one(c)), cameras, count, seed)[0]
+    return _fused(lambda c: _with_thin_parts(gaussians, cameras.one(c)), cameras, count, seed)[0]
 
 
 @torch.no_grad()
@@ -112,6 +114,20 @@ def _fused(
     points = _back_project(patch, cameras)
     chosen = _evenly(points, count, generator)
     return points[chosen], patch[chosen, 0].long()
+
+
+def _with_thin_parts(gaussians: Gaussians, camera: Cameras) -> tuple[Tensor, Tensor]:
+    """Return the depth map of one camera and its slopes, with depths also in pixels that thin parts cover in part.
+
+    The rims of what is at least three pixels wide are covered in part as well and stay as they are.
+    """
+    depth, slope = depth_map(gaussians, camera)
+    thin_depth, thin_slope = depth_map(gaussians, camera, THIN_COPIES)
+    solid = depth.isfinite()
+    wide = -F.max_pool2d(-solid[None].float(), 3, 1, 1)  # in the middle of 3x3 solid pixels
+    near_wide = F.max_pool2d(wide, 5, 1, 2)[0] > 0
+    taken = solid | near_wide
+    return torch.where(taken, depth, thin_depth), torch.where(taken[:, :, None], slope, thin_slope)
 
 
 def bright(gaussians: Gaussians, cameras: Cameras) -> Gaussians:

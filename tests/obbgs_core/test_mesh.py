@@ -19,10 +19,9 @@ from obbgs_core.model.mesh import SurfaceMesh
 from obbgs_core.render import render
 from obbgs_core.score.mesh import _where_seen, surface_mesh
 from tests import readers
-from tests.obbgs_core.test_surface import SIZE, cameras_around, discs, sphere
+from tests.obbgs_core.test_surface import PIXEL_M, SIZE, cameras_around, discs, sphere, thin_struts
 
 ROOT = Path(__file__).parents[2]
-PIXEL_M = 3.0 / (1.6 * SIZE)  # on the near side of the sphere, from cameras 4 m from its centre
 
 
 def solid(mesh: SurfaceMesh) -> trimesh.Trimesh:
@@ -59,20 +58,12 @@ def test_a_plate_without_thickness_keeps_its_area_and_place():
 
 
 def test_struts_thinner_than_a_pixel_stay_whole():
-    along = torch.linspace(-0.8, 0.8, 200)[:, None]
-    axes = torch.nn.functional.normalize(
-        torch.tensor([[1.0, -0.6, 0.35], [1, 0, 0.35], [1, 0.6, 0.35]]), dim=1
-    )
-    shifts = torch.tensor([[0.0, 0.0, -0.25], [0, 0, 0], [0, 0, 0.25]])
-    lines = torch.cat([along * axis + shift for axis, shift in zip(axes, shifts, strict=True)])
-    scatter = 0.5 * PIXEL_M * torch.randn(lines.shape, generator=torch.Generator().manual_seed(0))
-    struts = discs(lines + scatter, torch.tensor([[0.0, 0.0, 1.0]]).expand(600, 3), 1.0, opacity_logit=-2.0)
-    struts.log_scales[:] = math.log(0.05 * PIXEL_M)
+    struts, lines = thin_struts()
     shape = solid(surface_mesh(struts, cameras_around(20)))
     assert shape.is_watertight and shape.body_count == 3
-    gaps, _ = KDTree(shape.sample(20_000, seed=0)).query(lines.numpy())
+    gaps, _ = KDTree(shape.sample(20_000, seed=0)).query(lines)
     assert (gaps < 2 * PIXEL_M).mean() > 0.9
-    beside, _ = KDTree(lines.numpy()).query(shape.vertices)
+    beside, _ = KDTree(lines).query(shape.vertices)
     assert beside.max() < 4 * PIXEL_M
 
 

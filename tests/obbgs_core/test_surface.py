@@ -13,6 +13,7 @@ from obbgs_core.score.surface import depth_map, surface_points
 
 SIZE = 96
 DISTANCE = 4.0
+PIXEL_M = (4.0 - 1.0) / (1.6 * SIZE)  # on the near side of the sphere
 
 
 def evenly_on_a_sphere(count: int) -> torch.Tensor:
@@ -53,6 +54,27 @@ def cameras_around(count: int) -> Cameras:
     focal = 1.6 * SIZE
     K = torch.tensor([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]])
     return Cameras(torch.stack(poses).float(), K.expand(count, 3, 3), SIZE, SIZE)
+
+
+def thin_struts() -> tuple[Gaussians, np.ndarray]:
+    """Return three struts of faint small Gaussians that scatter by half a pixel, and their axes as points [600, 3]."""
+    along = torch.linspace(-0.8, 0.8, 200)[:, None]
+    axes = torch.nn.functional.normalize(
+        torch.tensor([[1.0, -0.6, 0.35], [1, 0, 0.35], [1, 0.6, 0.35]]), dim=1
+    )
+    shifts = torch.tensor([[0.0, 0.0, -0.25], [0, 0, 0], [0, 0, 0.25]])
+    lines = torch.cat([along * axis + shift for axis, shift in zip(axes, shifts, strict=True)])
+    scatter = 0.5 * PIXEL_M * torch.randn(lines.shape, generator=torch.Generator().manual_seed(0))
+    struts = discs(lines + scatter, torch.tensor([[0.0, 0.0, 1.0]]).expand(600, 3), 1.0, opacity_logit=-2.0)
+    struts.log_scales[:] = math.log(0.05 * PIXEL_M)
+    return struts, lines.numpy()
+
+
+def test_struts_thinner_than_a_pixel_have_points_along_all_of_them():
+    struts, lines = thin_struts()
+    points, _ = surface_points(struts, cameras_around(20), 5000)
+    assert (KDTree(points.numpy()).query(lines)[0] < PIXEL_M).mean() > 0.9
+    assert KDTree(lines).query(points.numpy())[0].max() < 5 * PIXEL_M
 
 
 def test_a_sphere_of_discs_gives_the_sphere_evenly():
