@@ -38,8 +38,9 @@ def surface_points(
 
     A pixel of a depth map is used if it is solid, or covered by three tenths by something thin, if it is on no depth
     edge and not seen at a grazing angle, if two other views see a surface at its depth, and if no more views see
-    through it than see it. Each gives points at random places on its patch of plane; of those, one is kept in every cell of a cubic grid that is as fine as the count allows. The
-    same seed gives the same points. Both are empty, [0, 3], if no pixel is left.
+    through it than see it. Each gives points at random places on its patch of plane; of those, one is kept in every
+    cell of a cubic grid that is as fine as the count allows. The same seed gives the same points. Both are empty,
+    [0, 3], if no pixel is left.
 
     Args:
         gaussians: on the CPU, as the cameras.
