@@ -6,7 +6,6 @@ This process only reads the session's frames, so that the one that receives them
 import functools
 import logging
 import math
-import re
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -15,7 +14,7 @@ from pathlib import Path
 from ground.arrivals import Arrivals
 from ground.cameras import sensor_of
 from ground.live_model import ShownModel
-from ground.live_status import LIVE_STATUS, LiveStatus, State
+from ground.live_status import LIVE_CHECKPOINT, LIVE_STATUS, LiveStatus, State
 from ground.live_uplink import LiveUplink
 from ground.model_files import Outputs
 from ground.reconstruct import KNOWN, finish_run
@@ -45,7 +44,6 @@ LOOK_S, STATUS_S, SHOW_S, SAVE_S = 0.5, 1.0, 5.0, 20.0  # between two looks, sta
 LAST_SHOW_S = 2.0  # between two models once the pass is over, when operators wait for them
 SHOW_PAUSE = 2.0  # at least so many times what comparing the last one took, until the next is compared
 WAIT_S = 0.1  # where there is nothing to train
-CHECKPOINT = re.compile(r"live-(\d+)\.checkpoint", re.ASCII)  # with the number of frames that have joined
 
 
 def reconstruct_live(
@@ -252,7 +250,7 @@ class LiveReconstruction:
     def _resumed(self) -> bool:
         """Go on from the newest checkpoint whose frames have all arrived, if there is one."""
         arrivals = self.arrivals
-        counts = [int(m[1]) for path in self._part.iterdir() if (m := CHECKPOINT.fullmatch(path.name))]
+        counts = [int(m[1]) for path in self._part.iterdir() if (m := LIVE_CHECKPOINT.fullmatch(path.name))]
         for count in sorted(counts, reverse=True):
             if arrivals.session is not None and FEWEST_FRAMES <= count <= len(arrivals.frames):
                 sensor, began_s = sensor_of(arrivals.session.camera), time.monotonic()
@@ -343,7 +341,7 @@ class LiveReconstruction:
             return
         self._saved_step = self.steps
         for other in self._part.iterdir():
-            if CHECKPOINT.fullmatch(other.name) and other != path:
+            if LIVE_CHECKPOINT.fullmatch(other.name) and other != path:
                 other.unlink()
 
     def finish(self, should_stop: Callable[[], bool]) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -9,6 +10,8 @@ from typing import Any, Literal
 from obbgs_base.files import write_whole
 
 LIVE_STATUS = "status.json"
+# its number is that of the frames that have joined
+LIVE_CHECKPOINT = re.compile(r"live-(\d+)\.checkpoint", re.ASCII)
 State = Literal["waiting", "training", "settled", "finished"]
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from ground import attitude
 from ground.attitude import FoundAttitude, in_body_axes
 from ground.cameras import sensor_of
-from ground.live_status import LIVE_STATUS
+from ground.live_status import LIVE_CHECKPOINT, LIVE_STATUS
 from ground.session import FrameRecord, Session, SessionError, open_session
 from ground.training_frames import split
 from obbgs_base.files import UNUSED
@@ -169,7 +169,8 @@ def check_not_live(folder: Path) -> None:
     Raises:
         SessionError: it is one that is not finished.
     """
-    if is_live(folder) or any(unfinished_folder(folder).glob("live-*.checkpoint")):
+    kept = unfinished_folder(folder).glob("*")
+    if is_live(folder) or any(LIVE_CHECKPOINT.fullmatch(path.name) for path in kept):
         raise SessionError(
             f"{folder} is a run of `ground live` that is not finished: `ground live --name {folder.name}` goes on with "
             "it, --name makes another run, --overwrite replaces it"

@@ -4,7 +4,6 @@
 the same method at a size that a CPU can train.
 """
 
-import dataclasses
 import hashlib
 import io
 import logging
@@ -18,7 +17,7 @@ import torch
 
 from ground.baselines.nerf_field import EncodingSize, Field
 from ground.baselines.nerf_pictures import Nerf
-from ground.baselines.nerf_rays import Occupancy, rays_of
+from ground.baselines.nerf_rays import Occupancy, on_device, rays_of
 from ground.baselines.reconstruction import Reconstruction, Work
 from obbgs_base.errors import Interrupted
 from obbgs_base.files import set_aside, write_whole
@@ -144,9 +143,7 @@ class Training:
         poses, K = self.cameras.world_to_camera, self.cameras.K
         pixels_across = float((2 * radius * K[:, 0, 0] / poses[:, :3, 3].norm(dim=1)).median())
         pixels_across = max(pixels_across, FEWEST_PIXELS_ACROSS)
-        self.rays_from = dataclasses.replace(
-            self.cameras, world_to_camera=poses.to(device), K=K.to(device), sun_dir=None
-        )
+        self.rays_from = on_device(self.cameras, device)
         reference_s = mean_exposure_s(frames)
         self.exposures = torch.tensor([f.exposure_time_s / reference_s for f in frames], device=device)
         dn = torch.stack([f.dn for f in frames])

@@ -1,7 +1,6 @@
 """A trained radiance field as a model: its images, and the surface on which its rays end."""
 
 import copy
-import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +14,7 @@ from ground.baselines.nerf_rays import (
     Samples,
     composited,
     march,
+    on_device,
     rays_of,
     transmittances,
     weights_of,
@@ -89,8 +89,7 @@ class Nerf:
     def _pieces(self, camera: Cameras) -> list[tuple[Rays, Tensor]]:
         """Return the rays of all pixels of one camera, row by row, some at a time, and where their samples start."""
         device = self.occupancy.density.device
-        pose, K = camera.world_to_camera.to(device), camera.K.to(device)
-        camera = dataclasses.replace(camera, world_to_camera=pose, K=K, sun_dir=None)
+        camera = on_device(camera, device)
         pieces = []
         for pixel in torch.arange(camera.height * camera.width, device=device).split(RAYS_AT_ONCE):
             row, column = pixel // camera.width, pixel % camera.width

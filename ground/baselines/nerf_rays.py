@@ -1,5 +1,6 @@
 """Rays through the unit cube: where they are sampled, which cells are empty, and how samples make a pixel's colour."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -36,6 +37,12 @@ class Samples:
 
     def select(self, chosen: Tensor) -> "Samples":
         return Samples(self.ray[chosen], self.distance[chosen], self.positions[chosen])
+
+
+def on_device(cameras: Cameras, device: torch.device) -> Cameras:
+    """Return cameras for `rays_of` on a device."""
+    pose, K = cameras.world_to_camera.to(device), cameras.K.to(device)
+    return dataclasses.replace(cameras, world_to_camera=pose, K=K)
 
 
 def rays_of(cameras: Cameras, camera: Tensor, row: Tensor, column: Tensor, radius_m: float) -> Rays:

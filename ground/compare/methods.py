@@ -115,25 +115,28 @@ _REFERENCES: dict[str, Callable[[Case, list[TrainingFrame]], list[Tensor]]] = {
 }
 MVSNET, UNTRAINED = "mvsnet", "untrained"  # the Gaussians that `obbgs` starts from
 NGP_MB = 1500.0  # 1,100 were seen beside PyTorch and the frames
+
+
+def _radiance_field(name: str, size: Size, working_mb: float = 0.0) -> list[Method]:
+    """Return a radiance field as published, blind to exposure, and with exposure known."""
+
+    def variant(exposure_aware: bool) -> Method:
+        return Method(
+            name + ("+exposure" if exposure_aware else ""),
+            lambda task: _nerf(task, size, exposure_aware),
+            seeded=True,
+            stepped=True,
+            working_mb=working_mb,
+        )
+
+    return [variant(False), variant(True)]
+
+
 _BASELINES: dict[str, Method] = {
     method.name: method
     for method in (
-        Method("nerf", lambda task: _nerf(task, FOR_A_CPU, False), seeded=True, stepped=True),
-        Method("nerf+exposure", lambda task: _nerf(task, FOR_A_CPU, True), seeded=True, stepped=True),
-        Method(
-            "instant-ngp",
-            lambda task: _nerf(task, AS_PUBLISHED, False),
-            seeded=True,
-            stepped=True,
-            working_mb=NGP_MB,
-        ),
-        Method(
-            "instant-ngp+exposure",
-            lambda task: _nerf(task, AS_PUBLISHED, True),
-            seeded=True,
-            stepped=True,
-            working_mb=NGP_MB,
-        ),
+        *_radiance_field("nerf", FOR_A_CPU),
+        *_radiance_field("instant-ngp", AS_PUBLISHED, NGP_MB),
         Method("mvs", lambda task: _stereo(task, one_exposure=True)),
         Method("mvs+raw", lambda task: _stereo(task, one_exposure=False)),
         Method("sfm", lambda task: _motion(task, "raw")),

@@ -72,13 +72,12 @@ class Results:
 
     def __init__(self, rows: Iterable[dict[str, Any]], asked: Collection[str] = ()):
         named: dict[tuple, dict[str, Any]] = {}
-        given = 0
-        for row in rows:
-            given += 1
+        given = list(rows)
+        for row in given:
             key = (row["method"], _budget(row), row["target"], row["condition"], row["seed"])
             if key not in named or named[key]["digest"] not in asked:
                 named[key] = row
-        self.replaced = given - len(named)
+        self.replaced = len(given) - len(named)
         self.rows = [with_best(row) for row in named.values()]
         budgets: dict[str, set[str]] = {}
         for row in self.rows:
