@@ -33,9 +33,12 @@ def write_page(out: Path, asked: Collection[str] = ()) -> Path:
         OSError: the folder cannot be written.
     """
     results = Results(Rows(out).rows.values(), asked)
-    replaced = (
-        f" {results.replaced} more of the same names are of other contents." if results.replaced else ""
-    )
+    replaced = ""
+    if results.replaced:
+        replaced = (
+            f" {results.replaced} more rows are left out: they bear the same names, and their condition, session or "
+            "settings have changed since, or are not those asked for."
+        )
     targets = f"{len(results.targets)} target{'s' if len(results.targets) != 1 else ''}"
     content = page(
         "Comparison of methods",
