@@ -11,7 +11,13 @@ from torch import Tensor
 
 from ground.formats.srgb import from_srgb, to_srgb
 from obbgs_core.score.lpips import SMALLEST_PX, WeightsMissing, lpips
-from obbgs_core.score.metrics import cloud_distances, foreground_psnr_db, psnr_db, ssim
+from obbgs_core.score.metrics import (
+    cloud_distances,
+    completeness_of_part,
+    foreground_psnr_db,
+    psnr_db,
+    ssim,
+)
 from obbgs_core.sensor import Sensor
 
 log = logging.getLogger(__name__)
@@ -104,7 +110,8 @@ def cloud_scores(
 
     Returns:
         chamfer, hausdorff, accuracy and completeness as `cloud_distances` has them, but for empty clouds;
-        surface_shown: percentage of the true surface that the frames show.
+        surface_shown: percentage of the true surface that the frames show; completeness_of_shown: the completeness of
+        exactly that part (`completeness_of_part`).
     """
     true_cloud = true_cloud_m * units_per_m
     figures: dict[str, float] = {}
@@ -112,7 +119,10 @@ def cloud_scores(
         if len(cloud_m):
             distances = cloud_distances(cloud_m * units_per_m, true_cloud, shown)
             figures |= {f"{key}{name}": value for key, value in distances.items()}
-    return figures if shown is None else figures | {"surface_shown": 100 * float(shown.mean())}
+    if shown is not None:
+        figures["surface_shown"] = 100 * float(shown.mean())
+        figures["completeness_of_shown"] = completeness_of_part(true_cloud, shown)
+    return figures
 
 
 def of_similarity(figures: dict[str, float]) -> dict[str, float]:
