@@ -1,21 +1,24 @@
 """Milliseconds of the rasterizer by Gaussians, pixels, backend and threads: python -m tests.benchmarks.rasterizer
 
 Times are medians over repeats of `render` and of the whole gradient to the model; `mean_ms` and `fastest_ms` are of
-both together, the latter disturbed least by other work on the machine. One and two threads take turns. `reference_ms`
-is the plain PyTorch backend on the same Gaussians, measured on a window of the image and scaled by the pixels: its cost
-is the same for each. `bytes` is the kernels' own memory.
+both together, the latter disturbed least by other work on the machine. Kernels take turns, and so do one and two
+threads; `over_best_kernel` is the fastest time over that of the machine's best kernel. `reference_ms` is the plain
+PyTorch backend on the same Gaussians, measured on a window of the image and scaled by the pixels: its cost is the same
+for each. `bytes` is the kernels' own memory.
 """
 
 import argparse
+import itertools
 import multiprocessing
 import statistics
 import time
+from collections.abc import Sequence
 
 import torch
 
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.render import native_kernels, render
+from obbgs_core.render import Rendered, native_kernels, render
 from tests.benchmarks.rows import shown
 
 REPEATS = 25
@@ -66,18 +69,21 @@ def measure_reference(count: int, width: int) -> float:
 
 
 def measure(
-    backend: str, count: int, width: int, threads: tuple[int, ...] = (1,), distance: float = DISTANCE
+    backends: Sequence[str], count: int, width: int, threads: Sequence[int] = (1,), distance: float = DISTANCE
 ) -> list[dict]:
-    """Return a row for each number of threads, measured in turns, so that other work on the machine slows all alike."""
+    """Return a row for each backend and number of threads, in turns, so that other work slows all of them alike."""
     gaussians, cameras, rows = scene(count), camera(width, distance), []
-    times: dict[int, list[tuple[float, float]]] = {number: [] for number in threads}
+    turns = list(itertools.product(backends, threads))
+    times: dict[tuple[str, int], list[tuple[float, float]]] = {turn: [] for turn in turns}
+    drawn: dict[tuple[str, int], Rendered] = {}
     for repeat in range(REPEATS + 2):
-        for number in threads:
+        for backend, number in turns:
             torch.set_num_threads(number)
-            out, forward_ms, backward_ms = once(gaussians, cameras, backend)
+            drawn[backend, number], forward_ms, backward_ms = once(gaussians, cameras, backend)
             if repeat > 1:
-                times[number].append((forward_ms, backward_ms))
-    for number, both in times.items():
+                times[backend, number].append((forward_ms, backward_ms))
+    for (backend, number), both in times.items():
+        out = drawn[backend, number]
         row = {
             "backend": backend,
             "gaussians": count,
@@ -98,8 +104,9 @@ def chart(path: str) -> None:
     """Write an HTML page: cost against pixels and against Gaussians, one thread, best kernel."""
     from plotly.subplots import make_subplots
 
-    by_width = [measure("native", 20_000, width)[0] for width in (100, 200, 400, 800, 1600)]
-    by_count = [measure("native", count, 400)[0] for count in (2000, 5000, 20_000, 50_000, 100_000, 200_000)]
+    native = ("native",)
+    by_width = [measure(native, 20_000, width)[0] for width in (100, 200, 400, 800, 1600)]
+    by_count = [measure(native, count, 400)[0] for count in (2000, 5000, 20_000, 50_000, 100_000, 200_000)]
     titles = ("20,000 Gaussians", "400 x 400 pixels")
     figure = make_subplots(cols=2, subplot_titles=titles, shared_yaxes=True)
     sides = [
@@ -143,15 +150,19 @@ def main() -> None:
         other.start()
     if arguments.chart:
         return chart(arguments.chart)
-    sizes = [(2000, 100)] if arguments.quick else [(n, w) for n in (20_000, 100_000) for w in (400, 800)]
+    every = [(3000, 200), *itertools.product((20_000, 100_000), (400, 800))]
+    sizes = [(2000, 100)] if arguments.quick else every
     kernels = [f"native-{kernel}" for kernel in native_kernels()]
     for count, width in sizes:
         reference_ms = round(measure_reference(count, width))
-        rows = [row for kernel in kernels for row in measure(kernel, count, width)]
+        rows = measure(kernels, count, width)
+        best_ms = next(row["fastest_ms"] for row in rows if row["backend"] == kernels[0])
+        for row in rows:
+            row["over_best_kernel"] = round(row["fastest_ms"] / best_ms, 2)
         if not arguments.quick:
-            rows += measure("native", count, width, (1, 2))
+            rows += measure(("native",), count, width, (1, 2))
         if (count, width) == (20_000, 800):  # the object covers a tenth of the pixels
-            rows += measure("native", count, width, distance=2.7 * DISTANCE)
+            rows += measure(("native",), count, width, distance=2.7 * DISTANCE)
         for row in rows:
             row["reference_ms"] = reference_ms
             print(shown(row, "rasterizer", arguments.json), flush=True)
