@@ -18,8 +18,11 @@ ROOT = Path(__file__).parents[2]  # of a clone of the project
 
 
 def with_origin(row: dict, bench: str, command: str) -> dict:
-    """Return a row with the benchmark, commit, machine, load, date and command that it comes from."""
-    return {"bench": bench} | row | origin(command)
+    """Return a row with the benchmark, commit, machine, threads, load, date and command that it comes from.
+
+    What the row says itself stays, such as threads that were set for it alone.
+    """
+    return {"bench": bench} | row | origin(command) | row
 
 
 def origin(command: str) -> dict:

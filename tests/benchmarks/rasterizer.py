@@ -84,8 +84,10 @@ def measure(
                 times[backend, number].append((forward_ms, backward_ms))
     for (backend, number), both in times.items():
         out = drawn[backend, number]
+        covered = float((out.alpha > 0).float().mean())
         row = {
             "backend": backend,
+            "target": f"{count:,} Gaussians, {width}x{width} pixels, {covered:.0%} covered, threads: {number}",
             "gaussians": count,
             "width": width,
             "forward_ms": round(statistics.median(f for f, _ in both), 2),
@@ -94,7 +96,7 @@ def measure(
             "mean_ms": round(statistics.mean(f + b for f, b in both), 2),
             "fastest_ms": round(min(f + b for f, b in both), 2),
             "bytes": out.radiance.grad_fn.rasterization.bytes,  # pyright: ignore
-            "covered": round(float((out.alpha > 0).float().mean()), 3),
+            "covered": round(covered, 3),
         }
         rows.append(row)
     return rows

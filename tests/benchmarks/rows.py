@@ -15,7 +15,7 @@ from ground.compare.origin import this_command, with_origin
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "results"
 # what a line of a table is called by, where a row has it
-NAMES = ("method", "ablation", "condition", "scenario", "target")
+NAMES = ("method", "backend", "ablation", "condition", "scenario", "target")
 # and these where rows differ in them
 BUDGETS = {
     "steps_share": "share of the steps",
@@ -55,6 +55,9 @@ FIGURES = {  # key of a row: column title and format
     "cpu_seconds": ("processor time", "{:.1f} s"),
     "gaussians": ("Gaussians", "{:,.0f}"),
     "seconds": ("seconds", "{:.0f}"),
+    "forward_ms": ("rendering", "{:.1f} ms"),
+    "backward_ms": ("gradient", "{:.1f} ms"),
+    "over_best_kernel": ("over the best kernel", "{:.2f}"),
     "step_ms": ("one step", "{:.1f} ms"),
     "step_over_rasterizer": ("over its rendering and gradient", "{:.2f}"),
     "psnr_after_a_third_db": ("after a third of the pass", "{:.1f} dB"),
