@@ -283,7 +283,9 @@ def with_bracket(
     if duration is not None:
         if count is not None:
             raise ConfigError("--for", "says how many brackets, as --count does; give one of them")
-        spacing_s = mission.bracket.interval_s if interval is None else interval
+        if not math.isfinite(duration):
+            raise ConfigError("--for", f"expected a time in seconds, got {duration:g}")
+        spacing_s = dataclasses.replace(mission.bracket, **changes).interval_s
         changes["count"] = max(1, math.ceil(duration / spacing_s))
     section: BracketSection = dataclasses.replace(mission.bracket, **changes)
     orbit = mission.orbit

@@ -1,13 +1,13 @@
 """Check and repair a frame store after a crash, a bad sector or a change by hand."""
 
 import json
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from flightsw.errors import StoreError
 from flightsw.icd.packet import PacketError
-from flightsw.store import StoredFrame, index_entry, lock_store, parse_index_line, quarantine
+from flightsw.store import lock_store, quarantine, unused_transaction
+from flightsw.store_index import StoredFrame, index_entry, parse_index_line
 from obbgs_base.files import sync_folder, write_whole
 
 
@@ -130,7 +130,7 @@ class _Check:
     def _transaction(self) -> None:
         path = self.folder / "transaction"
         text = path.read_text(errors="replace") if path.exists() else "0"
-        if not (text.strip().isdigit() and int(text) < 1 << 32) and self._note(
+        if not (text.strip().isdecimal() and int(text) < 1 << 32) and self._note(
             f"transaction: holds no number but {text[:20]!r}; set to one that was never used"
         ):
-            write_whole(path, f"{int(time.time())}\n".encode())
+            write_whole(path, f"{unused_transaction()}\n".encode())

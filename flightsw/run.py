@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from flightsw.cameras import open_camera
-from flightsw.cameras.reconnecting import RETRY_S, ReconnectingCamera
+from flightsw.cameras.reconnecting import PATIENCE_S, RETRY_S, ReconnectingCamera
 from flightsw.commands import ReplayCounter
 from flightsw.downlink import DownlinkProgress, run_downlink
-from flightsw.errors import CaptureError
+from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.icd.mission import Mission
 from flightsw.ports import Link, open_link
@@ -63,8 +63,9 @@ def run_pass(
 ) -> RunResult:
     """Capture and send at the same time, whichever are asked for, and return what became of the frames.
 
-    Key, link and camera are opened before the store, so that wrong ones leave no store behind. Without a camera that
-    answers, stored frames are sent all the same, and its error is raised afterwards.
+    Key, link and camera are opened before the store, so that wrong ones leave no store behind. Where there is a link,
+    stored frames are sent without a camera that answers; it is tried again until the pass is over, and if it never
+    answered its error is raised afterwards.
 
     Args:
         stop: when set, capture and downlink end cleanly.
@@ -82,17 +83,16 @@ def run_pass(
         link, counter = _open_link(link_url, key_file, opened)
         if camera_url is not None:
             try:
-                camera = ReconnectingCamera(open_camera(camera_url, mission.camera), stop.wait)
-                opened.callback(camera.close)
+                camera = _open_camera(camera_url, mission, stop, opened)
             except CaptureError as error:
                 if link is None:
                     raise
                 no_camera = error  # what is stored is sent all the same
         store = open_store(store_dir, mission)
         if link is not None:
-            thread = _DownlinkThread(
-                FrameStore(store_dir), link, mission, counter, exit_when_empty, stop, on_sent, camera, alive
-            )
+            waiting = (exit_when_empty, stop, on_sent, alive)
+            thread = _DownlinkThread(FrameStore(store_dir), link, mission, counter, *waiting)
+            thread.camera = camera
             if camera_url is not None:
                 thread.capturing.set()
             thread.start()
@@ -104,8 +104,8 @@ def run_pass(
             on_captured(counts)
 
         try:
-            if no_camera is not None:
-                raise no_camera
+            if camera_url is not None and thread is not None and no_camera is not None:
+                thread.camera = camera = _awaited_camera(camera_url, mission, stop, opened, alive, no_camera)
             if camera is not None:
                 captured = _capture(mission, camera, store, stop, report, alive)
         except Exception as error:
@@ -143,6 +143,49 @@ def _open_link(
     return opened.enter_context(open_link(link_url, FLIGHT_SIDE)), counter
 
 
+def _open_camera(
+    url: str, mission: Mission, stop: threading.Event, opened: contextlib.ExitStack
+) -> ReconnectingCamera:
+    """Return a camera that `opened` closes."""
+    camera = ReconnectingCamera(open_camera(url, mission.camera), stop.wait)
+    opened.callback(camera.close)
+    return camera
+
+
+def _awaited_camera(
+    url: str,
+    mission: Mission,
+    stop: threading.Event,
+    opened: contextlib.ExitStack,
+    watchdog: Watchdog,
+    error: CaptureError,
+) -> ReconnectingCamera:
+    """Return a camera that did not answer once it does; it is tried until the pass is over, for `PATIENCE_S` at least.
+
+    Raises:
+        CaptureError: it never answered, or it cannot be what the mission expects.
+    """
+    pass_s = mission.bracket.count * mission.bracket.interval_s
+    over_utc_ns, patient_until_s = mission.orbit.start_utc_ns + pass_s * 1e9, time.monotonic() + PATIENCE_S
+    log.warning("no camera yet, it is tried again every %g s: %s", RETRY_S, error)
+    try:
+        while isinstance(error, CameraLost) and not stop.is_set():
+            if time.time_ns() > over_utc_ns and time.monotonic() > patient_until_s:
+                break
+            watchdog.expect("capture", RETRY_S + EXPOSURE_WITHIN_S)
+            stop.wait(RETRY_S)
+            try:
+                camera = _open_camera(url, mission, stop, opened)
+            except CaptureError as again:
+                error = again
+            else:
+                log.warning("the camera answers")
+                return camera
+    finally:
+        watchdog.ended("capture")
+    raise error
+
+
 def _capture(
     mission: Mission,
     camera: ReconnectingCamera,
@@ -155,11 +198,9 @@ def _capture(
         while (
             not camera.has_own_clock and not stop.is_set() and (left_s := (utc_ns - time.time_ns()) / 1e9) > 0
         ):
-            watchdog.expect("capture", EXPOSURE_WITHIN_S)
+            watchdog.expect("capture", RETRY_S + EXPOSURE_WITHIN_S)
             camera.reconnect()
-            pause_s = min(left_s, RETRY_S) if camera.lost else left_s
-            watchdog.expect("capture", pause_s + EXPOSURE_WITHIN_S)
-            stop.wait(pause_s)
+            stop.wait(min(left_s, RETRY_S))  # not all of it: the clock may be set meanwhile
 
     def on_frame(counts: CaptureCounts) -> None:
         watchdog.expect("capture", EXPOSURE_WITHIN_S)
@@ -196,18 +237,18 @@ class _DownlinkThread(threading.Thread):
         exit_when_empty: bool,
         stop: threading.Event,
         on_progress: Callable[[DownlinkProgress], None],
-        camera: ReconnectingCamera | None,
         watchdog: Watchdog,
     ):
         super().__init__(name="downlink", daemon=True)
         self.capturing = threading.Event()  # set while more frames may come
         self.captured = CaptureCounts()  # so far
+        self.camera: ReconnectingCamera | None = None  # until it answers
         self.camera_failed = False
         self.result = DownlinkProgress()
         self.error: Exception | None = None
         self._store, self._link, self._mission, self._counter = store, link, mission, counter
         self._exit_when_empty, self._stop_event = exit_when_empty, stop
-        self._on_progress, self._camera, self._watchdog = on_progress, camera, watchdog
+        self._on_progress, self._watchdog = on_progress, watchdog
         self._empty_since_s: float | None = None
 
     def run(self) -> None:
@@ -228,7 +269,8 @@ class _DownlinkThread(threading.Thread):
 
     def _capture_values(self) -> dict[str, Any]:
         """Return what capture knows of the housekeeping packet."""
-        if self.camera_failed or (self._camera is not None and self._camera.lost):
+        missing = self.capturing.is_set() if self.camera is None else self.camera.lost
+        if self.camera_failed or missing:
             state = "failed"
         elif self.capturing.is_set():
             state = "capturing"

@@ -1,6 +1,7 @@
 """Plan, expose, tag, store: the capture sequence. Given times, it owns no clock; one bad frame never ends the pass."""
 
 import logging
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from flightsw.store import FrameStore
 
 log = logging.getLogger(__name__)
 NS = 1_000_000_000
+NUMBER = re.compile(r"[\d.]+")
 
 
 @dataclass(frozen=True)
@@ -83,55 +85,62 @@ def capture(
     Args:
         camera: a `ReconnectingCamera` logs its own losses; they are only counted here.
         wait_until: returns when it is time for an exposure (UTC, ns); it may return early to stop.
-        settings: what the ground has commanded, read before each bracket (times) and each exposure (NEAR, safe mode).
+        settings: what the ground has commanded, read when a bracket is due (times), and when an exposure is (NEAR, and
+            safe mode, in which the time of the exposure passes without it).
 
     Raises:
         NavigationError: the mission's navigation file is not there.
-        StoreError: the disk refuses; without a store there is no capture. A full store is counted, not raised.
+        StoreError: the store holds another pass, or the disk refuses; without a store there is no capture. A full
+            store is counted, not raised.
     """
     counts = CaptureCounts()
+    store.hold_pass(mission.orbit.start_utc_ns)
     tagger = PoseTagger(mission)
-    times = _BracketTimes(mission, store, settings)
+    times = _BracketTimes(mission, store, wait_until, settings)
     failures = _Repeats("%d more exposures lost for the same reason: %s")
     refusals = _Repeats("%d more frames refused: %s")
     short = set()
+
+    def take(shot: Shot, max_error_dn: int) -> None:
+        try:
+            frame = expose(mission, camera, shot, store.next_frame_id, tagger)
+            roi_mask = region_of_interest(frame.dn, mission)
+            store.put(frame, max_error_dn=max_error_dn, roi_mask=roi_mask)
+        except StoreFull as error:
+            counts.refused += 1
+            refusals.log("the store is full", str(error))
+        except CameraLost:
+            counts.failed += 1
+            counts.lost_with_camera += 1
+            short.add(shot.bracket_id)
+            counts.brackets_short = len(short)
+        except (CaptureError, ValueError) as error:
+            counts.failed += 1
+            place = f"bracket {shot.bracket_id} frame {shot.bracket_index}"
+            failures.log(str(error), f"{place} lost: {error}")
+        else:
+            failures.end()
+            refusals.end()
+            times.observe(frame)
+            counts.stored += 1
+            counts.in_eclipse += frame.pose.in_eclipse
+            counts.pose_invalid += not frame.pose.valid
+
     try:
         for shot in plan(mission, times.at):
             if should_stop():
                 break
-            commanded = settings() if settings else None
             if store.holds(shot.bracket_id, shot.bracket_index):
                 counts.already_stored += 1
-            elif commanded is not None and commanded.safe_mode:
-                counts.skipped += 1
             else:
                 wait_until(shot.start_utc_ns)
                 if should_stop():
                     break
-                try:
-                    frame = expose(mission, camera, shot, store.next_frame_id, tagger)
-                    max_error_dn = commanded.max_error_dn if commanded else 0
-                    roi_mask = region_of_interest(frame.dn, mission)
-                    store.put(frame, max_error_dn=max_error_dn, roi_mask=roi_mask)
-                except StoreFull as error:
-                    counts.refused += 1
-                    refusals.log("the store is full", str(error))
-                except CameraLost:
-                    counts.failed += 1
-                    counts.lost_with_camera += 1
-                    short.add(shot.bracket_id)
-                    counts.brackets_short = len(short)
-                except (CaptureError, ValueError) as error:
-                    counts.failed += 1
-                    place = f"bracket {shot.bracket_id} frame {shot.bracket_index}"
-                    failures.log(str(error), f"{place} lost: {error}")
+                commanded = settings() if settings else None
+                if commanded is not None and commanded.safe_mode:
+                    counts.skipped += 1
                 else:
-                    failures.end()
-                    refusals.end()
-                    times.observe(frame)
-                    counts.stored += 1
-                    counts.in_eclipse += frame.pose.in_eclipse
-                    counts.pose_invalid += not frame.pose.valid
+                    take(shot, commanded.max_error_dn if commanded else 0)
             counts.planned += 1
             counts.stale_elements = tagger.stale_elements
             counts.outside_ephemeris = tagger.outside_ephemeris
@@ -173,14 +182,14 @@ def expose(
 
 
 class _Repeats:
-    """Logs the first of several equal problems in a row, and when the row ends how many more there were."""
+    """Logs the first of several problems in a row that differ in numbers only, and then how many more there were."""
 
     def __init__(self, summary: str):
         self._summary = summary  # takes the count and the problem
         self._last, self._repeats = "", 0
 
     def log(self, problem: str, line: str) -> None:
-        if problem == self._last:
+        if NUMBER.sub("", problem) == NUMBER.sub("", self._last):
             self._repeats += 1
             return
         self.end()
@@ -196,8 +205,14 @@ class _Repeats:
 class _BracketTimes:
     """Which exposure times the next bracket has: commanded, the mission's, or by what the last bracket showed."""
 
-    def __init__(self, mission: Mission, store: FrameStore, settings: Callable[[], Settings] | None):
-        self._mission, self._settings = mission, settings
+    def __init__(
+        self,
+        mission: Mission,
+        store: FrameStore,
+        wait_until: Callable[[int], None],
+        settings: Callable[[], Settings] | None,
+    ):
+        self._mission, self._wait_until, self._settings = mission, wait_until, settings
         self._auto = AutoBracket(mission.camera, mission.bracket)
         self._taken: list[Frame] = []
         self._last_seen: Geometry | None = None
@@ -216,12 +231,17 @@ class _BracketTimes:
         self._taken.append(frame)
 
     def at(self, trigger_utc_ns: int) -> tuple[float, ...]:
-        """Return the exposure times of the bracket that begins now; empty for the mission's own."""
+        """Return the exposure times of a bracket once it is due; empty for the mission's own."""
+        times_s = (
+            self._automatic(trigger_utc_ns) if self._mission.bracket.auto else ()
+        )  # takes time: before the wait
+        self._wait_until(trigger_utc_ns)
         commanded = self._settings() if self._settings else None
         if commanded is not None and commanded.exposure_times_ms is not None:
             return tuple(time_ms / 1e3 for time_ms in commanded.exposure_times_ms)
-        if not self._mission.bracket.auto:
-            return ()
+        return times_s
+
+    def _automatic(self, trigger_utc_ns: int) -> tuple[float, ...]:
         if self._taken:
             self._last_seen = Geometry.of(self._taken[-1].pose)
             self._auto.observe([(frame.dn, frame.exposure_time_s) for frame in self._taken], self._last_seen)

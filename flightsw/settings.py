@@ -9,7 +9,7 @@ from pathlib import Path
 from flightsw.errors import StoreError
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import BracketSection, Mission
-from obbgs_base.files import write_whole
+from flightsw.store import write_with_reserve
 
 log = logging.getLogger(__name__)
 ORDERS = ("oldest", "triage", "thumbnail-first")
@@ -53,12 +53,16 @@ def load_settings(folder: Path, mission: Mission) -> Settings:
             tree["exposure_times_ms"] = tuple(map(float, tree["exposure_times_ms"]))
         tree["max_error_dn"] = tree.pop("near")
         settings = Settings(**tree)
-        settings.bracket(mission)
     except FileNotFoundError:
         return default
-    except (OSError, ValueError, TypeError, KeyError, ConfigError) as error:
+    except (OSError, ValueError, TypeError, KeyError) as error:
         log.error("%s is not usable, the mission's own settings are used: %s", path, error)
         return default
+    try:
+        settings.bracket(mission)
+    except ConfigError as error:  # the others still hold, safe mode above all
+        log.error("the commanded exposure times do not fit, the mission's own are used: %s", error)
+        return dataclasses.replace(settings, exposure_times_ms=None)
     return settings
 
 
@@ -71,6 +75,6 @@ def save_settings(folder: Path, settings: Settings) -> None:
     tree = dataclasses.asdict(settings)
     tree["near"] = tree.pop("max_error_dn")
     try:
-        write_whole(folder / "settings.json", json.dumps(tree).encode())
+        write_with_reserve(folder / "settings.json", json.dumps(tree).encode())
     except OSError as error:
         raise StoreError(f"cannot keep the settings: {error}") from error

@@ -7,35 +7,25 @@ import hashlib
 import json
 import logging
 import os
+import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from flightsw.errors import StoreError, StoreFull
-from flightsw.icd.frame import Frame, decode_frame, encode_frame
+from flightsw.icd.frame import Frame, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.icd.packet import PacketError
+from flightsw.store_index import StoredFrame, index_entry, parse_index_line
 from obbgs_base.files import append_line, sync_folder, write_whole
 
 log = logging.getLogger(__name__)
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-RESERVE_BYTES = (
-    64 * 1024
-)  # kept for transfer numbers, so that a full disk cannot stop the downlink that empties it
-
-
-@dataclass(frozen=True)
-class StoredFrame:
-    """One line of the index."""
-
-    frame_id: int
-    bracket_id: int
-    bracket_index: int
-    sha256: str
-    size_bytes: int
+RESERVE = "reserve"  # the file that is given up for transfer numbers and settings
+RESERVE_BYTES = 64 * 1024  # so that a full disk cannot stop the downlink that empties it, nor commands
 
 
 class FrameStore:
@@ -74,7 +64,10 @@ class FrameStore:
                 if self._index_read_bytes < self._index_bytes:  # the power went in the middle of a line
                     os.truncate(self._index, self._index_read_bytes)
                 self._index_unindexed()
-                self._keep_reserve()
+                try:
+                    self._keep_reserve()
+                except OSError as error:
+                    log.warning("no reserve for transfer numbers and settings: %s", error)
 
     @property
     def next_frame_id(self) -> int:
@@ -127,6 +120,8 @@ class FrameStore:
             if frame_id not in self._stored:
                 raise StoreError(f"there is no frame {frame_id} to delete")
             self._drop(frame_id, reason)
+            with contextlib.suppress(OSError):  # not yet
+                self._keep_reserve()
 
     def path(self, frame_id: int) -> Path:
         return self._frames / f"{frame_id:08d}.obf"
@@ -159,18 +154,33 @@ class FrameStore:
         """Return a file transfer's number, never given before, not even before a power cut."""
         path = self.folder / "transaction"
         with _disk_errors("number a transfer"), self.locked():
-            text = path.read_text() if path.exists() else "0"
-            if not text.strip().isdigit():
+            text = path.read_text(errors="replace") if path.exists() else str(unused_transaction())
+            if not text.strip().isdecimal():
                 raise StoreError(f"{path} should hold a number, it holds {text[:20]!r}; run flightsw fsck")
             number = (int(text) + 1) % (1 << 32)
-            try:
-                write_whole(path, f"{number}\n".encode())
-            except OSError as error:
-                if error.errno not in DISK_FULL:
-                    raise
-                self._reserve.unlink(missing_ok=True)
-                write_whole(path, f"{number}\n".encode())
+            write_with_reserve(path, f"{number}\n".encode())
         return number
+
+    def hold_pass(self, first_trigger_utc_ns: int) -> None:
+        """Note which pass the frames are of; exposures are told apart by their number in the pass.
+
+        Raises:
+            StoreError: the store holds exposures of a pass that begins at another time, or the disk refuses.
+        """
+        path, begins = self.folder / "pass.json", _iso(first_trigger_utc_ns)
+        with _disk_errors("note the pass"), self.locked():
+            try:
+                known = json.loads(path.read_bytes())["first_trigger_utc"] if path.exists() else None
+            except (ValueError, TypeError, KeyError) as error:
+                log.warning("%s is damaged and written again: %r", path, error)
+                known = None
+            if known is not None and known != begins and self._exposures:
+                raise StoreError(
+                    f"{self.folder} holds exposures of the pass that begins at {known}, and this one begins at "
+                    f"{begins}: name another --store, or go on with that pass by --start {known}"
+                )
+            if known != begins:
+                write_with_reserve(path, json.dumps({"first_trigger_utc": begins}).encode())
 
     def mark_delivered(self, frame_id: int) -> None:
         """Take a frame out of the outbox; the frame itself stays until its room is needed."""
@@ -235,16 +245,10 @@ class FrameStore:
         )  # a line lost here is written at the next start
         self._read_index()
 
-    @property
-    def _reserve(self) -> Path:
-        return self.folder / "reserve"
-
     def _keep_reserve(self) -> None:
-        try:
-            if not self._reserve.exists():
-                write_whole(self._reserve, bytes(RESERVE_BYTES))
-        except OSError as error:
-            log.warning("no reserve for transfer numbers: %s", error)
+        reserve = self.folder / RESERVE
+        if not reserve.exists():
+            write_whole(reserve, bytes(RESERVE_BYTES))
 
     @property
     def _index_bytes(self) -> int:
@@ -315,41 +319,32 @@ class FrameStore:
         append_line(self._index, json.dumps(entry).encode())
 
 
+def write_with_reserve(path: Path, data: bytes) -> None:
+    """Write a small file of a store whole or not at all; where the disk is full, its reserve makes room.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    try:
+        write_whole(path, data)
+    except OSError as error:
+        if error.errno not in DISK_FULL:
+            raise
+        (path.parent / RESERVE).unlink(missing_ok=True)
+        write_whole(path, data)
+
+
+def unused_transaction() -> int:
+    """Return a transfer's number that no counter has reached: the time in seconds.
+
+    A store begins with it, since a receiver that remembers the transfers of another store answers for those.
+    """
+    return int(time.time()) % (1 << 32)
+
+
 def open_store(folder: Path, mission: Mission) -> FrameStore:
     """Return the store with the mission's quota and policy."""
     return FrameStore(folder, mission.store.quota_bytes, mission.store.when_full)
-
-
-def parse_index_line(line: bytes) -> StoredFrame | tuple[int, str]:
-    """Return a line of the index: a stored frame, or the number of a deleted one and the reason.
-
-    Raises:
-        ValueError: it is neither.
-    """
-    entry = json.loads(line)
-    try:
-        if set(entry) == {"frame_id", "dropped"}:
-            return int(entry["frame_id"]), str(entry["dropped"])
-        stored = StoredFrame(**entry)
-    except TypeError as error:
-        raise ValueError(str(error)) from error
-    numbers = (stored.frame_id, stored.bracket_id, stored.bracket_index, stored.size_bytes)
-    if not all(isinstance(n, int) and n >= 0 for n in numbers) or not isinstance(stored.sha256, str):
-        raise ValueError(f"values out of range: {entry}")
-    return stored
-
-
-def index_entry(path: Path, container: bytes) -> StoredFrame:
-    """Return the index line of a container, after decoding all of it.
-
-    Raises:
-        PacketError: it is no whole container, or not the one that its name says.
-    """
-    frame = decode_frame(container)
-    if f"{frame.frame_id:08d}" != path.stem:
-        raise PacketError(f"the file is called {path.name} but holds frame {frame.frame_id}")
-    sha256 = hashlib.sha256(container).hexdigest()
-    return StoredFrame(frame.frame_id, frame.bracket_id, frame.bracket_index, sha256, len(container))
 
 
 def quarantine(store: Path, path: Path) -> Path:
@@ -369,6 +364,10 @@ def lock_store(folder: Path) -> Iterator[None]:
     with open(folder / "lock", "wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
+
+
+def _iso(utc_ns: int) -> str:
+    return (datetime.fromtimestamp(0, UTC) + timedelta(microseconds=utc_ns // 1000)).isoformat()
 
 
 @contextlib.contextmanager

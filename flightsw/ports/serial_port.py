@@ -14,6 +14,8 @@ READ_BYTES = 65_536
 class SerialLink(Port):
     """A serial port."""
 
+    OPEN_ERRORS = (*Port.OPEN_ERRORS, termios.error)  # which is no OSError
+
     _port: serial.Serial | None = None
     _unsent = b""
 
@@ -53,7 +55,7 @@ class SerialLink(Port):
             data = os.read(descriptor, READ_BYTES)
             if not data:
                 raise OSError("the port hung up")
-        except (OSError, ValueError, termios.error) as error:
+        except self.OPEN_ERRORS as error:
             self._hang_up(error)
             return b""
         self.bytes_read += len(data)

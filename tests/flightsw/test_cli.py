@@ -51,6 +51,16 @@ def test_every_command_has_help_with_an_example(tool, command):
             2,
             "exposure_times_ms[0]",
         ),
+        (
+            ["capture", "--camera", "hil:///x", "--interval", "0", "--for", "10", "--store", "{tmp}"],
+            2,
+            "interval_s: 0.0 s is shorter than the bracket itself",
+        ),
+        (
+            ["capture", "--camera", "hil:///x", "--for", "inf", "--store", "{tmp}"],
+            2,
+            "--for: expected a time in seconds, got inf",
+        ),
         (["downlink", "--link", "serial:///dev/nowhere?baud=9600", "--store", "{tmp}"], 1, "/dev/nowhere"),
         (["downlink", "--link", "carrier://pigeon", "--store", "{tmp}"], 2, "carrier://pigeon"),
         (["triage", "--model", "nowhere.onnx", "--frames", "{tmp}"], 1, "nowhere.onnx"),

@@ -1,8 +1,10 @@
 """The ports that flight and ground share: URLs, hang-up and return, back-pressure, CAN."""
 
 import contextlib
+import errno
 import os
 import subprocess
+import termios
 import time
 import tty
 from pathlib import Path
@@ -105,6 +107,17 @@ def test_a_port_that_is_not_there_is_a_link_error(tmp_path):
         open_link(f"slcan://{tmp_path}/none", FLIGHT_SIDE)
     with pytest.raises(LinkError, match="cannot open nocan0"):
         open_link("can://nocan0", FLIGHT_SIDE)
+
+
+def test_a_port_that_goes_away_while_it_is_opened_is_a_link_error(terminal, monkeypatch):
+    """Such a call of termios fails with an error of its own, which is no OSError."""
+
+    def gone(descriptor: int, queue: int) -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(termios, "tcflush", gone)
+    with pytest.raises(LinkError, match="Input/output error"):
+        open_link(f"serial://{terminal[2]}", FLIGHT_SIDE)
 
 
 def test_bytes_pass_unchanged_both_ways(terminal):

@@ -7,12 +7,14 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from flightsw import run
 from flightsw.cameras import open_camera
 from flightsw.cameras.camera import Exposure
 from flightsw.cameras.reconnecting import PATIENCE_S, RETRY_S, ReconnectingCamera
@@ -20,6 +22,8 @@ from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.mission import load_mission
 from flightsw.sequencer import capture
 from flightsw.store import FrameStore
+from flightsw.watchdog import Watchdog
+from hil.links.virtual_serial import VirtualSerial
 
 MISSION = load_mission(Path(__file__).parents[1] / "golden" / "mission.yaml")
 LOST, STUCK = CameraLost("no answer"), CaptureError("the shutter stuck")
@@ -230,6 +234,65 @@ def test_a_camera_that_never_comes_back_is_two_lines_a_summary_and_a_failure(tmp
     ]
 
 
+def test_a_camera_that_answers_only_after_flight_has_started_takes_the_pass(tmp_path, small_mission):
+    with VirtualSerial(921_600) as line:
+        process = start_capture(tmp_path, "--link", line.flight_url)
+        assert process.stderr and "no camera yet, it is tried again" in process.stderr.readline()
+        with camera_process(tmp_path):
+            assert "the camera answers" in process.stderr.readline()
+            while len(list((tmp_path / "store").glob("frames/*.obf"))) < 24:
+                assert process.poll() is None
+                time.sleep(0.05)
+            process.terminate()
+            out, err = process.communicate(timeout=60)
+    assert "captured 24 frames, 0 were there, 0 failed" in out, err
+
+
+def test_a_camera_that_never_answers_is_given_up_and_the_link_goes_on(tmp_path, small_mission):
+    with VirtualSerial(921_600) as line:
+        process = start_capture(tmp_path, "--link", line.flight_url, patience_s=0.2)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 1 and not out
+    first, *_, last = err.splitlines()
+    assert "no camera yet, it is tried again every 0.05 s" in first and "no camera at hil://" in last
+
+
+class ComputersClock:
+    """The clock of the computer, which is slow by half an hour until it is set, and a stop that moves both on."""
+
+    def __init__(self, utc_ns: int, set_utc_ns: int):
+        self.utc_ns, self._set_utc_ns = utc_ns, set_utc_ns
+
+    def time_ns(self) -> int:
+        return self.utc_ns - (0 if self.utc_ns >= self._set_utc_ns else 1800 * 10**9)
+
+    def monotonic(self) -> float:
+        return self.utc_ns / 1e9
+
+    def wait(self, seconds: float) -> bool:
+        self.utc_ns += round(seconds * 1e9)
+        return False
+
+    def is_set(self) -> bool:
+        return False
+
+
+def test_a_clock_that_is_set_during_a_wait_costs_no_exposure(tmp_path, monkeypatch):
+    start_ns = MISSION.orbit.start_utc_ns
+    clock = ComputersClock(start_ns - 300 * 10**9, set_utc_ns=start_ns - 240 * 10**9)
+    monkeypatch.setattr(run, "time", clock)
+    late_s = []
+
+    class Punctual(Scripted):
+        def expose(self, exposure_time_s: float, start_utc_ns: int) -> Exposure:
+            late_s.append((clock.utc_ns - start_utc_ns) / 1e9)
+            return super().expose(exposure_time_s, start_utc_ns)
+
+    camera = ReconnectingCamera(Punctual(has_own_clock=False))
+    counts = run._capture(MISSION, camera, FrameStore(tmp_path), clock, lambda counts: None, Watchdog())
+    assert counts.stored == 48 and max(late_s) < 1e-3
+
+
 def test_the_ground_is_told_that_the_camera_is_lost(tmp_path, small_mission):
     """In the housekeeping packets of `flightsw capture --link`, while it is tried again and after it was given up."""
     from flightsw.icd.can import GROUND_SIDE
@@ -237,7 +300,6 @@ def test_the_ground_is_told_that_the_camera_is_lost(tmp_path, small_mission):
     from flightsw.icd.packet import APID_EVENTS, APID_HOUSEKEEPING, TELECOMMAND
     from flightsw.icd.telemetry import DICTIONARY
     from flightsw.ports import open_link
-    from hil.links.virtual_serial import VirtualSerial
 
     path = tmp_path / "small.yaml"
     path.write_text(path.read_text().replace("link:", "link:\n  housekeeping_s: 0.1"))

@@ -1,15 +1,20 @@
 """The capture sequence with a camera that misbehaves, and the region of interest."""
 
 import dataclasses
+import tempfile
 from pathlib import Path
 
 import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from flightsw.cameras.camera import Exposure
 from flightsw.errors import CaptureError
 from flightsw.icd.frame import decode_frame
 from flightsw.icd.mission import load_mission
-from flightsw.sequencer import capture, plan, region_of_interest
+from flightsw.sequencer import NS, capture, plan, region_of_interest
+from flightsw.settings import Settings
 from flightsw.store import FrameStore
 
 MISSION = load_mission(Path(__file__).parents[1] / "golden" / "mission.yaml")
@@ -75,6 +80,68 @@ def test_stopping_is_prompt(tmp_path):
     store = FrameStore(tmp_path)
     counts = capture(MISSION, Sky(), store, should_stop=lambda: len(store.frames) >= 5)
     assert counts.stored == 5
+
+
+class Clock:
+    """A clock that runs only while something waits, and settings that are commanded at its times."""
+
+    def __init__(self, commanded: dict[float, Settings]):
+        self.now_ns = MISSION.orbit.start_utc_ns - 60 * NS
+        self._commanded = [
+            (MISSION.orbit.start_utc_ns + round(s * NS), value) for s, value in commanded.items()
+        ]
+
+    def wait_until(self, utc_ns: int) -> None:
+        self.now_ns = max(self.now_ns, utc_ns)
+
+    def settings(self) -> Settings:
+        return [value for utc_ns, value in self._commanded if utc_ns <= self.now_ns][-1]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.tuples(st.floats(-59, 1100), st.booleans()), max_size=4))
+def test_an_exposure_is_taken_unless_safe_mode_holds_when_it_is_due(commanded):
+    changes = {-60.0: Settings("oldest")} | {
+        at_s: Settings("oldest", safe_mode=safe) for at_s, safe in sorted(commanded)
+    }
+    clock, camera = Clock(changes), Sky()
+    with tempfile.TemporaryDirectory() as folder:
+        store = FrameStore(Path(folder))
+        counts = capture(MISSION, camera, store, wait_until=clock.wait_until, settings=clock.settings)
+    due_ns = [shot.start_utc_ns for shot in plan(MISSION)]
+    again, expected_ns = Clock(changes), []
+    for utc_ns in due_ns:
+        again.wait_until(utc_ns)
+        if not again.settings().safe_mode:
+            expected_ns.append(utc_ns)
+    assert camera.starts_ns == expected_ns
+    assert (counts.stored, counts.skipped) == (len(expected_ns), len(due_ns) - len(expected_ns))
+    assert clock.now_ns == due_ns[-1]  # safe mode does not rush through the pass
+
+
+@pytest.mark.parametrize("auto", [False, True])
+def test_commanded_exposure_times_hold_from_the_next_bracket_on(tmp_path, auto):
+    mission = dataclasses.replace(MISSION, bracket=dataclasses.replace(MISSION.bracket, auto=auto))
+    commanded = Settings("oldest", exposure_times_ms=(1.0, 2.0))
+    clock = Clock({-60.0: Settings("oldest"), MISSION.bracket.interval_s - 1.0: commanded})
+    store = FrameStore(tmp_path)
+    capture(mission, Sky(), store, wait_until=clock.wait_until, settings=clock.settings)
+    times_s = [decode_frame(store.read(stored.frame_id)).exposure_time_s for stored in store.frames]
+    assert not {1e-3, 2e-3} & set(times_s[:3])
+    assert times_s[3:7] == [1e-3, 2e-3, 1e-3, 2e-3]
+
+
+def test_failures_that_differ_in_numbers_only_are_one_line_and_a_count(tmp_path, caplog):
+    class Late(Sky):
+        def expose(self, exposure_time_s: float, start_utc_ns: int) -> Exposure:
+            self.count += 1
+            raise CaptureError(f"the exposure was due {700 + 27.5 * self.count:.1f} s ago")
+
+    counts = capture(MISSION, Late(), FrameStore(tmp_path))
+    assert counts.failed == 48
+    first, rest = (record.getMessage() for record in caplog.records)
+    assert first.startswith("bracket 0 frame 0 lost: the exposure was due")
+    assert rest.startswith("47 more exposures lost for the same reason")
 
 
 def test_the_stored_frame_holds_time_tag_and_pixels(tmp_path):

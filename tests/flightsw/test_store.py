@@ -13,7 +13,8 @@ import pytest
 from flightsw.errors import StoreError, StoreFull
 from flightsw.fsck import fsck
 from flightsw.icd.frame import decode_frame, encode_frame
-from flightsw.store import FrameStore
+from flightsw.settings import Settings, load_settings, save_settings
+from flightsw.store import RESERVE_BYTES, FrameStore
 from obbgs_base.files import write_whole
 
 
@@ -116,11 +117,38 @@ def test_a_full_disk_leaves_no_half_line(tmp_path, make_frame, monkeypatch):
 
 
 def test_transaction_numbers_are_never_given_twice(tmp_path):
-    numbers = [FrameStore(tmp_path).next_transaction() for _ in range(3)]
-    assert numbers == [1, 2, 3]
-    (tmp_path / "transaction").write_text("?")
-    with pytest.raises(StoreError, match="should hold a number"):
-        FrameStore(tmp_path).next_transaction()
+    first, *numbers = [FrameStore(tmp_path).next_transaction() for _ in range(3)]
+    assert numbers == [first + 1, first + 2]
+    for damaged in (b"?", b"\xff\xfe", "²".encode()):
+        (tmp_path / "transaction").write_bytes(damaged)
+        with pytest.raises(StoreError, match="should hold a number"):
+            FrameStore(tmp_path).next_transaction()
+
+
+def test_another_store_does_not_number_its_transfers_alike(tmp_path, monkeypatch):
+    """A receiver that still runs answers a transfer that it knows, without taking the file."""
+    monkeypatch.setattr("flightsw.store.time.time", lambda: 1_800_000_000.0)
+    early = FrameStore(tmp_path / "early")
+    numbers = {early.next_transaction() for _ in range(100)}
+    monkeypatch.setattr("flightsw.store.time.time", lambda: 1_800_003_600.0)
+    assert FrameStore(tmp_path / "late").next_transaction() not in numbers
+
+
+def test_a_store_holds_one_pass(tmp_path, make_frame):
+    second_ns = 10**9
+    store = FrameStore(tmp_path)
+    store.hold_pass(5 * second_ns)
+    store.hold_pass(7 * second_ns)  # nothing was taken yet
+    fill(store, make_frame, 1)
+    FrameStore(tmp_path).hold_pass(7 * second_ns)
+    with pytest.raises(
+        StoreError, match=r"begins at 1970-01-01T00:00:07.*--start 1970-01-01T00:00:07\+00:00"
+    ):
+        FrameStore(tmp_path).hold_pass(9 * second_ns)
+    (tmp_path / "pass.json").write_text("[")
+    FrameStore(tmp_path).hold_pass(9 * second_ns)
+    with pytest.raises(StoreError, match="00:00:09"):
+        FrameStore(tmp_path).hold_pass(7 * second_ns)
 
 
 CAPTURE_UNTIL_KILLED = """
@@ -245,7 +273,9 @@ def test_a_full_disk_is_met_by_the_policy_and_heals(tmp_path, make_frame, monkey
     assert FrameStore(tmp_path).outbox() == store.outbox()
 
 
-def test_a_disk_that_is_truly_full_is_met_and_a_transfer_number_can_still_be_had(tmp_path, make_frame):
+def test_on_a_disk_that_is_truly_full_transfers_are_numbered_and_settings_kept(
+    tmp_path, make_frame, small_mission
+):
     disk = tmp_path / "disk"
     disk.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", disk], check=False).returncode:
@@ -260,9 +290,16 @@ def test_a_disk_that_is_truly_full_is_met_and_a_transfer_number_can_still_be_had
         with open(disk / "foreign", "wb", buffering=0) as foreign, contextlib.suppress(OSError):
             while True:
                 foreign.write(bytes(512))
-        assert store.next_transaction() == 1
+        assert store.next_transaction()
+        settings = Settings("triage", safe_mode=True)
+        save_settings(store.folder, settings)
+        assert load_settings(store.folder, small_mission) == settings
         store.mark_delivered(0)
         store.put(make_frame(store.next_frame_id))
         assert fsck(disk / "store").problems == []
+        (disk / "foreign").unlink()
+        for frame in store.frames:
+            store.drop(frame.frame_id)
+        assert (disk / "store" / "reserve").stat().st_size == RESERVE_BYTES
     finally:
         subprocess.run(["umount", disk], check=True)
