@@ -4,7 +4,7 @@ import logging
 from pathlib import Path
 
 from ground.session import FrameRecord, MissingFrames, Session, SessionError, open_session, read_records
-from ground.training_frames import is_held_out, is_usable, split, training_frame
+from ground.training_frames import is_held_out, split, training_frame, usable
 from obbgs_core.frames import TrainingFrame
 
 log = logging.getLogger(__name__)
@@ -24,7 +24,7 @@ class Arrivals:
         self.frames: list[TrainingFrame] = []
         self.training: list[FrameRecord] = []
         self.held_out: list[FrameRecord] = []
-        self.eclipsed = self.without_pose = 0
+        self.eclipsed = self.untagged = 0  # untagged: without a valid pose or the Sun's direction
         self._bytes_seen = 0  # of frames.jsonl
 
     @property
@@ -64,11 +64,11 @@ class Arrivals:
             # in the order of the lines, and no more of them than the session that was read a moment before has
             known = {record.id for record in session.frames}
             records = [record for record in read_records(self.folder) if record.id in known]
+            chosen = usable(records)
             self.eclipsed = sum(r.in_eclipse for r in records)
-            self.without_pose = sum(not r.pose_valid and not r.in_eclipse for r in records)
-            usable = [r for r in records if is_usable(r)]
-            training = [r for r in usable if not is_held_out(r)]
-            self.held_out = [r for r in usable if is_held_out(r)]
+            self.untagged = len(records) - self.eclipsed - len(chosen)
+            training = [r for r in chosen if not is_held_out(r)]
+            self.held_out = [r for r in chosen if is_held_out(r)]
         if [r.id for r in training[: len(self.training)]] != [r.id for r in self.training]:
             raise SessionError(f"{self.folder} was replaced by another session: start again")
         self.frames += [training_frame(session, record) for record in training[len(self.training) :]]

@@ -58,6 +58,7 @@ def import_command(
     from ground.formats.colmap import read_colmap
     from ground.formats.nerf import read_nerf
     from ground.formats.nerfstudio import read_nerfstudio
+    from ground.formats.placement import placed
     from ground.formats.shirt import read_shirt
     from ground.formats.views import EXACT, Values, first_of_each_split, is_transparent, write_session
 
@@ -85,6 +86,7 @@ def import_command(
         views, found_poses = _checked_poses(views, given_sigmas or sigmas, poses is PoseChoice.MEND)
         if poses is PoseChoice.MEND:
             source += "".join(f", {len(pictures)} poses {kind}" for kind, pictures in found_poses.items())
+    views, origin_moved = placed(views)
     given = None if values is None else Values(values.value)
     with Progress(TextColumn("importing"), BarColumn(), TimeRemainingColumn(), console=stderr) as progress:
         task = progress.add_task("import", total=len(views))
@@ -98,6 +100,7 @@ def import_command(
             lambda: progress.advance(task),
             given_sigmas or sigmas,
             registration,
+            origin_moved,
         )
     if json_:
         print(json.dumps({"frames": count, "session": str(session), **(registration or {}), **found_poses}))

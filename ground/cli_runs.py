@@ -154,7 +154,7 @@ def mesh_command(
     from ground.estimated_poses import estimated_records, read_estimate
     from ground.evaluate import keep_metrics
     from ground.mesh_files import write_mesh
-    from ground.model_files import white_radiance_of
+    from ground.model_files import model_sizes, white_radiance_of
     from ground.runs import open_run
 
     run = open_run(session, name, out)
@@ -163,7 +163,11 @@ def mesh_command(
     path = run.folder / f"{stem}.{format_.value}"
     facts = write_mesh(run.gaussians, run.session, training, path, white_radiance_of(run.session, training))
     if format_ is MeshFormatName.GLB:
-        keep_metrics(run, run.metrics | facts)
+        kept = {
+            key: value for key, value in run.metrics.items() if not key.endswith("_mesh")
+        }  # of the old mesh
+        missing = {n: why for n, why in kept.get("missing_outputs", {}).items() if n != path.name}
+        keep_metrics(run, kept | {"missing_outputs": missing} | facts | model_sizes(run.folder))
     if json_:
         print(json.dumps({"mesh": str(path)} | facts))
     else:

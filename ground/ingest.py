@@ -125,40 +125,39 @@ def listen(
         LinkError: the port cannot be opened.
         SessionError: the folder cannot be used as this mission's session, or another process listens into it.
     """
-    with open_link(link_url, GROUND_SIDE) as link:
+    with open_link(link_url, GROUND_SIDE) as link, listening(Path(session_dir)):
         writer = SessionWriter(session_dir, mission)
-        with listening(writer.folder):
-            ingest = _Ingest(link, writer, mission, on_event, forward)
-            interval_s = timer_s(link.baud_rate)
+        ingest = _Ingest(link, writer, mission, on_event, forward)
+        interval_s = timer_s(link.baud_rate)
+        now_s = clock_s()
+        ingest.last_packet_s = last_save_s = last_status_s = now_s
+        complete_s: float | None = None  # when the session first held all frames asked for
+        while not should_stop():
             now_s = clock_s()
-            ingest.last_packet_s = last_save_s = last_status_s = now_s
-            complete_s: float | None = None  # when the session first held all frames asked for
-            while not should_stop():
-                now_s = clock_s()
-                frames_before = ingest.frames_received
-                ingest.turn(now_s)
-                if ingest.frames_received > frames_before or now_s - last_save_s >= SAVE_S:
-                    on_progress(ingest.summary())
-                if now_s - last_save_s >= SAVE_S:
-                    last_save_s = now_s
-                    ingest.save()
-                if now_s - last_status_s >= STATUS_S:
-                    last_status_s = now_s
-                    on_status(ingest.status(now_s))
-                if idle_timeout_s is not None and now_s - ingest.last_packet_s > idle_timeout_s:
-                    log.info("no packet for %.1f s", idle_timeout_s)
+            frames_before = ingest.frames_received
+            ingest.turn(now_s)
+            if ingest.frames_received > frames_before or now_s - last_save_s >= SAVE_S:
+                on_progress(ingest.summary())
+            if now_s - last_save_s >= SAVE_S:
+                last_save_s = now_s
+                ingest.save()
+            if now_s - last_status_s >= STATUS_S:
+                last_status_s = now_s
+                on_status(ingest.status(now_s))
+            if idle_timeout_s is not None and now_s - ingest.last_packet_s > idle_timeout_s:
+                log.info("no packet for %.1f s", idle_timeout_s)
+                break
+            if exit_after is not None and writer.frame_count >= exit_after:
+                # If the spacecraft is still there, it must learn that its last frames are stored.
+                complete_s = now_s if complete_s is None else complete_s
+                is_told = ingest.flight_outbox == 0 and not ingest.open_transfers
+                is_gone = now_s - ingest.last_packet_s > LINGER_INTERVALS * interval_s
+                if is_told or is_gone or now_s - complete_s > SETTLE_INTERVALS * interval_s:
                     break
-                if exit_after is not None and writer.frame_count >= exit_after:
-                    # If the spacecraft is still there, it must learn that its last frames are stored.
-                    complete_s = now_s if complete_s is None else complete_s
-                    is_told = ingest.flight_outbox == 0 and not ingest.open_transfers
-                    is_gone = now_s - ingest.last_packet_s > LINGER_INTERVALS * interval_s
-                    if is_told or is_gone or now_s - complete_s > SETTLE_INTERVALS * interval_s:
-                        break
-            ingest.save()
-            on_progress(ingest.summary())
-            on_status(ingest.status(now_s))
-            return ingest.summary()
+        ingest.save()
+        on_progress(ingest.summary())
+        on_status(ingest.status(now_s))
+        return ingest.summary()
 
 
 class _Ingest:

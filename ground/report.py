@@ -217,10 +217,6 @@ def _training(run: Run) -> str:
         "Left: the loss that training minimises. Right: the PSNR of each step's noisy frames. Both are running means; "
         "where they have levelled off, more steps would change little."
     )
-    if run.metrics["method"] == "obbgs":
-        note += (
-            " Early steps use averaged, less noisy pixels, so both curves jump where the resolution rises."
-        )
     return section("Training", note, plot(figure))
 
 

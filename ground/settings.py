@@ -50,8 +50,8 @@ def changes_for(
     if quality is not None:
         changes = quality_changes(config, quality)
     if budget != "auto":
-        if not (budget.isascii() and budget.isdigit()) or int(budget) == 0:
-            raise ValueError(f"--budget must be auto or a number of Gaussians, got {budget!r}")
+        if not (budget.isascii() and budget.isdigit()) or int(budget) < 2:
+            raise ValueError(f"--budget must be auto or a number of at least 2 Gaussians, got {budget!r}")
         changes = budget_changes(config, changes, int(budget))
     if steps is not None:
         changes["steps"] = steps

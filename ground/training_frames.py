@@ -1,6 +1,7 @@
 """From a session's frames to those of a training: which are used, which are held out for testing, in what form."""
 
 import logging
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -20,39 +21,47 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
     Where the frames state their splits, those of `test` are held out, or those of `val` where there is no test frame;
     otherwise the frames of `val` are in neither list. Where nothing but `train` is stated, and where no split is, every
     eighth bracket is held out as a whole (`is_held_out`); where that is none, the last one; a single bracket is all for
-    training. Frames in eclipse and frames whose pose is not valid are in neither list.
+    training. Frames that are not `usable` are in neither list.
 
     Raises:
         SessionError: no frame is left, or none that is for training.
     """
-    usable = [r for r in session.frames if is_usable(r)]
-    if not usable:
+    frames = usable(session.frames)
+    if not frames:
         eclipsed = sum(r.in_eclipse for r in session.frames)
         raise SessionError(
             f"none of the {len(session.frames)} frames can be used: {eclipsed} in eclipse, the others without a valid "
             "pose"
         )
-    if len(usable) < len(session.frames):
+    if len(frames) < len(session.frames):
         log.warning(
-            "%d frames are left out: in eclipse, or without a valid pose", len(session.frames) - len(usable)
+            "%d frames are left out: in eclipse, or without a valid pose or the Sun's direction",
+            len(session.frames) - len(frames),
         )
-    stated = {name: [r for r in usable if r.split == name] for name in SPLITS}
+    stated = {name: [r for r in frames if r.split == name] for name in SPLITS}
     if any(stated.values()) and not stated["train"]:
         raise SessionError(
-            f"none of the {len(usable)} usable frames is in the split train: import the training pictures too"
+            f"none of the {len(frames)} usable frames is in the split train: import the training pictures too"
         )
     if held_out := stated["test"] or stated["val"]:
         return stated["train"], held_out
-    brackets = sorted({r.bracket for r in usable})
-    chosen = {r.bracket for r in usable if is_held_out(r)}
+    brackets = sorted({r.bracket for r in frames})
+    chosen = {r.bracket for r in frames if is_held_out(r)}
     if not chosen and len(brackets) > 1:
         chosen = {brackets[-1]}
-    return [r for r in usable if r.bracket not in chosen], [r for r in usable if r.bracket in chosen]
+    return [r for r in frames if r.bracket not in chosen], [r for r in frames if r.bracket in chosen]
 
 
-def is_usable(record: FrameRecord) -> bool:
-    """Return whether a frame's pose is valid and it was not taken in eclipse."""
-    return record.pose_valid and not record.in_eclipse
+def usable(records: Sequence[FrameRecord]) -> list[FrameRecord]:
+    """Return the frames whose pose is valid and that were not taken in eclipse.
+
+    Where the first of them knows the Sun's direction, those that do not are left out as well: a model whose radiance
+    turns with the Sun can be compared with none of them. More frames after these change nothing of what is returned.
+    """
+    posed = [record for record in records if record.pose_valid and not record.in_eclipse]
+    if not posed or sun_direction(posed[0]) is None:
+        return posed
+    return [record for record in posed if sun_direction(record) is not None]
 
 
 def is_held_out(record: FrameRecord) -> bool:

@@ -19,7 +19,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
@@ -181,7 +180,9 @@ class Truth:
         try:
             with open(path, "rb") as file, np.load(file) as arrays:
                 return arrays["radiance"].astype(np.float32), arrays["alpha"].astype(np.float32) / 255
-        except (OSError, ValueError, KeyError, BadZipFile) as error:
+        except (
+            Exception
+        ) as error:  # of its zip archive, of zlib, or of NumPy's header: whichever the damage meets
             raise SessionError(f"{path} is damaged: {error}") from error
 
     def _require(self, record: FrameRecord) -> None:

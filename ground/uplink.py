@@ -191,9 +191,14 @@ def listening(session: Path) -> Iterator[None]:
     """Hold the lock by which only one process listens into a session.
 
     Raises:
-        SessionError: another process listens.
+        SessionError: another process listens, or the folder cannot be made.
     """
-    with open(session / "listener.lock", "wb") as lock:
+    with contextlib.ExitStack() as opened:
+        try:
+            session.mkdir(parents=True, exist_ok=True)
+            lock = opened.enter_context(open(session / "listener.lock", "wb"))
+        except OSError as error:
+            raise SessionError(f"cannot write the session {session}: {error}") from error
         for tried in range(LOCK_TRIES):
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

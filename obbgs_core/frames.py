@@ -101,15 +101,31 @@ def cameras_of(frames: list[TrainingFrame]) -> Cameras:
 
 
 def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[TrainingFrame], float | None]:
-    """Return the checked frames; with exposure ignored, all take the geometric mean of the exposures.
+    """Return the checked frames, in single precision; if exposure is ignored, all take the exposures' geometric mean.
 
     Raises:
         TooFewFrames: fewer than three.
-        ReconstructionError: sizes or backgrounds differ, a value is not finite, or a pose covariance is not a
-            covariance.
+        ReconstructionError: a shape is not that of `TrainingFrame` or a picture smaller than 3x3 pixels; sizes or
+            backgrounds differ, a value is not finite, or a pose covariance is not a covariance.
     """
     if len(frames) < FEWEST_FRAMES:
         raise TooFewFrames(f"a reconstruction needs at least {FEWEST_FRAMES} frames, got {len(frames)}")
+    frames = [
+        dataclasses.replace(
+            f, **{name: getattr(f, name).detach().float() for name in ("dn", "world_to_camera", "K")}
+        )
+        for f in frames
+    ]
+    for f in frames:
+        if f.dn.ndim != 3 or f.dn.shape[2] not in (1, 3) or min(f.dn.shape[:2]) < 3:
+            raise ReconstructionError(
+                f"frame {f.id}: expected a picture [H, W, 1 or 3] of at least 3x3 pixels, got {list(f.dn.shape)}"
+            )
+        if f.world_to_camera.shape != (4, 4) or f.K.shape != (3, 3):
+            shapes = f"{list(f.world_to_camera.shape)} and {list(f.K.shape)}"
+            raise ReconstructionError(
+                f"frame {f.id}: expected world_to_camera [4, 4] and K [3, 3], got {shapes}"
+            )
     shapes = {tuple(f.dn.shape) for f in frames}
     if len(shapes) > 1:
         raise ReconstructionError(f"all frames must have one size and channel count, got {sorted(shapes)}")

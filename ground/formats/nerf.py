@@ -1,11 +1,12 @@
 """NeRF-synthetic folders: transforms_{train,val,test}.json, camera-to-world in OpenGL axes, pictures of 8 bits.
 
 Keys that other readers ignore keep what the format has no place for: the calibration, and the exposure time, time,
-bracket and Sun direction of each frame.
+bracket, Sun direction and covariance of the pose of each frame.
 """
 
 import dataclasses
 import json
+import logging
 import math
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from ground.formats.views import (
 from ground.session import SPLITS, FrameRecord, Session
 from obbgs_base.files import write_whole
 
+log = logging.getLogger(__name__)
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 # Of eleven brackets six are for training, two for validation, three for testing; 121 brackets of three frames give
@@ -62,7 +64,7 @@ def read_nerf(folder: Path) -> tuple[list[View], Exported | None]:
 
 
 def export_nerf(session: Session, out: Path) -> dict[str, int]:
-    """Write a session as a NeRF-synthetic folder and return the number of frames in each split.
+    """Write a session's frames with a valid pose as a NeRF-synthetic folder, and return their number in each split.
 
     Pictures are opaque: black level to full scale becomes 0 to 255. Frames are in the splits of `split_frames`.
     """
@@ -71,7 +73,7 @@ def export_nerf(session: Session, out: Path) -> dict[str, int]:
     counts = {}
     for split in SPLITS:
         (out / split).mkdir(parents=True, exist_ok=True)
-        records = [record for record in session.frames if split_of[record.id] == split]
+        records = [record for record in posed_frames(session) if split_of[record.id] == split]
         frames = []
         for record in records:
             name = f"{split}/r_{record.id:04d}"
@@ -85,6 +87,16 @@ def export_nerf(session: Session, out: Path) -> dict[str, int]:
         write_whole(out / f"transforms_{split}.json", json.dumps(tree, indent=1).encode() + b"\n")
         counts[split] = len(records)
     return counts
+
+
+def posed_frames(session: Session) -> list[FrameRecord]:
+    """Return the frames that are exported, those whose pose is valid; what is left out is logged."""
+    posed = [record for record in session.frames if record.pose_valid]
+    if left_out := len(session.frames) - len(posed):
+        log.warning("%d frames are left out, because their poses are not valid", left_out)
+    if session.navigation.sigmas.vector().any():
+        log.warning("how far the pass's poses err together is not exported: they are as tagged")
+    return posed
 
 
 def split_frames(session: Session) -> dict[int, str]:
@@ -122,6 +134,7 @@ def frame_keys(session: Session, record: FrameRecord) -> dict[str, Any]:
         "bracket_index": record.bracket_index,
         "sun_dir_body": record.sun_dir_body.tolist(),
         "in_eclipse": record.in_eclipse,
+        **({"pose_covariance": record.covariance.tolist()} if record.covariance.any() else {}),
     }
 
 
@@ -156,6 +169,8 @@ def load_transforms(path: Path) -> dict[str, Any]:
     frames = tree.get("frames") if isinstance(tree, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise FormatError(f'{path}: expected an object with a list "frames"')
+    if masked := sum("mask_path" in frame for frame in frames):
+        log.warning("%s: the masks of %d pictures are not read: all of their pixels count", path, masked)
     return tree
 
 
@@ -178,6 +193,9 @@ def read_frame(frame: dict[str, Any], image: Path, intrinsics: Intrinsics, where
     try:
         time_ns, bracket = frame.get("mid_exposure_utc_ns"), frame.get("bracket")
         sun = np.array(frame.get("sun_dir_body", (0.0, 0.0, 0.0)), dtype=np.float64)
+        covariance = np.array(frame.get("pose_covariance", np.zeros((6, 6))), dtype=np.float64)
+        if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
+            raise ValueError(f"pose_covariance: expected finite [6, 6], got {covariance.tolist()}")
         exposure_time_s = float(frame.get("exposure_time_s", 1.0))
         if sun.shape != (3,) or not 0 < exposure_time_s < math.inf:
             raise ValueError(f"exposure_time_s {exposure_time_s}, sun_dir_body {sun.tolist()}")
@@ -191,8 +209,9 @@ def read_frame(frame: dict[str, Any], image: Path, intrinsics: Intrinsics, where
             bracket_index=int(frame.get("bracket_index", 0)),
             sun_dir_body=sun,
             in_eclipse=bool(frame.get("in_eclipse", False)),
+            covariance=covariance,
         )
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise FormatError(f"{where}: {image.name}: {error}") from error
 
 
@@ -251,5 +270,5 @@ def _intrinsics(tree: dict[str, Any], image: Path, where: Path) -> Intrinsics:
         )
     except KeyError as error:
         raise FormatError(f"{where}: {error} is missing") from error
-    except (TypeError, ValueError, ZeroDivisionError) as error:
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError) as error:
         raise FormatError(f"{where}: {image.name}: the intrinsics are not valid: {error}") from error

@@ -17,6 +17,7 @@ from ground.formats.nerf import (
     image_path,
     load_transforms,
     picture,
+    posed_frames,
     read_exported,
     read_frame,
     split_frames,
@@ -53,11 +54,11 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], Exported | None]:
 
 
 def export_nerfstudio(session: Session, out: Path) -> dict[str, int]:
-    """Write a session as a nerfstudio folder, pictures as in `export_nerf`; return the frames per split."""
+    """Write a session as a nerfstudio folder, frames and pictures as in `export_nerf`; return the frames per split."""
     (out / "images").mkdir(parents=True, exist_ok=True)
     split_of = split_frames(session)
     frames, splits = [], {"train": [], "val": [], "test": []}
-    for record in session.frames:
+    for record in posed_frames(session):
         name = f"images/frame_{record.id:06d}.png"
         write_whole(out / name, picture(session, record))
         frames.append({"file_path": name, **frame_keys(session, record)})
@@ -108,5 +109,5 @@ def _intrinsics(keys: dict[str, Any], where: Path) -> Intrinsics:
         )
     except KeyError as error:
         raise FormatError(f"{where}: {error} is missing") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{where}: the intrinsics are not valid: {error}") from error

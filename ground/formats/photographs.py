@@ -63,13 +63,21 @@ class Registered:
 
 
 def _keep_only_of(work: Path, folder: Path, names: Sequence[str]) -> None:
-    """Make the folder of features and matches, without those of other pictures: COLMAP knows pictures by name alone."""
+    """Make the folder of features and matches, without those of other pictures: COLMAP knows pictures by name alone.
+
+    Raises:
+        FormatError: there is a folder of that name that no import has made.
+    """
     digest = hashlib.sha256()
     for name in names:
         content = (folder / name).read_bytes()
         digest.update(f"{name}\0{len(content)}\0".encode() + content)
     noted = work / PICTURES
-    if work.exists() and not (noted.is_file() and noted.read_text() == digest.hexdigest()):
+    if work.exists() and any(work.iterdir()) and not noted.is_file():
+        raise FormatError(
+            f"{work} is there and not from an import: choose another --session, or move it away"
+        )
+    if noted.is_file() and noted.read_text(errors="replace") != digest.hexdigest():
         log.warning("%s is of other pictures and begins anew", work)
         shutil.rmtree(work)
     work.mkdir(parents=True, exist_ok=True)

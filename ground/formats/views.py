@@ -68,6 +68,7 @@ class View:
     bracket_index: int = 0
     sun_dir_body: np.ndarray = field(default_factory=lambda: np.zeros(3))  # unit; zero where unknown
     in_eclipse: bool = False
+    covariance: np.ndarray | None = None  # [6, 6] of the pose, as in a session's frames; None: not stated
     split: str | None = None  # train, val or test; stated for all views or for none
 
 
@@ -119,6 +120,7 @@ def write_session(
     on_view: Callable[[], None] = lambda: None,
     sigmas: PoseSigmas = EXACT,
     registration: dict | None = None,
+    origin_moved: np.ndarray | None = None,
 ) -> int:
     """Write a new session from pictures and return the number of its frames.
 
@@ -133,8 +135,9 @@ def write_session(
             black; None: as the export says, otherwise black.
         exported: what our own export says of the pictures; their 8 bits span its camera's range from black level to
             full scale.
-        sigmas: how far the poses can err; the training corrects what is not exact.
+        sigmas: how far the poses can err; the training corrects what is not exact. If exact, what the views say counts.
         registration: what structure from motion says of the pictures, for the session to keep.
+        origin_moved: [3] where in the data set's axes the session has its origin; None: in the same place.
 
     Raises:
         FormatError: there are no views, their sizes differ, or a picture cannot be read or has another size.
@@ -169,6 +172,7 @@ def write_session(
         "background": target.background,
         "encoding": target.encoding,
         **({} if registration is None else {"registration": registration}),
+        **({} if origin_moved is None else {"origin_moved": origin_moved.tolist()}),
         "tles": {},
         "losses": {},
         "frames_received": len(views),
@@ -359,10 +363,11 @@ def _foreign_camera(intrinsics: Intrinsics, channels: int, bit_depth: int, longe
 
 def _frame(view: View, number: int, dn: np.ndarray, camera: CameraSection, sigmas: PoseSigmas) -> Frame:
     w2c = view.world_to_camera
+    same_for_all = np.diag(np.repeat([sigmas.position_m**2, sigmas.rotation_rad**2], 3))
     pose = PoseTag(
         quat_body_to_camera=matrix_to_quat(w2c[:3, :3]),
         position_body_m=-w2c[:3, :3].T @ w2c[:3, 3],
-        covariance=np.diag(np.repeat([sigmas.position_m**2, sigmas.rotation_rad**2], 3)),
+        covariance=view.covariance if sigmas == EXACT and view.covariance is not None else same_for_all,
         sun_dir_body=view.sun_dir_body,
         in_eclipse=view.in_eclipse,
         valid=True,

@@ -183,11 +183,23 @@ def load_ply(path: Path) -> Gaussians:
         raise ReconstructionError(
             f"{path} should hold {4 * counts[0] * len(names)} bytes of numbers, has {len(body)}"
         )
-    table = dict(
-        zip(names, torch.from_numpy(np.frombuffer(body, "<f4").reshape(-1, len(names)).T.copy()), strict=True)
-    )
+    columns = torch.from_numpy(np.frombuffer(body, "<f4").reshape(-1, len(names)).T.copy())
+    table = dict(zip(names, columns, strict=True))
+    try:
+        return _model_of(table, lines)
+    except (LookupError, RuntimeError, ValueError) as error:
+        raise ReconstructionError(
+            f"{path} is damaged: its header does not describe a model: {error}"
+        ) from error
+
+
+def _model_of(table: dict[str, Tensor], lines: list[str]) -> Gaussians:
+    """Return the model of a PLY's columns and the lines of its header."""
+    names = list(table)
     radiance = [name for name in names if name.startswith("radiance_sh_")]
     channels = 1 + max(int(name.split("_")[3]) for name in radiance)
+    if len(radiance) % channels:
+        raise ValueError(f"{len(radiance)} columns of radiance for {channels} channels")
     shading: Shading = "view"
     ambient = torch.zeros(())
     fitted: dict[str, Any] = {}
@@ -210,7 +222,7 @@ def load_ply(path: Path) -> Gaussians:
         quats=torch.stack([table[f"rot_{i}"] for i in range(4)], 1),
         log_scales=torch.stack([table[f"scale_{i}"] for i in range(3)], 1),
         opacity_logits=table.get("fitted_opacity", table["opacity"]),
-        sh=torch.stack([table[name] for name in radiance], 1).reshape(counts[0], -1, channels),
+        sh=torch.stack([table[name] for name in radiance], 1).reshape(len(table["x"]), -1, channels),
         shading=shading,
         ambient=ambient,
         **fitted,

@@ -16,7 +16,7 @@ from obbgs_core.frames import TrainingFrame, mean_exposure_s
 from obbgs_core.model import sh
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
-from obbgs_core.settings import at_least_one, check
+from obbgs_core.settings import check, number
 from obbgs_core.start import hull
 
 log = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ class StartSettings:
     # seen: the radiance that the frames show where the points project; grey: half of full scale, plus up to 0.0011 of
     # it at random (3DGS, on data sets without a point cloud)
     colour: Literal["seen", "grey"] = "seen"
-    count: int = at_least_one(100_000)  # at most: the hull may have fewer points
+    count: int = number(100_000, least=2)  # at most: the hull may have fewer points
 
     def __post_init__(self):
         check(self, "start")
@@ -80,9 +80,13 @@ def first_gaussians(
         sh_degree: of the spherical harmonics that the Gaussians have room for.
 
     Raises:
-        ReconstructionError: every frame is black.
+        ReconstructionError: every frame is black, or the origin is behind the cameras.
     """
     radius = hull.radius_m(outlines)
+    if radius == 0 and any(outline.certain.any() for outline in outlines):
+        raise ReconstructionError(
+            "the origin of the body's axes lies behind every camera that sees light: poses must have it in the target"
+        )
     if radius == 0:
         raise ReconstructionError(
             f"all {len(frames)} frames are black (eclipse, or exposures too short): nothing rises above the noise"

@@ -19,6 +19,7 @@ from obbgs_core.frames import (
     FEWEST_FRAMES,
     TrainingFrame,
     camera_extent_m,
+    cameras_of,
     mean_exposure_s,
     sun_span_deg,
     usable,
@@ -47,6 +48,7 @@ NOISE_FRAMES = 12  # about so many, spread evenly, by which the noise is measure
 # of the scatter of empty sky over that of the sensor model, or the reverse; frames that fit it have 0.93 to 0.97
 CLEAR_EXCESS = 1.3
 UNSMOOTHED = 1.1  # ratio of the scatter of pixels two apart to that of neighbours; noise has 1.02 to 1.05
+MOST_HIDDEN = 0.01  # share of the first Gaussians that may be nearer to the cameras than what is drawn
 AS_MANY_PICTURES = 35  # long exposures: the lit pixels of fewer count as those of so many (experiment 084)
 EXACT_TAGS = "as tagged (the tags are exact)"
 TOO_FEW_BRACKETS = "as tagged (too few brackets for validation)"
@@ -134,6 +136,7 @@ def prepare(
     gaussians, radius_m, start = first_gaussians(
         posed, list(outlines.values()), sensor, config.start, config.light.sh_degree, rng
     )
+    _check_nearness(gaussians.means.detach(), posed)
     gaussians = dataclasses.replace(gaussians, footprint=config.footprint)
     sky = {i: outline.sky for i, outline in outlines.items()} if config.loss.sky_weight else None
     shown_part = windows(posed, gaussians.means.detach(), outlines) if config.windows else None
@@ -195,6 +198,24 @@ def _lit(frames: list[TrainingFrame], shown: list[bool]) -> list[TrainingFrame]:
             f"{len(lit)} rise above the noise, {FEWEST_FRAMES} are needed"
         )
     return lit
+
+
+def _check_nearness(points: Tensor, frames: list[TrainingFrame]) -> None:
+    """Refuse first Gaussians [N, 3] m that are too near to the cameras to be drawn.
+
+    Raises:
+        ReconstructionError: many of them are.
+    """
+    near_m = cameras_of(frames[:1]).near_m
+    poses = torch.stack([frame.world_to_camera for frame in frames])
+    depths_m = points @ poses[:, 2, :3].T + poses[:, 2, 3]
+    in_front = depths_m > 0
+    hidden = int((in_front & (depths_m < near_m)).sum()) / max(1, int(in_front.sum()))
+    if hidden > MOST_HIDDEN:
+        raise ReconstructionError(
+            f"{hidden:.0%} of the target is nearer to the cameras than {near_m} m and is not drawn: are the poses "
+            "in metres? Scale their positions up, by a thousand if they are in kilometres"
+        )
 
 
 def _adam(setup: TrainingSetup, gaussians: Gaussians, exact_tags: bool) -> Adam:

@@ -25,6 +25,7 @@ from obbgs_core.frames import cameras_of
 from obbgs_core.io.ply import load_ply
 from obbgs_core.score.metrics import foreground_psnr_db, psnr_db
 from obbgs_core.train.result import Exposing
+from tests.commands import call
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
 QUICK = {"steps": 30, "start.count": 500, "growth.max_gaussians": 600, "light.sh_degree": 0}
@@ -184,6 +185,23 @@ def test_a_damaged_mesh_is_named_whatever_its_reader_says(tmp_path, monkeypatch)
     monkeypatch.setattr(trimesh, "load_scene", reader)
     with pytest.raises(SessionError, match=r"model\.glb is damaged"):
         read_mesh_points(tmp_path / "model.glb", 10)
+
+
+def test_a_mesh_that_is_made_again_takes_the_place_of_what_was_said_of_the_old_one(session, tmp_path):
+    shutil.copytree(session, tmp_path / "s")
+    run = tmp_path / "s" / "runs" / "run"
+    metrics = json.loads((run / "metrics.json").read_text())
+    metrics |= {"missing_outputs": {"model.glb": "No space left", "model.onnx": "torn"}, "glb_bytes": None}
+    metrics["completeness_mesh"] = 12.5
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    (run / "model.glb").unlink()
+    done = call("ground", "mesh", "--session", str(tmp_path / "s"))
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["missing_outputs"] == {"model.onnx": "torn"}
+    assert metrics["glb_bytes"] == (run / "model.glb").stat().st_size
+    assert "completeness_mesh" not in metrics
+    assert "model.glb is missing" not in (run / "model_card.md").read_text()
 
 
 def test_the_mesh_is_scored_by_points_on_its_area_and_what_the_frames_show_apart(session):

@@ -1,5 +1,6 @@
 """Import and export: small folders in the exact layouts, and readers and writers that are not ours."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -18,11 +19,14 @@ from ground.formats.axes import opengl_to_world_to_camera, world_to_camera_to_op
 from ground.formats.colmap import read_colmap
 from ground.formats.nerf import export_nerf, read_nerf, split_frames
 from ground.formats.nerfstudio import export_nerfstudio, read_nerfstudio
+from ground.formats.placement import placed
 from ground.formats.shirt import read_shirt
 from ground.formats.views import (
     FormatError,
     Intrinsics,
+    PoseSigmas,
     Values,
+    View,
     undistort,
     write_session,
 )
@@ -169,6 +173,121 @@ def test_a_session_survives_export_and_import(tmp_path, session):
         assert np.abs(above_black - again.dn(b)).max() <= step_dn / 2 + 0.5
     assert again.camera.dn_per_radiance_s == session.camera.dn_per_radiance_s
     assert again.camera.read_noise_dn == pytest.approx(math.hypot(8.0, step_dn / math.sqrt(12)))
+
+
+def changed_frames(session, change):
+    """Return the session with its frames' lines changed."""
+    lines = [json.loads(line) for line in (session.path / "frames.jsonl").read_text().splitlines()]
+    for number, line in enumerate(lines):
+        change(number, line)
+    (session.path / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return open_session(session.path)
+
+
+FORMATS = pytest.mark.parametrize(
+    ("export", "read"), [(export_nerf, read_nerf), (export_nerfstudio, read_nerfstudio)]
+)
+
+
+@FORMATS
+def test_poses_that_are_not_valid_are_not_exported_and_others_keep_how_far_they_err(
+    tmp_path, session, export, read, caplog
+):
+    def change(number, line):
+        line["pose_valid"] = number not in (2, 7)
+        line["covariance"] = (np.eye(6) * (number + 1) * 1e-6).tolist()
+
+    session = changed_frames(session, change)
+    assert sum(export(session, tmp_path / "out").values()) == 10
+    assert "2 frames are left out, because their poses are not valid" in caplog.text
+    views, exported = read(tmp_path / "out")
+    write_session(views, tmp_path / "again", "out", exported=exported)
+    kept = [record for record in session.frames if record.pose_valid]
+    for a, b in zip(kept, open_session(tmp_path / "again").frames, strict=True):
+        np.testing.assert_array_equal(a.covariance, b.covariance)
+    write_session(views, tmp_path / "told", "out", exported=exported, sigmas=PoseSigmas(0.01, 0.1))
+    told = open_session(tmp_path / "told").frames[0].covariance
+    np.testing.assert_allclose(np.diag(told), [0.01] * 3 + [1e-4] * 3)
+
+
+@FORMATS
+def test_masks_are_not_read_and_that_is_said(tmp_path, session, export, read, caplog):
+    export(session, tmp_path / "out")
+    for path in (tmp_path / "out").glob("transforms*.json"):
+        tree = json.loads(path.read_text())
+        for frame in tree["frames"]:
+            frame["mask_path"] = "masks/none.png"
+        path.write_text(json.dumps(tree))
+    read(tmp_path / "out")
+    assert "are not read: all of their pixels count" in caplog.text
+
+
+@pytest.mark.parametrize("key", ["w", "bracket", "bracket_index", "mid_exposure_utc_ns", "pose_covariance"])
+def test_a_number_without_end_is_one_named_error(tmp_path, session, key):
+    export_nerfstudio(session, tmp_path / "out")
+    tree = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    (tree if key == "w" else tree["frames"][0])[key] = 0
+    text = json.dumps(tree).replace(f'"{key}": 0', f'"{key}": 1e400', 1)
+    (tmp_path / "out" / "transforms.json").write_text(text)
+    with pytest.raises(FormatError, match=r"transforms\.json"):
+        read_nerfstudio(tmp_path / "out")
+
+
+def ring(origin: np.ndarray, folder: Path, parallel: bool = False) -> list[View]:
+    """Views of a bright square at `origin`, from a ring about it, or from a plane of cameras that look alike."""
+    intrinsics = Intrinsics(64, 48, 80.0, 80.0, 32.0, 24.0)
+    views = []
+    for number, angle in enumerate(np.linspace(0, 2 * np.pi, 8, endpoint=False)):
+        towards = np.array([0.0, 0.0, 1.0]) if parallel else np.array([np.cos(angle), 0.3, np.sin(angle)])
+        towards /= np.linalg.norm(towards)
+        right = np.cross([0.0, 1.0, 0.0], towards)
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(towards, right), towards])
+        aside = np.array([0.6 * np.cos(angle), 0.6 * np.sin(angle), 0.0]) if parallel else np.zeros(3)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ (origin - 5 * towards + aside)
+        seen = np.array(intrinsics.K) @ (pose[:3, :3] @ origin + pose[:3, 3])
+        u, v = seen[:2] / seen[2]
+        picture = np.zeros((48, 64), np.uint8)
+        picture[round(v - 0.5) - 3 : round(v - 0.5) + 4, round(u - 0.5) - 3 : round(u - 0.5) + 4] = 200
+        path = folder / f"{number}.png"
+        write_png(path, picture)
+        views.append(View(path, pose, intrinsics))
+    return views
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+@pytest.mark.parametrize("origin", [(20.0, -3.0, 8.0), (0.0, 40.0, 5.0), (0.0, 0.0, 6.0)])
+def test_an_origin_out_of_sight_is_moved_into_the_target(tmp_path, parallel, origin):
+    target = np.array(origin)
+    moved, where = placed(ring(target, tmp_path, parallel))
+    seen = sum(view.world_to_camera[2, 3] > 0 for view in moved)
+    assert seen == 8
+    if where is None:  # the ring of (0, 0, 6) and the plane see the origin themselves
+        assert origin == (0.0, 0.0, 6.0) and parallel
+    else:
+        np.testing.assert_allclose(where, target, atol=0.15)  # two pixels
+        for view in moved:
+            assert np.linalg.norm(view.world_to_camera[:3, 3]) == pytest.approx(5.0, abs=0.8)
+
+
+def test_an_origin_that_pictures_show_stays_and_even_pictures_do_not_tell_it(tmp_path, caplog):
+    views = ring(np.zeros(3), tmp_path)
+    same, where = placed(views)
+    assert where is None and same == views and not caplog.messages
+    for view in views:
+        write_png(view.image, np.full((48, 64), 7, np.uint8))
+    far = [
+        dataclasses.replace(view, world_to_camera=view.world_to_camera @ shift(np.array([0.0, 90.0, 0.0])))
+        for view in views
+    ]
+    assert placed(far) == (far, None) and "do not tell where the target is" in caplog.text
+
+
+def shift(by: np.ndarray) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = by
+    return matrix
 
 
 def test_whole_brackets_go_to_one_split(session):

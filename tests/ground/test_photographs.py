@@ -162,6 +162,17 @@ def test_features_of_other_pictures_of_the_same_names_are_not_used(tmp_path, cap
     assert not features_stay() and "is of other pictures" in caplog.text
 
 
+def test_a_folder_that_no_import_has_made_is_left_alone(tmp_path):
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((64, 64), 50, np.uint8))
+    mine = tmp_path / "work" / "mine.txt"
+    mine.parent.mkdir()
+    mine.write_text("precious")
+    with pytest.raises(FormatError, match="not from an import"):
+        read_photographs(tmp_path, mine.parent)
+    assert mine.read_text() == "precious"
+
+
 def test_deviations_of_poses_are_numbers_of_at_least_0():
     with pytest.raises(ValueError, match="at least 0"):
         PoseSigmas(0.1, -1.0)

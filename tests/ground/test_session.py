@@ -2,14 +2,20 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from flightsw.icd.frame import encode_frame
 from flightsw.icd.pose_sections import NavigationErrorsSection
 from ground.session import MissingFrames, SessionCorrupt, SessionError, open_session
 from ground.session_writer import SessionWriter
+from ground.training_frames import usable
+
+GOLDEN_RECORD = open_session(Path(__file__).parents[1] / "golden" / "session").frames[0]
 
 
 @pytest.fixture
@@ -167,6 +173,29 @@ def test_an_empty_session_is_missing_its_frames(tmp_path, small_mission):
     SessionWriter(tmp_path / "empty", small_mission)
     with pytest.raises(MissingFrames, match="holds no frames"):
         open_session(tmp_path / "empty")
+
+
+@given(
+    st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans()), min_size=1, max_size=30),
+    st.integers(0, 30),
+)
+def test_frames_without_the_sun_are_left_out_where_the_first_has_it(tags, first_come):
+    records = [
+        dataclasses.replace(
+            GOLDEN_RECORD,
+            id=number,
+            pose_valid=valid,
+            in_eclipse=dark,
+            sun_dir_body=np.array([0.0, 0.0, 1.0 if sun else 0.0]),
+        )
+        for number, (valid, dark, sun) in enumerate(tags)
+    ]
+    posed = [number for number, (valid, dark, _) in enumerate(tags) if valid and not dark]
+    sunny = [number for number in posed if tags[number][2]]
+    chosen = [record.id for record in usable(records)]
+    assert chosen == (sunny if posed and tags[posed[0]][2] else posed)
+    earlier = [record.id for record in usable(records[:first_come])]
+    assert earlier == chosen[: len(earlier)]  # what comes later changes nothing of it
 
 
 def test_missing_pictures_are_named(session):

@@ -106,6 +106,22 @@ def test_a_damaged_truth_is_refused_and_named(session, changes):
         Truth(session)
 
 
+def test_whatever_byte_of_a_radiance_is_damaged_it_is_read_or_named(session):
+    truth, record = Truth(session), session.frames[0]
+    path = session.path / "truth" / "radiance" / f"{record.id:06d}.npz"
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    named = 0
+    for _ in range(300):
+        damaged = bytearray(whole)
+        damaged[rng.integers(len(whole))] = rng.integers(256)
+        path.write_bytes(damaged)
+        try:
+            truth.radiance(record)
+        except SessionError as error:
+            named += "is damaged" in str(error)
+    assert named > 50
+
+
 def test_a_frame_that_the_truth_lacks_and_a_damaged_file_are_named(session):
     truth, record = Truth(session), session.frames[0]
     (session.path / "truth" / "radiance" / f"{record.id:06d}.npz").write_bytes(b"PK\x03\x04 cut off")

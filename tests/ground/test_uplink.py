@@ -1,6 +1,7 @@
 """Commands on the ground: sealed, each with its own counter, repeated until the result is known, executed once."""
 
 import json
+import os
 import random
 import threading
 from pathlib import Path
@@ -12,6 +13,7 @@ from flightsw.icd.auth import Key, unseal, unseal_file
 from flightsw.icd.command import Command, Report
 from flightsw.icd.mission import ConfigError
 from flightsw.store import FrameStore
+from ground.ingest import listen
 from ground.session import SessionError
 from ground.uplink import (
     Uplinker,
@@ -221,6 +223,21 @@ def test_reports_of_commands_that_are_not_ours_change_nothing(session, key_file)
     uplinker.next_command(0.0)
     uplinker.take_report(Report(0, counter + 1, "completed", "forged"), 0.0)
     assert outcome(session, counter) is None and outcome(session, counter + 1) is None
+
+
+def test_a_second_listener_is_refused_before_it_touches_the_session(tmp_path, small_mission):
+    folder = tmp_path / "s"
+    master, slave = os.openpty()
+    try:
+        with listening(folder):
+            (folder / "frames.jsonl").write_text('{"id": 1, half a line')
+            with pytest.raises(SessionError, match="another process listens"):
+                listen(f"serial://{os.ttyname(slave)}", folder, small_mission)
+            assert (folder / "frames.jsonl").read_text() == '{"id": 1, half a line'
+            assert not (folder / "session.json").exists()
+    finally:
+        os.close(master)
+        os.close(slave)
 
 
 def test_one_process_listens_into_a_session(session):

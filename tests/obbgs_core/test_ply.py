@@ -107,6 +107,15 @@ def test_a_foreign_or_cut_ply_is_refused(tmp_path):
             load_ply(tmp_path / "b.ply")
 
 
+@pytest.mark.parametrize("name", [b"scale_1", b"rot_0", b"opacity", b"radiance_sh_0_1", b"property float x"])
+def test_a_header_that_lost_a_column_s_name_is_refused(tmp_path, name):
+    save_ply(model(3, 4, 3), tmp_path / "m.ply")
+    damaged = (tmp_path / "m.ply").read_bytes().replace(name, b"?" * len(name), 1)
+    (tmp_path / "m.ply").write_bytes(damaged)
+    with pytest.raises(ReconstructionError, match=r"m\.ply"):
+        load_ply(tmp_path / "m.ply")
+
+
 def test_a_surface_is_read_by_others(tmp_path):
     points, normals = torch.rand(7, 3), torch.nn.functional.normalize(torch.randn(7, 3), dim=1)
     save_surface_ply(points, normals, tmp_path / "surface.ply")

@@ -334,6 +334,69 @@ def test_hostile_frames_are_named(frames, field, value):
         Trainer([*frames, hostile], SENSOR, preset("obbgs", QUICK))
 
 
+def test_arrays_of_other_precision_train_as_those_of_single_precision(frames):
+    double = [
+        dataclasses.replace(
+            f, dn=f.dn.to(torch.int32), world_to_camera=f.world_to_camera.double(), K=f.K.double()
+        )
+        for f in frames
+    ]
+    config = preset("obbgs", QUICK | {"steps": 3})
+    single = [dataclasses.replace(f, dn=f.dn.to(torch.int32).float()) for f in frames]
+    ours, theirs = (train(given, SENSOR, config, seed=3) for given in (double, single))
+    for name, tensor in ours.gaussians.tensors().items():
+        assert torch.equal(tensor, getattr(theirs.gaussians, name)), name
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"dn": torch.zeros(16, 16)},
+        {"dn": torch.zeros(16, 16, 4)},
+        {"dn": torch.zeros(2, 16, 1)},
+        {"world_to_camera": torch.eye(3)},
+        {"K": torch.eye(4)},
+    ],
+)
+def test_a_wrong_shape_is_named_with_its_frame(frames, changes):
+    wrong = [*frames[:5], dataclasses.replace(frames[5], id=41, **changes), *frames[6:]]
+    with pytest.raises(ReconstructionError, match=r"frame 41: expected"):
+        train(wrong, SENSOR, preset("obbgs", QUICK))
+
+
+def moved(frames: list[TrainingFrame], scale: float, shift=(0.0, 0.0, 0.0)) -> list[TrainingFrame]:
+    """Return the frames as if a metre were `scale` m, with the body's origin moved by `shift` m."""
+    poses = []
+    for f in frames:
+        pose = f.world_to_camera.clone()
+        pose[:3, 3] = scale * pose[:3, 3] + pose[:3, :3] @ torch.tensor(shift)
+        poses.append(dataclasses.replace(f, world_to_camera=pose))
+    return poses
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e-7])
+def test_a_target_too_near_to_be_drawn_is_refused_with_advice(frames, scale):
+    with pytest.raises(ReconstructionError, match=r"nearer to the cameras than 0\.01 m .*in metres"):
+        Trainer(moved(frames, scale), SENSOR, preset("obbgs", QUICK))
+    assert Trainer(moved(frames, 1e3), SENSOR, preset("obbgs", QUICK)).setup.radius_m > 100
+
+
+def test_an_origin_behind_all_cameras_is_not_taken_for_darkness(frames):
+    away = [
+        dataclasses.replace(f, world_to_camera=f.world_to_camera - 2 * torch.diag(f.world_to_camera[:, 3]).T)
+        for f in frames
+    ]
+    for f in away:
+        f.world_to_camera[:3, 3] = torch.tensor([0.0, 0.0, -5.0])
+    with pytest.raises(ReconstructionError, match="behind every camera that sees light"):
+        Trainer(away, SENSOR, preset("obbgs", QUICK))
+
+
+def test_a_single_first_gaussian_is_refused():
+    with pytest.raises(ValueError, match=r"start\.count must be 2 or more, got 1"):
+        preset("obbgs", {"start.count": 1})
+
+
 def test_too_few_frames_and_a_diverging_rate_are_named_errors(frames):
     with pytest.raises(TooFewFrames, match="at least 3 frames, got 2"):
         train(frames[:2], SENSOR, preset("obbgs", QUICK))
