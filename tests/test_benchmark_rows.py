@@ -3,7 +3,9 @@
 import json
 import statistics
 
-from tests.benchmarks import rows
+import pytest
+
+from tests.benchmarks import charts, rows
 
 
 def test_a_row_says_commit_machine_load_and_command():
@@ -11,6 +13,8 @@ def test_a_row_says_commit_machine_load_and_command():
     assert row["bench"] == "triage" and row["psnr_clean_db"] == 40.0
     assert {"commit", "machine", "threads", "load", "utc", "command"} <= set(row)
     assert row["command"].startswith("python -m tests.benchmarks.triage")
+    own = json.loads(rows.shown({"threads": 7}, "rasterizer", as_json=True))
+    assert own["threads"] == 7
 
 
 def test_the_page_has_a_line_a_method_and_target_with_the_mean_over_seeds(tmp_path):
@@ -39,6 +43,14 @@ def test_budgets_stand_on_lines_of_their_own_where_rows_differ_in_them(tmp_path)
 def test_the_committed_page_is_made_of_the_committed_rows():
     page = rows.FOLDER / "RESULTS.md"
     assert page.read_text() == rows.page(sorted(rows.FOLDER.glob("*.jsonl")))
+
+
+@pytest.mark.parametrize("name", charts.CHARTS)
+def test_the_charts_are_drawn_from_the_committed_rows(name):
+    figure, drawn = charts.CHARTS[name]()
+    assert drawn and all(axis.lines for axis in figure.axes)
+    path = rows.ROOT / "docs" / f"{name}.png"
+    assert charts.drawn_from(path) == charts.digest(drawn), "run: python -m tests.benchmarks.charts"
 
 
 def test_no_row_stands_twice():
