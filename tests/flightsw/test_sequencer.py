@@ -99,16 +99,17 @@ class Clock:
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.lists(st.tuples(st.floats(-59, 1100), st.booleans()), max_size=4))
+@given(st.lists(st.tuples(st.floats(-59, 230), st.booleans()), max_size=4))
 def test_an_exposure_is_taken_unless_safe_mode_holds_when_it_is_due(commanded):
     changes = {-60.0: Settings("oldest")} | {
         at_s: Settings("oldest", safe_mode=safe) for at_s, safe in sorted(commanded)
     }
+    mission = dataclasses.replace(MISSION, bracket=dataclasses.replace(MISSION.bracket, count=4))
     clock, camera = Clock(changes), Sky()
     with tempfile.TemporaryDirectory() as folder:
         store = FrameStore(Path(folder))
-        counts = capture(MISSION, camera, store, wait_until=clock.wait_until, settings=clock.settings)
-    due_ns = [shot.start_utc_ns for shot in plan(MISSION)]
+        counts = capture(mission, camera, store, wait_until=clock.wait_until, settings=clock.settings)
+    due_ns = [shot.start_utc_ns for shot in plan(mission)]
     again, expected_ns = Clock(changes), []
     for utc_ns in due_ns:
         again.wait_until(utc_ns)
