@@ -1,9 +1,11 @@
 """Commands from the ground: decrypted, checked, counted, executed at most once, and reported stage by stage.
 
 Nothing has an effect before its tag, its counter, its arguments and, where it destroys, its arming are good, and the
-counter is on the disk before the effect. A command that comes again is answered with its reports, never executed.
+counter is on the disk before the effect. A command that comes again is answered with its reports, never executed. One
+whose counter cannot be kept is neither executed nor answered, as if it had been lost on the link.
 """
 
+import contextlib
 import dataclasses
 import fcntl
 import hashlib
@@ -23,16 +25,19 @@ from flightsw.icd.mission import Mission
 from flightsw.icd.packet import PacketError
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.settings import Settings, load_settings, save_settings
-from flightsw.store import FrameStore
+from flightsw.store import FrameStore, write_with_reserve
 from obbgs_base.files import write_whole
 
 log = logging.getLogger(__name__)
 REMEMBERED = 64  # commands whose reports are sent again when the ground asks again
+RESERVE_BYTES = 8 * 1024  # given up for the counter on a full disk: commands are what empties it
 ANSWER_S = 0.2  # between answers to repeated commands: a flood of replays must not fill the downlink
 
 
 class ReplayCounter:
     """The counter of the last authentic command, on the disk beside the key; one process at a time has it.
+
+    A file beside the counter holds some space in reserve for when the disk is full.
 
     Raises:
         ConfigError: the key or the counter file is missing, damaged or another key's.
@@ -53,21 +58,31 @@ class ReplayCounter:
         except BlockingIOError as error:
             self.close()
             raise ConfigError(str(self.path), "another process takes commands with this key") from error
+        self._reserve = self.path.with_name(self.path.name + ".reserve")
+        self._keep_reserve()
 
     def advance(self, counter: int) -> None:
         """Keep the counter of a command that is about to have an effect.
 
         Raises:
-            StoreError: the disk refuses; the command must not be executed.
+            StoreError: the disk refuses. The command must be neither executed nor reported as refused: after a restart
+                it could be taken, and then the report would not have been true.
         """
-        self.last = counter  # first: a command that is refused here must not be taken when it comes again
         try:
-            write_whole(self.path, self.key.counter_text(counter).encode())
+            write_with_reserve(self.path, self.key.counter_text(counter).encode(), self._reserve)
         except OSError as error:
             raise StoreError(f"cannot keep the command counter: {error}") from error
+        self.last = counter
+        self._keep_reserve()
 
     def close(self) -> None:
         os.close(self._lock)
+
+    def _keep_reserve(self) -> None:
+        """Make the reserve if there is none; without space it is tried again at the next command."""
+        with contextlib.suppress(OSError):
+            if not self._reserve.exists():
+                write_whole(self._reserve, bytes(RESERVE_BYTES))
 
 
 @dataclass(frozen=True)
@@ -91,8 +106,8 @@ class Upload:
 class Commander:
     """Takes sealed commands, gives reports.
 
-    `upload` is the file that the ground may send now, None most of the time. Without a counter (no key) every
-    command is refused.
+    `upload` is the file that the ground may send now, None most of the time. A model that has come has a file of its
+    own, by which the end of its verification is told. Without a counter (no key) every command is refused.
     """
 
     def __init__(
@@ -114,6 +129,7 @@ class Commander:
         self._on_refusal, self._clock_s, self._utc_ns = on_refusal, clock_s, utc_ns
         self._remembered: OrderedDict[int, list[Report]] = OrderedDict()
         self._armed: tuple[str, float] | None = None  # command, until when
+        self._verifying: dict[Path, int] = {}  # the command of each model that has come
         self._next_answer_s = float("-inf")
 
     @property
@@ -136,10 +152,14 @@ class Commander:
             return
         try:
             self._counter.advance(counter)
+        except StoreError as error:
+            self._refuse(f"command {counter} is not taken yet: {error}")
+            return  # without a report: the ground sends the command again
+        try:
             command = Command.unpack(content)
             self._check_arming(command)
             self._check(command)
-        except (PacketError, StoreError, ValueError) as error:
+        except (PacketError, ValueError) as error:
             self._refuse(f"counter {counter}: {error}")
             self._note(counter, "refused", str(error))
             return
@@ -163,7 +183,7 @@ class Commander:
         if upload is None or name != upload.file_name:
             return None
         self.upload = None
-        path = self._store.folder / "model.onnx.received"
+        path = self._store.folder / f"{name}.received"
         try:
             content = unseal_file(upload.file_key, data)
             if len(content) != upload.size_bytes or hashlib.sha256(content).digest() != upload.sha256:
@@ -172,11 +192,17 @@ class Commander:
         except (AuthError, OSError) as error:
             self._note(upload.counter, "failed", str(error))
             return None
+        self._verifying[path] = upload.counter
         return path
 
-    def end_model(self, counter: int, problem: str | None, result: str = "") -> None:
-        """Report how the verification of a model file ended."""
-        self._note(counter, "failed" if problem else "completed", problem or result)
+    def end_model(self, path: Path, problem: str | None, result: str = "") -> None:
+        """Report how the verification of a model file ended, to the command that announced it."""
+        self._note(self._verifying.pop(path), "failed" if problem else "completed", problem or result)
+
+    def end_models(self, problem: str) -> None:
+        """Report that no model is verified any more."""
+        for path in list(self._verifying):
+            self.end_model(path, problem)
 
     def _answer_again(self, counter: int) -> None:
         if self._clock_s() < self._next_answer_s:
@@ -226,6 +252,8 @@ class Commander:
                 self._change(priority=values["order"])
                 return values["order"]
             case "model":
+                if self.upload is not None:
+                    self._note(self.upload.counter, "failed", f"replaced by command {counter}")
                 self.upload = Upload(counter, **values)
                 return None
             case "arm":

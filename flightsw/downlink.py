@@ -172,6 +172,7 @@ class _Downlink:
         self._uploads: Receiver | None = None  # of the model file that was announced last
         self._upload_counter = 0
         self._ranking.start()
+        self._commander.end_models("the downlink failed before the model was in use")
         self._frames.look()
         for frame_id in {frame.frame_id for frame in store.frames}.difference(self.waiting):
             with contextlib.suppress(OSError), open(store.path(frame_id), "rb") as container:
@@ -347,7 +348,7 @@ class _Downlink:
             return
         if not is_from_before:
             text = f"model {result.sha256.hex()[:8]} ranks frames"
-            self._commander.end_model(self._upload_counter, result.problem, text)
+            self._commander.end_model(result.path, result.problem, text)
         if result.problem is None:
             self.events.add("model_in_use", sha256=result.sha256)
 

@@ -109,6 +109,8 @@ class FrameSender:
         try:
             return self._store.read(frame_id)
         except StoreError as error:
+            if frame_id not in self._store.outbox():  # deleted since the order was given
+                return None
             if frame_id not in self._retry_s:
                 log.error("%s", error)
                 self._counts.frames_unreadable += 1

@@ -1,7 +1,8 @@
 """The navigation filter's states as JSON lines, from a file or a TCP port, interpolated to the middle of an exposure.
 
 A line holds the states of both satellites, or the camera's pose relative to the target (SI units, quaternions w, x, y,
-z; a step of more than `max_gap_s` is a gap):
+z; a step of more than `max_gap_s` is a gap; after a step back in time or a gap two states in order are needed, so that
+one with a wrong time is passed over):
 
     {"utc_ns": 1784631150000000000,
      "target": {"position_m": [3, GCRS], "velocity_m_s": [3], "quat_gcrs_to_body": [4, optional]},
@@ -15,6 +16,7 @@ A pose's covariance is that of its errors: position minus the true one, and the 
 Without attitudes, the target turns as the mission says and the chaser points its camera at the target.
 """
 
+import bisect
 import collections
 import json
 import os
@@ -33,6 +35,9 @@ from flightsw.icd.quaternion import quat_to_matrix, slerp
 
 MAX_LINE_BYTES = 16_384
 MAX_STATES = 4096  # kept behind the newest one
+READ_AHEAD = (
+    2048  # states later than an exposure that are read in search of those around it, not a whole file
+)
 POLL_S = 0.01
 COVARIANCE_TOLERANCE = 1e-6  # of the mean variances: what six printed digits and float32 leave
 SMALLEST_VARIANCE = 1e-60  # for a vector without variance, any entry of whose covariance would then show
@@ -209,10 +214,14 @@ class NavigationStream:
     """
 
     def __init__(self, section: NavigationSection):
-        self.bad_lines = 0  # not understood, or not newer than the line before
+        self.bad_lines = 0  # not understood, or with a time that the stream did not go on from
         self.hang_ups = 0
         self._section = section
-        self._states: collections.deque[NavigationState] = collections.deque(maxlen=MAX_STATES)
+        self._states: collections.deque[NavigationState] = collections.deque(
+            maxlen=MAX_STATES
+        )  # times increase
+        # the newest state where it does not follow those, until the next comes
+        self._doubtful: NavigationState | None = None
         self._pending = b""
         self._descriptor: int | None = None
         self._socket: socket.socket | None = None
@@ -230,6 +239,7 @@ class NavigationStream:
             elif stream is not None:
                 os.close(stream)
         self._socket = self._descriptor = None
+        self._pending = b""
 
     def first(self, wait_s: float) -> NavigationState | None:
         """Return the first state of the stream, waiting for it; None if none came."""
@@ -239,36 +249,64 @@ class NavigationStream:
         return self._states[0] if self._states else None
 
     def at(self, utc_ns: int) -> NavigationState:
-        """Return the state at a time, waiting `wait_s` for one that is not older.
+        """Return the state at a time, waiting `wait_s` for the states around it.
 
         Raises:
             NavigationError: before the first state or after the last, or the states around it are too far apart.
         """
         deadline_s = time.monotonic() + self._section.wait_s
-        while not self._states or self._states[-1].utc_ns < utc_ns:
-            if not self._read(utc_ns) and time.monotonic() >= deadline_s:
-                newest = (
-                    f"{(utc_ns - self._states[-1].utc_ns) / NS:.3f} s older" if self._states else "missing"
-                )
-                raise NavigationError(f"gap in the navigation stream: the newest state is {newest}")
-        after = before = self._states[-1]
-        for state in reversed(self._states):
-            before = state
-            if state.utc_ns <= utc_ns:
-                break
-            after = state
-        if before.utc_ns > utc_ns:
-            raise NavigationError(
-                f"gap in the navigation stream: it begins {(before.utc_ns - utc_ns) / NS:.3f} s later"
-            )
-        if before.utc_ns == utc_ns:
-            after = before
-        gap_s = (after.utc_ns - before.utc_ns) / NS
-        if gap_s > self._section.max_gap_s or type(before) is not type(after):
-            raise NavigationError(
-                f"gap in the navigation stream: {gap_s:.3f} s between states, at most {self._section.max_gap_s} s"
-            )
-        return interpolate(before, after, utc_ns)
+        while True:
+            later = bisect.bisect_left(self._states, utc_ns, key=lambda state: state.utc_ns)
+            problem = self._gap(later, utc_ns)
+            if problem is None:
+                after = self._states[later]
+                before = after if after.utc_ns == utc_ns else self._states[later - 1]
+                return interpolate(before, after, utc_ns)
+            is_far_ahead = len(self._states) - later >= READ_AHEAD
+            if is_far_ahead and self._descriptor is None:  # a port sends no future: these times are wrong
+                self.close()
+                self._states.clear()
+            if is_far_ahead or (not self._read(utc_ns) and time.monotonic() >= deadline_s):
+                raise NavigationError(f"gap in the navigation stream: {problem}")
+
+    def _gap(self, later: int, utc_ns: int) -> str | None:
+        """Say why there is no state at a time, None if there is; `later` is the first that is not older."""
+        if not self._states:
+            return "the newest state is missing"
+        if later == len(self._states):
+            return f"the newest state is {(utc_ns - self._states[-1].utc_ns) / NS:.3f} s older"
+        before, after = self._states[max(later - 1, 0)], self._states[later]
+        if after.utc_ns == utc_ns:
+            return None
+        if later == 0:
+            return f"it begins {(after.utc_ns - utc_ns) / NS:.3f} s later"
+        if type(before) is not type(after):
+            return "the states around it are of two kinds"
+        if self._follows(before, after):
+            return None
+        gap_s, max_gap_s = (after.utc_ns - before.utc_ns) / NS, self._section.max_gap_s
+        return f"{gap_s:.3f} s between states, at most {max_gap_s} s"
+
+    def _follows(self, before: NavigationState, after: NavigationState) -> bool:
+        return 0 < after.utc_ns - before.utc_ns <= self._section.max_gap_s * NS
+
+    def _take(self, state: NavigationState) -> None:
+        """Keep a state that follows the newest; two that follow each other after a gap, or after a step back in time.
+
+        After a step back the states from before it with the same or later times go: the stream has taken them back.
+        """
+        doubtful, self._doubtful = self._doubtful, None
+        if not self._states or self._follows(self._states[-1], state):
+            self._states.append(state)
+            self.bad_lines += doubtful is not None
+        elif doubtful is not None and self._follows(doubtful, state):
+            while self._states and self._states[-1].utc_ns >= doubtful.utc_ns:
+                self._states.pop()
+                self.bad_lines += 1
+            self._states += [doubtful, state]
+        else:
+            self._doubtful = state
+            self.bad_lines += doubtful is not None
 
     def _read(self, until_utc_ns: int) -> bool:
         """Take in lines up to the first state that is not older; tell whether there was anything to read."""
@@ -281,12 +319,10 @@ class NavigationStream:
             line, _, self._pending = self._pending.partition(b"\n")
             try:
                 state = parse_state(line)
-                if self._states and state.utc_ns <= self._states[-1].utc_ns:
-                    raise NavigationError("a state that is not newer than the one before")
             except NavigationError:
                 self.bad_lines += 1
                 continue
-            self._states.append(state)
+            self._take(state)
             if state.utc_ns >= until_utc_ns:
                 break
         if len(self._pending) > MAX_LINE_BYTES and b"\n" not in self._pending:
@@ -308,7 +344,6 @@ class NavigationStream:
             if self._socket is None:
                 host, _, port = self._section.source.removeprefix("tcp://").rpartition(":")
                 self._socket = socket.create_connection((host, int(port)), timeout=1.0)
-                self._pending = b""
             if not select.select([self._socket], [], [], POLL_S)[0]:
                 return b""
             if data := self._socket.recv(65_536):

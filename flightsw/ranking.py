@@ -20,7 +20,7 @@ RANKING_S = 30.0  # for which frames are held back for a new model to rank them:
 class Ranking:
     """Scores of the frames in the outbox by the model in the store, and the sending order that follows from them.
 
-    The store holds the model in use as model.onnx; one that has come is model.onnx.received until it is verified.
+    The store holds the model in use as model.onnx; one that has come is model-COUNTER.received until it is verified.
     """
 
     def __init__(self, store: FrameStore, camera: CameraSection, clock_s: Callable[[], float]):
@@ -36,12 +36,13 @@ class Ranking:
         self._is_verifying = False  # of the model from before a restart
 
     def start(self) -> None:
-        """Verify the model that the store holds, if it holds one.
+        """Verify the model that the store holds, if it holds one, and delete those that were not verified in time.
 
         Raises:
             OSError: the disk refuses.
         """
-        (self._store.folder / "model.onnx.received").unlink(missing_ok=True)
+        for left in self._store.folder.glob("model*.received"):
+            left.unlink()
         self._is_verifying = self.model_path.exists()
         if self._is_verifying:
             self._worker.verify(self.model_path)

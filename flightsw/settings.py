@@ -9,7 +9,7 @@ from pathlib import Path
 from flightsw.errors import StoreError
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import BracketSection, Mission
-from flightsw.store import write_with_reserve
+from flightsw.store import RESERVE, write_with_reserve
 
 log = logging.getLogger(__name__)
 ORDERS = ("oldest", "triage", "thumbnail-first")
@@ -75,6 +75,6 @@ def save_settings(folder: Path, settings: Settings) -> None:
     tree = dataclasses.asdict(settings)
     tree["near"] = tree.pop("max_error_dn")
     try:
-        write_with_reserve(folder / "settings.json", json.dumps(tree).encode())
+        write_with_reserve(folder / "settings.json", json.dumps(tree).encode(), folder / RESERVE)
     except OSError as error:
         raise StoreError(f"cannot keep the settings: {error}") from error

@@ -158,7 +158,7 @@ class FrameStore:
             if not text.strip().isdecimal():
                 raise StoreError(f"{path} should hold a number, it holds {text[:20]!r}; run flightsw fsck")
             number = (int(text) + 1) % (1 << 32)
-            write_with_reserve(path, f"{number}\n".encode())
+            write_with_reserve(path, f"{number}\n".encode(), self.folder / RESERVE)
         return number
 
     def hold_pass(self, first_trigger_utc_ns: int) -> None:
@@ -180,7 +180,8 @@ class FrameStore:
                     f"{begins}: name another --store, or go on with that pass by --start {known}"
                 )
             if known != begins:
-                write_with_reserve(path, json.dumps({"first_trigger_utc": begins}).encode())
+                content = json.dumps({"first_trigger_utc": begins}).encode()
+                write_with_reserve(path, content, self.folder / RESERVE)
 
     def mark_delivered(self, frame_id: int) -> None:
         """Take a frame out of the outbox; the frame itself stays until its room is needed."""
@@ -319,8 +320,8 @@ class FrameStore:
         append_line(self._index, json.dumps(entry).encode())
 
 
-def write_with_reserve(path: Path, data: bytes) -> None:
-    """Write a small file of a store whole or not at all; where the disk is full, its reserve makes room.
+def write_with_reserve(path: Path, data: bytes, reserve: Path) -> None:
+    """Write a small file whole or not at all; where the disk is full, the file `reserve` is deleted for it.
 
     Raises:
         OSError: the disk refuses.
@@ -330,7 +331,7 @@ def write_with_reserve(path: Path, data: bytes) -> None:
     except OSError as error:
         if error.errno not in DISK_FULL:
             raise
-        (path.parent / RESERVE).unlink(missing_ok=True)
+        reserve.unlink(missing_ok=True)
         write_whole(path, data)
 
 

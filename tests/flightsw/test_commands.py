@@ -1,6 +1,10 @@
 """Commands on board: nothing without the key, nothing twice, nothing out of range, nothing that was not armed."""
 
+import contextlib
+import errno
 import hashlib
+import os
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flightsw.commands import ANSWER_S, Commander, ReplayCounter
+from flightsw.commands import ANSWER_S, RESERVE_BYTES, Commander, ReplayCounter
 from flightsw.icd.auth import Key, seal, seal_file
 from flightsw.icd.command import Command
 from flightsw.icd.config import ConfigError
@@ -16,6 +20,7 @@ from flightsw.icd.telemetry import DICTIONARY
 from flightsw.settings import Settings, load_settings, save_settings
 from flightsw.store import FrameStore
 from ground.uplink import make_key
+from obbgs_base.files import write_whole
 
 ANYTHING = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=80)
 
@@ -132,17 +137,87 @@ def test_the_counter_survives_a_restart_and_old_packets_stay_refused(spacecraft)
     assert spacecraft.send("ping")[-1] == ("completed", "alive")
 
 
-def test_a_command_has_no_effect_when_its_counter_cannot_be_kept(spacecraft):
+@pytest.mark.parametrize(
+    "then", ["the disk heals", "a restart", "a later command", "a restart and a later command"]
+)
+def test_a_command_whose_counter_cannot_be_kept_is_as_good_as_lost_on_the_link(spacecraft, then):
     block = spacecraft.replay.path.with_name(spacecraft.replay.path.name + ".part")
     block.mkdir()  # as root nothing less makes the disk refuse
     packet = spacecraft.seal("near", near=2)
-    spacecraft.commander.receive(packet)
-    assert [stage for stage, _ in spacecraft.reports()] == ["refused"]
-    assert spacecraft.commander.settings.max_error_dn == 0
+    before = spacecraft.state()
+    for _ in range(2):  # the ground has no answer and sends it again
+        spacecraft.commander.receive(packet)
+    assert spacecraft.reports() == []  # a report of a refusal would have to stay true after a restart
+    assert spacecraft.state() == before and "cannot keep" in spacecraft.refusals[0]
     block.rmdir()
-    spacecraft.commander.receive(packet)  # it was told as refused: it stays so
+    if "restart" in then:
+        spacecraft.restart()
+    if "later" in then:
+        spacecraft.send("ping")
+    spacecraft.commander.receive(packet)
+    assert spacecraft.commander.settings.max_error_dn == (0 if "later" in then else 2)
+    spacecraft.reports()
+    spacecraft.send("near", near=1)
+    spacecraft.restart()
+    spacecraft.commander.receive(packet)  # taken or overtaken, it is never taken again
     assert [stage for stage, _ in spacecraft.reports()] == ["refused"]
-    assert spacecraft.commander.settings.max_error_dn == 0
+    assert spacecraft.commander.settings.max_error_dn == 1
+
+
+@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT])
+def test_the_counter_is_kept_in_the_reserve_of_a_full_disk_which_is_made_again(
+    spacecraft, monkeypatch, error
+):
+    reserve = spacecraft.replay.path.with_name("mission.key.received.reserve")
+    assert reserve.stat().st_size == RESERVE_BYTES
+    is_full = True
+
+    def full_disk(path: Path, content: bytes) -> None:
+        if is_full and (reserve.exists() or len(content) >= RESERVE_BYTES):
+            raise OSError(error, os.strerror(error))
+        write_whole(path, content)
+
+    monkeypatch.setattr("flightsw.commands.write_whole", full_disk)
+    monkeypatch.setattr("flightsw.store.write_whole", full_disk)
+    assert spacecraft.send("ping")[-1] == ("completed", "alive")
+    assert not reserve.exists()
+    is_full = False
+    assert spacecraft.send("ping")[-1] == ("completed", "alive")
+    assert reserve.stat().st_size == RESERVE_BYTES
+
+
+def test_on_a_disk_that_is_truly_full_safe_mode_is_entered_and_frames_are_deleted(
+    tmp_path, small_mission, make_frame
+):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=512k", "tmpfs", disk], check=False).returncode:
+        pytest.skip("no right to mount a tmpfs here")
+    with contextlib.ExitStack() as opened:
+        opened.callback(subprocess.run, ["umount", disk], check=True)
+        spacecraft = Spacecraft(disk / "flight", small_mission, make_frame, frames=3)
+        opened.callback(lambda: spacecraft.replay.close())
+        with open(disk / "log", "wb", buffering=0) as log, contextlib.suppress(OSError):
+            while True:
+                log.write(bytes(512))
+        packets = [
+            spacecraft.seal("safe"),
+            spacecraft.seal("arm", command="delete"),
+            spacecraft.seal("delete", first_frame=0, last_frame=1),
+        ]
+        for packet in packets:
+            spacecraft.commander.receive(packet)
+        assert [text for stage, text in spacecraft.reports() if stage not in ("accepted", "started")] == [
+            "no exposures until resumed",
+            f"delete is armed for {DICTIONARY.arm_s} s",
+            "2 frames deleted",
+        ]
+        spacecraft.restart()
+        assert spacecraft.commander.settings.safe_mode
+        assert [frame.frame_id for frame in spacecraft.store.frames] == [2]
+        for packet in packets:
+            spacecraft.commander.receive(packet)
+        assert (spacecraft.commander.accepted, spacecraft.commander.repeated) == (0, 3)
 
 
 @pytest.mark.parametrize("forged", ["no key on board", "wrong key", "cut", "flipped", "noise"])
@@ -243,10 +318,35 @@ def test_the_announced_file_is_taken_once_under_a_name_of_ours(spacecraft):
     name = announce(spacecraft, b"a model")
     sealed = seal_file(bytes(range(32)), b"a model")
     path = spacecraft.commander.receive_model(name, sealed)
-    assert path == spacecraft.store.folder / "model.onnx.received" and path.read_bytes() == b"a model"
+    assert path == spacecraft.store.folder / f"{name}.received" and path.read_bytes() == b"a model"
     assert spacecraft.commander.receive_model(name, sealed) is None
-    spacecraft.commander.end_model(spacecraft.counter, None, "in use")
+    spacecraft.commander.end_model(path, None, "in use")
     assert spacecraft.reports() == [("completed", "in use")]
+
+
+def test_each_model_that_has_come_has_its_own_file_and_its_own_end(spacecraft):
+    paths = []
+    for content in (b"a model", b"another model"):
+        name = announce(spacecraft, content)
+        paths.append(spacecraft.commander.receive_model(name, seal_file(bytes(range(32)), content)))
+    assert [path.read_bytes() for path in paths] == [b"a model", b"another model"]
+    for path, problem in zip(paths, (None, "of another camera"), strict=True):
+        spacecraft.commander.end_model(path, problem, "in use")
+    ends = [(report.counter, report.stage, report.text) for report in spacecraft.commander.reports]
+    assert ends == [(1, "completed", "in use"), (2, "failed", "of another camera")]
+
+
+def test_a_model_that_is_announced_in_place_of_another_ends_that_ones_command(spacecraft):
+    first = announce(spacecraft, b"a model")
+    arguments = {"size_bytes": 3, "sha256": hashlib.sha256(b"new").digest(), "file_key": bytes(32)}
+    spacecraft.commander.receive(spacecraft.seal("model", **arguments))
+    assert [(report.counter, report.stage, report.text) for report in spacecraft.commander.reports] == [
+        (2, "accepted", "model"),
+        (2, "started", "model"),
+        (1, "failed", "replaced by command 2"),
+    ]
+    assert spacecraft.commander.receive_model(first, seal_file(bytes(range(32)), b"a model")) is None
+    assert spacecraft.commander.receive_model("model-2", seal_file(bytes(32), b"new")) is not None
 
 
 @pytest.mark.parametrize("name", ["../model-1", "/etc/passwd", "model-2", "model.onnx", "", "model-1\0"])

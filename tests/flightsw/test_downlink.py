@@ -1,11 +1,14 @@
 """What the flight side puts on the wire, in which order, without a port: a link of lists and a clock of ours."""
 
 import dataclasses
+import hashlib
 import logging
 import os
 import shutil
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -15,6 +18,8 @@ from flightsw.commands import ReplayCounter
 from flightsw.downlink import LAST_TELEMETRY_S, RESTARTS, WAIT_S, run_downlink
 from flightsw.errors import DownlinkError, StoreError
 from flightsw.housekeeping import MAX_EVENTS, EventLog, ProcessMeter
+from flightsw.icd.auth import Key, seal, seal_file
+from flightsw.icd.command import Command, model_file_name
 from flightsw.icd.frame import HEADER, read_header
 from flightsw.icd.framing import PacketStream
 from flightsw.icd.packet import (
@@ -23,12 +28,14 @@ from flightsw.icd.packet import (
     APID_FILES,
     APID_FRAME_HEADERS,
     APID_HOUSEKEEPING,
+    APID_REPORTS,
     APID_UPLINK_FILES,
     TELECOMMAND,
 )
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import UPLINK, Sender, parse_pdu
 from flightsw.icd.transfer.checksum import TYPES
+from flightsw.model_file import verified_model
 from flightsw.settings import Settings, save_settings
 from flightsw.store import FrameStore
 from ground.uplink import make_key
@@ -211,6 +218,96 @@ def test_a_file_that_no_command_announced_is_not_even_kept_in_memory(store, smal
     assert not [apid for apid, _ in link.packets() if apid == APID_UPLINK_FILES]  # not a word of answer
     assert {path.name for path in store.folder.iterdir()} >= {"frames", "outbox"}
     assert not list(store.folder.glob("*model*"))
+
+
+def model_packets(ground: PacketStream, key: Key, counter: int, content: bytes) -> list[bytes]:
+    """Return what the ground sends of a model, on a link that loses nothing: the command, then the sealed file."""
+    sha256, file_key = hashlib.sha256(content).digest(), bytes(range(32))
+    command = Command("model", {"size_bytes": len(content), "sha256": sha256, "file_key": file_key})
+    sender = Sender(ground.max_data_bytes, 1.0, route=UPLINK)
+    sender.put(model_file_name(counter), seal_file(file_key, content), counter, 0.0)
+    packets = [ground.encode(APID_COMMANDS, seal(key, counter, command.pack()))]
+    while (pdu := sender.next_pdu(0.0)) is not None:
+        packets.append(ground.encode(APID_UPLINK_FILES, pdu))
+    return packets
+
+
+class HeldTriage:
+    """Lets no model be verified before `go` is set, as a slow onnxruntime would."""
+
+    def __init__(self, monkeypatch):
+        self.go = threading.Event()
+
+        def verified(path: Path) -> bytes:
+            self.go.wait(30)
+            return verified_model(path)
+
+        monkeypatch.setattr("flightsw.triage.verified_model", verified)
+
+
+def ends(link: ListLink) -> dict[int, tuple[str, str]]:
+    """Return stage and text of the last report of each command."""
+    reports = [values for _, values in link.unpacked(APID_REPORTS, "reports")]
+    return {values["counter"]: (values["stage"], values["text"]) for values in reports}
+
+
+def test_a_model_that_is_verified_late_ends_its_own_command(store, small_mission, tmp_path, monkeypatch):
+    held, link, ground = HeldTriage(monkeypatch), ListLink(), PacketStream(TELECOMMAND, 1100)
+    key, counter = make_key(tmp_path / "k"), ReplayCounter(tmp_path / "k")
+    for number in (1, 2):  # the second comes while the first is being verified
+        link.incoming += model_packets(ground, key, number, bytes([number]) * 3000)
+
+    def should_stop() -> bool:
+        if not link.incoming:
+            held.go.set()
+        time.sleep(0.001)  # the thread that verifies has a clock of its own
+        return link.now_s > 600 or [end[0] for end in ends(link).values()] == ["failed", "failed"]
+
+    run_downlink(
+        store, link, small_mission, should_stop=should_stop, clock_s=lambda: link.now_s, counter=counter
+    )
+    counter.close()
+    for number, (stage, text) in ends(link).items():
+        assert stage == "failed" and f"model-{number}.received is not" in text
+    assert not list(store.folder.glob("model*"))
+
+
+def test_a_model_that_waits_for_its_verification_when_the_downlink_fails_has_an_end(
+    store, small_mission, tmp_path, monkeypatch, no_pause
+):
+    held, link, ground = HeldTriage(monkeypatch), FailingLink(), PacketStream(TELECOMMAND, 1100)
+    key, counter = make_key(tmp_path / "k"), ReplayCounter(tmp_path / "k")
+    link.incoming = model_packets(ground, key, 1, bytes(3000))
+
+    def fail_once(_progress) -> None:
+        if (store.folder / "model-1.received").exists() and not held.go.is_set():
+            link.failures_s = [link.now_s]
+            held.go.set()
+
+    progress = fly(link, store, small_mission, 3.0, on_progress=fail_once, counter=counter)
+    counter.close()
+    assert progress.restarts == 1
+    assert ends(link) == {1: ("failed", "the downlink failed before the model was in use")}
+    assert not list(store.folder.glob("model*"))
+
+
+@pytest.mark.parametrize("order", ["oldest", "thumbnail-first"])
+def test_frames_that_are_deleted_while_they_wait_are_not_told_as_unreadable(
+    store, small_mission, tmp_path, order
+):
+    save_settings(store.folder, Settings(order))
+    link, ground = ListLink(), PacketStream(TELECOMMAND, 1100)
+    key, counter = make_key(tmp_path / "k"), ReplayCounter(tmp_path / "k")
+    commands = [
+        Command("arm", {"command": "delete"}),
+        Command("delete", {"first_frame": 0, "last_frame": 2}),
+    ]
+    for number, command in enumerate(commands, start=1):  # they come before the next look at the outbox
+        link.incoming.append(ground.encode(APID_COMMANDS, seal(key, number, command.pack())))
+    progress = fly(link, store, small_mission, 0.5, counter=counter)
+    counter.close()
+    assert store.outbox() == []
+    assert (progress.waiting, progress.frames_unreadable, progress.restarts) == (0, 0, 0)
 
 
 def test_a_frame_that_cannot_be_read_is_counted_once_and_the_others_go_on(store, small_mission):

@@ -1,5 +1,6 @@
 """Navigation states: interpolated to mid-exposure, and where there are none, no pose is invented."""
 
+import contextlib
 import dataclasses
 import json
 import socket
@@ -281,6 +282,98 @@ def test_rubbish_between_states_is_counted_and_passed_over(tmp_path_factory, rub
     assert isinstance(stream.at(START_NS + NS // 2), SatelliteStates)
     assert stream.bad_lines == len(rubbish) + len(late)
     stream.close()
+
+
+STATES = 12  # a second apart
+LINES = [pose_line(START_NS + second * NS) for second in range(STATES)]
+YEAR_NS = 365 * 86_400 * NS
+
+
+def with_time(line: bytes, utc_ns: int) -> bytes:
+    return json.dumps(json.loads(line) | {"utc_ns": utc_ns}).encode() + b"\n"
+
+
+def poses_of(path: Path, lines: list[bytes]) -> tuple[dict[float, np.ndarray], int]:
+    """Return the positions halfway between the true states, by their time in seconds, and the count of bad lines."""
+    path.write_bytes(b"".join(lines))
+    stream, positions = NavigationStream(NavigationSection(f"file://{path}", wait_s=0.0)), {}
+    for second in range(STATES - 1):
+        with contextlib.suppress(NavigationError):
+            state = stream.at(START_NS + second * NS + NS // 2)
+            assert isinstance(state, RelativePose)
+            positions[second + 0.5] = state.position_body_m
+    stream.close()
+    return positions, stream.bad_lines
+
+
+@given(
+    st.integers(0, STATES - 1),
+    st.booleans(),
+    st.integers(0, (1 << 63) - 1) | st.integers(START_NS - 20 * NS, START_NS + 20 * NS),
+)
+def test_a_state_with_a_wrong_time_costs_no_more_than_the_exposures_next_to_it(
+    tmp_path_factory, place, is_added, wrong_utc_ns
+):
+    path = tmp_path_factory.mktemp("navigation") / "states.jsonl"
+    undisturbed, _ = poses_of(path, LINES)
+    assert len(undisturbed) == STATES - 1
+    wrong = with_time(LINES[place], wrong_utc_ns)
+    disturbed, bad_lines = poses_of(path, [*LINES[:place], wrong, *LINES[place + (not is_added) :]])
+    for at_s, position_m in undisturbed.items():
+        if abs(at_s - place) > 2:  # the time may be wrong by less than the gap that is allowed
+            np.testing.assert_array_equal(disturbed[at_s], position_m)
+    assert bad_lines <= 1
+
+
+@pytest.mark.parametrize("ahead_ns", [YEAR_NS, -YEAR_NS])
+@pytest.mark.parametrize("begin", [0, 4])
+def test_a_clock_that_is_wrong_for_some_states_costs_the_poses_of_that_time_only(tmp_path, begin, ahead_ns):
+    lines = list(LINES)
+    for number in range(begin, begin + 4):
+        lines[number] = with_time(lines[number], START_NS + number * NS + ahead_ns)
+    poses, bad_lines = poses_of(tmp_path / "states.jsonl", lines)
+    assert set(poses) >= {second + 0.5 for second in range(STATES - 1) if not begin - 1 <= second < begin + 4}
+    assert ahead_ns < 0 or bad_lines == 4  # what lies long before the others does no harm, and may stay
+
+
+def test_a_file_that_holds_the_whole_pass_keeps_what_later_exposures_need(tmp_path, monkeypatch):
+    monkeypatch.setattr("flightsw.navigation.MAX_STATES", 6)
+    monkeypatch.setattr("flightsw.navigation.READ_AHEAD", 3)
+    path = tmp_path / "states.jsonl"
+    path.write_bytes(b"".join(LINES[:1] + LINES[4:]))  # a gap of 4 s at the beginning
+    stream = NavigationStream(NavigationSection(f"file://{path}", wait_s=0.0))
+    for at_s in (0.5, 1.5, 2.5, 3.5):
+        with pytest.raises(NavigationError, match=r"4\.000 s between states"):
+            stream.at(START_NS + round(at_s * NS))
+    for second in range(4, STATES - 1):
+        assert isinstance(stream.at(START_NS + second * NS + NS // 2), RelativePose)
+    stream.close()
+
+
+def test_a_filter_that_starts_again_with_the_right_time_is_followed(monkeypatch):
+    """Its time was a year ahead for longer than the stream reads on: flight hangs up, and the filter is there anew."""
+    monkeypatch.setattr("flightsw.navigation.READ_AHEAD", 5)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def filter_process() -> None:
+            for ahead_ns in (YEAR_NS, 0):
+                connection, _ = server.accept()
+                with connection, contextlib.suppress(ConnectionError):
+                    for second, line in enumerate(LINES):
+                        connection.sendall(with_time(line, START_NS + second * NS + ahead_ns))
+                    connection.settimeout(30)
+                    connection.recv(1)  # until flight hangs up
+
+        thread = threading.Thread(target=filter_process, daemon=True)
+        thread.start()
+        source = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with contextlib.closing(NavigationStream(NavigationSection(source, wait_s=30))) as stream:
+            with pytest.raises(NavigationError, match="it begins 31536000"):
+                stream.at(START_NS)
+            for second in range(STATES - 1):
+                assert isinstance(stream.at(START_NS + second * NS + NS // 2), RelativePose)
+        thread.join(30)
+        assert not thread.is_alive()
 
 
 def test_a_line_without_end_does_not_fill_the_memory(tmp_path):

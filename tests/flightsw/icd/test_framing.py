@@ -2,6 +2,7 @@
 
 import binascii
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -87,6 +88,50 @@ def test_gaps_in_the_count_are_noticed_and_late_packets_taken_back():
         assert ground.decode(flight.encode(APID_EVENTS, b"counted on its own"))
     assert ground.packets_missing == 1
     assert ground.packets_received == 8
+
+
+def numbered(seq_count: int) -> bytes:
+    return frame_packet(pack_packet(TELEMETRY, APID_FILES, seq_count % (1 << 14), b"numbered"))
+
+
+@given(st.integers(0, (1 << 14) - 1), st.data())
+def test_whatever_is_lost_doubled_and_swapped_each_missing_packet_counts_once(first, data):
+    copies = data.draw(st.lists(st.integers(0, 2), min_size=1, max_size=150))
+    sent = [number for number, times in enumerate(copies) for _ in range(times)]
+    delays = data.draw(st.lists(st.integers(0, 20), min_size=len(sent), max_size=len(sent)))
+    order = [number for _, number in sorted(zip(map(sum, zip(sent, delays, strict=True)), sent, strict=True))]
+    ground = PacketStream(TELECOMMAND, MAX_PACKET_BYTES)
+    for number in order:
+        ground.decode(numbered(first + number))
+    # what was sent before the first packet that came is not known to exist
+    expected = set(range(order[0], max(order) + 1)) - set(order) if order else set()
+    assert ground.packets_missing == len(expected)
+
+
+@pytest.mark.parametrize(
+    ("heard_before", "unheard"), [(200, 0), (5000, 0), (5000, 500), (12_000, 0), (12_000, 500)]
+)
+def test_a_new_start_of_the_other_side_is_no_loss_and_hides_none(heard_before, unheard):
+    ground = PacketStream(TELECOMMAND, MAX_PACKET_BYTES)
+    for number in range(heard_before):
+        ground.decode(numbered(number))
+    for number in range(unheard, 3000):  # from 0 again, perhaps while the link was cut
+        if number % 10 != 5:
+            ground.decode(numbered(number))
+    lost = sum(number % 10 == 5 for number in range(unheard, 3000))
+    assert ground.packets_missing == lost
+
+
+@pytest.mark.parametrize("heard_before", [1, 700, 16_000])
+@pytest.mark.parametrize("cut", [1, 500, 1500, 5000])
+def test_what_a_cut_of_the_link_loses_is_counted(heard_before, cut):
+    """700 and 1,500 would not do if a jump that ends near 0 were always taken for a new start."""
+    ground = PacketStream(TELECOMMAND, MAX_PACKET_BYTES)
+    for number in [*range(heard_before), heard_before + cut]:
+        ground.decode(numbered(number))
+    wrapped = (heard_before + cut) % (1 << 14)
+    looks_like_a_new_start = cut > 1024 and wrapped < 1024
+    assert ground.packets_missing == (0 if looks_like_a_new_start else cut)
 
 
 def test_packets_of_another_application_or_our_own_echo_are_not_for_us():
