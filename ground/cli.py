@@ -126,7 +126,12 @@ def uplink(
     mission: Annotated[Path, typer.Option(help="The mission file; read with --link only.")] = Path(
         "mission.yaml"
     ),
-    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the result.")] = 120.0,
+    timeout: Annotated[
+        float,
+        typer.Option(
+            min=0.1, max=86_400.0, help="Seconds to wait for the result, or for a model to be under way."
+        ),
+    ] = 120.0,
     json_: AsJson = False,
 ) -> None:
     """Send a command through the session's `ground listen`, or over --link, and wait for its result.
@@ -147,7 +152,12 @@ def uplink(
     end_s = time.monotonic() + timeout + 1.0  # the listener writes a result when the command expires
 
     def ended() -> bool:
-        return uplinking.outcome(session, counter) is not None or time.monotonic() > end_s
+        if uplinking.outcome(session, counter) is not None:
+            return True
+        is_tended = model is not None and uplinking.is_waiting(session, counter)
+        if is_tended and link is None:
+            is_tended = uplinking.is_listening(session)
+        return time.monotonic() > end_s and not is_tended
 
     try:
         if link is None:

@@ -81,7 +81,7 @@ def compare_command(
         with _shown(stderr) as on_state:
             command = this_command("ground")
             summary = run_grid(cells, out, command, scheduler, workers, on_state, lambda: stop.requested)
-        asked = {cell.digest for cell in cells}
+        asked = {cell.digest: (cell.session.name, cell.condition_name) for cell in cells}
         page, figures = write_page(out, asked), write_figures(out, asked)
     for label, reason in summary.failed.items():
         say(stderr, f"not made: {label}: {reason}")

@@ -195,6 +195,7 @@ class LiveReconstruction:
             end.arrived()
         if self.trainer is None:
             self._begin()
+        if self.trainer is None:
             return
         now_s, trainer = time.monotonic(), self.trainer
         if len(self.arrivals.frames) > self._joined:
@@ -356,7 +357,8 @@ class LiveReconstruction:
         result = trainer.result(f"{self._over}; {self.steps} steps while {self._joined} frames came")
         self.shown.offer(result.gaussians, self.steps, result.pose_estimate)
         self.report("finished", self._over)
-        outputs, records = Outputs(self._part, should_stop), (self.arrivals.training, self.arrivals.held_out)
+        outputs = Outputs(self._part, should_stop)
+        records = self.arrivals.training[: self._joined], self.arrivals.held_out
         finish_run(outputs, self._folder, {KNOWN: result}, session, *records, self._seed)
 
     def _checkpoint(self, frames: int) -> Path:

@@ -1,5 +1,6 @@
 """The report's section on poses: what training found of their errors, how surely, and which frames still disagree."""
 
+import html
 import math
 from dataclasses import dataclass, replace
 
@@ -131,10 +132,8 @@ def poses_section(run: Run) -> str:
         )
     )
     if left_out := run.metrics.get("misfit_frames"):
-        told += (
-            f" The frames {', '.join(map(str, left_out))} were left out of the training: they fitted no pose that "
-            "their tags allow."
-        )
+        names = html.escape(", ".join(map(str, left_out)))
+        told += f" The frames {names} were left out of the training: they fitted no pose that their tags allow."
     body = two_tables(shared_rows(estimate)) if estimate.shared_prior.vector().any() else ""
     body += plot(correction_figure(history)) + plot(ellipse_figure(history)) + plot(residual_figure(history))
     return section("Poses as estimated", note, f"{body}<p>{told}</p>")

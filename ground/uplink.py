@@ -110,7 +110,7 @@ def submit(session: Path, key_file: Path, command: Command, model: Path | None, 
 
     Args:
         command: the arguments of `model` are made here from its file.
-        expires_s: how long from now it may be sent.
+        expires_s: how long from now it may be sent; a model's file that is under way by then is sent to its end.
 
     Raises:
         ConfigError: the key, its counter or the model file cannot be used.
@@ -121,6 +121,7 @@ def submit(session: Path, key_file: Path, command: Command, model: Path | None, 
     if model is not None:
         content, command = _model_command(model)
     packed = command.pack()  # it may be invalid, and should not use up a counter then
+    expires_utc_ns = time.time_ns() + int(expires_s * NS)
     folder = session / "uplink"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -132,7 +133,7 @@ def submit(session: Path, key_file: Path, command: Command, model: Path | None, 
             job = {
                 "command": command.name,
                 "packet": seal(key, counter, packed).hex(),
-                "expires_utc_ns": time.time_ns() + int(expires_s * NS),
+                "expires_utc_ns": expires_utc_ns,
             }
             write_whole(folder / f"{counter:020d}.json", json.dumps(job).encode())
     except OSError as error:
@@ -178,6 +179,11 @@ def outcome(session: Path, counter: int) -> dict[str, Any] | None:
     """Return a command's result (stage, text, reports); None while it has none."""
     path = session / "uplink" / f"{counter:020d}.done.json"
     return json.loads(path.read_bytes()) if path.exists() else None
+
+
+def is_waiting(session: Path, counter: int) -> bool:
+    """Return whether a command has no result yet, and was not withdrawn."""
+    return (session / "uplink" / f"{counter:020d}.json").exists()
 
 
 def withdraw(session: Path, counter: int) -> None:
@@ -314,7 +320,7 @@ class Uplinker:
         for counter, job in list(self.jobs.items()):
             if counter not in counters:
                 del self.jobs[counter]  # withdrawn
-            elif self._utc_ns() > job.expires_utc_ns:
+            elif self._utc_ns() > job.expires_utc_ns and model_file_name(counter) not in self.files.in_flight:
                 self._end(job, "failed", "no answer in time" if not job.reports else f"still {job.stage}")
 
     def _read(self, counter: int) -> Job:

@@ -90,9 +90,9 @@ def fitting_hosts(client: Client, need_mb: float) -> list[str] | None:
     """Return the hosts whose workers have the memory that a cell needs; None where all have, or do not say.
 
     Raises:
-        CompareError: no worker has it.
+        CompareError: no worker has it, or the scheduler is lost.
     """
-    found = client.scheduler_info(n_workers=-1)["workers"]
+    found = _workers(client)
     limits_mb = {address: info.get("memory_limit") or float("inf") for address, info in found.items()}
     fitting = [address for address, limit in limits_mb.items() if limit >= need_mb * 1e6]
     if found and not fitting:
@@ -107,5 +107,16 @@ def fitting_hosts(client: Client, need_mb: float) -> list[str] | None:
 
 
 def threads_of(client: Client) -> int:
-    """Return how many cells the workers take at once."""
-    return sum(info["nthreads"] for info in client.scheduler_info(n_workers=-1)["workers"].values())
+    """Return how many cells the workers take at once.
+
+    Raises:
+        CompareError: the scheduler is lost.
+    """
+    return sum(info["nthreads"] for info in _workers(client).values())
+
+
+def _workers(client: Client) -> dict[str, dict]:
+    try:
+        return client.scheduler_info(n_workers=-1)["workers"]
+    except (KeyError, OSError) as error:  # of a lost one nothing is known
+        raise CompareError("the scheduler was lost; the same command goes on from what is saved") from error

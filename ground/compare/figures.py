@@ -1,7 +1,8 @@
 """The figures of a comparison as PNG files, for papers and pages that cannot hold interactive ones."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,7 +21,7 @@ DPI = 110
 TITLES = {metric.key: metric.title for metric in METRICS}
 
 
-def write_figures(out: Path, asked: Collection[str] = ()) -> list[Path]:
+def write_figures(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyType({})) -> list[Path]:
     """Write the figures of a comparison's rows into its folder and return their paths.
 
     Args:

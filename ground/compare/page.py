@@ -2,8 +2,9 @@
 
 import html
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -22,7 +23,7 @@ WORST_SHOWN = 6
 COLUMNS = 5  # pictures in a row
 
 
-def write_page(out: Path, asked: Collection[str] = ()) -> Path:
+def write_page(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyType({})) -> Path:
     """Write compare.html into a comparison's folder and return its path.
 
     Args:

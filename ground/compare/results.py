@@ -2,8 +2,9 @@
 
 import math
 import statistics
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 from ground.compare.methods import reference_names
@@ -64,15 +65,21 @@ class Results:
     """The rows of a comparison; those of one method with several budgets are told apart by their label.
 
     Where a condition, session or setting was changed under its old name, a folder holds several rows of one name and
-    seed: the row whose digest is asked for counts, otherwise the last, and `replaced` counts the others.
+    seed: the row that is asked for counts, otherwise the last, and `replaced` counts the others. A row that was made
+    under other names is shown under those of today.
 
     Args:
-        asked: digests of the cells of the grid that was asked for last.
+        asked: session and condition of each cell of the grid that was asked for last, by its digest.
     """
 
-    def __init__(self, rows: Iterable[dict[str, Any]], asked: Collection[str] = ()):
+    def __init__(
+        self, rows: Iterable[dict[str, Any]], asked: Mapping[str, tuple[str, str]] = MappingProxyType({})
+    ):
         named: dict[tuple, dict[str, Any]] = {}
-        given = list(rows)
+        given = []
+        for row in rows:
+            target, condition = asked.get(row["digest"], (row["target"], row["condition"]))
+            given.append(row | {"target": target, "condition": condition})
         for row in given:
             key = (row["method"], _budget(row), row["target"], row["condition"], row["seed"])
             if key not in named or named[key]["digest"] not in asked:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ground.baselines.reconstruction import Work
-from ground.compare.case import Case, load_case
+from ground.compare.case import Case, content_digest, load_case
 from ground.compare.conditions import given
 from ground.compare.errors import CompareError
 from ground.compare.follow import FEW_MARKS, MARKS, Follower, image_of
@@ -16,6 +16,7 @@ from ground.compare.rows import locked
 from ground.compare.trainings import MODEL
 from ground.compare.views import write_views
 from ground.scores import of_similarity
+from ground.session import SessionError
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.process import prepare_process
 
@@ -36,7 +37,7 @@ def run_cell(cell: Cell, out: Path, stop: Path, command: str) -> dict[str, Any]:
 
     Raises:
         Interrupted: the file `stop` appeared; the work is saved.
-        SessionError: the session cannot be used any more.
+        SessionError: the session cannot be used any more, or is another than the grid was made for.
     """
     prepare_process(threads=1)
     commit()  # as it is now: files may change while the work goes on
@@ -46,6 +47,11 @@ def run_cell(cell: Cell, out: Path, stop: Path, command: str) -> dict[str, Any]:
 
 
 def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict[str, Any]:
+    if content_digest(cell.session.path) != cell.session.digest:
+        raise SessionError(
+            f"{cell.session.path} has changed since the command started, which would mix rows of two contents: start "
+            "the command again"
+        )
     case = load_case(cell.session.path, cell.condition.held_out_sector_deg)
     wanted = method(cell.method, cell.weights)
     follower = Follower(case, folder, stop, MARKS if wanted.settable else FEW_MARKS)

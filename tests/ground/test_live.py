@@ -136,6 +136,26 @@ def test_a_killed_reconstruction_goes_on_to_the_same_model(tmp_path):
         )
 
 
+def test_frames_that_came_while_a_settled_training_was_away_are_trained_on(tmp_path, fast):
+    """Its schedule is complete, and the pass is over when it is started again."""
+    writer, end = Writer(tmp_path / "s"), PassEnd(tmp_path / "s", 1e9, False)
+    writer.add(24)
+    first = begun(writer.folder, changes={"steps": 30})
+    while first.trainer is None or not first.trainer.stop_reason():
+        assert first.turn(end)
+    first.save()
+    writer.add(24)
+    over = PassEnd(tmp_path / "s", 0.0, False)
+    again, statuses = begun(writer.folder, changes={"steps": 30}), []
+    again._on_status = statuses.append
+    while again.turn(over):
+        pass
+    again.finish(lambda: False)
+    assert statuses[-1].state == "finished" and statuses[-1].frames_trained == 42
+    metrics = json.loads((writer.folder / "runs" / "live" / "metrics.json").read_text())
+    assert metrics["frames_trained"] == 42 and "while 42 frames came" in metrics["stop_reason"]
+
+
 def test_it_waits_and_says_what_is_missing_and_frames_in_eclipse_are_none(tmp_path):
     writer, end, statuses = Writer(tmp_path / "s"), PassEnd(tmp_path / "s", 1e9, False), []
     live = begun(writer.folder, statuses)

@@ -104,5 +104,11 @@ def test_a_bracket_whose_residual_stands_out_is_named(example):
     assert history.misfits == [estimate.frame_ids[place]]
 
 
+def test_frames_that_were_left_out_are_named_whatever_the_metrics_hold(example):
+    run, *_ = example
+    for held, told in (([3, 7], "The frames 3, 7 were left out"), (["<b>x"], "The frames &lt;b&gt;x were")):
+        assert told in poses_section(dataclasses.replace(run, metrics=run.metrics | {"misfit_frames": held}))
+
+
 def test_a_run_with_poses_as_tagged_has_no_such_section(example, tmp_path):
     assert poses_section(dataclasses.replace(example[0], folder=tmp_path)) == ""

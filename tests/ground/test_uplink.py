@@ -1,6 +1,7 @@
 """Commands on the ground: sealed, each with its own counter, repeated until the result is known, executed once."""
 
 import json
+import math
 import os
 import random
 import threading
@@ -183,6 +184,29 @@ def test_a_command_that_nobody_answers_expires_and_one_that_is_withdrawn_is_not_
     end = outcome(session, first)
     assert end is not None and (end["stage"], end["text"]) == ("failed", "no answer in time")
     assert outcome(session, second) is None
+
+
+def test_a_model_s_file_that_is_under_way_is_sent_to_its_end(session, key_file, tmp_path, small_mission):
+    (tmp_path / "m.onnx").write_bytes(bytes(range(256)) * 40)
+    utc_ns = [10**18]
+    uplinker = Uplinker(session, 200, INTERVAL_S, utc_ns=lambda: utc_ns[0])
+    counter = submit(session, key_file, Command("model", {}), tmp_path / "m.onnx", 600)
+    assert uplinker.next_command(0.0) is not None
+    uplinker.take_report(Report(0, counter, "accepted", ""), 0.1)
+    assert uplinker.next_pdu(0.2) is not None
+    utc_ns[0] = 10**19
+    uplinker.next_command(10.0)
+    assert outcome(session, counter) is None and uplinker.next_pdu(10.1) is not None
+    uplinker.take_report(Report(0, counter, "completed", "in use"), 11.0)
+    end = outcome(session, counter)
+    assert end is not None and end["stage"] == "completed"
+
+
+@pytest.mark.parametrize("expires_s", [math.inf, 1e300])
+def test_a_time_without_end_spends_no_counter(session, key_file, expires_s):
+    with pytest.raises(OverflowError):
+        submit(session, key_file, Command("ping", {}), None, expires_s)
+    assert submit(session, key_file, Command("ping", {}), None, 60) == 1
 
 
 def test_a_new_keys_first_command_is_not_answered_with_the_end_of_an_old_one(session, key_file, tmp_path):

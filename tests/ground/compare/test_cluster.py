@@ -154,6 +154,22 @@ def test_ctrl_c_saves_a_training_and_the_same_command_goes_on(sessions, compare,
     assert row["resumed_at"] >= saved[0]["share"] * row["steps"] - 1
 
 
+def test_a_scheduler_that_dies_is_one_sentence_and_the_same_command_goes_on(sessions, compare, tmp_path):
+    file, out = tmp_path / "scheduler.json", tmp_path / "out"
+    quiet = {"env": ENVIRONMENT, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    module = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
+    scheduler = subprocess.Popen([*module, "--scheduler-file", str(file)], **quiet)
+    await_that(file.exists, scheduler)
+    address = json.loads(file.read_text())["address"]
+    running = compare("--sessions", sessions[0], *LONG, "--out", out, "--scheduler", address)
+    await_that(lambda: (out / "work").is_dir(), running)  # no worker takes its cells
+    scheduler.kill()
+    scheduler.wait()
+    _, told = running.communicate()
+    assert running.returncode == 1 and "Traceback" not in told, told
+    assert "the same command goes on" in told
+
+
 @pytest.mark.parametrize(
     ("workers", "needs", "available", "expected"),
     [

@@ -19,6 +19,8 @@ from ground.compare.errors import CompareError
 from ground.compare.grid import Budget, cells_of, parse_budgets, session_facts
 from ground.compare.methods import method
 from ground.compare.rows import Rows, locked
+from ground.compare.worker import run_cell
+from ground.session import SessionError
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.presets import preset, quality_changes
 from tests.benchmarks import targets
@@ -68,6 +70,16 @@ def test_the_digest_of_a_session_is_of_its_content(session, tmp_path):
 
 
 @pytest.mark.skipif("TDRS" not in targets.names(), reason="the rendered targets are not there")
+def test_a_session_that_changed_since_the_grid_was_made_gives_no_row(session, tmp_path):
+    shutil.copytree(session, tmp_path / "s")
+    (cell,) = cells_of([session_facts(tmp_path / "s")], ["black"], 1, [Budget()], PLAIN)
+    assert run_cell(cell, tmp_path / "out", tmp_path / "stop", "compare")["digest"] == cell.digest
+    lines = (tmp_path / "s" / "frames.jsonl").read_text().splitlines()
+    (tmp_path / "s" / "frames.jsonl").write_text("\n".join(lines[:-1]) + "\n")
+    with pytest.raises(SessionError, match="has changed since the command started"):
+        run_cell(cell, tmp_path / "out", tmp_path / "stop", "compare")
+
+
 def test_a_rendered_target_is_the_same_as_a_session(tmp_path):
     expected = targets.load("TDRS", 100)
     targets.write(targets.expose("TDRS", 100), tmp_path / "TDRS-100")

@@ -110,8 +110,20 @@ def test_rows_of_other_contents_under_the_same_name_are_not_taken_for_seeds():
     last = Results(rows)
     assert last.mean("3dgs", "A", "as taken", "psnr_clean_db") == 20.0 and last.replaced == 1
     assert last.spread("3dgs", "A", "as taken", "psnr_clean_db") is None
-    assert Results(rows, {"old"}).mean("3dgs", "A", "as taken", "psnr_clean_db") == 30.0
+    asked = {"old": ("A", "as taken")}
+    assert Results(rows, asked).mean("3dgs", "A", "as taken", "psnr_clean_db") == 30.0
     assert Results(ROWS).replaced == 0
+
+
+def test_rows_stand_under_the_names_that_their_session_and_condition_have_today():
+    rows = [row("3dgs", psnr_clean_db=v) | {"digest": d} for v, d in ((30.0, "moved"), (20.0, "new"))]
+    asked = {"moved": ("A-old", "as taken"), "new": ("A", "as taken")}
+    results = Results(rows, asked)
+    assert results.replaced == 0 and results.targets == ["A-old", "A"]
+    assert results.mean("3dgs", "A-old", "as taken", "psnr_clean_db") == 30.0
+    assert results.mean("3dgs", "A", "as taken", "psnr_clean_db") == 20.0
+    renamed = Results(rows, {"moved": ("A", "b"), "new": ("A", "a")})
+    assert renamed.conditions == ["b", "a"] and renamed.replaced == 0
 
 
 def test_trainings_of_several_budgets_are_told_apart():
