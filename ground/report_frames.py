@@ -5,6 +5,7 @@ import torch
 
 from ground.cameras import exposed, predicted_image
 from ground.evaluate import clean_image
+from ground.exposures import in_ms
 from ground.page import grid, label, picture, section
 from ground.pictures import ERROR_FULL_SCALE, bounding_box, heat, tone
 from ground.runs import Run
@@ -22,18 +23,21 @@ ABOVE_EMPTY = 0.01
 
 def frames_section(run: Run) -> str:
     nominal = run.session.nominal_exposures
-    exposures = sorted({r.exposure_time_s for r in run.session.frames})
-    by_key = {(r.bracket, r.exposure_time_s): r for r in run.session.frames}
+    by_place = {(r.bracket, r.bracket_index): r for r in run.session.frames}
     picked = _spread(sorted({r.bracket for r in run.session.frames}), COLUMNS)
     cells = []
-    for exposure_s in exposures:
-        cells.append(label("" if nominal else f"{exposure_s * 1e3:g} ms"))
-        for bracket in picked:
-            record = by_key.get((bracket, exposure_s))
+    for place in sorted({r.bracket_index for r in run.session.frames}):
+        row = [by_place.get((bracket, place)) for bracket in picked]
+        times = {_exposure(run, record) for record in row if record is not None}
+        is_same = len(times) == 1
+        cells.append(label(*times) if is_same else label(f"exposure {place + 1}"))
+        for record in row:
             if record is None:
                 cells.append(label("missing"))
                 continue
             caption = f"frame {record.id}" + ("" if nominal else f", {_range_m(record):.0f} m")
+            if not is_same:
+                caption += f", {_exposure(run, record)}"
             if record.saturated:
                 caption += f"<br>{record.saturated:,} px saturated"
             cells.append(picture(_tone(run, _noisy_image(run, record)), f"frame {record.id}", caption))
@@ -41,20 +45,20 @@ def frames_section(run: Run) -> str:
         "Pictures" if nominal else "Frames by exposure",
         f"{len(picked)} of the {len(run.session.frames):,} imported pictures, {_brightness(run)}."
         if nominal
-        else "Frames as received: each column is a bracket, each row an exposure time; below each frame stand its "
-        f"number and the range to the target. Brightness is {_brightness(run)}.",
+        else "Frames as received: each column is a bracket, each row one of its exposures; below each frame stand its "
+        "number, the range to the target and, where they differ in a row, the exposure time. "
+        f"Brightness is {_brightness(run)}.",
         grid(f"{LABEL_WIDTH} repeat({len(picked)}, minmax(0, 1fr))", cells),
     )
 
 
 def scored_section(run: Run, truth: Truth | None) -> str:
     records = [truth.posed(r) for r in run.scored] if truth else run.scored
-    by_key = {(r.bracket, r.exposure_time_s): r for r in records}
     nominal, brackets = run.session.nominal_exposures, sorted({r.bracket for r in run.scored})
     shown = _spread(brackets, VIEWS_SHOWN)
     body = []
     for bracket in shown:
-        of_view = [by_key[key] for key in sorted(by_key) if key[0] == bracket]
+        of_view = sorted((r for r in records if r.bracket == bracket), key=lambda r: r.exposure_time_s)
         named = f"Picture {of_view[0].id}" if nominal else f"Bracket {bracket}, {_range_m(of_view[0]):.0f} m"
         body.append(f"<h3>{named}</h3>")
         body.append(_compared(run, truth, of_view))
@@ -103,7 +107,7 @@ def _compared(run: Run, truth: Truth | None, of_view: list[FrameRecord]) -> str:
 
 def _exposure(run: Run, record: FrameRecord) -> str:
     """Return a frame's exposure time in words; nothing where it is made up."""
-    return "" if run.session.nominal_exposures else f"{record.exposure_time_s * 1e3:g} ms"
+    return "" if run.session.nominal_exposures else f"{in_ms(record.exposure_time_s)} ms"
 
 
 def _spread(values: list[int], count: int) -> list[int]:

@@ -133,7 +133,9 @@ def poses_section(run: Run) -> str:
     )
     if left_out := run.metrics.get("misfit_frames"):
         names = html.escape(", ".join(map(str, left_out)))
-        told += f" The frames {names} were left out of the training: they fitted no pose that their tags allow."
+        told += (
+            f" The frames {names} were left out of the training: they fitted no pose that their tags allow."
+        )
     body = two_tables(shared_rows(estimate)) if estimate.shared_prior.vector().any() else ""
     body += plot(correction_figure(history)) + plot(ellipse_figure(history)) + plot(residual_figure(history))
     return section("Poses as estimated", note, f"{body}<p>{told}</p>")

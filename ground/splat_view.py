@@ -1,7 +1,6 @@
 """The report's view of the model: its Gaussians packed into the page, which draws them with WebGL and no network."""
 
 import base64
-import html
 import json
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import numpy as np
 import torch
 
 from ground.cameras import median_sun_direction, sun_direction
+from ground.exposures import offered_s
 from ground.runs import Run
 from ground.session import FrameRecord
 from ground.turntable import VIEWS, circle, extent, metres_per_pixel, moving_png, pictures
@@ -160,8 +160,8 @@ def _controls(facts: dict) -> str:
     ]
     if not facts["nominal"]:
         shown = "".join(
-            f'<button type="button" data-exposure="{s!r}">{html.escape(f"{1e3 * s:g}")} ms</button>'
-            for s in exposures_s
+            f'<button type="button" data-exposure="{time_s!r}">{text} ms</button>'
+            for text, time_s in offered_s(exposures_s).items()
         )
         parts.append(f'<span role="group" aria-label="exposures of the brackets">{shown}</span>')
     if len(facts["suns"]) > 1:

@@ -110,7 +110,7 @@ def _vertices(points_m: np.ndarray) -> PlyElement:
 class Truth:
     """The truth beside a session, read: `largest_dimension_m`, `cloud_m` [N, 3] and `simulation` as they were written.
 
-    Where the target's axes were found from the frames, poses and cloud are turned into those.
+    Where the target's axes were found from the frames, or chosen freely, poses and cloud are turned into those.
 
     Raises:
         SessionError: there is none, it is damaged, or a later version of this software wrote it.
@@ -133,13 +133,13 @@ class Truth:
             self.cloud_m = read_points(self.folder / facts["cloud"])
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise SessionError(f"{self.folder} is damaged: {error}") from error
-        if session.attitude_estimated:
-            self._turn_to_estimated_axes(session)
+        if session.attitude_estimated or session.navigation.attitude == "rate_only":
+            self._turn_to_axes_of(session)
 
-    def _turn_to_estimated_axes(self, session: Session) -> None:
+    def _turn_to_axes_of(self, session: Session) -> None:
         """Give poses and cloud in the axes of the target that the session's poses are given in.
 
-        Axes that were found may be any: the turn is the mean of those between true and found poses.
+        Axes that were found, or chosen freely, may be any: the turn is the mean of those between true and given poses.
         """
         known = [r for r in session.frames if r.id in self._poses]
         turns = sum(r.world_to_camera[:3, :3].T @ self._poses[r.id][:3, :3] for r in known)

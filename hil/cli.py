@@ -1,5 +1,6 @@
 """The command line `hil`: demo, camera, link, scenario, dataset, target."""
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -19,6 +20,7 @@ from flightsw.icd.mission import load_mission
 from hil.choices import NAVIGATION, CameraKind, FaultKind, LinkKind, NavigationKind, SensorKind
 from hil.sky import SHIPPED, SHIPPED_FOIL, Materials
 from obbgs_base.command_line import new_app, run
+from obbgs_base.locks import one_command_in
 
 app = new_app("The simulated world: sky, target, camera and link, so that a pass runs on a desk.")
 MissionFile = Annotated[Path, typer.Option("--mission", help="The mission file.")]
@@ -146,12 +148,15 @@ def camera(
     from hil.world.world import load_world, told
 
     world = load_world(told(load_mission(mission), attitude), scenario)
-    if scenario:
-        written = write_flight_inputs(world, inputs, seed if navigation == "realistic" else None)
-        print(f"start flight with --mission {written.mission_path}", file=sys.stderr)
-    unwind_on_sigterm()  # while rendering; then a signal ends the service
-    where = None if gige else listen
-    serve_camera(world, mesh, cache, where, real_time, prerender, _stop_event, Console(stderr=True))
+    with contextlib.ExitStack() as held:
+        if scenario:
+            # while this serves: flight and ground read what is written there
+            held.enter_context(one_command_in(inputs, "hil"))
+            written = write_flight_inputs(world, inputs, seed if navigation == "realistic" else None)
+            print(f"start flight with --mission {written.mission_path}", file=sys.stderr)
+        unwind_on_sigterm()  # while rendering; then a signal ends the service
+        where = None if gige else listen
+        serve_camera(world, mesh, cache, where, real_time, prerender, _stop_event, Console(stderr=True))
 
 
 @app.command()
@@ -319,7 +324,10 @@ def dataset(
                 tasks[label] = bars.add_task(label, total=step.total)
             bars.update(tasks[label], completed=step.done)
 
-        made = {path.stem: make_dataset(config, path, folder, cache, workers, show) for path, folder in jobs}
+        made = {}
+        for path, folder in jobs:
+            with one_command_in(folder, "hil"):
+                made[path.stem] = make_dataset(config, path, folder, cache, workers, show)
     if json_:
         print(json.dumps(made))
     for target_name, facts in () if json_ else made.items():

@@ -25,6 +25,7 @@ from hil.world.navigation import write_flight_inputs
 from hil.world.scenario import true_exposures
 from hil.world.world import load_world, told
 from obbgs_base.errors import ObbgsError
+from obbgs_base.locks import one_command_in
 
 MARKER = "demo.json"  # a folder with it was made by a demo and may be overwritten
 REPLACED = ("flight", "session", "scenario")  # by the next demo in the same folder
@@ -39,9 +40,15 @@ def run_demo(out: Path, mission_path: Path, mesh: Path, config: PassConfig, cons
     """Run the whole demo below `out` and return its figures; frames that an earlier run rendered are used again.
 
     Raises:
+        InUse: another demo works in `out`.
         DemoError: the reconstruction failed.
         And what `simulate_pass` raises.
     """
+    with one_command_in(out, "hil"):
+        return _run_demo(out, mission_path, mesh, config, console)
+
+
+def _run_demo(out: Path, mission_path: Path, mesh: Path, config: PassConfig, console: Console) -> dict:
     began_s = time.monotonic()
     simulation = simulate_pass(out, mission_path, mesh, config, console)
     console.print("[bold]4/4 Model[/] trained with known exposure, and once more blind to it")

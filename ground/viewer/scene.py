@@ -90,9 +90,10 @@ class Placed:
             ]
 
     def draw_sun(self, record: FrameRecord, visible: bool) -> None:
-        """Put an arrow towards the Sun of a frame into the scene, if the frame's tag knows it."""
+        """Put an arrow towards the Sun of a frame into the scene; none where the frame's tag does not know it."""
         sun = sun_direction(record)
         if sun is None:
+            self._remove("sun")
             return
         ends = np.stack([1.0 * RADIUS * sun.numpy(), 1.25 * RADIUS * sun.numpy()]) + self.offset
         arrow = self._server.scene.add_arrows(
@@ -113,9 +114,7 @@ class Placed:
         self, records: list[FrameRecord], chosen: Callable[[FrameRecord], None], visible: bool
     ) -> None:
         """Put one camera for each bracket into the scene, with a small picture; `chosen` is called with its frame."""
-        for handle in self.handles["cameras"]:
-            handle.remove()
-        self.handles["cameras"] = []
+        self._remove("cameras")
         for record in one_per_bracket(records):
             away = record.position_body_m - self.centre_m
             handle = add_camera(
@@ -123,6 +122,16 @@ class Placed:
             )
             handle.on_click(lambda _, record=record: chosen(record))
             self.handles["cameras"].append(handle)
+
+    def clear(self) -> None:
+        """Take the model out of the scene, but for its splats, which those of the next one replace without a gap."""
+        for part in ("cameras", "sun", "mesh"):
+            self._remove(part)
+
+    def _remove(self, part: str) -> None:
+        for handle in self.handles[part]:
+            handle.remove()
+        self.handles[part] = []
 
     def show(self, part: str, visible: bool) -> None:
         """Show or hide a part: splats, mesh, cameras, sun."""

@@ -1,4 +1,4 @@
-"""Which run a viewer shows: found by its folder or by its session's, and read again whenever model.ply is renewed."""
+"""Which run a viewer shows: found by its folder or by its session's, and read again whenever its model is renewed."""
 
 import os
 from dataclasses import dataclass
@@ -14,6 +14,8 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
 
 HEADER, MODEL, MESH = "session.json", "model.ply", "model.glb"
+FileStamp = tuple[int, int, int]  # number, time and size of a file
+Stamp = tuple[FileStamp, FileStamp | None]  # of a model, and of its mesh where there is one
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Source:
     def __init__(self, path: Path):
         self.session_path = session_of(path)
         self.folder = newest_run(path) if (path / HEADER).is_file() else path
-        self._read: tuple[int, int, int] | None = None
+        self._read: Stamp | None = None
 
     @property
     def name(self) -> str:
@@ -59,7 +61,7 @@ class Source:
         return self._stamp() is not None
 
     def renewed(self) -> bool:
-        """Return whether model.ply is another than was read last."""
+        """Return whether there is a model.ply, and it or the mesh is another than was read last."""
         return self._stamp() not in (None, self._read)
 
     def load(self) -> Shown:
@@ -91,15 +93,12 @@ class Source:
         self._read = stamp
         return shown
 
-    def _stamp(self) -> tuple[int, int, int] | None:
-        """Return what changes when a file is replaced whole; None where there is none."""
+    def _stamp(self) -> Stamp | None:
+        """Return what changes when the model or its mesh is replaced whole; None where there is no model."""
         if self.folder is None:
             return None
-        try:
-            status = os.stat(self.folder / MODEL)
-        except OSError:
-            return None
-        return status.st_ino, status.st_mtime_ns, status.st_size
+        model, mesh = (_file_stamp(self.folder / name) for name in (MODEL, MESH))
+        return None if model is None else (model, mesh)
 
 
 def newest_run(session: Path) -> Path | None:
@@ -108,6 +107,15 @@ def newest_run(session: Path) -> Path | None:
         path: _renewed_ns(path) for path in session.glob(f"runs/*/{MODEL}") if path.parent.name[0] != "."
     }
     return max(models, key=lambda path: models[path]).parent if models else None
+
+
+def _file_stamp(path: Path) -> FileStamp | None:
+    """Return what changes when a file is replaced whole; None where there is none."""
+    try:
+        status = os.stat(path)
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def _renewed_ns(path: Path) -> int:

@@ -1,6 +1,7 @@
 """The viewer's controls and what they do; it draws again whenever a run's model is renewed."""
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import torch
 import viser
 
 from ground.cameras import predicted_image
+from ground.exposures import offered_s
 from ground.pictures import ERROR_FULL_SCALE, heat, tone
 from ground.session import FrameRecord, SessionError
 from ground.turntable import VIEWS, circle, moving_png, pictures
@@ -31,6 +33,7 @@ NEAREST, FARTHEST = (
 )  # radii from the model that the camera may come to: the wheel never flies into it
 # the exposure slider reaches from a quarter of the shortest exposure to so many times the longest
 REACH = 4.0
+DIGITS = 2  # that the exposure slider shows behind the first one of its shortest time
 PICTURE_PX = (1200, 800)
 TURNTABLE_PX = (480, 320)
 PARTS = ("splats", "cameras", "sun", "mesh")
@@ -110,30 +113,20 @@ class Viewer:
         gui, session = self.server.gui, self.placed[0].shown.session
         self.status = gui.add_markdown("")
         exposures_s = sorted({record.exposure_time_s for record in session.frames})
-        low_ms, high_ms = 1e3 * exposures_s[0] / REACH, 1e3 * exposures_s[-1] * REACH
-        self.exposure_limits_ms = low_ms, high_ms
-        nominal = session.nominal_exposures
-        name = "Brightness, per mille" if nominal else "Exposure, ms"
         middle_ms = 1e3 * exposures_s[len(exposures_s) // 2]
-        self.exposure = gui.add_slider(
-            name, min=low_ms, max=high_ms, step=low_ms / 10, initial_value=middle_ms
-        )
+        name = "Brightness, per mille" if session.nominal_exposures else "Exposure, ms"
+        self.exposure = gui.add_slider(name, min=middle_ms, max=middle_ms, step=1.0, initial_value=middle_ms)
         self.exposure.on_update(lambda _: self.draw_splats())
-        if not nominal:
-            self.brackets = gui.add_button_group("Brackets, ms", [f"{1e3 * s:g}" for s in exposures_s])
-            self.brackets.on_click(lambda _: self._expose(self.brackets.value))
+        self.brackets = gui.add_button_group("Brackets, ms", [""], visible=not session.nominal_exposures)
+        self.brackets.on_click(lambda _: self._expose(self.brackets.value))
         self.colouring = gui.add_dropdown("Colours", COLOURS, initial_value=SENSOR)
         self.colouring.on_update(lambda _: self.draw_splats())
         self.checks = {}
         for part in PARTS:
-            if part == "mesh" and not any(each.shown.mesh for each in self.placed):
-                continue
             self.checks[part] = gui.add_checkbox(part.capitalize(), initial_value=part in ("splats", "sun"))
             self.checks[part].on_update(lambda _: self._show())
         with gui.add_folder("Timeline of the pass"):
-            self.timeline = gui.add_slider(
-                "Frame", min=0, max=max(1, len(self.frames) - 1), step=1, initial_value=0
-            )
+            self.timeline = gui.add_slider("Frame", min=0, max=1, step=1, initial_value=0)
             self.timeline.on_update(lambda _: self.draw_frame())
             self.facts = gui.add_markdown("")
             self.comparison = gui.add_image(
@@ -147,6 +140,20 @@ class Viewer:
         picture.on_click(lambda event: self._save_picture(event.client))
         turntable = gui.add_button("Save turntable")
         turntable.on_click(lambda event: self._save_turntable(event.client))
+        self._fit_controls()
+
+    def _fit_controls(self) -> None:
+        """Let the controls reach what there is to show; what was chosen stays where it still can be."""
+        exposures_s = [record.exposure_time_s for record in self.frames]
+        low_ms, high_ms = 1e3 * min(exposures_s) / REACH, 1e3 * max(exposures_s) * REACH
+        self.exposure_limits_ms = low_ms, high_ms
+        self.exposure.min, self.exposure.max, self.exposure.step = low_ms, high_ms, low_ms / 10
+        self.exposure.precision = max(0, DIGITS - math.floor(math.log10(low_ms)))
+        self.exposure.value = 1e3 * self.exposure_s  # within the limits
+        self.offered_s = offered_s(exposures_s)
+        self.brackets.options = tuple(self.offered_s)
+        self.timeline.max = max(1, len(self.frames) - 1)
+        self.checks["mesh"].visible = any(each.shown.mesh is not None for each in self.placed)
 
     def draw_all(self) -> None:
         """Draw everything anew, after a model was put in place."""
@@ -181,16 +188,15 @@ class Viewer:
         """Read a run again and draw it in place of the one that was there, in the same scale."""
         shown, old = source.load(), self.placed[index]
         with self.lock:
-            for handle in old.handles["cameras"]:
-                handle.remove()
             self.placed[index] = Placed(self.server, "ab"[index], shown, old.offset, old.per_metre)
+            old.clear()
             if index == 0:
                 self.frames = _in_time(self.placed[0])
-                self.timeline.max = max(1, len(self.frames) - 1)
+            self._fit_controls()
             self.draw_all()
 
     def _is_checked(self, part: str) -> bool:
-        return part in self.checks and bool(self.checks[part].value)
+        return bool(self.checks[part].value)
 
     def _show(self) -> None:
         with self.lock:
@@ -199,8 +205,8 @@ class Viewer:
                     each.show(part, self._is_checked(part))
 
     def _expose(self, text: str) -> None:
-        if text in self.brackets.options:
-            self.exposure.value = float(text)
+        if text in self.offered_s:
+            self.exposure.value = 1e3 * self.offered_s[text]
 
     def _choose(self, record: FrameRecord) -> None:
         self.timeline.value = self.frames.index(record)

@@ -9,6 +9,7 @@ ready by then.
 import json
 import logging
 import os
+import socket
 import socketserver
 import threading
 from collections.abc import Callable
@@ -29,6 +30,7 @@ from hil.world.clock import SimulatedClock
 log = logging.getLogger(__name__)
 MAX_SOCKET_PATH_BYTES = 107  # sun_path of Linux
 POLL_S = 0.02  # how soon it notices that it is closed
+ANSWER_S = 1.0  # how long another server may take to accept a connection
 
 
 class CameraServer:
@@ -43,7 +45,7 @@ class CameraServer:
     Raises:
         ValueError: `listen` is none of these, its path is too long or holds a file that is not a socket; or flight
             cannot follow the real-time factor.
-        OSError: the address is taken or not this machine's.
+        OSError: the address is taken, by another camera for instance, or not this machine's.
     """
 
     def __init__(
@@ -79,7 +81,8 @@ class CameraServer:
             self._server = _TcpServer(address, Handler)
             host, port = self._server.server_address[:2]
             self.url = f"hil://{host}:{port}"
-        self._socket_file = address if isinstance(address, str) else None
+        self._socket_file = Path(address) if isinstance(address, str) else None
+        self._bound = _identity(self._socket_file)
         self._thread = WatchedThread("camera server", lambda: self._server.serve_forever(POLL_S))
         self._thread.start()
 
@@ -100,8 +103,8 @@ class CameraServer:
             self._server.shutdown()
         self._server.server_close()
         self._thread.join()
-        if self._socket_file:
-            Path(self._socket_file).unlink(missing_ok=True)
+        if self._socket_file and _identity(self._socket_file) == self._bound:  # not another server's
+            self._socket_file.unlink(missing_ok=True)
         if kind is None:
             self.check()
 
@@ -185,5 +188,35 @@ def _address(listen: Path | str) -> str | tuple[str, int]:
         )
     if path.exists() and not path.is_socket():
         raise ValueError(f"{path}: is a file, not a socket; it would be overwritten")
-    path.unlink(missing_ok=True)
+    _make_way(path)
     return str(path)
+
+
+def _make_way(path: Path) -> None:
+    """Remove the socket that a killed server left behind.
+
+    Raises:
+        OSError: a server accepts connections there, or its state cannot be told.
+    """
+    with socket.socket(socket.AF_UNIX) as client:
+        client.settimeout(ANSWER_S)
+        try:
+            client.connect(str(path))
+        except FileNotFoundError:
+            return
+        except ConnectionRefusedError:  # nobody has it open
+            path.unlink(missing_ok=True)
+            return
+        except OSError as error:
+            raise OSError(f"{path} cannot be listened on: {error}; choose another socket") from error
+    raise OSError(
+        f"{path} is in use: another simulated camera serves there; stop it or choose another socket"
+    )
+
+
+def _identity(path: Path | None) -> tuple[int, int, int] | None:
+    """Return what tells a file from one that was made later at the same path; None where there is none."""
+    if path is None or not path.exists():
+        return None
+    status = path.stat()
+    return status.st_dev, status.st_ino, status.st_mtime_ns

@@ -17,6 +17,7 @@ from ground.evaluate import evaluate
 from ground.pictures import tone
 from ground.reconstruct import reconstruct
 from ground.report import write_report
+from ground.report_frames import frames_section, scored_section
 from ground.runs import open_run
 from ground.session import read_header
 from ground.splat_view import splat_view
@@ -240,6 +241,45 @@ def test_gaussians_that_are_not_finite_are_left_out(session):
     gaussians.means[3, 1] = torch.nan
     facts = splat_view(run).partition('data-part="model">')[2].partition("</script>")[0]
     assert json.loads(facts)["count"] == len(gaussians) - 1
+
+
+def with_automatic_brackets(session: Path, folder: Path, lost: tuple[int, ...] = ()) -> Path:
+    """Return a copy of the session as if each bracket had exposure times of its own, without the lost frames."""
+    shutil.copytree(session, folder)
+    lines = [json.loads(line) for line in (folder / "frames.jsonl").read_text().splitlines()]
+    for line in lines:
+        line["exposure_time_s"] *= 1.0123 ** line["bracket"]
+    kept = [line for line in lines if line["id"] not in lost]
+    (folder / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in kept))
+    return folder
+
+
+def test_the_report_shows_every_frame_of_automatic_brackets_with_its_time(session, tmp_path):
+    lost = open_run(session, "run").session.frames[1]  # of the first bracket, which is always shown
+    run = open_run(with_automatic_brackets(session, tmp_path / "session", (lost.id,)), "run")
+    page = frames_section(run)
+    assert page.count("<img") == 3 * 6 - 1 and page.count("missing") == 1
+    assert all(f"exposure {place}<" in page for place in (1, 2, 3)) and "exposure 4" not in page
+    for record in (run.session.frames[0], run.session.frames[-1]):
+        shown = f"{float(f'{1e3 * record.exposure_time_s:.4g}'):g} ms"
+        assert f"frame {record.id}, {np.linalg.norm(record.position_body_m):.0f} m, {shown}" in page
+    held_out = scored_section(run, None)
+    assert held_out.count('alt="render"') == len(run.scored) == 6
+
+
+def test_the_report_names_the_time_of_a_row_that_has_one(session):
+    page = frames_section(open_run(session, "run"))
+    assert page.count("<img") == 3 * 6 and "missing" not in page and "exposure 1" not in page
+    assert [page.count(f">{shown} ms<") for shown in ("0.05", "0.1", "0.2")] == [1, 1, 1]
+    assert page.count(" ms") == 3
+
+
+def test_of_many_exposure_times_a_few_are_offered(session, tmp_path):
+    run = open_run(with_automatic_brackets(session, tmp_path / "session"), "run")
+    times_s = sorted({record.exposure_time_s for record in run.session.frames})
+    offered = [float(text) for text in re.findall(r'data-exposure="([^"]+)"', splat_view(run))]
+    assert len(times_s) == 48 and len(offered) == 6 and set(offered) <= set(times_s)
+    assert (offered[0], offered[-1]) == (times_s[0], times_s[-1]) and offered == sorted(offered)
 
 
 def imported(session: Path, folder: Path) -> Path:

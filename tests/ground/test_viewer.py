@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 import queue
 import shutil
 import socket
@@ -13,6 +14,7 @@ import imagecodecs
 import numpy as np
 import pytest
 import torch
+import trimesh
 from typer.testing import CliRunner
 from websockets.datastructures import Headers
 from websockets.http11 import Request
@@ -280,6 +282,71 @@ def test_the_page_draws_the_splats_and_its_controls_work(session):
             waited_for(lambda: all(handle.visible for handle in first.handles["cameras"]))
             page.get_by_text("Save turntable").click()
             page.wait_for_selector("text=turntable.png")
+    finally:
+        server.stop()
+
+
+def test_controls_follow_a_run_that_gets_a_mesh_and_frames_of_other_exposures(session, tmp_path):
+    """In the browser: what a live run shows at first, when it has ended, and when it is made again."""
+    folder = tmp_path / "pass"
+    shutil.copytree(session, folder)
+    index, run = folder / "frames.jsonl", folder / "runs" / "run"
+    lines = [json.loads(line) for line in index.read_text().splitlines()]
+
+    def commanded(scale: float, count: int) -> None:
+        """Let all frames after the first 12 have exposure times of their own, as far as there are so many."""
+        for number, line in enumerate(lines[12:]):
+            line["exposure_time_s"] = scale * 1e-3 * 1.01**number
+        index.write_text("".join(json.dumps(line) + "\n" for line in lines[:count]))
+
+    commanded(2.0, 12)
+    server, source = opened("127.0.0.1", 0), Source(run)
+    try:
+        shown = viewer.Viewer(server, [Placed(server, "a", source.load(), np.zeros(3))])
+        assert shown.brackets.options == ("0.05", "0.1", "0.2")
+        with (
+            chromium() as browser,
+            page_of(browser, f"http://127.0.0.1:{server.get_port()}", known=VISERS) as page,
+        ):
+            page.wait_for_selector("text=Timeline of the pass")
+            mesh = page.get_by_text("Mesh", exact=True)
+            assert mesh.count() == 0
+            commanded(2.0, 24)
+            trimesh.creation.icosphere(radius=1.5).export(run / "model.glb")
+            assert source.renewed()
+            shown.renew(0, source)
+            mesh.wait_for()
+            assert len(shown.brackets.options) == 6 and shown.brackets.options[0] == "0.05"
+            assert shown.exposure_s == pytest.approx(1e-4)  # as it was chosen
+            longest = shown.brackets.options[-1]
+            page.get_by_text(longest, exact=True).click()
+            waited_for(lambda: shown.exposure_s == pytest.approx(2e-3 * 1.01**11))
+            mesh.click()
+            waited_for(lambda: [handle.visible for handle in shown.placed[0].handles["mesh"]] == [True])
+            (run / "model.glb").unlink()
+            commanded(0.2, 24)
+            assert source.renewed()
+            shown.renew(0, source)
+            mesh.wait_for(state="detached")
+            page.get_by_text(longest, exact=True).wait_for(state="detached")
+            assert shown.exposure_s == shown.exposure.max / 1e3 == pytest.approx(4 * 2e-4 * 1.01**11)
+            assert (
+                shown.placed[0].handles["mesh"] == [] and "/a/mesh" not in server.scene._handle_from_node_name
+            )
+    finally:
+        server.stop()
+
+
+def test_no_arrow_points_to_the_sun_of_another_frame(session):
+    shown = Source(session).load()
+    known = dataclasses.replace(shown.session.frames[0], sun_dir_body=np.array([0.0, 0.6, 0.8]))
+    server = opened("127.0.0.1", 0)
+    try:
+        placed = Placed(server, "a", shown, np.zeros(3))
+        placed.draw_sun(known, True)
+        assert "/a/sun" in server.scene._handle_from_node_name
+        placed.draw_sun(dataclasses.replace(known, sun_dir_body=np.zeros(3)), True)
+        assert not {"/a/sun", "/a/sun label"} & set(server.scene._handle_from_node_name)
     finally:
         server.stop()
 

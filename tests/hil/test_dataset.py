@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import subprocess
+import time
 from pathlib import Path
 
 import imagecodecs
@@ -16,8 +18,10 @@ from ground.formats.nerf import SPLIT_PATTERN
 from ground.session import open_session
 from hil import cli, dataset, truth
 from hil.dataset import DatasetConfig, DatasetError, load_dataset_config, make_dataset, target_meshes
+from hil.processes import installed
 from hil.sky import SHIPPED
 from hil.sky.sensor import PRESETS
+from tests.commands import call
 
 POINTS = 5000
 SMALL = DatasetConfig(frames=33, size_px=40, bracket_ms=(0.05, 0.1, 0.2), sensor="paper")
@@ -158,6 +162,41 @@ def test_other_settings_do_not_overwrite_a_data_set(made, cache):
     out, _ = made
     with pytest.raises(DatasetError, match="other settings"):
         make_dataset(dataclasses.replace(SMALL, seed=5), SHIPPED, out, cache)
+
+
+def test_a_second_command_with_the_same_folder_is_refused_and_the_first_one_ends_well(tmp_path):
+    """The second one comes while the first waits for Blender."""
+    out = tmp_path / "one"
+    arguments = [
+        "dataset",
+        "--out",
+        str(out),
+        "--cache",
+        str(tmp_path / "renders"),
+        "--frames",
+        "3",
+        "--size",
+        "16",
+    ]
+    first = subprocess.Popen(
+        [installed("hil"), *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        while not (out / "dataset.json").exists():
+            assert first.poll() is None
+            time.sleep(0.01)
+        second = call("hil", *arguments)
+        assert (second.returncode, second.stderr.splitlines()[-1]) == (
+            1,
+            f"hil: another hil command works in {out}: wait for its end, or choose another folder",
+        )
+        said, _ = first.communicate()
+        assert first.returncode == 0, said
+    finally:
+        first.kill()
+        first.wait()
+    assert len(open_session(out / "session").frames) == 3 and not (out / "lock").exists()
+    assert json.loads((out / "dataset.json").read_text())["complete"]
 
 
 def test_the_meshes_of_a_set_are_found_and_a_missing_one_is_named(tmp_path):

@@ -5,6 +5,7 @@ import re
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from ground.compare.references import black
 from hil import cli
 from hil.cameras.gige import GVCP_PORT, LOOPBACK
 from hil.demo import simulate_pass
+from hil.processes import installed
 from hil.simulated_pass import PassConfig, PassError, fly
 from hil.sky import SHIPPED
 from hil.world.scenario import Scene, load_scenario
@@ -179,6 +181,25 @@ def test_a_session_that_no_demo_made_is_never_overwritten(mission, tmp_path):
     (tmp_path / "session").mkdir()
     done = call("hil", "demo", "--out", tmp_path, "--mission", mission)
     assert done.returncode == 1 and "was not made by a demo" in done.stderr
+
+
+def test_a_second_demo_in_the_folder_of_a_running_one_is_refused_and_removes_nothing(quick, tmp_path):
+    """The first one flies for half a minute: a minute lies between its two brackets."""
+    out = tmp_path / "demo"
+    options = ["demo", "--out", str(out), "--mission", str(quick), "--real-time", "2"]
+    first = subprocess.Popen(
+        [installed("hil"), *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        while not (out / "session").exists():
+            assert first.poll() is None
+            time.sleep(0.05)
+        second = hil(*options)
+        assert second.returncode == 1 and f"another hil command works in {out}" in second.stderr
+        assert (out / "session").exists() and first.poll() is None
+    finally:
+        first.terminate()
+        first.wait()
 
 
 def test_a_demo_that_cannot_start_leaves_no_files_and_an_earlier_one_as_it_was(

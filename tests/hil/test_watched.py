@@ -1,6 +1,7 @@
-"""Servers of the simulator whose thread or rendering fails: clients are answered, and a dead server is reported."""
+"""Servers of the simulator that fail, or that another would displace: clients are answered, and it is reported."""
 
 import os
+import socket
 import threading
 
 import numpy as np
@@ -13,6 +14,8 @@ from hil.links.virtual_can import VirtualCan
 from hil.links.virtual_link import VirtualLink, run_link
 from hil.links.virtual_serial import VirtualSerial
 from hil.watched import ServerError, WatchedThread
+from obbgs_base.locks import one_command_in
+from tests.commands import call
 
 
 def failing_once():
@@ -49,6 +52,39 @@ def test_a_camera_server_whose_thread_failed_is_an_error_for_its_user(small_miss
         server._thread.join(30)
         with pytest.raises(ServerError):
             server.check()
+
+
+def test_a_second_camera_does_not_take_the_place_of_one_that_serves(small_mission, tmp_path):
+    place = f"hil://{tmp_path / 'camera.sock'}"
+    with CameraServer(small_mission, failing_once(), place) as server:
+        with pytest.raises(OSError, match=r"camera\.sock is in use: another simulated camera serves there"):
+            CameraServer(small_mission, failing_once(), place)
+        open_camera(server.url, small_mission.camera).close()
+    assert not (tmp_path / "camera.sock").exists()
+
+
+def test_a_camera_takes_the_place_of_one_that_was_killed_and_leaves_the_socket_of_another(
+    small_mission, tmp_path
+):
+    path = tmp_path / "camera.sock"
+    with socket.socket(socket.AF_UNIX) as killed:
+        killed.bind(str(path))
+        killed.listen()
+    with CameraServer(small_mission, failing_once(), path) as first:
+        open_camera(first.url, small_mission.camera).close()
+        path.unlink()  # by hand: then nobody can know of the first
+        second = CameraServer(small_mission, failing_once(), path)
+    with second:
+        open_camera(second.url, small_mission.camera).close()
+    assert not path.exists()
+
+
+def test_a_second_camera_does_not_replace_what_flight_reads_for_the_first(small_mission, tmp_path):
+    with one_command_in(tmp_path / "scenario", "hil"):
+        camera = ("camera", "--mission", tmp_path / "small.yaml", "--scenario", "v-bar")
+        done = call("hil", *camera, "--inputs", tmp_path / "scenario")
+        assert done.returncode == 1 and "another hil command works in" in done.stderr
+        assert [path.name for path in (tmp_path / "scenario").iterdir()] == ["lock"]
 
 
 @pytest.mark.parametrize("make", [lambda: VirtualSerial(921_600), VirtualCan], ids=["serial", "CAN"])
