@@ -157,7 +157,8 @@ def plan_command(mission: MissionFile = Path("mission.yaml"), json_: AsJson = Fa
     """Print the planned brackets: time, range, light and the readings to expect; then sunlit passes and eclipses.
 
     Phase is the angle between Sun and camera as the target sees it, Sun the angle between line of sight and Sun, DN the
-    reading that a white surface turned to the Sun would give.
+    brightest reading to expect of a white target: that of a surface turned to the Sun up to a phase of 90 degrees, less
+    beyond it and where the target is smaller than a pixel, and the black level in eclipse.
 
     Example: flightsw plan --mission mission.yaml
     """

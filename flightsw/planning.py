@@ -24,9 +24,8 @@ class PlannedBracket:
     eclipse: bool
     pose_valid: bool
     exposure_times_ms: tuple[float, ...]
-    expected_dn: tuple[
-        int, ...
-    ]  # of a white face turned to the Sun, in each exposure; full scale is saturated
+    # brightest of a white target in each exposure (`expected_light`); full scale is saturated
+    expected_dn: tuple[int, ...]
 
 
 @dataclass(frozen=True)

@@ -236,6 +236,9 @@ def _rank(renderer: Renderer, frame: Frame, path: Path, K: np.ndarray) -> Ranked
         raise TriageError(
             f"frame {frame.frame_id} has {channels} channels, the model renders {renderer.channels}"
         )
+    view = _view(frame.pose.position_body_m, frame.pose.sun_dir_body)
+    if frame.pose.source == "none":  # nothing to render it from
+        return Ranked(frame.frame_id, path, 0.0, 0.0, 0, 0, False, view)
     expected = renderer.expected_dn(frame.world_to_camera, K, frame.exposure_time_s, frame.pose.sun_dir_body)
     chi2 = chi2_map(frame.dn.reshape(expected.shape), expected, renderer.sensor)
     tiles = tile_means(chi2)
@@ -248,7 +251,7 @@ def _rank(renderer: Renderer, frame: Frame, path: Path, K: np.ndarray) -> Ranked
         int(row) * TILE_ROWS,
         int(column) * TILE_COLUMNS,
         frame.pose.valid and not frame.pose.in_eclipse,
-        _view(frame.pose.position_body_m, frame.pose.sun_dir_body),
+        view,
     )
 
 

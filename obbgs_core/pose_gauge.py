@@ -25,6 +25,9 @@ def best_motion(estimated: Tensor, true: Tensor, radius_m: float, with_size: boo
     """
     estimated, true = estimated.double(), true.double()
     motion = torch.eye(4, dtype=torch.float64)
+    # from the mean rotation on, since Gauss-Newton does not find back from half a turn
+    u, _, v = torch.linalg.svd((true[:, :3, :3].mT @ estimated[:, :3, :3]).sum(dim=0))
+    motion[:3, :3] = u @ torch.diag(torch.stack([*u.new_ones(2), torch.linalg.det(u @ v)])) @ v
     for _ in range(ROUNDS):
         now = seen_after(true, motion)
         flow, left = seen_points(now, estimated, radius_m)

@@ -39,6 +39,12 @@ def check_orbit(mission: Mission) -> list[Finding]:
             f"{orbit.max_element_age_days:g} are allowed: every pose will be marked invalid"
         )
         findings.append(Finding.failed("orbit", found, NEWER))
+    elif ages_days["the last trigger"] > orbit.max_element_age_days:
+        found = (
+            f"elements are {ages_days['the last trigger']:.1f} days old at the last trigger, "
+            f"{orbit.max_element_age_days:g} are allowed: poses at the end of the pass will be marked invalid"
+        )
+        findings.append(Finding.warning("orbit", found, NEWER))
     if last_ns < now_ns:
         days = (now_ns - last_ns) / (86_400 * NS)
         found = f"the pass ended {days:.1f} days ago; elements are {ages_days['now']:.1f} days old now"

@@ -68,7 +68,7 @@ def save_gltf_splats(
     diffuse = (0.5 + sh.C0 * shown[:, 0]).clamp(0, 1) ** DISPLAY_GAMMA  # of points COLOR_0 is linear
     colours = torch.cat([diffuse, opacities[:, None]], dim=1)
     arrays["COLOR_0"] = np.round(65535 * colours.numpy()).astype("<u2")
-    extras = {"white_radiance": white_radiance, "display_gamma": DISPLAY_GAMMA}
+    extras = {"white_radiance": float(white_radiance), "display_gamma": DISPLAY_GAMMA}
     write_whole(path, _glb(arrays, extras))
 
 

@@ -91,8 +91,10 @@ def save_ply(
 
     Raises:
         ValueError: the radiance depends on the Sun's direction, and sun_dir is not given.
+        ExportError: the model is empty or not finite.
     """
     gaussians = gaussians.detach()
+    require_writable(gaussians, white_radiance)
     for_viewers = viewer_logits(gaussians, cameras)
     count, coefficients, channels = gaussians.sh.shape
     shown = display_sh(lit_from(gaussians, sun_dir), white_radiance)
@@ -146,9 +148,13 @@ def viewer_logits(gaussians: Gaussians, cameras: Cameras | None) -> Tensor | Non
         return None
     psf_sigma_px = torch.tensor(KERBL_PX2 - PIXEL_PX2).sqrt()
     widened = dataclasses.replace(gaussians, footprint="camera", psf_sigma_px=psf_sigma_px)
-    projected = project(widened, dataclasses.replace(cameras, psf_sigma_px=None, scale=1.0))
-    seen = projected.depths > 0
-    share = (projected.peak_shares * seen).sum(dim=0) / seen.sum(dim=0).clamp(min=1)
+    total, count = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
+    for c in range(len(cameras)):  # of all at once, large models of many frames would not fit into the memory
+        projected = project(widened, dataclasses.replace(cameras.one(c), psf_sigma_px=None, scale=1.0))
+        seen = projected.depths[0] > 0
+        total += projected.peak_shares[0] * seen
+        count += seen
+    share = total / count.clamp(min=1)
     return torch.logit(gaussians.opacities * share.sqrt(), eps=1e-6)
 
 
@@ -176,7 +182,8 @@ def load_ply(path: Path) -> Gaussians:
     head, mark, body = data.partition(b"end_header\n")
     lines = head.decode("ascii", "replace").split("\n")
     names = [line.split()[-1] for line in lines if line.startswith("property float ")]
-    counts = [int(line.split()[-1]) for line in lines if line.startswith("element vertex ")]
+    sizes = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
+    counts = [int(size) for size in sizes if size.isdecimal()]
     if not mark or not data.startswith(b"ply\n") or len(counts) != 1 or "radiance_sh_0_0" not in names:
         raise ReconstructionError(f"{path} is not a model written by this software")
     if len(body) != 4 * counts[0] * len(names):

@@ -78,7 +78,7 @@ def save_spz(
         payload = bytearray(gzip.decompress(file.read_bytes()))
     payload[FLAGS_BYTE] |= FLAG_ANTIALIASED if gaussians.footprint != "kerbl" else 0
     content = gzip.compress(payload, mtime=0)
-    comment = f"obbgs white_radiance={white_radiance!r} channels={gaussians.sh.shape[2]}"
+    comment = f"obbgs white_radiance={float(white_radiance)!r} channels={gaussians.sh.shape[2]}"
     if gaussians.footprint != "kerbl":
         comment += f" footprint={gaussians.footprint} psf_sigma_px={gaussians.psf_sigma_px.item():.6g}"
     header = content[:3] + bytes([content[3] | GZIP_HAS_COMMENT]) + content[4:GZIP_HEADER_BYTES]  # RFC 1952

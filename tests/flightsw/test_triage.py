@@ -23,6 +23,7 @@ from flightsw.icd.mission import load_mission
 from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.model_file import MAX_MODEL_BYTES, verified_model
 from flightsw.ports import open_link
+from flightsw.pose import unknown_pose
 from flightsw.settings import Settings, save_settings
 from flightsw.store import FrameStore
 from flightsw.triage import (
@@ -42,6 +43,7 @@ from ground.ingest import listen
 from hil.links.virtual_serial import VirtualSerial
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.sensor import Sensor
+from tests.ground.test_moving_sun import lit_model
 from tests.scenes import ball
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -71,7 +73,7 @@ def frame_of(
     """A frame of the ball from 300 m, with noise and a patch that the model does not know."""
     position = quat_to_matrix(quat).T @ np.array([0.0, 0, -300])
     pose = PoseTag(quat, position, np.eye(6), np.array([0, 0, 1.0]), False, True)
-    dn = renderer.expected_dn(pose.world_to_camera, K, 1e-4)[..., 0]
+    dn = renderer.expected_dn(pose.world_to_camera, K, 1e-4, pose.sun_dir_body)[..., 0]
     variance = np.maximum(dn - 64, 0) / 4 + 64
     dn = dn + np.random.default_rng(seed).normal(size=dn.shape) * np.sqrt(variance)
     dn[25:35, 45:60] += patch_dn
@@ -212,6 +214,22 @@ def test_frames_in_eclipse_or_without_a_pose_come_last_whatever_their_residual(m
     ranked, _ = rank_frames(model, tmp_path, K)
     assert [r.frame_id for r in ranked if r.comparable] == [2] == [ranked[0].frame_id]
     assert {r.frame_id for r in ranked[1:]} == {0, 1}
+
+
+@pytest.mark.parametrize("sh_count", [1, 4])
+def test_a_frame_without_a_pose_or_a_sun_does_not_keep_a_model_from_ranking_the_others(tmp_path, sh_count):
+    path, folder = tmp_path / "lit.onnx", tmp_path / "frames"
+    folder.mkdir()
+    export_onnx(lit_model(60, sh_count, 1), SENSOR, path, CAMERA.width, CAMERA.height, CAMERA_EXPOSURES)
+    renderer = Renderer(path)
+    for frame_id in range(3):
+        frame = frame_of(renderer, frame_id, 20.0, seed=frame_id)
+        if frame_id == 1:
+            frame = replace(frame, pose=unknown_pose())
+        (folder / f"{frame_id:08d}.obf").write_bytes(encode_frame(frame))
+    ranked, unreadable = rank_frames(path, tmp_path, K)
+    assert [r.frame_id for r in ranked][-1] == 1 and len(ranked) == 3 and unreadable == 0
+    assert not ranked[-1].comparable
 
 
 def results(worker: TriageWorker, count: int) -> list:

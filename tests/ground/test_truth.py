@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
-from ground.session import SessionError, open_session
+from ground.session import Navigation, SessionError, open_session
 from ground.truth import SCHEMA_VERSION, TrueFrame, Truth, write_truth
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
@@ -104,6 +105,22 @@ def test_a_damaged_truth_is_refused_and_named(session, changes):
     rewritten(session, **changes)
     with pytest.raises(SessionError, match=r"truth.* is damaged"):
         Truth(session)
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180])
+def test_the_truth_is_in_axes_that_were_chosen_freely(session, degrees):
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec(degrees * np.array([0.6, 0, 0.8]), degrees=True).as_matrix()
+    before = Truth(session)
+    frames = [
+        dataclasses.replace(r, world_to_camera=before.posed(r).world_to_camera @ turn.T)
+        for r in session.frames
+    ]
+    turned = dataclasses.replace(session, frames=frames, navigation=Navigation(attitude="rate_only"))
+    truth = Truth(turned)
+    for record in frames:
+        np.testing.assert_allclose(truth.posed(record).world_to_camera, record.world_to_camera, atol=1e-9)
+    np.testing.assert_allclose(truth.cloud_m, before.cloud_m @ turn[:3, :3].T, atol=1e-9)
 
 
 def test_whatever_byte_of_a_radiance_is_damaged_it_is_read_or_named(session):

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.special import expit, sph_harm_y
 
-from obbgs_core.errors import ReconstructionError
+from obbgs_core.errors import ExportError, ReconstructionError
 from obbgs_core.io.ply import display_sh, load_ply, radiance_sh, save_ply, save_surface_ply
 from obbgs_core.model import sh
 from obbgs_core.model.cameras import Cameras
@@ -113,6 +113,17 @@ def test_a_header_that_lost_a_column_s_name_is_refused(tmp_path, name):
     damaged = (tmp_path / "m.ply").read_bytes().replace(name, b"?" * len(name), 1)
     (tmp_path / "m.ply").write_bytes(damaged)
     with pytest.raises(ReconstructionError, match=r"m\.ply"):
+        load_ply(tmp_path / "m.ply")
+
+
+def test_an_empty_model_is_not_written_and_a_count_that_is_none_is_refused(tmp_path):
+    with pytest.raises(ExportError):
+        save_ply(model(0), tmp_path / "m.ply")
+    assert not (tmp_path / "m.ply").exists()
+    save_ply(model(3), tmp_path / "m.ply")
+    damaged = (tmp_path / "m.ply").read_bytes().replace(b"element vertex 3", b"element vertex Y", 1)
+    (tmp_path / "m.ply").write_bytes(damaged)
+    with pytest.raises(ReconstructionError, match="not a model written by this software"):
         load_ply(tmp_path / "m.ply")
 
 

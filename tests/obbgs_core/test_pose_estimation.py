@@ -461,6 +461,16 @@ def test_the_best_motion_is_the_one_that_moved_all_poses(draw):
     assert left.rotation_deg < 1e-4 and left.range_share < 1e-6 and left.pixels < 1e-3
 
 
+@pytest.mark.parametrize("with_size", [False, True])
+@pytest.mark.parametrize("degrees", [90, 140, 179, 180])
+def test_the_best_motion_may_turn_the_body_around(degrees, with_size):
+    true = _poses(a_pass(6)[0]).double()
+    turn = np.deg2rad(degrees) * np.array([0.48, 0.6, 0.64])
+    motion = rigid_motions(torch.tensor([[*turn, 0.1, -0.2, 0.05]]).double())[0]
+    found = best_motion(true @ motion, true, 1.0, with_size)
+    torch.testing.assert_close(found, motion, rtol=0, atol=1e-6)
+
+
 @settings(max_examples=8)
 @given(st.lists(st.floats(-0.2, 0.2), min_size=7, max_size=7))
 def test_a_model_of_another_size_is_undone_by_the_similarity_alone(draw):

@@ -18,7 +18,7 @@ from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.motions import motion_vectors, rigid_motions
 from obbgs_core.model.pose_covariance import flaw, whitening
-from obbgs_core.pose_corrections import PoseCorrections
+from obbgs_core.pose_corrections import PoseCorrections, _null_space
 from obbgs_core.registration import pose_information
 from obbgs_core.render import render
 from obbgs_core.render.slopes import render_with_slopes
@@ -506,3 +506,14 @@ def test_a_turn_about_a_far_point_leaves_it_where_it_is(seed):
     np.testing.assert_allclose(motion.numpy() @ np.append(point, 1), np.append(point, 1), atol=1e-9)
     vectors = motion_vectors(torch.linalg.inv(motion)[None])[0]
     np.testing.assert_allclose(vectors, -np.concatenate([vector, np.cross(point, vector)]), atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 4, 6, 7, 20])
+def test_the_null_space_is_whole_however_few_rows_there_are(count):
+    rows = torch.randn(count, 7, generator=torch.Generator().manual_seed(count)).double()
+    rows[:, 5:] = 0  # what nothing sees
+    basis = _null_space(rows)
+    assert basis.shape == (7, 7 - min(count, 5))
+    torch.testing.assert_close(basis.T @ basis, torch.eye(basis.shape[1]).double())
+    assert (rows @ basis).abs().max() < 1e-9
+    assert _null_space(torch.zeros(6, 7).double()).shape == (7, 7)

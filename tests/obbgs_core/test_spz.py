@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from obbgs_core.errors import ExportError, ReconstructionError
+from obbgs_core.io.gltf_splats import save_gltf_splats
 from obbgs_core.io.ply import display_sh, save_ply
 from obbgs_core.io.spz import load_spz, save_spz
 from obbgs_core.model import sh
@@ -122,6 +123,15 @@ def test_a_model_of_any_size_keeps_its_means(tmp_path_factory, log10_extent, see
         2.0**-16, float(gaussians.means.abs().max()) / 2**22
     )  # 24 bits, one for the sign, one to spare
     torch.testing.assert_close(load_spz(path).means, gaussians.means, rtol=1e-6, atol=step_m)
+
+
+@pytest.mark.parametrize("white", [np.float64(2.0), np.float32(2.0), 2])
+def test_the_radiance_of_white_may_be_a_number_of_any_kind(tmp_path, white):
+    save_spz(ball(3), tmp_path / "a.spz", white)
+    save_spz(ball(3), tmp_path / "b.spz", 2.0)
+    assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
+    load_spz(tmp_path / "a.spz")
+    save_gltf_splats(ball(3), tmp_path / "a.glb", white)
 
 
 def test_the_same_model_makes_the_same_file(tmp_path):
