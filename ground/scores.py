@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ground.exposures import MOST_OFFERED
 from ground.formats.srgb import from_srgb, to_srgb
 from obbgs_core.score.lpips import SMALLEST_PX, WeightsMissing, lpips
 from obbgs_core.score.metrics import (
@@ -68,7 +69,7 @@ def clean_scores(views: Sequence[ScoredView]) -> dict[str, float]:
     """Return the scores of some views against the truth, means over them.
 
     - psnr_clean_db, ssim_clean, lpips_clean (AlexNet; where its weights were fetched, and pictures are large enough).
-    - psnr_clean_<exposure>_db: the first by exposure time.
+    - psnr_clean_<exposure>_db: the first by exposure time; where they are few, unlike those of automatic brackets.
     - psnr_clean_pooled_db: of the mean squared error over all views together. The mean above is lifted by single views
       that are nearly exact (each counts up to 120 dB), this is not.
     - psnr_clean_foreground_db: of the pixels that the target covers; missing where it covers none.
@@ -77,7 +78,7 @@ def clean_scores(views: Sequence[ScoredView]) -> dict[str, float]:
     for view in views:
         by_exposure.setdefault(view.exposure_time_s, []).append(psnr_db(view.image, view.clean))
     figures = {"psnr_clean_db": _mean([value for values in by_exposure.values() for value in values])}
-    for exposure_s, values in sorted(by_exposure.items()):
+    for exposure_s, values in sorted(by_exposure.items()) if len(by_exposure) <= MOST_OFFERED else ():
         figures[f"psnr_clean_{exposure_s * 1e3:g}ms_db"] = _mean(values)
     errors = [(view.image.double() - view.clean.double()).square().mean().item() for view in views]
     figures["psnr_clean_pooled_db"] = -10 * math.log10(max(_mean(errors), 1e-12))

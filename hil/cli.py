@@ -167,7 +167,9 @@ def link(
     fd: Annotated[
         bool, typer.Option(help="The bus is CAN FD, data phase at 5 Mbit/s; implies --can.")
     ] = False,
-    baud: Annotated[int, typer.Option(help="Serial: bits per second; a byte takes 10.")] = 921_600,
+    baud: Annotated[
+        int, typer.Option(min=10, max=100_000_000, help="Serial: bits per second; a byte takes 10.")
+    ] = 921_600,
     bitrate: Annotated[int, typer.Option(help="CAN: bits per second.")] = 1_000_000,
     latency: Annotated[
         float, typer.Option(help="Delay from one end to the other, s, in addition to the transmission time.")
@@ -182,7 +184,7 @@ def link(
     one_shot: Annotated[
         bool, typer.Option(help="CAN: the controller does not repeat a frame that is destroyed on the bus.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Seed of the random faults.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random faults.")] = 0,
 ) -> None:
     """Run a virtual serial line or CAN bus with faults until stopped; prints the URLs of both ends, then the counts.
 
@@ -231,11 +233,13 @@ def scenario(
     ] = False,
     mission: MissionFile = Path("mission.yaml"),
     radial: Annotated[
-        float, typer.Option(help="With --fly-around: half of the ellipse's height, m.")
+        float, typer.Option(min=0.0, help="With --fly-around: half of the ellipse's height, m.")
     ] = 200.0,
     out_of_plane: Annotated[
         float | None,
-        typer.Option(help="Half of its width across the orbit, m; default: what keeps the range constant."),
+        typer.Option(
+            min=0.0, help="Half of its width across the orbit, m; default: what keeps the range constant."
+        ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Where --fly-around writes the chaser's TLE.")] = Path(
         "chaser.tle"
@@ -286,7 +290,7 @@ def dataset(
         SensorKind,
         typer.Option(help="paper: 8 bits with the noise of Jiang et al. 2025; spacecam: a scientific CMOS."),
     ] = "paper",
-    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 1,
     materials: Annotated[
         Materials,
         typer.Option(help="own: those of the mesh; foil: crinkled foil, and cell glass where it is dark."),

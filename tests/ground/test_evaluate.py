@@ -19,6 +19,7 @@ from ground.evaluate import evaluate
 from ground.mesh_files import read_mesh_points
 from ground.reconstruct import reconstruct
 from ground.report import write_report
+from ground.scores import ScoredView, clean_scores
 from ground.session import SessionError
 from ground.truth import read_points
 from obbgs_core.frames import cameras_of
@@ -65,6 +66,15 @@ def test_figures_of_held_out_frames_are_called_so(session):
     body = page[page.index("<body>") :]
     for text in (card, body):
         assert "PSNR of held-out frames" in text and "training frames (" not in text
+
+
+@pytest.mark.parametrize(("count", "by_exposure"), [(3, 3), (6, 6), (40, 0)])
+def test_scores_by_exposure_time_are_given_where_these_are_few(count, by_exposure):
+    picture, covered = torch.full((48, 48, 1), 0.5), torch.ones(48, 48)
+    views = [ScoredView(picture, picture + 0.01 * i, covered, 1e-4 * (1 + i)) for i in range(count)]
+    figures = clean_scores(views)
+    assert sum(key.endswith("ms_db") for key in figures) == by_exposure
+    assert {"psnr_clean_db", "psnr_clean_pooled_db", "psnr_clean_foreground_db"} <= set(figures)
 
 
 def test_the_foreground_is_the_pixels_that_the_target_covers():

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from hil.processes import tied
+from tests.commands import call
 
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.skipif(
@@ -121,3 +122,18 @@ def test_a_tied_process_is_the_command_itself():
     )
     assert int(process.communicate(timeout=60)[0]) == process.pid
     assert process.returncode == 7
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["dataset", "--out", "{tmp}", "--seed", "-1"], "--seed"),
+        (["scenario", "--fly-around", "--out-of-plane", "-5", "--out", "{tmp}"], "--out-of-plane"),
+        (["link", "--baud", "99999999999999999999"], "--baud"),
+        (["link", "--seed", "-1"], "--seed"),
+    ],
+)
+def test_a_number_out_of_range_is_refused_before_anything_is_done(tmp_path, arguments, told):
+    done = call("hil", *[a.replace("{tmp}", str(tmp_path / "out")) for a in arguments])
+    assert done.returncode == 2 and told in done.stderr
+    assert not (tmp_path / "out").exists()
