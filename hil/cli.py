@@ -237,9 +237,7 @@ def scenario(
     ] = 200.0,
     out_of_plane: Annotated[
         float | None,
-        typer.Option(
-            min=0.0, help="Half of its width across the orbit, m; default: what keeps the range constant."
-        ),
+        typer.Option(min=0.0, help="Half of its width across the orbit, m; default: that of constant range."),
     ] = None,
     out: Annotated[Path, typer.Option(help="Where --fly-around writes the chaser's TLE.")] = Path(
         "chaser.tle"
