@@ -69,7 +69,6 @@ def test_the_digest_of_a_session_is_of_its_content(session, tmp_path):
     assert content_digest(copy) != content_digest(session)
 
 
-@pytest.mark.skipif("TDRS" not in targets.names(), reason="the rendered targets are not there")
 def test_a_session_that_changed_since_the_grid_was_made_gives_no_row(session, tmp_path):
     shutil.copytree(session, tmp_path / "s")
     (cell,) = cells_of([session_facts(tmp_path / "s")], ["black"], 1, [Budget()], PLAIN)
@@ -80,6 +79,7 @@ def test_a_session_that_changed_since_the_grid_was_made_gives_no_row(session, tm
         run_cell(cell, tmp_path / "out", tmp_path / "stop", "compare")
 
 
+@pytest.mark.skipif("TDRS" not in targets.names(), reason="the rendered targets are not there")
 def test_a_rendered_target_is_the_same_as_a_session(tmp_path):
     expected = targets.load("TDRS", 100)
     targets.write(targets.expose("TDRS", 100), tmp_path / "TDRS-100")
