@@ -25,7 +25,7 @@ from flightsw.icd.mission import Mission
 from flightsw.icd.packet import PacketError
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.settings import Settings, load_settings, save_settings
-from flightsw.store import FrameStore, write_with_reserve
+from flightsw.store import FrameStore, keep_reserve, write_with_reserve
 from obbgs_base.files import write_whole
 
 log = logging.getLogger(__name__)
@@ -81,8 +81,7 @@ class ReplayCounter:
     def _keep_reserve(self) -> None:
         """Make the reserve if there is none; without space it is tried again at the next command."""
         with contextlib.suppress(OSError):
-            if not self._reserve.exists():
-                write_whole(self._reserve, bytes(RESERVE_BYTES))
+            keep_reserve(self._reserve, RESERVE_BYTES)
 
 
 @dataclass(frozen=True)

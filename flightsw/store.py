@@ -65,7 +65,7 @@ class FrameStore:
                     os.truncate(self._index, self._index_read_bytes)
                 self._index_unindexed()
                 try:
-                    self._keep_reserve()
+                    keep_reserve(self.folder / RESERVE, RESERVE_BYTES)
                 except OSError as error:
                     log.warning("no reserve for transfer numbers and settings: %s", error)
 
@@ -121,7 +121,7 @@ class FrameStore:
                 raise StoreError(f"there is no frame {frame_id} to delete")
             self._drop(frame_id, reason)
             with contextlib.suppress(OSError):  # not yet
-                self._keep_reserve()
+                keep_reserve(self.folder / RESERVE, RESERVE_BYTES)
 
     def path(self, frame_id: int) -> Path:
         return self._frames / f"{frame_id:08d}.obf"
@@ -241,15 +241,9 @@ class FrameStore:
     def _drop(self, frame_id: int, reason: str) -> None:
         (self._outbox / f"{frame_id:08d}").unlink(missing_ok=True)
         self.path(frame_id).unlink(missing_ok=True)
-        self._append(
-            {"frame_id": frame_id, "dropped": reason}
-        )  # a line lost here is written at the next start
+        # a line that is lost here is written at the next start
+        self._append({"frame_id": frame_id, "dropped": reason})
         self._read_index()
-
-    def _keep_reserve(self) -> None:
-        reserve = self.folder / RESERVE
-        if not reserve.exists():
-            write_whole(reserve, bytes(RESERVE_BYTES))
 
     @property
     def _index_bytes(self) -> int:
@@ -318,6 +312,16 @@ class FrameStore:
 
     def _append(self, entry: dict) -> None:
         append_line(self._index, json.dumps(entry).encode())
+
+
+def keep_reserve(reserve: Path, size_bytes: int) -> None:
+    """Make the file that `write_with_reserve` may delete, unless it is there.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    if not reserve.exists():
+        write_whole(reserve, bytes(size_bytes))
 
 
 def write_with_reserve(path: Path, data: bytes, reserve: Path) -> None:

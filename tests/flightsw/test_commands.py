@@ -4,7 +4,6 @@ import contextlib
 import errno
 import hashlib
 import os
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from flightsw.settings import Settings, load_settings, save_settings
 from flightsw.store import FrameStore
 from ground.uplink import make_key
 from obbgs_base.files import write_whole
+from tests.small_disk import fill_disk, small_disk
 
 ANYTHING = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=80)
 
@@ -177,7 +177,6 @@ def test_the_counter_is_kept_in_the_reserve_of_a_full_disk_which_is_made_again(
             raise OSError(error, os.strerror(error))
         write_whole(path, content)
 
-    monkeypatch.setattr("flightsw.commands.write_whole", full_disk)
     monkeypatch.setattr("flightsw.store.write_whole", full_disk)
     assert spacecraft.send("ping")[-1] == ("completed", "alive")
     assert not reserve.exists()
@@ -189,17 +188,11 @@ def test_the_counter_is_kept_in_the_reserve_of_a_full_disk_which_is_made_again(
 def test_on_a_disk_that_is_truly_full_safe_mode_is_entered_and_frames_are_deleted(
     tmp_path, small_mission, make_frame
 ):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=512k", "tmpfs", disk], check=False).returncode:
-        pytest.skip("no right to mount a tmpfs here")
     with contextlib.ExitStack() as opened:
-        opened.callback(subprocess.run, ["umount", disk], check=True)
+        disk = opened.enter_context(small_disk(tmp_path / "disk", "512k"))
         spacecraft = Spacecraft(disk / "flight", small_mission, make_frame, frames=3)
         opened.callback(lambda: spacecraft.replay.close())
-        with open(disk / "log", "wb", buffering=0) as log, contextlib.suppress(OSError):
-            while True:
-                log.write(bytes(512))
+        fill_disk(disk / "log")
         packets = [
             spacecraft.seal("safe"),
             spacecraft.seal("arm", command="delete"),

@@ -1,6 +1,5 @@
 """The frame store: nothing half there, nothing numbered twice, whatever moment the power goes."""
 
-import contextlib
 import errno
 import hashlib
 import json
@@ -16,6 +15,7 @@ from flightsw.icd.frame import decode_frame, encode_frame
 from flightsw.settings import Settings, load_settings, save_settings
 from flightsw.store import RESERVE_BYTES, FrameStore
 from obbgs_base.files import write_whole
+from tests.small_disk import fill_disk, small_disk
 
 
 def fill(store: FrameStore, make_frame, count: int) -> None:
@@ -276,20 +276,14 @@ def test_a_full_disk_is_met_by_the_policy_and_heals(tmp_path, make_frame, monkey
 def test_on_a_disk_that_is_truly_full_transfers_are_numbered_and_settings_kept(
     tmp_path, make_frame, small_mission
 ):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", disk], check=False).returncode:
-        pytest.skip("no right to mount a tmpfs here")
-    try:
+    with small_disk(tmp_path / "disk", "256k") as disk:
         store = FrameStore(disk / "store")
         stored = 0
         with pytest.raises(StoreFull, match="No space left"):
             for stored in range(200):  # noqa: B007 (the count is wanted afterwards)
                 store.put(make_frame(store.next_frame_id))
         assert stored > 5 and len(store.frames) == stored
-        with open(disk / "foreign", "wb", buffering=0) as foreign, contextlib.suppress(OSError):
-            while True:
-                foreign.write(bytes(512))
+        fill_disk(disk / "foreign")
         assert store.next_transaction()
         settings = Settings("triage", safe_mode=True)
         save_settings(store.folder, settings)
@@ -301,5 +295,3 @@ def test_on_a_disk_that_is_truly_full_transfers_are_numbered_and_settings_kept(
         for frame in store.frames:
             store.drop(frame.frame_id)
         assert (disk / "store" / "reserve").stat().st_size == RESERVE_BYTES
-    finally:
-        subprocess.run(["umount", disk], check=True)
