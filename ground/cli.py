@@ -154,10 +154,12 @@ def uplink(
     def ended() -> bool:
         if uplinking.outcome(session, counter) is not None:
             return True
+        if time.monotonic() <= end_s:
+            return False
         is_tended = model is not None and uplinking.is_waiting(session, counter)
         if is_tended and link is None:
             is_tended = uplinking.is_listening(session)
-        return time.monotonic() > end_s and not is_tended
+        return not is_tended
 
     try:
         if link is None:

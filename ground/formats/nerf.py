@@ -68,12 +68,12 @@ def export_nerf(session: Session, out: Path) -> dict[str, int]:
 
     Pictures are opaque: black level to full scale becomes 0 to 255. Frames are in the splits of `split_frames`.
     """
-    split_of = split_frames(session)
+    split_of, posed = split_frames(session), posed_frames(session)
     camera = session.camera
     counts = {}
     for split in SPLITS:
         (out / split).mkdir(parents=True, exist_ok=True)
-        records = [record for record in posed_frames(session) if split_of[record.id] == split]
+        records = [record for record in posed if split_of[record.id] == split]
         frames = []
         for record in records:
             name = f"{split}/r_{record.id:04d}"
