@@ -35,9 +35,8 @@ from flightsw.icd.quaternion import quat_to_matrix, slerp
 
 MAX_LINE_BYTES = 16_384
 MAX_STATES = 4096  # kept behind the newest one
-READ_AHEAD = (
-    2048  # states later than an exposure that are read in search of those around it, not a whole file
-)
+# states later than an exposure that are read in search of those around it, not a whole file
+READ_AHEAD = 2048
 POLL_S = 0.01
 COVARIANCE_TOLERANCE = 1e-6  # of the mean variances: what six printed digits and float32 leave
 SMALLEST_VARIANCE = 1e-60  # for a vector without variance, any entry of whose covariance would then show

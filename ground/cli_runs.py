@@ -163,9 +163,8 @@ def mesh_command(
     path = run.folder / f"{stem}.{format_.value}"
     facts = write_mesh(run.gaussians, run.session, training, path, white_radiance_of(run.session, training))
     if format_ is MeshFormatName.GLB:
-        kept = {
-            key: value for key, value in run.metrics.items() if not key.endswith("_mesh")
-        }  # of the old mesh
+        # figures whose names end in _mesh are those of the mesh before
+        kept = {key: value for key, value in run.metrics.items() if not key.endswith("_mesh")}
         missing = {n: why for n, why in kept.get("missing_outputs", {}).items() if n != path.name}
         keep_metrics(run, kept | {"missing_outputs": missing} | facts | model_sizes(run.folder))
     if json_:

@@ -180,9 +180,8 @@ class Truth:
         try:
             with open(path, "rb") as file, np.load(file) as arrays:
                 return arrays["radiance"].astype(np.float32), arrays["alpha"].astype(np.float32) / 255
-        except (
-            Exception
-        ) as error:  # of its zip archive, of zlib, or of NumPy's header: whichever the damage meets
+        # errors of its zip archive, of zlib, or of NumPy's header: whichever the damage meets
+        except Exception as error:
             raise SessionError(f"{path} is damaged: {error}") from error
 
     def _require(self, record: FrameRecord) -> None:

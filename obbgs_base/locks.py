@@ -34,9 +34,8 @@ def one_command_in(folder: Path, tool: str) -> Iterator[None]:
     try:
         yield
     finally:
-        with contextlib.suppress(
-            OSError
-        ):  # before the lock ends: later the file may be that of the next command
+        # before the lock ends: later the file may be that of the next command
+        with contextlib.suppress(OSError):
             (folder / LOCK).unlink()
             if not found:
                 folder.rmdir()

@@ -383,9 +383,8 @@ def motion_of(frames: list[TrainingFrame]) -> NominalMotion:
 
 def _null_space(rows: Tensor) -> Tensor:
     """Return an orthonormal basis [n, k] of what all rows [M, n] map to zero, whatever their lengths."""
-    if (
-        missing := rows.shape[1] - rows.shape[0]
-    ) > 0:  # else directions that no row sees would not be returned
+    missing = rows.shape[1] - rows.shape[0]
+    if missing > 0:  # else directions that no row sees would not be returned
         rows = torch.cat([rows, rows.new_zeros(missing, rows.shape[1])])
     lengths = rows.norm(dim=1, keepdim=True)
     _, singular, basis = torch.linalg.svd(torch.where(lengths > 0, rows / lengths, 0.0), full_matrices=False)

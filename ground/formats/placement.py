@@ -13,9 +13,8 @@ from ground.formats.views import View, read_grey
 
 log = logging.getLogger(__name__)
 IN_SIGHT = 0.5  # share of the pictures that show the origin where it can stay
-LEAST_SPREAD = (
-    1e-4  # mean square of the sine between lines of sight, across every direction; less tells no distance
-)
+# mean square of the sine between lines of sight, across every direction; less tells no distance
+LEAST_SPREAD = 1e-4
 
 
 def placed(views: Sequence[View]) -> tuple[list[View], np.ndarray | None]:
