@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-import numpy as np
+from ground.spread import evenly_spread
 
 MOST_OFFERED = 6  # buttons; with automatic brackets every frame of a pass may have a time of its own
 
@@ -15,6 +15,4 @@ def in_ms(exposure_time_s: float) -> str:
 def offered_s(exposure_times_s: Iterable[float]) -> dict[str, float]:
     """Return at most six of the times by what `in_ms` writes, spread evenly by rank, shortest and longest included."""
     times_s = {in_ms(time_s): time_s for time_s in sorted(exposure_times_s)}
-    texts = list(times_s)
-    picked = np.unique(np.linspace(0, len(texts) - 1, MOST_OFFERED).round().astype(int))
-    return {texts[i]: times_s[texts[i]] for i in picked}
+    return dict(evenly_spread(list(times_s.items()), MOST_OFFERED))

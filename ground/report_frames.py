@@ -10,6 +10,7 @@ from ground.page import grid, label, picture, section
 from ground.pictures import ERROR_FULL_SCALE, bounding_box, heat, tone
 from ground.runs import Run
 from ground.session import FrameRecord
+from ground.spread import evenly_spread
 from ground.truth import Truth
 from obbgs_core.score.metrics import psnr_db
 
@@ -24,7 +25,7 @@ ABOVE_EMPTY = 0.01
 def frames_section(run: Run) -> str:
     nominal = run.session.nominal_exposures
     by_place = {(r.bracket, r.bracket_index): r for r in run.session.frames}
-    picked = _spread(sorted({r.bracket for r in run.session.frames}), COLUMNS)
+    picked = evenly_spread(sorted({r.bracket for r in run.session.frames}), COLUMNS)
     cells = []
     for place in sorted({r.bracket_index for r in run.session.frames}):
         row = [by_place.get((bracket, place)) for bracket in picked]
@@ -55,7 +56,7 @@ def frames_section(run: Run) -> str:
 def scored_section(run: Run, truth: Truth | None) -> str:
     records = [truth.posed(r) for r in run.scored] if truth else run.scored
     nominal, brackets = run.session.nominal_exposures, sorted({r.bracket for r in run.scored})
-    shown = _spread(brackets, VIEWS_SHOWN)
+    shown = evenly_spread(brackets, VIEWS_SHOWN)
     body = []
     for bracket in shown:
         of_view = sorted((r for r in records if r.bracket == bracket), key=lambda r: r.exposure_time_s)
@@ -108,11 +109,6 @@ def _compared(run: Run, truth: Truth | None, of_view: list[FrameRecord]) -> str:
 def _exposure(run: Run, record: FrameRecord) -> str:
     """Return a frame's exposure time in words; nothing where it is made up."""
     return "" if run.session.nominal_exposures else f"{in_ms(record.exposure_time_s)} ms"
-
-
-def _spread(values: list[int], count: int) -> list[int]:
-    """Return at most `count` of the values, evenly spread, first and last included."""
-    return [values[i] for i in np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))]
 
 
 def _range_m(record: FrameRecord) -> float:

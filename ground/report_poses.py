@@ -12,6 +12,7 @@ from plotly.subplots import make_subplots
 from ground.estimated_poses import read_estimate
 from ground.page import plot, section, two_tables
 from ground.runs import Run
+from ground.spread import evenly_spread
 from ground.training_frames import training_frame
 from obbgs_base.navigation_errors import LENGTHS, jacobian
 from obbgs_core.frames import TrainingFrame, cameras_of
@@ -196,7 +197,7 @@ def ellipse_figure(history: PoseHistory) -> go.Figure:
     """Return the shifts across the line of sight, in the order of time, with their ellipses before and after."""
     figure = go.Figure()
     shifts = history.correction[:, 3:5]
-    shown = np.unique(np.linspace(0, len(shifts) - 1, ELLIPSES_SHOWN).round().astype(int))
+    shown = evenly_spread(range(len(shifts)), ELLIPSES_SHOWN)
     for covariances, centres, colour, name in (
         (history.prior, np.zeros_like(shifts), "rgba(91,107,123,0.25)", "as the tags state"),
         (history.posterior, shifts, "#1f6feb", "left in doubt"),

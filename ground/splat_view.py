@@ -11,6 +11,7 @@ from ground.cameras import median_sun_direction, sun_direction
 from ground.exposures import offered_s
 from ground.runs import Run
 from ground.session import FrameRecord
+from ground.spread import evenly_spread
 from ground.turntable import VIEWS, circle, extent, metres_per_pixel, moving_png, pictures
 from obbgs_core.model.footprint import KERBL_PX2, MIP_SPLATTING_PX2, PIXEL_PX2, lowers_peak
 from obbgs_core.model.gaussians import Gaussians
@@ -141,7 +142,7 @@ def _suns(frames: tuple[FrameRecord, ...]) -> list[torch.Tensor]:
         return []
     if min(float(sun @ median) for sun in known) > np.cos(MOVES_RAD):
         return [median]
-    return [known[i] for i in np.unique(np.linspace(0, len(known) - 1, SUNS).round().astype(int))]
+    return evenly_spread(known, SUNS)
 
 
 def _directions(frames: tuple[FrameRecord, ...]) -> list[list[float]]:

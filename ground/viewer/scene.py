@@ -11,6 +11,7 @@ from flightsw.icd.quaternion import matrix_to_quat
 from ground.cameras import sensor_of, sun_direction
 from ground.pictures import tone
 from ground.session import FrameRecord, Session, SessionError
+from ground.spread import evenly_spread
 from ground.turntable import extent
 from ground.viewer.source import Shown
 from ground.viewer.splats import colours, error_colours, shapes, uncertainty_colours
@@ -142,8 +143,7 @@ class Placed:
 def one_per_bracket(records: list[FrameRecord]) -> list[FrameRecord]:
     """Return the last frame of each bracket, of at most MOST_CAMERAS brackets, spread evenly."""
     last = list({record.bracket: record for record in records}.values())
-    kept = np.unique(np.linspace(0, len(last) - 1, MOST_CAMERAS).round().astype(int))
-    return [last[i] for i in kept]
+    return evenly_spread(last, MOST_CAMERAS)
 
 
 def add_camera(

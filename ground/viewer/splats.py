@@ -15,6 +15,7 @@ from torch import Tensor
 from ground.cameras import cameras_of, exposed, sun_direction
 from ground.pictures import tone
 from ground.session import FrameRecord, Session
+from ground.spread import evenly_spread
 from ground.training_frames import split, training_frame
 from ground.turntable import metres_per_pixel
 from ground.viewer.source import Shown
@@ -50,7 +51,7 @@ def shapes(shown: Shown) -> Shapes:
     gaussians, session = shown.gaussians, shown.session
     variance = float(variance_px2(gaussians, session.camera.psf_sigma_px))
     widened = gaussians.covariances() + variance * metres_per_pixel(session) ** 2 * torch.eye(3)
-    projected = project(gaussians, cameras_of(session, _spread(list(session.frames), VIEWS)))
+    projected = project(gaussians, cameras_of(session, evenly_spread(session.frames, VIEWS)))
     seen = projected.depths > 0
     share = (projected.peak_shares * seen).sum(dim=0) / seen.sum(dim=0).clamp(min=1)
     return Shapes(gaussians.means.numpy(), widened.numpy(), (gaussians.opacities * share).numpy())
@@ -112,11 +113,7 @@ def uncertainty_colours(shown: Shown) -> np.ndarray:
 
 def _frames(session: Session) -> list:
     training, _ = split(session)
-    return [training_frame(session, record) for record in _spread(training, FRAMES)]
-
-
-def _spread(records: list[FrameRecord], count: int) -> list[FrameRecord]:
-    return [records[i] for i in np.unique(np.linspace(0, len(records) - 1, count).round().astype(int))]
+    return [training_frame(session, record) for record in evenly_spread(training, FRAMES)]
 
 
 def _gradient(image: Tensor, weights: Tensor, sh: Tensor, keep: bool) -> Tensor:
