@@ -216,9 +216,8 @@ class NavigationStream:
         self.bad_lines = 0  # not understood, or with a time that the stream did not go on from
         self.hang_ups = 0
         self._section = section
-        self._states: collections.deque[NavigationState] = collections.deque(
-            maxlen=MAX_STATES
-        )  # times increase
+        # their times increase
+        self._states: collections.deque[NavigationState] = collections.deque(maxlen=MAX_STATES)
         # the newest state where it does not follow those, until the next comes
         self._doubtful: NavigationState | None = None
         self._pending = b""

@@ -232,9 +232,8 @@ class _BracketTimes:
 
     def at(self, trigger_utc_ns: int) -> tuple[float, ...]:
         """Return the exposure times of a bracket once it is due; empty for the mission's own."""
-        times_s = (
-            self._automatic(trigger_utc_ns) if self._mission.bracket.auto else ()
-        )  # takes time: before the wait
+        # before the wait, since it takes time
+        times_s = self._automatic(trigger_utc_ns) if self._mission.bracket.auto else ()
         self._wait_until(trigger_utc_ns)
         commanded = self._settings() if self._settings else None
         if commanded is not None and commanded.exposure_times_ms is not None:

@@ -90,9 +90,8 @@ def test_the_mesh_of_a_finished_run_is_written_in_the_format_asked_for(session, 
     copy = Path(shutil.copytree(finished / "runs", session / "runs", dirs_exist_ok=True)) / "run" / name
     copy.unlink(missing_ok=True)
     metrics = json.loads((copy.parent / "metrics.json").read_text())
-    (copy.parent / "metrics.json").write_text(
-        json.dumps(metrics | {"mesh_triangles": 12})
-    )  # of an older version
+    # as an older version wrote them
+    (copy.parent / "metrics.json").write_text(json.dumps(metrics | {"mesh_triangles": 12}))
     done = CliRunner().invoke(cli.app, ["mesh", "--session", str(session), "--format", format_, "--json"])
     assert done.exit_code == 0, done.output
     facts = json.loads(done.stdout)
