@@ -154,7 +154,7 @@ def _details(m: dict) -> list[tuple[str, str]]:
         "completeness_shown_mesh": "… of the part that the frames show, %",
         "accuracy_mesh": "mean distance from model.glb to the true surface",
         "surface_shown": "part of the true surface that the frames show: in view, and above their noise, %",
-        "completeness_of_shown": f"true surface within {COMPLETENESS_RADIUS} of that part: without guesses no more, %",
+        "completeness_of_shown": f"true surface within {COMPLETENESS_RADIUS} of it: the most without guessing, %",
     }
     return [
         (text, f"{value:.4g}") for key, text in names.items() if (value := _finite(m.get(key))) is not None
