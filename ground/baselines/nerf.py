@@ -1,7 +1,7 @@
 """The baselines `nerf` and `instant-ngp`: neural radiance fields (Mildenhall 2020, Müller 2022).
 
-`instant-ngp` has the encoding and the batch that its authors publish, and runs on a GPU if PyTorch finds one; `nerf` is
-the same method at a size that a CPU can train.
+`instant-ngp` has the encoding and the batch that its authors publish; `nerf` is the same method at a size that a CPU
+can train.
 """
 
 import hashlib

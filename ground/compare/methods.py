@@ -153,7 +153,7 @@ def _reference(task: Task, images: Callable[[Case, list[TrainingFrame]], list[Te
 
 def _nerf(task: Task, size: Size, exposure_aware: bool) -> Outcome:
     settings = (task.seed, task.work, task.steps_share, exposure_aware, size)
-    on_gpu = size is AS_PUBLISHED and torch.cuda.is_available()
+    on_gpu = torch.cuda.is_available()
     made = reconstruct_nerf(task.frames, task.sensor, *settings, device="cuda" if on_gpu else "cpu")
     figures = made.figures | {"device": torch.cuda.get_device_name()} if on_gpu else made.figures
     return Outcome(dataclasses.replace(made, figures=figures))
