@@ -47,8 +47,8 @@ class Follower:
         )
         self._looked_s = self._told_s = -1e9
         self._share, self._meter, self._joules_before = 0.0, EnergyMeter(), 0.0
-        told = _read(folder / PROGRESS)
-        self.cpu_seconds = 0.0 if told is None else told.get("cpu_seconds", 0.0)
+        self._told = _read(folder / PROGRESS) or {}
+        self.cpu_seconds = 0.0
         self._worked_s = time.process_time()
         kept = _read(folder / CURVE)
         if kept is not None:
@@ -60,6 +60,8 @@ class Follower:
         `cpu_seconds` is the processor time of the work until now, over all its interrupted parts, without measuring.
         """
         self.cpu_seconds += time.process_time() - self._worked_s
+        if self._share == 0.0:
+            self._resume_costs(seconds)
         if share < self._share or self._share == 0.0:  # the work began, or went on, behind what was measured
             self.points = [point for point in self.points if point["share"] <= share]
         self._share = share
@@ -78,6 +80,8 @@ class Follower:
         if self._share:
             self._tell(reconstruction.seconds)
             self._add(self._share, reconstruction.seconds, reconstruction)
+        else:  # it was complete already
+            self._resume_costs(reconstruction.seconds)
         return self.points
 
     def should_stop(self) -> bool:
@@ -106,6 +110,13 @@ class Follower:
         """The energy that the processor packages took meanwhile, over all interrupted parts; None where unknown."""
         taken = self._meter.sample()
         return None if taken is None else self._joules_before + taken
+
+    def _resume_costs(self, seconds: float) -> None:
+        """Take over what the parts before cost, as far as the work goes on from them: none of it if it began anew."""
+        told_s = self._told.get("seconds", 0.0)
+        kept = min(1.0, seconds / told_s) if told_s else 0.0
+        self.cpu_seconds += kept * self._told.get("cpu_seconds", 0.0)
+        self._joules_before *= kept
 
     def _add(self, share: float, seconds: float, reconstruction: Reconstruction) -> None:
         point = {"share": round(share, 5), "seconds": round(seconds, 2)} | self._measured(reconstruction)

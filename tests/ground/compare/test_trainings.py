@@ -1,6 +1,7 @@
 """Trainings as compared methods: interrupted and resumed, ended early, and followed on the way."""
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 
@@ -108,10 +109,28 @@ def test_the_curve_is_measured_on_the_way_and_goes_on_after_an_interruption(case
         abs=1e-3,
     )
     again = Follower(case, tmp_path, tmp_path / "stop")
-    assert again.cpu_seconds == followed.cpu_seconds > 0
-    again.on_step(0.5, 1.0, lambda: result)  # resumed from a checkpoint in the middle
-    assert again.cpu_seconds > followed.cpu_seconds
+    again.on_step(0.5, result.seconds / 2, lambda: result)  # resumed from a checkpoint in the middle
+    assert followed.cpu_seconds / 2 < again.cpu_seconds < followed.cpu_seconds + 1
     assert max(point["share"] for point in again.points) <= 0.5 and len(again.points) >= 9
+
+
+def test_costs_are_of_the_parts_that_the_work_went_on_from(case, tmp_path):
+    result = trained(case, PUBLISHED, Work())
+
+    def follower() -> Follower:
+        told = {"share": 0.9, "seconds": 90.0, "cpu_seconds": 80.0, "pid": 1}
+        (tmp_path / "progress.json").write_text(json.dumps(told))
+        return Follower(case, tmp_path, tmp_path / "stop")
+
+    anew = follower()
+    anew.on_step(0.01, 0.0, lambda: result)  # its checkpoint could not be used
+    assert anew.cpu_seconds < 5
+    resumed = follower()
+    resumed.on_step(0.5, 45.0, lambda: result)
+    assert resumed.cpu_seconds == pytest.approx(40, abs=5)
+    complete = follower()
+    complete.finish(dataclasses.replace(result, seconds=90.0))
+    assert complete.cpu_seconds == pytest.approx(80)
 
 
 @pytest.mark.parametrize(
