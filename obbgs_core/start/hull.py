@@ -20,12 +20,15 @@ from obbgs_core.sensor import Sensor, dark_reading
 log = logging.getLogger(__name__)
 # a window's mean above this is light with few false alarms; the target's radius is taken from it
 CERTAIN_SIGMA = 5.5
-SKY_SIGMA = 1.0  # a 9x9 window's mean up to this may be empty sky
+# A window is empty sky where its mean is this many natural logarithms of odds likelier of nothing than of the faintest
+# face that should not be taken for nothing, of so many sigmas in each pixel.
+SKY_ODDS, FAINTEST_SIGMA = 1.6, 0.2
 BRIGHT_SIGMA = 4.0  # of a single pixel
 EDGE_SIGMA = 1.5  # of a single pixel beside brighter ones
 # a window's mean above this is likely light: some of it is noise, but one view in twenty may disagree on a voxel
 LIKELY_SIGMA = 2.0
 WINDOWS_PX = (3, 5, 9, 15)  # wide windows find shadowed faces that no single pixel shows
+SKY_WINDOWS_PX = (5, 9, 15, 25)
 FEWEST_BRIGHT_PX = 4  # a frame with fewer counts as black
 FEWEST_CHOSEN = 3  # pixels of a window that a mean is taken of
 SPECK = 0.4  # a certain pixel is noise where no more than this share of its 3x3 window is certain
@@ -42,8 +45,9 @@ VOXELS_AT_ONCE = 1_000_000  # bounds the memory
 class Silhouette:
     """Where one frame sees light, by confidence; [H, W] bool each.
 
-    certain: light with few false alarms; likely: light with few misses; sky: no sign of light. A third of the truly
-    empty pixels pass as sky, and of a face whose light is twice the noise of a 5x5 mean one pixel in fifty.
+    certain: light with few false alarms; likely: light with few misses; sky: empty, with few false alarms. Nearly all
+    empty pixels that are far from light pass as sky, a fifth of those right beside a faint face, and one in forty of a
+    face of FAINTEST_SIGMA.
     """
 
     certain: Tensor
@@ -75,8 +79,11 @@ def silhouette(dn: Tensor, sensor: Sensor, world_to_camera: Tensor, K: Tensor) -
         likely |= (faint[w] > LIKELY_SIGMA) & (faint[5] > 0)
     likely |= (means[3] > CERTAIN_SIGMA) & (signal > EDGE_SIGMA)
     certain &= _mean(certain.float(), 3) > SPECK
-    lit = likely | (faint[5] > 0) | (faint[9] > SKY_SIGMA)
-    return Silhouette(certain[0, 0], likely[0, 0], ~lit[0, 0], world_to_camera, K)
+    sky = torch.zeros_like(bright)
+    for w in SKY_WINDOWS_PX:
+        expected = FAINTEST_SIGMA * w  # of a window on the faintest face, in sigmas of its mean
+        sky |= _mean_of(signal, ~bright, w, few=torch.inf) < expected / 2 - SKY_ODDS / expected
+    return Silhouette(certain[0, 0], likely[0, 0], (sky & ~likely)[0, 0], world_to_camera, K)
 
 
 def light(dn: Tensor, sensor: Sensor, background: float, exposure_time_s: float) -> Tensor:
@@ -91,10 +98,10 @@ def light(dn: Tensor, sensor: Sensor, background: float, exposure_time_s: float)
     return sensor.black_dn + (dn - empty_dn).abs()
 
 
-def _mean_of(signal: Tensor, chosen: Tensor, window: int) -> Tensor:
-    """Return the mean of the chosen pixels around each [1, 1, H, W], in sigmas of that mean; 0 where they are few."""
+def _mean_of(signal: Tensor, chosen: Tensor, window: int, few: float = 0.0) -> Tensor:
+    """Return the mean of the chosen pixels around each [1, 1, H, W], in sigmas of that mean; `few` where they are."""
     share, total = _mean(chosen.float(), window), _mean(signal * chosen, window) * window
-    return torch.where(share * window**2 > FEWEST_CHOSEN - 0.5, total / share.clamp(min=1e-6).sqrt(), 0.0)
+    return torch.where(share * window**2 > FEWEST_CHOSEN - 0.5, total / share.clamp(min=1e-6).sqrt(), few)
 
 
 def _mean(image: Tensor, window: int) -> Tensor:

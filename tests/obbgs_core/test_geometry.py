@@ -89,8 +89,23 @@ def test_light_does_not_leak_into_the_dark_and_a_faint_face_is_found():
     assert seen.certain[30:90, 20:60].all()
     assert seen.likely[32:88, 20:108].float().mean() > 0.98  # most of the faint face
     assert seen.likely[30:90, :18].float().mean() < 0.2  # two pixels beside the lit face only noise is left
-    assert seen.sky[32:88, 20:108].float().mean() < 0.02 and not (seen.sky & seen.likely).any()
-    assert 0.2 < seen.sky[:, 120:].float().mean() < 0.6
+    assert not (seen.sky & seen.likely).any() and not seen.sky[32:88, 20:108].any()
+    assert seen.sky[:, 130:].float().mean() > 0.9
+
+
+@pytest.mark.parametrize(("faint_sigma", "most"), [(0.0, 1.0), (0.2, 0.05), (0.4, 0.001)])
+def test_a_wide_face_far_below_the_noise_is_not_taken_for_sky(faint_sigma, most):
+    sensor = Sensor(64.0, 4095.0, 1e7, 1e9, 6.0)
+    generator = np.random.default_rng(2)
+    signal = np.zeros((200, 200, 3))
+    signal[40:160, 40:160] = (
+        faint_sigma * 6 / math.sqrt(3)
+    )  # the mean of three channels is told by sigmas of its own
+    dn = torch.from_numpy(np.round(64 + signal + generator.normal(0, 6, signal.shape))).float()
+    seen = hull.silhouette(dn, sensor, torch.eye(4), torch.eye(3))
+    assert seen.sky[60:140, 60:140].float().mean() <= most
+    assert seen.sky[:20].float().mean() > 0.9  # twenty pixels beside it
+    assert seen.sky[36:40, 60:140].float().mean() > 0.1  # right beside it
 
 
 def test_the_start_leaves_no_thin_part_out():
