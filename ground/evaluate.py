@@ -60,7 +60,7 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     - chamfer, hausdorff, accuracy, completeness: of the Gaussians' centres, in units where the target's largest
       dimension is 2; the same with _surface: of the points in surface.ply; with _mesh: of points on model.glb.
     - surface_shown: percentage of the true surface that the training frames show (`shown_points`); completeness_shown:
-      completeness of that part; completeness_of_shown: what it has as completeness itself (`completeness_of_part`).
+      completeness of that part.
     - psnr_clean_settled_db: from the settled poses; pose_error_deg, pose_error_range (of the range), pose_error_px: of
       the training's estimated poses, root mean squares, and pose_error_tagged_... of its tags; only of refined poses.
     - size_error_percent: by how much the model of refined poses is too large, which no picture shows where navigation

@@ -153,8 +153,7 @@ def _details(m: dict) -> list[tuple[str, str]]:
         "completeness_mesh": f"true surface within {COMPLETENESS_RADIUS} of model.glb, %",
         "completeness_shown_mesh": "… of the part that the frames show, %",
         "accuracy_mesh": "mean distance from model.glb to the true surface",
-        "surface_shown": "part of the true surface that the frames show: in view, and above their noise, %",
-        "completeness_of_shown": f"true surface within {COMPLETENESS_RADIUS} of it: the most without guessing, %",
+        "surface_shown": "part of the true surface of which each point by itself is above the noise of the frames, %",
     }
     return [
         (text, f"{value:.4g}") for key, text in names.items() if (value := _finite(m.get(key))) is not None

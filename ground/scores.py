@@ -14,7 +14,6 @@ from ground.formats.srgb import from_srgb, to_srgb
 from obbgs_core.score.lpips import SMALLEST_PX, WeightsMissing, lpips
 from obbgs_core.score.metrics import (
     cloud_distances,
-    completeness_of_part,
     foreground_psnr_db,
     psnr_db,
     ssim,
@@ -111,8 +110,7 @@ def cloud_scores(
 
     Returns:
         chamfer, hausdorff, accuracy and completeness as `cloud_distances` has them, but for empty clouds;
-        surface_shown: percentage of the true surface that the frames show; completeness_of_shown: the completeness of
-        exactly that part (`completeness_of_part`).
+        surface_shown: percentage of the true surface that the frames show.
     """
     true_cloud = true_cloud_m * units_per_m
     figures: dict[str, float] = {}
@@ -122,7 +120,6 @@ def cloud_scores(
             figures |= {f"{key}{name}": value for key, value in distances.items()}
     if shown is not None:
         figures["surface_shown"] = 100 * float(shown.mean())
-        figures["completeness_of_shown"] = completeness_of_part(true_cloud, shown)
     return figures
 
 

@@ -65,14 +65,3 @@ def cloud_distances(
     if shown is not None and shown.any():
         figures["completeness_shown"] = 100 * float(is_found[shown].mean())
     return figures
-
-
-def completeness_of_part(truth: np.ndarray, shown: np.ndarray) -> float:
-    """Return the completeness of a cloud that is exactly those true points [M, 3] that are `shown` [M], a percentage.
-
-    It is what a method that finds all that frames show, and guesses nothing, reaches.
-    """
-    if not shown.any():
-        return 0.0
-    to_shown, _ = KDTree(truth[shown], **TREE).query(truth, distance_upper_bound=COMPLETENESS_RADIUS)
-    return 100 * float(np.isfinite(to_shown).mean())

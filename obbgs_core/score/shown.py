@@ -24,7 +24,8 @@ def shown_points(points_m: np.ndarray, frames: Sequence[TrainingFrame], sensor: 
     A point is in view of a camera if no other point in its cell of the picture, or those around it, is clearly nearer.
     The readings of the frames that have it in view, at least two, are added up, weighted as for a radiance that is the
     same from all sides; the point is shown if the sum exceeds that of an unlit point by SHOWN_SIGMA deviations. What is
-    shown less is unlit or behind other parts: no method can be expected to find it, other than by symmetry.
+    shown less is dark or behind other parts. A wide face of such points may still be found, by what all of them read
+    together.
 
     Args:
         points_m: [N, 3] m, body frame, evenly over the whole surface.

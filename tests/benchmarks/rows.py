@@ -50,7 +50,6 @@ FIGURES = {  # key of a row: column title and format
     "completeness_shown_mesh": ("mesh complete of what is shown", "{:.1f} %"),
     "accuracy_mesh": ("accuracy of the mesh", "{:.4f}"),
     "surface_shown": ("of the surface is shown", "{:.1f} %"),
-    "completeness_of_shown": ("complete if just that is found", "{:.1f} %"),
     "mesh_triangles": ("triangles", "{:,.0f}"),
     "cpu_seconds": ("processor time", "{:.1f} s"),
     "gaussians": ("Gaussians", "{:,.0f}"),

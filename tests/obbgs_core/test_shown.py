@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import torch
 
-from obbgs_core.score.metrics import cloud_distances, completeness_of_part
+from obbgs_core.score.metrics import cloud_distances
 from obbgs_core.score.shown import shown_points
 from tests.raycast import SENSOR, Box, cast, directions, looking_at_origin, photographed
 
@@ -61,10 +61,3 @@ def test_completeness_of_what_is_shown_leaves_out_the_rest():
         cloud_distances(truth[:2], truth, np.array([True, True, False, False]))["completeness_shown"] == 100
     )
     assert "completeness_shown" not in cloud_distances(truth, truth, np.zeros(4, bool))
-
-
-def test_what_is_shown_reaches_as_far_as_completeness_does():
-    truth = np.array([[0, 0, 0], [0.009, 0, 0], [0.011, 0, 0], [1, 0, 0]], float)
-    shown = np.array([True, False, False, False])
-    assert completeness_of_part(truth, shown) == cloud_distances(truth[shown], truth)["completeness"] == 50
-    assert completeness_of_part(truth, np.zeros(4, bool)) == 0
