@@ -104,7 +104,7 @@ def interval_scores(
     return {
         f"interval_90_{name}": torch.cat(values).double().mean().item()
         for name, values in held.items()
-        if values
+        if sum(part.numel() for part in values)
     }
 
 

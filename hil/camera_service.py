@@ -10,6 +10,7 @@ from hil.cameras.gige import GigeCameraServer
 from hil.cameras.virtual import CameraServer
 from hil.progress import progress_bar
 from hil.sky.render_farm import RenderFarm
+from hil.world.clock import SimulatedClock
 from hil.world.scenario import true_exposures
 from hil.world.world import World
 
@@ -39,7 +40,10 @@ def serve_camera(
         MeshError, BlenderError: the mesh or Blender is not usable.
         CaptureError, ValueError, OSError: the camera cannot be served.
     """
+    SimulatedClock(world.mission, real_time)  # refuses an impossible factor before anything is rendered
     with RenderFarm(world.mission, mesh, cache, WORKERS) as farm:
+        if listen is not None:  # opened and closed: an address that cannot be served is refused, too
+            CameraServer(world.mission, farm.radiance, listen, 0, world.pose_at, real_time).close()
         moments = []
         if prerender:
             exposures = true_exposures(world.mission, world.pose_at)

@@ -19,7 +19,7 @@ from flightsw.icd.frame import Attitude
 from flightsw.icd.mission import load_mission
 from hil.choices import NAVIGATION, CameraKind, FaultKind, LinkKind, NavigationKind, SensorKind
 from hil.sky import SHIPPED, SHIPPED_FOIL, Materials
-from obbgs_base.command_line import new_app, run
+from obbgs_base.command_line import new_app, refuse_beside, run
 from obbgs_base.locks import one_command_in
 
 app = new_app("The simulated world: sky, target, camera and link, so that a pass runs on a desk.")
@@ -267,6 +267,7 @@ def scenario(
 
 @app.command()
 def dataset(
+    context: typer.Context,
     out: Annotated[
         Path, typer.Option(help="The data set's folder; with --set it holds one folder a target.")
     ],
@@ -306,8 +307,8 @@ def dataset(
     from hil.progress import progress_bar
 
     if set_ is not None:
-        if mesh is not None:
-            raise ValueError("give --mesh or --set, not both")
+        own = ("mesh", "scenario", "frames", "size", "bracket", "sensor", "seed", "materials")
+        refuse_beside(context, "--set", own)
         config = load_dataset_config(set_)
         jobs = [(path, out / path.stem) for path in target_meshes(config, meshes)]
     else:

@@ -28,8 +28,8 @@ from obbgs_base.errors import ObbgsError
 from obbgs_base.locks import one_command_in
 
 MARKER = "demo.json"  # a folder with it was made by a demo and may be overwritten
-REPLACED = ("flight", "session", "scenario")  # by the next demo in the same folder
 LOGS = ("ground.log", "flight.log", "flight.json")
+REPLACED = ("flight", "session", "scenario", *LOGS)  # by the next demo in the same folder
 
 
 class DemoError(ObbgsError):
@@ -97,8 +97,9 @@ def simulate_pass(
             farm.prerender([e.pose for e in exposures], lambda: progress.advance(task))
         _clear(out)  # not earlier: a mesh that cannot be rendered must not remove an earlier pass
         errors = None
-        known = mission.target_attitude.knowledge == "known"
-        if config.scenario or config.navigation == "realistic" or not known:
+        # where the mission file alone would lead flight to the true poses, it is flown as it is
+        sgp4 = mission.navigation.source == "sgp4" and mission.target_attitude.knowledge == "known"
+        if config.scenario or config.attitude or config.navigation == "realistic" or not sgp4:
             seed = config.seed if config.navigation == "realistic" else None
             inputs = write_flight_inputs(world, out / "scenario", seed)
             mission_path, errors = inputs.mission_path, inputs.errors
@@ -116,7 +117,7 @@ def simulate_pass(
 
 
 def _require_own(out: Path) -> None:
-    """Refuse a folder whose flight/, session/ or scenario/ no demo made.
+    """Refuse a folder with a flight/, session/, scenario/ or log that no demo made.
 
     Raises:
         DemoError: there is such a one.
@@ -130,7 +131,7 @@ def _require_own(out: Path) -> None:
 def _clear(out: Path) -> None:
     """Remove what an earlier demo flew and mark the folder as a demo's; rendered frames stay."""
     for name in REPLACED:
-        if (out / name).exists():
+        if (out / name).is_dir():
             shutil.rmtree(out / name)
     out.mkdir(parents=True, exist_ok=True)
     (out / MARKER).write_text("{}\n")

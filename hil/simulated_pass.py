@@ -6,6 +6,7 @@ Only the link carries frames from one process to the other.
 import contextlib
 import json
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -31,7 +32,9 @@ from hil.progress import progress_bar
 from hil.world.world import World
 from obbgs_base.errors import ObbgsError
 
-STALL_S = 60.0  # the pass has failed when nothing was captured or received for this long
+# the pass has failed when nothing was captured or received for this long, and for as long as frames without any
+# compression would take that the link carries side by side
+STALL_S = 60.0
 FAULT_SEED = 1
 FAULT_WORDS = {
     "lost",
@@ -96,7 +99,7 @@ def fly(
         CaptureError, OSError: the GigE camera cannot be served: Aravis is missing, or its port is taken.
     """
     mission = world.mission
-    with config.open_link(mission) as line, _open_camera(out, world, radiance, config) as camera:
+    with config.open_link(mission) as line, _open_camera(world, radiance, config) as camera:
         cut = _Cut(line, config.cut_s, _planned_frames(mission))
         _run_flight_and_ground(out, mission, mission_path, line, camera.url, cut, config, console)
         link_figures = _link_figures(line, config, cut)
@@ -130,13 +133,21 @@ def _planned_frames(mission: Mission) -> int:
     return mission.bracket.count * len(mission.bracket.exposure_times_ms)
 
 
+@contextlib.contextmanager
 def _open_camera(
-    out: Path, world: World, radiance: Callable[[PoseTag], np.ndarray], config: PassConfig
-) -> CameraServer | GigeCameraServer:
+    world: World, radiance: Callable[[PoseTag], np.ndarray], config: PassConfig
+) -> Iterator[CameraServer | GigeCameraServer]:
+    """Serve the camera; the socket is in a folder of its own, since its path must be short."""
     more = {"pose_at": world.pose_at, "real_time": config.real_time}
     if config.camera == "gige":
-        return GigeCameraServer(world.mission, radiance, **more)
-    return CameraServer(world.mission, radiance, out / "camera.sock", **more)
+        with GigeCameraServer(world.mission, radiance, **more) as camera:
+            yield camera
+        return
+    with (
+        tempfile.TemporaryDirectory(prefix="hil-") as folder,
+        CameraServer(world.mission, radiance, Path(folder) / "camera.sock", **more) as camera,
+    ):
+        yield camera
 
 
 class _Cut:
@@ -171,14 +182,15 @@ def _run_flight_and_ground(
     Raises:
         PassError: one of them failed, or the pass stalled.
     """
-    bracket, frames = mission.bracket, _planned_frames(mission)
+    frames = _planned_frames(mission)
     listen = ["listen", "--link", line.ground_url, "--session", str(out / "session")]
     listen += ["--exit-after", str(frames), "--mission", str(mission_path)]
-    times_ms = ",".join(f"{time_ms:g}" for time_ms in bracket.exposure_times_ms)
-    capture = ["capture", "--bracket", times_ms, "--count", str(bracket.count), "--camera", camera_url]
-    capture += ["--store", str(out / "flight"), "--link", line.flight_url]
+    capture = ["capture", "--camera", camera_url, "--store", str(out / "flight"), "--link", line.flight_url]
     capture += ["--mission", str(mission_path), "--json"]
-    stall_s = STALL_S + (bracket.interval_s / config.real_time if config.real_time else 0.0)
+    camera = mission.camera
+    at_once_bits = 16 * camera.width * camera.height * camera.channels * mission.link.files_in_flight
+    stall_s = STALL_S + at_once_bits / mission.link.baud_rate
+    stall_s += mission.bracket.interval_s / config.real_time if config.real_time else 0.0
     with (
         open(out / "ground.log", "w") as ground_log,
         open(out / "flight.log", "w") as flight_log,

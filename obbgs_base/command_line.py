@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from collections.abc import Iterable
 from importlib.metadata import version
 from typing import Annotated, Any
 
@@ -44,6 +45,18 @@ def new_app(summary: str) -> typer.Typer:
         pass
 
     return app
+
+
+def refuse_beside(context: typer.Context, option: str, others: Iterable[str]) -> None:
+    """Refuse options, by the names of their parameters, that would have no effect beside another one.
+
+    Raises:
+        ValueError: one of them was given.
+    """
+    for name in others:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            raise ValueError(f"--{name} has no effect beside {option}: leave one of them out")
 
 
 def run(app: typer.Typer, tool: str) -> None:

@@ -43,6 +43,8 @@ class Navigation:
 class TrainingFrame:
     """One exposure: dn [H, W, C] float, known exposure time, pose [4, 4] body to camera, K [3, 3] px.
 
+    The origin of the body's axes lies in the target, or not much farther from it than its size.
+
     pose_covariance: [6, 6] float64, of the motion that in front of world_to_camera makes the tagged pose the true one:
         rotation vector about the camera's axes (rad) and shift along them (m), as in `model.motions`; None or zeros:
         the pose is exact but for what the navigation's parameters change.

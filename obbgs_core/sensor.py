@@ -10,6 +10,7 @@ from torch import Tensor
 HALF_DN = 0.5  # a reading of 0 means a signal below this, since signals are rounded
 # edge of the blocks by which noise is measured, and the share of them that is surely sky
 BLOCK_PX, SKY_BLOCKS = 8, 0.25
+SKY_SCATTERS = 1.0  # a block whose mean is farther above an empty one, in deviations of a reading, is no sky
 
 
 @dataclass(frozen=True)
@@ -155,13 +156,17 @@ def dark_reading(sensor: Sensor) -> tuple[float, float]:
     return first, math.sqrt(second - first**2)
 
 
-def noise_excess(dn: Tensor, sensor: Sensor) -> tuple[float, float]:
+def noise_excess(dn: Tensor, sensor: Sensor, empty_dn: float) -> tuple[float, float]:
     """Return the scatter of empty sky over the stated one, and that of readings two apart over that of neighbours.
 
     Differences of neighbouring readings dn [H, W, C] have twice the variance of a reading. Of blocks of 8x8 pixels
     those with the smaller differences are empty sky, also where the target fills half of the picture or stars are in
-    it. The second figure is the deviation of differences two pixels apart over that of neighbours in these blocks: 1.03
-    for noise, more where the picture was smoothed or compressed, infinite where it has no noise.
+    it; they read what is empty within SKY_SCATTERS of their own scatter, or else they show the target, and nothing is
+    learnt: 1 is returned. The second figure is the deviation of differences two pixels apart over that of neighbours
+    in these blocks: 1.03 for noise, more where the picture was smoothed or compressed, infinite where it has no noise.
+
+    Args:
+        empty_dn: what an empty pixel reads in the mean.
     """
     squares = [
         (dn[:, lag:] - dn[:, :-lag])[:, : dn.shape[1] - 2].square().mean(dim=2)[None] for lag in (1, 2)
@@ -169,5 +174,10 @@ def noise_excess(dn: Tensor, sensor: Sensor) -> tuple[float, float]:
     near, far = (F.avg_pool2d(s, min(BLOCK_PX, *s.shape[1:])).flatten() for s in squares)
     quietest = near.quantile(SKY_BLOCKS)
     sky = near <= quietest
+    level = F.avg_pool2d(
+        (dn[:, :-2].mean(dim=2) - empty_dn)[None], min(BLOCK_PX, *squares[0].shape[1:])
+    ).flatten()
+    if (level[sky].median() > SKY_SCATTERS * (0.5 * quietest).sqrt()).item():
+        return 1.0, math.inf
     farther = (far[sky].mean() / near[sky].mean()).sqrt().nan_to_num(nan=torch.inf).item()
     return math.sqrt(0.5 * quietest.item()) / dark_reading(sensor)[1], farther

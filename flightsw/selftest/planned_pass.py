@@ -33,7 +33,15 @@ def check_orbit(mission: Mission) -> list[Finding]:
         ages_days[name] = max(abs(state.element_age_days) for state in states)
         ranges_m[name] = float(np.linalg.norm(states[0].position_m - states[1].position_m))
     findings = []
-    if ages_days["the first trigger"] > orbit.max_element_age_days:
+    by_elements = mission.navigation.source == "sgp4"
+    if not by_elements and ages_days["the last trigger"] > orbit.max_element_age_days:
+        found = (
+            f"elements are {ages_days['the last trigger']:.1f} days old at the last trigger, "
+            f"{orbit.max_element_age_days:g} are allowed: poses come from navigation, but the plan of the pass and the "
+            "Earth's shadow are less exact"
+        )
+        findings.append(Finding.warning("orbit", found, NEWER))
+    elif ages_days["the first trigger"] > orbit.max_element_age_days:
         found = (
             f"elements are {ages_days['the first trigger']:.1f} days old at the first trigger, "
             f"{orbit.max_element_age_days:g} are allowed: every pose will be marked invalid"
@@ -57,7 +65,7 @@ def check_orbit(mission: Mission) -> list[Finding]:
             f"{ages_days['the first trigger']:.1f} days old then, {ages_days['now']:.1f} now"
         )
         findings.append(Finding.ok("orbit", found))
-    if mission.navigation.source != "sgp4":
+    if not by_elements:
         findings += _navigation(mission.navigation)
     return findings
 

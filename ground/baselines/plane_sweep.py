@@ -25,7 +25,7 @@ from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
 
 NOTHING = -1.0  # the correlation where a window cannot be compared
-FLAT = 1e-10  # a variance below this, full scale 1, is no texture
+FLAT = 1e-6  # a variance below this times 1 + mean², full scale 1, is no texture: rounding alone has a tenth of it
 PIXELS_AT_ONCE = 200_000  # keeps the arrays of a pass in the processor's cache
 
 
@@ -187,7 +187,9 @@ def correlation(a: Tensor, b: Tensor, window_px: int) -> Tensor:
     covariance = _sums(a * b, window_px) / count - mean_a * mean_b
     variance_a = _sums(a * a, window_px) / count - mean_a**2
     variance_b = _sums(b * b, window_px) / count - mean_b**2
-    both = variance_a.clamp(min=FLAT) * variance_b.clamp(min=FLAT)
+    both = torch.maximum(variance_a, FLAT * (1 + mean_a**2)) * torch.maximum(
+        variance_b, FLAT * (1 + mean_b**2)
+    )
     return (covariance / both.sqrt()).clamp(-1, 1)
 
 

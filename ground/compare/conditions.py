@@ -72,6 +72,11 @@ class Condition:
         for name in ("exposure_error", "frames", "missing_exposure", "pose_error_deg"):
             require(getattr(self, name) >= 0, name, f"expected 0 or more, got {getattr(self, name):g}")
         require(
+            self.exposure_error <= MOST_EXPOSURE_ERROR,
+            "exposure_error",
+            f"expected at most {MOST_EXPOSURE_ERROR:g}, got {self.exposure_error:g}",
+        )
+        require(
             0 <= self.lost_percent < 100,
             "lost_percent",
             f"expected 0 to less than 100, got {self.lost_percent:g}",
@@ -107,6 +112,7 @@ class Condition:
         return {name: value for name, value in fields.items() if value != getattr(default, name)}
 
 
+MOST_EXPOSURE_ERROR = 3.0  # of ln(true / tagged exposure time): twenty times too long or short
 AS_TAKEN = "as taken"  # the name of the condition that changes nothing
 
 
@@ -163,7 +169,8 @@ def given(case: Case, condition: Condition) -> tuple[list[TrainingFrame], Sensor
     if condition.eclipse:
         first, last = condition.eclipse
         frames = [
-            _unlit(f, case.sensor) if first <= i / len(frames) < last else f for i, f in enumerate(frames)
+            _unlit(f, case.sensor, condition) if first <= i / len(frames) < last else f
+            for i, f in enumerate(frames)
         ]
     if condition.pose_error_deg:
         frames = [_turned(f, math.radians(condition.pose_error_deg)) for f in frames]
@@ -233,10 +240,10 @@ def read_out(
     return np.rint(sensor.black_dn + signal_dn + condition.noise * noise_dn).clip(0, sensor.white_dn)
 
 
-def _unlit(frame: TrainingFrame, sensor: Sensor) -> TrainingFrame:
+def _unlit(frame: TrainingFrame, sensor: Sensor, condition: Condition) -> TrainingFrame:
     """Return a frame of the same camera that shows no light, only noise."""
     dark = read_out(
-        np.zeros(tuple(frame.dn.shape)), frame.exposure_time_s, sensor, Condition(), _random(DARK, frame)
+        np.zeros(tuple(frame.dn.shape)), frame.exposure_time_s, sensor, condition, _random(DARK, frame)
     )
     return dataclasses.replace(frame, dn=torch.from_numpy(dark.astype(np.float32)))
 
@@ -266,6 +273,8 @@ def _left(frames: list[TrainingFrame], condition: Condition) -> list[TrainingFra
         order = np.random.default_rng(LOSS).permutation(len(frames))
         lost = set(order[: int(len(frames) * condition.lost_percent / 100)].tolist())
         frames = [frame for i, frame in enumerate(frames) if i not in lost]
+    if not frames:
+        raise CompareError("the condition leaves no training frame")
     return frames
 
 

@@ -42,11 +42,11 @@ def parse_budgets(text: str) -> list[Budget]:
         share, at, largest = part.strip().partition("@")
         try:
             budget = Budget(float(share), int(largest) if at else None)
-            if not 0 < budget.steps_share < 1e6 or (budget.largest is not None and budget.largest < 1):
+            if not 0 < budget.steps_share < 1e6 or (budget.largest is not None and budget.largest < 2):
                 raise ValueError
         except ValueError as error:
             raise ValueError(
-                "--budgets: expected shares of the steps above 0, each with @ and a number of Gaussians if wanted, "
+                "--budgets: expected shares of the steps above 0, each with @ and 2 or more Gaussians if wanted, "
                 f"such as 1,0.5,1@8000; got {part!r}"
             ) from error
         budgets.append(budget)

@@ -174,7 +174,7 @@ def _motion(task: Task, pictures: Pictures) -> Outcome:
 def _training(config: MethodConfig, name: str, time_limit_s: float = float("inf")) -> Method:
     def run(task: Task) -> Outcome:
         changes = dict(task.settings)
-        changes.setdefault("steps", max(1, round(config.steps * task.steps_share)))
+        changes["steps"] = max(1, round(changes.get("steps", config.steps) * task.steps_share))
         if task.largest is not None:
             changes = budget_changes(config, changes, task.largest)
         used = changed(config, changes)

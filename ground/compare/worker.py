@@ -1,5 +1,6 @@
 """Makes one row: loads a cell's session, runs its method under its condition, scores the result. Runs in a worker."""
 
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -52,9 +53,6 @@ def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict
             f"{cell.session.path} has changed since the command started, which would mix rows of two contents: start "
             "the command again"
         )
-    case = load_case(cell.session.path, cell.condition.held_out_sector_deg)
-    wanted = method(cell.method, cell.weights)
-    follower = Follower(case, folder, stop, MARKS if wanted.settable else FEW_MARKS)
     row: dict[str, Any] = {
         "digest": cell.digest,
         "method": cell.method,
@@ -69,6 +67,9 @@ def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict
     if cell.condition.stated():
         row["changes"] = cell.condition.stated()
     try:
+        case = load_case(cell.session.path, cell.condition.held_out_sector_deg)
+        wanted = method(cell.method, cell.weights)
+        follower = Follower(case, folder, stop, MARKS if wanted.settable else FEW_MARKS)
         frames, sensor = given(case, cell.condition)
         task = Task(
             case,
@@ -137,4 +138,9 @@ def clear_work(out: Path, digest: str) -> None:
 
 
 def _rounded_all(figures: dict[str, Any]) -> dict[str, Any]:
-    return {key: round(value, 5) if isinstance(value, float) else value for key, value in figures.items()}
+    """Return the figures as rows have them; one that is not finite has no meaning, and is left out."""
+    return {
+        key: round(value, 5) if isinstance(value, float) else value
+        for key, value in figures.items()
+        if not isinstance(value, float) or math.isfinite(value)
+    }

@@ -98,6 +98,12 @@ class CameraServer:
         self._thread.check()
 
     def __exit__(self, kind: object, *_: object) -> None:
+        self.close()
+        if kind is None:
+            self.check()
+
+    def close(self) -> None:
+        """Serve no more, and give the address free."""
         self._closing.set()
         if self._thread.is_alive():
             self._server.shutdown()
@@ -105,8 +111,6 @@ class CameraServer:
         self._thread.join()
         if self._socket_file and _identity(self._socket_file) == self._bound:  # not another server's
             self._socket_file.unlink(missing_ok=True)
-        if kind is None:
-            self.check()
 
     def answer(self, line: bytes) -> tuple[dict, bytes]:
         """Return the reply to one request line: header and pixel bytes; ok=False and the reason if it failed."""

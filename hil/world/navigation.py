@@ -10,6 +10,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import Mission, NavigationSection
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.icd.tle import orbit_axes
@@ -17,6 +18,7 @@ from flightsw.orbit import OrbitState, propagate
 from flightsw.pose import look_along
 from hil.world.navigation_errors import NOISE_DEG, NavigationErrors, draw, stated_sigmas, turned
 from hil.world.world import World
+from obbgs_base.files import write_whole
 
 NS = 1_000_000_000
 MARGIN_S = 10.0  # the states end so long after the last exposure
@@ -36,10 +38,17 @@ def write_flight_inputs(world: World, folder: Path, seed: int | None) -> FlightI
     Each state holds both orbits and the chaser's attitude, and the target's as far as the mission says that it is
     known; two of them come in the mission's `max_gap_s`. With a seed they have random errors
     (`hil.world.navigation_errors`), and the mission file states their standard deviations.
+
+    Raises:
+        ConfigError: the folder holds a mission.yaml that this did not write.
     """
     folder.mkdir(parents=True, exist_ok=True)
     stream, path = folder.resolve() / "navigation.jsonl", folder / "mission.yaml"
-    section = dataclasses.replace(world.mission.navigation, source=f"file://{stream}")
+    source = f"file://{stream}"
+    if path.exists() and not _reads(path, source):
+        problem = f"is not of an earlier run, whose navigation.source is {source}, and would be written over"
+        raise ConfigError(str(path), f"{problem}: choose another folder")
+    section = dataclasses.replace(world.mission.navigation, source=source)
     mission, errors = dataclasses.replace(world.mission, navigation=section), None
     if seed is not None:
         start_ns = mission.orbit.start_utc_ns
@@ -49,11 +58,20 @@ def write_flight_inputs(world: World, folder: Path, seed: int | None) -> FlightI
         stated = stated_sigmas(range_m, _rate_deg_s(world, start_ns), mean_motion_rad_s)
         pose = dataclasses.replace(mission.pose, sigma_attitude_deg=NOISE_DEG)
         mission = dataclasses.replace(mission, pose=pose, navigation_errors=stated)
-    stream.write_text("".join(json.dumps(state) + "\n" for state in _states(world, section, errors, seed)))
+    states = "".join(json.dumps(state) + "\n" for state in _states(world, section, errors, seed))
+    write_whole(stream, states.encode())
     tree = dataclasses.asdict(mission)
     del tree["sha256"]  # of the file itself
-    path.write_text(yaml.safe_dump(tree, sort_keys=False))
+    write_whole(path, yaml.safe_dump(tree, sort_keys=False).encode())
     return FlightInputs(path, errors)
+
+
+def _reads(path: Path, source: str) -> bool:
+    """Return whether a mission file has this navigation source."""
+    try:
+        return yaml.safe_load(path.read_bytes())["navigation"]["source"] == source
+    except (yaml.YAMLError, KeyError, TypeError):
+        return False
 
 
 def _rate_deg_s(world: World, utc_ns: int) -> np.ndarray:

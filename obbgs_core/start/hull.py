@@ -139,6 +139,22 @@ def radius_m(silhouettes: list[Silhouette]) -> float:
     return 1.05 * float(reach.kthvalue(max(1, int(INSIDE * len(reach)))).values)
 
 
+def origin_apart(silhouettes: list[Silhouette]) -> float:
+    """Return how far the origin is from the middle of certain light, in deviations of that light: the median view's.
+
+    Infinite where it lies behind the camera.
+    """
+    apart = []
+    for s in silhouettes:
+        lit = torch.nonzero(s.certain).flip(1) + 0.5  # columns, then rows
+        origin = s.K @ s.world_to_camera[:3, 3]
+        if len(lit) >= FEWEST_BRIGHT_PX:
+            spread_px = lit.std(dim=0).norm().clamp(min=1.0)
+            offset_px = (origin[:2] / origin[2] - lit.mean(dim=0)).norm()
+            apart.append(float(offset_px / spread_px) if origin[2] > 0 else math.inf)
+    return sorted(apart)[len(apart) // 2] if apart else 0.0
+
+
 def hull_points(silhouettes: list[Silhouette], radius: float) -> tuple[Tensor, float]:
     """Return surface points [M, 3] m of the visual hull, and the voxel size, m.
 

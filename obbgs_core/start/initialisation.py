@@ -22,6 +22,7 @@ from obbgs_core.start import hull
 log = logging.getLogger(__name__)
 FEWEST_HULL_POINTS = 200  # with fewer the start is random
 FEWEST_VIEWS = 12  # that carve the hull
+FARTHEST_ORIGIN = 4.0  # from the target, in deviations of its light about its middle, where there is no hull
 VIEWS_FOR_COLOUR = 24  # about so many frames, spread evenly, are averaged for the first radiance
 HULL_OPACITY, RANDOM_OPACITY = 0.5, 0.1  # of the first Gaussians
 # Deviation on the hull over the mean distance to the nearest three: spread points are 1.4 times as far from each other
@@ -80,7 +81,7 @@ def first_gaussians(
         sh_degree: of the spherical harmonics that the Gaussians have room for.
 
     Raises:
-        ReconstructionError: every frame is black, or the origin is behind the cameras.
+        ReconstructionError: every frame is black, or the origin is behind the cameras or far from the target.
     """
     radius = hull.radius_m(outlines)
     if radius == 0 and any(outline.certain.any() for outline in outlines):
@@ -101,6 +102,15 @@ def first_gaussians(
             width_m = HULL_WIDTH * _mean_spacing(points)
             model = _round_gaussians(points, colours, width_m, coefficients, HULL_OPACITY)
             return model, radius, f"visual hull, {len(chosen)} points"
+        if (apart := hull.origin_apart(outlines)) > FARTHEST_ORIGIN:
+            where = (
+                f"{apart:.0f} times the target's width beside it"
+                if apart < math.inf
+                else "behind the cameras"
+            )
+            raise ReconstructionError(
+                f"the origin of the body's axes lies {where}: poses must have it in the target"
+            )
         log.warning("the silhouettes agree on only %d points; starting at random", len(points))
     points = (2 * torch.rand(settings.count, 3, generator=rng) - 1) * radius
     colours = _colours(points, frames, sensor, settings, rng)

@@ -26,7 +26,7 @@ from obbgs_core.frames import (
 )
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.pose_corrections import PoseCorrections
-from obbgs_core.sensor import Sensor, noise_excess
+from obbgs_core.sensor import Sensor, dark_reading, noise_excess
 from obbgs_core.settings import flat
 from obbgs_core.start.alignment import settled
 from obbgs_core.start.hull import Silhouette, light, shows_light
@@ -45,6 +45,9 @@ from obbgs_core.train.windows import windows
 
 log = logging.getLogger(__name__)
 NOISE_FRAMES = 12  # about so many, spread evenly, by which the noise is measured
+USUAL_FULL_SCALE = (
+    10.0  # radiances of full scale at the mean exposure between this and its inverse do no harm
+)
 # of the scatter of empty sky over that of the sensor model, or the reverse; frames that fit it have 0.93 to 0.97
 CLEAR_EXCESS = 1.3
 UNSMOOTHED = 1.1  # ratio of the scatter of pixels two apart to that of neighbours; noise has 1.02 to 1.05
@@ -132,6 +135,7 @@ def prepare(
     seen = silhouettes(lit, sensor, known)
     outlines, poses, why = settled(lit, seen, config.poses.refine != "never", refined)
     posed = lit if poses is None else poses.frames(lit)
+    noise += _unusual_unit(lit, sensor)
     config, budget = _limited(config, [int(outline.certain.sum()) for outline in outlines.values()])
     gaussians, radius_m, start = first_gaussians(
         posed, list(outlines.values()), sensor, config.start, config.light.sh_degree, rng
@@ -231,7 +235,13 @@ def _with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Senso
     parts of the target would count as noise. Smoothed pictures scatter less too, but their nearest neighbours most.
     """
     shown = frames[:: max(1, len(frames) // NOISE_FRAMES)]
-    ratios, farther = zip(*(noise_excess(frame.dn, sensor) for frame in shown), strict=True)
+    dark_dn, _ = dark_reading(sensor)
+    empty_dn = [
+        max(dark_dn, sensor.expected_dn(torch.tensor(frame.background), frame.exposure_time_s).item())
+        for frame in shown
+    ]
+    pairs = zip(shown, empty_dn, strict=True)
+    ratios, farther = zip(*(noise_excess(frame.dn, sensor, level) for frame, level in pairs), strict=True)
     excess = statistics.median(ratios)
     too_much = excess < 1 / CLEAR_EXCESS and statistics.median(farther) < UNSMOOTHED
     if not (excess > CLEAR_EXCESS or too_much):
@@ -245,6 +255,19 @@ def _with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Senso
     )
     log.warning(changed)
     return seen, f"; {changed}"
+
+
+def _unusual_unit(frames: list[TrainingFrame], sensor: Sensor) -> str:
+    """Return a warning, also logged, if radiance is measured in a unit in which full scale is far from 1."""
+    white = sensor.full_scale_radiance(mean_exposure_s(frames))
+    if 1 / USUAL_FULL_SCALE <= white <= USUAL_FULL_SCALE:
+        return ""
+    unusual = (
+        f"full scale is a radiance of {white:.2g}, and trainings are tuned to about 1: choose the unit of radiance so, "
+        f"for instance with {white:.2g} times the gain dn_per_radiance_s"
+    )
+    log.warning(unusual)
+    return f"; {unusual}"
 
 
 def _limited(config: MethodConfig, lit_pixels: list[int]) -> tuple[MethodConfig, str]:

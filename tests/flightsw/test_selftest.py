@@ -260,6 +260,10 @@ def test_elements_too_old_or_beyond_use_and_a_pass_that_is_over(small_mission, i
 
     (old,) = found_with(start_utc="2026-08-21T10:52:30Z")
     assert old.state == "failed" and "31.0 days old at the first trigger, 7 are allowed" in old.found
+    states = NavigationSection(source="file:///none")
+    orbit = dataclasses.replace(small_mission.orbit, start_utc="2026-08-21T10:52:30Z")
+    told, _ = planned_pass.check_orbit(dataclasses.replace(small_mission, orbit=orbit, navigation=states))
+    assert told.state == "warning" and "poses come from navigation" in told.found
     long = dataclasses.replace(small_mission.bracket, interval_s=86_400.0, count=30)
     (late,) = planned_pass.check_orbit(dataclasses.replace(small_mission, bracket=long))
     assert late.state == "warning" and "29.0 days old at the last trigger, 7 are allowed" in late.found

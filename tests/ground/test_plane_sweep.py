@@ -39,6 +39,12 @@ def test_correlation_matches_scikit_image():
         assert ours[row, column].item() == pytest.approx(theirs, abs=1e-4)  # float32 sums of 49 values
 
 
+def test_windows_without_texture_do_not_correlate():
+    for level in torch.linspace(0.05, 3, 60).tolist():
+        value = correlation(torch.full((7, 7), level), torch.full((1, 7, 7), level), 7)
+        assert abs(float(value)) < 0.5
+
+
 @settings(max_examples=10)
 @given(gain=st.floats(0.1, 10), offset=st.floats(-1, 1), seed=st.integers(0, 99))
 def test_correlation_ignores_gain_and_offset_and_stays_within_one(gain, offset, seed):

@@ -221,6 +221,8 @@ def test_a_set_of_two_targets_is_one_command_and_one_file(cache, tmp_path):
     arguments += ["--out", str(tmp_path / "out"), "--cache", str(cache), "--workers", "1"]
     done = CliRunner().invoke(cli.app, arguments)
     assert done.exit_code == 0 and set(json.loads(done.stdout)) == {"Cube", "Plank"}
+    refused = CliRunner().invoke(cli.app, [*arguments, "--size", "32"])
+    assert "--size has no effect beside --set" in str(refused.exception)
     assert open_session(tmp_path / "out" / "Plank" / "session").frames[2].exposure_time_s == 2e-4
 
 

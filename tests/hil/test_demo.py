@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from rich.console import Console
 
+from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import load_mission
 from ground.compare.case import load_case
 from ground.compare.references import black
@@ -21,6 +23,7 @@ from hil.demo import simulate_pass
 from hil.processes import installed
 from hil.simulated_pass import PassConfig, PassError, fly
 from hil.sky import SHIPPED
+from hil.world.navigation import write_flight_inputs
 from hil.world.scenario import Scene, load_scenario
 from hil.world.world import load_world
 from tests.commands import call
@@ -177,10 +180,41 @@ def test_impossible_options_are_refused_before_anything_is_written(mission, tmp_
     assert not (tmp_path / "d").exists()
 
 
-def test_a_session_that_no_demo_made_is_never_overwritten(mission, tmp_path):
-    (tmp_path / "session").mkdir()
-    done = call("hil", "demo", "--out", tmp_path, "--mission", mission)
-    assert done.returncode == 1 and "was not made by a demo" in done.stderr
+def test_what_no_demo_made_is_never_overwritten(mission, tmp_path):
+    (tmp_path / "a" / "session").mkdir(parents=True)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "flight.log").write_text("mine\n")
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        done = call("hil", "demo", "--out", folder, "--mission", mission)
+        assert done.returncode == 1 and "was not made by a demo" in done.stderr
+    assert (tmp_path / "b" / "flight.log").read_text() == "mine\n"
+
+
+def test_a_mission_of_one_s_own_is_not_replaced_by_the_inputs_of_a_simulation(tmp_path):
+    world = load_world(load_mission(ROOT / "mission.yaml"), "v-bar")
+    (tmp_path / "mission.yaml").write_text("# mine\n")
+    with pytest.raises(ConfigError, match=r"mission.yaml: is not of an earlier run.*choose another folder"):
+        write_flight_inputs(world, tmp_path, None)
+    assert (tmp_path / "mission.yaml").read_text() == "# mine\n"
+    for _ in range(2):  # its own are written again
+        write_flight_inputs(world, tmp_path / "spaces in its name", None)
+
+
+def test_a_demo_flies_the_bracket_of_its_mission_and_exact_tags_whatever_is_known(quick, tmp_path):
+    tree = yaml.safe_load(quick.read_text())
+    tree["bracket"]["auto"] = True
+    tree["target_attitude"]["knowledge"] = "unknown"
+    tree["navigation"] = {"source": "file:///nowhere"}
+    mission = tmp_path / "auto.yaml"
+    mission.write_text(yaml.safe_dump(tree))
+    long = tmp_path / ("a" * 60) / ("b" * 60)  # a socket in it would have too long a path
+    figures = simulate_pass(
+        long, mission, SHIPPED, PassConfig(attitude="known", navigation="perfect"), Console(stderr=True)
+    )
+    assert figures["navigation"]["rotation_error_deg"] < 0.01 and figures["frames"]["without_valid_pose"] == 0
+    lines = (long / "session" / "frames.jsonl").read_text().splitlines()
+    times = {json.loads(line)["exposure_time_s"] for line in lines}
+    assert times.isdisjoint({t / 1e3 for t in tree["bracket"]["exposure_times_ms"]})
 
 
 def test_a_second_demo_in_the_folder_of_a_running_one_is_refused_and_removes_nothing(quick, tmp_path):

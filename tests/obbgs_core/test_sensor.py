@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import uniform_filter
 
-from obbgs_core.sensor import Sensor, clipped_mean, noise_excess
+from obbgs_core.errors import ReconstructionError
+from obbgs_core.sensor import Sensor, clipped_mean, dark_reading, noise_excess
 from obbgs_core.train.presets import preset
-from obbgs_core.train.setup import UNSMOOTHED
+from obbgs_core.train.setup import UNSMOOTHED, prepare
 from obbgs_core.train.trainer import Trainer
 from tests import scenes
 
@@ -83,6 +84,21 @@ def test_the_stabilised_scale_keeps_its_digits_however_small_the_shot_noise(elec
     torch.testing.assert_close(sensor.stabilised(dn).double(), exact, rtol=1e-5, atol=1e-5)
 
 
+def test_a_unit_of_radiance_far_from_full_scale_and_an_origin_far_from_the_target_are_told():
+    frames = scenes.photographed(scenes.target(), 13, size_px=40, focal_px=70.0)
+    config = preset("obbgs", {"steps": 2})
+    usual, _ = prepare(frames, scenes.SENSOR, config, 0)
+    assert "full scale" not in usual.start
+    strong = dataclasses.replace(scenes.SENSOR, dn_per_radiance_s=scenes.SENSOR.dn_per_radiance_s / 1000)
+    unusual, _ = prepare(frames, strong, config, 0)
+    assert "full scale is a radiance of" in unusual.start and "times the gain" in unusual.start
+    far = torch.eye(4)
+    far[0, 3] = -100.0
+    shifted = [dataclasses.replace(f, world_to_camera=f.world_to_camera @ far) for f in frames]
+    with pytest.raises(ReconstructionError, match="axes lies .*: poses must have it in the target"):
+        prepare(shifted, scenes.SENSOR, config, 0)
+
+
 @pytest.mark.parametrize("black_dn", [0, 64])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_the_scatter_of_empty_sky_says_by_how_much_stated_noise_is_too_small(black_dn, channels):
@@ -93,12 +109,14 @@ def test_the_scatter_of_empty_sky_says_by_how_much_stated_noise_is_too_small(bla
     dn = torch.from_numpy(read.astype(np.float32))
     for stated, expected in ((8.0, 1.0), (4.0, 2.0), (16.0, 0.5)):
         sensor = dataclasses.replace(SENSOR, black_dn=black_dn, read_noise_dn=stated)
-        excess, farther = noise_excess(dn, sensor)
+        excess, farther = noise_excess(dn, sensor, dark_reading(sensor)[0])
         assert excess == pytest.approx(expected, rel=0.12)
         assert farther < UNSMOOTHED - 0.03
     smoothed = torch.from_numpy(uniform_filter(read, (2, 2, 1)).astype(np.float32))
-    assert noise_excess(smoothed, sensor)[1] > UNSMOOTHED + 0.1
-    assert noise_excess(torch.from_numpy(black_dn + signal).float(), sensor)[1] == torch.inf
+    assert noise_excess(smoothed, sensor, black_dn)[1] > UNSMOOTHED + 0.1
+    assert noise_excess(torch.from_numpy(black_dn + signal).float(), sensor, black_dn)[1] == torch.inf
+    # where the target fills the picture nothing is learnt of the noise
+    assert noise_excess(dn[20:90, 30:80], sensor, black_dn) == (1.0, torch.inf)
 
 
 @pytest.mark.parametrize(("stated_dn", "changed"), [(3.0, False), (1.0, True), (6.0, True)])

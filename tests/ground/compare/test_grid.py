@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from ground.compare.errors import CompareError
 from ground.compare.grid import Budget, cells_of, parse_budgets, session_facts
 from ground.compare.methods import method
 from ground.compare.rows import Rows, locked
-from ground.compare.worker import run_cell
+from ground.compare.worker import _rounded_all, run_cell
 from ground.session import SessionError
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.presets import preset, quality_changes
@@ -144,7 +145,7 @@ def test_two_sessions_of_one_content_are_refused(session, tmp_path):
         cells_of([session_facts(session), session_facts(tmp_path / "copy")], ["black"], 1, [Budget()], PLAIN)
 
 
-@pytest.mark.parametrize("text", ["", "0", "-1", "a", "1@", "1@0", "1@2.5", "nan", "inf", "1,,2"])
+@pytest.mark.parametrize("text", ["", "0", "-1", "a", "1@", "1@0", "1@1", "1@2.5", "nan", "inf", "1,,2"])
 def test_budgets_that_are_none_are_refused(text):
     with pytest.raises(ValueError, match="--budgets: expected shares of the steps"):
         parse_budgets(text)
@@ -196,6 +197,8 @@ def test_frames_are_lost_as_the_condition_says(case):
     for i, unlit in enumerate(frames_under(case, eclipse=(0.0, 0.5))):
         dark = unlit.dn.max() < case.sensor.black_dn + 6 * case.sensor.read_noise_dn
         assert dark == (i < 10.5)  # of 21
+    noisy = torch.stack([f.dn for f in frames_under(case, eclipse=(0.0, 0.5), noise=5.0)[:10]])
+    assert noisy.std() == pytest.approx(5 * case.sensor.read_noise_dn, rel=0.1)
 
 
 def test_a_method_is_told_the_beliefs_of_a_condition(case):
@@ -242,6 +245,26 @@ def test_photographs_become_a_bracket_without_any_truth(session, tmp_path):
 def test_conditions_that_do_not_fit_a_session_are_refused(case, changes, told):
     with pytest.raises(CompareError, match=told):
         given(case, Condition(**changes))
+    one = [frame for frame in case.training if frame.exposure_time_s == case.training[0].exposure_time_s]
+    with pytest.raises(CompareError, match="leaves no training frame"):
+        given(dataclasses.replace(case, training=one), Condition(missing_exposure=1))
+
+
+def test_a_sector_that_leaves_no_frame_gives_a_row_that_says_so(session, tmp_path):
+    wide = {"wide": Condition(held_out_sector_deg=350.0)}
+    (cell,) = cells_of([session_facts(session)], ["mean"], 1, [Budget()], wide)
+    row = run_cell(cell, tmp_path / "out", tmp_path / "stop", "compare")
+    assert "leaves no frame" in row["error"] and row["method"] == "mean"
+
+
+def test_the_share_of_the_steps_is_of_those_that_a_condition_sets(session, tmp_path):
+    few = {"few": Condition(set={"steps": 40})}
+    (cell,) = cells_of([session_facts(session)], ["obbgs"], 1, [Budget(0.1)], few)
+    assert run_cell(cell, tmp_path / "out", tmp_path / "stop", "compare")["steps"] == 4
+
+
+def test_a_figure_that_is_no_number_is_left_out_of_a_row():
+    assert _rounded_all({"a": 1.0000001, "b": math.nan, "c": math.inf, "d": 3}) == {"a": 1.0, "d": 3}
 
 
 @pytest.mark.parametrize(
@@ -250,6 +273,7 @@ def test_conditions_that_do_not_fit_a_session_are_refused(case, changes, told):
         ("", "expected a mapping of names"),
         ("a: {nois: 2}", "conditions.a.nois: unknown key"),
         ("a: {noise: 0}", "conditions.a.noise: expected more than 0"),
+        ("a: {exposure_error: 1000}", "conditions.a.exposure_error: expected at most 3"),
         ("a: {noise: loud}", "conditions.a.noise: expected a number"),
         ("a: {eclipse: [0.7, 0.4]}", "conditions.a.eclipse: expected two shares"),
         ("a: {synthetic_bracket: [1, 0]}", "conditions.a.synthetic_bracket: expected numbers above 0"),
