@@ -98,8 +98,8 @@ def simulate_pass(
         _clear(out)  # not earlier: a mesh that cannot be rendered must not remove an earlier pass
         errors = None
         # where the mission file alone would lead flight to the true poses, it is flown as it is
-        sgp4 = mission.navigation.source == "sgp4" and mission.target_attitude.knowledge == "known"
-        if config.scenario or config.attitude or config.navigation == "realistic" or not sgp4:
+        by_itself = mission.navigation.source == "sgp4" and mission.target_attitude.knowledge == "known"
+        if config.scenario or config.attitude or config.navigation == "realistic" or not by_itself:
             seed = config.seed if config.navigation == "realistic" else None
             inputs = write_flight_inputs(world, out / "scenario", seed)
             mission_path, errors = inputs.mission_path, inputs.errors

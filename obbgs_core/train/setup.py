@@ -45,9 +45,8 @@ from obbgs_core.train.windows import windows
 
 log = logging.getLogger(__name__)
 NOISE_FRAMES = 12  # about so many, spread evenly, by which the noise is measured
-USUAL_FULL_SCALE = (
-    10.0  # radiances of full scale at the mean exposure between this and its inverse do no harm
-)
+# full scale at the mean exposure may be a radiance between this and its inverse without harm
+USUAL_FULL_SCALE = 10.0
 # of the scatter of empty sky over that of the sensor model, or the reverse; frames that fit it have 0.93 to 0.97
 CLEAR_EXCESS = 1.3
 UNSMOOTHED = 1.1  # ratio of the scatter of pixels two apart to that of neighbours; noise has 1.02 to 1.05

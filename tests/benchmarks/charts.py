@@ -91,11 +91,12 @@ def failures() -> tuple[Figure, list[Row]]:
         drawn += references
         best = max(row["psnr_clean_db"] for row in references)
         axis.plot([best, best], [y - 0.35, y + 0.35], color=REFERENCE, lw=3, solid_capstyle="butt")
-        for method, colour in COLOURS.items():
+        for place, (method, colour) in enumerate(COLOURS.items()):
             if method in of_it:
                 drawn.append(of_it[method])
                 name = method if condition == AS_TAKEN else None
-                axis.plot(of_it[method]["psnr_clean_db"], y, "o", color=colour, label=name, ms=7)
+                beside = y + 0.12 * (place - 2)  # equal ones do not hide each other
+                axis.plot(of_it[method]["psnr_clean_db"], beside, "o", color=colour, label=name, ms=7)
         axis.axhline(y, color="0.9", lw=0.8, zorder=0)
     axis.set_yticks(range(len(CONDITIONS)), list(CONDITIONS.values()), fontsize=9)
     axis.invert_yaxis()

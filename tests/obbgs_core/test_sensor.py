@@ -95,7 +95,7 @@ def test_a_unit_of_radiance_far_from_full_scale_and_an_origin_far_from_the_targe
     far = torch.eye(4)
     far[0, 3] = -100.0
     shifted = [dataclasses.replace(f, world_to_camera=f.world_to_camera @ far) for f in frames]
-    with pytest.raises(ReconstructionError, match="axes lies .*: poses must have it in the target"):
+    with pytest.raises(ReconstructionError, match=r"axes lies .*: poses must have it in the target"):
         prepare(shifted, scenes.SENSOR, config, 0)
 
 
