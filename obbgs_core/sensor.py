@@ -160,10 +160,11 @@ def noise_excess(dn: Tensor, sensor: Sensor, empty_dn: float) -> tuple[float, fl
     """Return the scatter of empty sky over the stated one, and that of readings two apart over that of neighbours.
 
     Differences of neighbouring readings dn [H, W, C] have twice the variance of a reading. Of blocks of 8x8 pixels
-    those with the smaller differences are empty sky, also where the target fills half of the picture or stars are in
-    it; they read what is empty within SKY_SCATTERS of their own scatter, or else they show the target, and nothing is
-    learnt: 1 is returned. The second figure is the deviation of differences two pixels apart over that of neighbours
-    in these blocks: 1.03 for noise, more where the picture was smoothed or compressed, infinite where it has no noise.
+    those that read what is empty within SKY_SCATTERS of their own scatter, and of these the ones with the smaller
+    differences, are empty sky, also where the target fills most of the picture or stars are in it. If there is none,
+    nothing is learnt: 1 is returned. The second figure is the deviation of differences two pixels apart over that of
+    neighbours in these blocks: 1.03 for noise, more where the picture was smoothed or compressed, infinite where it
+    has no noise.
 
     Args:
         empty_dn: what an empty pixel reads in the mean.
@@ -171,13 +172,15 @@ def noise_excess(dn: Tensor, sensor: Sensor, empty_dn: float) -> tuple[float, fl
     squares = [
         (dn[:, lag:] - dn[:, :-lag])[:, : dn.shape[1] - 2].square().mean(dim=2)[None] for lag in (1, 2)
     ]
-    near, far = (F.avg_pool2d(s, min(BLOCK_PX, *s.shape[1:])).flatten() for s in squares)
-    quietest = near.quantile(SKY_BLOCKS)
-    sky = near <= quietest
-    level = F.avg_pool2d(
-        (dn[:, :-2].mean(dim=2) - empty_dn)[None], min(BLOCK_PX, *squares[0].shape[1:])
-    ).flatten()
-    if (level[sky].median() > SKY_SCATTERS * (0.5 * quietest).sqrt()).item():
+    block_px = min(BLOCK_PX, *squares[0].shape[1:])
+    near, far = (F.avg_pool2d(s, block_px).flatten() for s in squares)
+    level = F.avg_pool2d((dn[:, :-2].mean(dim=2) - empty_dn)[None], block_px).flatten()
+    empty = level <= SKY_SCATTERS * (0.5 * near).sqrt()
+    share = empty.float().mean().item()
+    if share == 0:
         return 1.0, math.inf
+    # as many blocks as a quarter of all, but where so many are not empty for sure a quarter of those that are
+    quietest = near[empty].quantile(SKY_BLOCKS / share if share >= 2 * SKY_BLOCKS else SKY_BLOCKS)
+    sky = empty & (near <= quietest)
     farther = (far[sky].mean() / near[sky].mean()).sqrt().nan_to_num(nan=torch.inf).item()
     return math.sqrt(0.5 * quietest.item()) / dark_reading(sensor)[1], farther

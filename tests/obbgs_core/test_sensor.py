@@ -113,10 +113,16 @@ def test_the_scatter_of_empty_sky_says_by_how_much_stated_noise_is_too_small(bla
         assert excess == pytest.approx(expected, rel=0.12)
         assert farther < UNSMOOTHED - 0.03
     smoothed = torch.from_numpy(uniform_filter(read, (2, 2, 1)).astype(np.float32))
-    assert noise_excess(smoothed, sensor, black_dn)[1] > UNSMOOTHED + 0.1
-    assert noise_excess(torch.from_numpy(black_dn + signal).float(), sensor, black_dn)[1] == torch.inf
-    # where the target fills the picture nothing is learnt of the noise
+    assert noise_excess(smoothed, sensor, dark_reading(sensor)[0])[1] > UNSMOOTHED + 0.1
+    assert (
+        noise_excess(torch.from_numpy(black_dn + signal).float(), sensor, dark_reading(sensor)[0])[1]
+        == torch.inf
+    )
+    # where the target fills the picture nothing is learnt of the noise, and where it nearly does, not from the target
     assert noise_excess(dn[20:90, 30:80], sensor, black_dn) == (1.0, torch.inf)
+    exact = dataclasses.replace(SENSOR, black_dn=black_dn, read_noise_dn=8.0)
+    cut = dn[4:90, 14:80]  # a quarter of it is empty
+    assert noise_excess(cut, exact, dark_reading(exact)[0])[0] == pytest.approx(1, rel=0.15)
 
 
 @pytest.mark.parametrize(("stated_dn", "changed"), [(3.0, False), (1.0, True), (6.0, True)])
