@@ -25,7 +25,7 @@ from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
 
 NOTHING = -1.0  # the correlation where a window cannot be compared
-FLAT = 1e-6  # a variance below this times 1 + mean², full scale 1, is no texture: rounding alone has a tenth of it
+FLAT = 1e-6  # a variance below this times 1 + mean², full scale 1, is no texture: rounding alone has up to half of it
 PIXELS_AT_ONCE = 200_000  # keeps the arrays of a pass in the processor's cache
 
 

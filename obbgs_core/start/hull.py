@@ -73,7 +73,7 @@ def silhouette(dn: Tensor, sensor: Sensor, world_to_camera: Tensor, K: Tensor) -
     certain, likely = torch.zeros_like(bright), bright.clone()
     means = {w: _mean(signal, w) * w for w in WINDOWS_PX}
     # bright pixels are left out, so that they do not make their neighbours look lit
-    faint = {w: _mean_of(signal, ~bright, w) for w in WINDOWS_PX}
+    faint = {w: _mean_of(signal, ~bright, w) for w in sorted({*WINDOWS_PX, *SKY_WINDOWS_PX})}
     for w in WINDOWS_PX:  # the 3x3 test keeps out pixels that are only near to light
         certain |= (means[w] > CERTAIN_SIGMA) & (means[3] > LIKELY_SIGMA)
         likely |= (faint[w] > LIKELY_SIGMA) & (faint[5] > 0)
@@ -82,7 +82,7 @@ def silhouette(dn: Tensor, sensor: Sensor, world_to_camera: Tensor, K: Tensor) -
     sky = torch.zeros_like(bright)
     for w in SKY_WINDOWS_PX:
         expected = FAINTEST_SIGMA * w  # of a window on the faintest face, in sigmas of its mean
-        sky |= _mean_of(signal, ~bright, w, few=torch.inf) < expected / 2 - SKY_ODDS / expected
+        sky |= faint[w] < expected / 2 - SKY_ODDS / expected
     return Silhouette(certain[0, 0], likely[0, 0], (sky & ~likely)[0, 0], world_to_camera, K)
 
 
@@ -98,10 +98,12 @@ def light(dn: Tensor, sensor: Sensor, background: float, exposure_time_s: float)
     return sensor.black_dn + (dn - empty_dn).abs()
 
 
-def _mean_of(signal: Tensor, chosen: Tensor, window: int, few: float = 0.0) -> Tensor:
-    """Return the mean of the chosen pixels around each [1, 1, H, W], in sigmas of that mean; `few` where they are."""
+def _mean_of(signal: Tensor, chosen: Tensor, window: int) -> Tensor:
+    """Return the mean of the chosen pixels around each [1, 1, H, W], in sigmas of that mean; nan where they are few."""
     share, total = _mean(chosen.float(), window), _mean(signal * chosen, window) * window
-    return torch.where(share * window**2 > FEWEST_CHOSEN - 0.5, total / share.clamp(min=1e-6).sqrt(), few)
+    return torch.where(
+        share * window**2 > FEWEST_CHOSEN - 0.5, total / share.clamp(min=1e-6).sqrt(), torch.nan
+    )
 
 
 def _mean(image: Tensor, window: int) -> Tensor:

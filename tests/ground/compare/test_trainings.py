@@ -63,7 +63,8 @@ def test_a_training_that_estimates_its_poses_hands_them_on_and_its_curve_is_meas
     frames = [dataclasses.replace(frame, pose_covariance=doubt) for frame in case.training]
     dark = dataclasses.replace(frames[0], dn=torch.full_like(frames[0].dn, case.sensor.black_dn))
     frames[0] = dark
-    changes = {"steps": STEPS, "start.count": 150, "poses.refine": "always", "poses.refine_from": 0.1}
+    # twice the steps: by the models of fewer a frame may stay where it is
+    changes = {"steps": 2 * STEPS, "start.count": 150, "poses.refine": "always", "poses.refine_from": 0.1}
     followed = Follower(case, tmp_path, tmp_path / "stop")
     config = preset("obbgs", changes | {"chi2_end": 1e-9})
     result = reconstruct_gaussians(frames, case.sensor, config, 0, Work(None, followed.on_step))
@@ -76,8 +77,8 @@ def test_a_training_that_estimates_its_poses_hands_them_on_and_its_curve_is_meas
     views = [image_of(result, frame) for frame in seen.held_out]
     assert curve[-1]["psnr_clean_db"] == pytest.approx(seen.image_scores(views)["psnr_clean_db"], abs=1e-3)
     tagged = [dataclasses.replace(frame, pose_covariance=doubt) for frame in case.held_out]
-    pairs = zip(tagged, result.poses.settled(tagged), strict=True)  # a frame stays where no step gains
-    assert any(not torch.equal(before.world_to_camera, after.world_to_camera) for before, after in pairs)
+    for before, after in zip(tagged, result.poses.settled(tagged), strict=True):
+        assert not torch.equal(before.world_to_camera, after.world_to_camera)
 
 
 def test_a_training_states_its_errors_where_it_knows_the_exposure(case):
