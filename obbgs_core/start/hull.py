@@ -29,6 +29,7 @@ EDGE_SIGMA = 1.5  # of a single pixel beside brighter ones
 LIKELY_SIGMA = 2.0
 WINDOWS_PX = (3, 5, 9, 15)  # wide windows find shadowed faces that no single pixel shows
 SKY_WINDOWS_PX = (5, 9, 15, 25)
+RIM_PX = 1  # of certain light, in which a pixel may be covered in part
 FEWEST_BRIGHT_PX = 4  # a frame with fewer counts as black
 FEWEST_CHOSEN = 3  # pixels of a window that a mean is taken of
 SPECK = 0.4  # a certain pixel is noise where no more than this share of its 3x3 window is certain
@@ -48,6 +49,7 @@ class Silhouette:
     certain: light with few false alarms; likely: light with few misses; sky: empty, with few false alarms. Nearly all
     empty pixels that are far from light pass as sky, a fifth of those right beside a faint face, and one in forty of a
     face of FAINTEST_SIGMA.
+    grown_px: by how much likely light was grown, and sky shrunk.
     """
 
     certain: Tensor
@@ -55,13 +57,20 @@ class Silhouette:
     sky: Tensor
     world_to_camera: Tensor
     K: Tensor
+    grown_px: int = 0
+
+    @property
+    def solid(self) -> Tensor:
+        """The pixels [H, W] that show light to a pixel around, and further by what likely light was grown: something
+        opaque is there, however dark, since a spacecraft is not translucent."""
+        return ~_dilated(~self.certain[None, None], RIM_PX + self.grown_px)[0, 0]
 
     def dilated(self, reach_px: int) -> "Silhouette":
         """Return the silhouette with its likely light grown, and its sky shrunk, by `reach_px` for pose errors."""
         if reach_px == 0:
             return self
         likely, lit = (_dilated(mask[None, None], reach_px)[0, 0] for mask in (self.likely, ~self.sky))
-        return dataclasses.replace(self, likely=likely, sky=~lit)
+        return dataclasses.replace(self, likely=likely, sky=~lit, grown_px=self.grown_px + reach_px)
 
 
 def silhouette(dn: Tensor, sensor: Sensor, world_to_camera: Tensor, K: Tensor) -> Silhouette:

@@ -26,15 +26,17 @@ class Batch:
     exposure_time_s: Tensor  # [B, 1, 1, 1]
     averaged_pixels: int  # sensor pixels in one pixel of dn
     share: float = 1.0  # of the pixels of the whole frames that these images show
-    # [B, H, W] share of each pixel that a silhouette shows to be empty, 0 where it has none
+    # [B, H, W] share of each pixel that a silhouette shows to be empty or solid, 0 where there is none
     sky: Tensor | None = None
+    solid: Tensor | None = None
 
 
 class Batches:
     """The training frames at every image scale; each scale is averaged once, when it is first asked for.
 
     white_dn: the sensor's full scale.
-    sky: where silhouettes show empty sky [H, W] bool, by the frame's index; frames without a silhouette are not in it.
+    sky, solid: where silhouettes show empty sky, and what is solid, [H, W] bool by the frame's index; frames without a
+        silhouette are not in them.
     windows: the part of each frame [F, 4] that is shown, see `windows.windows`; None: all of it.
     """
 
@@ -44,11 +46,13 @@ class Batches:
         white_dn: float,
         sky: dict[int, Tensor] | None = None,
         windows: Tensor | None = None,
+        solid: dict[int, Tensor] | None = None,
     ):
-        self.frames, self.white_dn, self.sky = frames, white_dn, sky or {}
+        self.frames, self.white_dn = frames, white_dn
+        self._masks = (sky or {}, solid or {})
         self._windows = windows
         self._images: dict[int, list[Tensor]] = {}
-        self._sky_shares: dict[int, list[Tensor]] = {}
+        self._shares: dict[int, tuple[list[Tensor] | None, ...]] = {}
 
     def posed(self, frames: list[TrainingFrame]) -> "Batches":
         """Return the same images with the poses of other frames, such as refined ones."""
@@ -61,13 +65,14 @@ class Batches:
         factor = round(1 / scale)
         if factor not in self._images:
             images = [averaged(f.dn, factor, self.white_dn) for f in self.frames]
-            self._sky_shares[factor] = self._sky_shares_at(images[0].shape[:2], factor)
+            self._shares[factor] = tuple(self._shares_at(m, images[0].shape[:2], factor) for m in self._masks)
             self._images[factor] = images  # last: another thread may ask meanwhile
         cameras, share, shown = self._shown(indices, factor)
 
         def stacked(images: list[Tensor]) -> Tensor:
             return torch.stack([images[i][part] for i, part in zip(indices, shown, strict=True)])
 
+        sky, solid = (None if shares is None else stacked(shares) for shares in self._shares[factor])
         return Batch(
             indices,
             cameras.scaled(1 / factor) if factor > 1 else cameras,
@@ -75,7 +80,8 @@ class Batches:
             torch.tensor([self.frames[i].exposure_time_s for i in indices]).view(-1, 1, 1, 1),
             factor * factor,
             share,
-            stacked(self._sky_shares[factor]) if self.sky else None,
+            sky,
+            solid,
         )
 
     def _shown(self, indices: list[int], factor: int) -> tuple[Cameras, float, list[tuple[slice, slice]]]:
@@ -92,12 +98,14 @@ class Batches:
         shown = [(slice(top, bottom), slice(left, right)) for left, top, right, bottom in ends]
         return dataclasses.replace(cameras, K=K, width=width, height=height), share, shown
 
-    def _sky_shares_at(self, size: torch.Size, factor: int) -> list[Tensor]:
-        """Return each frame's share of empty sky [H, W]; frames without a silhouette share one image of zeros."""
+    def _shares_at(self, masks: dict[int, Tensor], size: torch.Size, factor: int) -> list[Tensor] | None:
+        """Return each frame's shares of a mask [H, W], those without one share one image of zeros; None if none has."""
+        if not masks:
+            return None
         unknown = torch.zeros(size)
         shares = {
-            i: F.avg_pool2d(sky[None].float(), factor, ceil_mode=True)[0] if factor > 1 else sky.float()
-            for i, sky in self.sky.items()
+            i: F.avg_pool2d(mask[None].float(), factor, ceil_mode=True)[0] if factor > 1 else mask.float()
+            for i, mask in masks.items()
         }
         return [shares.get(i, unknown) for i in range(len(self.frames))]
 

@@ -34,6 +34,8 @@ class LossSettings:
     # of the mean shortest scale over the target's radius: flat Gaussians are surface
     flat_weight: float = 0.0
     sky_weight: float = 0.0  # of the mean alpha of pixels that show no light: space is empty
+    # of the mean transmittance of pixels that certainly show light: what is dark is opaque too
+    solid_weight: float = 0.0
 
     def __post_init__(self):
         check(self, "loss")
@@ -72,7 +74,8 @@ def priors(
     settings: LossSettings,
     nearest: Tensor | None = None,
 ) -> Tensor:
-    """Return the weighted sum of the priors on the Gaussians: matt, flat, smooth, and not in front of the empty sky.
+    """Return the weighted sum of the priors on the Gaussians: matt, flat, smooth, opaque where light is seen, and not
+    in front of the empty sky.
 
     nearest: [N, K], the neighbours of each Gaussian whose normals are compared; None: they are not.
     """
@@ -83,6 +86,9 @@ def priors(
         )
     if batch.sky is not None:
         total = total + settings.sky_weight * batch.share * (rendered.alpha * batch.sky).mean()
+    if batch.solid is not None:
+        through = (1 - rendered.alpha) * batch.solid
+        total = total + settings.solid_weight * batch.share * through.mean()
     if settings.flat_weight:
         total = total + settings.flat_weight * gaussians.scales.amin(dim=1).mean() / radius_m
     if nearest is not None:

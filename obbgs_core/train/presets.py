@@ -79,6 +79,7 @@ PRESETS: dict[str, MethodConfig] = {
                 normal_weight=0.02,
                 flat_weight=15.0,
                 sky_weight=1.0,
+                solid_weight=1.0,
             ),
             growth=GrowthSettings(
                 max_gaussians=10_000,

@@ -142,6 +142,7 @@ def prepare(
     _check_nearness(gaussians.means.detach(), posed)
     gaussians = dataclasses.replace(gaussians, footprint=config.footprint)
     sky = {i: outline.sky for i, outline in outlines.items()} if config.loss.sky_weight else None
+    solid = {i: outline.solid for i, outline in outlines.items()} if config.loss.solid_weight else None
     shown_part = windows(posed, gaussians.means.detach(), outlines) if config.windows else None
     setup = TrainingSetup(
         frames=lit,
@@ -149,7 +150,7 @@ def prepare(
         asked=asked,
         config=config,
         seed=seed,
-        batches=Batches(lit, sensor.white_dn, sky, shown_part),
+        batches=Batches(lit, sensor.white_dn, sky, shown_part, solid),
         radius_m=radius_m,
         unit_m=camera_extent_m(lit) if config.length_unit == "cameras" else radius_m,
         radiance_unit=sensor.full_scale_radiance(mean_exposure_s(lit))
