@@ -16,7 +16,7 @@ from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.mesh import SurfaceMesh
 from obbgs_core.render import lit_from, render
-from obbgs_core.score.surface import bright, depth_map
+from obbgs_core.score.surface import bright, with_thin_parts
 
 MAX_TRIANGLES = 50_000
 VIEWS = 24  # are compared, evenly chosen of those given
@@ -25,7 +25,8 @@ CHUNK = 30_000  # nodes at a time, such that their distances stay in the process
 MAX_NODES = 2_000_000  # wider voxels are used if there would be more
 BAND_VOXELS = 1.5  # a view says nothing of what lies deeper than this behind the surface that it sees
 # of each Gaussian in the depth maps: the Gaussians of a face lie in layers, of which the outer ones are nearest to it
-COPIES = 5
+COPIES = 2
+THIN_COPIES = 5  # the same in pixels that are covered in part: a strut may cover a seventh of one
 SEEN_THROUGH = 0.3  # of the views that see a place; if so many see past it, it is empty
 THICKER_VOXELS = 0.8  # on each side, so that a plate thinner than a voxel is not lost between two nodes
 DRAWN_BACK_VOXELS = 0.6  # of that, when triangles are made
@@ -72,7 +73,7 @@ def surface_mesh(
         raise ExportError(
             "the model has no Gaussian that is brighter than the sky: there is nothing to make a mesh of"
         )
-    seen = [depth_map(solid, cameras.one(c), COPIES) for c in range(len(cameras))]
+    seen = [with_thin_parts(solid, cameras.one(c), COPIES, THIN_COPIES) for c in range(len(cameras))]
     maps = [_wider(*depth_and_slope) for depth_and_slope in seen]
     if not any(depth.isfinite().any() for depth, _ in seen):
         raise ExportError(

@@ -53,7 +53,7 @@ def surface_points(
     gaussians = bright(gaussians, cameras)
     if len(gaussians) == 0:
         return torch.zeros(0, 3), torch.zeros(0, 3)
-    return fused_points(lambda c: _with_thin_parts(gaussians, cameras.one(c)), cameras, count, seed)
+    return fused_points(lambda c: with_thin_parts(gaussians, cameras.one(c)), cameras, count, seed)
 
 
 @torch.no_grad()
@@ -66,7 +66,7 @@ def surface_positions(gaussians: Gaussians, cameras: Cameras, count: int = 100_0
     gaussians = bright(gaussians, cameras)
     if len(gaussians) == 0:
         return torch.zeros(0, 3)
-    return _fused(lambda c: _with_thin_parts(gaussians, cameras.one(c)), cameras, count, seed)[0]
+    return _fused(lambda c: with_thin_parts(gaussians, cameras.one(c)), cameras, count, seed)[0]
 
 
 @torch.no_grad()
@@ -117,13 +117,18 @@ def _fused(
     return points[chosen], patch[chosen, 0].long()
 
 
-def _with_thin_parts(gaussians: Gaussians, camera: Cameras) -> tuple[Tensor, Tensor]:
+def with_thin_parts(
+    gaussians: Gaussians, camera: Cameras, copies: int = 1, thin_copies: int = THIN_COPIES
+) -> tuple[Tensor, Tensor]:
     """Return the depth map of one camera and its slopes, with depths also in pixels that thin parts cover in part.
 
     The rims of what is at least three pixels wide are covered in part as well and stay as they are.
+
+    Args:
+        copies, thin_copies: of each Gaussian, as for `depth_map`, in pixels that are solid and in the others.
     """
-    depth, slope = depth_map(gaussians, camera)
-    thin_depth, thin_slope = depth_map(gaussians, camera, THIN_COPIES)
+    depth, slope = depth_map(gaussians, camera, copies)
+    thin_depth, thin_slope = depth_map(gaussians, camera, thin_copies)
     solid = depth.isfinite()
     wide = -F.max_pool2d(-solid[None].float(), 3, 1, 1)  # in the middle of 3x3 solid pixels
     near_wide = F.max_pool2d(wide, 5, 1, 2)[0] > 0
