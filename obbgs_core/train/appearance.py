@@ -44,6 +44,10 @@ class LightSettings:
     def __post_init__(self):
         check(self, "light")
 
+    def moves(self, span_deg: float) -> bool:
+        """Return whether a Sun whose direction spans so much is one that moves."""
+        return 0 < self.sun_span_deg < span_deg
+
 
 @dataclass
 class Shadows:

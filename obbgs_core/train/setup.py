@@ -83,7 +83,7 @@ class TrainingSetup:
     @property
     def sun_moves(self) -> bool:
         """Whether the Sun moves by enough to be tested as what the radiance depends on."""
-        return 0 < self.config.light.sun_span_deg < self.sun_span_deg
+        return self.config.light.moves(self.sun_span_deg)
 
     @property
     def albedos_turn(self) -> bool:
@@ -141,8 +141,8 @@ def prepare(
     )
     _check_nearness(gaussians.means.detach(), posed)
     gaussians = dataclasses.replace(gaussians, footprint=config.footprint)
-    sky = {i: outline.sky for i, outline in outlines.items()} if config.loss.sky_weight else None
-    solid = {i: outline.solid for i, outline in outlines.items()} if config.loss.solid_weight else None
+    span_deg = sun_span_deg(lit)
+    sky, solid = _masks(outlines, config, span_deg)
     shown_part = windows(posed, gaussians.means.detach(), outlines) if config.windows else None
     setup = TrainingSetup(
         frames=lit,
@@ -156,7 +156,7 @@ def prepare(
         radiance_unit=sensor.full_scale_radiance(mean_exposure_s(lit))
         if config.radiance_unit == "full_scale"
         else 1.0,
-        sun_span_deg=sun_span_deg(lit),
+        sun_span_deg=span_deg,
         start=start + noise,
         budget=budget,
         reference_exposure_s=reference_exposure_s,
@@ -202,6 +202,19 @@ def _lit(frames: list[TrainingFrame], shown: list[bool]) -> list[TrainingFrame]:
             f"{len(lit)} rise above the noise, {FEWEST_FRAMES} are needed"
         )
     return lit
+
+
+def _masks(
+    outlines: dict[int, Silhouette], config: MethodConfig, span_deg: float
+) -> tuple[dict[int, Tensor], dict[int, Tensor]]:
+    """Return where silhouettes show empty sky, and what is solid, by the frame's index; empty where not asked for.
+
+    What is dark under one Sun is lit under another, which tells it from dust: where the Sun moves nothing is solid.
+    """
+    sky = {i: outline.sky for i, outline in outlines.items()} if config.loss.sky_weight else {}
+    lit_alike = not config.light.moves(span_deg)
+    solid = {i: s.solid for i, s in outlines.items()} if config.loss.solid_weight and lit_alike else {}
+    return sky, solid
 
 
 def _check_nearness(points: Tensor, frames: list[TrainingFrame]) -> None:

@@ -2,6 +2,7 @@
 
 import math
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,7 +17,7 @@ from obbgs_core.start.hull import Silhouette
 from obbgs_core.train.batches import Batches
 from obbgs_core.train.objective import LossSettings, priors
 from obbgs_core.train.trainer import Trainer
-from tests.scenes import SENSOR, photographed, target
+from tests.scenes import QUICK, SENSOR, photographed, target
 
 FAINT = 1e-3  # radiance, which reads 2.7 deviations of the noise in a pixel of the longest exposure
 
@@ -92,6 +93,17 @@ def test_dust_that_shines_like_a_dark_face_becomes_opaque():
             let_through.append((1 - render(trainer.gaussians, cameras).alpha[0])[covered].mean())
         through[weight] = float(torch.stack(let_through).mean())
     assert through[1.0] < 0.7 * through[0.0]  # 0.05 and 0.12
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_where_the_sun_moves_frames_tell_themselves(moving):
+    suns = torch.tensor([[1.0, 0.0, 0.0]]).repeat(24, 1)
+    if moving:
+        suns[12:] = torch.tensor([0.0, 1.0, 0.0])
+    trainer = Trainer(photographed(target(), 24, suns=suns), SENSOR, preset("obbgs", QUICK))
+    assert trainer.setup.sun_moves == moving
+    batch = trainer.setup.batches.batch([0, 1, 2])
+    assert batch.sky is not None and (batch.solid is None) == moving
 
 
 def test_published_methods_do_not_know_it():
