@@ -198,11 +198,14 @@ def export_command(
     """
     from ground.formats.nerf import export_nerf
     from ground.formats.nerfstudio import export_nerfstudio
-    from ground.session import open_session
+    from ground.session import SessionError, open_session
 
     exporters = {ExportFormat.NERF: export_nerf, ExportFormat.NERFSTUDIO: export_nerfstudio}
     read = open_session(session)
     read.check_body_axes()
+    if (out.exists() and not out.is_dir()) or (out / "session.json").exists():
+        kind = "a session" if out.is_dir() else "a file"
+        raise SessionError(f"{out} is {kind}: give a folder of its own with --out, new or empty")
     counts = exporters[format_](read, out)
     text = ", ".join(f"{count} {split}" for split, count in counts.items())
     print(json.dumps(counts) if json_ else f"{text} in {out}")

@@ -70,7 +70,8 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
     """Return a finished run; `out` is the folder of runs if it is not the session's own.
 
     Raises:
-        SessionError: there is no such session or run, it is a run of another session, or its metrics.json is damaged.
+        SessionError: there is no such session or run, it is a run of another session, its metrics.json is damaged, or
+            its model is missing.
     """
     session = open_session(session_dir)
     folder = run_folder(session.path, name, out)
@@ -78,6 +79,8 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
         raise SessionError(
             f"{folder} is not a finished run; make one with `ground reconstruct --name {name}`"
         )
+    if not (folder / "model.ply").is_file():
+        raise SessionError(f"{folder} has lost its model.ply: make the run again with `ground reconstruct`")
     if (found := FoundAttitude.read(folder / attitude.FILE)) is not None:
         session = in_body_axes(session, found)
     training, held_out = split(session)

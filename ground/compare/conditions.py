@@ -120,9 +120,12 @@ def load_conditions(path: Path) -> dict[str, Condition]:
     """Return the conditions of a YAML file, a mapping of names to conditions, in their order.
 
     Raises:
+        CompareError: there is no such file.
         ConfigError: the file is not such a mapping, or two conditions are the same; names the file and the key.
         OSError: the file cannot be read.
     """
+    if not path.is_file():
+        raise CompareError(f"{path} is not there: --conditions takes a YAML file of names and conditions")
     with in_file(path):
         tree = parse_yaml(path.read_bytes(), "conditions")
         require(

@@ -55,9 +55,11 @@ def locked(folder: Path, wait: bool = False) -> Iterator[None]:
         wait: for the end of another process that holds it, instead of raising.
 
     Raises:
-        CompareError: another process holds it.
+        CompareError: another process holds it, or it is a file.
         OSError: the folder cannot be made.
     """
+    if folder.exists() and not folder.is_dir():
+        raise CompareError(f"{folder} is a file: give a folder with --out")
     folder.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
     try:

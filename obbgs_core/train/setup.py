@@ -142,7 +142,7 @@ def prepare(
     _check_nearness(gaussians.means.detach(), posed)
     gaussians = dataclasses.replace(gaussians, footprint=config.footprint)
     span_deg = sun_span_deg(lit)
-    sky, solid = _masks(outlines, config, span_deg)
+    sky, solid = _masks(outlines, config, span_deg, lit[0].background)
     shown_part = windows(posed, gaussians.means.detach(), outlines) if config.windows else None
     setup = TrainingSetup(
         frames=lit,
@@ -205,16 +205,16 @@ def _lit(frames: list[TrainingFrame], shown: list[bool]) -> list[TrainingFrame]:
 
 
 def _masks(
-    outlines: dict[int, Silhouette], config: MethodConfig, span_deg: float
+    outlines: dict[int, Silhouette], config: MethodConfig, span_deg: float, background: float
 ) -> tuple[dict[int, Tensor], dict[int, Tensor]]:
     """Return where silhouettes show empty sky, and what is solid, by the frame's index; empty where not asked for.
 
-    What is dark under one Sun is lit under another, which tells it from dust: where the Sun moves nothing is solid.
+    What is dark under one Sun is lit under another, which tells it from dust: where the Sun moves nothing is solid. Nor
+    is it in front of another background than black, which shows through dust.
     """
     sky = {i: outline.sky for i, outline in outlines.items()} if config.loss.sky_weight else {}
-    lit_alike = not config.light.moves(span_deg)
-    solid = {i: s.solid for i, s in outlines.items()} if config.loss.solid_weight and lit_alike else {}
-    return sky, solid
+    alike = config.loss.solid_weight and not config.light.moves(span_deg) and not background
+    return sky, {i: outline.solid for i, outline in outlines.items()} if alike else {}
 
 
 def _check_nearness(points: Tensor, frames: list[TrainingFrame]) -> None:

@@ -172,6 +172,13 @@ def test_damaged_metrics_are_named_by_their_file(session, tmp_path, content, tol
     assert str(path) in str(caught.value) and told in str(caught.value)
 
 
+def test_a_run_without_its_model_is_named(session, tmp_path):
+    shutil.copytree(session, tmp_path / "session")
+    (tmp_path / "session" / "runs" / "run" / "model.ply").unlink()
+    with pytest.raises(SessionError, match=r"has lost its model\.ply: make the run again"):
+        evaluate(tmp_path / "session", "run")
+
+
 def distance_to_triangles(point: np.ndarray, triangles: np.ndarray) -> float:
     """Return the distance of a point from the nearest plane of those triangles [F, 3, 3] that it lies over."""
     corner, sides = triangles[:, 0], triangles[:, 1:] - triangles[:, :1]

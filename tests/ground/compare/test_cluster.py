@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from ground import cli
 from ground.compare.cluster import share_memory
 from ground.compare.errors import CompareError
+from tests.commands import call
 from tests.small_sessions import small_session
 
 pytestmark = pytest.mark.timeout(900)  # half a minute on an idle core
@@ -186,3 +187,10 @@ def test_no_more_workers_are_started_than_the_memory_holds(workers, needs, avail
 def test_a_cell_that_the_memory_does_not_hold_is_refused():
     with pytest.raises(CompareError, match=r"about 2\.0 GB of memory, 1\.0 GB are available"):
         share_memory(2, [2000], 1000)
+
+
+def test_the_command_refuses_to_compare_no_method(sessions, tmp_path):
+    done = call(
+        "ground", "compare", "--sessions", str(sessions[0]), "--methods", " ,", "--out", str(tmp_path / "out")
+    )
+    assert done.returncode == 1 and "no method is named" in done.stderr and not (tmp_path / "out").exists()

@@ -293,6 +293,11 @@ def test_files_of_conditions_are_read_strictly(tmp_path, text, told):
     assert told in str(caught.value) and "conditions.yaml" in str(caught.value)
 
 
+def test_a_file_of_conditions_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(CompareError, match=r"nope\.yaml is not there"):
+        load_conditions(tmp_path / "nope.yaml")
+
+
 @pytest.mark.parametrize("path", sorted(GRIDS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_the_grids_of_the_benchmarks_are_conditions(path):
     conditions = load_conditions(path)
@@ -337,4 +342,7 @@ def test_one_command_at_a_time_works_in_a_folder(tmp_path):
     ):
         pass
     with locked(tmp_path / "out"):
+        pass
+    (tmp_path / "file").touch()
+    with pytest.raises(CompareError, match="is a file: give a folder"), locked(tmp_path / "file"):
         pass
