@@ -67,7 +67,6 @@ def compare_command(
         with quick_imports():
             from ground.compare.command import run_grid
             from ground.compare.conditions import AS_TAKEN, Condition, load_conditions
-            from ground.compare.errors import CompareError
             from ground.compare.figures import write_figures
             from ground.compare.grid import cells_of, parse_budgets, session_facts
             from ground.compare.origin import this_command
@@ -78,10 +77,6 @@ def compare_command(
         facts = [session_facts(folder) for folder in (sessions, *(more_sessions or []))]
         chosen = load_conditions(conditions) if conditions else {AS_TAKEN: Condition()}
         names = [name.strip() for name in methods.split(",") if name.strip()]
-        if not names:
-            raise CompareError(
-                "no method is named: give --methods names with commas between, such as obbgs,3dgs"
-            )
         cells = cells_of(facts, names, seeds, parse_budgets(budgets), chosen, weights)
         with _shown(stderr) as on_state:
             command = this_command("ground")

@@ -29,7 +29,8 @@ EDGE_SIGMA = 1.5  # of a single pixel beside brighter ones
 LIKELY_SIGMA = 2.0
 WINDOWS_PX = (3, 5, 9, 15)  # wide windows find shadowed faces that no single pixel shows
 SKY_WINDOWS_PX = (5, 9, 15, 25)
-RIM_PX = 1  # of certain light, which reaches beyond edges; many pixels of thin parts are covered in part all the same
+# Certain light reaches about so far beyond edges; inside of it, many pixels of thin parts are still covered in part.
+RIM_PX = 1
 FEWEST_BRIGHT_PX = 4  # a frame with fewer counts as black
 FEWEST_CHOSEN = 3  # pixels of a window that a mean is taken of
 SPECK = 0.4  # a certain pixel is noise where no more than this share of its 3x3 window is certain
@@ -61,8 +62,8 @@ class Silhouette:
 
     @property
     def solid(self) -> Tensor:
-        """The pixels [H, W] that show light to a pixel around, and further by what likely light was grown: something
-        opaque is there, however dark, since a spacecraft is not translucent."""
+        """The pixels [H, W] inside certain light, away from its rim by RIM_PX and by as much as likely light was grown:
+        something opaque is there, however dark, since a spacecraft is not translucent."""
         return ~_dilated(~self.certain[None, None], RIM_PX + self.grown_px)[0, 0]
 
     def dilated(self, reach_px: int) -> "Silhouette":

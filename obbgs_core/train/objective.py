@@ -34,8 +34,8 @@ class LossSettings:
     # of the mean shortest scale over the target's radius: flat Gaussians are surface
     flat_weight: float = 0.0
     sky_weight: float = 0.0  # of the mean alpha of pixels that show no light: space is empty
-    # of the mean transmittance of pixels that certainly show light, where the Sun stands still: what is dark is opaque
-    # too
+    # of the mean transmittance of pixels that certainly show light, where the Sun stands still and the sky is black:
+    # what is dark is opaque too
     solid_weight: float = 0.0
 
     def __post_init__(self):

@@ -213,8 +213,8 @@ def _masks(
     is it in front of another background than black, which shows through dust.
     """
     sky = {i: outline.sky for i, outline in outlines.items()} if config.loss.sky_weight else {}
-    alike = config.loss.solid_weight and not config.light.moves(span_deg) and not background
-    return sky, {i: outline.solid for i, outline in outlines.items()} if alike else {}
+    used = config.loss.solid_weight and not config.light.moves(span_deg) and not background
+    return sky, {i: outline.solid for i, outline in outlines.items()} if used else {}
 
 
 def _check_nearness(points: Tensor, frames: list[TrainingFrame]) -> None:
