@@ -41,5 +41,5 @@ def test_the_page_of_commands_is_that_of_the_command_lines():
 
 def test_every_page_is_in_the_site():
     navigation = (ROOT / "mkdocs.yml").read_text()
-    pages = [p.relative_to(ROOT / "docs") for p in PAGES if p.parent == ROOT / "docs"]
+    pages = [p.relative_to(ROOT / "docs") for p in PAGES if p.is_relative_to(ROOT / "docs")]
     assert [str(page) for page in pages if f"{page}" not in navigation] == []
