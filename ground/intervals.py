@@ -8,7 +8,7 @@ from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.losses import ON_TARGET_ALPHA
-from obbgs_core.misfit import model_error
+from obbgs_core.misfit import chi2_sums
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.score.uncertainty import (
@@ -18,7 +18,7 @@ from obbgs_core.score.uncertainty import (
     parameter_deviations,
     rendered_deviation,
 )
-from obbgs_core.sensor import Prediction, Sensor
+from obbgs_core.sensor import Sensor
 
 
 @dataclass(frozen=True)
@@ -135,21 +135,16 @@ def stated_error_scores(
     Args:
         misfit: the model's own error as a share of the light; None: not learnt.
     """
-    keys = ("chi2_held_out",) if misfit is None else ("chi2_held_out", "chi2_held_out_both")
-    squares, expected = dict.fromkeys(keys, 0.0), dict.fromkeys(keys, 0.0)
+    stated = {"chi2_held_out": None} | ({} if misfit is None else {"chi2_held_out_both": misfit})
+    squares, expected = dict.fromkeys(stated, 0.0), dict.fromkeys(stated, 0.0)
     for frame in scored:
         rendered = render(gaussians, cameras_of([frame]))
         on_target = rendered.alpha > ON_TARGET_ALPHA
         exposure_s = torch.tensor(frame.exposure_time_s)
-        predictions = [sensor.predicted(rendered.radiance, exposure_s)]
-        if misfit is not None:
-            error = model_error(rendered.radiance, exposure_s, sensor, 1, misfit)
-            variance = predictions[0].variance_dn2 + error.variance_dn2(predictions[0], sensor)
-            predictions.append(Prediction(predictions[0].expected_dn, variance, variance.sqrt()))
-        for key, prediction in zip(keys, predictions, strict=True):
-            terms = prediction.chi2_terms(frame.dn[None], sensor.white_dn)
-            squares[key] += terms[0][on_target].sum().item()
-            expected[key] += terms[1][on_target].sum().item()
+        for key, share in stated.items():
+            sums = chi2_sums(rendered.radiance, on_target, exposure_s, frame.dn[None], sensor, share)
+            squares[key] += sums[0]
+            expected[key] += sums[1]
     if not all(expected.values()):
         return {}
-    return {key: squares[key] / expected[key] for key in keys}
+    return {key: squares[key] / expected[key] for key in stated}

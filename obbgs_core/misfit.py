@@ -1,14 +1,20 @@
 """The model's own error beside the noise: how large it is, and how it spreads over a picture."""
 
+import math
 from dataclasses import dataclass
 
 import torch
+from scipy.optimize import root_scalar
 from torch import Tensor
 
 from obbgs_core.sensor import Prediction, Sensor
 
 ROWS = 50  # of an image that the model's own error is measured on, about
 OWN = 0.8  # share of the error's variance that goes with a pixel's own light; the rest goes with that of its picture
+STATED = (
+    1e-3,
+    10.0,
+)  # the smallest and the largest own error that is looked for in pictures, as a share of the light
 
 
 @dataclass(frozen=True)
@@ -66,6 +72,59 @@ def relative_misfit(
     seen = (light_dn > 2 * variance.sqrt()) & (dn < sensor.white_dn)
     excess = torch.where(seen, (prediction.expected_dn - dn).square() - variance, 0.0).sum()
     return (excess / torch.where(seen, light_dn.square(), 0.0).sum()).clamp(min=0).sqrt().item()
+
+
+@torch.no_grad()
+def chi2_sums(
+    radiance: Tensor,
+    on_target: Tensor,
+    exposure_time_s: Tensor,
+    dn: Tensor,
+    sensor: Sensor,
+    misfit: float | None,
+) -> tuple[float, float]:
+    """Return the squared errors of readings on the target, and the variance that is stated for them, each summed.
+
+    Both are over the variance of noise and own error before clipping, as in `Prediction.chi2_terms`; their ratio is 1
+    where errors are as large as stated.
+
+    Args:
+        radiance: [B, H, W, C], rendered; dn: what was read there.
+        on_target: [B, H, W], which pixels count.
+        misfit: the model's own error as a share of the light; None: noise alone.
+    """
+    prediction = sensor.predicted(radiance, exposure_time_s)
+    if misfit is not None:
+        error = model_error(radiance, exposure_time_s, sensor, 1, misfit)
+        variance = prediction.variance_dn2 + error.variance_dn2(prediction, sensor)
+        prediction = Prediction(prediction.expected_dn, variance, variance.sqrt())
+    squares, expected = prediction.chi2_terms(dn, sensor.white_dn)
+    return squares[on_target].sum().item(), expected[on_target].sum().item()
+
+
+@torch.no_grad()
+def stated_misfit(
+    radiance: Tensor, on_target: Tensor, exposure_time_s: Tensor, dn: Tensor, sensor: Sensor
+) -> float:
+    """Return the own error, as a share of the light, with which the errors of pictures are as large as stated.
+
+    It is the root of chi² = 1 over noise and own error: 0 where noise explains the errors, NaN where no pixel of the
+    target can be read. The arguments are as for `chi2_sums`.
+    """
+
+    def excess(log_share: float) -> float:
+        squares, expected = chi2_sums(*images, sensor, math.exp(log_share))
+        return squares / expected - 1
+
+    images = (radiance, on_target, exposure_time_s, dn)
+    least, most = map(math.log, STATED)
+    if not chi2_sums(*images, sensor, None)[1]:
+        return math.nan
+    if excess(least) <= 0:
+        return 0.0
+    if excess(most) >= 0:
+        return STATED[1]
+    return math.exp(root_scalar(excess, bracket=(least, most), xtol=0.005).root)
 
 
 @torch.no_grad()

@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from obbgs_core.errors import Diverged
+from obbgs_core.losses import ON_TARGET_ALPHA
+from obbgs_core.misfit import sampled, stated_misfit
 from obbgs_core.pose_corrections import PoseCorrections
-from obbgs_core.render import Rendered
+from obbgs_core.render import Rendered, render
 from obbgs_core.train import pose_rounds
 from obbgs_core.train.appearance import SUN_FROM, described, raised_degree
 from obbgs_core.train.batches import Batch, Batches, FrameOrder
@@ -30,11 +32,14 @@ from obbgs_core.train.growth import (
 from obbgs_core.train.multi_view import crossing_boxes, inside, threshold_factor
 from obbgs_core.train.parsimony import justified
 from obbgs_core.train.poses import HELD_AT, HOLDS
-from obbgs_core.train.setup import TrainingSetup
+from obbgs_core.train.setup import TOO_FEW_BRACKETS, TrainingSetup
 from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import TrainingState
 from obbgs_core.train.validation import correction_evidence
 
+UNSEEN_UNTIL = (
+    0.6  # share of the steps from which brackets that were kept back are trained on (docs/experiments/093)
+)
 log = logging.getLogger(__name__)
 
 
@@ -88,7 +93,8 @@ def observe(
 def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> None:
     """Refine the poses if the validation brackets say that they err.
 
-    They are asked before the first round of refinement, and trained on from then on.
+    They are asked before the first round of refinement, and trained on from then on, or once they have told the model's
+    own error (`measure_unseen`).
     """
     config = setup.config
     if (
@@ -105,7 +111,30 @@ def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> No
     state.holds = HOLDS if refined else 0
     state.poses_decided = f"{'refined' if refined else 'as tagged'} (step {state.steps_done + 1}: {evidence})"
     log.info("poses %s", state.poses_decided)
-    state.order = FrameOrder.of(setup.frames, config.bracket_steps, [], state.order.turn)
+    if refined or not setup.keeps_unseen:
+        state.order = FrameOrder.of(setup.frames, config.bracket_steps, [], state.order.turn)
+
+
+@torch.no_grad()
+def measure_unseen(setup: TrainingSetup, state: TrainingState, share: float) -> None:
+    """Learn how many times as large the model's own error is on brackets that were kept back, and train on them too.
+
+    When growth has ended most details are found, and there is still time to learn what these brackets show.
+    """
+    brackets = state.order.validation_brackets
+    decided = state.poses_decided not in ("", TOO_FEW_BRACKETS)
+    if not (brackets and decided and setup.keeps_unseen and share >= UNSEEN_UNTIL):
+        return
+    batch = setup.batches.batch([index for bracket in brackets for index in bracket])
+    rendered = render(state.model, batch.cameras)
+    radiance, alpha, dn = sampled(rendered.radiance, rendered.alpha, batch.dn)
+    on_target = alpha > ON_TARGET_ALPHA
+    misfit = stated_misfit(radiance, on_target, batch.exposure_time_s, dn, setup.sensor)
+    if state.misfit and math.isfinite(misfit):
+        state.unseen_factor = misfit / state.misfit
+        log.info("the model's own error is %.2f times as large on brackets kept back", state.unseen_factor)
+    order = state.order
+    state.order = FrameOrder.of(setup.frames, setup.config.bracket_steps, [], order.turn, visits=order.visits)
 
 
 def change_number(

@@ -63,7 +63,9 @@ class TrainResult:
     poses: str  # whether the poses were refined, and why
     pose_estimate: PoseEstimate | None  # the refined poses; None: as tagged
     exposing: Exposing  # what its pictures are made with
-    misfit: float | None  # the model's own error as a share of the light; None: it was not learnt
+    # the model's own error as a share of the light, on frames that it was not trained on where brackets were kept back
+    # for that; None: not learnt
+    misfit: float | None
     sun_span_deg: float  # largest angle between two frames' Suns, body frame
     dark_frames: int  # left out: nothing in them rises above the noise
     misfit_frames: list[int]  # left out, by their ids: they fitted no pose that their tags allow

@@ -86,6 +86,14 @@ class TrainingSetup:
         return self.config.light.moves(self.sun_span_deg)
 
     @property
+    def keeps_unseen(self) -> bool:
+        """Whether brackets are kept back to learn how much more the model errs on frames that it was not trained on.
+
+        Under Suns that no frame was taken under it errs by far more than under those of its frames.
+        """
+        return self.config.loss.misfit and self.sun_moves
+
+    @property
     def albedos_turn(self) -> bool:
         """Whether albedos under Lambert's law turn with the Sun, which is where it does not go all round."""
         return self.sun_span_deg <= TURNING_SPAN_DEG
@@ -170,12 +178,13 @@ def prepare(
     poses_decided = _decided_at_once(config, lit, brackets) if poses is None else f"refined ({why})"
     if poses is None and config.poses.refine == "always":
         poses = PoseCorrections(lit)
+    kept_back = brackets if not poses_decided or (setup.keeps_unseen and poses is None) else []
     state = TrainingState(
         rng=rng,
         gaussians=gaussians,
         adam=_adam(setup, gaussians, exact_tags=poses is None and poses_decided != ""),
         growth=Growth.of(len(gaussians)),
-        order=FrameOrder.of(lit, config.bracket_steps, [] if poses_decided else brackets),
+        order=FrameOrder.of(lit, config.bracket_steps, kept_back),
         poses=poses,
         poses_aligned=bool(why),
         poses_decided=poses_decided,

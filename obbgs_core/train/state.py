@@ -32,7 +32,7 @@ from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 14  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 15  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -101,6 +101,8 @@ class TrainingState:
     neighbours: Neighbours = field(default_factory=Neighbours)
     chi2: float = math.nan  # running mean
     misfit: float | None = None  # running mean of the model's own error; None: not learnt, or not yet
+    # how many times as large that error is on frames that were kept back; 1 where none were
+    unseen_factor: float = 1.0
     psnr_db: float = math.nan  # of the last step's frames
     steps_done: int = 0
     seconds: float = 0.0

@@ -149,6 +149,7 @@ class Trainer:
                 seen = self._compensated(render(state.model, cameras, sunlit=sunlit), batch)
         self._descend(share)
         decisions.decide_poses(setup, state, share)
+        decisions.measure_unseen(setup, state, share)
         pose_rounds.advance(setup, state, share)
         decisions.change_number(setup, state, batch, residual, moment)
         decisions.select_model(setup, state)
@@ -338,7 +339,7 @@ class Trainer:
             poses=state.poses_decided or "as tagged (training ended before this was decided)",
             pose_estimate=pose_rounds.estimate(setup, state),
             exposing=self.exposing,
-            misfit=state.misfit,
+            misfit=None if state.misfit is None else state.misfit * state.unseen_factor,
             sun_span_deg=setup.sun_span_deg,
             dark_frames=setup.dark_frames,
             misfit_frames=[setup.frames[i].id for i in state.misfits],

@@ -5,9 +5,12 @@ import dataclasses
 import pytest
 import torch
 
+from obbgs_core.frames import cameras_of
+from obbgs_core.misfit import stated_misfit
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
+from obbgs_core.train import decisions
 from obbgs_core.train.batches import Batches
 from obbgs_core.train.parsimony import (
     SHOWN_RADII,
@@ -23,6 +26,7 @@ from obbgs_core.train.poses import HELD_FROM
 from obbgs_core.train.presets import preset
 from obbgs_core.train.smoothing import sampling_rates
 from obbgs_core.train.trainer import Trainer, train
+from obbgs_core.train.validation import CorrectionEvidence
 from tests.scenes import QUICK, SENSOR, move_poses_in, photographed, tagged, target
 
 
@@ -118,16 +122,20 @@ def test_colour_that_turns_with_the_view_justifies_harmonics_and_plain_colour_do
     assert gains[1][0] > gains[1][1]
 
 
+# with these a training of `tagged` frames tells right poses from wrong ones
+TELLING = {
+    "steps": 400,
+    "start.count": 1500,
+    "growth.max_gaussians": 2000,
+    "poses.refine": "auto",
+    "poses.refine_from": 0.4,
+}
+
+
 @pytest.mark.parametrize("wrong", [True, False])
 def test_wrong_poses_are_refined_and_exact_ones_are_left_alone(wrong):
-    changes = QUICK | {
-        "steps": 400,
-        "start.count": 1500,
-        "growth.max_gaussians": 2000,
-        "poses.refine_from": 0.4,
-    }
     frames = tagged(photographed(target(80, seed=5), 42), wrong, sigma_rad=0.01)
-    trainer = Trainer(frames, SENSOR, preset("obbgs", changes | {"poses.refine": "auto"}))
+    trainer = Trainer(frames, SENSOR, preset("obbgs", TELLING))
     while not trainer.state.poses_decided:
         assert trainer.state.order.validation_brackets == [[i] for i in range(3, 42, 7)]
         trainer.step()
@@ -138,6 +146,39 @@ def test_wrong_poses_are_refined_and_exact_ones_are_left_alone(wrong):
     assert trainer.state.poses_decided.startswith("refined" if wrong else "as tagged")
     assert (trainer.state.poses is not None) == wrong
     assert trainer.result("").poses == trainer.state.poses_decided
+
+
+@pytest.mark.parametrize("tags", ["exact", "uncertain, and no evidence against them"])
+def test_where_the_sun_moves_brackets_not_yet_seen_tell_the_models_own_error(tags, monkeypatch):
+    no_evidence = CorrectionEvidence(torch.tensor([-1.0, -2.0, -3.0]))
+    monkeypatch.setattr(decisions, "correction_evidence", lambda *_: no_evidence)
+    suns = torch.nn.functional.normalize(
+        torch.randn(42, 3, generator=torch.Generator().manual_seed(2)), dim=1
+    )
+    frames, unseen = photographed(target(80, seed=5), 42, suns=suns), list(range(3, 42, 7))
+    frames = frames if tags == "exact" else tagged(frames, wrong=False)
+    trainer = Trainer(frames, SENSOR, preset("obbgs", TELLING))
+    while trainer.state.steps_done <= TELLING["steps"] * decisions.UNSEEN_UNTIL:
+        before = (trainer.state.model.copied(), trainer.state.misfit, trainer.state.unseen_factor)
+        assert trainer.state.order.validation_brackets == [[i] for i in unseen] and before[2] == 1
+        trainer.step()
+        assert not set(unseen) & set(trainer.state.order.visits)
+    assert trainer.state.order.validation_brackets == []
+    seen = [render(before[0], cameras_of([frames[i]])) for i in unseen]
+    stated = stated_misfit(
+        torch.cat([r.radiance for r in seen]),
+        torch.cat([r.alpha for r in seen]) > 0.05,
+        torch.tensor([frames[i].exposure_time_s for i in unseen]).view(-1, 1, 1, 1),
+        torch.stack([frames[i].dn for i in unseen]),
+        SENSOR,
+    )
+    # of the model of one step before, and here of whole pictures
+    assert trainer.state.unseen_factor == pytest.approx(stated / before[1], rel=0.25)
+    while not (reason := trainer.stop_reason()):
+        trainer.step()
+    assert set(unseen) <= set(trainer.state.order.visits)
+    result = trainer.result(reason)
+    assert result.misfit == trainer.state.misfit * trainer.state.unseen_factor
 
 
 def test_with_exact_poses_or_few_frames_no_bracket_is_kept_for_validation():

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from obbgs_core.losses import cauchy, likelihood_loss
-from obbgs_core.misfit import OWN, model_error, relative_misfit
+from obbgs_core.misfit import OWN, STATED, model_error, relative_misfit, stated_misfit
 from obbgs_core.sensor import Sensor
 from tests.obbgs_core.test_losses import (
     value_and_gradient,
@@ -43,6 +43,26 @@ def test_noise_alone_is_no_misfit_and_darkness_tells_nothing():
     radiance, dn = erring(0.0, 1)
     assert relative_misfit(radiance, EXPOSURES_S, dn, SENSOR) < 0.01
     assert math.isnan(relative_misfit(0 * radiance, EXPOSURES_S, 0 * dn, SENSOR))
+
+
+@given(st.floats(0.05, 0.3), st.integers(0, 1000), st.booleans())
+def test_the_share_with_which_errors_are_as_large_as_stated_is_found_on_the_target(share, seed, with_noise):
+    radiance, dn = erring(share, seed, with_noise)
+    on_target = torch.ones(radiance.shape[:3], dtype=torch.bool)
+    on_target[:, ::3] = False
+    dn[~on_target] = SENSOR.white_dn  # whatever is read elsewhere
+    seen = (radiance, on_target, EXPOSURES_S, dn, SENSOR)
+    assert stated_misfit(*seen) == pytest.approx(share, rel=0.1)
+
+
+def test_no_share_is_stated_of_noise_or_of_nothing_and_no_more_than_the_largest():
+    radiance, dn = erring(0.0, 1)
+    on_target = torch.ones(radiance.shape[:3], dtype=torch.bool)
+    quiet = SENSOR.expected_dn(radiance, EXPOSURES_S)
+    assert stated_misfit(radiance, on_target, EXPOSURES_S, dn, SENSOR) < 0.01
+    assert stated_misfit(radiance, on_target, EXPOSURES_S, quiet, SENSOR) == 0
+    assert math.isnan(stated_misfit(radiance, ~on_target, EXPOSURES_S, dn, SENSOR))
+    assert stated_misfit(1e-3 * radiance, on_target, EXPOSURES_S, dn, SENSOR) == STATED[1]
 
 
 def test_the_mean_of_several_pixels_has_less_noise_and_the_same_misfit():
