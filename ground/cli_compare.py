@@ -73,11 +73,12 @@ def compare_command(
             from ground.compare.page import write_page
 
         os.nice(nice)
-        say(stderr, "reading the sessions")
-        facts = [session_facts(folder) for folder in (sessions, *(more_sessions or []))]
         chosen = load_conditions(conditions) if conditions else {AS_TAKEN: Condition()}
         names = [name.strip() for name in methods.split(",") if name.strip()]
-        cells = cells_of(facts, names, seeds, parse_budgets(budgets), chosen, weights)
+        shares = parse_budgets(budgets)
+        say(stderr, "reading the sessions")
+        facts = [session_facts(folder) for folder in (sessions, *(more_sessions or []))]
+        cells = cells_of(facts, names, seeds, shares, chosen, weights)
         with _shown(stderr) as on_state:
             command = this_command("ground")
             summary = run_grid(cells, out, command, scheduler, workers, on_state, lambda: stop.requested)

@@ -8,10 +8,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from ground.live_status import line, read_status
-from ground.runs import is_live, read_metrics, unfinished_folder
+from ground.runs import is_live, read_config, read_metrics, unfinished_folder
 from ground.session import SessionError, flight_counts, read_header, read_records
 
 DEEPEST = 3  # levels of folders below the given ones in which sessions are looked for
@@ -165,7 +163,7 @@ def compare_runs(first: Path, second: Path) -> dict[str, dict[str, list]]:
     Raises:
         SessionError: a folder is not a finished run, or its files are damaged.
     """
-    settings = [_flat(_config(folder)) for folder in (first, second)]
+    settings = [_flat(read_config(folder)) for folder in (first, second)]
     metrics = [read_metrics(folder / "metrics.json") for folder in (first, second)]
     names = sorted(settings[0].keys() | settings[1].keys())
     return {
@@ -180,17 +178,6 @@ def compare_runs(first: Path, second: Path) -> dict[str, dict[str, list]]:
             if any(m.get(key) is not None for m in metrics)
         },
     }
-
-
-def _config(folder: Path) -> dict:
-    path = folder / "config.yaml"
-    try:
-        tree = yaml.safe_load(path.read_text())
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise SessionError(f"{folder} is not a finished run: {path} cannot be read: {error}") from error
-    if not isinstance(tree, dict):
-        raise SessionError(f"{path} should hold the settings of a run; make the run again")
-    return tree
 
 
 def _flat(tree: dict, above: str = "") -> dict[str, Any]:

@@ -5,8 +5,6 @@ import json
 import math
 from pathlib import Path
 
-import yaml
-
 from ground.cameras import median_sun_direction
 from ground.card import chi2_explained, frames_captured, scored_frames
 from ground.page import as_yaml, cards, page, plot, section, two_tables
@@ -14,7 +12,7 @@ from ground.plots import histogram_figure, training_figure
 from ground.report_attitude import attitude_section
 from ground.report_frames import frames_section, scored_section
 from ground.report_poses import poses_section
-from ground.runs import Run, open_run, written_to
+from ground.runs import Run, open_run, read_config, written_to
 from ground.session import SessionError
 from ground.splat_view import splat_view
 from ground.telemetry_plots import broken_limits, housekeeping_series, telemetry_figure
@@ -297,12 +295,8 @@ def _spelled(key: str) -> str:
 
 
 def _configuration(run: Run) -> str:
-    path = run.folder / "config.yaml"
-    try:
-        config = yaml.safe_load(path.read_text())
-        method = {"method": config.pop("method")}
-    except (OSError, yaml.YAMLError, AttributeError, KeyError) as error:
-        raise SessionError(f"{path} is damaged: {error!r}") from error
+    config = read_config(run.folder)
+    method = {"method": config.pop("method")}
     camera = {"camera": vars(run.session.camera)}
     tles = {"tles": {name: list(lines) for name, lines in run.session.tles.items()}}
     columns = f"<div>{as_yaml(method)}</div><div>{as_yaml(config)}{as_yaml(camera)}</div>"

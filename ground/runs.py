@@ -11,6 +11,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import yaml
+
 from ground import attitude
 from ground.attitude import FoundAttitude, in_body_axes
 from ground.cameras import sensor_of
@@ -106,6 +108,27 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
         load_ply(folder / "blind.ply") if with_blind else None,
         metrics,
     )
+
+
+def read_config(folder: Path) -> dict:
+    """Return the settings in the config.yaml of a run's folder.
+
+    Raises:
+        SessionError: it is missing, no YAML, or not the settings of a run; the message names the file.
+    """
+    path = folder / "config.yaml"
+    if not path.is_file():
+        example = "give the folder of one, such as SESSION/runs/run"
+        raise SessionError(f"{folder} is not a finished run: it has no {path.name}; {example}")
+    try:
+        settings = yaml.safe_load(path.read_text())
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise SessionError(f"{path} cannot be read: {error}; make the run again") from error
+    if not (isinstance(settings, dict) and isinstance(settings.get("method"), dict)):
+        raise SessionError(
+            f"{path} should hold the settings of a run, with those of a method; make the run again"
+        )
+    return settings
 
 
 def read_metrics(path: Path) -> dict:

@@ -25,6 +25,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 
 from ground.session import FrameRecord, Session, SessionError
 
+GO_ON = "simulate the pass again, or move the folder away to go on without the truth"
 SCHEMA_VERSION = 1  # sessions from before it was written have the same layout
 
 
@@ -131,8 +132,10 @@ class Truth:
             self.largest_dimension_m = float(facts["largest_dimension_m"])
             self.simulation: dict[str, dict] = facts.get("simulation", {})
             self.cloud_m = read_points(self.folder / facts["cloud"])
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise SessionError(f"{self.folder} is damaged: {error}") from error
+        except KeyError as error:
+            raise SessionError(f"{self.folder} is damaged: truth.json has no {error}; {GO_ON}") from error
+        except (OSError, ValueError, TypeError, AttributeError) as error:
+            raise SessionError(f"{self.folder} is damaged: {error}; {GO_ON}") from error
         if session.attitude_estimated or session.navigation.attitude == "rate_only":
             self._turn_to_axes_of(session)
 

@@ -26,6 +26,9 @@ def passes(tmp_path_factory) -> Path:
     (session / "runs" / ".third.part").mkdir()
     (session / "runs" / "fourth").mkdir()
     (session / "runs" / "fourth" / "metrics.json").write_text("{")
+    (session / "runs" / "fourth" / "config.yaml").write_text("seed: [")
+    shutil.copytree(session / "runs" / "first", session / "runs" / "fifth")
+    (session / "runs" / "fifth" / "config.yaml").write_text("seed: 0")
     (folder / "damaged").mkdir()
     (folder / "damaged" / "session.json").write_text("not JSON")
     return folder
@@ -49,7 +52,7 @@ def test_sessions_are_found_below_a_folder_and_damaged_ones_are_shown_with_the_r
 def test_every_run_is_listed_finished_or_not(passes):
     session = json.loads(called("list", str(passes / "2026"), "--json"))[0]
     runs = {run["name"]: run for run in session["runs"]}
-    assert set(runs) == {"first", "second", "third", "fourth"}
+    assert set(runs) == {"first", "second", "third", "fourth", "fifth"}
     for name, method in (("first", "obbgs"), ("second", "3dgs")):
         metrics = json.loads((passes / "2026/pass-12/runs" / name / "metrics.json").read_text())
         assert (runs[name]["method"], runs[name]["gaussians"]) == (method, metrics["gaussians"])
@@ -80,8 +83,10 @@ def test_comparing_runs_names_exactly_the_settings_that_differ(passes, tmp_path)
     ("arguments", "told"),
     [
         (("list", "{missing}"), "not a folder"),
-        (("compare-runs", "{runs}/first", "{runs}/third"), "not a finished run"),
-        (("compare-runs", "{runs}/fourth", "{runs}/first"), "config.yaml"),
+        (("compare-runs", "{runs}/first", "{runs}/third"), "third is not a finished run"),
+        (("compare-runs", "{runs}/..", "{runs}/first"), "give the folder of one, such as SESSION/runs/run"),
+        (("compare-runs", "{runs}/fourth", "{runs}/first"), "config.yaml cannot be read"),
+        (("report", "--session", "{runs}/..", "--name", "fifth"), "config.yaml should hold the settings of a run"),
     ],
 )
 def test_what_is_not_there_is_said(passes, tmp_path, arguments, told):

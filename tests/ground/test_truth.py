@@ -107,6 +107,12 @@ def test_a_damaged_truth_is_refused_and_named(session, changes):
         Truth(session)
 
 
+def test_what_a_truth_has_not_and_how_to_go_on_is_said(session):
+    (session.path / "truth" / "truth.json").write_text("{}")
+    with pytest.raises(SessionError, match=r"truth\.json has no 'frames'; simulate the pass again, or move"):
+        Truth(session)
+
+
 @pytest.mark.parametrize("degrees", [0, 90, 180])
 def test_the_truth_is_in_axes_that_were_chosen_freely(session, degrees):
     turn = np.eye(4)
