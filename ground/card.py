@@ -141,6 +141,10 @@ def _quality(metrics: dict) -> list[str]:
         lines.append(f"- Residual chi² {chi2:.2f}: {chi2_explained(chi2)}")
     if isinstance(misfit := metrics.get("misfit"), float):
         line = f"- The model's own error, beside the noise: {100 * misfit:.0f} % of the light"
+        if factor := metrics.get("misfit_unseen_factor"):
+            line += (
+                f" under Suns that it has not seen, {100 * misfit / factor:.0f} % under those of its frames"
+            )
         if both := metrics.get("chi2_held_out_both"):
             line += (
                 f". Held-out frames have a chi² of {metrics['chi2_held_out']:.2f} over the noise and of {both:.2f} "

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.losses import ON_TARGET_ALPHA
-from obbgs_core.misfit import chi2_sums
+from obbgs_core.misfit import Compared
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.score.uncertainty import (
@@ -140,9 +140,9 @@ def stated_error_scores(
     for frame in scored:
         rendered = render(gaussians, cameras_of([frame]))
         on_target = rendered.alpha > ON_TARGET_ALPHA
-        exposure_s = torch.tensor(frame.exposure_time_s)
+        compared = Compared(rendered.radiance, on_target, torch.tensor(frame.exposure_time_s), frame.dn[None])
         for key, share in stated.items():
-            sums = chi2_sums(rendered.radiance, on_target, exposure_s, frame.dn[None], sensor, share)
+            sums = compared.chi2_sums(sensor, share)
             squares[key] += sums[0]
             expected[key] += sums[1]
     if not all(expected.values()):

@@ -57,6 +57,7 @@ def training_metrics(
         "misfit_frames": result.misfit_frames,
         "chi2": None if math.isnan(chi2) else chi2,
         "misfit": result.misfit,  # null: not learnt
+        "misfit_unseen_factor": result.unseen_factor,  # null: it is that of the training frames
         "frames_received": len(session.frames),
         "frames_captured": session.frames_captured,  # null: flight did not say
         "frames_trained": len(training),

@@ -127,8 +127,11 @@ class Truth:
                     f"{self.folder} was written with schema version {version}; this software reads up to "
                     f"{SCHEMA_VERSION}: install a newer one"
                 )
-            self._radiance = {entry["id"]: entry["radiance"] for entry in facts["frames"]}
-            self._poses = {entry["id"]: np.array(entry["world_to_camera"]) for entry in facts["frames"]}
+            self._radiance = {entry["id"]: Path(entry["radiance"]) for entry in facts["frames"]}
+            self._poses = {
+                entry["id"]: np.array(entry["world_to_camera"], dtype=float).reshape(4, 4)
+                for entry in facts["frames"]
+            }
             self.largest_dimension_m = float(facts["largest_dimension_m"])
             self.simulation: dict[str, dict] = facts.get("simulation", {})
             self.cloud_m = read_points(self.folder / facts["cloud"])
@@ -145,6 +148,8 @@ class Truth:
         Axes that were found, or chosen freely, may be any: the turn is the mean of those between true and given poses.
         """
         known = [r for r in session.frames if r.id in self._poses]
+        if not known:
+            self._require(session.frames[0])
         turns = sum(r.world_to_camera[:3, :3].T @ self._poses[r.id][:3, :3] for r in known)
         u, _, v = np.linalg.svd(np.asarray(turns))
         turn = np.eye(4)
@@ -185,13 +190,11 @@ class Truth:
                 return arrays["radiance"].astype(np.float32), arrays["alpha"].astype(np.float32) / 255
         # errors of its zip archive, of zlib, or of NumPy's header: whichever the damage meets
         except Exception as error:
-            raise SessionError(f"{path} is damaged: {error}") from error
+            raise SessionError(f"{path} is damaged: {error}; {GO_ON}") from error
 
     def _require(self, record: FrameRecord) -> None:
         if record.id not in self._poses:
-            raise SessionError(
-                f"{self.folder} holds no frame {record.id}: it is of another pass of this session"
-            )
+            raise SessionError(f"{self.folder} holds no frame {record.id}: it is of another pass; {GO_ON}")
 
 
 def read_points(path: Path) -> np.ndarray:

@@ -1,6 +1,7 @@
 """The model's own error beside the noise: how large it is, and how it spreads over a picture."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -74,56 +75,52 @@ def relative_misfit(
     return (excess / torch.where(seen, light_dn.square(), 0.0).sum()).clamp(min=0).sqrt().item()
 
 
-@torch.no_grad()
-def chi2_sums(
-    radiance: Tensor,
-    on_target: Tensor,
-    exposure_time_s: Tensor,
-    dn: Tensor,
-    sensor: Sensor,
-    misfit: float | None,
-) -> tuple[float, float]:
-    """Return the squared errors of readings on the target, and the variance that is stated for them, each summed.
+@dataclass(frozen=True)
+class Compared:
+    """Some rendered pictures beside what was read there."""
 
-    Both are over the variance of noise and own error before clipping, as in `Prediction.chi2_terms`; their ratio is 1
-    where errors are as large as stated.
+    radiance: Tensor  # [B, H, W, C], rendered
+    on_target: Tensor  # [B, H, W], which pixels count
+    exposure_time_s: Tensor  # [B, 1, 1, 1]
+    dn: Tensor  # [B, H, W, C]
 
-    Args:
-        radiance: [B, H, W, C], rendered; dn: what was read there.
-        on_target: [B, H, W], which pixels count.
-        misfit: the model's own error as a share of the light; None: noise alone.
-    """
-    prediction = sensor.predicted(radiance, exposure_time_s)
-    if misfit is not None:
-        error = model_error(radiance, exposure_time_s, sensor, 1, misfit)
-        variance = prediction.variance_dn2 + error.variance_dn2(prediction, sensor)
-        prediction = Prediction(prediction.expected_dn, variance, variance.sqrt())
-    squares, expected = prediction.chi2_terms(dn, sensor.white_dn)
-    return squares[on_target].sum().item(), expected[on_target].sum().item()
+    @torch.no_grad()
+    def chi2_sums(self, sensor: Sensor, misfit: float | None) -> tuple[float, float]:
+        """Return the squared errors of the readings that count, and the variance that is stated for them, each summed.
+
+        Both are over the variance of noise and own error before clipping, as in `Prediction.chi2_terms`; their ratio is
+        1 where errors are as large as stated.
+
+        Args:
+            misfit: the model's own error as a share of the light; None: noise alone.
+        """
+        prediction = sensor.predicted(self.radiance, self.exposure_time_s)
+        if misfit is not None:
+            error = model_error(self.radiance, self.exposure_time_s, sensor, 1, misfit)
+            variance = prediction.variance_dn2 + error.variance_dn2(prediction, sensor)
+            prediction = Prediction(prediction.expected_dn, variance, variance.sqrt())
+        squares, expected = prediction.chi2_terms(self.dn, sensor.white_dn)
+        return squares[self.on_target].sum().item(), expected[self.on_target].sum().item()
 
 
-@torch.no_grad()
-def stated_misfit(
-    radiance: Tensor, on_target: Tensor, exposure_time_s: Tensor, dn: Tensor, sensor: Sensor
-) -> float:
+def stated_misfit(compared: Sequence[Compared], sensor: Sensor) -> float:
     """Return the own error, as a share of the light, with which the errors of pictures are as large as stated.
 
     It is the root of chi² = 1 over noise and own error: 0 where noise explains the errors, NaN where no pixel of the
-    target can be read. The arguments are as for `chi2_sums`.
+    target can be read or no error of up to ten times the light is large enough.
     """
 
     def excess(log_share: float) -> float:
-        squares, expected = chi2_sums(*images, sensor, math.exp(log_share))
-        return squares / expected - 1
+        sums = [images.chi2_sums(sensor, math.exp(log_share)) for images in compared]
+        return sum(squares for squares, _ in sums) / sum(expected for _, expected in sums) - 1
 
-    images = (radiance, on_target, exposure_time_s, dn)
     least, most = map(math.log, STATED)
-    if not chi2_sums(*images, sensor, None)[1]:
+    if not sum(images.chi2_sums(sensor, None)[1] for images in compared):
         return math.nan
     if excess(least) <= 0:
         return 0.0
     if excess(most) >= 0:
-        return STATED[1]
+        return math.nan
     return math.exp(root_scalar(excess, bracket=(least, most), xtol=0.005).root)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from obbgs_core.errors import Diverged
 from obbgs_core.losses import ON_TARGET_ALPHA
-from obbgs_core.misfit import sampled, stated_misfit
+from obbgs_core.misfit import Compared, sampled, stated_misfit
 from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.render import Rendered, render
 from obbgs_core.train import pose_rounds
@@ -115,26 +115,39 @@ def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> No
         state.order = FrameOrder.of(setup.frames, config.bracket_steps, [], state.order.turn)
 
 
-@torch.no_grad()
 def measure_unseen(setup: TrainingSetup, state: TrainingState, share: float) -> None:
     """Learn how many times as large the model's own error is on brackets that were kept back, and train on them too.
 
     When growth has ended most details are found, and there is still time to learn what these brackets show.
     """
-    brackets = state.order.validation_brackets
-    decided = state.poses_decided not in ("", TOO_FEW_BRACKETS)
-    if not (brackets and decided and setup.keeps_unseen and share >= UNSEEN_UNTIL):
+    if share < UNSEEN_UNTIL or not is_keeping_unseen(setup, state):
         return
-    batch = setup.batches.batch([index for bracket in brackets for index in bracket])
-    rendered = render(state.model, batch.cameras)
-    radiance, alpha, dn = sampled(rendered.radiance, rendered.alpha, batch.dn)
-    on_target = alpha > ON_TARGET_ALPHA
-    misfit = stated_misfit(radiance, on_target, batch.exposure_time_s, dn, setup.sensor)
-    if state.misfit and math.isfinite(misfit):
-        state.unseen_factor = misfit / state.misfit
-        log.info("the model's own error is %.2f times as large on brackets kept back", state.unseen_factor)
+    state.unseen_factor = unseen_factor(setup, state)
     order = state.order
     state.order = FrameOrder.of(setup.frames, setup.config.bracket_steps, [], order.turn, visits=order.visits)
+
+
+def is_keeping_unseen(setup: TrainingSetup, state: TrainingState) -> bool:
+    """Return whether there are brackets that are kept back for `measure_unseen`."""
+    decided = state.poses_decided not in ("", TOO_FEW_BRACKETS)
+    return setup.keeps_unseen and decided and bool(state.order.validation_brackets)
+
+
+@torch.no_grad()
+def unseen_factor(setup: TrainingSetup, state: TrainingState) -> float | None:
+    """Return how many times as large the model's own error is on the brackets that are kept back; None if not known."""
+    compared = []
+    for bracket in state.order.validation_brackets:
+        batch = setup.batches.batch(bracket)
+        rendered = render(state.model, batch.cameras)
+        radiance, alpha, dn = sampled(rendered.radiance, rendered.alpha, batch.dn)
+        compared.append(Compared(radiance, alpha > ON_TARGET_ALPHA, batch.exposure_time_s, dn))
+    misfit = stated_misfit(compared, setup.sensor)
+    if not state.misfit or math.isnan(misfit):
+        log.warning("the brackets kept back do not tell the model's own error: that of the others is stated")
+        return None
+    log.info("the model's own error is %.2f times as large on brackets kept back", misfit / state.misfit)
+    return misfit / state.misfit
 
 
 def change_number(

@@ -16,7 +16,7 @@ from obbgs_core.train.adam import Adam
 from obbgs_core.train.appearance import SUN_FROM
 from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.decisions import smooth
+from obbgs_core.train.decisions import is_keeping_unseen, smooth
 from obbgs_core.train.glints import first_lobes
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.parsimony import padded_to
@@ -119,11 +119,13 @@ def join(
 
 
 def withhold(setup: TrainingSetup, state: TrainingState) -> None:
-    """Draw from all frames, but for every seventh bracket until it is decided whether poses are refined.
+    """Draw from all frames, but for every seventh bracket until it has told what it is kept back for.
 
-    Brackets keep their numbers when others follow, so those that decide have never been trained on.
+    That is whether poses are refined, and the model's own error. Brackets keep their numbers when others follow, so
+    those that tell it have never been trained on.
     """
-    withheld = every_seventh_bracket(setup.frames) if state.poses_decided in ("", TOO_FEW_BRACKETS) else []
+    undecided = state.poses_decided in ("", TOO_FEW_BRACKETS)
+    withheld = every_seventh_bracket(setup.frames) if undecided or is_keeping_unseen(setup, state) else []
     state.order = FrameOrder.of(
         setup.frames,
         setup.config.bracket_steps,

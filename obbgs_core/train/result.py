@@ -63,9 +63,11 @@ class TrainResult:
     poses: str  # whether the poses were refined, and why
     pose_estimate: PoseEstimate | None  # the refined poses; None: as tagged
     exposing: Exposing  # what its pictures are made with
-    # the model's own error as a share of the light, on frames that it was not trained on where brackets were kept back
-    # for that; None: not learnt
+    # the model's own error as a share of the light, on frames that it was not trained on where that was measured; None:
+    # not learnt
     misfit: float | None
+    # how many times as large that is as on the frames that it was trained on; None: not measured
+    unseen_factor: float | None
     sun_span_deg: float  # largest angle between two frames' Suns, body frame
     dark_frames: int  # left out: nothing in them rises above the noise
     misfit_frames: list[int]  # left out, by their ids: they fitted no pose that their tags allow

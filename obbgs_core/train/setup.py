@@ -89,9 +89,11 @@ class TrainingSetup:
     def keeps_unseen(self) -> bool:
         """Whether brackets are kept back to learn how much more the model errs on frames that it was not trained on.
 
-        Under Suns that no frame was taken under it errs by far more than under those of its frames.
+        Under Suns between those of its frames it can err by far more than under these.
         """
-        return self.config.loss.misfit and self.sun_moves
+        loss = self.config.loss
+        learnt = loss.misfit and loss.kind == "likelihood" and not self.config.compensation
+        return learnt and self.sun_moves
 
     @property
     def albedos_turn(self) -> bool:

@@ -101,8 +101,9 @@ class TrainingState:
     neighbours: Neighbours = field(default_factory=Neighbours)
     chi2: float = math.nan  # running mean
     misfit: float | None = None  # running mean of the model's own error; None: not learnt, or not yet
-    # how many times as large that error is on frames that were kept back; 1 where none were
-    unseen_factor: float = 1.0
+    unseen_factor: float | None = (
+        None  # how many times as large it is on frames not trained on; None: not measured
+    )
     psnr_db: float = math.nan  # of the last step's frames
     steps_done: int = 0
     seconds: float = 0.0

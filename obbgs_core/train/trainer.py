@@ -230,7 +230,8 @@ class Trainer:
         if state.seconds >= time_limit_s:
             untrained = ", before the first step: the model is its untrained start"
             return f"time limit of {time_limit_s:g} s" + (untrained if state.steps_done == 0 else "")
-        if config.chi2_end and state.chi2 <= config.chi2_end and self.is_past_growth:
+        told = not state.order.validation_brackets  # what was kept back is trained on first
+        if config.chi2_end and state.chi2 <= config.chi2_end and self.is_past_growth and told:
             return f"residual chi² reached the noise ({state.chi2:.3f})"
         if state.steps_done >= config.steps:
             return f"all {config.steps} steps done (residual chi² {state.chi2:.2f})"
@@ -322,6 +323,9 @@ class Trainer:
         """
         setup, state = self.setup, self.state
         decisions.drop_not_finite(state)
+        factor = state.unseen_factor
+        if decisions.is_keeping_unseen(setup, state):  # ended before they were trained on
+            factor = decisions.unseen_factor(setup, state)
         gaussians, removed = self.gaussians, 0
         if setup.config.outlier_filter:
             stray = outliers(gaussians)
@@ -339,7 +343,8 @@ class Trainer:
             poses=state.poses_decided or "as tagged (training ended before this was decided)",
             pose_estimate=pose_rounds.estimate(setup, state),
             exposing=self.exposing,
-            misfit=None if state.misfit is None else state.misfit * state.unseen_factor,
+            misfit=None if state.misfit is None else state.misfit * (1.0 if factor is None else factor),
+            unseen_factor=factor,
             sun_span_deg=setup.sun_span_deg,
             dark_frames=setup.dark_frames,
             misfit_frames=[setup.frames[i].id for i in state.misfits],

@@ -123,6 +123,10 @@ def test_the_card_tells_the_models_own_error_where_it_was_learnt(session, misfit
     metrics = json.loads((session / "runs" / "run" / "metrics.json").read_text()) | {"misfit": misfit}
     card = model_card("2026-07-21T00:00:00+00:00", metrics)
     assert ("own error, beside the noise: 21 % of the light" in card) == told
+    card = model_card("2026-07-21T00:00:00+00:00", metrics | {"misfit_unseen_factor": 2.13})
+    assert (
+        "21 % of the light under Suns that it has not seen, 10 % under those of its frames" in card
+    ) == told
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,10 @@ def test_comparing_runs_names_exactly_the_settings_that_differ(passes, tmp_path)
         (("compare-runs", "{runs}/first", "{runs}/third"), "third is not a finished run"),
         (("compare-runs", "{runs}/..", "{runs}/first"), "give the folder of one, such as SESSION/runs/run"),
         (("compare-runs", "{runs}/fourth", "{runs}/first"), "config.yaml cannot be read"),
-        (("report", "--session", "{runs}/..", "--name", "fifth"), "config.yaml should hold the settings of a run"),
+        (
+            ("report", "--session", "{runs}/..", "--name", "fifth"),
+            "config.yaml should hold the settings of a run",
+        ),
     ],
 )
 def test_what_is_not_there_is_said(passes, tmp_path, arguments, told):

@@ -98,8 +98,15 @@ def test_a_truth_of_a_later_version_is_refused_with_both_versions(session):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"schema_version": "new"}, {"frames": None}, {"frames": [{"id": 0}]}, {"cloud": "none.ply"}],
-    ids=["version", "no frames", "no pose", "no cloud"],
+    [
+        {"schema_version": "new"},
+        {"frames": None},
+        {"frames": [{"id": 0}]},
+        {"frames": [{"id": 0, "radiance": 7, "world_to_camera": np.eye(4).tolist()}]},
+        {"frames": [{"id": 0, "radiance": "a.npz", "world_to_camera": np.eye(3).tolist()}]},
+        {"cloud": "none.ply"},
+    ],
+    ids=["version", "no frames", "no pose", "no path", "no 4x4 pose", "no cloud"],
 )
 def test_a_damaged_truth_is_refused_and_named(session, changes):
     rewritten(session, **changes)
@@ -111,6 +118,16 @@ def test_what_a_truth_has_not_and_how_to_go_on_is_said(session):
     (session.path / "truth" / "truth.json").write_text("{}")
     with pytest.raises(SessionError, match=r"truth\.json has no 'frames'; simulate the pass again, or move"):
         Truth(session)
+
+
+def test_a_truth_of_another_pass_cannot_be_turned_and_is_named(session):
+    others = [{"id": 9000, "radiance": "a.npz", "world_to_camera": np.eye(4).tolist()}]
+    rewritten(session, frames=others)
+    turned = dataclasses.replace(session, navigation=Navigation(attitude="rate_only"))
+    with pytest.raises(
+        SessionError, match="holds no frame 0: it is of another pass; simulate the pass again"
+    ):
+        Truth(turned)
 
 
 @pytest.mark.parametrize("degrees", [0, 90, 180])

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from obbgs_core.frames import cameras_of
-from obbgs_core.misfit import stated_misfit
+from obbgs_core.frames import TrainingFrame, cameras_of
+from obbgs_core.misfit import Compared, stated_misfit
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
@@ -148,37 +148,80 @@ def test_wrong_poses_are_refined_and_exact_ones_are_left_alone(wrong):
     assert trainer.result("").poses == trainer.state.poses_decided
 
 
+def under_a_moving_sun() -> tuple[list[TrainingFrame], list[int]]:
+    """Return frames that each have a Sun of their own, and the indices of those that are kept back at first."""
+    suns = torch.nn.functional.normalize(
+        torch.randn(42, 3, generator=torch.Generator().manual_seed(2)), dim=1
+    )
+    return photographed(target(80, seed=5), 42, suns=suns), list(range(3, 42, 7))
+
+
+def own_error(model: Gaussians, frames: list[TrainingFrame], indices: list[int]) -> float:
+    compared = []
+    for i in indices:
+        seen = render(model, cameras_of([frames[i]]))
+        times_s = torch.tensor(frames[i].exposure_time_s).view(1, 1, 1, 1)
+        compared.append(Compared(seen.radiance, seen.alpha > 0.05, times_s, frames[i].dn[None]))
+    return stated_misfit(compared, SENSOR)
+
+
 @pytest.mark.parametrize("tags", ["exact", "uncertain, and no evidence against them"])
 def test_where_the_sun_moves_brackets_not_yet_seen_tell_the_models_own_error(tags, monkeypatch):
     no_evidence = CorrectionEvidence(torch.tensor([-1.0, -2.0, -3.0]))
     monkeypatch.setattr(decisions, "correction_evidence", lambda *_: no_evidence)
-    suns = torch.nn.functional.normalize(
-        torch.randn(42, 3, generator=torch.Generator().manual_seed(2)), dim=1
-    )
-    frames, unseen = photographed(target(80, seed=5), 42, suns=suns), list(range(3, 42, 7))
+    frames, unseen = under_a_moving_sun()
     frames = frames if tags == "exact" else tagged(frames, wrong=False)
     trainer = Trainer(frames, SENSOR, preset("obbgs", TELLING))
+    trainer.withhold()  # as where frames may join, of which none came
     while trainer.state.steps_done <= TELLING["steps"] * decisions.UNSEEN_UNTIL:
-        before = (trainer.state.model.copied(), trainer.state.misfit, trainer.state.unseen_factor)
-        assert trainer.state.order.validation_brackets == [[i] for i in unseen] and before[2] == 1
+        model, misfit = trainer.state.model.copied(), trainer.state.misfit
+        trainer.state.chi2 = 0.5  # of noise alone: the training goes on until all frames are trained on
+        assert trainer.stop_reason() == ""
+        assert trainer.state.order.validation_brackets == [[i] for i in unseen]
+        assert trainer.state.unseen_factor is None
         trainer.step()
         assert not set(unseen) & set(trainer.state.order.visits)
-    assert trainer.state.order.validation_brackets == []
-    seen = [render(before[0], cameras_of([frames[i]])) for i in unseen]
-    stated = stated_misfit(
-        torch.cat([r.radiance for r in seen]),
-        torch.cat([r.alpha for r in seen]) > 0.05,
-        torch.tensor([frames[i].exposure_time_s for i in unseen]).view(-1, 1, 1, 1),
-        torch.stack([frames[i].dn for i in unseen]),
-        SENSOR,
-    )
+    assert trainer.state.order.validation_brackets == [] and misfit is not None
     # of the model of one step before, and here of whole pictures
-    assert trainer.state.unseen_factor == pytest.approx(stated / before[1], rel=0.25)
+    assert trainer.state.unseen_factor == pytest.approx(own_error(model, frames, unseen) / misfit, rel=0.25)
     while not (reason := trainer.stop_reason()):
         trainer.step()
     assert set(unseen) <= set(trainer.state.order.visits)
     result = trainer.result(reason)
     assert result.misfit == trainer.state.misfit * trainer.state.unseen_factor
+    assert result.unseen_factor == trainer.state.unseen_factor
+
+
+def test_a_training_that_ends_before_states_the_error_on_the_brackets_that_it_has_not_seen():
+    frames, unseen = under_a_moving_sun()
+    trainer = Trainer(frames, SENSOR, preset("obbgs", TELLING))
+    for _ in range(150):
+        trainer.step()
+    result = trainer.result("time limit of 1 s")
+    assert trainer.state.unseen_factor is None and result.unseen_factor is not None
+    assert result.misfit == pytest.approx(own_error(result.gaussians, frames, unseen), rel=0.25)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"loss.kind": "l1_ssim"}, {"loss.misfit": False}, {"compensation": True}]
+)
+def test_where_no_own_error_is_learnt_no_bracket_is_kept_back_for_it(changes):
+    frames, _ = under_a_moving_sun()
+    trainer = Trainer(frames, SENSOR, preset("obbgs", TELLING | changes))
+    assert trainer.state.order.validation_brackets == []
+
+
+def test_brackets_that_do_not_tell_an_error_leave_that_of_the_others(caplog):
+    frames, unseen = under_a_moving_sun()
+    trainer = Trainer(frames, SENSOR, preset("obbgs", TELLING))
+    for _ in range(5):
+        trainer.step()
+    for i in unseen:  # nothing but full scale is read
+        trainer.setup.batches.frames[i].dn.fill_(SENSOR.white_dn)
+    trainer.setup.batches._images.clear()
+    assert decisions.unseen_factor(trainer.setup, trainer.state) is None
+    assert "do not tell the model's own error" in caplog.text
+    assert trainer.state.misfit == Trainer.result(trainer, "").misfit
 
 
 def test_with_exact_poses_or_few_frames_no_bracket_is_kept_for_validation():

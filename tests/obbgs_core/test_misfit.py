@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from obbgs_core.losses import cauchy, likelihood_loss
-from obbgs_core.misfit import OWN, STATED, model_error, relative_misfit, stated_misfit
+from obbgs_core.misfit import OWN, Compared, model_error, relative_misfit, stated_misfit
 from obbgs_core.sensor import Sensor
 from tests.obbgs_core.test_losses import (
     value_and_gradient,
@@ -51,18 +51,22 @@ def test_the_share_with_which_errors_are_as_large_as_stated_is_found_on_the_targ
     on_target = torch.ones(radiance.shape[:3], dtype=torch.bool)
     on_target[:, ::3] = False
     dn[~on_target] = SENSOR.white_dn  # whatever is read elsewhere
-    seen = (radiance, on_target, EXPOSURES_S, dn, SENSOR)
-    assert stated_misfit(*seen) == pytest.approx(share, rel=0.1)
+    # in two parts of unlike sizes
+    parts = [
+        Compared(radiance[:, rows], on_target[:, rows], EXPOSURES_S, dn[:, rows])
+        for rows in (slice(0, 50), slice(50, None))
+    ]
+    assert stated_misfit(parts, SENSOR) == pytest.approx(share, rel=0.1)
 
 
-def test_no_share_is_stated_of_noise_or_of_nothing_and_no_more_than_the_largest():
+def test_no_share_is_stated_of_noise_of_nothing_or_of_errors_beyond_all_light():
     radiance, dn = erring(0.0, 1)
     on_target = torch.ones(radiance.shape[:3], dtype=torch.bool)
     quiet = SENSOR.expected_dn(radiance, EXPOSURES_S)
-    assert stated_misfit(radiance, on_target, EXPOSURES_S, dn, SENSOR) < 0.01
-    assert stated_misfit(radiance, on_target, EXPOSURES_S, quiet, SENSOR) == 0
-    assert math.isnan(stated_misfit(radiance, ~on_target, EXPOSURES_S, dn, SENSOR))
-    assert stated_misfit(1e-3 * radiance, on_target, EXPOSURES_S, dn, SENSOR) == STATED[1]
+    assert stated_misfit([Compared(radiance, on_target, EXPOSURES_S, dn)], SENSOR) < 0.01
+    assert stated_misfit([Compared(radiance, on_target, EXPOSURES_S, quiet)], SENSOR) == 0
+    for light, counts in ((radiance, ~on_target), (1e-3 * radiance, on_target)):
+        assert math.isnan(stated_misfit([Compared(light, counts, EXPOSURES_S, dn)], SENSOR))
 
 
 def test_the_mean_of_several_pixels_has_less_noise_and_the_same_misfit():
