@@ -277,6 +277,22 @@ def test_a_sun_that_moves_only_later_is_tested_then(frames):
     assert "with the sun it would gain" in trainer.result("").appearance
 
 
+def test_brackets_that_are_to_tell_the_own_error_stay_unseen_while_frames_join(frames):
+    suns = F.normalize(torch.randn(36, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    moving = [dataclasses.replace(f, sun_dir=sun) for f, sun in zip(frames, suns, strict=True)]
+    trainer = Trainer(moving[:24], SENSOR, CONFIG)
+    trainer.withhold()
+    for count, unseen in ((24, [3, 10, 17]), (36, [3, 10, 17, 24, 31])):
+        trainer.join(moving[24:count])
+        assert trainer.state.order.validation_brackets == [[i] for i in unseen]
+        for _ in range(15):
+            trainer.step()
+        assert not set(unseen) & set(trainer.state.order.visits)
+    trainer.end_joining()  # begins again as a training of all frames would
+    assert trainer.state.order.validation_brackets == [[i] for i in unseen]
+    assert trainer.state.steps_done == 0
+
+
 def test_frames_join_no_training_whose_first_step_depends_on_their_number(frames):
     trainer = Trainer(frames[:18], SENSOR, preset("3dgs", {"start.count": 100}))
     with pytest.raises(
