@@ -125,12 +125,12 @@ def size() -> tuple[Figure, list[Row]]:
         asked = sorted(
             (row["gaussians"], row["psnr_clean_db"])
             for row in of_obbgs
-            if row["target"] == target and row["condition"].startswith("at most")
+            if row["target"] == target and "largest" in row
         )
         axis.plot(
             *zip(*asked, strict=True), "o-", color=colour, ms=3, lw=1.2, label=target.removesuffix("-200")
         )
-        (chosen,) = (r for r in of_obbgs if r["target"] == target and r["condition"] == "chosen by itself")
+        (chosen,) = (row for row in of_obbgs if row["target"] == target and "largest" not in row)
         axis.plot(chosen["gaussians"], chosen["psnr_clean_db"], "*", color=colour, ms=13, mec="white")
         for row in opponents:
             if row["target"] == target:
