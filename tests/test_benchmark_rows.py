@@ -53,6 +53,26 @@ def test_the_charts_are_drawn_from_the_committed_rows(name):
     assert charts.drawn_from(path) == charts.digest(drawn), "run: python -m tests.benchmarks.charts"
 
 
+def test_a_training_that_ends_below_an_image_without_training_is_listed_with_the_reason(tmp_path):
+    values = {"black": 24.0, "mean": 23.0, "untrained": 25.0, "ours": 40.0, "theirs": 23.5}
+    made = [
+        {"method": m, "target": "T", "condition": "as taken", "psnr_clean_db": v} for m, v in values.items()
+    ]
+    made[-1]["why_below"] = "it fits the noise"
+    (tmp_path / "some.jsonl").write_text("".join(json.dumps(row) + "\n" for row in made))
+    page = rows.page([tmp_path / "some.jsonl"])
+    assert "- theirs, T, as taken, seed 0: 23.50 dB, below untrained, black; it fits the noise" in page
+    assert "- ours" not in page
+
+
+@pytest.mark.parametrize("name", ["opponents-200x200", "opponents-400x400", "frozen-targets-200x200"])
+def test_every_opponent_beats_images_without_training_or_its_row_says_why_not(name):
+    made = [json.loads(line) for line in (rows.FOLDER / f"{name}.jsonl").read_text().splitlines()]
+    usual = [row for row in made if row.get("condition", "as taken") == "as taken"]
+    silent = [(r["method"], r["target"]) for r, _ in rows.ending_below(usual) if "why_below" not in r]
+    assert silent == []
+
+
 def test_no_row_stands_twice():
     for file in rows.FOLDER.glob("*.jsonl"):
         lines = file.read_text().splitlines()

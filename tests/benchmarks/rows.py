@@ -22,6 +22,8 @@ BUDGETS = {
     "largest": "at most Gaussians",
     "size_px": "pixels along a side, where not the usual number",
 }
+WITHOUT_TRAINING = ("black", "mean", "untrained")
+NO_METHODS = (*WITHOUT_TRAINING, "noise", "ceiling")
 FIGURES = {  # key of a row: column title and format
     "psnr_clean_db": ("clean PSNR", "{:.2f} dB"),
     "psnr_settled_db": ("from settled poses", "{:.2f} dB"),
@@ -95,7 +97,7 @@ def page(files: Iterable[Path]) -> str:
         loads = [row["load"] for row in rows if "load" in row]
         if loads:
             parts.append(f"- Load while they ran: {min(loads):g} to {max(loads):g}")
-        parts += ["", *_table(rows), ""]
+        parts += ["", *_table(rows), "", *_below(rows)]
     return "\n".join(parts)
 
 
@@ -115,6 +117,37 @@ def _table(rows: list[dict]) -> list[str]:
         ]
         lines.append("| " + " | ".join(cells) + " |")
     return lines
+
+
+def ending_below(rows: list[dict]) -> list[tuple[dict, list[str]]]:
+    """Return the trainings that end below images without training, and in which order these are better, best first."""
+    references: dict[tuple, dict[str, float]] = {}
+    for row in rows:
+        if row.get("method") in WITHOUT_TRAINING and "psnr_clean_db" in row:
+            references.setdefault(_case(row), {})[row["method"]] = row["psnr_clean_db"]
+    found = []
+    for row in rows:
+        better = references.get(_case(row), {})
+        if row.get("method") not in NO_METHODS and "psnr_clean_db" in row:
+            names = [name for name, psnr_db in better.items() if psnr_db > row["psnr_clean_db"]]
+            if names:
+                found.append((row, sorted(names, key=lambda name: -better[name])))
+    return found
+
+
+def _case(row: dict) -> tuple:
+    return row.get("target"), row.get("condition")
+
+
+def _below(rows: list[dict]) -> list[str]:
+    """Return the lines that say which trainings end below images without training, and why where the row says so."""
+    lines = [
+        f"- {row['method']}, {row['target']}, {row.get('condition', 'as taken')}, seed {row.get('seed', 0)}: "
+        f"{row['psnr_clean_db']:.2f} dB, below {', '.join(names)}"
+        + (f"; {row['why_below']}" if "why_below" in row else "")
+        for row, names in ending_below(rows)
+    ]
+    return ["Trainings that end below an image without training:", "", *lines, ""] if lines else []
 
 
 def _cell(values: list[float], form: str) -> str:
