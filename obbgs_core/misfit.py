@@ -12,10 +12,8 @@ from obbgs_core.sensor import Prediction, Sensor
 
 ROWS = 50  # of an image that the model's own error is measured on, about
 OWN = 0.8  # share of the error's variance that goes with a pixel's own light; the rest goes with that of its picture
-STATED = (
-    1e-3,
-    10.0,
-)  # the smallest and the largest own error that is looked for in pictures, as a share of the light
+# the smallest and the largest own error that is looked for in pictures, as a share of the light
+STATED = (1e-3, 10.0)
 
 
 @dataclass(frozen=True)

@@ -37,9 +37,8 @@ from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import TrainingState
 from obbgs_core.train.validation import correction_evidence
 
-UNSEEN_UNTIL = (
-    0.6  # share of the steps from which brackets that were kept back are trained on (docs/experiments/093)
-)
+# share of the steps from which brackets that were kept back are trained on (docs/experiments/093)
+UNSEEN_UNTIL = 0.6
 log = logging.getLogger(__name__)
 
 
@@ -127,10 +126,14 @@ def measure_unseen(setup: TrainingSetup, state: TrainingState, share: float) -> 
     state.order = FrameOrder.of(setup.frames, setup.config.bracket_steps, [], order.turn, visits=order.visits)
 
 
+def is_undecided(state: TrainingState) -> bool:
+    """Return whether validation brackets are still to decide on the poses, or would if there were enough of them."""
+    return state.poses_decided in ("", TOO_FEW_BRACKETS)
+
+
 def is_keeping_unseen(setup: TrainingSetup, state: TrainingState) -> bool:
     """Return whether there are brackets that are kept back for `measure_unseen`."""
-    decided = state.poses_decided not in ("", TOO_FEW_BRACKETS)
-    return setup.keeps_unseen and decided and bool(state.order.validation_brackets)
+    return setup.keeps_unseen and not is_undecided(state) and bool(state.order.validation_brackets)
 
 
 @torch.no_grad()

@@ -16,7 +16,7 @@ from obbgs_core.train.adam import Adam
 from obbgs_core.train.appearance import SUN_FROM
 from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.decisions import is_keeping_unseen, smooth
+from obbgs_core.train.decisions import is_keeping_unseen, is_undecided, smooth
 from obbgs_core.train.glints import first_lobes
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.parsimony import padded_to
@@ -124,8 +124,8 @@ def withhold(setup: TrainingSetup, state: TrainingState) -> None:
     That is whether poses are refined, and the model's own error. Brackets keep their numbers when others follow, so
     those that tell it have never been trained on.
     """
-    undecided = state.poses_decided in ("", TOO_FEW_BRACKETS)
-    withheld = every_seventh_bracket(setup.frames) if undecided or is_keeping_unseen(setup, state) else []
+    wanted = is_undecided(state) or is_keeping_unseen(setup, state)
+    withheld = every_seventh_bracket(setup.frames) if wanted else []
     state.order = FrameOrder.of(
         setup.frames,
         setup.config.bracket_steps,

@@ -101,9 +101,8 @@ class TrainingState:
     neighbours: Neighbours = field(default_factory=Neighbours)
     chi2: float = math.nan  # running mean
     misfit: float | None = None  # running mean of the model's own error; None: not learnt, or not yet
-    unseen_factor: float | None = (
-        None  # how many times as large it is on frames not trained on; None: not measured
-    )
+    # how many times as large it is on frames that are not trained on; None: not measured
+    unseen_factor: float | None = None
     psnr_db: float = math.nan  # of the last step's frames
     steps_done: int = 0
     seconds: float = 0.0

@@ -230,8 +230,8 @@ class Trainer:
         if state.seconds >= time_limit_s:
             untrained = ", before the first step: the model is its untrained start"
             return f"time limit of {time_limit_s:g} s" + (untrained if state.steps_done == 0 else "")
-        told = not state.order.validation_brackets  # what was kept back is trained on first
-        if config.chi2_end and state.chi2 <= config.chi2_end and self.is_past_growth and told:
+        all_drawn = not state.order.validation_brackets  # what is kept back is to be trained on first
+        if config.chi2_end and state.chi2 <= config.chi2_end and self.is_past_growth and all_drawn:
             return f"residual chi² reached the noise ({state.chi2:.3f})"
         if state.steps_done >= config.steps:
             return f"all {config.steps} steps done (residual chi² {state.chi2:.2f})"

@@ -120,7 +120,7 @@ def _table(rows: list[dict]) -> list[str]:
 
 
 def ending_below(rows: list[dict]) -> list[tuple[dict, list[str]]]:
-    """Return the trainings that end below images without training, and in which order these are better, best first."""
+    """Return the trainings that end below images without training, and which of these are better, the best first."""
     references: dict[tuple, dict[str, float]] = {}
     for row in rows:
         if row.get("method") in WITHOUT_TRAINING and "psnr_clean_db" in row:
