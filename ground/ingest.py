@@ -154,6 +154,7 @@ def listen(
                 is_gone = now_s - ingest.last_packet_s > LINGER_INTERVALS * interval_s
                 if is_told or is_gone or now_s - complete_s > SETTLE_INTERVALS * interval_s:
                     break
+        ingest.turn(clock_s())  # what lies in the port already is not lost
         ingest.save()
         on_progress(ingest.summary())
         on_status(ingest.status(now_s))

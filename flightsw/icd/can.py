@@ -1,13 +1,10 @@
-"""Packets over CAN: ISO-TP messages in CAN frames, and CAN frames as an slcan adapter's text.
+"""Packets over CAN: ISO-TP messages in CAN frames.
 
 Bytes and the time in, frames out and back, no port and no clock. can-isotp does ISO 15765-2 except for its time-outs,
 which would also count the time during which this computer did not read its port.
-python-can's own slcan (4.6.1) is not used: it reads a byte a call, waits two seconds at opening and for each
-write, and never gets past a byte that is not ASCII. The tests hold this text to it.
 """
 
 import logging
-import re
 from collections import deque
 from collections.abc import Callable, Iterable
 from itertools import groupby
@@ -16,7 +13,7 @@ from typing import NamedTuple
 import isotp
 
 from flightsw.icd.framing import DELIMITER
-from flightsw.icd.link_url import SLCAN_BITRATES, LinkUrl
+from flightsw.icd.link_url import LinkUrl
 
 # The ground's identifiers are the lower ones and win the bus: flow control and commands pass first.
 GROUND_IDS, FLIGHT_IDS = tuple(range(0x0C0, 0x0D0)), tuple(range(0x0D0, 0x0E0))
@@ -44,12 +41,12 @@ ANSWER_S = 0.2  # for the other side to answer at all, on a busy computer too
 # first frame or its answer may be lost, and nothing else was sent. The receiver may wait longer for the rest of a
 # message (N_Cr), since the next message of the channel ends the wait as well.
 OFFERS, LONGEST_WAIT_S = 5, 1.0
+SECOND_ANSWER_S = 0.4  # after the answer to an offer, for the answer to its repetition
 REST_S = 2.0
 # time between two reads of the port counts for time-outs only up to this: frames may wait unread
 LOOK_S = 0.05
 FIRST_FRAME, CONSECUTIVE_FRAME, FLOW_CONTROL = 1, 2, 3  # the types in the first half byte, ISO 15765-2
 NEVER_MS = 24 * 3600 * 1000
-FD_SIZES = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)  # bytes by length code, ISO 11898-1
 
 _isotp_log = "isotp.link"
 logging.getLogger(_isotp_log).setLevel(logging.CRITICAL)  # a warning a lost frame: they are counted
@@ -61,6 +58,9 @@ class _Channel:
     def __init__(self, own_id: int, other_id: int, fd: bool, send_frame: Callable[[isotp.CanMessage], None]):
         self.offers = 0  # how often the first frame of the message in transit was sent
         self.answer_until_s = self.rest_until_s = 0.0
+        # A second answer to an offer that was repeated would be taken for that to the channel's next message, which
+        # would then overtake others: the channel waits for it before it starts another.
+        self._answers_due, self._answers_until_s = 0, 0.0
         self.errors: list[Exception] = []  # since they were last looked at
         self.frames_repeated = 0
         self._incoming: deque[isotp.CanMessage] = deque()
@@ -92,6 +92,10 @@ class _Channel:
     def is_sending(self) -> bool:
         return self._layer.transmitting()
 
+    def is_free(self, time_s: float) -> bool:
+        """Whether another message can start, and no answer that is still due could be taken for one to it."""
+        return not self.is_sending and not (self._answers_due and time_s < self._answers_until_s)
+
     @property
     def is_receiving(self) -> bool:
         return self._layer.is_rx_active()
@@ -108,9 +112,10 @@ class _Channel:
 
     def reset(self) -> None:
         self._layer.reset()
+        self._answers_due = 0
 
     def send(self, message: bytes) -> None:
-        self._message, self.offers = message, 0
+        self._message, self.offers, self._answers_due = message, 0, 0
         self.offer()
 
     def offer(self) -> None:
@@ -120,8 +125,16 @@ class _Channel:
         self._layer.send(self._message)
         self._layer.process()
 
-    def give_up_sending(self) -> None:
+    def give_up_sending(self, time_s: float) -> None:
         self._layer.stop_sending()
+        self._await_answers(self.offers, time_s)
+
+    def _await_answers(self, count: int, time_s: float) -> None:
+        self._answers_due, self._answers_until_s = count, time_s + SECOND_ANSWER_S
+
+    def take_unexpected_answer(self) -> None:
+        """Note a flow control that came while no message was waiting for one."""
+        self._answers_due = max(self._answers_due - 1, 0)
 
     def give_up_receiving(self) -> None:
         self._layer.stop_receiving()
@@ -134,6 +147,7 @@ class _Channel:
         repeated. It is answered again, but not soon after an answer that the sender cannot have had yet: an answer too
         many would be taken for that to the next message, which would then overtake others.
         """
+        was_sending = self.is_sending
         for frame in frames:
             kind = frame.data[0] >> 4 if frame.data else None
             if kind != FLOW_CONTROL:
@@ -150,6 +164,8 @@ class _Channel:
                     self._answered_s = time_s
             self._incoming.append(frame)
         self._process()
+        if was_sending and not self.is_sending:
+            self._await_answers(self.offers - 1, time_s)
         received = bytearray()
         while (message := self._layer.recv()) is not None:
             received += message.rstrip(DELIMITER) + DELIMITER  # without what lengthened it
@@ -193,7 +209,7 @@ class IsoTpChannels:
     @property
     def ready(self) -> bool:
         """Whether another message can start."""
-        return not self._waiting and not all(channel.is_sending for channel in self._channels.values())
+        return not self._waiting and any(channel.is_free(self._time_s) for channel in self._channels.values())
 
     @property
     def messages_pending(self) -> int:
@@ -248,7 +264,9 @@ class IsoTpChannels:
         for error in channel.errors:
             if isinstance(error, isotp.OverflowError):
                 self.messages_failed += 1
-            elif not isinstance(error, isotp.UnexpectedFlowControlError):  # the answer to an offer repeated
+            elif isinstance(error, isotp.UnexpectedFlowControlError):  # the answer to an offer repeated
+                channel.take_unexpected_answer()
+            else:
                 self.frames_discarded += 1
         channel.errors.clear()
 
@@ -259,7 +277,7 @@ class IsoTpChannels:
             self.frames_discarded += 1
         if channel.is_sending and self._time_s > channel.answer_until_s:
             if channel.offers == OFFERS:
-                channel.give_up_sending()
+                channel.give_up_sending(self._time_s)
                 self.messages_failed += 1
             else:
                 channel.offer()
@@ -274,7 +292,7 @@ class IsoTpChannels:
         """Give waiting messages to free channels."""
         if not self._waiting:
             return
-        idle = [channel for channel in self._channels.values() if not channel.is_sending]
+        idle = [channel for channel in self._channels.values() if channel.is_free(self._time_s)]
         pending_bytes = sum(channel.pending_bytes for channel in self._channels.values())
         while self._waiting and idle:
             message = self._waiting[0]
@@ -290,105 +308,3 @@ class IsoTpChannels:
                 idle.remove(channel)
                 pending_bytes += len(message)
                 self._wait_for_answer(channel)
-
-
-class SlcanText:
-    """CAN frames from an slcan adapter's bytes (LAWICEL CANUSB, with CANable's d, D, b, B for CAN FD).
-
-    At all times `frame_bytes + reply_bytes + skipped_bytes + pending_bytes` is the number of bytes fed.
-    """
-
-    LINE = re.compile(rb"([tdb])([0-7][0-9A-Fa-f]{2})|([TDB])([01][0-9A-Fa-f]{7})")
-    MAX_LINE_BYTES = 10 + 2 * 64
-
-    def __init__(self):
-        self.frame_bytes = 0
-        self.reply_bytes = 0  # the adapter's answers to commands
-        self.skipped_bytes = 0  # neither
-        self.skipped_lines = 0
-        self.adapter_errors = 0  # a bell: the adapter refused a command or a frame
-        self._pending = bytearray()
-        self._too_long = False
-
-    @property
-    def pending_bytes(self) -> int:
-        return len(self._pending)
-
-    def feed(self, data: bytes) -> list[isotp.CanMessage]:
-        """Return the frames that `data` completes; memory is bounded by the longest line."""
-        bells = data.count(b"\a")
-        self.adapter_errors += bells
-        self.reply_bytes += bells
-        *ended, rest = data.replace(b"\a", b"").split(b"\r")
-        frames = []
-        for part in ended:
-            self._collect(part)
-            frame = self._end_line()
-            if frame is not None:
-                frames.append(frame)
-        self._collect(rest)
-        return frames
-
-    def _collect(self, part: bytes) -> None:
-        if self._too_long or len(self._pending) + len(part) > self.MAX_LINE_BYTES:
-            self._too_long = True
-            self.skipped_bytes += len(self._pending) + len(part)
-            self._pending.clear()
-        else:
-            self._pending += part
-
-    def _end_line(self) -> isotp.CanMessage | None:
-        line, too_long = bytes(self._pending), self._too_long
-        self._pending.clear()
-        self._too_long = False
-        frame = None if too_long else parse_slcan(line)
-        if frame is not None:
-            self.frame_bytes += len(line) + 1
-        elif line in (b"", b"z", b"Z") and not too_long:
-            self.reply_bytes += len(line) + 1
-        else:
-            self.skipped_bytes += len(line) + 1
-            self.skipped_lines += 1
-        return frame
-
-
-def parse_slcan(line: bytes) -> isotp.CanMessage | None:
-    """Return the data frame in a line without its carriage return; None if it is not exactly one."""
-    match = SlcanText.LINE.match(line)
-    if match is None:
-        return None
-    kind, digits = (match[1] or match[3]).decode(), match[2] or match[4]
-    code, text = line[match.end() : match.end() + 1], line[match.end() + 1 :]
-    fd = kind not in "tT"
-    if code not in (b"0123456789ABCDEFabcdef" if fd else b"012345678") or not code:
-        return None
-    size = FD_SIZES[int(code, 16)]
-    if len(text) != 2 * size or (size and not text.isalnum()):
-        return None
-    try:
-        data = bytes.fromhex(text.decode())
-    except ValueError:
-        return None
-    return isotp.CanMessage(int(digits, 16), int(code, 16), data, kind.isupper(), fd, kind in "bB")
-
-
-def format_slcan(frame: isotp.CanMessage) -> bytes:
-    """Return a data frame as an slcan line, with its carriage return."""
-    kind = ("b" if frame.bitrate_switch else "d") if frame.is_fd else "t"
-    head = (
-        f"{kind.upper()}{frame.arbitration_id:08X}"
-        if frame.is_extended_id
-        else f"{kind}{frame.arbitration_id:03X}"
-    )
-    return f"{head}{FD_SIZES.index(len(frame.data)):X}{frame.data.hex().upper()}\r".encode()
-
-
-def open_slcan(url: LinkUrl) -> bytes:
-    """Return the commands that end a half line, close the adapter's channel, set its rates and open it."""
-    code = SLCAN_BITRATES.index(url.bitrate)
-    data_phase = "Y5\r" if url.fd else ""
-    return f"\r\rC\rS{code}\r{data_phase}O\r".encode()
-
-
-def close_slcan() -> bytes:
-    return b"\rC\r"

@@ -134,7 +134,7 @@ class IsoTpPort(Port):
     """
 
     _channels: IsoTpChannels
-    _last_frame_s = float("-inf")  # when a frame was given to the port
+    _last_frame_s = float("-inf")  # when a frame was given to the port, or the adapter took one
 
     @property
     def _has_unsent(self) -> bool:

@@ -5,8 +5,9 @@ from collections.abc import Callable
 
 from isotp import CanMessage
 
-from flightsw.icd.can import CanSide, IsoTpChannels, SlcanText, close_slcan, format_slcan, open_slcan
+from flightsw.icd.can import CanSide, IsoTpChannels
 from flightsw.icd.link_url import parse_link_url
+from flightsw.icd.slcan import SlcanText, close_slcan, format_slcan, open_slcan
 from flightsw.ports.port import IsoTpPort
 from flightsw.ports.serial_port import SerialLink
 
@@ -19,6 +20,7 @@ class SlcanLink(SerialLink, IsoTpPort):
     def __init__(self, url: str, side: CanSide, clock_s: Callable[[], float] = time.monotonic):
         self._channels = IsoTpChannels(*side, parse_link_url(url))
         self._text = SlcanText()
+        self._frames_given = 0
         self._last_byte_s = clock_s()
         super().__init__(url, clock_s)
 
@@ -30,7 +32,8 @@ class SlcanLink(SerialLink, IsoTpPort):
 
     @property
     def _has_unsent(self) -> bool:
-        return bool(self._unsent)
+        """Whether text has not gone out, or is still on its way to an adapter that acknowledges frames."""
+        return bool(self._unsent) or 0 < self._text.frames_accepted < self._frames_given
 
     @property
     def ready(self) -> bool:
@@ -53,7 +56,10 @@ class SlcanLink(SerialLink, IsoTpPort):
     def exchange(self, timeout_s: float) -> bytes:
         text = super().exchange(timeout_s)
         now_s = self._clock_s()
+        accepted_before = self._text.frames_accepted
         packets, frames = self._channels.exchange(self._text.feed(text), now_s)
+        if self._text.frames_accepted > accepted_before:
+            self._last_frame_s = now_s
         self._send(frames)
         if text:
             self._last_byte_s = now_s
@@ -65,9 +71,11 @@ class SlcanLink(SerialLink, IsoTpPort):
     def _send(self, frames: list[CanMessage]) -> None:
         if frames:
             self._last_frame_s = self._clock_s()
+            self._frames_given += len(frames)
             super().write(b"".join(map(format_slcan, frames)))
 
     def _open(self) -> None:
         super()._open()
         self._channels.abandon()
         self._unsent = open_slcan(self.url)
+        self._frames_given = self._text.frames_accepted = 0

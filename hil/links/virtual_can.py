@@ -69,6 +69,7 @@ class VirtualCan(VirtualLink):
             busy = any(adapter.queue or adapter.has_unwritten for adapter in adapters)
             readable, _, _ = select.select(readers, [], [], TICK_S if busy else 0.02)
             now_s = time.monotonic()
+            self._transmit(now_s)  # the bus did not wait for this thread, which a busy computer may hold up
             for adapter in adapters:
                 if adapter.master in readable:
                     adapter.read(now_s)

@@ -43,15 +43,7 @@ import isotp
 
 from flightsw.commands import Commander, ReplayCounter
 from flightsw.icd.auth import Key, seal, seal_file, unseal, unseal_file
-from flightsw.icd.can import (
-    FD_SIZES,
-    FLIGHT_IDS,
-    GROUND_IDS,
-    MAX_MESSAGE_BYTES,
-    IsoTpChannels,
-    SlcanText,
-    format_slcan,
-)
+from flightsw.icd.can import FLIGHT_IDS, GROUND_IDS, MAX_MESSAGE_BYTES, IsoTpChannels
 from flightsw.icd.command import Command, Report
 from flightsw.icd.config import ConfigError
 from flightsw.icd.frame import CRC, HEADER, MAX_PIXELS, decode_frame
@@ -69,6 +61,7 @@ from flightsw.icd.packet import (
     PacketError,
     unpack_packet,
 )
+from flightsw.icd.slcan import FD_SIZES, SlcanText, format_slcan
 from flightsw.icd.telemetry import DICTIONARY, NUMBERS, Item
 from flightsw.icd.transfer import Receiver, Sender, parse_pdu
 from flightsw.store import open_store

@@ -7,16 +7,18 @@ import subprocess
 import termios
 import time
 import tty
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import can
 import pytest
 from isotp import CanMessage
 
-from flightsw.icd.can import FLIGHT_SIDE, GROUND_SIDE, format_slcan
+from flightsw.icd.can import FLIGHT_SIDE, GROUND_SIDE
 from flightsw.icd.config import ConfigError
 from flightsw.icd.framing import frame_packet
 from flightsw.icd.link_url import LinkUrl, parse_link_url
+from flightsw.icd.slcan import format_slcan
 from flightsw.ports import LinkError, SlcanLink, open_link
 from flightsw.ports.slcan import SILENT_S
 
@@ -212,6 +214,22 @@ def test_a_packet_is_one_iso_tp_message_in_frames_of_the_side_s_identifier(side,
         )
         os.write(master, format_slcan(CanMessage(side.other_ids[1], 4, b"\x03xyz")))
         assert exchange_until(link, lambda data: data) == b"xyz\0"
+
+
+def test_an_slcan_adapter_is_not_closed_before_it_has_taken_the_last_frame(terminal):
+    master, _, name = terminal
+    link = open_link(f"slcan://{name}", FLIGHT_SIDE)
+    os.write(master, b"\r\r\r\rz\r")  # to what set it up, and to a frame
+    link.write(b"a\0")
+    exchange_until(link, lambda data: link.bytes_read == 6)
+    link.write(b"b\0")
+    with ThreadPoolExecutor(1) as pool:
+        closing = pool.submit(link.close)
+        time.sleep(0.3)
+        assert not read_all(master).endswith(b"\rC\r")
+        os.write(master, b"z\r")
+        closing.result(10)
+    assert read_all(master) == b"\rC\r"
 
 
 def test_what_an_slcan_adapter_garbles_is_counted(terminal):

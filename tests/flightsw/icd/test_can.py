@@ -7,20 +7,10 @@ from can.interfaces.slcan import slcanBus
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flightsw.icd.can import (
-    FD_SIZES,
-    FLIGHT_IDS,
-    GROUND_IDS,
-    MAX_MESSAGE_BYTES,
-    OFFERS,
-    IsoTpChannels,
-    SlcanText,
-    format_slcan,
-    open_slcan,
-    parse_slcan,
-)
+from flightsw.icd.can import FLIGHT_IDS, GROUND_IDS, MAX_MESSAGE_BYTES, OFFERS, IsoTpChannels
 from flightsw.icd.framing import frame_packet
 from flightsw.icd.link_url import parse_link_url
+from flightsw.icd.slcan import FD_SIZES, SlcanText, format_slcan, open_slcan, parse_slcan
 
 CLASSIC, FD = (parse_link_url(f"slcan:///dev/null?fd={fd}") for fd in (0, 1))
 BOTH = pytest.mark.parametrize("url", [CLASSIC, FD], ids=["classic", "fd"])
@@ -288,6 +278,47 @@ def test_offers_that_waited_unread_together_are_answered_once(url):
     offers += pass_time(wire, 1.0)
     assert len(offers) > 1
     assert len(wire.ground.exchange(offers, wire.now_s)[1]) == 1
+
+
+@BOTH
+def test_a_second_answer_that_comes_late_lets_no_message_overtake_another(url):
+    """Where computers or adapters are busy, an offer and its repetition may both be answered."""
+    wire = Wire(url)
+    packets = [frame_packet(bytes([number]) * 100) for number in (1, 2, 3)]
+    wire.flight.write(packets[0])
+    _, offer = wire.flight.exchange([], wire.now_s)
+    _, answer = wire.ground.exchange(offer, wire.now_s)
+    offer_again = pass_time(wire, 0.5)
+    _, second_answer = wire.ground.exchange(offer_again, wire.now_s)
+    assert len(answer) == len(second_answer) == 1
+    wire.flight.write(packets[1])
+    _, down = wire.flight.exchange([], wire.now_s)
+    down += wire.flight.exchange(answer, wire.now_s)[1]
+    wire.flight.write(packets[2])
+    down += wire.flight.exchange([], wire.now_s)[1]
+    down += wire.flight.exchange(second_answer, wire.now_s)[1]
+    while down:
+        packet, up = wire.ground.exchange(down, wire.now_s)
+        wire.received += packet
+        _, down = wire.flight.exchange(up, wire.now_s)
+    assert wire.received == b"".join(packets)
+    assert wire.ground.frames_discarded == wire.flight.messages_failed == 0
+
+
+@BOTH
+def test_a_channel_whose_second_answer_never_comes_is_used_again(url):
+    wire = Wire(url)
+    packet = frame_packet(bytes(range(1, 100)))
+    wire.flight.write(packet)
+    _, offer = wire.flight.exchange([], wire.now_s)
+    _, answer = wire.ground.exchange(offer, wire.now_s)
+    pass_time(wire, 0.5)
+    wire.flight.exchange(answer, wire.now_s)
+    channels = {offer[0].arbitration_id}
+    pass_time(wire, 1.5)
+    wire.flight.write(packet)
+    _, offer = wire.flight.exchange([], wire.now_s)
+    assert {frame.arbitration_id for frame in offer} == channels
 
 
 @BOTH
