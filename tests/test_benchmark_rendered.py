@@ -28,3 +28,12 @@ def test_only_a_moving_sun_moves_and_static_views_lie_all_around():
         assert (centres @ corner).max() > np.cos(np.radians(25))
     moving = rendered.moving_views()[1]
     assert (moving @ moving.T).min() < 0
+
+
+def test_dense_views_are_the_same_and_others_between_them():
+    poses, dense = rendered.static_views()[0], rendered.static_views(dense=True)[0]
+    assert len(dense) == 3 * len(poses)
+    np.testing.assert_array_equal(dense[: len(poses)], poses)
+    towards = -dense[:, 2, :3]
+    angles = np.degrees(np.arccos(np.clip(towards @ towards.T, -1, 1))) + 180 * np.eye(len(towards))
+    assert angles[: len(poses), : len(poses)].min(axis=1).mean() > 1.4 * angles.min(axis=1).mean()

@@ -2,7 +2,7 @@
 
 Blender is needed. A Sun that stands still shines on 120 views, 40 on an inclined ring and 80 spread over the sphere;
 under one that moves they are those of the scenario `tumbling`, from the same distance. What is rendered already is
-kept, so that an interrupted run goes on:
+kept, so that an interrupted run goes on. `--dense` adds 240 views between the 120, whose frames stay the same:
 
     python -m tests.benchmarks.rendered --materials foil --sun moving --out data spacecraft-foil
     OBBGS_TARGETS=data python -m tests.benchmarks.targets --sun --out sessions spacecraft-foil
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from flightsw.pose import look_along
 from hil.sky import SHIPPED, SHIPPED_FOIL
@@ -29,21 +30,39 @@ CLOUD = 20_000  # points on the surface, before those that no view shows are lef
 SEEN_FROM = 60  # views that decide what is shown
 
 
-def static_views() -> tuple[np.ndarray, np.ndarray]:
-    """Return poses [V, 4, 4] (body to camera) all around the target, in random order, and Sun directions [V, 3]."""
-    place = np.arange(VIEWS - ON_RING) + 0.5
-    z, angle = 1 - 2 * place / len(place), np.pi * (1 + 5**0.5) * place
+def static_views(dense: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Return poses [V, 4, 4] (body to camera) all around the target, in random order, and Sun directions [V, 3].
+
+    Args:
+        dense: 240 more follow, on the same ring between its views and over the sphere turned.
+    """
+    turn = 2 * np.pi * np.arange(ON_RING) / ON_RING
+    towards = _shuffled(_ring(turn), _sphere(VIEWS - ON_RING), seed=3)
+    if dense:
+        between = (turn[:, None] + 2 * np.pi / ON_RING * np.array([1, 2]) / 3).ravel()
+        turned = _sphere(2 * (VIEWS - ON_RING)) @ Rotation.from_euler("xyz", [0.7, 1.1, 0.3]).as_matrix().T
+        towards = np.concatenate([towards, _shuffled(_ring(between), turned, seed=4)])
+    poses = np.tile(np.eye(4), (len(towards), 1, 1))
+    for pose, direction in zip(poses, towards, strict=True):
+        pose[:3, :3] = look_along(-direction, down=np.array([0.1, -0.3, 1.0]))
+        pose[:3, 3] = -DISTANCE * pose[:3, :3] @ direction
+    return poses, np.tile(SUN, (len(towards), 1))
+
+
+def _ring(turn: np.ndarray) -> np.ndarray:
+    tilt = np.radians(RING_INCLINATION_DEG)
+    return np.stack([np.cos(turn), np.sin(turn) * np.cos(tilt), np.sin(turn) * np.sin(tilt)], axis=1)
+
+
+def _sphere(count: int) -> np.ndarray:
+    place = np.arange(count) + 0.5
+    z, angle = 1 - 2 * place / count, np.pi * (1 + 5**0.5) * place
     across = np.sqrt(1 - z * z)
-    sphere = np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
-    turn, tilt = 2 * np.pi * np.arange(ON_RING) / ON_RING, np.radians(RING_INCLINATION_DEG)
-    ring = np.stack([np.cos(turn), np.sin(turn) * np.cos(tilt), np.sin(turn) * np.sin(tilt)], axis=1)
-    poses = np.tile(np.eye(4), (VIEWS, 1, 1))
-    for pose, towards in zip(
-        poses, np.random.default_rng(3).permutation(np.concatenate([ring, sphere])), strict=True
-    ):
-        pose[:3, :3] = look_along(-towards, down=np.array([0.1, -0.3, 1.0]))
-        pose[:3, 3] = -DISTANCE * pose[:3, :3] @ towards
-    return poses, np.tile(SUN, (VIEWS, 1))
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+
+
+def _shuffled(ring: np.ndarray, sphere: np.ndarray, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).permutation(np.concatenate([ring, sphere]))
 
 
 def moving_views() -> tuple[np.ndarray, np.ndarray]:
@@ -123,11 +142,16 @@ def main() -> None:
     parser.add_argument("--mesh", type=Path, help="default: the shipped spacecraft")
     parser.add_argument("--materials", choices=("own", "foil"), default="own")
     parser.add_argument("--sun", choices=("static", "moving"), default="static")
+    parser.add_argument(
+        "--dense", action="store_true", help="three times the views, under a Sun that stands still"
+    )
     parser.add_argument("--size", type=int, default=400, help="pixels along a side")
     parser.add_argument("--out", type=Path, required=True, help="folder for NAME_400.npz")
     arguments = parser.parse_args()
+    if arguments.dense and arguments.sun == "moving":
+        parser.error("--dense is for a Sun that stands still")
     shipped = SHIPPED_FOIL if arguments.materials == "foil" else SHIPPED
-    views = static_views() if arguments.sun == "static" else moving_views()
+    views = static_views(arguments.dense) if arguments.sun == "static" else moving_views()
     kept = arguments.out / f"{arguments.name}-{arguments.materials}-{arguments.sun}-{arguments.size}"
     kept.mkdir(parents=True, exist_ok=True)
     worker = Worker(arguments.mesh or shipped, materials=arguments.materials)

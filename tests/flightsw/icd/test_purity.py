@@ -26,7 +26,10 @@ def test_the_code_reads_two_files_and_names_no_clock_port_or_thread():
                 name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
                 called.add((path.name, name))
     assert {entry for entry in imported if entry[1] in OUTSIDE} == set()
-    assert {entry for entry in imported if entry[1] == "isotp"} == {("can.py", "isotp"), ("slcan.py", "isotp")}
+    assert {entry for entry in imported if entry[1] == "isotp"} == {
+        ("can.py", "isotp"),
+        ("slcan.py", "isotp"),
+    }
     assert {entry for entry in called if entry[1] in READING | WRITING | CLOCKS} == {
         ("mission.py", "read_bytes"),
         ("telemetry.py", "read_bytes"),
