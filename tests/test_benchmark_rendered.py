@@ -30,10 +30,12 @@ def test_only_a_moving_sun_moves_and_static_views_lie_all_around():
     assert (moving @ moving.T).min() < 0
 
 
-def test_dense_views_are_the_same_and_others_between_them():
-    poses, dense = rendered.static_views()[0], rendered.static_views(dense=True)[0]
-    assert len(dense) == 3 * len(poses)
+@pytest.mark.parametrize("views", [rendered.static_views, rendered.moving_views])
+def test_dense_views_are_the_same_and_others_between_them(views):
+    (poses, suns), (dense, dense_suns) = views(), views(dense=True)
+    assert len(dense) == len(dense_suns) == 3 * len(poses)
     np.testing.assert_array_equal(dense[: len(poses)], poses)
+    np.testing.assert_array_equal(dense_suns[: len(poses)], suns)
     towards = -dense[:, 2, :3]
     angles = np.degrees(np.arccos(np.clip(towards @ towards.T, -1, 1))) + 180 * np.eye(len(towards))
     assert angles[: len(poses), : len(poses)].min(axis=1).mean() > 1.4 * angles.min(axis=1).mean()

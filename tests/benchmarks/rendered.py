@@ -65,11 +65,20 @@ def _shuffled(ring: np.ndarray, sphere: np.ndarray, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).permutation(np.concatenate([ring, sphere]))
 
 
-def moving_views() -> tuple[np.ndarray, np.ndarray]:
-    """Return the same for views of the scenario `tumbling`, evenly over its pass."""
+def moving_views(dense: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same for views of the scenario `tumbling`, evenly over its pass.
+
+    Args:
+        dense: 240 more follow, at times between those.
+    """
     scene, poses, suns = Scene(load_scenario("tumbling")), [], []
-    for share in np.random.default_rng(3).permutation((np.arange(VIEWS) + 0.5) / VIEWS):
-        state = scene.state(scene.orbit.start_utc_ns + round(share * PASS_S * 1e9))
+    share = (np.arange(VIEWS) + 0.5) / VIEWS
+    shares = np.random.default_rng(3).permutation(share)
+    if dense:
+        between = (share[:, None] + np.array([-1, 1]) / (3 * VIEWS)).ravel()
+        shares = np.concatenate([shares, np.random.default_rng(4).permutation(between)])
+    for at in shares:
+        state = scene.state(scene.orbit.start_utc_ns + round(at * PASS_S * 1e9))
         pose = np.array(state.pose.world_to_camera, dtype=float)
         pose[:3, 3] *= DISTANCE / np.linalg.norm(pose[:3, 3])
         poses.append(pose)
@@ -148,10 +157,8 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=400, help="pixels along a side")
     parser.add_argument("--out", type=Path, required=True, help="folder for NAME_400.npz")
     arguments = parser.parse_args()
-    if arguments.dense and arguments.sun == "moving":
-        parser.error("--dense is for a Sun that stands still")
     shipped = SHIPPED_FOIL if arguments.materials == "foil" else SHIPPED
-    views = static_views(arguments.dense) if arguments.sun == "static" else moving_views()
+    views = (static_views if arguments.sun == "static" else moving_views)(arguments.dense)
     kept = arguments.out / f"{arguments.name}-{arguments.materials}-{arguments.sun}-{arguments.size}"
     kept.mkdir(parents=True, exist_ok=True)
     worker = Worker(arguments.mesh or shipped, materials=arguments.materials)
