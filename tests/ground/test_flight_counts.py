@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+import os
 import shutil
 import threading
 import time
+import tty
 from pathlib import Path
 
 import imagecodecs
@@ -15,6 +17,7 @@ from hypothesis import strategies as st
 
 from flightsw.downlink import run_downlink
 from flightsw.icd.frame import HEADER, encode_frame
+from flightsw.icd.framing import frame_packet
 from flightsw.icd.packet import APID_FRAME_HEADERS
 from flightsw.ports import SerialLink
 from flightsw.store import FrameStore
@@ -27,6 +30,7 @@ from ground.session import SessionCorrupt, open_session
 from ground.session_writer import SessionWriter
 from ground.telemetry import FlightCounts, TelemetryLog
 from hil.links.virtual_serial import VirtualSerial
+from tests.dictionary_packets import packets
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
 QUICK = {"steps": 10, "start.count": 300, "growth.max_gaussians": 300, "light.sh_degree": 0}
@@ -220,3 +224,18 @@ def test_run_card_and_report_count_the_frames_of_both_ends(tmp_path, flight, cap
     assert f"<b>{card}</b><span>frames received / captured" in page
     assert missing in page[page.index("frames missing") :][:80]
     assert ("the store had no room" in page) == (flight is not None)
+
+
+def test_what_lies_in_the_port_when_listening_ends_is_received(tmp_path, small_mission):
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    sent = b"".join(frame_packet(packet) for packet, *_ in packets(3, seed=4))
+
+    def stop() -> bool:
+        os.write(ours, sent)
+        return True
+
+    summary = listen(f"serial://{os.ttyname(theirs)}", tmp_path / "session", small_mission, should_stop=stop)
+    assert summary.packets_received == 3
+    os.close(ours)
+    os.close(theirs)
