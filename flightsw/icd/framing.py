@@ -31,59 +31,69 @@ def max_frame_bytes(max_packet_bytes: int) -> int:
     return content + content // 254 + 1
 
 
-class Deframer:
+class DelimitedBytes:
+    """Cuts a byte stream at a delimiter; what is too long is dropped and counted as it comes, so memory is bounded."""
+
+    def __init__(self, delimiter: bytes, longest_bytes: int):
+        self.skipped_bytes = 0  # too long, damaged or nothing that is known
+        self._delimiter, self._longest_bytes = delimiter, longest_bytes
+        self._pending = bytearray()
+        self._too_long = False  # the bytes since the last delimiter are already dropped
+
+    @property
+    def pending_bytes(self) -> int:
+        """Bytes that are kept since the last delimiter."""
+        return len(self._pending)
+
+    def split(self, data: bytes) -> list[bytes | None]:
+        """Return the parts that end in `data`, without their delimiters; None for a part that was too long."""
+        *ended, rest = data.split(self._delimiter)
+        parts = []
+        for piece in ended:
+            self._collect(piece)
+            parts.append(None if self._too_long else bytes(self._pending))
+            self._pending.clear()
+            self._too_long = False
+        self._collect(rest)
+        return parts
+
+    def _collect(self, piece: bytes) -> None:
+        if self._too_long or len(self._pending) + len(piece) > self._longest_bytes:
+            self._too_long = True
+            self.skipped_bytes += len(self._pending) + len(piece)
+            self._pending.clear()
+        else:
+            self._pending += piece
+
+
+class Deframer(DelimitedBytes):
     """Finds packets in a byte stream that may start, break and lie anywhere.
 
     At all times `packet_bytes + idle_bytes + skipped_bytes + pending_bytes` is the number of bytes fed.
     """
 
     def __init__(self, max_packet_bytes: int):
+        super().__init__(DELIMITER, max_frame_bytes(max_packet_bytes))
         self.packet_bytes = 0  # of packets delivered, as framed
         self.idle_bytes = 0  # delimiters with nothing between them
-        self.skipped_bytes = 0  # damaged, too long or no frame at all
         self.crc_errors = 0  # runs of bytes between delimiters that are no packet
-        self._max_frame_bytes = max_frame_bytes(max_packet_bytes)
-        self._pending = bytearray()
-        self._too_long = False  # the bytes of the current frame are already dropped
-
-    @property
-    def pending_bytes(self) -> int:
-        """Bytes of a frame still without its delimiter."""
-        return len(self._pending)
 
     def feed(self, data: bytes) -> list[bytes]:
         """Return the packets that `data` completes; memory is bounded by the longest packet."""
-        *ended, rest = data.split(DELIMITER)
-        packets = []
-        for part in ended:
-            self._collect(part)
-            packet = self._end_frame()
-            if packet is not None:
-                packets.append(packet)
-        self._collect(rest)
-        return packets
+        packets = map(self._packet_of, self.split(data))
+        return [packet for packet in packets if packet is not None]
 
-    def _collect(self, part: bytes) -> None:
-        if self._too_long or len(self._pending) + len(part) > self._max_frame_bytes:
-            self._too_long = True
-            self.skipped_bytes += len(self._pending) + len(part)
-            self._pending.clear()
-        else:
-            self._pending += part
-
-    def _end_frame(self) -> bytes | None:
-        frame, too_long = bytes(self._pending), self._too_long
-        self._pending.clear()
-        self._too_long = False
-        if not frame and not too_long:
+    def _packet_of(self, frame: bytes | None) -> bytes | None:
+        if frame == b"":
             self.idle_bytes += 1
             return None
-        packet = None if too_long else _packet_in(frame)
+        packet = None if frame is None else _packet_in(frame)
+        size_bytes = len(frame or b"") + 1
         if packet is None:
-            self.skipped_bytes += len(frame) + 1
+            self.skipped_bytes += size_bytes
             self.crc_errors += 1
         else:
-            self.packet_bytes += len(frame) + 1
+            self.packet_bytes += size_bytes
         return packet
 
 

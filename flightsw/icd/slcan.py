@@ -8,12 +8,13 @@ import re
 
 import isotp
 
+from flightsw.icd.framing import DelimitedBytes
 from flightsw.icd.link_url import SLCAN_BITRATES, LinkUrl
 
 FD_SIZES = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)  # bytes by length code, ISO 11898-1
 
 
-class SlcanText:
+class SlcanText(DelimitedBytes):
     """CAN frames from an slcan adapter's bytes (LAWICEL CANUSB, with CANable's d, D, b, B for CAN FD).
 
     At all times `frame_bytes + reply_bytes + skipped_bytes + pending_bytes` is the number of bytes fed.
@@ -23,54 +24,31 @@ class SlcanText:
     MAX_LINE_BYTES = 10 + 2 * 64
 
     def __init__(self):
+        super().__init__(b"\r", self.MAX_LINE_BYTES)
         self.frame_bytes = 0
         self.reply_bytes = 0  # the adapter's answers to commands and frames
         self.frames_accepted = 0  # of those given to the adapter, where it says so
-        self.skipped_bytes = 0  # neither
         self.skipped_lines = 0
         self.adapter_errors = 0  # a bell: the adapter refused a command or a frame
-        self._pending = bytearray()
-        self._too_long = False
-
-    @property
-    def pending_bytes(self) -> int:
-        return len(self._pending)
 
     def feed(self, data: bytes) -> list[isotp.CanMessage]:
         """Return the frames that `data` completes; memory is bounded by the longest line."""
         bells = data.count(b"\a")
         self.adapter_errors += bells
         self.reply_bytes += bells
-        *ended, rest = data.replace(b"\a", b"").split(b"\r")
-        frames = []
-        for part in ended:
-            self._collect(part)
-            frame = self._end_line()
-            if frame is not None:
-                frames.append(frame)
-        self._collect(rest)
-        return frames
+        frames = map(self._frame_of, self.split(data.replace(b"\a", b"")))
+        return [frame for frame in frames if frame is not None]
 
-    def _collect(self, part: bytes) -> None:
-        if self._too_long or len(self._pending) + len(part) > self.MAX_LINE_BYTES:
-            self._too_long = True
-            self.skipped_bytes += len(self._pending) + len(part)
-            self._pending.clear()
-        else:
-            self._pending += part
-
-    def _end_line(self) -> isotp.CanMessage | None:
-        line, too_long = bytes(self._pending), self._too_long
-        self._pending.clear()
-        self._too_long = False
-        frame = None if too_long else parse_slcan(line)
+    def _frame_of(self, line: bytes | None) -> isotp.CanMessage | None:
+        frame = None if line is None else parse_slcan(line)
+        size_bytes = len(line or b"") + 1
         if frame is not None:
-            self.frame_bytes += len(line) + 1
-        elif line in (b"", b"z", b"Z") and not too_long:
+            self.frame_bytes += size_bytes
+        elif line in (b"", b"z", b"Z"):
             self.frames_accepted += bool(line)
-            self.reply_bytes += len(line) + 1
+            self.reply_bytes += size_bytes
         else:
-            self.skipped_bytes += len(line) + 1
+            self.skipped_bytes += size_bytes
             self.skipped_lines += 1
         return frame
 

@@ -235,7 +235,10 @@ def test_what_lies_in_the_port_when_listening_ends_is_received(tmp_path, small_m
         os.write(ours, sent)
         return True
 
-    summary = listen(f"serial://{os.ttyname(theirs)}", tmp_path / "session", small_mission, should_stop=stop)
+    try:
+        url = f"serial://{os.ttyname(theirs)}"
+        summary = listen(url, tmp_path / "session", small_mission, should_stop=stop)
+    finally:
+        os.close(ours)
+        os.close(theirs)
     assert summary.packets_received == 3
-    os.close(ours)
-    os.close(theirs)
