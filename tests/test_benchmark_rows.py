@@ -1,6 +1,7 @@
 """Rows of benchmarks carry where they come from, and the page made of them shows every one."""
 
 import json
+import re
 import statistics
 
 import pytest
@@ -71,6 +72,12 @@ def test_every_opponent_beats_images_without_training_or_its_row_says_why_not(na
     usual = [row for row in made if row.get("condition", "as taken") == "as taken"]
     silent = [(r["method"], r["target"]) for r, _ in rows.ending_below(usual) if "why_below" not in r]
     assert silent == []
+
+
+def test_commands_name_no_path_of_a_machine():
+    for file in rows.FOLDER.glob("*.jsonl"):
+        made = [json.loads(line) for line in file.read_text().splitlines()]
+        assert [row["command"] for row in made if re.search(r"(^|[ =])/", row["command"])] == [], file.name
 
 
 def test_no_row_stands_twice():

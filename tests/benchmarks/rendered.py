@@ -151,9 +151,7 @@ def main() -> None:
     parser.add_argument("--mesh", type=Path, help="default: the shipped spacecraft")
     parser.add_argument("--materials", choices=("own", "foil"), default="own")
     parser.add_argument("--sun", choices=("static", "moving"), default="static")
-    parser.add_argument(
-        "--dense", action="store_true", help="three times the views, under a Sun that stands still"
-    )
+    parser.add_argument("--dense", action="store_true", help="three times the views")
     parser.add_argument("--size", type=int, default=400, help="pixels along a side")
     parser.add_argument("--out", type=Path, required=True, help="folder for NAME_400.npz")
     arguments = parser.parse_args()

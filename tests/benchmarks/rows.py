@@ -68,6 +68,11 @@ FIGURES = {  # key of a row: column title and format
     "seconds_to_half_db": ("within 0.5 dB after", "{:.0f} s"),
     "latency_live_median_s": ("latency, live", "{:.2f} s"),
     "latency_alone_median_s": ("latency, no training", "{:.2f} s"),
+    "pass_seconds": ("seconds of a pass", "{:.2f} s"),
+    "passes": ("passes", "{:.0f}"),
+    "passes_repeating": ("of them sent segments twice", "{:.0f}"),
+    "passes_losing_the_end": ("lost their last packets", "{:.0f}"),
+    "segments_resent": ("segments sent again", "{:.0f}"),
 }
 
 
