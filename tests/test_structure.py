@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PARTS = ("obbgs_base", "obbgs_core", "flightsw", "ground", "hil")
-LONGEST_FILE, LONGEST_FUNCTION = 400, 80  # lines
+LONGEST_FILE, LONGEST_FUNCTION = 800, 80  # lines
 CORE = {"obbgs_base", "obbgs_core.model", "obbgs_core"}  # what every room of the library may use
 LIBRARY = {f"obbgs_core.{room}" for room in ("model", "render", "train", "io", "score")} | {"obbgs_core"}
 CONTRACT = {"obbgs_base", "flightsw.icd", "flightsw.icd.transfer"}
