@@ -5,7 +5,6 @@ import dataclasses
 import json
 import signal
 import threading
-import time
 from pathlib import Path
 from typing import Annotated
 
@@ -17,13 +16,10 @@ from ground.cli_compare import compare_command
 from ground.cli_formats import export_command, import_command
 from ground.cli_list import compare_runs_command, list_command
 from ground.cli_live import live_command
-from ground.cli_options import (
-    AsJson,
-    SessionDir,
-    UplinkCommand,
-)
+from ground.cli_options import AsJson, SessionDir
 from ground.cli_runs import evaluate_command, mesh_command, reconstruct_command, report_command
 from ground.cli_systems import dictionary_command, yamcs_command
+from ground.cli_uplink import uplink_command
 from ground.cli_view import view_command
 from obbgs_base.command_line import new_app, run
 
@@ -112,85 +108,7 @@ def key(
         print(f"key {made.spi} ({made.fingerprint}) in {file}; copy it and {file}.received to the spacecraft")
 
 
-@app.command()
-def uplink(
-    command: Annotated[UplinkCommand, typer.Argument(help="The command.")],
-    arguments: Annotated[list[str] | None, typer.Argument(help="Its arguments, as above.")] = None,
-    session: Annotated[Path, typer.Option("--session", help="The session folder.")] = Path("session"),
-    key_file: Annotated[Path, typer.Option("--key", help="The file of the mission's key.")] = Path(
-        "mission.key"
-    ),
-    link: Annotated[
-        str | None, typer.Option(help="The link's URL, if no `ground listen` has it open.")
-    ] = None,
-    mission: Annotated[Path, typer.Option(help="The mission file; read with --link only.")] = Path(
-        "mission.yaml"
-    ),
-    timeout: Annotated[
-        float,
-        typer.Option(
-            min=0.1, max=86_400.0, help="Seconds to wait for the result, or for a model to be under way."
-        ),
-    ] = 120.0,
-    json_: AsJson = False,
-) -> None:
-    """Send a command through the session's `ground listen`, or over --link, and wait for its result.
-
-    ping · bracket 0.05,0.1,0.2 (exposure times, ms) · near 2 (largest coding error, DN) · priority oldest, triage or
-    thumbnail-first · model FILE (a run's model.onnx) · safe (no more exposures). `arm delete` and then delete FIRST
-    LAST (numbers of frames), `arm resume` and then resume, each at most 30 s later.
-
-    Example: ground uplink bracket 0.02,0.05,0.1 --session pass-12 --key mission.key
-    """
-    from ground import uplink as uplinking
-    from ground.session import SessionError
-
-    made, model = uplinking.parse_command(command.value, arguments or [])
-    if link is None and not uplinking.is_listening(session):
-        raise SessionError(f"no `ground listen` receives into {session}: start one, or give --link URL")
-    counter = uplinking.submit(session, key_file, made, model, timeout)
-    end_s = time.monotonic() + timeout + 1.0  # the listener writes a result when the command expires
-
-    def ended() -> bool:
-        if uplinking.outcome(session, counter) is not None:
-            return True
-        if time.monotonic() <= end_s:
-            return False
-        is_tended = model is not None and uplinking.is_waiting(session, counter)
-        if is_tended and link is None:
-            is_tended = uplinking.is_listening(session)
-        return not is_tended
-
-    try:
-        if link is None:
-            while not ended():
-                time.sleep(0.05)
-        else:
-            from ground.ingest import listen
-
-            listen(link, session, load_mission(mission), should_stop=ended)
-    finally:
-        uplinking.withdraw(session, counter)
-    result = uplinking.outcome(session, counter)
-    if result is None:
-        result = {
-            "counter": counter,
-            "command": made.name,
-            "stage": "failed",
-            "text": "no process sent it",
-            "reports": [],
-        }
-    if json_:
-        print(json.dumps(result))
-    else:
-        for report in result["reports"]:
-            print(f"{report['stage']}: {report['text']}")
-        if not result["reports"]:
-            print(f"{result['stage']}: {result['text']}")
-    if result["stage"] != "completed":
-        raise typer.Exit(1)
-
-
+app.command("uplink")(uplink_command)
 app.command("live")(live_command)
 app.command("reconstruct")(reconstruct_command)
 app.command("evaluate")(evaluate_command)

@@ -8,7 +8,8 @@
     frames/000123.png   the frame's digital numbers, 16-bit linear, mono or RGB
     truth/              only from a simulator: true poses, radiance and surface; never read in training
     runs/NAME/          the models made of the session
-    thumbnails/, telemetry.jsonl, events.jsonl, reports.jsonl, uplink/    what else came down and went up
+    thumbnails/, telemetry.jsonl, events.jsonl, reports.jsonl    what else came down
+    commands.jsonl, uplink/    what went up
 
 `SessionWriter` in session_writer.py adds frames; each step is whole or not done, so that a session opens again after
 a power cut at any moment. `open_session` reads one.

@@ -3,7 +3,8 @@
 `ground uplink` seals a command (AES-GCM), so that only it needs the key, and leaves it in the session's folder uplink/
 as NUMBER.json, where NUMBER is the command's counter; the sealed file of a model lies beside it as NUMBER.bin. The
 listener has the port: it sends commands in the order of their counters, repeats each until the spacecraft reports its
-result, and writes that to NUMBER.done.json.
+result, and writes that to NUMBER.done.json. The session's commands.jsonl has a line for each command that ended: one
+history, whoever sent them.
 """
 
 import contextlib
@@ -14,6 +15,7 @@ import logging
 import os
 import re
 import secrets
+import shlex
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -25,11 +27,12 @@ from flightsw.icd.command import ENDED, Command, Report, model_file_name
 from flightsw.icd.mission import Checksum, ConfigError
 from flightsw.icd.transfer import UPLINK, Sender
 from ground.session import SessionError
-from obbgs_base.files import write_whole
+from obbgs_base.files import append_line, write_whole
 
 log = logging.getLogger(__name__)
 JOB_NAME = re.compile(r"(\d{20})\.json", re.ASCII)
 MAX_MODEL_BYTES = 64 * 1024 * 1024  # as the dictionary's `model.size_bytes`
+HISTORY = "commands.jsonl"
 POLL_S = 0.2  # between looks at the folder
 LOCK_TRIES = 5  # to become the session's listener
 RESEND_INTERVALS = 2  # timer intervals before an unanswered command is sent again
@@ -96,6 +99,36 @@ def parse_command(name: str, arguments: list[str]) -> tuple[Command, Path | None
     raise ValueError(f"not a command with its arguments: {given!r}; see `ground uplink --help`")
 
 
+def parse_script(text: str) -> list[tuple[Command, Path | None]]:
+    """Return the commands of a script: one a line as on the command line; empty lines and those after # count nothing.
+
+    Raises:
+        ValueError: a line is no command, or its arguments are out of range; the message has its number.
+    """
+    commands = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        try:
+            if words := shlex.split(line, comments=True):
+                commands.append(parse_command(words[0], words[1:]))
+                command, model = commands[-1]
+                if model is None:
+                    command.pack()
+                elif not model.is_file():
+                    raise ValueError(f"{model} is no file")
+        except ValueError as error:
+            raise ValueError(f"line {number} of the script: {error}") from error
+    if not commands:
+        raise ValueError("the script holds no command; expected one a line, such as `bracket 0.05,0.1`")
+    return commands
+
+
+def in_words(command: Command, model: Path | None) -> str:
+    """Return a command as a person gives it, such as `bracket 0.05,0.1`."""
+    values = command.arguments.values() if model is None else (model,)
+    texts = [",".join(f"{x:g}" for x in v) if isinstance(v, tuple) else str(v) for v in values]
+    return " ".join([command.name, *texts])
+
+
 def _number(text: str, kind: type) -> Any:
     try:
         return kind(text)
@@ -117,7 +150,7 @@ def submit(session: Path, key_file: Path, command: Command, model: Path | None, 
         ValueError: an argument is out of range.
         SessionError: the session folder cannot be written.
     """
-    content = b""
+    content, given = b"", in_words(command, model)
     if model is not None:
         content, command = _model_command(model)
     packed = command.pack()  # it may be invalid, and should not use up a counter then
@@ -132,6 +165,7 @@ def submit(session: Path, key_file: Path, command: Command, model: Path | None, 
                 write_whole(folder / f"{counter:020d}.bin", seal_file(file_key, content))
             job = {
                 "command": command.name,
+                "given": given,
                 "packet": seal(key, counter, packed).hex(),
                 "expires_utc_ns": expires_utc_ns,
             }
@@ -179,6 +213,15 @@ def outcome(session: Path, counter: int) -> dict[str, Any] | None:
     """Return a command's result (stage, text, reports); None while it has none."""
     path = session / "uplink" / f"{counter:020d}.done.json"
     return json.loads(path.read_bytes()) if path.exists() else None
+
+
+def note_end(session: Path, done: dict[str, Any], utc_ns: int) -> None:
+    """Add the end of a command, as `outcome` has it, to the session's history; a disk that refuses it is logged."""
+    line = {"ended_utc_ns": utc_ns} | {name: done[name] for name in ("counter", "given", "stage", "text")}
+    try:
+        append_line(session / HISTORY, json.dumps(line).encode())
+    except OSError as error:
+        log.error("the end of command %d is missing in %s: %s", done["counter"], session / HISTORY, error)
 
 
 def is_waiting(session: Path, counter: int) -> bool:
@@ -234,6 +277,7 @@ class Job:
 
     counter: int
     command: str
+    given: str  # the command with its arguments
     packet: bytes
     expires_utc_ns: int
     file: bytes | None
@@ -328,17 +372,20 @@ class Uplinker:
         file = self._folder / f"{counter:020d}.bin"
         content = file.read_bytes() if file.exists() else None
         packet = bytes.fromhex(tree["packet"])
-        return Job(counter, str(tree["command"]), packet, int(tree["expires_utc_ns"]), content)
+        name = str(tree["command"])
+        return Job(counter, name, str(tree.get("given", name)), packet, int(tree["expires_utc_ns"]), content)
 
     def _end(self, job: Job, stage: str, text: str) -> None:
         done = {
             "counter": job.counter,
             "command": job.command,
+            "given": job.given,
             "stage": stage,
             "text": text,
             "reports": [vars(report) for report in job.reports],
         }
         name = f"{job.counter:020d}"
+        note_end(self._folder.parent, done, self._utc_ns())
         try:
             write_whole(self._folder / f"{name}.done.json", json.dumps(done).encode())
             for suffix in (".json", ".bin"):

@@ -8,21 +8,25 @@ import threading
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from flightsw.commands import Commander, ReplayCounter
 from flightsw.icd.auth import Key, unseal, unseal_file
 from flightsw.icd.command import Command, Report
 from flightsw.icd.mission import ConfigError
 from flightsw.store import FrameStore
+from ground import cli
 from ground.ingest import listen
 from ground.session import SessionError
 from ground.uplink import (
     Uplinker,
+    in_words,
     is_listening,
     listening,
     make_key,
     outcome,
     parse_command,
+    parse_script,
     submit,
     withdraw,
 )
@@ -271,3 +275,58 @@ def test_one_process_listens_into_a_session(session):
         with pytest.raises(SessionError, match="another process listens"), listening(session):
             pass
     assert not is_listening(session)
+
+
+def test_a_script_is_read_whole_before_anything_is_sent(tmp_path):
+    """The second line's time is out of range, the third line's file is not there: neither costs a counter."""
+    made = parse_script("# a pass\nbracket 0.05,0.1  # shorter\n\narm delete\ndelete 0 3\n")
+    assert [in_words(*each) for each in made] == ["bracket 0.05,0.1", "arm delete", "delete 0 3"]
+    for text, told in (
+        ("ping\nnear 99", "line 2 of the script"),
+        (f"ping\nping\nmodel {tmp_path / 'none.onnx'}", "line 3 of the script: .*is no file"),
+        ("fire", "line 1 of the script: not a command"),
+        ("bracket '0.05", "line 1 of the script"),
+        ("# nothing\n", "holds no command"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            parse_script(text)
+
+
+def test_a_script_stops_at_the_first_command_that_is_not_completed_and_one_history_tells_all(
+    session, key_file, tmp_path, small_mission
+):
+    """The real command line, listener's side and spacecraft's side, joined without a wire."""
+    replay, stop = ReplayCounter(key_file), threading.Event()
+    commander = Commander(replay, FrameStore(tmp_path / "store"), small_mission)
+
+    def listener() -> None:
+        uplinker, now_s = Uplinker(session, 1000, INTERVAL_S), 0.0
+        while not stop.wait(0.01):
+            now_s += 1.0
+            if (packet := uplinker.next_command(now_s)) is not None:
+                commander.receive(packet)
+            for report in commander.reports:
+                uplinker.take_report(report, now_s)
+            commander.reports.clear()
+
+    (tmp_path / "script").write_text("near 3\ndelete 0 9  # without arm\nping\n")
+    options = ("--session", str(session), "--key", str(key_file))
+    with listening(session):
+        thread = threading.Thread(target=listener)
+        thread.start()
+        try:
+            ran = CliRunner().invoke(cli.app, ["uplink", "--script", str(tmp_path / "script"), *options])
+            alone = CliRunner().invoke(cli.app, ["uplink", "ping", *options])
+        finally:
+            stop.set()
+            thread.join()
+            replay.close()
+    assert ran.exit_code == 1 and alone.exit_code == 0
+    assert "near 3: completed" in ran.output and "delete 0 9: refused" in ran.output
+    assert "not sent: 1 more" in ran.output and "ping" not in ran.output
+    history = [json.loads(line) for line in (session / "commands.jsonl").read_text().splitlines()]
+    assert [(line["given"], line["stage"]) for line in history] == [
+        ("near 3", "completed"),
+        ("delete 0 9", "refused"),
+        ("ping", "completed"),
+    ]
