@@ -80,6 +80,7 @@ def run_downlink(
     clock_s: Callable[[], float] = time.monotonic,
     counter: ReplayCounter | None = None,
     capture_values: Callable[[], dict[str, Any]] = dict,
+    boot: int = 0,
 ) -> DownlinkProgress:
     """Send the outbox until told to stop, or until it is empty, and return the counts.
 
@@ -90,12 +91,13 @@ def run_downlink(
     Args:
         counter: the key and its replay counter; without one every command is refused.
         capture_values: what capture knows of the housekeeping packet's items.
+        boot: the number of this start of the flight software, for the housekeeping packet.
 
     Raises:
         StoreError: the outbox cannot be read or changed, six times in a row.
         DownlinkError: an unforeseen error, six times in a row.
     """
-    downlink = _Downlink(store, link, mission, counter, capture_values, clock_s)
+    downlink = _Downlink(store, link, mission, counter, capture_values, clock_s, boot)
     logger = logging.getLogger("flightsw")
     logger.addHandler(downlink.events)
     try:
@@ -140,11 +142,12 @@ class _Downlink:
         counter: ReplayCounter | None,
         capture_values: Callable[[], dict[str, Any]],
         clock_s: Callable[[], float],
+        boot: int,
     ):
         self.interval_s = timer_s(link.baud_rate)
         self.events = EventLog()
         self._store, self._link, self._mission, self._clock_s = store, link, mission, clock_s
-        self._capture_values = capture_values
+        self._capture_values, self._boot = capture_values, boot
         self._stream = PacketStream(TELEMETRY, mission.link.max_packet_bytes)
         self._commander = Commander(counter, store, mission, self._note_refusal, clock_s)
         self._meter = ProcessMeter(clock_s)
@@ -288,6 +291,7 @@ class _Downlink:
         frames_stored, bracket = len(self._store.frames), settings.bracket(self._mission)
         values = {
             "utc_ns": time.time_ns(),
+            "boot": self._boot,
             "mode": "safe" if settings.safe_mode else "normal",
             "camera": "none",
             "exposure_times_ms": bracket.exposure_times_ms,

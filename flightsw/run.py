@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from flightsw.boot_counter import count_boot
 from flightsw.cameras import open_camera
 from flightsw.cameras.reconnecting import PATIENCE_S, RETRY_S, ReconnectingCamera
 from flightsw.commands import ReplayCounter
@@ -92,7 +93,7 @@ def run_pass(
         if link is not None:
             waiting = (exit_when_empty, stop, on_sent, alive)
             thread = _DownlinkThread(FrameStore(store_dir), link, mission, counter, *waiting)
-            thread.camera = camera
+            thread.camera, thread.boot = camera, count_boot(store_dir)
             if camera_url is not None:
                 thread.capturing.set()
             thread.start()
@@ -244,6 +245,7 @@ class _DownlinkThread(threading.Thread):
         self.captured = CaptureCounts()  # so far
         self.camera: ReconnectingCamera | None = None  # until it answers
         self.camera_failed = False
+        self.boot = 0  # the number of this start
         self.result = DownlinkProgress()
         self.error: Exception | None = None
         self._store, self._link, self._mission, self._counter = store, link, mission, counter
@@ -261,6 +263,7 @@ class _DownlinkThread(threading.Thread):
                 should_stop=self._should_stop,
                 counter=self._counter,
                 capture_values=self._capture_values,
+                boot=self.boot,
             )
         except Exception as error:  # it would be lost with this thread; the main thread raises it
             self.error = error

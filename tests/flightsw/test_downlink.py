@@ -159,7 +159,8 @@ def test_little_is_put_ahead_of_the_wire_so_that_the_order_can_still_change(
 
 def test_housekeeping_comes_in_its_interval_and_says_what_is_so(store, small_mission):
     link = ListLink()
-    fly(link, store, small_mission, 5.5, capture_values=lambda: {"camera": "capturing", "frames_failed": 4})
+    capture_values = {"camera": "capturing", "frames_failed": 4}
+    fly(link, store, small_mission, 5.5, capture_values=lambda: capture_values, boot=7)
     packets = link.unpacked(APID_HOUSEKEEPING, "telemetry")
     assert len(packets) == 7  # at 0, 1, 2, 3, 4, 5 s and at the end
     name, values = packets[-1]
@@ -169,7 +170,7 @@ def test_housekeeping_comes_in_its_interval_and_says_what_is_so(store, small_mis
     assert values["exposure_times_ms"] == small_mission.bracket.exposure_times_ms
     assert values["store_bytes"] == sum(frame.size_bytes for frame in store.frames)
     assert values["priority"] == "thumbnail-first" and values["model"] == bytes(4)
-    assert values["uptime_s"] == 5
+    assert (values["uptime_s"], values["boot"], values["restarts"]) == (5, 7, 0)
 
 
 def test_warnings_of_any_part_become_events_and_the_end_is_told(store, small_mission):
