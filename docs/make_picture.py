@@ -7,35 +7,33 @@ import imagecodecs
 import numpy as np
 import torch
 
-from ground.cameras import predicted_image
-from ground.estimated_poses import Alignment, read_estimate
-from ground.evaluate import clean_image
+from ground.estimated_poses import scored_records
+from ground.evaluate import clean_image, model_image
 from ground.pictures import ERROR_FULL_SCALE, bounding_box, heat, tone
 from ground.runs import open_run
+from ground.spread import evenly_spread
 from ground.truth import Truth
 
+OUT = Path(__file__).with_name("demo.png")
 SIZE_PX = 200
 
 
-def main(session: Path, name: str) -> None:
+def main(session: Path, name: str, out: Path = OUT) -> None:
     run = open_run(session, name)
     truth = Truth(run.session)
-    estimate = read_estimate(run.folder)
-    motion = None if estimate is None else Alignment.of(estimate, run.session, truth).motion.numpy()
-    rows, scored = [], [truth.posed(record, motion) for record in run.scored]
+    rows, scored = [], scored_records(run, truth)
     brackets = sorted({r.bracket for r in scored})
     for exposure_s in sorted({r.exposure_time_s for r in scored}):
         cells = []
-        for bracket in (brackets[1], brackets[2]):
+        for bracket in evenly_spread(brackets, 2):
             record = next(r for r in scored if (r.bracket, r.exposure_time_s) == (bracket, exposure_s))
             clean = clean_image(run, truth, record)
-            render = predicted_image(run.gaussians, run.session, record, run.sensor, exposure_s)
+            render = model_image(run, record)
             box = bounding_box(torch.from_numpy(truth.radiance(record)[1] > 0), 4)
             error = ((render - clean).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
             cells += [_fitted(tone(image[box].numpy(), run.sensor)) for image in (clean, render)]
             cells.append(_fitted(heat(error[box].numpy())))
         rows.append(np.hstack(cells))
-    out = Path(__file__).with_name("demo.png")
     out.write_bytes(bytes(imagecodecs.png_encode(np.vstack(rows), level=9)))
     print(out)
 

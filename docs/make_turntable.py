@@ -11,11 +11,13 @@ import torch
 from PIL import Image
 
 from ground.cameras import exposed, median_sun_direction
+from ground.estimated_poses import as_estimated, read_estimate
 from ground.runs import Run, open_run
 from ground.turntable import looking_at
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.render import render
 
+OUT = Path(__file__).with_name("turntable.gif")
 VIEWS, WIDTH, HEIGHT = 36, 480, 320
 ELEVATION_DEG = 25.0  # above the body's xy plane; the demo's cameras stood between -4 and 38 degrees
 FRAME_MS = 90
@@ -23,7 +25,7 @@ MARGIN = 1.04  # of the target's radius
 GREYS = 64
 
 
-def main(session_dir: Path, name: str) -> None:
+def main(session_dir: Path, name: str, out: Path = OUT) -> None:
     run = open_run(session_dir, name)
     exposures_s = sorted({record.exposure_time_s for record in run.session.frames})
     exposure_s = exposures_s[len(exposures_s) // 2]  # the middle of the bracket
@@ -35,7 +37,6 @@ def main(session_dir: Path, name: str) -> None:
         shown = srgb(np.clip((image - black) / (1 - black), 0, 1).mean(axis=2))
         grey = np.rint(shown * (GREYS - 1)) / (GREYS - 1)
         pictures.append(Image.fromarray(np.rint(255 * grey).astype(np.uint8)))
-    out = Path(__file__).with_name("turntable.gif")
     pictures[0].save(out, save_all=True, append_images=pictures[1:], duration=FRAME_MS, loop=0, optimize=True)
     print(f"{out}: {len(pictures)} views, {out.stat().st_size / 1e6:.2f} MB")
 
@@ -44,7 +45,8 @@ def turntable(run: Run) -> Cameras:
     """Return cameras around the target at the session's median range, which fills the images' width; body z is up."""
     solid = run.gaussians.means[run.gaussians.opacities > 0.5]
     radius_m = float(torch.quantile(solid.norm(dim=1), 0.995))
-    range_m = float(np.median([np.linalg.norm(record.position_body_m) for record in run.session.frames]))
+    posed = as_estimated(run.session, read_estimate(run.folder)).frames
+    range_m = float(np.median([np.linalg.norm(record.position_body_m) for record in posed]))
     focal_px = WIDTH / 2 * range_m / (MARGIN * radius_m)
     K = torch.tensor([[focal_px, 0, WIDTH / 2], [0, focal_px, HEIGHT / 2], [0, 0, 1.0]])
     elevation_rad = float(np.radians(ELEVATION_DEG))

@@ -49,6 +49,12 @@ def sun_direction(record: FrameRecord) -> Tensor | None:
     return torch.tensor(record.sun_dir_body / length, dtype=torch.float32) if length > 0 else None
 
 
+def range_in_words(record: FrameRecord) -> str:
+    """Return how far the camera was from the origin of the body frame, with four digits and the unit."""
+    range_m = float(np.linalg.norm(record.position_body_m))
+    return f"{range_m:,.0f} m" if range_m >= 1000 else f"{range_m:.4g} m"
+
+
 def median_sun_direction(records: list[FrameRecord]) -> Tensor | None:
     """Return the Sun direction [3] with the least summed distance to those of all frames; None where none is known.
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from flightsw.icd.quaternion import matrix_to_quat
+from ground.runs import Run
 from ground.session import FrameRecord, Session, SessionError
 from ground.training_frames import training_frame
 from ground.truth import Truth
@@ -74,10 +75,43 @@ def as_estimated(session: Session, estimate: PoseEstimate | None) -> Session:
     return dataclasses.replace(session, frames=tuple(records))
 
 
-def settled_records(
-    gaussians: Gaussians, session: Session, records: list[FrameRecord], sensor: Sensor, estimate: PoseEstimate
+def scored_records(
+    run: Run, truth: Truth | None = None, records: list[FrameRecord] | None = None
 ) -> list[FrameRecord]:
-    """Return held-out frames with the poses that are settled on their pictures, the model fixed."""
+    """Return scored frames of a run with the poses from which pictures of its model are compared with them.
+
+    With a truth these are the true poses, moved along where the model moved with the poses that its training refined.
+    Without one they are those that settle on the frames' own pictures, or the tags where nothing was refined.
+
+    Args:
+        records: whole brackets of them; None: all.
+
+    Raises:
+        SessionError: the run's estimate is damaged, the truth lacks a frame, or a picture cannot be read.
+    """
+    estimate, records = read_estimate(run.folder), run.scored if records is None else records
+    if truth is None:
+        return settled_records(run.gaussians, run.session, records, run.sensor, estimate)
+    motion = None if estimate is None else Alignment.of(estimate, run.session, truth).motion.numpy()
+    return [truth.posed(record, motion) for record in records]
+
+
+def settled_records(
+    gaussians: Gaussians,
+    session: Session,
+    records: list[FrameRecord],
+    sensor: Sensor,
+    estimate: PoseEstimate | None,
+) -> list[FrameRecord]:
+    """Return held-out frames with the poses that settle on their pictures, the model fixed.
+
+    They are as they were where the training left its poses as tagged.
+
+    Args:
+        session: with the poses as tagged.
+    """
+    if estimate is None or not records:
+        return records
     frames = with_estimate([training_frame(session, record) for record in records], estimate)
     poses = settled_poses(gaussians, frames, sensor)
     return [_placed(record, pose.double().numpy()) for record, pose in zip(records, poses, strict=True)]

@@ -9,7 +9,7 @@ import torch
 
 from ground.cameras import camera_of, exposed, predicted_image
 from ground.card import model_card
-from ground.estimated_poses import Alignment, estimated_records, read_estimate, settled_records
+from ground.estimated_poses import Alignment, estimated_records, read_estimate, scored_records
 from ground.intervals import interval_scores, stated_error_scores
 from ground.mesh_files import read_mesh_points
 from ground.model_files import SURFACE_POINTS
@@ -71,18 +71,18 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
         SessionError: no such session or run, damaged metrics or truth, or a run folder that cannot be written.
     """
     run = open_run(session_dir, name, out)
-    estimate, shown = read_estimate(run.folder), run.scored
-    if estimate is not None:
-        shown = settled_records(run.gaussians, run.session, run.scored, run.sensor, estimate)
+    estimate, shown = read_estimate(run.folder), scored_records(run)
     figures: dict[str, float] = {
-        "psnr_noisy_db": noisy_psnr_db((_image(run, record), _noisy(run, record)) for record in shown)
+        "psnr_noisy_db": noisy_psnr_db(
+            (model_image(run, record), noisy_image(run, record)) for record in shown
+        )
     }
     states_errors = run.metrics["scored_frames"] == "held_out" and not run.metrics.get("reference_exposure_s")
     if states_errors:
         frames = (training_frame(run.session, record) for record in shown)
         figures |= stated_error_scores(run.gaussians, run.sensor, frames, run.metrics.get("misfit"))
     if run.session.frames_imported is not None and run.session.camera.channels == 3:
-        pairs = ((_image(run, record), _noisy(run, record)) for record in shown)
+        pairs = ((model_image(run, record), noisy_image(run, record)) for record in shown)
         figures |= display_scores(pairs, run.sensor, run.session.encoding)
     truth = Truth(run.session) if Truth.exists(run.session) else None
     if truth is not None:
@@ -95,7 +95,7 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
             similarity = alignment.similarity.numpy()
             sized = [_scored(run, truth, truth.posed(record, similarity)) for record in run.scored]
             figures |= of_similarity(clean_scores(sized) | _cloud_figures(clouds, seen, truth, similarity))
-        shown = [truth.posed(record, motion) for record in run.scored]
+        shown = scored_records(run, truth)
         figures |= clean_scores([_scored(run, truth, record) for record in shown])
         figures |= _radiance_figures(run, truth, shown) | _cloud_figures(clouds, seen, truth, motion)
     if states_errors:
@@ -150,15 +150,17 @@ def _interval_figures(
     return interval_scores(run.gaussians, known, run.sensor, scored, radiance)
 
 
-def _image(run: Run, record: FrameRecord) -> torch.Tensor:
-    """Return the model's image of a frame."""
+def model_image(run: Run, record: FrameRecord) -> torch.Tensor:
+    """Return the model's image [H, W, C] of a frame as a fraction of full scale, as it is scored."""
     return predicted_image(run.gaussians, run.session, record, run.sensor, _exposure_s(run, record))
 
 
 def _scored(run: Run, truth: Truth, record: FrameRecord) -> ScoredView:
     """Return the model's image of a frame with its truth."""
     coverage = torch.from_numpy(truth.radiance(record)[1])
-    return ScoredView(_image(run, record), clean_image(run, truth, record), coverage, record.exposure_time_s)
+    return ScoredView(
+        model_image(run, record), clean_image(run, truth, record), coverage, record.exposure_time_s
+    )
 
 
 def _radiance_figures(run: Run, truth: Truth, records: list[FrameRecord]) -> dict[str, float]:
@@ -190,7 +192,7 @@ def _exposure_s(run: Run, record: FrameRecord) -> float:
     return run.metrics.get("reference_exposure_s") or record.exposure_time_s
 
 
-def _noisy(run: Run, record: FrameRecord) -> torch.Tensor:
+def noisy_image(run: Run, record: FrameRecord) -> torch.Tensor:
     """Return a frame as received [H, W, C], as a fraction of full scale."""
     dn = run.session.dn(record).astype(np.float32)
     return torch.from_numpy(dn.reshape(*dn.shape[:2], -1) / run.sensor.white_dn)

@@ -78,8 +78,7 @@ class ShownModel:
             return math.nan
         sensor, values = sensor_of(session.camera), []
         scored = held_out[:: math.ceil(len(held_out) / (SCORED if estimate is None else SETTLED))]
-        if estimate is not None:
-            scored = settled_records(gaussians, session, scored, sensor, estimate)
+        scored = settled_records(gaussians, session, scored, sensor, estimate)
         for record in scored:
             if record.id not in self._images:
                 dn = torch.from_numpy(session.dn(record).astype("float32"))

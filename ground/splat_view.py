@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from ground.cameras import median_sun_direction, sun_direction
+from ground.estimated_poses import as_estimated, read_estimate
 from ground.exposures import offered_s
 from ground.runs import Run
 from ground.session import FrameRecord
@@ -58,7 +59,7 @@ def packed(run: Run, gaussians: Gaussians) -> tuple[dict, dict[str, np.ndarray]]
     radiance padded with zeros, then axis and weight of the highlight in a model that has them. sunlit: [suns, N] bytes,
     the share of each Sun that reaches a Gaussian, 255 for all.
     """
-    session, count = run.session, len(gaussians)
+    session, count = as_estimated(run.session, read_estimate(run.folder)), len(gaussians)
     suns = _suns(session.frames) if gaussians.shading != "view" else _suns(session.frames)[:1]
     sunlit = np.zeros((0, count), np.uint8)
     if gaussians.shading == "lambert":

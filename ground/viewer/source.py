@@ -1,16 +1,17 @@
 """Which run a viewer shows: found by its folder or by its session's, and read again whenever its model is renewed."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ground import attitude
 from ground.attitude import FoundAttitude
 from ground.cameras import sensor_of
-from ground.estimated_poses import as_estimated, read_estimate
-from ground.session import Session, SessionError, open_session
+from ground.estimated_poses import as_estimated, read_estimate, settled_records
+from ground.session import FrameRecord, Session, SessionError, open_session
 from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.sensor import Sensor
 
 HEADER, MODEL, MESH = "session.json", "model.ply", "model.glb"
@@ -22,7 +23,8 @@ Stamp = tuple[FileStamp, FileStamp | None]  # of a model, and of its mesh where 
 class Shown:
     """A model with its session, whose poses are those of the model, as it was when it was read.
 
-    mesh: the bytes of model.glb where there is one.
+    mesh: the bytes of model.glb where there is one. tagged: the session with its tags; estimate: what the training
+    found of them, None where they are as tagged.
     """
 
     name: str
@@ -30,6 +32,23 @@ class Shown:
     sensor: Sensor
     gaussians: Gaussians
     mesh: bytes | None
+    tagged: Session
+    estimate: PoseEstimate | None
+    _compared: dict[int, FrameRecord] = field(default_factory=dict, repr=False)
+
+    def compared(self, record: FrameRecord) -> FrameRecord:
+        """Return a frame with the pose from which the model's picture is compared with it.
+
+        Where poses were refined, one that the training did not see is settled on its picture, as in the scores.
+        """
+        if self.estimate is None or record.id in self.estimate.frame_ids or not record.pose_valid:
+            return record
+        if record.id not in self._compared:
+            seen = set(self.estimate.frame_ids)
+            bracket = [r for r in self.tagged.frames if r.bracket == record.bracket and r.id not in seen]
+            settled = settled_records(self.gaussians, self.tagged, bracket, self.sensor, self.estimate)
+            self._compared.update({r.id: r for r in settled})
+        return self._compared[record.id]
 
 
 class Source:
@@ -79,14 +98,16 @@ class Source:
         session = open_session(self.session_path)
         if (found := FoundAttitude.read(self.folder / attitude.FILE)) is not None:
             session = attitude.in_body_axes(session, found)
-        session = as_estimated(session, read_estimate(self.folder))
+        estimate = read_estimate(self.folder)
         mesh = self.folder / MESH
         shown = Shown(
             self.name,
-            session,
+            as_estimated(session, estimate),
             sensor_of(session.camera),
             load_ply(self.folder / MODEL),
             mesh.read_bytes() if mesh.is_file() else None,
+            session,
+            estimate,
         )
         if len(shown.gaussians) == 0:
             raise SessionError(f"{self.folder / MODEL} holds no Gaussian")

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import viser
 
-from ground.cameras import predicted_image
+from ground.cameras import predicted_image, range_in_words
 from ground.exposures import offered_s
 from ground.pictures import ERROR_FULL_SCALE, heat, tone
 from ground.session import FrameRecord, SessionError
@@ -235,8 +235,8 @@ class Viewer:
         """Put a viewer's camera where the chosen frame's was, as far away, with its direction of up and field."""
         if client is None:
             return
-        record, first = self.record, self.placed[0]
-        session = first.shown.session
+        first = self.placed[0]
+        record, session = first.shown.compared(self.record), first.shown.session
         pose, K = record.world_to_camera, session.K(record)
         client.camera.max_orbit_distance = 1e6 * RADIUS
         position = first.place(-pose[:3, :3].T @ pose[:3, 3])
@@ -285,10 +285,9 @@ def _fitting_distance(models: int) -> float:
 
 def _facts(record: FrameRecord) -> str:
     taken = datetime.fromtimestamp(record.mid_exposure_utc_ns / 1e9, UTC)
-    range_m = float(np.linalg.norm(record.position_body_m))
     return (
         f"frame {record.id} of bracket {record.bracket}, {1e3 * record.exposure_time_s:g} ms, {taken:%H:%M:%S}, "
-        f"{range_m:.4g} m, {record.saturated:,} pixels saturated"
+        f"{range_in_words(record)}, {record.saturated:,} pixels saturated"
     )
 
 
@@ -301,7 +300,8 @@ def _compared(placed: Placed, record: FrameRecord) -> np.ndarray:
         log.warning("%s", error)
         return np.zeros((2, 6, 3), np.uint8)
     frame = torch.from_numpy(dn.reshape(*dn.shape[:2], -1) / shown.sensor.white_dn)
-    image = predicted_image(shown.gaussians, shown.session, record, shown.sensor, record.exposure_time_s)
+    seen_from = shown.compared(record)
+    image = predicted_image(shown.gaussians, shown.session, seen_from, shown.sensor, record.exposure_time_s)
     error = ((image - frame).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
     encoding = shown.session.encoding
     toned = [tone(each.numpy(), shown.sensor, encoding) for each in (frame, image)]

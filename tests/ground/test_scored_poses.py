@@ -1,0 +1,122 @@
+"""From which poses a run with refined poses is scored and shown: the same in figures, report, viewer and documents."""
+
+import base64
+import importlib.util
+import re
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import imagecodecs
+import numpy as np
+import pytest
+from scipy.ndimage import center_of_mass
+
+from ground.cameras import range_in_words
+from ground.evaluate import evaluate
+from ground.reconstruct import reconstruct
+from ground.report import write_report
+from ground.viewer.source import Source
+from ground.viewer.viewer import _compared
+from tests.scenes import move_poses_in
+from tests.small_sessions import SIZE_PX, erring_session
+
+STEPS = {"steps": 60, "start.count": 400, "growth.max_gaussians": 600}
+BRACKETS, HELD_OUT = 16, 6  # frames of the brackets 7 and 15
+ZOOM = 5  # of make_picture, from 40 to 200 pixels
+A_PIXEL = 1.0  # pictures from the tags are 6 pixels off
+
+
+@pytest.fixture(scope="module")
+def refined(tmp_path_factory) -> Path:
+    """A session whose tags err by 6 pixels, with a run that refined its poses."""
+    session = erring_session(tmp_path_factory.mktemp("refined") / "session", brackets=BRACKETS)
+    with pytest.MonkeyPatch.context() as patch:
+        move_poses_in(patch, 2)
+        reconstruct(session, "run", "obbgs", STEPS)
+    metrics = evaluate(session, "run")
+    assert metrics["poses"].startswith("refined") and metrics["pose_error_tagged_px"] > 5
+    assert metrics["pose_error_px"] < 0.5
+    return session
+
+
+def without_truth(session: Path, folder: Path) -> Path:
+    return Path(shutil.copytree(session, folder, ignore=shutil.ignore_patterns("truth")))
+
+
+def held_out_section(session: Path) -> str:
+    page = write_report(session, "run").read_text()
+    return next(part for part in page.split("<section>") if part.startswith("<h2>Held-out views"))
+
+
+def pictures_of(section: str) -> list[tuple[str, np.ndarray, str]]:
+    """Return what each picture is (frame or truth, render, error), its bytes [H, W, 3] and its caption."""
+    found = re.findall(r'<img alt="(\w+)" src="data:image/png;base64,([^"]*)"><figcaption>([^<]*)', section)
+    return [(alt, imagecodecs.png_decode(base64.b64decode(png)), caption) for alt, png, caption in found]
+
+
+def shift_px(one: np.ndarray, other: np.ndarray) -> float:
+    """Return how far the light's centre in a picture of bytes [H, W, 3] is from that in another."""
+    centres = [center_of_mass(picture[..., 0].astype(float)) for picture in (one, other)]
+    return float(np.hypot(*np.subtract(*centres)))
+
+
+@pytest.mark.parametrize(("key", "reference"), [("psnr_clean_db", "truth"), ("psnr_noisy_db", "frame")])
+def test_the_reports_held_out_views_are_those_of_the_headline(refined, tmp_path, key, reference):
+    """With truth and without: the dB under the pictures average to the headline, and renders match what is beside."""
+    session = refined if reference == "truth" else without_truth(refined, tmp_path / "session")
+    headline_db = evaluate(session, "run")[key]
+    section = held_out_section(session)
+    shown = pictures_of(section)
+    rows = list(zip(shown[::3], shown[1::3], shown[2::3], strict=True))
+    assert len(rows) == HELD_OUT
+    values_db = [float(render[2].removesuffix(" dB")) for _, render, _ in rows]
+    assert np.mean(values_db) == pytest.approx(headline_db, abs=0.051)  # captions have one digit
+    assert f"its mean over all {HELD_OUT} frames is {headline_db:.2f} dB" in section
+    for frame, render, error in rows:
+        assert (frame[0], render[0], error[0]) == (reference, "render", "error")
+        assert frame[1].max() > 50 and shift_px(frame[1], render[1]) < A_PIXEL
+
+
+def test_ranges_of_report_and_viewer_are_those_of_the_refined_poses(refined):
+    page = write_report(refined, "run").read_text()
+    frames = Source(refined / "runs" / "run").load().session.frames
+    told = re.findall(r"frame (\d+), ([\d.,]+ m)", page)
+    assert len(told) > 10
+    by_number = {record.id: range_in_words(record) for record in frames}
+    assert all(by_number[int(number)] == text for number, text in told)
+    assert f"Bracket 7, {by_number[21]}" in page
+
+
+def test_the_viewer_compares_held_out_frames_from_the_poses_that_they_are_scored_from(refined):
+    shown = Source(refined / "runs" / "run").load()
+    placed: Any = SimpleNamespace(shown=shown)
+    for record in shown.session.frames[21:24]:
+        frame, model, _ = np.split(_compared(placed, record), 3, axis=1)
+        assert frame.shape == (SIZE_PX, SIZE_PX, 3)
+        assert shift_px(frame, model) < A_PIXEL
+    trained = shown.session.frames[0]
+    assert shown.compared(trained) is trained
+
+
+def test_pictures_of_the_documents_are_of_the_scored_poses(refined, tmp_path):
+    script("make_picture").main(refined, "run", tmp_path / "demo.png")
+    picture = imagecodecs.imread(tmp_path / "demo.png")
+    rows, columns = len(picture) // 200, picture.shape[1] // 200
+    assert (rows, columns) == (3, 6)  # exposures; two brackets
+    for row in np.split(picture, rows):
+        for truth, render in (np.split(row, columns, axis=1)[:2], np.split(row, columns, axis=1)[3:5]):
+            assert truth.max() > 50 and shift_px(truth, render) < ZOOM * A_PIXEL
+    script("make_turntable").main(refined, "run", tmp_path / "turntable.gif")
+    assert (tmp_path / "turntable.gif").read_bytes().startswith(b"GIF89a")
+
+
+def script(name: str) -> Any:
+    """Return a script of docs/ as a module."""
+    path = Path(__file__).parents[2] / "docs" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
