@@ -34,6 +34,17 @@ td.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-num
 .grid .label { color: var(--soft); font-size: 13px; align-self: center; }
 .grid figure { margin: 0; } .grid figcaption { color: var(--soft); font-size: 12px; text-align: center; }
 h3 { font-size: 15px; margin: 18px 0 8px; }
+.scroll { overflow-x: auto; }
+.scores td, .scores th { white-space: nowrap; overflow-wrap: normal; }
+.scores td.words { white-space: normal; min-width: 240px; }
+.scores td:first-child, .scores th:first-child { position: sticky; left: 0; background: var(--card); }
+.beside { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 0 16px; }
+.beside > * { min-width: 0; }
+.views { grid-template-columns: repeat(auto-fill, minmax(min(46%, 170px), 1fr)); }
+.compared { grid-template-columns: minmax(0, 1.1fr) repeat(3, minmax(0, 1fr)); max-width: 840px; }
+.legend { display: flex; flex-wrap: wrap; gap: 2px 18px; font-size: 13.5px; margin: 6px 0; }
+.legend span::before { content: ""; display: inline-block; width: 12px; height: 12px; border-radius: 3px;
+  background: var(--of); margin-right: 6px; vertical-align: -1px; }
 .two { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 8px 32px; align-items: start; }
 .ramp { display: inline-block; width: 90px; height: 10px; border-radius: 3px; margin: 0 6px;
   border: 1px solid var(--line); background: linear-gradient(90deg, #000, #f00, #ff0, #fff); }
@@ -47,6 +58,9 @@ pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px;
   .card b { font-size: 20px; } td { padding: 5px 4px; overflow-wrap: anywhere; }
   td.n { white-space: normal; } .grid { gap: 3px; }
   .grid .label, .grid figcaption { font-size: 10px; overflow-wrap: anywhere; }
+  .compared { grid-template-columns: repeat(3, minmax(0, 1fr)); }
+  .scores td.n { white-space: nowrap; } .scores td.words { min-width: 0; } .scores td.words div { width: 52vw; }
+  .compared .label { grid-column: 1 / -1; font-size: 12px; margin-top: 8px; } .compared .head { display: none; }
 }
 """
 
@@ -89,6 +103,17 @@ def _table(rows: Iterable[tuple[str, str]]) -> str:
 def grid(columns: str, cells: list[str]) -> str:
     """Return cells in rows; `columns` are the widths as CSS has them."""
     return f'<div class="grid" style="grid-template-columns: {columns}">{"".join(cells)}</div>'
+
+
+def beside(parts: Iterable[str]) -> str:
+    """Return parts side by side where there is room for them, and one below another on a narrow screen."""
+    return f'<div class="beside">{"".join(f"<div>{part}</div>" for part in parts)}</div>'
+
+
+def legend(entries: Iterable[tuple[str, str]]) -> str:
+    """Return names, each with its colour before it, in as many lines as they need."""
+    spans = "".join(f'<span style="--of: {colour}">{html.escape(name)}</span>' for name, colour in entries)
+    return f'<div class="legend">{spans}</div>'
 
 
 def label(text: str) -> str:

@@ -44,7 +44,7 @@ def training_figure(history: Sequence[dict]) -> go.Figure:
                 row=1,
                 col=column,
             )
-    ticks = _ticks_1_2_5(losses)
+    ticks = ticks_1_2_5(losses)
     figure.update_yaxes(type="log", tickvals=ticks, ticktext=[f"{t:g}" for t in ticks], row=1, col=1)
     figure.update_xaxes(title_text="training time, s", rangemode="tozero")
     figure.update_layout(
@@ -100,7 +100,7 @@ def running_mean(values: Sequence[float], window: int = SMOOTHED) -> list[float]
     return ((total[ends] - total[starts]) / (ends - starts)).tolist()
 
 
-def _ticks_1_2_5(values: Iterable[float]) -> list[float]:
+def ticks_1_2_5(values: Iterable[float]) -> list[float]:
     """Return ticks at 1, 2 and 5 times powers of ten that cover the positive values; Plotly's own omit the power."""
     positive = [value for value in values if value > 0]
     if not positive:

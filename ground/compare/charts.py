@@ -4,13 +4,15 @@ from collections.abc import Callable
 
 import plotly.graph_objects as go
 from plotly.colors import qualitative
-from plotly.subplots import make_subplots
 
-from ground.compare.results import GAINS, METRICS, VERDICTS, Results, pareto
+from ground.compare.results import VERDICTS, Results, pareto
+from ground.plots import ticks_1_2_5
 
 COLOURS = (*qualitative.D3, *qualitative.Set2)
 VERDICT_COLOURS = ("#2a9d8f", "#e9c46a", "#f4a261", "#c0392b", "#8795a5")  # of VERDICTS
-REFERENCE_COLOUR, FRONT_COLOUR = "#8795a5", "#1c2733"
+REFERENCE_COLOUR, FRONT_COLOUR = "#5b6b7b", "#1c2733"
+LABELS_APART = 0.06  # of the values drawn: names of lines that are nearer would cover one another
+EXACT_DB = 119.0  # the score of a picture that is compared with itself, which would squeeze all others
 
 
 def colour_of(results: Results) -> Callable[[str], str]:
@@ -19,100 +21,120 @@ def colour_of(results: Results) -> Callable[[str], str]:
     return lambda label: colours.get(label, REFERENCE_COLOUR)
 
 
-def speed_figure(results: Results, target: str) -> go.Figure:
-    """Return score and Chamfer distance of one target against seconds: curves, final scores, their Pareto fronts."""
-    colour, score = colour_of(results), results.score
-    shown = ((score.key, score.title, 1.0), ("chamfer", "Chamfer distance", -1.0))
-    figure = make_subplots(
-        rows=1, cols=2, subplot_titles=[title for _, title, _ in shown], horizontal_spacing=0.1
-    )
-    for column, (key, _, sign) in enumerate(shown, start=1):
-        ends: list[tuple[float, float]] = []
-        for label in results.trained:
-            for row in results.of(label, target, results.base):
-                curve = [point for point in row.get("curve", []) if key in point]
+def speed_figures(results: Results, target: str) -> list[go.Figure]:
+    """Return score and Chamfer distance of one target against seconds, each where any method has it.
+
+    Curves, final scores and their Pareto front; the score's figure also has the methods without training as lines.
+    """
+    score = results.score_of(target)
+    figures = []
+    for key, title, sign in ((score.key, score.title, 1.0), ("chamfer", "Chamfer distance", -1.0)):
+        figure = _speed(results, target, key, sign)
+        if figure.data:
+            figure.update_layout(title={"text": title, "font": {"size": 14}})
+            figures.append(figure)
+            if key == score.key:
+                _draw_references(figure, results, target, key)
+            else:
+                figure.update_yaxes(type="log")
+    return figures
+
+
+def _speed(results: Results, target: str, key: str, sign: float) -> go.Figure:
+    """Return curves, ends and Pareto front of one metric; `sign` is -1 where less is better."""
+    figure, colour = go.Figure(), colour_of(results)
+    ends: list[tuple[float, float]] = []
+    for label in results.trained:
+        for row in results.of(label, target, results.base):
+            curve = [point for point in row.get("curve", []) if key in point]
+            if curve:
                 figure.add_scatter(
                     x=[point["seconds"] for point in curve],
                     y=[point[key] for point in curve],
                     mode="lines",
                     line={"color": colour(label), "width": 2},
-                    legendgroup=label,
-                    showlegend=False,
                     hovertemplate=f"{label}<br>%{{x:.1f}} s: %{{y:.4g}}<extra></extra>",
-                    row=1,
-                    col=column,
                 )
-                if row.get(key) is None or not row.get("seconds"):
-                    continue
-                ends.append((row["seconds"], sign * row[key]))
-                first = row["seed"] == min(r["seed"] for r in results.of(label, target, results.base))
-                figure.add_scatter(
-                    x=[row["seconds"]],
-                    y=[row[key]],
-                    mode="markers",
-                    name=label,
-                    marker={"color": colour(label), "size": 10, "symbol": "diamond"},
-                    legendgroup=label,
-                    showlegend=column == 1 and first,
-                    hovertemplate=f"{label}, seed {row['seed']}<br>%{{x:.1f}} s: %{{y:.4g}}<extra></extra>",
-                    row=1,
-                    col=column,
-                )
-        front = pareto(ends)
+            if row.get(key) is None or not row.get("seconds"):
+                continue
+            ends.append((row["seconds"], sign * row[key]))
+            figure.add_scatter(
+                x=[row["seconds"]],
+                y=[row[key]],
+                mode="markers",
+                name=label,
+                marker={"color": colour(label), "size": 10, "symbol": "diamond"},
+                hovertemplate=f"{label}, seed {row['seed']}<br>%{{x:.1f}} s: %{{y:.4g}}<extra></extra>",
+            )
+    if front := pareto(ends):
         figure.add_scatter(
             x=[cost for cost, _ in front],
             y=[sign * value for _, value in front],
             mode="lines",
             name="Pareto front",
             line={"color": FRONT_COLOUR, "dash": "dot", "shape": "hv", "width": 1.5},
-            showlegend=column == 1,
             hoverinfo="skip",
-            row=1,
-            col=column,
         )
-    for label in results.labels:
-        value = results.mean(label, target, results.base, score.key)
-        if label not in results.trained and value is not None and results.method_of[label] != "ceiling":
-            figure.add_hline(
-                y=value,
-                line={"dash": "dash", "color": REFERENCE_COLOUR, "width": 1},
-                annotation={"text": label, "font": {"size": 11, "color": REFERENCE_COLOUR}},
-                row=1,  # pyright: ignore[reportArgumentType]
-                col=1,  # pyright: ignore[reportArgumentType]
-            )
-    figure.update_xaxes(type="log", title_text="seconds of training")
-    figure.update_yaxes(type="log", row=1, col=2)
-    return _sized(figure, 430)
+    _draw_log_axis(figure, "seconds of training")
+    return _sized(figure, 380)
 
 
-def size_figure(results: Results) -> go.Figure:
+def _draw_references(figure: go.Figure, results: Results, target: str, key: str) -> None:
+    """Draw a line for each method without training, and one name for those that lie too close to be told apart."""
+    shown = [label for label in results.labels if label not in results.trained]
+    values = {
+        label: value
+        for label in shown
+        if results.method_of[label] != "ceiling"
+        and (value := results.mean(label, target, results.base, key)) is not None
+        and value < EXACT_DB
+    }
+    drawn = [y for trace in figure.data for y in trace.y] + list(values.values())
+    apart = LABELS_APART * (max(drawn) - min(drawn))
+    groups: list[list[str]] = []
+    for label in sorted(values, key=lambda label: values[label]):
+        if groups and values[label] - values[groups[-1][0]] < apart:
+            groups[-1].append(label)
+        else:
+            groups.append([label])
+        figure.add_hline(y=values[label], line={"dash": "dash", "color": REFERENCE_COLOUR, "width": 1})
+    for group in groups:
+        figure.add_annotation(
+            **{"x": 0, "xref": "paper", "xanchor": "left", "y": values[group[-1]], "yanchor": "bottom"},
+            text=", ".join(group),
+            showarrow=False,
+            font={"size": 11, "color": REFERENCE_COLOUR},
+            bgcolor="rgba(255,255,255,0.8)",
+        )
+
+
+def size_figures(results: Results) -> list[go.Figure]:
     """Return score against the number of Gaussians and against bytes, a marker for each method and target."""
-    colour, score = colour_of(results), results.score
-    figure = make_subplots(rows=1, cols=2, subplot_titles=["Gaussians", "kB that one would keep"])
-    for label in results.trained:
-        for column, (key, unit) in enumerate((("gaussians", 1.0), ("bytes", 1e-3)), start=1):
+    colour, figures = colour_of(results), []
+    for key, title, unit in (("gaussians", "Gaussians", 1.0), ("bytes", "kB that one would keep", 1e-3)):
+        figure = go.Figure()
+        for label in results.trained:
             points = [
                 (size * unit, value, target)
                 for target in results.targets
                 if (size := results.mean(label, target, results.base, key))
-                and (value := results.mean(label, target, results.base, score.key)) is not None
+                and (value := results.mean(label, target, results.base, results.score.key)) is not None
             ]
-            figure.add_scatter(
-                x=[size for size, _, _ in points],
-                y=[value for _, value, _ in points],
-                text=[target for _, _, target in points],
-                mode="markers",
-                name=label,
-                legendgroup=label,
-                showlegend=column == 2,
-                marker={"color": colour(label), "size": 10},
-                hovertemplate=f"{label}, %{{text}}<br>%{{x:,.0f}}: %{{y:.2f}} dB<extra></extra>",
-                row=1,
-                col=column,
-            )
-    figure.update_xaxes(type="log")
-    figure.update_yaxes(title_text=score.title, row=1, col=1)
-    return _sized(figure, 400)
+            if points:
+                figure.add_scatter(
+                    x=[size for size, _, _ in points],
+                    y=[value for _, value, _ in points],
+                    text=[target for _, _, target in points],
+                    mode="markers",
+                    name=label,
+                    marker={"color": colour(label), "size": 10},
+                    hovertemplate=f"{label}, %{{text}}<br>%{{x:,.0f}}: %{{y:.2f}} dB<extra></extra>",
+                )
+        if figure.data:
+            _draw_log_axis(figure, title)
+            figure.update_yaxes(title_text=results.score.title)
+            figures.append(_sized(figure, 360))
+    return figures
 
 
 def failure_figure(results: Results) -> go.Figure:
@@ -142,7 +164,7 @@ def failure_figure(results: Results) -> go.Figure:
             colorscale=scale,
             xgap=2,
             ygap=2,
-            colorbar={"tickvals": list(range(levels)), "ticktext": list(VERDICTS), "thickness": 12},
+            showscale=False,
         )
     )
     figure.update_xaxes(side="top")
@@ -151,14 +173,14 @@ def failure_figure(results: Results) -> go.Figure:
 
 def gain_figure(results: Results, label: str, base: str) -> go.Figure:
     """Return the relative gains of a method over a base method, a tile for each metric and target."""
-    titles = {metric.key: metric.title for metric in METRICS}
-    values = [[results.gain(label, base, target, key) for target in results.targets] for key in GAINS]
+    gains = results.gains(label, base)
+    values = [of_targets for _, of_targets in gains]
     largest = max((abs(value) for row in values for value in row if value is not None), default=1.0)
     figure = go.Figure(
         go.Heatmap(
             z=values,
             x=results.targets,
-            y=[titles[key] for key in GAINS],
+            y=[metric.title for metric, _ in gains],
             text=[["" if value is None else f"{value:+.1f} %" for value in row] for row in values],
             texttemplate="%{text}",
             hovertemplate="%{y}, %{x}: %{z:+.1f} %<extra></extra>",
@@ -167,13 +189,19 @@ def gain_figure(results: Results, label: str, base: str) -> go.Figure:
             zmax=largest,
             xgap=2,
             ygap=2,
-            colorbar={"title": {"text": "%"}, "thickness": 12},
+            showscale=False,
         )
     )
     figure.update_yaxes(autorange="reversed")
-    return _sized(figure, 300)
+    return _sized(figure, 110 + 32 * len(gains))
+
+
+def _draw_log_axis(figure: go.Figure, title: str) -> None:
+    """Make the x axis logarithmic, with whole numbers at its ticks."""
+    ticks = ticks_1_2_5(x for trace in figure.data for x in trace.x)
+    figure.update_xaxes(type="log", title_text=title, tickvals=ticks, ticktext=[f"{t:,g}" for t in ticks])
 
 
 def _sized(figure: go.Figure, height_px: int) -> go.Figure:
-    figure.update_layout(height=height_px, margin={"l": 60, "r": 20, "t": 50, "b": 50})
+    figure.update_layout(height=height_px, margin={"l": 60, "r": 20, "t": 50, "b": 50}, showlegend=False)
     return figure

@@ -13,12 +13,11 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ground.compare.charts import COLOURS, VERDICT_COLOURS
 from ground.compare.page import error_of, shown_view
-from ground.compare.results import GAINS, METRICS, VERDICTS, Results, pareto
+from ground.compare.results import VERDICTS, Results, pareto
 from ground.compare.rows import Rows
 from ground.pictures import heat, tone
 
 DPI = 110
-TITLES = {metric.key: metric.title for metric in METRICS}
 
 
 def write_figures(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyType({})) -> list[Path]:
@@ -41,9 +40,9 @@ def write_figures(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxy
         **{f"views-{target}": _views(results, out, target) for target in results.targets},
     }
     base = results.gain_base
-    if results.truth and base is not None:
+    if base is not None:
         for label in results.trained:
-            if label != base:
+            if label != base and results.gains(label, base):
                 figures[f"gain-{label}"] = _gain(results, label, base)
     paths = []
     for name, figure in figures.items():
@@ -68,7 +67,7 @@ def _plain(colour: str) -> str:
 
 
 def _speed(results: Results, target: str) -> Figure:
-    colour, score = _colour_of(results), results.score
+    colour, score = _colour_of(results), results.score_of(target)
     rows = [row for label in results.trained for row in results.of(label, target, results.base)]
     measured = any("chamfer" in row for row in rows)  # imported pictures have no true surface
     figure = Figure(figsize=(11 if measured else 5.8, 4.2), layout="constrained")
@@ -156,12 +155,13 @@ def _failures(results: Results) -> Figure:
 def _gain(results: Results, label: str, base: str) -> Figure:
     figure = Figure(figsize=(2.8 + 1.2 * len(results.targets), 4), layout="constrained")
     axis = figure.subplots()
-    values = [[results.gain(label, base, target, key) for target in results.targets] for key in GAINS]
+    gains = results.gains(label, base)
+    values = [of_targets for _, of_targets in gains]
     shown = np.array([[np.nan if value is None else value for value in row] for row in values], float)
     least = min(0.0, float(np.nanmin(shown))) if np.isfinite(shown).any() else 0.0
     image = axis.imshow(shown, "viridis", vmin=least, aspect="auto")
     texts = [["" if value is None else f"{value:+.1f} %" for value in row] for row in values]
-    _tiles(axis, texts, results.targets, [TITLES[key] for key in GAINS])
+    _tiles(axis, texts, results.targets, [metric.title for metric, _ in gains])
     axis.set_title(f"{label} against {base}, %", fontsize=10)
     figure.colorbar(image, ax=axis)
     return figure

@@ -8,19 +8,26 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ground.compare.charts import failure_figure, gain_figure, size_figure, speed_figure
+from ground.compare.charts import (
+    VERDICT_COLOURS,
+    colour_of,
+    failure_figure,
+    gain_figure,
+    size_figures,
+    speed_figures,
+)
 from ground.compare.methods import reference_names
-from ground.compare.results import HOLDS_DB, MARGIN_DB, METRICS, SHAKEN_DB, Metric, Results
+from ground.compare.results import HOLDS_DB, MARGIN_DB, SHAKEN_DB, VERDICTS, Metric, Results
 from ground.compare.rows import Rows
 from ground.compare.views import SHOWN, WORST, KeptView, read_views
 from ground.compare.worker import VIEWS
-from ground.page import grid, label, page, picture, plot, section
+from ground.page import beside, label, legend, page, picture, plot, section
 from ground.pictures import ERROR_FULL_SCALE, heat, tone
 from obbgs_base.files import write_whole
 
 PAGE = "compare.html"
 WORST_SHOWN = 6
-COLUMNS = 5  # pictures in a row
+CELL_PX = 90  # of a method in a map of conditions, at least
 
 
 def write_page(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyType({})) -> Path:
@@ -62,32 +69,51 @@ def write_page(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyTyp
 
 def _tables(results: Results) -> str:
     """Return the table of means over the targets, and one of each target."""
-    truth = (
-        "Clean figures compare with noiseless exposures of held-out views, full scale as 1; foreground counts only the "
-        "pixels that the target covers; pooled is of the mean squared error over all views together, which single "
-        "nearly exact views do not lift. Best on the way is the highest clean PSNR of a curve: what "
-        "a method would reach if the truth told it when to stop. Distances are in units where the target's largest "
-        "dimension is 2: Chamfer, Hausdorff and centres complete are of the Gaussians' centres or the points of a "
-        "cloud; surface complete and accuracy of 100,000 points on the surface that the training views see."
-        if results.truth
-        else "No truth is known of these sessions: methods are compared with received held-out frames."
-    )
-    notes = (
-        f"{truth} Complete: within 0.01 of a point. Bold: the best of those that reconstruct something. "
-        "The ceiling is a perfect model that ignores exposure: true radiance at the geometric mean of the exposure "
-        "times; at that exposure it is exact (120 dB), so that only its pooled figure tells. Noise is the noisy frame "
-        "itself, which of course equals itself (120 dB). ± is the deviation over seeds."
-    )
-    several = len(results.targets) > 1
-    body = _table(results, None) if several else ""
+    body = _table(results, None) if len(results.targets) > 1 else ""
     for target in results.targets:
         body += f"<h3>{html.escape(target)}</h3>{_table(results, target)}"
-    return section(f"Scores, {html.escape(results.base)}", notes, body)
+    return section(f"Scores, {html.escape(results.base)}", _explained(results), body)
+
+
+def _explained(results: Results) -> str:
+    """Return what the columns and rows that are there mean."""
+    methods = set(results.method_of.values())
+    notes = []
+    if results.truth:
+        notes.append(
+            "Clean figures compare with noiseless exposures of held-out views, full scale as 1; foreground counts only "
+            "the pixels that the target covers; pooled is of the mean squared error over all views together, which "
+            "single nearly exact views do not lift. Best on the way is the highest clean PSNR of a curve: what a "
+            "method would reach if the truth told it when to stop. Distances are in units where the target's largest "
+            "dimension is 2: Chamfer, Hausdorff and centres complete are of the Gaussians' centres or the points of a "
+            "cloud; surface complete and accuracy of 100,000 points on the surface that the training views see. "
+            "Complete: within 0.01 of a point."
+        )
+    if not all(results.score_of(target).key == "psnr_clean_db" for target in results.targets):
+        which = (
+            "Of some of these sessions no truth is known"
+            if results.truth
+            else "No truth is known of these sessions"
+        )
+        notes.append(
+            f"{which}: their methods are compared with held-out frames as received, whose own noise bounds the PSNR."
+        )
+    notes.append("Bold: the best of those that reconstruct something.")
+    if "ceiling" in methods:
+        notes.append(
+            "The ceiling is a perfect model that ignores exposure: true radiance at the geometric mean of the exposure "
+            "times; at that exposure it is exact (120 dB), so that only its pooled figure tells."
+        )
+    if "noise" in methods:
+        notes.append("Noise is the noisy frame itself, which of course equals itself (120 dB).")
+    if any(len(results.of(label, t, results.base)) > 1 for label in results.labels for t in results.targets):
+        notes.append("± is the deviation over seeds.")
+    return " ".join(notes)
 
 
 def _table(results: Results, target: str | None) -> str:
     """Return the table of one target, or of the means over all."""
-    shown = [m for m in METRICS if any(row.get(m.key) is not None for row in results.rows)]
+    shown = results.known(target)
 
     def value(label: str, metric: Metric) -> tuple[float | None, str]:
         if target is None:
@@ -113,11 +139,13 @@ def _table(results: Results, target: str | None) -> str:
             text = f"<b>{text}</b>" if mean is not None and mean == best[metric.key] else text
             cells.append(f'<td class="n">{text}</td>')
         if reason is not None:
-            cells = [cells[0], f'<td colspan="{len(shown)}">{html.escape(reason)}</td>']
+            words = f"No result: {html.escape(reason.rstrip('.'))}."
+            cells = [cells[0], f'<td class="words" colspan="{max(1, len(shown))}"><div>{words}</div></td>']
         lines.append(f"<tr>{''.join(cells)}</tr>")
     head = "".join(f"<th>{html.escape(m.title)}</th>" for m in shown)
     title = "<h3>Mean of the targets</h3>" if target is None else ""
-    return f'{title}<div style="overflow-x: auto"><table><tr><th>method</th>{head}</tr>{"".join(lines)}</table></div>'
+    rows = f"<tr><th>method</th>{head}</tr>{''.join(lines)}"
+    return f'{title}<div class="scroll"><table class="scores">{rows}</table></div>'
 
 
 def _scaled(metric: Metric, value: float) -> float:
@@ -132,16 +160,26 @@ def _best(results: Results, metric: Metric, value: Callable[[str], float | None]
     return max(known) if metric.more_is_better else min(known)
 
 
+def _methods_legend(results: Results) -> str:
+    scored = {row["method"] for row in results.rows if row.get(results.score.key) is not None}
+    colour = colour_of(results)
+    return legend((name, colour(name)) for name in results.trained if results.method_of[name] in scored)
+
+
 def _speed(results: Results) -> str:
     note = (
         "Curves are measured on the way, on up to 16 of the held-out views; measuring is not counted as time. "
         "Diamonds are final scores over all held-out views, and the dotted line their Pareto front: no other "
         "method is both faster and better than those on it."
     )
-    body = "".join(
-        f"<h3>{html.escape(target)}</h3>{plot(speed_figure(results, target))}" for target in results.targets
-    )
-    return section("Speed against accuracy", note, body if results.trained else "No method was trained.")
+    body = ""
+    for target in results.targets:
+        figures = speed_figures(results, target)
+        drawn = beside(map(plot, figures)) if figures else "<p>No method has a score on this target.</p>"
+        body += f"<h3>{html.escape(target)}</h3>{drawn}"
+    if not results.trained:
+        return section("Speed against accuracy", note, "No method was trained.")
+    return section("Speed against accuracy", note, _methods_legend(results) + body)
 
 
 def _failures(results: Results, out: Path) -> str:
@@ -161,32 +199,41 @@ def _failures(results: Results, out: Path) -> str:
         if key not in worst or view.psnr_db < worst[key][1].psnr_db:
             worst[key] = (f"{row['method']}, {row['target']}, {row['condition']}", view)
     shown = sorted(worst.values(), key=lambda entry: entry[1].psnr_db)[:WORST_SHOWN]
-    cells = [label(""), label("expected"), label("render"), label("error")]
+    cells = [f'<div class="label head">{words}</div>' for words in ("", "expected", "render", "error")]
     for words, view in shown:
         cells += [label(f"{html.escape(words)}, frame {view.frame}"), *_compared(view)]
     title = "<h3>Worst views, one of each method and target</h3>"
-    pictures = title + grid("220px repeat(3, 200px)", cells) if shown else ""
-    return section(
-        "Where methods fail", note, (plot(failure_figure(results)) if results.trained else "") + pictures
-    )
+    pictures = f'{title}<div class="grid compared">{"".join(cells)}</div>' if shown else ""
+    drawn = ""
+    if results.trained:
+        width_px = CELL_PX * (1 + len(results.trained))
+        drawn = legend(zip(VERDICTS, VERDICT_COLOURS, strict=True))
+        drawn += f'<div class="scroll"><div style="min-width: {width_px}px">{plot(failure_figure(results))}</div></div>'
+    return section("Where methods fail", note, drawn + pictures)
 
 
 def _size(results: Results) -> str:
     note = "A marker for each method and target: left up is what one wants, no more model than a scene needs."
-    return section("Size against accuracy", note, plot(size_figure(results)) if results.trained else "")
+    figures = size_figures(results)
+    return (
+        section("Size against accuracy", note, _methods_legend(results) + beside(map(plot, figures)))
+        if figures
+        else ""
+    )
 
 
 def _gains(results: Results) -> str:
     base = results.gain_base
     others = [name for name in results.trained if name != base]
-    if base is None or not others or not results.truth:
+    if base is None or not others:
         return ""
     note = (
         f"By how many per cent a method is better than {html.escape(base)}, tile by tile; for distances and LPIPS a "
         "smaller value is the better one, so that a positive gain is always an improvement."
     )
-    body = "".join(f"<h3>{html.escape(name)}</h3>{plot(gain_figure(results, name, base))}" for name in others)
-    return section(f"Relative gains over {html.escape(base)}", note, body)
+    figures = [(name, gain_figure(results, name, base)) for name in others if results.gains(name, base)]
+    body = "".join(f"<h3>{html.escape(name)}</h3>{plot(figure)}" for name, figure in figures)
+    return section(f"Relative gains over {html.escape(base)}", note, body) if body else ""
 
 
 def _side_by_side(results: Results, out: Path) -> str:
@@ -211,8 +258,8 @@ def _side_by_side(results: Results, out: Path) -> str:
         for name, view in kept:
             _, render, error = _compared(view)
             cells.append(f'<div>{render}{error}<div class="label">{html.escape(name)}</div></div>')
-        body.append(grid(f"repeat({COLUMNS}, 1fr)", cells))
-    return section("Side by side", note, "".join(body))
+        body.append(f'<div class="grid views">{"".join(cells)}</div>')
+    return section("Side by side", note, "".join(body)) if body else ""
 
 
 def shown_view(results: Results, out: Path, name: str, target: str) -> KeptView | None:
@@ -260,4 +307,6 @@ def _origin(results: Results) -> str:
         f"Every row is a line of rows.jsonl with its own commit, machine, load and date. {early} trainings ended early "
         "because their curve had moved by less than 0.05 dB over its last fifth (`converged`)."
     )
-    return section("Where the rows come from", note, f"<table>{''.join(lines)}</table>")
+    return section(
+        "Where the rows come from", note, f'<div class="scroll"><table>{"".join(lines)}</table></div>'
+    )

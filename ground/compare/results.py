@@ -1,6 +1,7 @@
 """The rows of a comparison brought together: means over seeds, by method, target and condition."""
 
 import math
+import re
 import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -47,8 +48,13 @@ METRICS = (
     Metric("seconds", "seconds", "{:,.0f}", None),
     Metric("energy_j", "energy, J", "{:,.0f}", None),
 )
-# of the paper's figure: relative gains of these, the first three of pictures, the others of geometry
+# of the paper's figure: relative gains of these, the first three of pictures, the others of geometry; where no truth is
+# known, of noisy PSNR, which all sessions have
 GAINS = ("psnr_clean_db", "ssim_clean", "lpips", "chamfer", "completeness_centres", "hausdorff")
+CLASS_NAME = re.compile(r"^[A-Z]\w*: ")  # that a row's error begins with, for programs
+
+
+CLEAN, NOISY = METRICS[0], next(metric for metric in METRICS if metric.key == "psnr_noisy_db")
 
 
 def with_best(row: dict[str, Any]) -> dict[str, Any]:
@@ -112,8 +118,19 @@ class Results:
 
     @property
     def score(self) -> Metric:
-        """What methods are ranked by: clean PSNR, or noisy where no truth is known."""
-        return METRICS[0] if self.truth else next(m for m in METRICS if m.key == "psnr_noisy_db")
+        """What methods are ranked by over all targets: clean PSNR where the truth of most is known, noisy elsewhere."""
+        scores = [self.score_of(target) for target in self.targets]
+        return max((CLEAN, NOISY), key=scores.count)
+
+    def score_of(self, target: str) -> Metric:
+        """Return what methods are ranked by on one target: clean PSNR, or noisy where its truth is not known."""
+        is_known = any(row.get(CLEAN.key) is not None for row in self.rows if row["target"] == target)
+        return CLEAN if is_known else NOISY
+
+    def known(self, target: str | None = None) -> list[Metric]:
+        """Return the columns that any row has a value of, as they were taken: of one target, or of all."""
+        rows = [row for row in self.rows if target in (None, row["target"]) and row["condition"] == self.base]
+        return [metric for metric in METRICS if any(row.get(metric.key) is not None for row in rows)]
 
     @property
     def trained(self) -> list[str]:
@@ -141,10 +158,10 @@ class Results:
         return statistics.stdev(values) if len(values) > 1 else None
 
     def error(self, label: str, target: str, condition: str) -> str | None:
-        """Return why a cell has no result; None where it has one or was not asked for."""
+        """Return in words why a cell has no result; None where it has one or was not asked for."""
         return next(
             (
-                str(row.get("error") or row.get("failed"))
+                CLASS_NAME.sub("", str(row.get("error") or row.get("failed")))
                 for row in self.of(label, target, condition)
                 if row.get("error") or row.get("failed")
             ),
@@ -162,7 +179,7 @@ class Results:
     def _verdict(self, label: str, target: str, condition: str) -> tuple[str, str] | None:
         if (reason := self.error(label, target, condition)) is not None:
             return "refused", f"{target}: {reason}"
-        key = self.score.key
+        key = self.score_of(target).key
         value = self.mean(label, target, condition, key)
         if value is None:
             return None
@@ -183,7 +200,7 @@ class Results:
         found = []
         for label in self.labels:
             if self.method_of[label] in ("black", "mean", "untrained"):
-                key = self.score.key
+                key = self.score_of(target).key
                 value = self.mean(label, target, condition, key)
                 found.append(self.mean(label, target, self.base, key) if value is None else value)
         return max((value for value in found if value is not None), default=None)
@@ -195,6 +212,17 @@ class Results:
             return None
         better = next(metric.more_is_better for metric in METRICS if metric.key == key)
         return 100 * (ours - theirs if better else theirs - ours) / abs(theirs)
+
+    def gains(self, label: str, base: str) -> list[tuple[Metric, list[float | None]]]:
+        """Return a method's gains over another, target by target, of the metrics of which any is known."""
+        is_known = all(self.score_of(target) is CLEAN for target in self.targets)
+        names = GAINS if is_known else (NOISY.key, *GAINS)
+        found = []
+        for metric in sorted((m for m in METRICS if m.key in names), key=lambda m: names.index(m.key)):
+            values = [self.gain(label, base, target, metric.key) for target in self.targets]
+            if any(value is not None for value in values):
+                found.append((metric, values))
+        return found
 
     @property
     def gain_base(self) -> str | None:
