@@ -23,7 +23,7 @@ def list_command(
     ] = None,
     json_: AsJson = False,
 ) -> None:
-    """Show the sessions in some folders, and their runs: frames, losses, method, PSNR, Gaussians, age.
+    """Show the sessions in some folders, and their runs: frames, what is lost, method, quality, PSNR, poses, age.
 
     Example: ground list passes demo --json
     """
@@ -71,16 +71,18 @@ def _sessions_table(sessions: "list[SessionEntry]") -> Table:
         "frames / method",
         "lost / clean PSNR",
         "size / Gaussians",
-        "remarks",
+        "link / poses",
     ):
         table.add_column(heading, overflow="fold")
     for s in sessions:
         captured = "" if s.frames_captured is None else f" of {s.frames_captured}"
-        lost = (
-            ", ".join(f"{count:,} {kind.replace('_', ' ')}" for kind, count in s.losses.items()) or "nothing"
-        )
+        lost = _counts(s.frames_lost) or "nothing"
+        if s.frames_missing:
+            least = "at least " if s.frames_captured is None else ""
+            lost += f"; {least}{s.frames_missing:,} not received yet"
+        link = f"repaired: {_counts(s.link)}" if s.link else s.imported_from or ""
         frames = f"{s.frames}{captured} in {s.brackets} brackets"
-        cells = [s.folder, _age(s.created_utc), frames, lost, s.size, s.imported_from or ""]
+        cells = [s.folder, _age(s.created_utc), frames, lost, s.size, link]
         if s.problem:
             cells = [s.folder, "", "", "", "", s.problem]
         table.add_row(*map(Text, cells), style="bold")
@@ -96,8 +98,17 @@ def _run_cells(run: "RunEntry") -> list[str]:
     if psnr and run.psnr_clean_db is None:
         psnr += " (noisy frames)"
     gaussians = "" if run.gaussians is None else f"{run.gaussians:,}"
-    remark = run.problem or f"trained in {run.seconds:.0f} s"
-    return [f"  {run.name}", _age(run.made_utc), run.method or "", psnr, gaussians, remark]
+    method = ", ".join(part for part in (run.method, run.quality) if part)
+    if run.seconds is not None:
+        method += f", {run.seconds:.0f} s"
+    poses = (run.poses or "").partition(" (")[0]  # the reason stands in `compare-runs` and in the report
+    if run.pose_error_px is not None:
+        poses += f", off by {run.pose_error_px:.2g} px, {run.pose_error_deg or 0:.2g}°"
+    return [f"  {run.name}", _age(run.made_utc), method, psnr, gaussians, run.problem or poses]
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count:,} {kind.replace('_', ' ')}" for kind, count in counts.items())
 
 
 def _age(utc: str) -> str:

@@ -1,5 +1,6 @@
 """What lies in some folders: sessions with their runs, and what differs between two runs; read, never changed."""
 
+import dataclasses
 import json
 import os
 from collections.abc import Iterator, Sequence
@@ -11,6 +12,7 @@ from typing import Any
 from ground.live_status import line, read_status
 from ground.runs import is_live, read_config, read_metrics, unfinished_folder
 from ground.session import SessionError, flight_counts, read_header, read_records
+from obbgs_core.train.presets import QUALITIES, preset
 
 DEEPEST = 3  # levels of folders below the given ones in which sessions are looked for
 FIGURES = (  # of metrics.json, in the order of a comparison
@@ -23,8 +25,23 @@ FIGURES = (  # of metrics.json, in the order of a comparison
         "lpips_clean",
     ),
     *("chi2", "chamfer", "hausdorff", "completeness_surface", "accuracy_surface", "gaussians", "ply_bytes"),
+    *(
+        "poses",
+        "pose_error_tagged_px",
+        "pose_error_px",
+        "pose_error_deg",
+        "pose_error_range",
+        "size_error_percent",
+    ),
     *("train_seconds", "train_steps", "frames_trained", "frames_held_out"),
 )
+LOST_ON_BOARD = {
+    "frames_failed": "exposures failed",
+    "frames_refused": "refused for lack of room",
+    "frames_dropped": "deleted undelivered",
+}
+LOST_ON_GROUND = {"frames_rejected": "unusable"}
+DIGEST = "_sha256"  # names of settings that end so say nothing to a person
 
 
 @dataclass(frozen=True)
@@ -36,6 +53,10 @@ class RunEntry:
 
     name: str
     method: str | None
+    quality: str | None  # draft, standard or best by its steps, or the number of steps
+    poses: str | None  # what was decided of them, and why
+    pose_error_px: float | None  # root mean square of refined poses, where the truth is known
+    pose_error_deg: float | None
     psnr_clean_db: float | None
     psnr_noisy_db: float | None
     gaussians: int | None
@@ -48,6 +69,9 @@ class RunEntry:
 class SessionEntry:
     """One session; frames_captured is None where the spacecraft did not say how many it took.
 
+    frames_lost: frames that will never come, by what became of them; without those that are 0.
+    frames_missing: frames that have not come and are not known to be lost; at least, where frames_captured is None.
+    link: what was counted on the link, such as segments that came again: it costs time, and no frame.
     problem: why the session cannot be read; its other values are then 0, None or empty.
     """
 
@@ -57,7 +81,9 @@ class SessionEntry:
     frames: int
     frames_captured: int | None
     brackets: int
-    losses: dict[str, int]  # by kind, without the kinds that are 0
+    frames_lost: dict[str, int]
+    frames_missing: int
+    link: dict[str, int]
     size: str  # of the pictures, such as 256x256
     runs: list[RunEntry]
     problem: str
@@ -97,7 +123,16 @@ def _session_entry(folder: Path) -> SessionEntry:
     try:
         header, records = read_header(folder), read_records(folder)
         flight = flight_counts(header)
-        captured = flight.captured(max(r.id for r in records)) if flight and records else None
+        last = max((record.id for record in records), default=-1)
+        captured = flight.captured(last) if flight and records else None
+        counts = {**(dataclasses.asdict(flight) if flight else {}), **header["losses"]}
+        lost = {
+            w: counts[name] for name, w in {**LOST_ON_BOARD, **LOST_ON_GROUND}.items() if counts.get(name)
+        }
+        never_came = sum(
+            counts.get(name, 0) for name in ("frames_refused", "frames_dropped", "frames_rejected")
+        )
+        taken = last + 1 if captured is None else captured
         camera = header["camera"]
         return SessionEntry(
             str(folder),
@@ -106,13 +141,15 @@ def _session_entry(folder: Path) -> SessionEntry:
             len(records),
             captured,
             len({record.bracket for record in records}),
-            {name: count for name, count in header["losses"].items() if count},
+            lost,
+            0 if "imported_from" in header else max(0, taken - len(records) - never_came),
+            {name: n for name, n in header["losses"].items() if n and name not in LOST_ON_GROUND},
             f"{camera['width']}x{camera['height']}",
             _runs(folder),
             "",
         )
     except (SessionError, KeyError, TypeError, ValueError, AttributeError) as error:
-        return SessionEntry(str(folder), "", None, 0, None, 0, {}, "", [], str(error))
+        return SessionEntry(str(folder), "", None, 0, None, 0, {}, 0, {}, "", [], str(error))
 
 
 def _runs(session: Path) -> list[RunEntry]:
@@ -145,6 +182,10 @@ def _run_entry(folder: Path) -> RunEntry:
     return RunEntry(
         name,
         metrics.get("method"),
+        _quality(metrics),
+        metrics.get("poses"),
+        metrics.get("pose_error_px"),
+        metrics.get("pose_error_deg"),
         metrics.get("psnr_clean_db"),
         metrics.get("psnr_noisy_db"),
         metrics.get("gaussians"),
@@ -154,29 +195,44 @@ def _run_entry(folder: Path) -> RunEntry:
     )
 
 
+def _quality(metrics: dict[str, Any]) -> str | None:
+    """Return the quality that a run's steps are those of, such as `draft`; other numbers of steps as they are."""
+    steps = metrics.get("train_steps")
+    if steps is None:
+        return None
+    try:
+        of_method = preset(metrics["method"]).steps
+    except ValueError:  # of an older version, or of changed settings
+        return f"{steps:,} steps"
+    named = {round(of_method * factor): quality for quality, factor in QUALITIES.items()}
+    return named.get(steps, f"{steps:,} steps")
+
+
 def compare_runs(first: Path, second: Path) -> dict[str, dict[str, list]]:
     """Return what differs between two run folders: {"settings": {name: [first, second]}, "figures": the same}.
 
-    Settings are those of config.yaml by their dotted names, without digests and versions that are equal; figures those
-    of metrics.json that either has, also where they are equal.
+    Settings are those of config.yaml by their dotted names that are not equal. Digests are not shown: where those of
+    the frames differ, `session.frames` says so. Figures are the quality and those of metrics.json that either has, also
+    where they are equal.
 
     Raises:
         SessionError: a folder is not a finished run, or its files are damaged.
     """
     settings = [_flat(read_config(folder)) for folder in (first, second)]
     metrics = [read_metrics(folder / "metrics.json") for folder in (first, second)]
-    names = sorted(settings[0].keys() | settings[1].keys())
+    differing = {
+        name: [tree.get(name) for tree in settings]
+        for name in sorted(settings[0].keys() | settings[1].keys())
+        if settings[0].get(name) != settings[1].get(name)
+    }
+    if "session.frames_jsonl_sha256" in differing:
+        counts = [m["frames_received"] for m in metrics]
+        differing["session.frames"] = [f"{counts[0]:,} frames", f"{counts[1]:,} frames, not the same ones"]
+    figures = {"quality": [_quality(m) for m in metrics]}
+    figures |= {key: [m.get(key) for m in metrics] for key in FIGURES}
     return {
-        "settings": {
-            name: [tree.get(name) for tree in settings]
-            for name in names
-            if settings[0].get(name) != settings[1].get(name)
-        },
-        "figures": {
-            key: [m.get(key) for m in metrics]
-            for key in FIGURES
-            if any(m.get(key) is not None for m in metrics)
-        },
+        "settings": {name: pair for name, pair in differing.items() if not name.endswith(DIGEST)},
+        "figures": {key: pair for key, pair in figures.items() if pair != [None, None]},
     }
 
 

@@ -1,6 +1,7 @@
 """The interactive figures of a comparison's page."""
 
 from collections.abc import Callable
+from typing import Any
 
 import plotly.graph_objects as go
 from plotly.colors import qualitative
@@ -89,7 +90,7 @@ def _draw_references(figure: go.Figure, results: Results, target: str, key: str)
         and (value := results.mean(label, target, results.base, key)) is not None
         and value < EXACT_DB
     }
-    drawn = [y for trace in figure.data for y in trace.y] + list(values.values())
+    drawn = [*_drawn(figure, "y"), *values.values()]
     apart = LABELS_APART * (max(drawn) - min(drawn))
     groups: list[list[str]] = []
     for label in sorted(values, key=lambda label: values[label]):
@@ -198,8 +199,14 @@ def gain_figure(results: Results, label: str, base: str) -> go.Figure:
 
 def _draw_log_axis(figure: go.Figure, title: str) -> None:
     """Make the x axis logarithmic, with whole numbers at its ticks."""
-    ticks = ticks_1_2_5(x for trace in figure.data for x in trace.x)
+    ticks = ticks_1_2_5(_drawn(figure, "x"))
     figure.update_xaxes(type="log", title_text=title, tickvals=ticks, ticktext=[f"{t:,g}" for t in ticks])
+
+
+def _drawn(figure: go.Figure, axis: str) -> list[float]:
+    """Return the values of all marks along an axis."""
+    traces: Any = figure.data
+    return [value for trace in traces for value in trace[axis]]
 
 
 def _sized(figure: go.Figure, height_px: int) -> go.Figure:

@@ -34,8 +34,8 @@ def passes(tmp_path_factory) -> Path:
     return folder
 
 
-def called(*arguments: str) -> str:
-    result = CliRunner().invoke(cli.app, arguments, env={"COLUMNS": "200"}, catch_exceptions=False)
+def called(*arguments: str, columns: int = 200) -> str:
+    result = CliRunner().invoke(cli.app, arguments, env={"COLUMNS": str(columns)}, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.output
 
@@ -96,3 +96,47 @@ def test_what_is_not_there_is_said(passes, tmp_path, arguments, told):
     names = {"missing": tmp_path / "nowhere", "runs": passes / "2026" / "pass-12" / "runs"}
     result = CliRunner().invoke(cli.app, [a.format(**names) for a in arguments])
     assert result.exit_code != 0 and told in str(result.exception)
+
+
+def test_lost_is_what_never_comes_and_not_what_the_link_repaired(tmp_path):
+    """Of 60 frames taken 5 were refused and 3 deleted on board, 1 was unusable, 48 have come: 3 are still to come."""
+    session = tmp_path / "pass"
+    shutil.copytree(GOLDEN, session)
+    header = json.loads((session / "session.json").read_text())
+    header["flight"] = {"frames_stored": 55, "frames_refused": 5, "frames_dropped": 3, "frames_failed": 2}
+    header["losses"] = {"segments_resent": 12, "crc_errors": 7, "frames_rejected": 1, "duplicates": 0}
+    (session / "session.json").write_text(json.dumps(header))
+    (found,) = json.loads(called("list", str(tmp_path), "--json"))
+    assert found["frames_lost"] == {
+        "exposures failed": 2,
+        "refused for lack of room": 5,
+        "deleted undelivered": 3,
+        "unusable": 1,
+    }
+    assert (found["frames_captured"], found["frames_missing"]) == (60, 3)
+    assert found["link"] == {"segments_resent": 12, "crc_errors": 7}
+    text = called("list", str(tmp_path), columns=500)
+    assert "48 of 60" in text and "repaired" in text and "3 not received yet" in text
+
+
+def test_a_run_shows_its_quality_what_was_decided_of_poses_and_their_errors_but_no_digest(passes, tmp_path):
+    runs = tmp_path / "pass" / "runs"
+    shutil.copytree(passes / "2026" / "pass-12", tmp_path / "pass")
+    shutil.rmtree(runs / "second")
+    shutil.copytree(runs / "first", runs / "second")
+    steps = round(0.3 * preset("obbgs").steps)
+    errors = {"pose_error_px": 0.31, "pose_error_deg": 0.02, "poses": "refined (held-out loss fell by 3 %)"}
+    metrics = json.loads((runs / "first" / "metrics.json").read_text()) | errors | {"train_steps": steps}
+    (runs / "second" / "metrics.json").write_text(json.dumps(metrics))
+    config = (runs / "second" / "config.yaml").read_text()
+    digest = next(line for line in config.splitlines() if "frames_jsonl_sha256" in line)
+    (runs / "second" / "config.yaml").write_text(config.replace(digest, digest[:-8] + "01234567"))
+    text = called("list", str(tmp_path), columns=500)
+    assert "obbgs, draft" in text and "obbgs, 8 steps" in text
+    assert "refined, off by" in text and "0.31 px" in text
+    text = called("compare-runs", str(runs / "first"), str(runs / "second"), columns=500)
+    assert "sha256" not in text and "not the same ones" in text and "held-out loss fell" in text
+    found = json.loads(called("compare-runs", str(runs / "first"), str(runs / "second"), "--json"))
+    assert found["figures"]["quality"] == ["8 steps", "draft"]
+    assert found["figures"]["pose_error_px"] == [None, 0.31]
+    assert list(found["settings"]) == ["session.frames"]
