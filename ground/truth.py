@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyParseError
 
 from ground.session import FrameRecord, Session, SessionError
+from obbgs_base.ply import PlyError, read_ply, write_ply
 
 GO_ON = "simulate the pass again, or move the folder away to go on without the truth"
 SCHEMA_VERSION = 1  # sessions from before it was written have the same layout
@@ -74,10 +74,9 @@ def write_truth(
         "largest_dimension_m": largest_dimension_m or float(np.ptp(vertices_m, axis=0).max()),
         "simulation": simulation or {},
     }
-    triangles = np.zeros(len(faces), dtype=[("vertex_indices", "i4", (3,))])
-    triangles["vertex_indices"] = faces
-    PlyData([_vertices(vertices_m), PlyElement.describe(triangles, "face")]).write(str(part / "mesh.ply"))
-    PlyData([_vertices(cloud_m)]).write(str(part / "cloud.ply"))
+    triangles = {"vertex_indices": np.asarray(faces, dtype=np.int32)}
+    write_ply(part / "mesh.ply", {"vertex": _vertices(vertices_m), "face": triangles})
+    write_ply(part / "cloud.ply", {"vertex": _vertices(cloud_m)})
     (part / "truth.json").write_text(json.dumps(facts))
     shutil.rmtree(folder, ignore_errors=True)
     part.rename(folder)
@@ -101,11 +100,8 @@ def _write_frame(folder: Path, frame: TrueFrame) -> dict[str, Any]:
     return entry
 
 
-def _vertices(points_m: np.ndarray) -> PlyElement:
-    vertices = np.zeros(len(points_m), dtype=[(axis, "f4") for axis in "xyz"])
-    for column, axis in enumerate("xyz"):
-        vertices[axis] = points_m[:, column]
-    return PlyElement.describe(vertices, "vertex")
+def _vertices(points_m: np.ndarray) -> dict[str, np.ndarray]:
+    return {axis: np.asarray(points_m[:, column], dtype=np.float32) for column, axis in enumerate("xyz")}
 
 
 class Truth:
@@ -204,7 +200,7 @@ def read_points(path: Path) -> np.ndarray:
         SessionError: the file is missing or damaged.
     """
     try:
-        vertices = PlyData.read(str(path))["vertex"]
-        return np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-    except (OSError, ValueError, KeyError, PlyParseError) as error:
+        vertices = read_ply(path).tables["vertex"]
+        return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    except (OSError, KeyError, PlyError) as error:
         raise SessionError(f"{path} is damaged: {error}") from error

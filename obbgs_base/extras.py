@@ -9,7 +9,6 @@ EXTRAS = {
             "onnx",
             "onnxruntime",
             "plotly",
-            "plyfile",
             "scipy",
             "skimage",
             "torch",

@@ -15,6 +15,9 @@ from obbgs_core.model.cameras import Cameras, stacked_suns
 from obbgs_core.model.pose_covariance import flaw
 
 FEWEST_FRAMES = 3
+ROTATION_TOLERANCE = 1e-3  # of R Rᵀ from 1, single precision and printed numbers included
+K_TOLERANCE_PX = 1e-3
+READING_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +64,7 @@ class TrainingFrame:
     exposure_time_s: float
     world_to_camera: Tensor
     K: Tensor
-    id: int = 0  # names the frame in messages
+    id: int = 0  # names the frame in messages; where ids are not unique, its place in the list does
     bracket: int | None = None  # frames of one trigger share a pose correction
     pose_covariance: Tensor | None = None
     sun_dir: Tensor | None = None
@@ -102,13 +105,19 @@ def cameras_of(frames: list[TrainingFrame]) -> Cameras:
     return Cameras(poses, K, width, height, sun_dir=suns, psf_sigma_px=psf_sigma_px, background=background)
 
 
-def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[TrainingFrame], float | None]:
+def usable(
+    frames: list[TrainingFrame], exposure_aware: bool, white_dn: float = math.inf
+) -> tuple[list[TrainingFrame], float | None]:
     """Return the checked frames, in single precision; if exposure is ignored, all take the exposures' geometric mean.
+
+    Args:
+        white_dn: the largest reading that the sensor gives.
 
     Raises:
         TooFewFrames: fewer than three.
         ReconstructionError: a shape is not that of `TrainingFrame` or a picture smaller than 3x3 pixels; sizes or
-            backgrounds differ, a value is not finite, or a pose covariance is not a covariance.
+            backgrounds differ, a value is not finite, a reading is above `white_dn`, a pose is not a rotation with a
+            translation, K is not a pinhole matrix without skew, or a pose covariance is not a covariance.
     """
     if len(frames) < FEWEST_FRAMES:
         raise TooFewFrames(f"a reconstruction needs at least {FEWEST_FRAMES} frames, got {len(frames)}")
@@ -118,6 +127,8 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
         )
         for f in frames
     ]
+    if len({f.id for f in frames}) < len(frames):  # ids that name no frame: places in the list do
+        frames = [dataclasses.replace(f, id=position) for position, f in enumerate(frames)]
     for f in frames:
         if f.dn.ndim != 3 or f.dn.shape[2] not in (1, 3) or min(f.dn.shape[:2]) < 3:
             raise ReconstructionError(
@@ -156,6 +167,8 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
             raise ReconstructionError(
                 f"frame {f.id} holds a value or a pose that is not finite, or no exposure time; leave it out"
             )
+        if fault := _pinhole_fault(f, white_dn):
+            raise ReconstructionError(f"frame {f.id}: {fault}")
         if f.pose_covariance is not None and (fault := flaw(f.pose_covariance)):
             raise ReconstructionError(
                 f"frame {f.id} has a pose covariance that {fault}, expected a symmetric [6, 6] without negative "
@@ -167,10 +180,43 @@ def usable(frames: list[TrainingFrame], exposure_aware: bool) -> tuple[list[Trai
     return [dataclasses.replace(f, exposure_time_s=reference_s) for f in frames], reference_s
 
 
+def _pinhole_fault(frame: TrainingFrame, white_dn: float) -> str | None:
+    """Return what of a frame no pinhole camera and sensor can have, and what to do; None if all is well."""
+    rotation, K = frame.world_to_camera[:3, :3].double(), frame.K.double()
+    size = torch.linalg.det(rotation).item()
+    if (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max() > ROTATION_TOLERANCE:
+        return (
+            "world_to_camera [:3, :3] must be a rotation, but its rows are not orthonormal (determinant "
+            f"{size:.4g}); take a scale out of the pose"
+        )
+    if size < 0:
+        return "world_to_camera is mirrored (determinant -1), expected a rotation; flip one axis of the pose"
+    if not torch.equal(frame.world_to_camera[3].double(), torch.tensor([0.0, 0, 0, 1], dtype=torch.float64)):
+        return f"the last row of world_to_camera must be 0 0 0 1, got {frame.world_to_camera[3].tolist()}"
+    if not (K[0, 0] > 0 and K[1, 1] > 0):
+        return (
+            f"the focal lengths must be positive, got {K[0, 0]:.4g} and {K[1, 1]:.4g} px; OpenGL's y axis points up: "
+            "turn the pose's y and z axes over instead"
+        )
+    below = torch.stack([K[1, 0], K[2, 0], K[2, 1], K[2, 2] - 1]).abs().max().item()
+    if below > K_TOLERANCE_PX or abs(K[0, 1]) > K_TOLERANCE_PX:
+        return (
+            f"K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; a picture with skew must be warped to "
+            "one without, which `ground import` does"
+        )
+    highest = frame.dn.max().item()
+    if highest > white_dn * (1 + READING_TOLERANCE):
+        return (
+            f"it has readings of {highest:.6g} DN, above the sensor's white_dn of {white_dn:.6g}; 12 bits that are "
+            "shifted into 16 must be shifted back, or white_dn be that of the readings"
+        )
+    return None
+
+
 def bracket_numbers(frames: list[TrainingFrame]) -> list[int]:
-    """Return the bracket of each frame, counted from 0; a frame that names none is one by itself."""
+    """Return the bracket of each frame, counted from 0; a frame that names none is one by itself, whatever its id."""
     numbers: dict[int, int] = {}
-    keys = [f.id if f.bracket is None else -1 - f.bracket for f in frames]
+    keys = [-1 - position if f.bracket is None else f.bracket for position, f in enumerate(frames)]
     return [numbers.setdefault(key, len(numbers)) for key in keys]
 
 

@@ -16,10 +16,16 @@ Most viewers widen every Gaussian by 0.3 px² of their screen and keep its peak,
 stands in a comment, and `opacity` is then made for such viewers: the model's own, which follows as fitted_opacity,
 times the root of the share by which 0.3 px² would lower the peak at the distance of the cameras. All of the share would
 match there and let a viewer see through the surface from nearer.
+
+Tools that write a PLY again drop its comments, so what reading a model needs stands in columns too, with the same value
+in every row: shading, ambient, footprint, psf_sigma_px, gloss_0 and so on, static_sun_0 and so on. The last
+column, row_check, is a hash of its row: rows may be left out or sorted anew, but none that was changed is taken.
 """
 
 import dataclasses
 import math
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +34,12 @@ import torch
 from torch import Tensor
 
 from obbgs_base.files import write_whole
+from obbgs_base.ply import PlyError, read_ply
 from obbgs_core.errors import ExportError, ReconstructionError
 from obbgs_core.model import sh
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.footprint import KERBL_PX2, PIXEL_PX2, lowers_peak
-from obbgs_core.model.gaussians import Gaussians, Shading
+from obbgs_core.model.gaussians import Footprint, Gaussians, Shading
 from obbgs_core.render import lit_from, project
 
 DISPLAY_GAMMA = 2.2
@@ -42,6 +49,15 @@ LOBE_NAMES = ("lobe_x", "lobe_y", "lobe_z", "lobe_log_weight")
 HIGHLIGHTS = "comment highlights: GGX of alpha "
 STATIC_SUN = ", Sun towards "
 LAMBERT = "comment radiance_sh are albedos in units of the Sun's light, ambient light "
+SHADINGS: tuple[Shading, ...] = ("view", "sun", "lambert")  # a column holds the place in this list
+FOOTPRINTS: tuple[Footprint, ...] = ("kerbl", "camera", "mip-splatting")
+ROW_CHECK = "row_check"
+RADIANCE = re.compile(r"radiance_sh_(\d{1,2})_(\d)", re.ASCII)
+FACTS = re.compile(r"shading|ambient|footprint|psf_sigma_px|(gloss|static_sun)_\d", re.ASCII)
+OWN_COLUMNS = re.compile(
+    rf"[xyz]|(f_dc|f_rest|scale|rot)_\d+|(fitted_)?opacity|lobe_\w+|{FACTS.pattern}|{RADIANCE.pattern}",
+    re.ASCII,
+)
 
 
 def display_sh(gaussians: Gaussians, white_radiance: float) -> Tensor:
@@ -117,6 +133,8 @@ def save_ply(
         }
     if for_viewers is not None:
         table["fitted_opacity"] = gaussians.opacity_logits
+    table |= _facts(gaussians)
+    table[ROW_CHECK] = _row_check(table)
     comments = [
         f"comment f_dc and f_rest: (radiance / {white_radiance:.9g})^(1/{DISPLAY_GAMMA}); radiance_sh: scene-linear"
     ]
@@ -173,64 +191,129 @@ def _ply(table: dict[str, Tensor], *comments: str) -> bytes:
 
 
 def load_ply(path: Path) -> Gaussians:
-    """Return the model in a PLY that `save_ply` wrote.
+    """Return the model in a PLY that `save_ply` wrote, also if another tool wrote its columns and rows again.
+
+    Byte order, order of the columns and of the rows do not matter, rows may be missing, and so may comments.
 
     Raises:
-        ReconstructionError: the file is something else, or truncated.
+        ReconstructionError: the file is something else, is cut off, or its Gaussians are not those that were written:
+            another tool rotated, scaled, coloured or rounded them, or dropped what the model needs.
     """
-    data = path.read_bytes()
-    head, mark, body = data.partition(b"end_header\n")
-    lines = head.decode("ascii", "replace").split("\n")
-    names = [line.split()[-1] for line in lines if line.startswith("property float ")]
-    sizes = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
-    counts = [int(size) for size in sizes if size.isdecimal()]
-    if not mark or not data.startswith(b"ply\n") or len(counts) != 1 or "radiance_sh_0_0" not in names:
-        raise ReconstructionError(f"{path} is not a model written by this software")
-    if len(body) != 4 * counts[0] * len(names):
-        raise ReconstructionError(
-            f"{path} should hold {4 * counts[0] * len(names)} bytes of numbers, has {len(body)}"
-        )
-    columns = torch.from_numpy(np.frombuffer(body, "<f4").reshape(-1, len(names)).T.copy())
-    table = dict(zip(names, columns, strict=True))
     try:
-        return _model_of(table, lines)
+        content = read_ply(path)
+    except (PlyError, OSError) as error:
+        raise ReconstructionError(f"{path} is not a model written by this software: {error}") from error
+    columns = content.tables.get("vertex", {})
+    if "radiance_sh_0_0" not in columns:
+        raise ReconstructionError(
+            f"{path} is not a model written by this software: it has no column radiance_sh_0_0"
+        )
+    if any(values.ndim != 1 or values.dtype.kind != "f" for values in columns.values()):
+        raise ReconstructionError(f"{path} is damaged: expected every column of vertex to be of type float")
+    table = {name: torch.from_numpy(values.astype(np.float32)) for name, values in columns.items()}
+    if ROW_CHECK in table and (changed := int((_row_check(table) != table[ROW_CHECK]).sum())):
+        raise ReconstructionError(
+            f"{path}: another tool changed {changed} of its {len(table[ROW_CHECK])} Gaussians (rotated, scaled, "
+            "coloured or rounded them), so that what they mean together is lost; take the file as it was written"
+        )
+    try:
+        return _model_of(table, content.comments)
     except (LookupError, RuntimeError, ValueError) as error:
         raise ReconstructionError(
             f"{path} is damaged: its header does not describe a model: {error}"
         ) from error
 
 
-def _model_of(table: dict[str, Tensor], lines: list[str]) -> Gaussians:
-    """Return the model of a PLY's columns and the lines of its header."""
-    names = list(table)
-    radiance = [name for name in names if name.startswith("radiance_sh_")]
-    channels = 1 + max(int(name.split("_")[3]) for name in radiance)
-    if len(radiance) % channels:
-        raise ValueError(f"{len(radiance)} columns of radiance for {channels} channels")
-    shading: Shading = "view"
-    ambient = torch.zeros(())
-    fitted: dict[str, Any] = {}
-    for line in lines:
+def _row_check(table: dict[str, Tensor]) -> Tensor:
+    """Return 24 bits [N] of a hash over each row's own columns, by name, as whole numbers that a float holds exactly.
+
+    Source: FNV-1a (Fowler, Noll, Vo), over words of 32 bits.
+    """
+    names = sorted(name for name in table if OWN_COLUMNS.fullmatch(name))
+    hashed = np.full(len(table[names[0]]), 0x811C9DC5, dtype=np.uint32)
+    for name in names:
+        hashed = (hashed ^ table[name].detach().cpu().numpy().astype("<f4").view("<u4")) * np.uint32(
+            0x01000193
+        )
+    return torch.from_numpy((hashed >> np.uint32(8)).astype(np.float32))
+
+
+def _facts(gaussians: Gaussians) -> dict[str, Tensor]:
+    """Return what the model is beside its Gaussians, as columns [N] with one value each; none of a plain model."""
+    facts: dict[str, Tensor] = {}
+    if gaussians.shading != "view":
+        facts["shading"] = torch.tensor(float(SHADINGS.index(gaussians.shading)))
+        facts["ambient"] = gaussians.ambient
+    if gaussians.footprint != "kerbl":
+        facts["footprint"] = torch.tensor(float(FOOTPRINTS.index(gaussians.footprint)))
+        facts["psf_sigma_px"] = gaussians.psf_sigma_px
+    if gaussians.has_highlights:
+        facts |= {f"gloss_{i}": value for i, value in enumerate(gaussians.gloss)}
+        facts |= {f"static_sun_{i}": value for i, value in enumerate(gaussians.static_sun)}
+    return {name: value.float().expand(len(gaussians)) for name, value in facts.items()}
+
+
+def _read_facts(table: dict[str, Tensor]) -> dict[str, Any]:
+    """Return the arguments of Gaussians that columns of `_facts` hold."""
+    values = {}
+    for name, column in table.items():
+        if FACTS.fullmatch(name):
+            if len(column) and not (column == column[0]).all():
+                raise ValueError(f"{name} differs between Gaussians, as if two models were joined")
+            values[name] = column[0].clone()
+    found: dict[str, Any] = {}
+    if "shading" in values:
+        found |= {"shading": SHADINGS[int(values["shading"])], "ambient": values["ambient"]}
+    if "footprint" in values:
+        found |= {
+            "footprint": FOOTPRINTS[int(values["footprint"])],
+            "psf_sigma_px": values["psf_sigma_px"],
+        }
+    for name in ("gloss", "static_sun"):
+        count = sum(key.startswith(f"{name}_") for key in values)
+        if count:
+            found[name] = torch.stack([values[f"{name}_{i}"] for i in range(count)])
+    return found
+
+
+def _read_comments(comments: Sequence[str]) -> dict[str, Any]:
+    """Return the same from comments, where alone files of version 0.2 and before hold it."""
+    found: dict[str, Any] = {}
+    for line in (f"comment {text}" for text in comments):
         if line.startswith(FOOTPRINT):
             footprint, _, psf_sigma_px = line.removeprefix(FOOTPRINT).partition(", psf_sigma_px ")
-            fitted |= {"footprint": footprint, "psf_sigma_px": torch.tensor(float(psf_sigma_px))}
+            found |= {"footprint": footprint, "psf_sigma_px": torch.tensor(float(psf_sigma_px))}
         if line.startswith(HIGHLIGHTS):
             material, _, sun = line.removeprefix(HIGHLIGHTS).partition(";")[0].partition(STATIC_SUN)
             alpha, _, peak = material.partition(", peak radiance ")
-            fitted["gloss"] = torch.tensor([float(value) for value in (alpha, *peak.split())]).log()
-            fitted["static_sun"] = torch.tensor([float(value) for value in sun.split()])
-            fitted["lobes"] = torch.stack([table[name] for name in LOBE_NAMES if name in table], 1)
+            found["gloss"] = torch.tensor([float(value) for value in (alpha, *peak.split())]).log()
+            found["static_sun"] = torch.tensor([float(value) for value in sun.split()])
         if line.startswith(TURNS_WITH_SUN):
-            shading = "sun"
+            found["shading"] = "sun"
         elif line.startswith(LAMBERT):
-            shading, ambient = "lambert", torch.tensor(float(line.removeprefix(LAMBERT).partition(";")[0]))
+            ambient = float(line.removeprefix(LAMBERT).partition(";")[0])
+            found |= {"shading": "lambert", "ambient": torch.tensor(ambient)}
+    return found
+
+
+def _model_of(table: dict[str, Tensor], comments: Sequence[str]) -> Gaussians:
+    """Return the model of a PLY's columns and comments; the columns' order means nothing."""
+    indices = [tuple(map(int, m.groups())) for name in table if (m := RADIANCE.fullmatch(name))]
+    coefficients, channels = (1 + max(index) for index in zip(*indices, strict=True))
+    facts = _read_comments(comments) | _read_facts(table)
+    if "fitted_opacity" in table and "footprint" not in facts:
+        raise ValueError("its footprint is missing, which its comments told; another tool dropped them")
+    lobes = [table[name] for name in LOBE_NAMES if name in table]
+    if bool(lobes) != ("gloss" in facts):
+        raise ValueError("its highlights have no material or no lobes; another tool dropped them")
+    if lobes:
+        facts["lobes"] = torch.stack(lobes, 1)
+    radiance = [table[f"radiance_sh_{k}_{c}"] for k in range(coefficients) for c in range(channels)]
     return Gaussians(
         means=torch.stack([table[a] for a in "xyz"], 1),
         quats=torch.stack([table[f"rot_{i}"] for i in range(4)], 1),
         log_scales=torch.stack([table[f"scale_{i}"] for i in range(3)], 1),
-        opacity_logits=table.get("fitted_opacity", table["opacity"]),
-        sh=torch.stack([table[name] for name in radiance], 1).reshape(len(table["x"]), -1, channels),
-        shading=shading,
-        ambient=ambient,
-        **fitted,
+        opacity_logits=table["fitted_opacity"] if "fitted_opacity" in table else table["opacity"],
+        sh=torch.stack(radiance, 1).reshape(len(table["x"]), coefficients, channels),
+        **facts,
     )

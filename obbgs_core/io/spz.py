@@ -16,7 +16,9 @@ radiance, their higher harmonics to -1 .. 1.
 import gzip
 import math
 import re
+import struct
 import tempfile
+import zlib
 from pathlib import Path
 
 import gsply
@@ -33,6 +35,9 @@ from obbgs_core.render import lit_from
 FLIP = torch.tensor([1.0, -1.0, -1.0])  # a rotation by 180 degrees about x, its own inverse
 LARGEST_FIXED_POINT = 2**23 - 1
 MAX_FRACTIONAL_BITS = 16  # 15 um: finer than any sigma that SPZ can hold
+CONTENT_HEADER, SPZ_MAGIC = struct.Struct("<IIIBBBB"), 0x5053474E
+BYTES_EACH = 20  # of a Gaussian without harmonics, in version 3
+MOST_GAUSSIANS, PIECE_BYTES = 10_000_000, 1 << 20  # as many as Niantic's own reader takes
 GZIP_HEADER_BYTES = 10
 GZIP_HAS_COMMENT = 0x10
 FLAGS_BYTE, FLAG_ANTIALIASED = (
@@ -97,8 +102,9 @@ def load_spz(path: Path) -> Gaussians:
     if not start.startswith(b"\x1f\x8b") or not note:
         raise ReconstructionError(f"{path} is not an SPZ written by this software: no radiance scale in it")
     try:
+        _check_size(path.read_bytes())
         packed = gsply.read_spz(path)
-    except ValueError as error:
+    except (ValueError, zlib.error, EOFError, OSError) as error:
         raise ReconstructionError(f"{path} is damaged: {error}") from error
     means, log_scales, quats, opacity_logits, f_dc = (
         torch.from_numpy(array.copy())
@@ -121,6 +127,34 @@ def load_spz(path: Path) -> Gaussians:
         sh=radiance_sh(shown, float(note[1]), int(note[2])),
         **fitted,
     )
+
+
+def _check_size(content: bytes) -> None:
+    """Check, before all of it is inflated, that a file holds as many bytes as its header says, and not too many.
+
+    Raises:
+        ValueError: it does not.
+        zlib.error: it is no gzip.
+    """
+    stream = zlib.decompressobj(wbits=31)  # one gzip member
+    header = stream.decompress(content, CONTENT_HEADER.size)
+    if len(header) < CONTENT_HEADER.size:
+        raise ValueError("it ends before its header does")
+    magic, version, count, degree, *_ = CONTENT_HEADER.unpack(header)
+    if magic != SPZ_MAGIC or version != 3 or degree > 3:
+        raise ValueError(
+            f"expected SPZ of version 3 and degree 0 to 3, got version {version}, degree {degree}"
+        )
+    if count > MOST_GAUSSIANS:
+        raise ValueError(f"it says that it holds {count} Gaussians; at most {MOST_GAUSSIANS} are read")
+    left = count * (BYTES_EACH + 3 * ((degree + 1) ** 2 - 1))
+    while left >= 0 and not stream.eof:
+        piece = stream.decompress(stream.unconsumed_tail, min(left + 1, PIECE_BYTES))
+        if not piece and not stream.unconsumed_tail and not stream.eof:
+            break
+        left -= len(piece)
+    if left or not stream.eof or stream.unused_data:
+        raise ValueError(f"it does not hold the {count} Gaussians that its header says")
 
 
 def _sh_signs(count: int) -> torch.Tensor:

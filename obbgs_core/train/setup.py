@@ -135,7 +135,7 @@ def prepare(
     Raises:
         TooFewFrames, ReconstructionError: as in `train`.
     """
-    checked, reference_exposure_s = usable(frames, asked.exposure_aware)
+    checked, reference_exposure_s = usable(frames, asked.exposure_aware, sensor.white_dn)
     sensor, noise = _with_noise_seen(checked, sensor)
     shown = [shows_light(light(f.dn, sensor, f.background, f.exposure_time_s), sensor) for f in checked]
     lit = _lit(checked, shown)

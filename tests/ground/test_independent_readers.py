@@ -9,7 +9,6 @@ import imagecodecs
 import numpy as np
 import pytest
 import torch
-from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 from obbgs_core.io.gltf_splats import save_gltf_splats
@@ -18,7 +17,7 @@ from obbgs_core.io.spz import save_spz
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
-from tests import readers, scenes
+from tests import ply_by_trimesh, readers, scenes
 from tests.browser import chromium, opened
 
 SIZE_PX, FOCAL_PX, RANGE_M = 256, 400.0, 5.0
@@ -248,8 +247,8 @@ def test_splat_transform_reads_both_files_as_the_same_model(programs, tmp_path, 
     read = {}
     for file in ("model.ply", "model.spz"):
         readers.splat_transform(programs, tmp_path / file, tmp_path / f"{file}.ply")
-        read[file] = PlyData.read(tmp_path / f"{file}.ply")["vertex"].data
-    written = PlyData.read(tmp_path / "model.ply")["vertex"].data
+        read[file] = ply_by_trimesh.read(tmp_path / f"{file}.ply")
+    written = ply_by_trimesh.read(tmp_path / "model.ply")
     names = ["x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)), *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(3 * (sh_count - 1))]
     for name in names:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import onnxruntime
-import plyfile
 import pytest
 import torch
 import yaml
@@ -32,6 +31,7 @@ from obbgs_base.errors import Interrupted
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.io.ply import load_ply
 from obbgs_core.train.presets import PRESETS
+from tests import ply_by_trimesh
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
 TRAINED = {"steps": 700, "start.count": 2500, "growth.max_gaussians": 3000}
@@ -130,7 +130,7 @@ def test_every_output_is_there_and_the_card_says_what_they_are(trained):
     for name in ("ply", "spz", "onnx"):
         size_bytes = (folder / f"model.{name}").stat().st_size
         assert metrics[f"{name}_bytes"] == size_bytes and f"| {size_bytes:,} |" in card
-    vertices = plyfile.PlyData.read(str(folder / "surface.ply"))["vertex"]
+    vertices = ply_by_trimesh.read(folder / "surface.ply")
     normals = np.stack([vertices[axis] for axis in ("nx", "ny", "nz")], axis=1)
     assert len(vertices) == 100_000
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)

@@ -15,7 +15,7 @@ from obbgs_core.io.gltf_splats import EXTENSION, save_gltf_splats
 from obbgs_core.io.ply import save_ply
 from obbgs_core.model import sh
 from obbgs_core.model.gaussians import Gaussians
-from tests import readers, scenes
+from tests import ply_by_trimesh, readers, scenes
 
 WHITE_RADIANCE = 2.0
 BODY_TO_GLTF = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # z up to y up, as the node of model.glb
@@ -101,9 +101,7 @@ def test_the_file_holds_the_model_with_its_z_axis_up(tmp_path, sh_count, channel
     np.testing.assert_allclose(arrays["COLOR_0"][:, 3], gaussians.opacities.numpy(), atol=1 / 65535)
     display = {}
     save_ply(gaussians, tmp_path / "model.ply", WHITE_RADIANCE)
-    from plyfile import PlyData
-
-    table = PlyData.read(tmp_path / "model.ply")["vertex"].data
+    table = ply_by_trimesh.read(tmp_path / "model.ply")
     for k in range(sh_count):
         names = [f"f_dc_{c}" if k == 0 else f"f_rest_{c * (sh_count - 1) + k - 1}" for c in range(3)]
         display[k] = np.stack([table[name] for name in names], axis=1)

@@ -4,6 +4,8 @@ import dataclasses
 import gzip
 import math
 import struct
+import tracemalloc
+import zlib
 
 import numpy as np
 import pytest
@@ -164,6 +166,32 @@ def test_a_foreign_or_cut_file_is_refused(tmp_path):
         (tmp_path / "b.spz").write_bytes(broken)
         with pytest.raises(ReconstructionError):
             load_spz(tmp_path / "b.spz")
+
+
+@pytest.mark.parametrize(("count", "inflated"), [(5, 300_000_000), (3_000_000_000, 1000), (9_999_999, 1000)])
+def test_a_file_that_inflates_to_more_or_less_than_its_header_says_costs_no_memory(tmp_path, count, inflated):
+    save_spz(ball(5), tmp_path / "m.spz", WHITE)
+    content = (tmp_path / "m.spz").read_bytes()
+    start = content[: content.index(b"\0", 10) + 1]  # gzip's header with our comment
+    stream = zlib.compressobj(9, zlib.DEFLATED, -15)
+    packed = stream.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, count, 0, 12, 0, 0))
+    packed += b"".join(
+        stream.compress(bytes(min(1_000_000, inflated))) for _ in range(inflated // 1_000_000 + 1)
+    )
+    (tmp_path / "b.spz").write_bytes(start + packed + stream.flush() + bytes(8))
+    tracemalloc.start()
+    with pytest.raises(ReconstructionError, match=r"b\.spz is damaged"):
+        load_spz(tmp_path / "b.spz")
+    assert tracemalloc.get_traced_memory()[1] < 20e6  # bytes
+    tracemalloc.stop()
+
+
+def test_bytes_after_the_model_are_refused(tmp_path):
+    save_spz(ball(5), tmp_path / "m.spz", WHITE)
+    content = (tmp_path / "m.spz").read_bytes()
+    (tmp_path / "b.spz").write_bytes(content + gzip.compress(bytes(10_000)))
+    with pytest.raises(ReconstructionError, match="does not hold the 5 Gaussians"):
+        load_spz(tmp_path / "b.spz")
 
 
 @pytest.mark.parametrize("footprint", ["camera", "mip-splatting"])
