@@ -4,7 +4,6 @@ Changes are named as in `preset`: `steps`, or `growth.interval` for a setting of
 """
 
 import operator
-import re
 from collections.abc import Sequence
 
 from flightsw.icd.mission import ConfigError, ReconstructSection, build, parse_yaml
@@ -81,8 +80,6 @@ def set_changes(assignments: Sequence[str]) -> dict:
         if not equals or not key:
             raise ConfigError("--set", f"expected key=value, got {text!r}")
         given = parse_yaml(value.encode(), f"--set {key}")
-        if isinstance(given, str) and re.fullmatch(r"\s*[+-]?\d+[eE][+-]?\d+\s*", value):
-            given = float(value)  # YAML takes 2e-3, without a point, for text
         group, dot, name = key.partition(".")
         tree = {group: {name: given} if dot else given}
         for name, setting in checked_settings(tree, "--set").items():

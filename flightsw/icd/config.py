@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import re
 import types
 import typing
 from collections.abc import Iterator
@@ -55,14 +56,27 @@ def keys_below(path: str, own_path: str) -> Iterator[None]:
         raise ConfigError(moved, error.problem, error.file) from error.__cause__
 
 
+class _Loader(yaml.SafeLoader):
+    """PyYAML's loader, to which 4.0e7, 2e-3 and 1E5 are numbers as in YAML 1.2; to YAML 1.1 they are text."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$"),
+    list("-+.0123456789"),
+)
+
+
 def parse_yaml(content: bytes, path: str) -> Any:
     """Return what a YAML text holds; YAML itself would silently keep the last of two equal keys.
+
+    Numbers with an exponent may be written as everywhere else, such as 4.0e7.
 
     Raises:
         ConfigError: not YAML, or a key is written twice; the path of the key starts with `path`.
     """
     try:
-        loader = yaml.SafeLoader(content)
+        loader = _Loader(content)
         try:
             node = loader.get_single_node()
             _refuse_repeated_keys(node, path, set())

@@ -30,6 +30,23 @@ def test_a_text_without_repeated_keys_is_read_as_by_the_lenient_readers(tree):
     assert parse_json(json.dumps(tree).encode(), "x") == tree
 
 
+@given(
+    st.floats(allow_nan=False, allow_infinity=False, width=32),
+    st.sampled_from(["{:e}", "{:.3g}", "{:.0e}", "{!r}", "{:E}", "{:+.2e}", "{:#.0e}"]),
+    st.booleans(),
+)
+def test_a_number_is_read_as_python_reads_it_however_its_exponent_is_written(number, form, short):
+    text = form.format(number)
+    text = text.replace("e+", "e").replace("E+", "E") if short else text
+    value = parse_yaml(f"a: {text}".encode(), "x")["a"]
+    assert isinstance(value, (int, float)) and value == float(text)
+    assert parse_yaml(f"a: '{text}'\nb: x{text}\nc: {text}m".encode(), "x") == {
+        "a": text,
+        "b": f"x{text}",
+        "c": f"{text}m",
+    }
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
