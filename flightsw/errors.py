@@ -37,3 +37,9 @@ class DownlinkError(FlightError):
 
 class TriageError(FlightError):
     """A model or a frame cannot be used for triage."""
+
+
+class TriageMissing(TriageError):
+    """Triage needs onnxruntime, an extra of the package, which is not installed."""
+
+    exit_code = 2

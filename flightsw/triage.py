@@ -17,10 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from flightsw.errors import TriageError
+from flightsw.errors import TriageError, TriageMissing
 from flightsw.icd.frame import FLAG_ECLIPSE, FLAG_POSE_VALID, Frame, decode_frame, read_header
 from flightsw.icd.packet import PacketError
 from flightsw.model_file import verified_model
+from obbgs_base.extras import install_command
 
 log = logging.getLogger(__name__)
 
@@ -64,13 +65,14 @@ class Renderer:
     Raises:
         TriageError: not a model, too large, not of standard operators, not all in one file, or without what triage
             needs.
+        TriageMissing: onnxruntime is not installed.
     """
 
     def __init__(self, path: Path, threads: int = 1):
         try:
             import onnxruntime
         except ImportError as error:
-            raise TriageError("triage needs onnxruntime: pip install 'obbgs[onnx]'") from error
+            raise TriageMissing(f"triage needs onnxruntime: {install_command('onnx')}") from error
         content = verified_model(path)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = threads

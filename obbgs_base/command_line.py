@@ -3,14 +3,13 @@
 import logging
 import sys
 from collections.abc import Iterable
-from importlib.metadata import version
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from obbgs_base.errors import Interrupted, ObbgsError
-from obbgs_base.extras import how_to_install
+from obbgs_base.extras import how_to_install, installed_package
 
 
 class _Group(TyperGroup):
@@ -27,7 +26,7 @@ class _Group(TyperGroup):
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        print(f"obbgs {version('obbgs')}")
+        print(*installed_package())
         raise typer.Exit
 
 

@@ -1,4 +1,8 @@
-"""Which modules belong to which extra of the package, so that a command can say what to install for a missing one."""
+"""Which package this code was installed by, and which modules belong to which extra of it, for what a command says."""
+
+from importlib import metadata
+
+PACKAGES = ("obbgs", "obbgs-flight")  # the whole, and the flight software alone
 
 EXTRAS = {
     "ground": {
@@ -20,6 +24,24 @@ EXTRAS = {
 }
 
 
+def installed_package() -> tuple[str, str]:
+    """Return name and version of the package that this code was installed by; the whole one where nothing is installed.
+
+    The version of a mere copy of the sources is "0, not installed".
+    """
+    for name in PACKAGES:
+        try:
+            return name, metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return PACKAGES[0], "0, not installed"
+
+
+def install_command(extra: str) -> str:
+    """Return the command that installs an extra of this package."""
+    return f"pip install '{installed_package()[0]}[{extra}]'"
+
+
 def how_to_install(error: ModuleNotFoundError, extra: str) -> str | None:
     """Return how to get a missing module that belongs to an extra of this package; None for any other module.
 
@@ -31,6 +53,6 @@ def how_to_install(error: ModuleNotFoundError, extra: str) -> str | None:
         return None
     extra = next((name for name in ("compare", "view") if module in EXTRAS[name]), extra)
     return (
-        f"this command needs {module}, which is not installed: pip install 'obbgs[{extra}]', "
+        f"this command needs {module}, which is not installed: {install_command(extra)}, "
         f"or in a clone of the project: pip install '.[{extra}]'"
     )

@@ -1,5 +1,8 @@
-"""What is installed by `pip install obbgs` and by its extras, and what a command says where its extra is missing."""
+"""What is installed by `pip install obbgs` and by its extras, what a command says where its extra is missing, and that
+every command runs from the wheels, where nothing is but what they hold and ask for."""
 
+import os
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -11,6 +14,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from obbgs_base.extras import EXTRAS
+from tests.wheels import environment, flight_wheel, whole_wheel
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -120,3 +124,83 @@ def test_every_extra_of_the_package_is_known_to_the_message():
     listed = {extra: requirements(extra)[len(requirements()) :] for extra in EXTRAS}
     names = {extra: {modules.get(r.name, r.name) for r in wanted} for extra, wanted in listed.items()}
     assert names == EXTRAS
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory) -> Path:
+    """The commands of the flight software's wheel, without its extra."""
+    folder = tmp_path_factory.mktemp("flight")
+    return environment(flight_wheel(folder), set(), folder / "environment")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """The commands of the whole wheel with the extras that the simulator needs."""
+    folder = tmp_path_factory.mktemp("whole")
+    return environment(whole_wheel(folder), {"hil"}, folder / "environment")
+
+
+def run_installed(commands: Path, tool: str, *arguments: str, code: int = 0) -> str:
+    """Run a command of an environment away from the sources; return what it says where its exit code is this."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "COV"))}
+    done = subprocess.run(
+        [str(commands / tool), *arguments],
+        cwd=commands,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
+    assert done.returncode == code and "Traceback" not in done.stderr, done.stderr
+    return done.stdout + done.stderr
+
+
+HELP_OF_ALL = """
+import importlib, sys
+import typer
+from typer.testing import CliRunner
+
+def commands(group, *path):
+    for name, command in group.commands.items():
+        yield from commands(command, *path, name) if hasattr(command, "commands") else [(*path, name)]
+
+for tool in sys.argv[1:]:
+    module = importlib.import_module(f"{tool}.cli")
+    assert module.__file__.startswith(sys.prefix), module.__file__
+    for path in [(), *commands(typer.main.get_command(module.app))]:
+        done = CliRunner().invoke(module.app, [*path, "--help"])
+        assert done.exit_code == 0 and "Usage:" in done.output, (tool, path, done.output, done.exception)
+        print(tool, *path)
+"""
+
+
+def test_every_command_of_the_flight_wheel_runs_from_it(flight, tmp_path):
+    helped = run_installed(flight, "python", "-c", HELP_OF_ALL, "flightsw").splitlines()
+    assert {"flightsw", "flightsw serve", "flightsw plan", "flightsw selftest"} <= set(helped)
+    version = PROJECT["version"]
+    assert run_installed(flight, "flightsw", "--version") == f"obbgs-flight {version}\n"
+    mission = ("--mission", str(ROOT / "mission.yaml"))
+    assert "pass: brackets 0 to " in run_installed(flight, "flightsw", "plan", *mission)
+    model = ("--model", str(ROOT / "no.onnx"), "--frames", str(tmp_path))
+    hint = run_installed(flight, "flightsw", "triage", *model, *mission, code=2)
+    assert "pip install 'obbgs-flight[onnx]'" in hint
+    assert "no frame store" in run_installed(flight, "flightsw", "fsck", "--store", str(tmp_path), code=1)
+
+
+def test_every_command_of_the_whole_wheel_runs_from_it(whole, tmp_path):
+    helped = run_installed(whole, "python", "-c", HELP_OF_ALL, "flightsw", "ground", "hil").splitlines()
+    assert {"flightsw plan", "ground reconstruct", "ground list", "hil demo"} <= set(helped)
+    for tool in ("flightsw", "ground", "hil"):
+        assert run_installed(whole, tool, "--version") == f"obbgs {PROJECT['version']}\n"
+    session = tmp_path / "session"
+    shutil.copytree(GOLDEN, session)
+    run_installed(whole, "hil", "target", "--out", str(tmp_path / "target.glb"))
+    run_installed(whole, "ground", "key", str(tmp_path / "mission.key"))
+    run_installed(
+        whole, "ground", "reconstruct", "--session", str(session), "--name", "two", "--set", "steps=2"
+    )
+    assert "two" in run_installed(whole, "ground", "list", str(tmp_path))
+    hint = run_installed(
+        whole, "ground", "compare", "--sessions", str(session), "--out", str(tmp_path / "c"), code=2
+    )
+    assert "pip install 'obbgs[compare]'" in hint

@@ -12,19 +12,15 @@ from pathlib import Path
 import pytest
 
 from flightsw.orbit import EPHEMERIS
+from tests.wheels import flight_wheel
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "packaging" / "flight"
-BUILD = "import sys; from hatchling.build import build_wheel; print(build_wheel(sys.argv[1]))"
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    done = subprocess.run(
-        [sys.executable, "-c", BUILD, str(folder)], cwd=PACKAGE, capture_output=True, text=True, check=True
-    )
-    return folder / done.stdout.split()[-1]
+    return flight_wheel(tmp_path_factory.mktemp("wheel"))
 
 
 def test_it_holds_flight_and_what_it_shares_and_nothing_compiled(wheel):
