@@ -15,6 +15,7 @@ from ground.spread import evenly_spread
 from ground.turntable import extent
 from ground.viewer.source import Shown
 from ground.viewer.splats import colours, error_colours, shapes, uncertainty_colours
+from obbgs_core.io.mesh import Z_UP_TO_Y_UP
 
 RADIUS = 10.0  # of the first model in the scene: large enough for the half-precision covariances of viser
 CAMERAS_AT = 2.0  # radii: true directions, but nearer, or the model could not be seen beside them
@@ -78,13 +79,14 @@ class Placed:
         return self._overlays[colour]
 
     def draw_mesh(self, visible: bool) -> None:
-        """Put model.glb into the scene, if the run has one."""
+        """Put model.glb into the scene, if the run has one; its node turns the body's z axis to glTF's y, here back."""
         if self.shown.mesh is not None:
             self.handles["mesh"] = [
                 self._server.scene.add_glb(
                     f"/{self._name}/mesh",
                     self.shown.mesh,
                     scale=self.per_metre,
+                    wxyz=tuple(matrix_to_quat(Z_UP_TO_Y_UP[:3, :3].T)),
                     position=tuple(self.place(np.zeros(3))),
                     visible=visible,
                 )
