@@ -33,15 +33,19 @@ td.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-num
 .grid img { width: 100%; display: block; background: #000; border-radius: 3px; image-rendering: pixelated; }
 .grid .label { color: var(--soft); font-size: 13px; align-self: center; }
 .grid figure { margin: 0; } .grid figcaption { color: var(--soft); font-size: 12px; text-align: center; }
+details { margin: 10px 0; } summary { cursor: pointer; color: var(--soft); font-size: 13.5px; }
 h3 { font-size: 15px; margin: 18px 0 8px; }
 .scroll { overflow-x: auto; }
 .scores td, .scores th { white-space: nowrap; overflow-wrap: normal; }
 .scores td.words { white-space: normal; min-width: 240px; }
 .scores td:first-child, .scores th:first-child { position: sticky; left: 0; background: var(--card); }
-.beside { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 0 16px; }
+.beside { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, var(--least)), 1fr)); gap: 0 16px; }
 .beside > * { min-width: 0; }
 .views { grid-template-columns: repeat(auto-fill, minmax(min(46%, 170px), 1fr)); }
 .compared { grid-template-columns: minmax(0, 1.1fr) repeat(3, minmax(0, 1fr)); max-width: 840px; }
+dl { display: grid; grid-template-columns: max-content minmax(0, 1fr); gap: 4px 16px; margin: 8px 0;
+  font-size: 13.5px; }
+dt { color: var(--soft); } dd { margin: 0; }
 .legend { display: flex; flex-wrap: wrap; gap: 2px 18px; font-size: 13.5px; margin: 6px 0; }
 .legend span::before { content: ""; display: inline-block; width: 12px; height: 12px; border-radius: 3px;
   background: var(--of); margin-right: 6px; vertical-align: -1px; }
@@ -56,8 +60,9 @@ pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px;
   main { padding: 16px 8px 40px; } section { padding: 14px 12px; } h1 { font-size: 21px; overflow-wrap: anywhere; }
   .cards { grid-template-columns: minmax(0, 1fr); } .two > * { min-width: 0; }
   .card b { font-size: 20px; } td { padding: 5px 4px; overflow-wrap: anywhere; }
-  td.n { white-space: normal; } .grid { gap: 3px; }
-  .grid .label, .grid figcaption { font-size: 10px; overflow-wrap: anywhere; }
+  td.n { white-space: normal; overflow-wrap: normal; } .grid { gap: 3px; }
+  .grid .label, .grid figcaption { font-size: 10px; }
+  dl { grid-template-columns: minmax(0, 1fr); } dd { margin: 0 0 6px; }
   .compared { grid-template-columns: repeat(3, minmax(0, 1fr)); }
   .scores td.n { white-space: nowrap; } .scores td.words { min-width: 0; } .scores td.words div { width: 52vw; }
   .compared .label { grid-column: 1 / -1; font-size: 12px; margin-top: 8px; } .compared .head { display: none; }
@@ -101,13 +106,20 @@ def _table(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def grid(columns: str, cells: list[str]) -> str:
-    """Return cells in rows; `columns` are the widths as CSS has them."""
-    return f'<div class="grid" style="grid-template-columns: {columns}">{"".join(cells)}</div>'
+    """Return cells in rows; `columns` are the widths as CSS has them. On a screen without room for them it scrolls."""
+    inner = f'<div class="grid" style="grid-template-columns: {columns}">{"".join(cells)}</div>'
+    return f'<div class="scroll">{inner}</div>'
 
 
-def beside(parts: Iterable[str]) -> str:
-    """Return parts side by side where there is room for them, and one below another on a narrow screen."""
-    return f'<div class="beside">{"".join(f"<div>{part}</div>" for part in parts)}</div>'
+def beside(parts: Iterable[str], least_px: int = 420) -> str:
+    """Return parts side by side where each has so much room, and one below another on a narrow screen."""
+    cells = "".join(f"<div>{part}</div>" for part in parts)
+    return f'<div class="beside" style="--least: {least_px}px">{cells}</div>'
+
+
+def fold(title: str, body: str) -> str:
+    """Return HTML that is seen when its title is clicked."""
+    return f"<details><summary>{title}</summary>{body}</details>"
 
 
 def legend(entries: Iterable[tuple[str, str]]) -> str:

@@ -5,7 +5,6 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 
 from ground.session import Session
 from obbgs_core.sensor import Sensor
@@ -19,18 +18,20 @@ KNOWN_COLOUR, BLIND_COLOUR = "#1f6feb", "#d1652a"
 EXPOSURE_COLOURS = ("#1f6feb", "#2a9d8f", "#d1652a", "#8e44ad", "#c0392b")
 
 
-def training_figure(history: Sequence[dict]) -> go.Figure:
-    """Return loss and PSNR over time, as running means, of each training in the lines of metrics.jsonl."""
-    figure = make_subplots(
-        rows=1, cols=2, subplot_titles=("loss", "PSNR of each step's frames, dB"), horizontal_spacing=0.08
-    )
+def training_figures(history: Sequence[dict]) -> tuple[list[go.Figure], list[tuple[str, str]]]:
+    """Return loss and PSNR over time, as running means, of each training in the lines of metrics.jsonl.
+
+    The second value is the legend: the trainings with their colours.
+    """
+    named, figures = [], [go.Figure(), go.Figure()]
     losses: list[float] = []
     for label, colour in (("known exposure", KNOWN_COLOUR), ("blind to exposure", BLIND_COLOUR)):
         rows = [line for line in history if line["training"] == label]
         if not rows:
             continue
+        named.append((label, colour))
         seconds = [line["seconds"] for line in rows]
-        for column, key in ((1, "loss"), (2, "psnr_db")):
+        for figure, key in zip(figures, ("loss", "psnr_db"), strict=True):
             values = running_mean([line[key] for line in rows])
             if key == "loss":
                 losses += values
@@ -40,31 +41,30 @@ def training_figure(history: Sequence[dict]) -> go.Figure:
                 name=label,
                 mode="lines" if len(rows) > 1 else "markers",
                 line={"color": colour, "width": 2},
-                showlegend=column == 1,
-                row=1,
-                col=column,
             )
     ticks = ticks_1_2_5(losses)
-    figure.update_yaxes(type="log", tickvals=ticks, ticktext=[f"{t:g}" for t in ticks], row=1, col=1)
-    figure.update_xaxes(title_text="training time, s", rangemode="tozero")
-    figure.update_layout(
-        height=370,
-        margin={"l": 50, "r": 20, "t": 40, "b": 45},
-        legend={"orientation": "h", "y": -0.22, "x": 0.5, "xanchor": "center"},
-    )
-    return figure
+    figures[0].update_yaxes(type="log", tickvals=ticks, ticktext=[f"{t:g}" for t in ticks], title_text="loss")
+    figures[1].update_yaxes(title_text="PSNR of each step's frames, dB")
+    for figure in figures:
+        figure.update_xaxes(title_text="training time, s", rangemode="tozero")
+        figure.update_layout(height=330, margin={"l": 60, "r": 20, "t": 15, "b": 45}, showlegend=False)
+    return figures, named
 
 
-def histogram_figure(session: Session, sensor: Sensor, nominal: bool) -> go.Figure:
-    """Return the histogram of the readings in all frames, one line for each exposure time.
+def histogram_figure(
+    session: Session, sensor: Sensor, nominal: bool
+) -> tuple[go.Figure, list[tuple[str, str]]]:
+    """Return the histogram of the readings in all frames, one line for each exposure time, and its legend.
 
     Args:
         nominal: exposure times are made up and not named.
     """
-    figure = go.Figure()
+    named, figure = [], go.Figure()
     edges = np.linspace(0, sensor.white_dn + 1, BINS + 1)
     for index, exposure_s in enumerate(sorted({r.exposure_time_s for r in session.frames})):
-        counts = np.zeros(BINS)
+        counts, colour = np.zeros(BINS), EXPOSURE_COLOURS[index % len(EXPOSURE_COLOURS)]
+        if not nominal:
+            named.append((f"{exposure_s * 1e3:g} ms", colour))
         for record in session.frames:
             if record.exposure_time_s == exposure_s:
                 counts += np.histogram(session.dn(record), edges)[0]
@@ -73,7 +73,7 @@ def histogram_figure(session: Session, sensor: Sensor, nominal: bool) -> go.Figu
             y=np.where(counts > 0, counts, np.nan),
             name="" if nominal else f"{exposure_s * 1e3:g} ms",
             mode="lines",
-            line={"shape": "hvh", "width": 2, "color": EXPOSURE_COLOURS[index % len(EXPOSURE_COLOURS)]},
+            line={"shape": "hvh", "width": 2, "color": colour},
             hovertemplate="%{y:,} pixels near %{x:.0f} DN",
         )
     for level, label, side in (
@@ -88,8 +88,8 @@ def histogram_figure(session: Session, sensor: Sensor, nominal: bool) -> go.Figu
         )
     figure.update_yaxes(type="log", title_text="pixels", dtick=1)
     figure.update_xaxes(title_text="digital number (DN)", range=[0, 1.02 * sensor.white_dn])
-    figure.update_layout(height=350, margin={"l": 60, "r": 20, "t": 30, "b": 45})
-    return figure
+    figure.update_layout(height=350, margin={"l": 60, "r": 20, "t": 30, "b": 45}, showlegend=False)
+    return figure, named
 
 
 def running_mean(values: Sequence[float], window: int = SMOOTHED) -> list[float]:

@@ -7,18 +7,27 @@ from pathlib import Path
 
 from ground.cameras import median_sun_direction
 from ground.card import chi2_explained, frames_captured, scored_frames
-from ground.page import as_yaml, cards, page, plot, section, two_tables
-from ground.plots import histogram_figure, training_figure
+from ground.page import as_yaml, beside, cards, fold, legend, page, plot, section, two_tables
+from ground.plots import histogram_figure, training_figures
 from ground.report_attitude import attitude_section
-from ground.report_frames import frames_section, scored_section
+from ground.report_frames import brightness, frames_section, scored_section
 from ground.report_poses import poses_section
 from ground.runs import Run, open_run, read_config, written_to
 from ground.session import SessionError
 from ground.splat_view import splat_view
-from ground.telemetry_plots import broken_limits, housekeeping_series, telemetry_figure
+from ground.telemetry_plots import broken_limits, housekeeping_series, telemetry_figures
 from ground.truth import Truth
 from obbgs_base.files import write_whole
 from obbgs_core.score.metrics import COMPLETENESS_RADIUS
+
+TELEMETRY_PX = 280  # least width of a plot
+DECISIONS = {  # of metrics.json
+    "appearance": "the light of a Gaussian",
+    "poses": "poses",
+    "growth": "growth",
+    "budget": "budget",
+    "start": "start",
+}
 
 
 def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
@@ -171,15 +180,21 @@ def _exposure_ms(key: str) -> str:
 
 
 def _model(run: Run) -> str:
+    m = run.metrics
     note = (
-        f"The {len(run.gaussians):,} Gaussians of the model as the sensor would see them at the chosen exposure; "
-        "brightness is shown as in the frames below. Drag to turn, wheel or pinch to zoom, shift and drag to move."
+        f"The target in 3D, made from {m['frames_trained']:,} frames and drawn as the camera would see it at the "
+        "chosen exposure. Drag to turn, wheel or pinch to zoom, shift and drag to move."
     )
-    if "appearance" in run.metrics:
-        note += f" Radiance: {html.escape(run.metrics['appearance'])}."
-        if median_sun_direction(list(run.session.frames)) is not None:
-            note += f" The Sun's direction spans {run.metrics['sun_span_deg']:.1f} degrees."
-    return section("Model", note, splat_view(run))
+    if m["scored_frames"] == "held_out":
+        note += " The next section says how well it matches frames that it was not made from."
+    decisions = [("made of", f"{len(run.gaussians):,} Gaussians"), ("brightness", brightness(run))]
+    if "appearance" in m and median_sun_direction(list(run.session.frames)) is not None:
+        decisions.append(("the Sun's direction spans", f"{m['sun_span_deg']:.1f} degrees"))
+    for key, words in DECISIONS.items():
+        if m.get(key):
+            decisions.append((words, html.escape(m[key])))
+    details = "".join(f"<dt>{words}</dt><dd>{value}</dd>" for words, value in decisions)
+    return section("Model", note, splat_view(run) + fold("What the training decided", f"<dl>{details}</dl>"))
 
 
 def _registration(run: Run) -> str:
@@ -207,14 +222,14 @@ def _training(run: Run) -> str:
         history = [json.loads(line) for line in path.read_text().splitlines()]
         if not history:
             return section("Training", "No step was done: the model is its untrained start.", "")
-        figure = training_figure(history)
+        figures, named = training_figures(history)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SessionError(f"{path} is damaged: {error!r}") from error
     note = (
-        "Left: the loss that training minimises. Right: the PSNR of each step's noisy frames. Both are running means; "
+        "First the loss that training minimises, then the PSNR of each step's noisy frames. Both are running means; "
         "where they have levelled off, more steps would change little."
     )
-    return section("Training", note, plot(figure))
+    return section("Training", note, legend(named) + beside(map(plot, figures)))
 
 
 def _histogram(run: Run) -> str:
@@ -226,7 +241,8 @@ def _histogram(run: Run) -> str:
         f"and a pile at full scale carry little information. {saturated:,} pixels are saturated: training takes such a "
         "reading as a lower bound of the light."
     )
-    return section(title, note, plot(histogram_figure(run.session, run.sensor, nominal)))
+    figure, named = histogram_figure(run.session, run.sensor, nominal)
+    return section(title, note, legend(named) + plot(figure))
 
 
 def _losses(run: Run) -> str:
@@ -270,7 +286,7 @@ def _telemetry(run: Run) -> str:
         f"of the telemetry dictionary are yellow or red, dotted lines are the limits. Limits were broken by: "
         f"{broken or 'none'}."
     )
-    return section("Telemetry", note, plot(telemetry_figure(series)))
+    return section("Telemetry", note, beside(map(plot, telemetry_figures(series)), TELEMETRY_PX))
 
 
 def _simulation(truth: Truth | None) -> str:

@@ -5,7 +5,7 @@ import plotly.graph_objects as go
 
 from ground.attitude import FILE, FoundAttitude, refined_motion
 from ground.estimated_poses import read_estimate
-from ground.page import plot, section, two_tables
+from ground.page import legend, plot, section, two_tables
 from ground.runs import Run
 from obbgs_base.free_rotation import free_rotation
 from obbgs_core.attitude.target_motion import TargetMotion
@@ -13,6 +13,12 @@ from obbgs_core.model.gaussians import Gaussians
 
 REACH = 1.3  # of the axis, in radii of the model
 POINTS_SHOWN = 4000
+COLOURS = {
+    "model": "#8a97a5",
+    "axis of rotation": "#d1652a",
+    "two deviations": "#e9a27c",
+    (PATH := "path of the axis"): "#1f6feb",
+}
 LEAST_OPACITY = 0.3
 PATH_POINTS = 300
 
@@ -38,7 +44,9 @@ def attitude_section(run: Run) -> str:
         + (", and the path of that axis through the body during the pass." if motion.tumbles else ".")
     )
     body = two_tables(rotation_rows(motion, None if estimate is None else found.motion))
-    return section("Rotation as found", note, body + plot(axis_figure(run.gaussians, motion, times_s)))
+    figure = axis_figure(run.gaussians, motion, times_s)
+    named = [item for item in COLOURS.items() if motion.tumbles or item[0] != PATH]
+    return section("Rotation as found", note, body + legend(named) + plot(figure))
 
 
 def rotation_rows(motion: TargetMotion, before: TargetMotion | None) -> list[tuple[str, str]]:
@@ -79,27 +87,31 @@ def axis_figure(gaussians: Gaussians, motion: TargetMotion, times_s: np.ndarray)
     rate = motion.rate_body_rad_s
     along = rate / np.linalg.norm(rate)
     figure = go.Figure()
-    _lines(figure, points, "model", mode="markers", marker={"size": 1.5, "color": "#8a97a5"})
-    _lines(
-        figure, np.stack([-along, along]) * reach_m, "axis of rotation", line={"color": "#d1652a", "width": 6}
-    )
+    x, y, z = points.T.round(4)
+    dots = {"size": 1.5, "color": COLOURS["model"]}
+    figure.add_scatter3d(x=x, y=y, z=z, name="model", mode="markers", hoverinfo="name", marker=dots)
+    _lines(figure, np.stack([-along, along]) * reach_m, "axis of rotation", width=6)
     cone = _cone(along, 2 * np.radians(motion.facts()["axis_sigma_deg"])) * reach_m
-    _lines(figure, cone, "two deviations", line={"color": "#e9a27c", "width": 2})
+    _lines(figure, cone, "two deviations", width=2)
     if motion.tumbles:
         at_s = np.linspace(times_s.min(), times_s.max(), PATH_POINTS)
         rates = free_rotation(at_s, rate[None], motion.moments[None])[1][0]
         path = rates / np.linalg.norm(rates, axis=1, keepdims=True)
-        _lines(figure, path * reach_m, "path of the axis", line={"color": "#1f6feb", "width": 3})
+        _lines(figure, path * reach_m, PATH, width=3)
     scene = {f"{name}axis": {"title": {"text": f"{name}, m"}} for name in "xyz"}
     figure.update_layout(
-        height=520, margin={"l": 0, "r": 0, "t": 10, "b": 0}, scene={**scene, "aspectmode": "data"}
+        height=520,
+        margin={"l": 0, "r": 0, "t": 10, "b": 0},
+        scene={**scene, "aspectmode": "data"},
+        showlegend=False,
     )
     return figure
 
 
-def _lines(figure: go.Figure, points: np.ndarray, name: str, mode: str = "lines", **style) -> None:
+def _lines(figure: go.Figure, points: np.ndarray, name: str, width: float) -> None:
     x, y, z = points.T.round(4)
-    figure.add_scatter3d(x=x, y=y, z=z, name=name, mode=mode, hoverinfo="name", **style)
+    line = {"color": COLOURS[name], "width": width}
+    figure.add_scatter3d(x=x, y=y, z=z, name=name, mode="lines", hoverinfo="name", line=line)
 
 
 def _cone(along: np.ndarray, angle_rad: float) -> np.ndarray:

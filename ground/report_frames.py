@@ -17,7 +17,8 @@ from ground.spread import evenly_spread
 from ground.truth import Truth
 from obbgs_core.score.metrics import psnr_db
 
-LABEL_WIDTH = "minmax(0, 60px)"
+LABEL_WIDTH = "minmax(44px, 60px)"
+PICTURE_WIDTH = "minmax(72px, 1fr)"
 COLUMNS = 6  # brackets shown for each exposure
 VIEWS_SHOWN = 3
 MARGIN_PX = 10
@@ -49,12 +50,12 @@ def frames_section(run: Run) -> str:
             cells.append(picture(_tone(run, noisy_image(run, record).numpy()), f"frame {record.id}", caption))
     return section(
         "Pictures" if nominal else "Frames by exposure",
-        f"{len(picked)} of the {len(run.session.frames):,} imported pictures, {_brightness(run)}."
+        f"{len(picked)} of the {len(run.session.frames):,} imported pictures, {brightness(run)}."
         if nominal
         else "Frames as received: each column is a bracket, each row one of its exposures; below each frame stand its "
         "number, the range to the target and, where they differ in a row, the exposure time. "
-        f"Brightness is {_brightness(run)}.",
-        grid(f"{LABEL_WIDTH} repeat({len(picked)}, minmax(0, 1fr))", cells),
+        f"Brightness is {brightness(run)}.",
+        grid(f"{LABEL_WIDTH} repeat({len(picked)}, {PICTURE_WIDTH})", cells),
     )
 
 
@@ -123,7 +124,7 @@ def _compared(run: Run, truth: Truth | None, of_view: list[FrameRecord]) -> str:
             caption = f"{psnr_db(render, image):.1f} dB"
             cells.append(picture(_tone(run, render[box].numpy()), "render", caption))
             cells.append(picture(heat(error[box].numpy()), "error", "&nbsp;"))
-    return grid(f"{LABEL_WIDTH} repeat({len(names)}, minmax(0, 1fr))", cells)
+    return grid(f"{LABEL_WIDTH} repeat({len(names)}, {PICTURE_WIDTH})", cells)
 
 
 def _exposure(run: Run, record: FrameRecord) -> str:
@@ -131,7 +132,7 @@ def _exposure(run: Run, record: FrameRecord) -> str:
     return "" if run.session.nominal_exposures else f"{in_ms(record.exposure_time_s)} ms"
 
 
-def _brightness(run: Run) -> str:
+def brightness(run: Run) -> str:
     """Return in words how pixel values become brightness on the page."""
     if run.session.encoding == "srgb":
         return "shown as they are"

@@ -10,7 +10,7 @@ import torch
 from plotly.subplots import make_subplots
 
 from ground.estimated_poses import read_estimate
-from ground.page import plot, section, two_tables
+from ground.page import legend, plot, section, two_tables
 from ground.runs import Run
 from ground.spread import evenly_spread
 from ground.training_frames import training_frame
@@ -24,6 +24,8 @@ from obbgs_core.render import render
 
 MARGINS_PX = {"l": 60, "r": 20, "t": 20, "b": 45}
 AXES = {"x": "#1f6feb", "y": "#2a9d8f", "z": "#d1652a"}
+ELLIPSES = {"as the tags state": "rgba(91,107,123,0.4)", "left in doubt": "#1f6feb"}
+RESIDUALS = {"from the tagged pose": "#d1652a", "from the estimated pose": "#1f6feb"}
 ORBIT, BODY = ("radial", "transverse", "normal"), ("x", "y", "z")
 SHOWN = {  # the parameters that a pass shares: words, unit, axes
     "position_m": ("relative position,", "m", ORBIT),
@@ -138,7 +140,11 @@ def poses_section(run: Run) -> str:
             f" The frames {names} were left out of the training: they fitted no pose that their tags allow."
         )
     body = two_tables(shared_rows(estimate)) if estimate.shared_prior.vector().any() else ""
-    body += plot(correction_figure(history)) + plot(ellipse_figure(history)) + plot(residual_figure(history))
+    body += legend([(f"along {axis}", colour) for axis, colour in AXES.items()]) + plot(
+        correction_figure(history)
+    )
+    body += legend(ELLIPSES.items()) + plot(ellipse_figure(history))
+    body += legend(RESIDUALS.items()) + plot(residual_figure(history))
     return section("Poses as estimated", note, f"{body}<p>{told}</p>")
 
 
@@ -155,9 +161,15 @@ def shared_rows(estimate: PoseEstimate) -> list[tuple[str, str]]:
         for i in np.flatnonzero(priors):
             axis = f" {axes[i]}" if axes else ""
             doubt = ": not determined by the frames" if {name, f"{name}[{i}]"} & doubted else ""
-            value = f"{values[i]:.4g} ± {left[i]:.2g} (stated ± {priors[i]:.2g}) {unit}"
+            value = _unbroken(f"{values[i]:.4g} ± {left[i]:.2g}") + " "
+            value += _unbroken(f"(stated ± {priors[i]:.2g}) {unit}")
             rows.append((f"{words}{axis}{doubt}", value))
     return rows
+
+
+def _unbroken(text: str) -> str:
+    """Return text that stays in one line."""
+    return text.replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def correction_figure(history: PoseHistory) -> go.Figure:
@@ -171,7 +183,6 @@ def correction_figure(history: PoseHistory) -> go.Figure:
                 **line,
                 y=factor * history.correction[:, first + i],
                 name=axis,
-                showlegend=row == 1,
                 line={"color": colour},
                 mode="lines+markers",
                 marker={"size": 4},
@@ -183,13 +194,12 @@ def correction_figure(history: PoseHistory) -> go.Figure:
                     **line,
                     y=sign * factor * deviations[:, first + i],
                     mode="lines",
-                    showlegend=False,
                     hoverinfo="skip",
                     line={"color": colour, "dash": "dot", "width": 1},
                 )
         figure.update_yaxes(title_text=f"{'rotation' if row == 1 else 'shift'}, {unit}", row=row, col=1)
     figure.update_xaxes(title_text="minutes", row=2, col=1)
-    figure.update_layout(height=460, margin=MARGINS_PX)
+    figure.update_layout(height=460, margin=MARGINS_PX, showlegend=False)
     return figure
 
 
@@ -198,22 +208,27 @@ def ellipse_figure(history: PoseHistory) -> go.Figure:
     figure = go.Figure()
     shifts = history.correction[:, 3:5]
     shown = evenly_spread(range(len(shifts)), ELLIPSES_SHOWN)
-    for covariances, centres, colour, name in (
-        (history.prior, np.zeros_like(shifts), "rgba(91,107,123,0.25)", "as the tags state"),
-        (history.posterior, shifts, "#1f6feb", "left in doubt"),
+    for covariances, centres, name in (
+        (history.prior, np.zeros_like(shifts), "as the tags state"),
+        (history.posterior, shifts, "left in doubt"),
     ):
         outline = [_ellipse(covariances[i, 3:5, 3:5]) + centres[i] for i in shown]
         gap = np.full((1, 2), np.nan)
         points = np.concatenate([part for one in outline for part in (one, gap)])
         figure.add_scatter(
-            x=points[:, 0], y=points[:, 1], mode="lines", name=name, line={"color": colour}, hoverinfo="skip"
+            x=points[:, 0],
+            y=points[:, 1],
+            mode="lines",
+            name=name,
+            line={"color": ELLIPSES[name]},
+            hoverinfo="skip",
         )
     figure.add_scatter(
         x=shifts[:, 0],
         y=shifts[:, 1],
         mode="lines+markers",
         name="correction",
-        line={"color": "#c8d2dc", "width": 1},
+        line={"color": "#b9c4d0", "width": 1},
         marker={
             "color": history.minutes,
             "colorscale": "Viridis",
@@ -224,7 +239,7 @@ def ellipse_figure(history: PoseHistory) -> go.Figure:
     )
     figure.update_yaxes(title_text="shift along camera y, m", scaleanchor="x")
     figure.update_xaxes(title_text="shift along camera x, m")
-    figure.update_layout(height=460, margin=MARGINS_PX, legend={"orientation": "h"})
+    figure.update_layout(height=460, margin=MARGINS_PX, showlegend=False)
     return figure
 
 
@@ -239,9 +254,8 @@ def _ellipse(covariance: np.ndarray) -> np.ndarray:
 def residual_figure(history: PoseHistory) -> go.Figure:
     """Return the residual of each bracket from its tagged and from its estimated pose."""
     figure = go.Figure()
-    for values, name, colour in (
-        (history.chi2_tagged, "from the tagged pose", "#d1652a"),
-        (history.chi2_estimated, "from the estimated pose", "#1f6feb"),
+    for values, (name, colour) in zip(
+        (history.chi2_tagged, history.chi2_estimated), RESIDUALS.items(), strict=True
     ):
         figure.add_scatter(
             x=history.minutes,
@@ -254,5 +268,5 @@ def residual_figure(history: PoseHistory) -> go.Figure:
         )
     figure.update_yaxes(title_text="residual chi²", type="log")
     figure.update_xaxes(title_text="minutes")
-    figure.update_layout(height=320, margin=MARGINS_PX, legend={"orientation": "h"})
+    figure.update_layout(height=320, margin=MARGINS_PX, showlegend=False)
     return figure

@@ -1,13 +1,11 @@
-"""The spacecraft's housekeeping over time, as figures with the limits of the telemetry dictionary in colour."""
+"""The spacecraft's housekeeping over time, as small figures with the limits of the telemetry dictionary in colour."""
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 
 from flightsw.icd.telemetry import DICTIONARY, Item
 
@@ -16,8 +14,7 @@ SHOWN = (  # the items that say how a pass went; telemetry.jsonl holds all of th
     *("frames_stored", "outbox_frames", "delivered", "frames_failed", "frames_refused", "frames_dropped"),
     *("segments_resent", "crc_errors", "hang_ups", "disk_free_bytes", "cpu_percent", "rss_bytes"),
 )
-COLUMNS = 3
-ROW_PX = 170
+HEIGHT_PX = 175
 BYTES_PER_MB = 1e6
 
 
@@ -51,15 +48,11 @@ def housekeeping_series(session: Path) -> list[Series]:
     return [Series(layout.item(name), seconds, values[name]) for name in SHOWN]
 
 
-def telemetry_figure(series: list[Series]) -> go.Figure:
+def telemetry_figures(series: list[Series]) -> list[go.Figure]:
     """Return one small plot for each series; values beyond a limit are yellow or red, the limits are lines."""
-    rows = -(-len(series) // COLUMNS)
-    titles = [f"{each.item.name.replace('_', ' ')}{_unit(each.item)}" for each in series]
-    figure = make_subplots(
-        rows=rows, cols=COLUMNS, subplot_titles=titles, vertical_spacing=0.35 / rows, horizontal_spacing=0.07
-    )
-    for i, each in enumerate(series):
-        place: dict[str, Any] = {"row": i // COLUMNS + 1, "col": i % COLUMNS + 1}
+    figures = []
+    for each in series:
+        figure = go.Figure()
         factor = BYTES_PER_MB if each.item.unit == "B" else 1.0
         figure.add_scatter(
             x=each.seconds,
@@ -69,19 +62,19 @@ def telemetry_figure(series: list[Series]) -> go.Figure:
             marker={"size": 4, "color": [LIMIT_COLOURS[limit] for limit in each.limits]},
             hovertemplate="%{y:,} after %{x:.0f} s<extra></extra>",
             showlegend=False,
-            **place,
         )
         for limit, bounds in (("yellow", each.item.yellow), ("red", each.item.red)):
             for bound in bounds:
                 if _is_near(bound, each.values):
                     line = {"color": LIMIT_COLOURS[limit], "width": 1, "dash": "dot"}
-                    figure.add_hline(y=bound / factor, line=line, **place)
+                    figure.add_hline(y=bound / factor, line=line)
         if each.values.min() == each.values.max():  # a scale of thousandths around a constant says nothing
             value = each.values[0] / factor
-            figure.update_yaxes(range=[value - max(1.0, abs(value)), value + max(1.0, abs(value))], **place)
-    figure.update_annotations(font_size=12)
-    figure.update_layout(height=ROW_PX * rows + 30, margin={"l": 40, "r": 15, "t": 30, "b": 25})
-    return figure
+            figure.update_yaxes(range=[value - max(1.0, abs(value)), value + max(1.0, abs(value))])
+        title = {"text": f"{each.item.name.replace('_', ' ')}{_unit(each.item)}", "font": {"size": 12}}
+        figure.update_layout(height=HEIGHT_PX, title=title, margin={"l": 45, "r": 15, "t": 30, "b": 25})
+        figures.append(figure)
+    return figures
 
 
 def broken_limits(series: list[Series]) -> list[tuple[str, str]]:

@@ -86,7 +86,7 @@ def test_the_residual_is_that_of_noise_from_the_right_poses_only(example):
 
 def test_the_section_tells_values_with_both_deviations_and_what_the_frames_do_not_determine(example):
     run, *_ = example
-    page = poses_section(run)
+    page = poses_section(run).replace("\N{NO-BREAK SPACE}", " ")
     assert (
         "boresight, camera x" in page and "0.6303 ± 0.057 (stated ± 1.1) deg" in page
     )  # 0.011 rad in degrees

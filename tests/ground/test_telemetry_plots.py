@@ -11,7 +11,7 @@ from ground.telemetry_plots import (
     SHOWN,
     broken_limits,
     housekeeping_series,
-    telemetry_figure,
+    telemetry_figures,
 )
 
 
@@ -51,10 +51,10 @@ def test_limits_are_those_of_the_dictionary_and_stand_in_the_figure(tmp_path):
         ("disk_free_bytes", "red"),
         ("rss_bytes", "yellow"),
     ]
-    figure = telemetry_figure(series)
-    colours = dict(zip(SHOWN, (trace.marker.color for trace in figure.data), strict=True))
+    figures = dict(zip(SHOWN, telemetry_figures(series), strict=True))
+    colours = {name: figure.data[0].marker.color for name, figure in figures.items()}
     assert colours["frames_refused"] == tuple(LIMIT_COLOURS[limit] for limit in ("green", "red", "green"))
-    heights = {shape.y0: shape.line.color for shape in figure.layout.shapes}
+    heights = {shape.y0: shape.line.color for shape in figures["rss_bytes"].layout.shapes}
     assert heights[300.0] == LIMIT_COLOURS["yellow"]  # of the memory, in MB
 
 

@@ -1,9 +1,10 @@
-"""From which poses a run with refined poses is scored and shown: the same in figures, report, viewer and documents."""
+"""A run that refined its poses: its figures, report, views and pictures are of the same poses, and read on a phone."""
 
 import base64
 import importlib.util
 import re
 import shutil
+from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +20,8 @@ from ground.reconstruct import reconstruct
 from ground.report import write_report
 from ground.viewer.source import Source
 from ground.viewer.viewer import _compared
+from tests.browser import as_url, chromium, opened
+from tests.ground.test_telemetry_plots import packet, written
 from tests.scenes import move_poses_in
 from tests.small_sessions import SIZE_PX, erring_session
 
@@ -87,6 +90,51 @@ def test_ranges_of_report_and_viewer_are_those_of_the_refined_poses(refined):
     by_number = {record.id: range_in_words(record) for record in frames}
     assert all(by_number[int(number)] == text for number, text in told)
     assert f"Bracket 7, {by_number[21]}" in page
+
+
+PHONE_PX = 390
+# words with a digit that are broken between two lines, in tables and on cards
+BROKEN_NUMBERS = """() => [...document.querySelectorAll("td.n, .card b")].flatMap(cell => {
+  const text = cell.firstChild;
+  return [...text.data.matchAll(/\\S*\\d\\S*/g)].filter(word => {
+    const range = document.createRange();
+    range.setStart(text, word.index);
+    range.setEnd(text, word.index + word[0].length);
+    return new Set([...range.getClientRects()].map(box => Math.round(box.top))).size > 1;
+  }).map(word => word[0]);
+})"""
+# titles, notes and legends of the figures, as [text, left, top, right, bottom]
+WORDS = """() => [...document.querySelectorAll(
+  ".js-plotly-plot :is(.gtitle, .xtitle, .ytitle, .cbtitle text, .annotation-text), .js-plotly-plot .legend, " +
+  "div.legend span"
+)].map(words => [words.textContent, words.getBoundingClientRect()])
+  .map(([text, box]) => [text, box.left, box.top, box.right, box.bottom])"""
+
+
+def test_the_report_can_be_read_on_a_phone_and_begins_with_words(refined, tmp_path):
+    """In the browser, 390 pixels wide: no number breaks, nothing covers a legend, figures of decisions are folded."""
+    session = without_truth(refined, tmp_path / "session")
+    written(session, *(packet(second, cpu_percent=second % 90) for second in range(20)))
+    url = as_url(write_report(session, "run"))
+    with chromium() as browser, opened(browser, url, PHONE_PX, 800) as page:
+        page.wait_for_selector(".js-plotly-plot .xtitle")
+        assert page.evaluate("document.documentElement.scrollWidth") == PHONE_PX
+        assert page.evaluate(BROKEN_NUMBERS) == []
+        words = page.evaluate(WORDS)
+        assert {"known exposure", "cpu percent, %", "from the tagged pose"} <= {word[0] for word in words}
+        assert [(a[0], b[0]) for a, b in combinations(words, 2) if overlap_px(a, b) > 1] == []
+        assert not re.search("nats|BIC", page.locator("p.note").all_inner_texts()[1])
+        decided = page.locator("dd", has_text="nats at a BIC penalty").first
+        assert not decided.is_visible()
+        page.get_by_text("What the training decided").click()
+        assert decided.is_visible()
+
+
+def overlap_px(one: list, other: list) -> float:
+    """Return how deep two boxes [text, left, top, right, bottom] lie in each other."""
+    across = min(one[3], other[3]) - max(one[1], other[1])
+    down = min(one[4], other[4]) - max(one[2], other[2])
+    return min(across, down)
 
 
 def test_the_viewer_compares_held_out_frames_from_the_poses_that_they_are_scored_from(refined):
