@@ -30,6 +30,7 @@ from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.score.shown import shown_points
+from obbgs_core.sky_level import field
 
 
 def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
@@ -79,7 +80,7 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     }
     states_errors = run.metrics["scored_frames"] == "held_out" and not run.metrics.get("reference_exposure_s")
     if states_errors:
-        frames = (training_frame(run.session, record) for record in shown)
+        frames = run.without_sky_level(shown)
         figures |= stated_error_scores(run.gaussians, run.sensor, frames, run.metrics.get("misfit"))
     if run.session.frames_imported is not None and run.session.camera.channels == 3:
         pairs = ((model_image(run, record), noisy_image(run, record)) for record in shown)
@@ -146,7 +147,7 @@ def _interval_figures(
     """Return how often the intervals hold that the model states of the held-out frames."""
     radiance = [] if truth is None else [torch.from_numpy(truth.radiance(record)[0]) for record in shown]
     training = estimated_records(run.training, estimate)
-    known, scored = ([training_frame(run.session, r) for r in records] for records in (training, shown))
+    known, scored = (run.without_sky_level(records) for records in (training, shown))
     return interval_scores(run.gaussians, known, run.sensor, scored, radiance)
 
 
@@ -193,6 +194,9 @@ def _exposure_s(run: Run, record: FrameRecord) -> float:
 
 
 def noisy_image(run: Run, record: FrameRecord) -> torch.Tensor:
-    """Return a frame as received [H, W, C], as a fraction of full scale."""
-    dn = run.session.dn(record).astype(np.float32)
-    return torch.from_numpy(dn.reshape(*dn.shape[:2], -1) / run.sensor.white_dn)
+    """Return a frame as received [H, W, C], without what empty sky reads above black, as a fraction of full scale."""
+    dn = torch.from_numpy(run.session.dn(record).astype(np.float32))
+    dn = dn.reshape(*dn.shape[:2], -1)
+    if (planes := run.sky_planes_dn.get(record.id)) is not None:
+        dn = (dn - field(planes, *dn.shape[:2])).clamp(min=0)
+    return dn / run.sensor.white_dn

@@ -54,6 +54,8 @@ def training_metrics(
         "removed_outliers": result.removed_outliers,
         "removed_not_finite": result.removed_not_finite,
         "dark_frames": result.dark_frames,
+        "sky_level": None if result.sky_level.fits else str(result.sky_level),  # null: the stated black level
+        "sky_level_dn": None if result.sky_level.fits else result.sky_level.by_frame(),
         "misfit_frames": result.misfit_frames,
         "chi2": None if math.isnan(chi2) else chi2,
         "misfit": result.misfit,  # null: not learnt

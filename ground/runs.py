@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import functools
 import json
 import logging
 import os
@@ -12,18 +13,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
+from torch import Tensor
 
 from ground import attitude
 from ground.attitude import FoundAttitude, in_body_axes
 from ground.cameras import sensor_of
 from ground.live_status import LIVE_CHECKPOINT, LIVE_STATUS
 from ground.session import FrameRecord, Session, SessionError, open_session
-from ground.training_frames import split
+from ground.training_frames import split, training_frame
 from obbgs_base.files import UNUSED
 from obbgs_core.errors import ReconstructionError
+from obbgs_core.frames import TrainingFrame
 from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
+from obbgs_core.sky_level import levelled
 
 LOG = "log"
 LOCK = "lock"  # in the folder of an unfinished run; holds the name of the process that works on it
@@ -55,6 +59,22 @@ class Run:
     gaussians: Gaussians
     blind: Gaussians | None  # of the training that ignored exposure times
     metrics: dict
+
+    def without_sky_level(self, records: list[FrameRecord]) -> list[TrainingFrame]:
+        """Return frames of the run, without what empty sky reads above black where its training took that off."""
+        frames = [training_frame(self.session, record) for record in records]
+        return levelled(frames, self.sensor)[0] if self.metrics.get("sky_level") else frames
+
+    @functools.cached_property
+    def sky_planes_dn(self) -> dict[int, Tensor]:
+        """What empty sky reads above the stated black in the scored frames: planes [C, 3] as in `SkyLevel`, by frame.
+
+        None are there where the training found that the stated level fits.
+        """
+        if not self.metrics.get("sky_level"):
+            return {}
+        level = levelled([training_frame(self.session, record) for record in self.scored], self.sensor)[2]
+        return dict(zip(level.frame_ids, level.planes_dn, strict=True))
 
 
 def run_folder(session_dir: Path, name: str, out: Path | None = None) -> Path:

@@ -21,7 +21,7 @@ from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.motions import rigid_motions
 from obbgs_core.sensor import Sensor
 
-NOISE, SHUTTER, DARK, POSE, LOSS = range(5)  # streams of random numbers, one a purpose
+NOISE, SHUTTER, DARK, POSE, LOSS, STRAY = range(6)  # streams of random numbers, one a purpose
 MOST_ELECTRONS = 1e15  # NumPy's Poisson refuses about 9e18
 UNCERTAIN_SHIFT_M = 1e-6  # of a pose error that turns only: a covariance must not be singular
 
@@ -36,6 +36,8 @@ class Condition:
     - noise: factor on the standard deviation of the noise.
     - exposure_error: standard deviation of ln(true / tagged exposure time), frame by frame.
     - response_gamma: the readings follow signal ** gamma (full scale 1), while the method takes them for linear.
+    - pedestal: share of full scale that is added to every reading before it is clipped, while no method is told of it.
+    - stray_gradient: the same, from 0 at one corner of the picture to this share at another, in a direction at random.
 
     These need no truth:
 
@@ -55,6 +57,8 @@ class Condition:
     noise: float = 1.0
     exposure_error: float = 0.0
     response_gamma: float = 1.0
+    pedestal: float = 0.0
+    stray_gradient: float = 0.0
     synthetic_bracket: tuple[float, ...] = ()
     believed_noise: float = 1.0
     believed_gain: float = 1.0
@@ -76,6 +80,11 @@ class Condition:
             "exposure_error",
             f"expected at most {MOST_EXPOSURE_ERROR:g}, got {self.exposure_error:g}",
         )
+        for name in ("pedestal", "stray_gradient"):
+            share = getattr(self, name)
+            require(
+                0 <= share < 1, name, f"expected a share of full scale from 0 to less than 1, got {share:g}"
+            )
         require(
             0 <= self.lost_percent < 100,
             "lost_percent",
@@ -100,10 +109,8 @@ class Condition:
     @property
     def exposes_anew(self) -> bool:
         """Whether frames are made from the truth."""
-        return bool(self.exposure_ratios or self.exposure_error) or (self.noise, self.response_gamma) != (
-            1,
-            1,
-        )
+        changed = (self.exposure_ratios, self.exposure_error, self.pedestal, self.stray_gradient)
+        return any(changed) or (self.noise, self.response_gamma) != (1, 1)
 
     def stated(self) -> dict[str, Any]:
         """Return what differs from the frames as they were taken, by name."""
@@ -203,7 +210,8 @@ def _exposed_anew(case: Case, condition: Condition) -> list[TrainingFrame]:
         exposure_s = tagged_s.get(frame.exposure_time_s, frame.exposure_time_s)
         longer = math.exp(_random(SHUTTER, frame).normal(0, condition.exposure_error))
         light = radiance(frame).double().numpy()
-        dn = read_out(light, exposure_s * longer, case.sensor, condition, _random(NOISE, frame))
+        added_dn = _added_dn(frame, case.sensor, condition)
+        dn = read_out(light, exposure_s * longer, case.sensor, condition, _random(NOISE, frame), added_dn)
         dn = torch.from_numpy(dn.astype(np.float32))
         frames.append(dataclasses.replace(frame, dn=dn, exposure_time_s=exposure_s))
     return frames
@@ -227,12 +235,31 @@ def _bracketed(case: Case, condition: Condition) -> list[TrainingFrame]:
     return frames
 
 
+def _added_dn(frame: TrainingFrame, sensor: Sensor, condition: Condition) -> np.ndarray:
+    """Return what a condition adds to the readings [H, W, 1] of a frame, DN."""
+    height, width = frame.dn.shape[:2]
+    angle = _random(STRAY, frame).uniform(0, 2 * math.pi)
+    y, x = ((np.arange(n) + 0.5) / n for n in (height, width))
+    along = math.cos(angle) * x[None] + math.sin(angle) * y[:, None]
+    along = (along - along.min()) / np.ptp(along)
+    share = condition.pedestal + condition.stray_gradient * along
+    return share[..., None] * (sensor.white_dn - sensor.black_dn)
+
+
 def read_out(
-    radiance: np.ndarray, exposure_s: float, sensor: Sensor, condition: Condition, rng: np.random.Generator
+    radiance: np.ndarray,
+    exposure_s: float,
+    sensor: Sensor,
+    condition: Condition,
+    rng: np.random.Generator,
+    added_dn: np.ndarray | float = 0.0,
 ) -> np.ndarray:
     """Return the readings (DN) of a radiance: shot and read noise times the condition's factor, rounded, then clipped.
 
     The response bends the signal before the noise: signal ** response_gamma, full scale as 1.
+
+    Args:
+        added_dn: [H, W, 1] what is added to the signal, without shot noise.
     """
     range_dn = sensor.white_dn - sensor.black_dn
     signal_dn = sensor.dn_per_radiance_s * exposure_s * radiance.clip(min=0)
@@ -240,14 +267,15 @@ def read_out(
     mean_e = np.minimum(signal_dn * sensor.electrons_per_dn, MOST_ELECTRONS)
     shot_dn = (rng.poisson(mean_e) - mean_e) / sensor.electrons_per_dn
     noise_dn = shot_dn + sensor.read_noise_dn * rng.standard_normal(radiance.shape)
-    return np.rint(sensor.black_dn + signal_dn + condition.noise * noise_dn).clip(0, sensor.white_dn)
+    return np.rint(sensor.black_dn + added_dn + signal_dn + condition.noise * noise_dn).clip(
+        0, sensor.white_dn
+    )
 
 
 def _unlit(frame: TrainingFrame, sensor: Sensor, condition: Condition) -> TrainingFrame:
     """Return a frame of the same camera that shows no light, only noise."""
-    dark = read_out(
-        np.zeros(tuple(frame.dn.shape)), frame.exposure_time_s, sensor, condition, _random(DARK, frame)
-    )
+    nothing, added_dn = np.zeros(tuple(frame.dn.shape)), _added_dn(frame, sensor, condition)
+    dark = read_out(nothing, frame.exposure_time_s, sensor, condition, _random(DARK, frame), added_dn)
     return dataclasses.replace(frame, dn=torch.from_numpy(dark.astype(np.float32)))
 
 

@@ -134,23 +134,24 @@ class FrameOrder:
         frames: list[TrainingFrame],
         by_exposure: bool,
         validation_brackets: list[list[int]],
-        turn: int = 0,
         left_out: Sequence[int] = (),
-        visits: dict[int, int] | None = None,
+        earlier: "FrameOrder | None" = None,
     ) -> "FrameOrder":
         """Return the order of all frames but those of the validation brackets, and those that are left out for good.
 
         Args:
-            visits: how often frames were drawn before.
+            earlier: the order by which frames were drawn until now. Its turn and how often it drew each frame go on, so
+                that frames which joined late are still drawn more often.
         """
         withheld = {index for bracket in validation_brackets for index in bracket} | set(left_out)
         groups: dict[float, list[int]] = {}
         for index, frame in enumerate(frames):
             if index not in withheld:
                 groups.setdefault(frame.exposure_time_s if by_exposure else 0.0, []).append(index)
-        return FrameOrder(
-            list(groups.values()), validation_brackets, [[] for _ in groups], turn, visits or {}
-        )
+        order = FrameOrder(list(groups.values()), validation_brackets, [[] for _ in groups])
+        if earlier is not None:
+            order.turn, order.visits = earlier.turn, dict(earlier.visits)
+        return order
 
     def draw(self, count: int, rng: torch.Generator) -> list[int]:
         """Return the indices of the next frames."""

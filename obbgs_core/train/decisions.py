@@ -31,8 +31,8 @@ from obbgs_core.train.growth import (
 )
 from obbgs_core.train.multi_view import crossing_boxes, inside, threshold_factor
 from obbgs_core.train.parsimony import justified
-from obbgs_core.train.poses import HELD_AT, HOLDS
-from obbgs_core.train.setup import TOO_FEW_BRACKETS, TrainingSetup
+from obbgs_core.train.poses import HELD_AT, HOLDS, PoseDecision
+from obbgs_core.train.setup import TrainingSetup
 from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import TrainingState
 from obbgs_core.train.validation import correction_evidence
@@ -97,7 +97,7 @@ def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> No
     """
     config = setup.config
     if (
-        state.poses_decided
+        state.pose_decision is not PoseDecision.OPEN
         or share < config.poses.refine_from
         or not pose_rounds.is_turn(setup, state, share)
     ):
@@ -108,10 +108,11 @@ def decide_poses(setup: TrainingSetup, state: TrainingState, share: float) -> No
     refined = evidence.says_so
     state.poses = PoseCorrections(setup.frames) if refined else None
     state.holds = HOLDS if refined else 0
-    state.poses_decided = f"{'refined' if refined else 'as tagged'} (step {state.steps_done + 1}: {evidence})"
-    log.info("poses %s", state.poses_decided)
+    state.pose_decision = PoseDecision.REFINED if refined else PoseDecision.TAGS_HOLD
+    state.pose_evidence = f"step {state.steps_done + 1}: {evidence}"
+    log.info("poses %s", state.pose_report)
     if refined or not setup.keeps_unseen:
-        state.order = FrameOrder.of(setup.frames, config.bracket_steps, [], state.order.turn)
+        state.order = FrameOrder.of(setup.frames, config.bracket_steps, [], state.misfits, state.order)
 
 
 def measure_unseen(setup: TrainingSetup, state: TrainingState, share: float) -> None:
@@ -122,13 +123,13 @@ def measure_unseen(setup: TrainingSetup, state: TrainingState, share: float) -> 
     if share < UNSEEN_UNTIL or not is_keeping_unseen(setup, state):
         return
     state.unseen_factor = unseen_factor(setup, state)
-    order = state.order
-    state.order = FrameOrder.of(setup.frames, setup.config.bracket_steps, [], order.turn, visits=order.visits)
+    by_exposure = setup.config.bracket_steps
+    state.order = FrameOrder.of(setup.frames, by_exposure, [], state.misfits, state.order)
 
 
 def is_undecided(state: TrainingState) -> bool:
     """Return whether validation brackets are still to decide on the poses, or would if there were enough of them."""
-    return state.poses_decided in ("", TOO_FEW_BRACKETS)
+    return state.pose_decision in (PoseDecision.OPEN, PoseDecision.TOO_FEW_BRACKETS)
 
 
 def is_keeping_unseen(setup: TrainingSetup, state: TrainingState) -> bool:

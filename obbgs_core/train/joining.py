@@ -20,8 +20,8 @@ from obbgs_core.train.decisions import is_keeping_unseen, is_undecided, smooth
 from obbgs_core.train.glints import first_lobes
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.parsimony import padded_to
-from obbgs_core.train.poses import HELD_FROM, HOLDS
-from obbgs_core.train.setup import TOO_FEW_BRACKETS, UNTESTED, TrainingSetup
+from obbgs_core.train.poses import HELD_FROM, HOLDS, PoseDecision
+from obbgs_core.train.setup import TrainingSetup
 from obbgs_core.train.state import TrainingState
 from obbgs_core.train.validation import every_seventh_bracket
 
@@ -105,13 +105,9 @@ def join(
     if state.poses is not None:
         state.poses = fresh.poses
         state.pose_rounds *= len(setup.frames) / len(joined.frames)
-    elif state.poses_decided in UNTESTED or fresh.poses is not None:
-        state.poses, state.poses_aligned, state.poses_decided, state.holds = (
-            fresh.poses,
-            fresh.poses_aligned,
-            fresh.poses_decided,
-            fresh.holds,
-        )
+    elif not state.pose_decision.is_tested or fresh.poses is not None:
+        state.poses, state.poses_aligned, state.holds = fresh.poses, fresh.poses_aligned, fresh.holds
+        state.pose_decision, state.pose_evidence = fresh.pose_decision, fresh.pose_evidence
     state.placed_by, state.round = fresh.placed_by, None
     withhold(joined, state)
     smooth(joined, state)
@@ -126,23 +122,15 @@ def withhold(setup: TrainingSetup, state: TrainingState) -> None:
     """
     wanted = is_undecided(state) or is_keeping_unseen(setup, state)
     withheld = every_seventh_bracket(setup.frames) if wanted else []
-    state.order = FrameOrder.of(
-        setup.frames,
-        setup.config.bracket_steps,
-        withheld,
-        state.order.turn,
-        state.misfits,
-        state.order.visits,
-    )
+    by_exposure = setup.config.bracket_steps
+    state.order = FrameOrder.of(setup.frames, by_exposure, withheld, state.misfits, state.order)
 
 
 def release(setup: TrainingSetup, state: TrainingState, hold: float) -> None:
     """Train on the withheld brackets too where they stayed too few for a decision, because no frames follow."""
-    if state.poses_decided == TOO_FEW_BRACKETS and state.order.validation_brackets:
-        order = state.order
-        state.order = FrameOrder.of(
-            setup.frames, setup.config.bracket_steps, [], order.turn, visits=order.visits
-        )
+    if state.pose_decision is PoseDecision.TOO_FEW_BRACKETS and state.order.validation_brackets:
+        by_exposure = setup.config.bracket_steps
+        state.order = FrameOrder.of(setup.frames, by_exposure, [], state.misfits, state.order)
         state.steps_done = min(state.steps_done, round(setup.config.steps_until(hold)))
 
 
@@ -159,7 +147,8 @@ def begun_again(state: TrainingState, fresh: TrainingState) -> TrainingState:
         removed_not_finite=state.removed_not_finite,
     )
     if state.poses is not None and fresh.poses is state.poses:
-        again.poses_decided, again.poses_aligned = state.poses_decided, True
+        again.pose_decision, again.pose_evidence = state.pose_decision, state.pose_evidence
+        again.poses_aligned = True
         again.holds = 0 if state.pose_rounds >= SETTLED_ROUNDS else HOLDS
     return again
 

@@ -160,13 +160,8 @@ def _leave_out(setup: TrainingSetup, state: TrainingState, brackets: list[list[i
     log.warning(
         "step %d: frames %s fit no pose that their tags allow and are left out", state.steps_done, names
     )
-    state.order = FrameOrder.of(
-        setup.frames,
-        setup.config.bracket_steps,
-        state.order.validation_brackets,
-        state.order.turn,
-        state.misfits,
-    )
+    by_exposure, withheld = setup.config.bracket_steps, state.order.validation_brackets
+    state.order = FrameOrder.of(setup.frames, by_exposure, withheld, state.misfits, state.order)
 
 
 def fitting(setup: TrainingSetup, state: TrainingState) -> list[int]:

@@ -7,6 +7,7 @@ from torch import Tensor
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.sensor import Sensor
+from obbgs_core.sky_level import SkyLevel
 from obbgs_core.train.compensation import mapped, nearest
 from obbgs_core.train.config import MethodConfig
 
@@ -68,6 +69,7 @@ class TrainResult:
     misfit: float | None
     # how many times as large that is as on the frames that it was trained on; None: not measured
     unseen_factor: float | None
+    sky_level: SkyLevel  # of the frames that were given
     sun_span_deg: float  # largest angle between two frames' Suns, body frame
     dark_frames: int  # left out: nothing in them rises above the noise
     misfit_frames: list[int]  # left out, by their ids: they fitted no pose that their tags allow

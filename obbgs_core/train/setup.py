@@ -28,6 +28,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.sensor import Sensor, dark_reading, noise_excess
 from obbgs_core.settings import flat
+from obbgs_core.sky_level import SkyLevel, levelled
 from obbgs_core.start.alignment import settled
 from obbgs_core.start.hull import Silhouette, light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
@@ -37,7 +38,7 @@ from obbgs_core.train.batches import Batches, FrameOrder
 from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import Growth
-from obbgs_core.train.poses import HOLDS
+from obbgs_core.train.poses import HOLDS, PoseDecision
 from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import Identity, TrainingState
 from obbgs_core.train.validation import validation_brackets
@@ -52,9 +53,6 @@ CLEAR_EXCESS = 1.3
 UNSMOOTHED = 1.1  # ratio of the scatter of pixels two apart to that of neighbours; noise has 1.02 to 1.05
 MOST_HIDDEN = 0.01  # share of the first Gaussians that may be nearer to the cameras than what is drawn
 AS_MANY_PICTURES = 35  # long exposures: the lit pixels of fewer count as those of so many (experiment 084)
-EXACT_TAGS = "as tagged (the tags are exact)"
-TOO_FEW_BRACKETS = "as tagged (too few brackets for validation)"
-UNTESTED = ("", EXACT_TAGS, TOO_FEW_BRACKETS)  # of poses whose refinement no validation brackets have decided
 
 
 @dataclass(frozen=True)
@@ -79,6 +77,7 @@ class TrainingSetup:
     silhouettes: dict[int, Silhouette]  # of the long exposures as tagged, by the frame's index
     outlines: dict[int, Silhouette]  # the same, grown or moved by the errors of the poses
     start_means: Tensor  # [N, 3] m, of the first Gaussians
+    sky_level: SkyLevel  # of the frames that were given, also of those that show no light
 
     @property
     def sun_moves(self) -> bool:
@@ -136,6 +135,7 @@ def prepare(
         TooFewFrames, ReconstructionError: as in `train`.
     """
     checked, reference_exposure_s = usable(frames, asked.exposure_aware, sensor.white_dn)
+    checked, sensor, sky_level = levelled(checked, sensor)
     sensor, noise = _with_noise_seen(checked, sensor)
     shown = [shows_light(light(f.dn, sensor, f.background, f.exposure_time_s), sensor) for f in checked]
     lit = _lit(checked, shown)
@@ -146,9 +146,8 @@ def prepare(
     posed = lit if poses is None else poses.frames(lit)
     noise += _unusual_unit(lit, sensor)
     config, budget = _limited(config, [int(outline.certain.sum()) for outline in outlines.values()])
-    gaussians, radius_m, start = first_gaussians(
-        posed, list(outlines.values()), sensor, config.start, config.light.sh_degree, rng
-    )
+    given = (posed, list(outlines.values()), sensor, config.start, config.light.sh_degree, rng)
+    gaussians, radius_m, start = first_gaussians(*given)
     _check_nearness(gaussians.means.detach(), posed)
     gaussians = dataclasses.replace(gaussians, footprint=config.footprint)
     span_deg = sun_span_deg(lit)
@@ -163,9 +162,7 @@ def prepare(
         batches=Batches(lit, sensor.white_dn, sky, shown_part, solid),
         radius_m=radius_m,
         unit_m=camera_extent_m(lit) if config.length_unit == "cameras" else radius_m,
-        radiance_unit=sensor.full_scale_radiance(mean_exposure_s(lit))
-        if config.radiance_unit == "full_scale"
-        else 1.0,
+        radiance_unit=_radiance_unit(config, sensor, lit),
         sun_span_deg=span_deg,
         start=start + noise,
         budget=budget,
@@ -175,29 +172,40 @@ def prepare(
         silhouettes=seen,
         outlines=outlines,
         start_means=gaussians.means.detach(),
+        sky_level=sky_level,
     )
     brackets = validation_brackets(lit)
-    poses_decided = _decided_at_once(config, lit, brackets) if poses is None else f"refined ({why})"
+    decision = PoseDecision.REFINED if poses is not None else _decided_at_once(config, lit, brackets)
+    is_open = decision is PoseDecision.OPEN
     if poses is None and config.poses.refine == "always":
         poses = PoseCorrections(lit)
-    kept_back = brackets if not poses_decided or (setup.keeps_unseen and poses is None) else []
+    kept_back = brackets if is_open or (setup.keeps_unseen and poses is None) else []
     state = TrainingState(
         rng=rng,
         gaussians=gaussians,
-        adam=_adam(setup, gaussians, exact_tags=poses is None and poses_decided != ""),
+        adam=_adam(setup, gaussians, exact_tags=poses is None and not is_open),
         growth=Growth.of(len(gaussians)),
         order=FrameOrder.of(lit, config.bracket_steps, kept_back),
         poses=poses,
         poses_aligned=bool(why),
-        poses_decided=poses_decided,
+        pose_decision=decision,
+        pose_evidence=why,
         holds=HOLDS if poses is not None else 0,
         placed_by=copy.deepcopy(refined),
         appearance_reason="as configured" if config.light.sh_degree else "",
         compensation=Compensation(len(lit), lit[0].dn.shape[2]) if config.compensation else None,
+        smoothing_m=_first_smoothing_m(config, gaussians, lit),
     )
-    if config.smoothing_px2:
-        state.smoothing_m = sampling_deviation_m(gaussians.means, lit, config.smoothing_px2)
     return setup, state
+
+
+def _first_smoothing_m(
+    config: MethodConfig, gaussians: Gaussians, frames: list[TrainingFrame]
+) -> Tensor | None:
+    """Return the deviations [N] of the 3D filter of the first Gaussians; None where the method has none."""
+    if not config.smoothing_px2:
+        return None
+    return sampling_deviation_m(gaussians.means, frames, config.smoothing_px2)
 
 
 def _lit(frames: list[TrainingFrame], shown: list[bool]) -> list[TrainingFrame]:
@@ -244,6 +252,13 @@ def _check_nearness(points: Tensor, frames: list[TrainingFrame]) -> None:
             f"{hidden:.0%} of the target is nearer to the cameras than {near_m} m and is not drawn: are the poses "
             "in metres? Scale their positions up, by a thousand if they are in kilometres"
         )
+
+
+def _radiance_unit(config: MethodConfig, sensor: Sensor, frames: list[TrainingFrame]) -> float:
+    """Return the method's unit of radiance."""
+    return (
+        sensor.full_scale_radiance(mean_exposure_s(frames)) if config.radiance_unit == "full_scale" else 1.0
+    )
 
 
 def _adam(setup: TrainingSetup, gaussians: Gaussians, exact_tags: bool) -> Adam:
@@ -316,10 +331,12 @@ def _limited(config: MethodConfig, lit_pixels: list[int]) -> tuple[MethodConfig,
     return dataclasses.replace(config, growth=growth, start=start), budget
 
 
-def _decided_at_once(config: MethodConfig, frames: list[TrainingFrame], brackets: list[list[int]]) -> str:
-    """Return whether the poses are refined, and why, where no training is needed to know; else nothing."""
+def _decided_at_once(
+    config: MethodConfig, frames: list[TrainingFrame], brackets: list[list[int]]
+) -> PoseDecision:
+    """Return whether the poses are refined where no training is needed to know; else that this is open."""
     if config.poses.refine != "auto":
-        return {"never": "as tagged", "always": "refined"}[config.poses.refine]
+        return {"never": PoseDecision.NEVER, "always": PoseDecision.REFINED}[config.poses.refine]
     if not PoseCorrections(frames).covariances.any():
-        return EXACT_TAGS
-    return "" if brackets else TOO_FEW_BRACKETS
+        return PoseDecision.EXACT_TAGS
+    return PoseDecision.OPEN if brackets else PoseDecision.TOO_FEW_BRACKETS

@@ -28,11 +28,12 @@ from obbgs_core.train.growth import Growth
 from obbgs_core.train.neighbours import Neighbours
 from obbgs_core.train.pose_answers import SAVED as ROUND_SAVED
 from obbgs_core.train.pose_answers import PoseRound
+from obbgs_core.train.poses import PoseDecision
 from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed
 
 log = logging.getLogger(__name__)
-FORMAT = 15  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 16  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,10 @@ class TrainingState:
     order: FrameOrder
     poses: PoseCorrections | None  # None: as tagged
     poses_aligned: bool  # before the first step, or by rounds before the schedule was set back
-    poses_decided: str  # whether the poses are refined, and why; empty: the validation brackets will decide
+    pose_decision: PoseDecision
+    pose_evidence: (
+        str  # what the decision rests on, in words for the report; nothing where the decision says it all
+    )
     holds: int  # how often the schedule will still be set back for the poses
     appearance_reason: str  # why the radiance depends on what it does
     highlights_reason: str = ""  # why it has highlights or not; empty: not tested
@@ -121,6 +125,12 @@ class TrainingState:
 
     def _filtered(self, gaussians: Gaussians) -> Gaussians:
         return gaussians if self.smoothing_m is None else smoothed(gaussians, self.smoothing_m)
+
+    @property
+    def pose_report(self) -> str:
+        """Whether the poses are refined, and why, in words."""
+        decision = self.pose_decision.report
+        return f"{decision} ({self.pose_evidence})" if self.pose_evidence else decision
 
     @property
     def log_lowering(self) -> Tensor | None:
@@ -187,6 +197,7 @@ SAVED = [
     Compensation,
     FrameOrder,
     PoseCorrections,
+    PoseDecision,
     Whitening,
     Obb,
     Shadows,

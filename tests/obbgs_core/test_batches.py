@@ -88,7 +88,7 @@ def test_frames_that_join_late_are_drawn_more_often_until_they_have_caught_up():
     order, rng = FrameOrder.of(frames[:12], True, []), torch.Generator().manual_seed(0)
     order.draw(12 * 8, rng)
     assert set(order.visits.values()) == {8}
-    order = FrameOrder.of(frames, True, [], order.turn, visits=order.visits)
+    order = FrameOrder.of(frames, True, [], earlier=order)
     drawn = order.draw(48, rng)  # a round: each of the old once, each of the new three times
     assert sorted(drawn) == sorted([*range(12), *[i for i in range(12, 24) for _ in range(3)]])
     for _ in range(20):

@@ -22,7 +22,7 @@ from obbgs_core.train.parsimony import (
     next_degree_gain,
     shown_frames,
 )
-from obbgs_core.train.poses import HELD_FROM
+from obbgs_core.train.poses import HELD_FROM, PoseDecision
 from obbgs_core.train.presets import preset
 from obbgs_core.train.smoothing import sampling_rates
 from obbgs_core.train.trainer import Trainer, train
@@ -136,16 +136,20 @@ TELLING = {
 def test_wrong_poses_are_refined_and_exact_ones_are_left_alone(wrong):
     frames = tagged(photographed(target(80, seed=5), 42), wrong, sigma_rad=0.01)
     trainer = Trainer(frames, SENSOR, preset("obbgs", TELLING))
-    while not trainer.state.poses_decided:
+    while trainer.state.pose_decision is PoseDecision.OPEN:
         assert trainer.state.order.validation_brackets == [[i] for i in range(3, 42, 7)]
         trainer.step()
     assert trainer.state.order.validation_brackets == [] and trainer.state.history[-1].step == 161
     assert trainer.state.steps_done == (
         400 * HELD_FROM if wrong else 161
     )  # a refinement sets the schedule back
-    assert trainer.state.poses_decided.startswith("refined" if wrong else "as tagged")
+    assert trainer.state.pose_decision is (PoseDecision.REFINED if wrong else PoseDecision.TAGS_HOLD)
+    assert trainer.state.pose_report.startswith("refined (step 161" if wrong else "as tagged (step 161")
     assert (trainer.state.poses is not None) == wrong
-    assert trainer.result("").poses == trainer.state.poses_decided
+    assert trainer.result("").poses == trainer.state.pose_report
+    # who was drawn how often is not forgotten: frames that join late are drawn more often
+    order = trainer.state.order
+    assert sum(order.visits.values()) == order.turn > 0
 
 
 def under_a_moving_sun() -> tuple[list[TrainingFrame], list[int]]:
@@ -230,7 +234,7 @@ def test_with_exact_poses_or_few_frames_no_bracket_is_kept_for_validation():
     for frames, why in ((exact, "the tags are exact"), (tagged(exact, True)[:23], "too few brackets")):
         trainer = Trainer(frames, SENSOR, config)
         assert (
-            why in trainer.state.poses_decided
+            why in trainer.state.pose_report
             and not trainer.state.order.validation_brackets
             and trainer.state.poses is None
         )

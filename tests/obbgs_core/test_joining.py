@@ -13,9 +13,8 @@ from obbgs_core.model.gaussians import TENSORS, Gaussians
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.train.joining import NEW_SPACINGS, SETTLED_ROUNDS
-from obbgs_core.train.poses import HOLDS
+from obbgs_core.train.poses import HOLDS, PoseDecision
 from obbgs_core.train.presets import preset
-from obbgs_core.train.setup import TOO_FEW_BRACKETS
 from obbgs_core.train.trainer import HOLD, Trainer
 from tests.scenes import EXPOSURES_S, QUICK, SENSOR, SIZE_PX, photographed, tagged, target
 
@@ -206,14 +205,16 @@ def test_brackets_that_decide_on_the_poses_have_never_been_trained_on(frames):
     trainer = Trainer(doubted[:6], SENSOR, config)
     trainer.withhold()
     for first in range(6, 42, 6):
-        assert trainer.state.poses_decided == (TOO_FEW_BRACKETS if first < 24 else "")
+        assert trainer.state.pose_decision is (
+            PoseDecision.TOO_FEW_BRACKETS if first < 24 else PoseDecision.OPEN
+        )
         assert trainer.state.poses is None
         drawn = {index for group in trainer.state.order.groups for index in group}
         assert drawn == {i for i in range(first) if i % 7 != 3}
         trainer.join(doubted[first : first + 6])
-    while not trainer.state.poses_decided:
+    while trainer.state.pose_decision is PoseDecision.OPEN:
         trainer.step()
-    assert "that a validation bracket's pose errs" in trainer.state.poses_decided
+    assert "that a validation bracket's pose errs" in trainer.state.pose_report
     assert sorted(index for group in trainer.state.order.groups for index in group) == list(range(42))
 
 
@@ -255,7 +256,7 @@ def test_too_few_brackets_to_decide_are_trained_on_when_no_more_come(frames):
     assert trainer.state.order.validation_brackets == [[3], [10], [17]]
     trainer.end_joining()
     assert sorted(index for group in trainer.state.order.groups for index in group) == list(range(18))
-    assert trainer.state.poses_decided == TOO_FEW_BRACKETS
+    assert trainer.state.pose_decision is PoseDecision.TOO_FEW_BRACKETS
 
 
 def test_a_sun_that_moves_only_later_is_tested_then(frames):

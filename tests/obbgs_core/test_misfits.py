@@ -47,6 +47,8 @@ def test_frames_whose_poses_err_by_more_than_their_tags_say_are_left_out_and_nam
     result = trainer.result("")
     assert sorted(result.misfit_frames) == [4, 17]
     assert {i for group in trainer.state.order.groups for i in group} == set(range(26)) - {4, 17}
+    order = trainer.state.order  # who was drawn how often is not forgotten
+    assert sum(order.visits.values()) == order.turn
     assert result.pose_estimate is not None
     assert result.pose_estimate.frame_ids == [i for i in range(26) if i not in (4, 17)]
     assert result.pose_estimate.estimated.shape == (24, 4, 4)

@@ -178,6 +178,27 @@ def test_shot_noise_has_the_variance_of_its_electrons():
     assert dn.var() == pytest.approx(expected, rel=0.04)  # 40,000 readings: deviation 0.7 %
 
 
+def test_a_pedestal_and_a_gradient_are_added_before_readings_are_clipped(case):
+    range_dn = case.sensor.white_dn - case.sensor.black_dn
+    for plain, raised in zip(
+        frames_under(case, noise=1e-6), frames_under(case, noise=1e-6, pedestal=0.1), strict=True
+    ):
+        expected = (plain.dn + 0.1 * range_dn).clamp(max=case.sensor.white_dn)
+        assert (
+            raised.dn - expected
+        ).abs().max() <= 1.5  # rounding of both, and the shot noise of few electrons
+    for plain, slanted in zip(
+        frames_under(case, noise=1e-6), frames_under(case, noise=1e-6, stray_gradient=0.1), strict=True
+    ):
+        added = (slanted.dn - plain.dn)[..., 0]
+        corners = added[[0, 0, -1, -1], [0, -1, 0, -1]]  # show no target
+        assert corners.min() == pytest.approx(0, abs=2) and corners.max() == pytest.approx(
+            0.1 * range_dn, abs=2
+        )
+        steps = added[0].diff()  # along the uppermost row, which shows none either
+        assert (steps - steps.mean()).abs().max() <= 2
+
+
 def test_pose_errors_turn_the_camera_and_say_so(case):
     frames = frames_under(case, pose_error_deg=1.0)
     angles = []

@@ -1,0 +1,319 @@
+"""The level of empty sky: what a pixel reads where the target is not, measured on the frames themselves.
+
+A sensor's stated black level leaves out what a pass adds: a pedestal that drifts with temperature, and stray light that
+changes from one side of the picture to the other. Both are added to every reading, target or sky, so that a plane in
+each frame and channel describes them. The plane is fitted to blocks of pixels that scatter as empty sky does; readings
+are normal variables clipped at zero (Tobin 1958), and the expectation of what is clipped is fitted.
+
+Frames learn from each other: each plane is the mean of what its own frame shows and of what all show, weighted by how
+precisely the one is measured and by how much frames differ (empirical Bayes; Efron and Morris, Data analysis using
+Stein's estimator, 1975).
+"""
+
+import dataclasses
+import logging
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from obbgs_core.frames import TrainingFrame
+from obbgs_core.sensor import Sensor, clipped_mean, clipped_moments
+
+log = logging.getLogger(__name__)
+BLOCKS = 28  # along the shorter side of the picture, about
+FEWEST_BLOCKS = 12  # of sky, that a plane can be fitted to
+# The first plane has about this share of all blocks below it. Most pictures are mostly sky, and light of the target is
+# never below it.
+LOW_SHARE = 0.2
+# The first noise is that of about this share of the blocks, and half of it may be clipped, which leaves so much of a
+# deviation.
+QUIET_SHARE, CLIPPED_SIGMA = 0.25, math.sqrt(0.5 - 0.5 / math.pi)
+FAR = 3.0  # a block whose mean is more deviations away from the plane is no empty sky
+TOO_VARIED = 4.0  # nor is one whose variance is above that of noise by so many of its deviations
+# Nothing is darker than the sky: where more blocks than this share are far below the plane, it lies in the target.
+MOST_BELOW = 0.02
+FAR_BELOW = 4.0
+FIRST_SWEEPS, SWEEPS = 30, 6  # of the first plane, and of the plane through sky
+# Of a reading's deviation: a level that departs by less from the stated black, in the mean of squares over frames and
+# pixels, is no reason to doubt it. Windows of 25 pixels tell sky from a face of 0.2 (`start.hull.FAINTEST_SIGMA`).
+NEGLIGIBLE = 0.03
+CERTAIN = 3.0  # and it has to be above the error of measurement by so many deviations
+
+
+@dataclass(frozen=True)
+class SkyLevel:
+    """What empty sky reads in some frames.
+
+    frame_ids: of the frames.
+    planes_dn: [F, C, 3] the level above the stated black at the picture's centre, and how much it rises from there to
+        the right edge and to the lower edge, DN; zeros where the stated level fits.
+    sigma_dn: [F, C, 3] the deviations of `planes_dn`; infinite for a frame that shows too little sky of its own.
+    """
+
+    frame_ids: list[int]
+    planes_dn: Tensor
+    sigma_dn: Tensor
+
+    @property
+    def fits(self) -> bool:
+        """Whether the stated black level is that of empty sky."""
+        return not self.planes_dn.any()
+
+    def by_frame(self) -> dict[int, list[float]]:
+        """Return the level above black in the middle of each frame and its deviation, DN, means of the channels."""
+        values = torch.stack([self.planes_dn, self.sigma_dn])[..., 0].mean(dim=2).T.tolist()
+        return {
+            number: [round(v, 3) for v in pair] for number, pair in zip(self.frame_ids, values, strict=True)
+        }
+
+    def __str__(self) -> str:
+        if self.fits:
+            return "empty sky reads the stated black level"
+        level, rise = self.planes_dn[..., 0], self.planes_dn[..., 1:].norm(dim=2)
+        return (
+            f"empty sky reads {level.min():.2f} to {level.max():.2f} DN more than the stated black level in the middle "
+            f"of the frames, and up to {rise.max():.2f} DN more at an edge: this is taken off every reading"
+        )
+
+
+def levelled(frames: list[TrainingFrame], sensor: Sensor) -> tuple[list[TrainingFrame], Sensor, SkyLevel]:
+    """Measure the level of empty sky in frames of one size, and take its departure from the stated black off them.
+
+    In front of another background than black, and where fewer than half of the frames show sky, nothing is measured and
+    the stated level holds.
+
+    Returns:
+        The frames and the sensor with which their readings say of the light what those given say of light and
+        departure; those given where the stated level fits. And the level.
+    """
+    channels = frames[0].dn.shape[2]
+    nothing = torch.zeros(len(frames), channels, 3)
+    ids = [f.id for f in frames]
+    told = SkyLevel(ids, nothing, torch.full_like(nothing, math.inf))
+    if frames[0].background:
+        return frames, sensor, told
+    planes, covariance, sigma_dn = _measured(frames, sensor)
+    measured = covariance.isfinite().all(dim=2).all(dim=1)
+    if 2 * int(measured.sum()) < len(frames):
+        return frames, sensor, told
+    planes = planes - torch.tensor([sensor.black_dn, 0, 0])
+    departs = _departs(planes[measured], covariance[measured], NEGLIGIBLE * sigma_dn)
+    planes, covariance = _shared(planes, covariance, measured)
+    if not departs:
+        return frames, sensor, dataclasses.replace(told, sigma_dn=covariance.sqrt().float())
+    level = SkyLevel(ids, planes.float(), covariance.sqrt().float())
+    log.warning("%s", level)
+    return *_without(frames, sensor, level.planes_dn), level
+
+
+def field(plane_dn: Tensor, height: int, width: int) -> Tensor:
+    """Return the departure [H, W, C] of one frame's planes [C, 3], DN."""
+    return torch.einsum("hwk,ck->hwc", _basis(height, width).to(plane_dn), plane_dn)
+
+
+def _basis(rows: int, columns: int) -> Tensor:
+    """Return 1 and the place from -1 at the left and upper edges to 1 at the others, of cells [rows, columns, 3]."""
+    y, x = ((torch.arange(n) + 0.5) * 2 / n - 1 for n in (rows, columns))
+    y, x = torch.meshgrid(y, x, indexing="ij")
+    return torch.stack([torch.ones_like(x), x, y], dim=-1)
+
+
+def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tensor, float]:
+    """Return planes [F, C, 3] and their variances, infinite where a frame shows no sky, and a reading's deviation."""
+    height, width, channels = frames[0].dn.shape
+    px = max(2, round(min(height, width) / BLOCKS))
+    rows, columns = height // px, width // px
+    if rows * columns < FEWEST_BLOCKS:
+        nothing = torch.zeros(len(frames), channels, 3).double()
+        return nothing, torch.full_like(nothing, math.inf), 1.0
+    pooled = [_block_moments(f.dn, px) for f in frames]
+    mean, variance = (torch.stack(moments) for moments in zip(*pooled, strict=True))  # [F, C, B]
+    whole = _basis(height, width)[: rows * px, : columns * px].movedim(-1, 0)[None]
+    basis = F.avg_pool2d(whole, px)[0].flatten(1).T.double()  # [B, 3]
+    quiet = variance.mean(dim=1).quantile(QUIET_SHARE, dim=1).median()
+    sigma_dn = max(math.sqrt(float(quiet)) / CLIPPED_SIGMA, math.sqrt(1 / 12))
+    levels = _levels(mean.mean(dim=1), sigma_dn)
+    even = torch.zeros(len(frames), 3).double()
+    even[:, 0] = levels.quantile(LOW_SHARE, dim=1)
+    found = [
+        _through_sky(start, basis, mean, variance, (px * px, rows), sigma_dn, sensor)
+        for start in (_low_planes(basis, levels, sigma_dn), even)
+    ]
+    # of the two planes of a frame that with more sky; the noise as most frames show it
+    first = found[0].count >= found[1].count
+    plane = torch.where(first[:, None], found[0].plane, found[1].plane)
+    sky = torch.where(first[:, None], found[0].sky, found[1].sky)
+    usable = found[0].count.maximum(found[1].count) > 0
+    sigma_dn = max(found, key=lambda f: int(f.count.sum())).sigma_dn
+    planes, variances = [], []
+    for channel in range(channels):
+        own, of_reading = plane, torch.empty(0)
+        for _ in range(SWEEPS):
+            own, of_reading = _fitted(own, basis, mean[:, channel], sky, sigma_dn, sensor)
+        planes.append(own)
+        variances.append(of_reading / (px * px))
+    errors = torch.where(usable[:, None, None], torch.stack(variances, dim=1), math.inf)
+    return torch.stack(planes, dim=1), errors, sigma_dn
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Planes [F, 3] through the sky of frames, which blocks [F, B] are sky, and a reading's deviation.
+
+    count: [F] of blocks of sky; 0 where they are too few, or where something is darker than the plane.
+    """
+
+    plane: Tensor
+    sky: Tensor
+    count: Tensor
+    sigma_dn: float
+
+
+def _through_sky(
+    plane: Tensor,
+    basis: Tensor,
+    mean: Tensor,
+    variance: Tensor,
+    size: tuple[int, int],
+    sigma_dn: float,
+    sensor: Sensor,
+) -> _Fit:
+    """Return planes after sweeps that tell sky from the target and fit plane and noise to the sky.
+
+    Args:
+        plane: [F, 3] the first planes.
+        mean, variance: [F, C, B] of the readings of each block.
+        size: pixels of a block, and rows of blocks.
+    """
+    grey, scatter, readings = mean.mean(dim=1), variance.mean(dim=1), size[0] * mean.shape[1]
+    sky = torch.ones_like(grey, dtype=torch.bool)
+    expected, spread = _moments(plane, basis, sigma_dn, sensor)
+    for _ in range(SWEEPS):
+        sky = _sky_blocks(grey, scatter, expected, spread, readings, size[1])
+        plane, _ = _fitted(plane, basis, grey, sky, sigma_dn, sensor)
+        _, spread = _moments(plane, basis, sigma_dn, sensor)
+        ratio = (scatter * sky).sum(dim=1) / (spread * sky).sum(dim=1)
+        if ratio.isfinite().any():
+            sigma_dn *= math.sqrt(float(ratio.nanmedian()))
+        expected, spread = _moments(plane, basis, sigma_dn, sensor)
+    below = (grey < expected - FAR_BELOW * (spread / readings).sqrt()).double().mean(dim=1)
+    count = sky.sum(dim=1)
+    return _Fit(plane, sky, count * ((count >= FEWEST_BLOCKS) & (below <= MOST_BELOW)), sigma_dn)
+
+
+def _block_moments(dn: Tensor, px: int) -> tuple[Tensor, Tensor]:
+    """Return mean and variance [C, B] of blocks of px x px readings dn [H, W, C]."""
+    image = dn.movedim(-1, 0)[None].double()
+    mean, square = F.avg_pool2d(image, px), F.avg_pool2d(image.square(), px)
+    return mean[0].flatten(1), ((square - mean.square()) * px**2 / (px**2 - 1))[0].flatten(1).clamp(min=0)
+
+
+def _levels(mean: Tensor, sigma_dn: float) -> Tensor:
+    """Return the levels whose readings, clipped at zero, have given means; by Newton's method, from above."""
+    level, sigma = mean.clone(), torch.full_like(mean, sigma_dn)
+    for _ in range(SWEEPS):
+        level -= (clipped_mean(level, sigma) - mean) / torch.special.ndtr(level / sigma)
+        level.clamp_(min=-FAR * sigma_dn)
+    return level
+
+
+def _low_planes(basis: Tensor, mean: Tensor, sigma_dn: float) -> Tensor:
+    """Return planes [F, 3] below which LOW_SHARE of the blocks' levels [F, B] lie.
+
+    Source: Koenker and Bassett, Regression quantiles, 1978; by iteratively reweighted least squares.
+    """
+    weight, planes = torch.ones_like(mean), torch.zeros(len(mean), 3).double()
+    for _ in range(FIRST_SWEEPS):
+        planes = _solved(basis, mean, weight)
+        above = mean - planes @ basis.T
+        weight = torch.where(above > 0, LOW_SHARE, 1 - LOW_SHARE) / (above.abs() + 0.05 * sigma_dn)
+    return planes
+
+
+def _solved(basis: Tensor, values: Tensor, weight: Tensor) -> Tensor:
+    """Return the planes [F, 3] that fit values [F, B] best by weighted squares."""
+    normal = torch.einsum("bi,fb,bj->fij", basis, weight, basis)
+    return torch.linalg.solve(normal, torch.einsum("bi,fb->fi", basis, weight * values))
+
+
+def _moments(planes: Tensor, basis: Tensor, sigma_dn: float, sensor: Sensor) -> tuple[Tensor, Tensor]:
+    """Return mean and variance [F, B] of readings of sky at the level of the planes, clipped as the sensor clips."""
+    level = planes @ basis.T
+    return clipped_moments(level, torch.full_like(level, sigma_dn), sensor.white_dn)
+
+
+def _sky_blocks(
+    mean: Tensor, variance: Tensor, expected: Tensor, spread: Tensor, readings: int, rows: int
+) -> Tensor:
+    """Return which blocks [F, B] read and scatter as empty sky, and have no neighbours that do not."""
+    lit = (mean - expected).abs() > FAR * (spread / readings).sqrt()
+    lit |= variance > spread * (1 + TOO_VARIED * math.sqrt(2 / readings))
+    grid = lit.double().view(len(lit), 1, rows, -1)
+    near = F.max_pool2d(grid, 3, 1, 1).view(len(lit), -1) > 0
+    enough = (~near).sum(dim=1, keepdim=True) >= FEWEST_BLOCKS
+    return torch.where(enough, ~near, ~lit)
+
+
+def _fitted(
+    planes: Tensor, basis: Tensor, mean: Tensor, sky: Tensor, sigma_dn: float, sensor: Sensor
+) -> tuple[Tensor, Tensor]:
+    """Return planes [F, 3] after one Gauss-Newton step towards the block means, and their variances for one reading."""
+    expected, spread = _moments(planes, basis, sigma_dn, sensor)
+    slope = torch.special.ndtr(planes @ basis.T / sigma_dn)  # of the clipped mean by the level
+    weight = sky / spread.clamp(min=1e-9)
+    normal = torch.einsum("bi,fb,bj->fij", basis, weight * slope.square(), basis)
+    normal = normal + 1e-9 * torch.eye(3).double()
+    step = torch.linalg.solve(normal, torch.einsum("bi,fb->fi", basis, weight * slope * (mean - expected)))
+    return planes + step, torch.linalg.inv(normal).diagonal(dim1=1, dim2=2)
+
+
+def _departs(planes: Tensor, variance: Tensor, negligible_dn: float) -> bool:
+    """Return whether planes [F, C, 3] depart from zero by more than what is negligible and than their errors.
+
+    Mean squares over the picture are compared, those of all frames and those of the mean plane.
+    """
+    over_picture = torch.tensor([1, 1 / 3, 1 / 3]).double()  # the mean square of each term
+    noise = float((variance @ over_picture).mean())
+    for seen, error, count in ((planes, noise, len(planes)), (planes.mean(dim=0), noise / len(planes), 1)):
+        excess = float((seen.square() @ over_picture).mean()) - error
+        if excess > negligible_dn**2 + CERTAIN * error * math.sqrt(2 / count):
+            return True
+    return False
+
+
+def _shared(planes: Tensor, variance: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
+    """Return planes and their variances [F, C, 3] after each frame has learnt from the others."""
+    seen, noise = planes[measured], variance[measured]
+    mean = seen.mean(dim=0)
+    between = (seen.var(dim=0, unbiased=len(seen) > 1) - noise.mean(dim=0)).clamp(min=0)
+    trust = torch.where(variance.isfinite(), between / (between + variance), 0.0)
+    own = torch.where(variance.isfinite(), planes, mean)
+    of_others = between + noise.mean(dim=0) / len(seen)
+    posterior = trust * variance.nan_to_num(posinf=0) + (1 - trust) * of_others
+    return mean + trust * (own - mean), posterior
+
+
+def _without(
+    frames: list[TrainingFrame], sensor: Sensor, planes_dn: Tensor
+) -> tuple[list[TrainingFrame], Sensor]:
+    """Return frames and sensor without the fields of given planes.
+
+    A reading clipped at zero says "at most this much", one at full scale "at least this much". Both still do after the
+    field was taken off, if all readings are clipped again at levels that no field moves the old ones beyond.
+    """
+    height, width = frames[0].dn.shape[:2]
+    corner = planes_dn[..., 1:].abs().sum(dim=2)
+    lowest = min(0.0, float((planes_dn[..., 0] - corner).min()))
+    highest = max(0.0, float((planes_dn[..., 0] + corner).max()))
+    black_dn = max(0.0, sensor.black_dn + lowest)
+    white_dn = sensor.white_dn - (highest - (black_dn - sensor.black_dn))
+    corrected = []
+    for frame, plane in zip(frames, planes_dn, strict=True):
+        off = field(plane, height, width) - (black_dn - sensor.black_dn)
+        dn = (frame.dn - off).clamp(0, white_dn)
+        dn[frame.dn <= 0], dn[frame.dn >= sensor.white_dn] = 0.0, white_dn
+        corrected.append(dataclasses.replace(frame, dn=dn))
+    return corrected, dataclasses.replace(sensor, black_dn=black_dn, white_dn=white_dn)
