@@ -6,6 +6,7 @@ import logging
 import math
 import signal
 import threading
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any
@@ -57,9 +58,13 @@ CameraUrl = Annotated[
 LinkUrl = Annotated[
     str, typer.Option("--link", help="The link's URL, such as serial:///dev/ttyUSB0?baud=921600.")
 ]
-KeyFile = Annotated[
-    Path | None,
-    typer.Option("--key", help="The file of the mission's key; without it every command is refused."),
+KeyFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--key",
+        help="The file of a key; can be repeated, for the key that takes the other's place. Without a usable one every "
+        "command is refused.",
+    ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
@@ -96,14 +101,16 @@ def serve(
     link: LinkUrl,
     mission: MissionFile = Path("mission.yaml"),
     store: StoreDir = Path("store"),
-    key: KeyFile = None,
+    key: KeyFiles = None,
     json_: AsJson = False,
 ) -> None:
     """Take the planned brackets, send frames and obey commands until stopped (SIGTERM or Ctrl-C end it cleanly).
 
     Example: flightsw serve --camera gige://192.168.0.10 --link 'serial:///dev/ttyS1?baud=921600' --key mission.key
     """
-    _run(load_mission(mission), store, camera, link, exit_when_empty=False, as_json=json_, key_file=key)
+    _run(
+        load_mission(mission), store, camera, link, exit_when_empty=False, as_json=json_, key_files=key or ()
+    )
 
 
 @app.command()
@@ -112,14 +119,14 @@ def downlink(
     mission: MissionFile = Path("mission.yaml"),
     store: StoreDir = Path("store"),
     exit_when_empty: Annotated[bool, typer.Option(help="Stop when every frame is confirmed.")] = False,
-    key: KeyFile = None,
+    key: KeyFiles = None,
     json_: AsJson = False,
 ) -> None:
     """Send the frames that the ground has not confirmed, in the mission's or the commanded order; no camera is needed.
 
     Example: flightsw downlink --link 'serial:///dev/ttyUSB0?baud=921600' --store store --exit-when-empty
     """
-    _run(load_mission(mission), store, None, link, exit_when_empty, as_json=json_, key_file=key)
+    _run(load_mission(mission), store, None, link, exit_when_empty, as_json=json_, key_files=key or ())
 
 
 @app.command()
@@ -201,7 +208,9 @@ def selftest(
     ] = False,
     mission: MissionFile = Path("mission.yaml"),
     store: StoreDir = Path("store"),
-    key: Annotated[Path | None, typer.Option("--key", help="Check this key and its counter.")] = None,
+    key: Annotated[
+        list[Path] | None, typer.Option("--key", help="Check this key and its counter; can be repeated.")
+    ] = None,
     json_: AsJson = False,
 ) -> None:
     """Check clock, disk, computer and orbital elements, and key, link and camera if they are named; stop flight first.
@@ -219,7 +228,7 @@ def selftest(
             if finding.advice:
                 print(f"{'':20} -> {finding.advice}")
 
-    findings = self_test(load_mission(mission), store, camera, link, loopback, key, on_finding=show)
+    findings = self_test(load_mission(mission), store, camera, link, loopback, key or (), on_finding=show)
     failed = sum(finding.state == "failed" for finding in findings)
     if json_:
         print(json.dumps({"ok": not failed, "findings": [dataclasses.asdict(f) for f in findings]}))
@@ -303,7 +312,7 @@ def _run(
     link_url: str | None,
     exit_when_empty: bool,
     as_json: bool,
-    key_file: Path | None = None,
+    key_files: Sequence[Path] = (),
 ) -> None:
     """Capture and send, whichever are asked for, with a bar for each; print what became of every frame."""
     stop = threading.Event()
@@ -323,7 +332,7 @@ def _run(
             stop,
             camera_url=camera_url,
             link_url=link_url,
-            key_file=key_file,
+            key_files=key_files,
             exit_when_empty=exit_when_empty,
             on_captured=lambda now: progress.update(captured_bar, completed=now.planned, visible=True),
             on_sent=show_sent,

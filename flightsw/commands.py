@@ -2,7 +2,8 @@
 
 Nothing has an effect before its tag, its counter, its arguments and, where it destroys, its arming are good, and the
 counter is on the disk before the effect. A command that comes again is answered with its reports, never executed. One
-whose counter cannot be kept is neither executed nor answered, as if it had been lost on the link.
+whose counter cannot be kept is neither executed nor answered, as if it had been lost on the link. Every report says by
+a digest on which packet it is; a packet that no key on board has sealed, or whose counter another one used, is told so.
 """
 
 import contextlib
@@ -12,13 +13,13 @@ import hashlib
 import logging
 import os
 import time
-from collections import OrderedDict
-from collections.abc import Callable
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from flightsw.errors import FlightError, StoreError
-from flightsw.icd.auth import TAG_BYTES, AuthError, Key, unseal, unseal_file
+from flightsw.icd.auth import MAX_COUNTER, TAG_BYTES, AuthError, Key, claimed, digest, unseal, unseal_file
 from flightsw.icd.command import ENDED, Command, Report, model_file_name
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import Mission
@@ -26,28 +27,32 @@ from flightsw.icd.packet import PacketError
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.settings import Settings, load_settings, save_settings
 from flightsw.store import FrameStore, keep_reserve, write_with_reserve
+from obbgs_base.checked import copy_of, each_copy
 from obbgs_base.files import write_whole
 
 log = logging.getLogger(__name__)
 REMEMBERED = 64  # commands whose reports are sent again when the ground asks again
 RESERVE_BYTES = 8 * 1024  # given up for the counter on a full disk: commands are what empties it
-ANSWER_S = 0.2  # between answers to repeated commands: a flood of replays must not fill the downlink
+ANSWER_S = 0.2  # between answers to packets without effect: a flood of them must not fill the downlink
+DELETE_S = 0.05  # for deleting frames in one turn of the downlink's loop
 
 
 class ReplayCounter:
     """The counter of the last authentic command, on the disk beside the key; one process at a time has it.
 
-    A file beside the counter holds some space in reserve for when the disk is full.
+    It stands in two files, each with a checksum. The larger of the two counts, and a damaged one is written again; they
+    differ by one command where the power went between them. A third file holds some space in reserve for when the disk
+    is full.
 
     Raises:
-        ConfigError: the key or the counter file is missing, damaged or another key's.
+        ConfigError: the key is missing or damaged, or both counter files are missing, damaged or another key's.
     """
 
     def __init__(self, key_file: Path):
         self.path = key_file.with_name(key_file.name + ".received")
+        self._reserve = self.path.with_name(self.path.name + ".reserve")
         try:
             self.key = Key.parse(key_file.read_text(), str(key_file))
-            self.last = self.key.parse_counter(self.path.read_text(), str(self.path))
             self._lock = os.open(
                 key_file.with_name(self.path.name + ".lock"), os.O_WRONLY | os.O_CREAT, 0o600
             )
@@ -55,11 +60,32 @@ class ReplayCounter:
             raise ConfigError(str(key_file), f"cannot read the key and its counter: {error}") from error
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self.last = self._read()
         except BlockingIOError as error:
             self.close()
             raise ConfigError(str(self.path), "another process takes commands with this key") from error
-        self._reserve = self.path.with_name(self.path.name + ".reserve")
+        except ConfigError:
+            self.close()
+            raise
         self._keep_reserve()
+
+    @property
+    def is_retired(self) -> bool:
+        """Whether the counter has come to its end, by which a key is retired."""
+        return self.last == MAX_COUNTER
+
+    def _read(self) -> int:
+        counters, problems = each_copy(self.path, lambda text: self.key.parse_counter(text, str(self.path)))
+        if not counters:
+            raise ConfigError(str(self.path), f"neither the counter nor its copy can be used: {problems[0]}")
+        if problems:
+            log.warning("one of the two files of the command counter is mended: %s", problems[0])
+        last, content = max(counters), self.key.counter_text(max(counters)).encode()
+        for each in (self.path, copy_of(self.path)):
+            with contextlib.suppress(OSError):  # one of the two is good
+                if not each.exists() or each.read_bytes() != content:
+                    write_with_reserve(each, content, self._reserve)
+        return last
 
     def advance(self, counter: int) -> None:
         """Keep the counter of a command that is about to have an effect.
@@ -68,11 +94,16 @@ class ReplayCounter:
             StoreError: the disk refuses. The command must be neither executed nor reported as refused: after a restart
                 it could be taken, and then the report would not have been true.
         """
+        content = self.key.counter_text(counter).encode()
         try:
-            write_with_reserve(self.path, self.key.counter_text(counter).encode(), self._reserve)
+            write_with_reserve(self.path, content, self._reserve)
         except OSError as error:
             raise StoreError(f"cannot keep the command counter: {error}") from error
         self.last = counter
+        try:
+            write_with_reserve(copy_of(self.path), content, self._reserve)
+        except OSError as error:
+            log.warning("the copy of the command counter cannot be written: %s", error)
         self._keep_reserve()
 
     def close(self) -> None:
@@ -84,18 +115,77 @@ class ReplayCounter:
             keep_reserve(self._reserve, RESERVE_BYTES)
 
 
+class KeyRing:
+    """The keys that seal commands, each with a counter of its own: two while one takes the other's place.
+
+    A key that cannot be used is left out, since without commands frames are still taken and sent.
+
+    problems: why keys were left out.
+    """
+
+    def __init__(self, key_files: Iterable[Path]):
+        self.counters: list[ReplayCounter] = []
+        self.problems: list[str] = []
+        for key_file in key_files:
+            try:
+                counter = ReplayCounter(key_file)
+            except ConfigError as error:
+                self.problems.append(str(error))
+                continue
+            if self.of(counter.key.spi) is not None:
+                self.problems.append(f"{key_file}: another key has the number {counter.key.spi} already")
+                counter.close()
+                continue
+            self.counters.append(counter)
+
+    def of(self, spi: int) -> ReplayCounter | None:
+        """Return the counter of the key with this number."""
+        return next((counter for counter in self.counters if counter.key.spi == spi), None)
+
+    def unseal(self, packet: bytes) -> tuple[ReplayCounter, int, bytes]:
+        """Return whose key sealed a packet, its counter and its content.
+
+        Raises:
+            AuthError: no key on board did, or it was changed.
+        """
+        spi, _ = claimed(packet)
+        if not self.counters:
+            raise AuthError(self.problems[0] if self.problems else "there is no key on board")
+        own = self.of(spi)
+        on_board = ", ".join(str(counter.key) for counter in self.counters)
+        if own is None:
+            raise AuthError(f"sealed with key {spi}; on board: {on_board}")
+        try:
+            return own, *unseal(own.key, packet)
+        except AuthError as error:
+            raise AuthError(f"{error}, or another key {spi}; on board: {on_board}") from error
+
+    def close(self) -> None:
+        for counter in self.counters:
+            counter.close()
+
+
+@dataclass(frozen=True)
+class Received:
+    """Which authentic packet a command came in."""
+
+    spi: int
+    counter: int
+    digest: bytes
+
+
 @dataclass(frozen=True)
 class Upload:
     """A model file that an authentic command has announced."""
 
-    counter: int
+    command: Received
     size_bytes: int
     sha256: bytes
     file_key: bytes
 
     @property
     def file_name(self) -> str:
-        return model_file_name(self.counter)
+        return model_file_name(self.command.counter)
 
     @property
     def sealed_bytes(self) -> int:
@@ -106,12 +196,13 @@ class Commander:
     """Takes sealed commands, gives reports.
 
     `upload` is the file that the ground may send now, None most of the time. A model that has come has a file of its
-    own, by which the end of its verification is told. Without a counter (no key) every command is refused.
+    own, by which the end of its verification is told. Without a key every command is refused. `poll` does what takes
+    longer than one turn of the downlink's loop may.
     """
 
     def __init__(
         self,
-        counter: ReplayCounter | None,
+        keys: KeyRing | None,
         store: FrameStore,
         mission: Mission,
         on_refusal: Callable[[str], None] = lambda problem: None,
@@ -124,54 +215,78 @@ class Commander:
         self.refused = 0
         self.repeated = 0
         self.reports: list[Report] = []  # to be sent; the owner takes them out
-        self._counter, self._store, self._mission = counter, store, mission
+        self._keys, self._store, self._mission = keys or KeyRing([]), store, mission
         self._on_refusal, self._clock_s, self._utc_ns = on_refusal, clock_s, utc_ns
-        self._remembered: OrderedDict[int, list[Report]] = OrderedDict()
+        self._remembered: OrderedDict[Received, list[Report]] = OrderedDict()
         self._armed: tuple[str, float] | None = None  # command, until when
-        self._verifying: dict[Path, int] = {}  # the command of each model that has come
+        self._verifying: dict[Path, Received] = {}  # the command of each model that has come
+        self._deleting: deque[tuple[Received, deque[int], int]] = (
+            deque()
+        )  # with the frames, and how many they were
+        self._last_used = next(iter(self._keys.counters), None)
         self._next_answer_s = float("-inf")
 
     @property
     def last_counter(self) -> int:
-        return self._counter.last if self._counter else 0
+        """The counter of the last authentic command of the key that was used last."""
+        return self._last_used.last if self._last_used else 0
 
     def receive(self, data: bytes) -> None:
         """Take a packet from the link; it may be anything."""
-        if self._counter is None:
-            self._refuse("there is no key on board")
-            return
         try:
-            counter, content = unseal(self._counter.key, data)
+            own, number, content = self._keys.unseal(data)
         except AuthError as error:
             self._refuse(str(error))
+            with contextlib.suppress(AuthError):  # too short to be anybody's command
+                self._answer([self._report(Received(*claimed(data), digest(data)), "refused", str(error))])
             return
-        if counter <= self._counter.last:
+        received = Received(own.key.spi, number, digest(data))
+        if number <= own.last:
             self.repeated += 1
-            self._answer_again(counter)
+            self._answer(self._remembered.get(received) or [self._used_before(received, own)])
             return
         try:
-            self._counter.advance(counter)
+            own.advance(number)
         except StoreError as error:
-            self._refuse(f"command {counter} is not taken yet: {error}")
+            self._refuse(f"command {number} is not taken yet: {error}")
             return  # without a report: the ground sends the command again
+        self._last_used = own
         try:
             command = Command.unpack(content)
             self._check_arming(command)
-            self._check(command)
+            self._check(received, command)
         except (PacketError, ValueError) as error:
-            self._refuse(f"counter {counter}: {error}")
-            self._note(counter, "refused", str(error))
+            self._refuse(f"counter {number}: {error}")
+            self._note(received, "refused", str(error))
             return
         self.accepted += 1
-        self._note(counter, "accepted", command.name)
-        self._note(counter, "started", command.name)
+        self._note(received, "accepted", command.name)
+        self._note(received, "started", command.name)
         try:
-            result = self._execute(counter, command)
+            result = self._execute(received, command)
         except FlightError as error:
-            self._note(counter, "failed", str(error))
+            self._note(received, "failed", str(error))
         else:
             if result is not None:
-                self._note(counter, "completed", result)
+                self._note(received, "completed", result)
+
+    def poll(self) -> None:
+        """Go on with what commands have begun, for `DELETE_S` at most."""
+        end_s = self._clock_s() + DELETE_S
+        while self._deleting:
+            received, frames, count = self._deleting[0]
+            try:
+                while frames:
+                    if self._store.path(frames[0]).exists():  # it may have been deleted for another's room
+                        self._store.drop(frames[0])
+                    frames.popleft()
+                    if self._clock_s() > end_s:
+                        return
+            except FlightError as error:
+                self._note(received, "failed", f"{count - len(frames)} of {count} frames deleted: {error}")
+            else:
+                self._note(received, "completed", f"{count} frames deleted")
+            self._deleting.popleft()
 
     def receive_model(self, name: str, data: bytes) -> Path | None:
         """Return where the announced model now lies, to be verified; None, and the command failed, if it is another.
@@ -189,9 +304,9 @@ class Commander:
                 raise AuthError("the file is not the one that was announced")
             write_whole(path, content)
         except (AuthError, OSError) as error:
-            self._note(upload.counter, "failed", str(error))
+            self._note(upload.command, "failed", str(error))
             return None
-        self._verifying[path] = upload.counter
+        self._verifying[path] = upload.command
         return path
 
     def end_model(self, path: Path, problem: str | None, result: str = "") -> None:
@@ -203,14 +318,28 @@ class Commander:
         for path in list(self._verifying):
             self.end_model(path, problem)
 
-    def _answer_again(self, counter: int) -> None:
-        if self._clock_s() < self._next_answer_s:
-            return
-        self._next_answer_s = self._clock_s() + ANSWER_S
-        unknown = self._report(
-            counter, "refused", "was taken before; what became of it is not known here any more"
-        )
-        self.reports += self._remembered.get(counter, [unknown])
+    def _answer(self, reports: list[Report]) -> None:
+        """Answer a packet that had no effect, at a walking pace."""
+        if self._clock_s() >= self._next_answer_s:
+            self._next_answer_s = self._clock_s() + ANSWER_S
+            self.reports += reports
+
+    def _used_before(self, received: Received, own: ReplayCounter) -> Report:
+        """Return the answer to an authentic packet whose counter is used up and whose own reports are not known."""
+        number, last = received.counter, own.last
+        if own.is_retired:
+            text = f"key {received.spi} is retired"
+        elif any((known.spi, known.counter) == (received.spi, number) for known in self._remembered):
+            text = (
+                f"not executed: counter {number} was used by another command, the last is {last}; "
+                f"`ground key FILE --counter {last}`, then again"
+            )
+        else:
+            text = (
+                f"counter {number} was used before, by this command or another; the last is {last}, what became of it "
+                f"is not known any more"
+            )
+        return self._report(received, "refused", text)
 
     def _check_arming(self, command: Command) -> None:
         armed, self._armed = self._armed, None  # whatever comes next disarms
@@ -219,7 +348,7 @@ class Commander:
         if armed is None or armed[0] != command.name or self._clock_s() > armed[1]:
             raise ValueError(f"not armed: send `arm {command.name}` at most {DICTIONARY.arm_s} s before")
 
-    def _check(self, command: Command) -> None:
+    def _check(self, received: Received, command: Command) -> None:
         """Refuse what is in range but makes no sense here.
 
         Raises:
@@ -230,8 +359,13 @@ class Commander:
             dataclasses.replace(self.settings, **values).bracket(self._mission)
         elif command.name == "delete" and values["first_frame"] > values["last_frame"]:
             raise ValueError(f"frames {values['first_frame']} to {values['last_frame']} are none")
+        elif command.name == "retire":
+            if values["key"] == received.spi:
+                raise ValueError(f"key {received.spi} would retire itself: seal this with the key that stays")
+            if self._keys.of(values["key"]) is None:
+                raise ValueError(f"there is no key {values['key']} on board")
 
-    def _execute(self, counter: int, command: Command) -> str | None:
+    def _execute(self, received: Received, command: Command) -> str | None:
         """Do it and return the result in words; None when it goes on.
 
         Raises:
@@ -252,14 +386,22 @@ class Commander:
                 return values["order"]
             case "model":
                 if self.upload is not None:
-                    self._note(self.upload.counter, "failed", f"replaced by command {counter}")
-                self.upload = Upload(counter, **values)
+                    self._note(self.upload.command, "failed", f"replaced by command {received.counter}")
+                self.upload = Upload(received, **values)
                 return None
             case "arm":
                 self._armed = (values["command"], self._clock_s() + DICTIONARY.arm_s)
                 return f"{values['command']} is armed for {DICTIONARY.arm_s} s"
             case "delete":
-                return self._delete(values["first_frame"], values["last_frame"])
+                first, last = values["first_frame"], values["last_frame"]
+                frames = deque(f.frame_id for f in self._store.frames if first <= f.frame_id <= last)
+                self._deleting.append((received, frames, len(frames)))
+                return None
+            case "retire":
+                retired = self._keys.of(values["key"])
+                assert retired is not None  # checked
+                retired.advance(MAX_COUNTER)
+                return f"key {retired.key} is retired"
             case "safe" | "resume":
                 self._change(safe_mode=command.name == "safe")
                 return "no exposures until resumed" if self.settings.safe_mode else "exposures go on"
@@ -270,23 +412,17 @@ class Commander:
         save_settings(self._store.folder, settings)
         self.settings = settings
 
-    def _delete(self, first_frame: int, last_frame: int) -> str:
-        deleted = [f.frame_id for f in self._store.frames if first_frame <= f.frame_id <= last_frame]
-        for frame_id in deleted:
-            self._store.drop(frame_id)
-        return f"{len(deleted)} frames deleted"
-
-    def _note(self, counter: int, stage: str, text: str) -> None:
-        report = self._report(counter, stage, text)
-        self._remembered.setdefault(counter, []).append(report)
+    def _note(self, received: Received, stage: str, text: str) -> None:
+        report = self._report(received, stage, text)
+        self._remembered.setdefault(received, []).append(report)
         if len(self._remembered) > REMEMBERED:
             self._remembered.popitem(last=False)
         self.reports.append(report)
         if stage in ENDED:
-            log.info("command %d %s: %s", counter, stage, text)
+            log.info("command %d %s: %s", received.counter, stage, text)
 
-    def _report(self, counter: int, stage: str, text: str) -> Report:
-        return Report(self._utc_ns(), counter, stage, text)
+    def _report(self, received: Received, stage: str, text: str) -> Report:
+        return Report(self._utc_ns(), received.counter, received.digest, stage, text)
 
     def _refuse(self, problem: str) -> None:
         self.refused += 1

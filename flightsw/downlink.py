@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from flightsw.commands import Commander, ReplayCounter
+from flightsw.commands import Commander, KeyRing, Upload
 from flightsw.errors import DownlinkError, FlightError
 from flightsw.frame_sender import FrameSender, SendingCounts
 from flightsw.housekeeping import EventLog, ProcessMeter, disk_values
@@ -78,7 +78,7 @@ def run_downlink(
     on_progress: Callable[[DownlinkProgress], None] = lambda progress: None,
     should_stop: Callable[[], bool] = lambda: False,
     clock_s: Callable[[], float] = time.monotonic,
-    counter: ReplayCounter | None = None,
+    keys: KeyRing | None = None,
     capture_values: Callable[[], dict[str, Any]] = dict,
     boot: int = 0,
 ) -> DownlinkProgress:
@@ -89,7 +89,7 @@ def run_downlink(
     from what is on the disk, with an event to the ground; nothing on board may end the link while frames wait.
 
     Args:
-        counter: the key and its replay counter; without one every command is refused.
+        keys: the keys and their replay counters; without one every command is refused.
         capture_values: what capture knows of the housekeeping packet's items.
         boot: the number of this start of the flight software, for the housekeeping packet.
 
@@ -97,9 +97,11 @@ def run_downlink(
         StoreError: the outbox cannot be read or changed, six times in a row.
         DownlinkError: an unforeseen error, six times in a row.
     """
-    downlink = _Downlink(store, link, mission, counter, capture_values, clock_s, boot)
+    downlink = _Downlink(store, link, mission, keys, capture_values, clock_s, boot)
     logger = logging.getLogger("flightsw")
     logger.addHandler(downlink.events)
+    for problem in keys.problems if keys is not None else ():
+        log.error("no command is taken with a key: %s", problem)
     try:
         empty_since_s: float | None = None
         next_look_s = float("-inf")
@@ -139,7 +141,7 @@ class _Downlink:
         store: FrameStore,
         link: Link,
         mission: Mission,
-        counter: ReplayCounter | None,
+        keys: KeyRing | None,
         capture_values: Callable[[], dict[str, Any]],
         clock_s: Callable[[], float],
         boot: int,
@@ -149,7 +151,7 @@ class _Downlink:
         self._store, self._link, self._mission, self._clock_s = store, link, mission, clock_s
         self._capture_values, self._boot = capture_values, boot
         self._stream = PacketStream(TELEMETRY, mission.link.max_packet_bytes)
-        self._commander = Commander(counter, store, mission, self._note_refusal, clock_s)
+        self._commander = Commander(keys, store, mission, self._note_refusal, clock_s)
         self._meter = ProcessMeter(clock_s)
         self._telemetry: deque[tuple[int, bytes]] = deque()
         self._next_housekeeping_s = self._next_refusal_s = float("-inf")
@@ -173,7 +175,7 @@ class _Downlink:
             self._mission.link,
         )
         self._uploads: Receiver | None = None  # of the model file that was announced last
-        self._upload_counter = 0
+        self._upload: Upload | None = None
         self._ranking.start()
         self._commander.end_models("the downlink failed before the model was in use")
         self._frames.look()
@@ -243,6 +245,7 @@ class _Downlink:
                 self._commander.receive(content)
             elif apid == APID_UPLINK_FILES:
                 self._receive_upload(content, now_s)
+        self._commander.poll()
         ended, failed = self._frames.outcomes()
         for outcome in failed:
             self.events.add("transfer_failed", file=outcome.name, reason=outcome.reason)
@@ -324,8 +327,8 @@ class _Downlink:
     def _receive_upload(self, pdu: bytes, now_s: float) -> None:
         """Take a PDU of the announced file; without an announcement there is nothing to keep it in."""
         upload = self._commander.upload
-        if upload is not None and upload.counter != self._upload_counter:
-            self._upload_counter = upload.counter
+        if upload is not None and upload != self._upload:
+            self._upload = upload
             self._uploads = Receiver(
                 self._stream.max_data_bytes,
                 self.interval_s,

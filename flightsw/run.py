@@ -5,7 +5,7 @@ import dataclasses
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 from flightsw.boot_counter import count_boot
 from flightsw.cameras import open_camera
 from flightsw.cameras.reconnecting import PATIENCE_S, RETRY_S, ReconnectingCamera
-from flightsw.commands import ReplayCounter
+from flightsw.commands import KeyRing
 from flightsw.downlink import DownlinkProgress, run_downlink
 from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.can import FLIGHT_SIDE
@@ -57,7 +57,7 @@ def run_pass(
     *,
     camera_url: str | None = None,
     link_url: str | None = None,
-    key_file: Path | None = None,
+    key_files: Sequence[Path] = (),
     exit_when_empty: bool = False,
     on_captured: Callable[[CaptureCounts], None] = lambda counts: None,
     on_sent: Callable[[DownlinkProgress], None] = lambda progress: None,
@@ -70,7 +70,7 @@ def run_pass(
 
     Args:
         stop: when set, capture and downlink end cleanly.
-        key_file: the mission's key; without it every command is refused.
+        key_files: the mission's keys; one that cannot be used is left out, and without any every command is refused.
         exit_when_empty: end the downlink once every frame is confirmed, not only when stopped.
         on_captured: called after each planned exposure.
         on_sent: called from the downlink's thread, about five times a second.
@@ -81,7 +81,7 @@ def run_pass(
     """
     captured, camera, no_camera, thread, alive = CaptureCounts(), None, None, None, Watchdog()
     with contextlib.ExitStack() as opened:
-        link, counter = _open_link(link_url, key_file, opened)
+        link, keys = _open_link(link_url, key_files, opened)
         if camera_url is not None:
             try:
                 camera = _open_camera(camera_url, mission, stop, opened)
@@ -92,7 +92,7 @@ def run_pass(
         store = open_store(store_dir, mission)
         if link is not None:
             waiting = (exit_when_empty, stop, on_sent, alive)
-            thread = _DownlinkThread(FrameStore(store_dir), link, mission, counter, *waiting)
+            thread = _DownlinkThread(FrameStore(store_dir), link, mission, keys, *waiting)
             thread.camera, thread.boot = camera, count_boot(store_dir)
             if camera_url is not None:
                 thread.capturing.set()
@@ -133,15 +133,14 @@ def run_pass(
 
 
 def _open_link(
-    link_url: str | None, key_file: Path | None, opened: contextlib.ExitStack
-) -> tuple[Link | None, ReplayCounter | None]:
-    """Return the link and the counter of the key, each None if it was not asked for; `opened` closes them."""
+    link_url: str | None, key_files: Sequence[Path], opened: contextlib.ExitStack
+) -> tuple[Link | None, KeyRing]:
+    """Return the link, None if it was not asked for, and the keys; `opened` closes them."""
     if link_url is None:
-        return None, None
-    counter = ReplayCounter(key_file) if key_file is not None else None
-    if counter is not None:
-        opened.callback(counter.close)
-    return opened.enter_context(open_link(link_url, FLIGHT_SIDE)), counter
+        return None, KeyRing([])
+    keys = KeyRing(key_files)
+    opened.callback(keys.close)
+    return opened.enter_context(open_link(link_url, FLIGHT_SIDE)), keys
 
 
 def _open_camera(
@@ -234,7 +233,7 @@ class _DownlinkThread(threading.Thread):
         store: FrameStore,
         link: Link,
         mission: Mission,
-        counter: ReplayCounter | None,
+        keys: KeyRing,
         exit_when_empty: bool,
         stop: threading.Event,
         on_progress: Callable[[DownlinkProgress], None],
@@ -248,7 +247,7 @@ class _DownlinkThread(threading.Thread):
         self.boot = 0  # the number of this start
         self.result = DownlinkProgress()
         self.error: Exception | None = None
-        self._store, self._link, self._mission, self._counter = store, link, mission, counter
+        self._store, self._link, self._mission, self._keys = store, link, mission, keys
         self._exit_when_empty, self._stop_event = exit_when_empty, stop
         self._on_progress, self._watchdog = on_progress, watchdog
         self._empty_since_s: float | None = None
@@ -261,7 +260,7 @@ class _DownlinkThread(threading.Thread):
                 self._mission,
                 on_progress=self._keep,
                 should_stop=self._should_stop,
-                counter=self._counter,
+                keys=self._keys,
                 capture_values=self._capture_values,
                 boot=self.boot,
             )

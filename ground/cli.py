@@ -91,6 +91,15 @@ def key(
     spi: Annotated[
         int, typer.Option(min=1, max=65534, help="The key's number (security parameter index).")
     ] = 1,
+    counter: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=(1 << 63),
+            help="Make no key: move the ground's counter of this one forward, past this number, which the spacecraft "
+            "has taken. A lost FILE.sent is made anew.",
+        ),
+    ] = None,
     json_: AsJson = False,
 ) -> None:
     """Make the key that authenticates a mission's commands, and a counter for each side.
@@ -99,8 +108,16 @@ def key(
 
     Example: ground key mission.key
     """
-    from ground.uplink import make_key
+    from ground.uplink import make_key, move_counter
 
+    if counter is not None:
+        moved = move_counter(file, counter)
+        print(
+            json.dumps({"file": str(file), "counter": moved})
+            if json_
+            else f"the next command of {file} is {moved + 1}"
+        )
+        return
     made = make_key(file, spi)
     if json_:
         print(json.dumps({"file": str(file), "spi": made.spi, "fingerprint": made.fingerprint}))

@@ -93,6 +93,7 @@ class UplinkCommand(StrEnum):
     DELETE = "delete"
     SAFE = "safe"
     RESUME = "resume"
+    RETIRE = "retire"
 
 
 # of `ground import`

@@ -4,7 +4,7 @@
 as NUMBER.json, where NUMBER is the command's counter; the sealed file of a model lies beside it as NUMBER.bin. The
 listener has the port: it sends commands in the order of their counters, repeats each until the spacecraft reports its
 result, and writes that to NUMBER.done.json. The session's commands.jsonl has a line for each command that ended: one
-history, whoever sent them.
+history, whoever sent them. For how long a command may be sent is elapsed time, whatever this computer's clock says.
 """
 
 import contextlib
@@ -16,34 +16,33 @@ import os
 import re
 import secrets
 import shlex
+import stat
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from flightsw.icd.auth import Key, seal, seal_file
+from flightsw.icd.auth import MAX_COUNTER, Key, digest, seal, seal_file
 from flightsw.icd.command import ENDED, Command, Report, model_file_name
 from flightsw.icd.mission import Checksum, ConfigError
 from flightsw.icd.transfer import UPLINK, Sender
 from ground.session import SessionError
+from ground.telemetry import plain
+from obbgs_base.checked import copy_of, each_copy
 from obbgs_base.files import append_line, write_whole
 
 log = logging.getLogger(__name__)
 JOB_NAME = re.compile(r"(\d{20})\.json", re.ASCII)
 MAX_MODEL_BYTES = 64 * 1024 * 1024  # as the dictionary's `model.size_bytes`
+MAX_JOB_BYTES = 64 * 1024  # of a command file
+COUNTER_MARGIN = 1 << 20  # that `move_counter` leaves for commands that were sent and never arrived
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # elapsed time counts from this start of the computer
 HISTORY = "commands.jsonl"
 POLL_S = 0.2  # between looks at the folder
 LOCK_TRIES = 5  # to become the session's listener
 RESEND_INTERVALS = 2  # timer intervals before an unanswered command is sent again
-UNREADABLE = (
-    OSError,
-    ValueError,
-    KeyError,
-    TypeError,
-    OverflowError,
-    RecursionError,
-)  # a damaged command file
+DAMAGED = (ValueError, KeyError, TypeError, OverflowError, RecursionError)  # a command file
 RESULT_INTERVALS = 4  # the same for a command without a result; the spacecraft repeats its reports
 NS = 1_000_000_000
 
@@ -71,6 +70,33 @@ def make_key(path: Path, spi: int = 1) -> Key:
     return key
 
 
+def move_counter(path: Path, last_used: int) -> int:
+    """Move the ground's counter of a key forward, past one that was used already; return the new one.
+
+    It never goes back, and may be lost or damaged. `COUNTER_MARGIN` beyond what is known are left unused, so that none
+    is used again that was given to a command which never arrived: a counter that is used twice gives the key away.
+
+    Args:
+        last_used: such as the spacecraft says in a report, or as `command_counter` in its housekeeping.
+
+    Raises:
+        ConfigError: the key cannot be read, the counter cannot be written, or there are none beyond it.
+    """
+    try:
+        with _locked_counter(path) as sent:
+            key = Key.parse(path.read_text(), str(path))
+            counters, _ = each_copy(sent, lambda text: key.parse_counter(text, str(sent)))
+            counter = max([last_used, *counters]) + COUNTER_MARGIN
+            if counter >= MAX_COUNTER:
+                raise ConfigError(
+                    "--counter", f"expected less than {MAX_COUNTER - COUNTER_MARGIN}, got {last_used}"
+                )
+            _keep_counter(sent, key, counter)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(str(path), f"cannot use the key and its counter: {error}") from error
+    return counter
+
+
 def parse_command(name: str, arguments: list[str]) -> tuple[Command, Path | None]:
     """Return the command that a command line asks for, and the model file of `model`.
 
@@ -95,6 +121,8 @@ def parse_command(name: str, arguments: list[str]) -> tuple[Command, Path | None
         case "delete", [first, last]:
             frames = {"first_frame": _number(first, int), "last_frame": _number(last, int)}
             return Command(name, frames), None
+        case "retire", [key]:
+            return Command(name, {"key": _number(key, int)}), None
     given = " ".join([name, *arguments])
     raise ValueError(f"not a command with its arguments: {given!r}; see `ground uplink --help`")
 
@@ -154,12 +182,11 @@ def submit(session: Path, key_file: Path, command: Command, model: Path | None, 
     if model is not None:
         content, command = _model_command(model)
     packed = command.pack()  # it may be invalid, and should not use up a counter then
-    expires_utc_ns = time.time_ns() + int(expires_s * NS)
+    expires_ns = time.monotonic_ns() + int(expires_s * NS)
     folder = session / "uplink"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with _next_counter(key_file) as (key, counter):
-            (folder / f"{counter:020d}.done.json").unlink(missing_ok=True)  # of an earlier key
+        with _next_counter(key_file, folder) as (key, counter):
             if content:
                 file_key = command.arguments["file_key"]
                 write_whole(folder / f"{counter:020d}.bin", seal_file(file_key, content))
@@ -167,7 +194,8 @@ def submit(session: Path, key_file: Path, command: Command, model: Path | None, 
                 "command": command.name,
                 "given": given,
                 "packet": seal(key, counter, packed).hex(),
-                "expires_utc_ns": expires_utc_ns,
+                "boot": _boot_id(),
+                "expires_ns": expires_ns,
             }
             write_whole(folder / f"{counter:020d}.json", json.dumps(job).encode())
     except OSError as error:
@@ -195,18 +223,48 @@ def _model_command(model: Path) -> tuple[bytes, Command]:
 
 
 @contextlib.contextmanager
-def _next_counter(key_file: Path) -> Iterator[tuple[Key, int]]:
-    """Give the key and a counter that was never used before; a lock keeps other processes out meanwhile."""
-    path = key_file.with_name(key_file.name + ".sent")
+def _next_counter(key_file: Path, folder: Path) -> Iterator[tuple[Key, int]]:
+    """Give the key and a counter that was never used before; a lock keeps other processes out meanwhile.
+
+    One that names files of another key's command in the folder is passed over.
+    """
     try:
-        with open(path.with_name(path.name + ".lock"), "wb") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        with _locked_counter(key_file) as sent:
             key = Key.parse(key_file.read_text(), str(key_file))
-            counter = key.parse_counter(path.read_text(), str(path)) + 1
-            write_whole(path, key.counter_text(counter).encode())
+            counters, problems = each_copy(sent, lambda text: key.parse_counter(text, str(sent)))
+            if not counters:
+                raise ConfigError(
+                    str(sent),
+                    f"the counter cannot be used ({problems[0]}); `ground key {key_file} --counter N` makes it anew, "
+                    "with N from `command_counter` in the newest housekeeping",
+                )
+            counter = max(counters) + 1
+            while any((folder / f"{counter:020d}{suffix}").exists() for suffix in (".json", ".done.json")):
+                counter += 1
+            if counter >= MAX_COUNTER:
+                raise ConfigError(str(sent), "is at its end: make another key with `ground key`")
+            _keep_counter(sent, key, counter)
             yield key, counter
     except (FileNotFoundError, PermissionError, UnicodeDecodeError) as error:
         raise ConfigError(str(key_file), f"cannot use the key and its counter: {error}") from error
+
+
+@contextlib.contextmanager
+def _locked_counter(key_file: Path) -> Iterator[Path]:
+    """Give the file of the ground's counter while no other process has it."""
+    sent = key_file.with_name(key_file.name + ".sent")
+    with open(sent.with_name(sent.name + ".lock"), "wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield sent
+
+
+def _keep_counter(sent: Path, key: Key, counter: int) -> None:
+    for each in (sent, copy_of(sent)):
+        write_whole(each, key.counter_text(counter).encode())
+
+
+def _boot_id() -> str:
+    return BOOT_ID.read_text().strip()
 
 
 def outcome(session: Path, counter: int) -> dict[str, Any] | None:
@@ -268,6 +326,8 @@ def is_listening(session: Path) -> bool:
         return False
     except BlockingIOError:
         return True
+    except OSError as error:
+        raise SessionError(f"cannot tell whether a process listens into {session}: {error}") from error
     return False
 
 
@@ -279,7 +339,7 @@ class Job:
     command: str
     given: str  # the command with its arguments
     packet: bytes
-    expires_utc_ns: int
+    expires_ns: int  # of the elapsed time
     file: bytes | None
     file_put: bool = False
     next_send_s: float = float("-inf")
@@ -291,7 +351,10 @@ class Job:
 
 
 class Uplinker:
-    """The listener's side: gives packets to send, takes reports, writes results. It has no port and no clock."""
+    """The listener's side: gives packets to send, takes reports, writes results. It has no port and no clock.
+
+    What lies in the folder for commands, or that it cannot be read, is logged once and never raised.
+    """
 
     def __init__(
         self,
@@ -301,11 +364,15 @@ class Uplinker:
         on_end: Callable[[int, str, str, str], None] = lambda counter, command, stage, text: None,
         utc_ns: Callable[[], int] = time.time_ns,
         checksum: Checksum = "crc-32",
+        elapsed_ns: Callable[[], int] = time.monotonic_ns,
     ):
         self.jobs: dict[int, Job] = {}
         self.files = Sender(max_pdu_bytes, interval_s, route=UPLINK, checksum=checksum)
         self._folder, self._on_end, self._utc_ns = session / "uplink", on_end, utc_ns
-        self._interval_s = interval_s
+        self._interval_s, self._max_packet_bytes = interval_s, max_pdu_bytes
+        self._elapsed_ns, self._boot = elapsed_ns, _boot_id()
+        self._left_alone: set[int] = set()  # counters of files that could not be read, or not be removed
+        self._is_unreadable = False
         self._next_poll_s = float("-inf")
 
     @property
@@ -343,9 +410,11 @@ class Uplinker:
         return pdu
 
     def take_report(self, report: Report, report_s: float) -> None:
-        """Take a report of the spacecraft; one of a command that is not ours is ignored."""
+        """Take a report of the spacecraft; one on a packet that is not ours is ignored."""
         job = self.jobs.get(report.counter)
-        if job is None or any(report.stage == known.stage for known in job.reports):
+        if job is None or report.digest != digest(job.packet):
+            return
+        if any(report.stage == known.stage for known in job.reports):
             return
         job.reports.append(report)
         job.next_send_s = report_s + RESULT_INTERVALS * self._interval_s
@@ -353,27 +422,56 @@ class Uplinker:
             self._end(job, report.stage, report.text)
 
     def _poll(self) -> None:
-        names = os.listdir(self._folder) if self._folder.is_dir() else []
+        try:
+            names = os.listdir(self._folder) if self._folder.is_dir() else []
+        except OSError as error:
+            if not self._is_unreadable:
+                log.error(
+                    "no command is taken from %s, where this user may not look: %s", self._folder, error
+                )
+            self._is_unreadable = True
+            names = [f"{counter:020d}.json" for counter in self.jobs]  # as far as is known
+        else:
+            self._is_unreadable = False
         counters = {int(match[1]) for match in map(JOB_NAME.fullmatch, names) if match}
-        for counter in counters - set(self.jobs):
+        self._left_alone &= counters
+        for counter in counters - set(self.jobs) - self._left_alone:
             try:
                 self.jobs[counter] = self._read(counter)
-            except UNREADABLE as error:
-                log.error("command %d cannot be read: %s", counter, error)
-                (self._folder / f"{counter:020d}.json").unlink(missing_ok=True)
+            except OSError as error:  # perhaps another user's
+                log.error("command %d cannot be read and is not sent: %s", counter, error)
+                self._left_alone.add(counter)
+            except DAMAGED as error:
+                log.error("command %d is damaged: %s", counter, error)
+                self._remove(counter)
         for counter, job in list(self.jobs.items()):
             if counter not in counters:
                 del self.jobs[counter]  # withdrawn
-            elif self._utc_ns() > job.expires_utc_ns and model_file_name(counter) not in self.files.in_flight:
+            elif self._elapsed_ns() > job.expires_ns and model_file_name(counter) not in self.files.in_flight:
                 self._end(job, "failed", "no answer in time" if not job.reports else f"still {job.stage}")
 
     def _read(self, counter: int) -> Job:
-        tree = json.loads((self._folder / f"{counter:020d}.json").read_bytes())
+        tree = json.loads(_content(self._folder / f"{counter:020d}.json", MAX_JOB_BYTES))
         file = self._folder / f"{counter:020d}.bin"
-        content = file.read_bytes() if file.exists() else None
+        content = _content(file, 2 * MAX_MODEL_BYTES) if file.exists() else None
         packet = bytes.fromhex(tree["packet"])
+        if not 0 < len(packet) <= self._max_packet_bytes:
+            raise ValueError(f"its packet has {len(packet)} bytes")
         name = str(tree["command"])
-        return Job(counter, name, str(tree.get("given", name)), packet, int(tree["expires_utc_ns"]), content)
+        expires_ns = int(tree["expires_ns"])
+        if tree["boot"] != self._boot:
+            log.warning("command %d was left before this computer started, or by another one", counter)
+            expires_ns = 0
+        return Job(counter, name, str(tree.get("given", name)), packet, expires_ns, content)
+
+    def _remove(self, counter: int) -> None:
+        """Remove a command's files; one that stays, since the folder does not let go of it, is not looked at again."""
+        for suffix in (".json", ".bin"):
+            try:
+                (self._folder / f"{counter:020d}{suffix}").unlink(missing_ok=True)
+            except OSError as error:
+                log.error("the files of command %d cannot be removed: %s", counter, error)
+                self._left_alone.add(counter)
 
     def _end(self, job: Job, stage: str, text: str) -> None:
         done = {
@@ -382,15 +480,30 @@ class Uplinker:
             "given": job.given,
             "stage": stage,
             "text": text,
-            "reports": [vars(report) for report in job.reports],
+            "reports": [plain(vars(report)) for report in job.reports],
         }
         name = f"{job.counter:020d}"
         note_end(self._folder.parent, done, self._utc_ns())
         try:
             write_whole(self._folder / f"{name}.done.json", json.dumps(done).encode())
-            for suffix in (".json", ".bin"):
-                (self._folder / f"{name}{suffix}").unlink(missing_ok=True)
         except OSError as error:
             log.error("the end of command %d cannot be written: %s", job.counter, error)
+        self._remove(job.counter)
         self.jobs.pop(job.counter, None)
         self._on_end(job.counter, job.command, stage, text)
+
+
+def _content(path: Path, max_bytes: int) -> bytes:
+    """Return a file's content; nothing that lies under its name makes this wait.
+
+    Raises:
+        OSError: it cannot be read, or is no ordinary file.
+        ValueError: it is larger.
+    """
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+        facts = os.fstat(file.fileno())
+        if not stat.S_ISREG(facts.st_mode):
+            raise OSError(f"{path.name} is no ordinary file")
+        if facts.st_size > max_bytes:
+            raise ValueError(f"expected at most {max_bytes:,} bytes, got {facts.st_size:,}")
+        return file.read(max_bytes)

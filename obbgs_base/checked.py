@@ -98,3 +98,19 @@ def read_twice(path: Path, on_damage: Callable[[str], None]) -> dict[str, Any] |
     if problems:
         on_damage(f"{path.name} or its copy was damaged ({problems[0]}); the good one of the two is used")
     return parse_checked_line(good.removesuffix(b"\n"))
+
+
+def each_copy(path: Path, parse: Callable[[str], int]) -> tuple[list[int], list[Exception]]:
+    """Return the numbers in a file and in its copy as `parse` reads them, and what is wrong with what it cannot read.
+
+    For a number that must never fall: the caller takes the larger. A copy that is not there yet is no problem.
+    """
+    values: list[int] = []
+    problems: list[Exception] = []
+    for each in (path, copy_of(path)):
+        try:
+            values.append(parse(each.read_text()))
+        except (OSError, ValueError) as error:  # of an encoding too
+            if each == path or not isinstance(error, FileNotFoundError):
+                problems.append(error)
+    return values, problems

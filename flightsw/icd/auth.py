@@ -1,7 +1,8 @@
 """Sealed commands: AES-256-GCM in the shape of CCSDS 355.0-B. Bytes in, bytes out; keeps no counter and no file.
 
 A sealed packet is the security header (key number, initialisation vector), the encrypted command and the tag. The
-vector is a counter that never comes again under the same key, so it is also what replays are recognised by.
+vector is a counter that never comes again under the same key, so it is also what replays are recognised by. Reports on
+a packet carry its digest, so that none is taken for the report on another packet.
 """
 
 import hashlib
@@ -15,11 +16,15 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from flightsw.icd.config import ConfigError
 from flightsw.icd.packet import PacketError
+from obbgs_base.checked import checked_line, parse_checked_line
 
 SECURITY_HEADER = struct.Struct(">H4xQ")  # SPI; IV of 12 bytes: zeros, counter
 TAG_BYTES = 16
+DIGEST_BYTES = 8  # of a sealed packet
+MAX_COUNTER = (1 << 64) - 1
 KEY_TEXT = re.compile(r"(\d{1,5}) ([0-9a-f]{64})\n", re.ASCII)
-COUNTER_TEXT = re.compile(r"(\d{1,20}) ([0-9a-f]{16})\n", re.ASCII)
+# of earlier versions, without a checksum
+EARLIER_COUNTER = re.compile(r"(\d{1,20}) ([0-9a-f]{16})\n", re.ASCII)
 
 
 class AuthError(PacketError):
@@ -61,9 +66,12 @@ class Key:
         """16 hexadecimal digits that tell keys apart and give nothing away."""
         return hashlib.sha256(b"fingerprint" + self.secret).hexdigest()[:16]
 
+    def __str__(self) -> str:
+        return f"{self.spi} ({self.fingerprint})"
+
     def counter_text(self, counter: int) -> str:
-        """Return what a counter file of this key holds."""
-        return f"{counter} {self.fingerprint}\n"
+        """Return what a counter file of this key holds: a line of JSON with a checksum."""
+        return checked_line({"counter": counter, "key": self.fingerprint}).decode() + "\n"
 
     def parse_counter(self, text: str, path: str) -> int:
         """Return the counter in a counter file's text.
@@ -71,10 +79,24 @@ class Key:
         Raises:
             ConfigError: damaged, or another key's. Starting again from 0 would repeat vectors and admit replays.
         """
-        match = COUNTER_TEXT.fullmatch(text)
-        if not match or match[2] != self.fingerprint or int(match[1]) >= 1 << 64:
-            raise ConfigError(path, "is not this key's counter: make a new key with `ground key`")
-        return int(match[1])
+        try:
+            tree = parse_checked_line(text.removesuffix("\n").encode())
+            counter, fingerprint = tree["counter"], tree["key"]
+        except (ValueError, KeyError) as error:
+            earlier = EARLIER_COUNTER.fullmatch(text)
+            if earlier is None:
+                raise ConfigError(path, "is damaged: it is not this key's counter") from error
+            counter, fingerprint = int(earlier[1]), earlier[2]
+        if fingerprint != self.fingerprint or type(counter) is not int or not 0 <= counter <= MAX_COUNTER:
+            raise ConfigError(
+                path, f"is not this key's counter, which has the fingerprint {self.fingerprint}"
+            )
+        return counter
+
+
+def digest(packet: bytes) -> bytes:
+    """Return what tells a sealed packet from all others in the reports on it."""
+    return hashlib.sha256(packet).digest()[:DIGEST_BYTES]
 
 
 def seal(key: Key, counter: int, content: bytes) -> bytes:
@@ -89,11 +111,7 @@ def unseal(key: Key, data: bytes) -> tuple[int, bytes]:
     Raises:
         AuthError: too short, another key's, or changed.
     """
-    if len(data) < SECURITY_HEADER.size + TAG_BYTES:
-        raise AuthError(
-            f"a sealed packet has at least {SECURITY_HEADER.size + TAG_BYTES} bytes, got {len(data)}"
-        )
-    spi, counter = SECURITY_HEADER.unpack_from(data)
+    spi, counter = claimed(data)
     if spi != key.spi:
         raise AuthError(f"sealed with key {spi}, this is key {key.spi}")
     header, sealed = data[: SECURITY_HEADER.size], data[SECURITY_HEADER.size :]
@@ -101,6 +119,19 @@ def unseal(key: Key, data: bytes) -> tuple[int, bytes]:
         return counter, AESGCM(key.secret).decrypt(header[2:], sealed, header)
     except InvalidTag as error:
         raise AuthError("the tag does not fit: forged or changed") from error
+
+
+def claimed(data: bytes) -> tuple[int, int]:
+    """Return the key number and the counter that a sealed packet says it has; anybody can say so.
+
+    Raises:
+        AuthError: too short to be sealed.
+    """
+    if len(data) < SECURITY_HEADER.size + TAG_BYTES:
+        raise AuthError(
+            f"a sealed packet has at least {SECURITY_HEADER.size + TAG_BYTES} bytes, got {len(data)}"
+        )
+    return SECURITY_HEADER.unpack_from(data)
 
 
 def seal_file(file_key: bytes, content: bytes) -> bytes:

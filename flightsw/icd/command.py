@@ -46,10 +46,11 @@ class Command:
 
 @dataclass(frozen=True)
 class Report:
-    """What became of the command with this counter."""
+    """What became of the command in one sealed packet."""
 
     utc_ns: int
     counter: int
+    digest: bytes  # of the packet: another one with the same counter has another
     stage: str  # accepted, refused, started, completed or failed
     text: str
 

@@ -1,6 +1,7 @@
 """What `flightsw selftest` looks at before a pass: everything is tried for real, and only a key's lock file remains."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from flightsw.icd.mission import Mission
@@ -18,14 +19,14 @@ def self_test(
     camera_url: str | None = None,
     link_url: str | None = None,
     loopback: bool = False,
-    key_file: Path | None = None,
+    key_files: Sequence[Path] = (),
     on_finding: Callable[[Finding], None] = lambda finding: None,
 ) -> list[Finding]:
     """Return what was found, one or more findings a check; `on_finding` gets each as soon as it is there.
 
     Args:
         store: the folder in which the frame store will be; it need not exist yet.
-        camera_url, link_url, key_file: not checked where they are None.
+        camera_url, link_url: not checked where they are None.
         loopback: a plug on the link returns what is sent.
 
     Raises:
@@ -38,8 +39,7 @@ def self_test(
         lambda: check_computer(mission),
         lambda: check_orbit(mission),
     ]
-    if key_file is not None:
-        checks.append(lambda: check_key(key_file))
+    checks += [functools.partial(check_key, key_file) for key_file in key_files]
     if link_url is not None:
         checks.append(lambda: check_link(link_url, loopback, mission.link.max_packet_bytes))
     if camera_url is not None:

@@ -41,7 +41,7 @@ import zlib
 
 import isotp
 
-from flightsw.commands import Commander, ReplayCounter
+from flightsw.commands import Commander, KeyRing
 from flightsw.icd.auth import Key, seal, seal_file, unseal, unseal_file
 from flightsw.icd.can import FLIGHT_IDS, GROUND_IDS, MAX_MESSAGE_BYTES, IsoTpChannels
 from flightsw.icd.command import Command, Report
@@ -371,7 +371,7 @@ def commander(containers: list[bytes]) -> Target:
     plain.append(Command("delete", {"first_frame": 0, "last_frame": 5}).pack())
     seeds = [joined(plain[:4]), joined(plain[4:]), *(seal(key, 1 << 40, command) for command in plain)]
     target = Target(seeds, lambda data: None)
-    on_board = Commander(ReplayCounter(folder / "key"), open_store(folder / "store", mission), mission)
+    on_board = Commander(KeyRing([folder / "key"]), open_store(folder / "store", mission), mission)
 
     def check(data: bytes) -> None:
         before = (on_board.last_counter, on_board.settings)
@@ -407,7 +407,7 @@ def ground_telemetry(containers: list[bytes]) -> Target:
     """What the ground writes down of telemetry: every line must be JSON that can be read again."""
     folder = Path(tempfile.mkdtemp())
     apids = [APID_HOUSEKEEPING, APID_EVENTS, APID_REPORTS, APID_FRAME_HEADERS, 0x7FF]
-    report = Report(1, 7, "accepted", "ping").pack()
+    report = Report(1, 7, bytes(8), "accepted", "ping").pack()
     event = DICTIONARY.events["transfer_failed"].pack(utc_ns=5, file="a", reason="b")
     values = {item.name: sample(item) for item in DICTIONARY.telemetry["housekeeping"].items}
     housekeeping = DICTIONARY.telemetry["housekeeping"].pack(**values)
@@ -440,7 +440,9 @@ def uplink(containers: list[bytes]) -> Target:
     session = Path(tempfile.mkdtemp())
     job = session / "uplink" / f"{7:020d}.json"
     job.parent.mkdir()
-    text = json.dumps({"packet": bytes(60).hex(), "command": "ping", "expires_utc_ns": 1 << 62}).encode()
+    text = json.dumps(
+        {"packet": bytes(60).hex(), "command": "ping", "boot": "", "expires_ns": 1 << 62}
+    ).encode()
     words = [
         "ping",
         "bracket\0000.05,0.1",

@@ -65,11 +65,6 @@ def test_every_command_has_help_with_an_example(tool, command):
         (["downlink", "--link", "carrier://pigeon", "--store", "{tmp}"], 2, "carrier://pigeon"),
         (["triage", "--model", "nowhere.onnx", "--frames", "{tmp}"], 1, "nowhere.onnx"),
         (["serve", *NOWHERE, "--link", "serial:///dev/nowhere", "--store", "{tmp}"], 1, "/dev/nowhere"),
-        (
-            ["serve", *NOWHERE, "--link", "serial:///dev/null", "--key", "no.key", "--store", "{tmp}"],
-            2,
-            "no.key",
-        ),
         (["serve", "--camera", "ftp://x", "--link", "can://nowhere", "--store", "{tmp}"], 1, "nowhere"),
         (["fsck", "--store", "{tmp}"], 1, "is no frame store"),
         (["frobnicate"], 2, "frobnicate"),

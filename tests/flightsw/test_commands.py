@@ -11,8 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flightsw.commands import ANSWER_S, RESERVE_BYTES, Commander, ReplayCounter
-from flightsw.icd.auth import Key, seal, seal_file
+from flightsw.commands import ANSWER_S, DELETE_S, RESERVE_BYTES, Commander, KeyRing, ReplayCounter
+from flightsw.icd.auth import MAX_COUNTER, Key, digest, seal, seal_file
 from flightsw.icd.command import Command
 from flightsw.icd.config import ConfigError
 from flightsw.icd.telemetry import DICTIONARY
@@ -35,7 +35,7 @@ class Spacecraft:
         self.store = FrameStore(folder / "store")
         for _ in range(frames):
             self.store.put(make_frame(self.store.next_frame_id))
-        self.now_s = 100.0
+        self.now_s, self.tick_s = 100.0, 0.0  # the time, and what each look at the clock adds
         self.counter = 0
         self.refusals: list[str] = []
         self.restart()
@@ -43,11 +43,16 @@ class Spacecraft:
     def restart(self) -> None:
         """Forget everything that is not on the disk."""
         if self.counter:
-            self.replay.close()
-        self.replay = ReplayCounter(self.key_file)
+            self.keys.close()
+        self.keys = KeyRing([self.key_file])
+        (self.replay,) = self.keys.counters
         self.commander = Commander(
-            self.replay, self.store, self.mission, self.refusals.append, lambda: self.now_s, lambda: 5
+            self.keys, self.store, self.mission, self.refusals.append, self.clock_s, lambda: 5
         )
+
+    def clock_s(self) -> float:
+        self.now_s += self.tick_s
+        return self.now_s
 
     def seal(self, name: str, **arguments) -> bytes:
         self.counter += 1
@@ -56,6 +61,7 @@ class Spacecraft:
     def send(self, name: str, **arguments) -> list[tuple[str, str]]:
         """Return stage and text of what is reported."""
         self.commander.receive(self.seal(name, **arguments))
+        self.commander.poll()
         return self.reports()
 
     def reports(self) -> list[tuple[str, str]]:
@@ -72,7 +78,7 @@ class Spacecraft:
 def spacecraft(tmp_path, small_mission, make_frame):
     made = Spacecraft(tmp_path / "flight", small_mission, make_frame, frames=3)
     yield made
-    made.replay.close()
+    made.keys.close()
 
 
 def test_a_command_is_accepted_started_and_completed(spacecraft):
@@ -200,6 +206,7 @@ def test_on_a_disk_that_is_truly_full_safe_mode_is_entered_and_frames_are_delete
         ]
         for packet in packets:
             spacecraft.commander.receive(packet)
+            spacecraft.commander.poll()
         assert [text for stage, text in spacecraft.reports() if stage not in ("accepted", "started")] == [
             "no exposures until resumed",
             f"delete is armed for {DICTIONARY.arm_s} s",
@@ -229,7 +236,9 @@ def test_what_is_not_authentic_is_refused_counted_and_has_no_effect(spacecraft, 
         spacecraft.commander = Commander(None, store, mission, spacecraft.refusals.append)
     before = spacecraft.state()
     spacecraft.commander.receive(bytes(packet))
-    assert spacecraft.reports() == []  # nobody who can prove anything is there to be told
+    told = spacecraft.commander.reports
+    assert [(report.digest, report.stage) for report in told] == [(digest(bytes(packet)), "refused")]
+    assert forged == "no key on board" or spacecraft.key.fingerprint in told[0].text
     assert spacecraft.state() == before
     assert spacecraft.commander.refused == len(spacecraft.refusals) == 1
 
@@ -396,3 +405,135 @@ def test_damaged_settings_fall_back_to_the_mission(tmp_path, small_mission):
     ):
         (tmp_path / "settings.json").write_text(text)
         assert load_settings(tmp_path, small_mission) == default
+
+
+def test_frames_are_deleted_some_a_turn_and_the_command_ends_when_all_are(spacecraft, make_frame):
+    for _ in range(9):
+        spacecraft.store.put(make_frame(spacecraft.store.next_frame_id))
+    packets = [
+        spacecraft.seal("arm", command="delete"),
+        spacecraft.seal("delete", first_frame=0, last_frame=9),
+        spacecraft.seal("ping"),
+    ]
+    for packet in packets:
+        spacecraft.commander.receive(packet)
+    assert len(spacecraft.store.frames) == 12  # nothing is deleted where packets are received
+    spacecraft.store.drop(5)  # meanwhile for another frame's room
+    spacecraft.tick_s = DELETE_S / 3
+    turns = 0
+    while len(spacecraft.store.frames) > 2:
+        before = len(spacecraft.store.frames)
+        stages = [report.stage for report in spacecraft.commander.reports if report.counter == 2]
+        assert stages == ["accepted", "started"]
+        spacecraft.commander.poll()
+        turns += 1
+        assert before - len(spacecraft.store.frames) <= 4
+    assert turns >= 3
+    spacecraft.commander.poll()
+    ends = [(r.counter, r.text) for r in spacecraft.commander.reports if r.stage == "completed"]
+    assert ends[1:] == [(3, "alive"), (2, "10 frames deleted")]
+
+
+@pytest.mark.parametrize("suffix", ["", ".copy"])
+def test_no_flipped_bit_of_a_counter_file_takes_a_command_away_or_lets_one_in_again(tmp_path, suffix):
+    key_file = tmp_path / "k"
+    key = make_key(key_file)
+    keys = KeyRing([key_file])
+    keys.counters[0].advance(41)
+    keys.close()
+    damaged = tmp_path / f"k.received{suffix}"
+    good = damaged.read_bytes()
+    contents = [good[:size] for size in range(0, len(good), 7)]
+    for bit in range(8 * len(good)):
+        content = bytearray(good)
+        content[bit // 8] ^= 1 << bit % 8
+        contents.append(bytes(content))
+    for content in contents:
+        damaged.write_bytes(content)
+        counter = ReplayCounter(key_file)
+        counter.close()
+        assert counter.last == 41 and damaged.read_bytes() == good, content
+    damaged.unlink()
+    counter = ReplayCounter(key_file)
+    counter.close()
+    assert counter.last == 41 and damaged.read_bytes() == good
+    damaged.write_text(key.counter_text(40))  # the power went between the two, or one is from a backup
+    counter = ReplayCounter(key_file)
+    counter.close()
+    assert counter.last == 41 and damaged.read_bytes() == good
+
+
+def test_a_counter_file_of_an_earlier_version_is_taken_over(tmp_path):
+    key = make_key(tmp_path / "k")
+    (tmp_path / "k.received").write_text(f"41 {key.fingerprint}\n")
+    counter = ReplayCounter(tmp_path / "k")
+    counter.close()
+    assert counter.last == 41
+    assert (tmp_path / "k.received").read_text() == key.counter_text(41)
+
+
+def test_without_a_usable_counter_every_command_is_refused_with_the_reason(spacecraft):
+    spacecraft.keys.close()
+    packet = spacecraft.seal("ping")
+    for name in ("mission.key.received", "mission.key.received.copy"):
+        spacecraft.key_file.with_name(name).write_bytes(b"")
+    keys = KeyRing([spacecraft.key_file])
+    spacecraft.keys = keys
+    commander = Commander(keys, spacecraft.store, spacecraft.mission, spacecraft.refusals.append)
+    commander.receive(packet)
+    ((report,), (refusal,)) = commander.reports, spacecraft.refusals
+    assert "neither the counter nor its copy can be used" in keys.problems[0]
+    assert report.text == refusal == keys.problems[0] and report.stage == "refused"
+
+
+def test_a_packet_with_a_used_counter_is_never_answered_with_the_end_of_another(spacecraft):
+    assert spacecraft.send("near", near=1)[-1] == ("completed", "NEAR 1")
+    spacecraft.send("ping")
+    spacecraft.now_s += ANSWER_S
+    spacecraft.counter = 0  # the ground's counter comes from a backup
+    ((stage, text),) = spacecraft.send("safe")
+    assert stage == "refused" and "counter 1 was used by another command, the last is 2" in text
+    assert "--counter 2" in text and not spacecraft.commander.settings.safe_mode
+
+
+def test_a_key_takes_the_place_of_another_which_is_then_retired(spacecraft):
+    old, new_file = spacecraft.key, spacecraft.key_file.with_name("new.key")
+    new = make_key(new_file, spi=2)
+    spacecraft.keys.close()
+    restart = [spacecraft.key_file, new_file]
+    spacecraft.keys = KeyRing(restart)
+
+    def commander() -> Commander:
+        return Commander(spacecraft.keys, spacecraft.store, spacecraft.mission, clock_s=lambda: 1e3)
+
+    def send(on_board: Commander, sealing: Key, counter: int, name: str, **arguments) -> tuple[str, str]:
+        on_board.receive(seal(sealing, counter, Command(name, arguments).pack()))
+        reports, on_board.reports[:] = list(on_board.reports), []
+        return reports[-1].stage, reports[-1].text
+
+    on_board = commander()
+    assert send(on_board, old, 1, "ping") == ("completed", "alive")
+    assert send(on_board, new, 1, "ping") == ("completed", "alive")  # each key has a counter of its own
+    assert send(on_board, new, 2, "retire", key=1)[0] == "refused"  # not armed
+    for counter, key, problem in ((3, 2, "would retire itself"), (5, 9, "there is no key 9 on board")):
+        send(on_board, new, counter, "arm", command="retire")
+        stage, text = send(on_board, new, counter + 1, "retire", key=key)
+        assert stage == "refused" and problem in text
+    send(on_board, new, 7, "arm", command="retire")
+    stage, text = send(on_board, new, 8, "retire", key=1)
+    assert stage == "completed" and old.fingerprint in text
+    spacecraft.keys.close()
+    spacecraft.keys = KeyRing(restart)
+    assert not spacecraft.keys.problems
+    assert send(commander(), old, 2, "safe") == ("refused", "key 1 is retired")
+    assert send(commander(), old, MAX_COUNTER, "safe") == ("refused", "key 1 is retired")
+    assert send(commander(), new, 9, "ping") == ("completed", "alive")
+
+
+def test_two_keys_of_one_number_are_told_and_the_first_counts(tmp_path):
+    for name in ("a", "b"):
+        make_key(tmp_path / name)
+    keys = KeyRing([tmp_path / "a", tmp_path / "b", tmp_path / "none"])
+    keys.close()
+    assert [counter.path.name for counter in keys.counters] == ["a.received"]
+    assert "another key has the number 1 already" in keys.problems[0] and "none" in keys.problems[1]

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from spacepackets.cfdp.pdu import FileDataPdu, MetadataPdu
 
-from flightsw.commands import ReplayCounter
+from flightsw.commands import KeyRing
 from flightsw.downlink import LAST_TELEMETRY_S, RESTARTS, WAIT_S, run_downlink
 from flightsw.errors import DownlinkError, StoreError
 from flightsw.housekeeping import MAX_EVENTS, EventLog, ProcessMeter
@@ -197,11 +197,11 @@ def test_a_port_that_takes_nothing_does_not_keep_the_software_from_ending(store,
 
 def test_a_flood_of_forged_commands_is_counted_and_does_not_fill_the_downlink(store, small_mission, tmp_path):
     make_key(tmp_path / "k")
-    counter = ReplayCounter(tmp_path / "k")
+    keys = KeyRing([tmp_path / "k"])
     link, ground = ListLink(), PacketStream(TELECOMMAND, 1100)
     link.incoming = [b"".join(ground.encode(APID_COMMANDS, bytes(50)) for _ in range(5)) for _ in range(100)]
-    progress = fly(link, store, small_mission, 3.5, counter=counter)
-    counter.close()
+    progress = fly(link, store, small_mission, 3.5, keys=keys)
+    keys.close()
     assert progress.commands_refused == 500
     refusals = [name for name, _ in link.unpacked(APID_EVENTS, "events") if name == "command_refused"]
     assert 1 <= len(refusals) <= 4
@@ -254,7 +254,7 @@ def ends(link: ListLink) -> dict[int, tuple[str, str]]:
 
 def test_a_model_that_is_verified_late_ends_its_own_command(store, small_mission, tmp_path, monkeypatch):
     held, link, ground = HeldTriage(monkeypatch), ListLink(), PacketStream(TELECOMMAND, 1100)
-    key, counter = make_key(tmp_path / "k"), ReplayCounter(tmp_path / "k")
+    key, keys = make_key(tmp_path / "k"), KeyRing([tmp_path / "k"])
     for number in (1, 2):  # the second comes while the first is being verified
         link.incoming += model_packets(ground, key, number, bytes([number]) * 3000)
 
@@ -264,10 +264,8 @@ def test_a_model_that_is_verified_late_ends_its_own_command(store, small_mission
         time.sleep(0.001)  # the thread that verifies has a clock of its own
         return link.now_s > 600 or [end[0] for end in ends(link).values()] == ["failed", "failed"]
 
-    run_downlink(
-        store, link, small_mission, should_stop=should_stop, clock_s=lambda: link.now_s, counter=counter
-    )
-    counter.close()
+    run_downlink(store, link, small_mission, should_stop=should_stop, clock_s=lambda: link.now_s, keys=keys)
+    keys.close()
     for number, (stage, text) in ends(link).items():
         assert stage == "failed" and f"model-{number}.received is not" in text
     assert not list(store.folder.glob("model*"))
@@ -277,7 +275,7 @@ def test_a_model_that_waits_for_its_verification_when_the_downlink_fails_has_an_
     store, small_mission, tmp_path, monkeypatch, no_pause
 ):
     held, link, ground = HeldTriage(monkeypatch), FailingLink(), PacketStream(TELECOMMAND, 1100)
-    key, counter = make_key(tmp_path / "k"), ReplayCounter(tmp_path / "k")
+    key, keys = make_key(tmp_path / "k"), KeyRing([tmp_path / "k"])
     link.incoming = model_packets(ground, key, 1, bytes(3000))
 
     def fail_once(_progress) -> None:
@@ -285,8 +283,8 @@ def test_a_model_that_waits_for_its_verification_when_the_downlink_fails_has_an_
             link.failures_s = [link.now_s]
             held.go.set()
 
-    progress = fly(link, store, small_mission, 3.0, on_progress=fail_once, counter=counter)
-    counter.close()
+    progress = fly(link, store, small_mission, 3.0, on_progress=fail_once, keys=keys)
+    keys.close()
     assert progress.restarts == 1
     assert ends(link) == {1: ("failed", "the downlink failed before the model was in use")}
     assert not list(store.folder.glob("model*"))
@@ -298,15 +296,15 @@ def test_frames_that_are_deleted_while_they_wait_are_not_told_as_unreadable(
 ):
     save_settings(store.folder, Settings(order))
     link, ground = ListLink(), PacketStream(TELECOMMAND, 1100)
-    key, counter = make_key(tmp_path / "k"), ReplayCounter(tmp_path / "k")
+    key, keys = make_key(tmp_path / "k"), KeyRing([tmp_path / "k"])
     commands = [
         Command("arm", {"command": "delete"}),
         Command("delete", {"first_frame": 0, "last_frame": 2}),
     ]
     for number, command in enumerate(commands, start=1):  # they come before the next look at the outbox
         link.incoming.append(ground.encode(APID_COMMANDS, seal(key, number, command.pack())))
-    progress = fly(link, store, small_mission, 0.5, counter=counter)
-    counter.close()
+    progress = fly(link, store, small_mission, 0.5, keys=keys)
+    keys.close()
     assert store.outbox() == []
     assert (progress.waiting, progress.frames_unreadable, progress.restarts) == (0, 0, 0)
 

@@ -160,7 +160,7 @@ def test_telemetry_is_kept_with_the_session_as_it_came(tmp_path, make_frame):
     log.add(APID_FRAME_HEADERS, container[: HEADER.size])
     log.add(APID_EVENTS, DICTIONARY.events["warning"].pack(utc_ns=5, problem="cold"))
     log.add(APID_EVENTS, DICTIONARY.events["model_in_use"].pack(utc_ns=6, sha256=bytes(range(32))))
-    log.add(APID_REPORTS, Report(8, 3, "completed", "alive").pack())
+    log.add(APID_REPORTS, Report(8, 3, bytes(8), "completed", "alive").pack())
     packet, header = read(tmp_path, "telemetry.jsonl")
     assert (packet["packet"], packet["outbox_frames"], packet["received_utc_ns"]) == ("housekeeping", 9, 77)
     assert (header["packet"], header["frame_id"]) == ("frame", 12)

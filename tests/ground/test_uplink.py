@@ -1,17 +1,20 @@
 """Commands on the ground: sealed, each with its own counter, repeated until the result is known, executed once."""
 
+import contextlib
 import json
 import math
 import os
 import random
+import socket
 import threading
+import time
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
-from flightsw.commands import Commander, ReplayCounter
-from flightsw.icd.auth import Key, unseal, unseal_file
+from flightsw.commands import Commander, KeyRing
+from flightsw.icd.auth import Key, digest, unseal, unseal_file
 from flightsw.icd.command import Command, Report
 from flightsw.icd.mission import ConfigError
 from flightsw.store import FrameStore
@@ -19,11 +22,13 @@ from ground import cli
 from ground.ingest import listen
 from ground.session import SessionError
 from ground.uplink import (
+    COUNTER_MARGIN,
     Uplinker,
     in_words,
     is_listening,
     listening,
     make_key,
+    move_counter,
     outcome,
     parse_command,
     parse_script,
@@ -129,7 +134,7 @@ def test_whatever_is_lost_each_command_is_executed_once_and_its_end_is_known(
     session, key_file, tmp_path, small_mission, loss
 ):
     draw = random.Random(5).random
-    replay = ReplayCounter(key_file)
+    replay = KeyRing([key_file])
     now_s = 0.0
     commander = Commander(replay, FrameStore(tmp_path / "store"), small_mission, clock_s=lambda: now_s)
     uplinker = Uplinker(session, 1000, INTERVAL_S)
@@ -153,7 +158,7 @@ def test_whatever_is_lost_each_command_is_executed_once_and_its_end_is_known(
 
 
 def test_a_listener_that_starts_again_goes_on_with_what_is_left(session, key_file, tmp_path, small_mission):
-    replay = ReplayCounter(key_file)
+    replay = KeyRing([key_file])
     commander = Commander(replay, FrameStore(tmp_path / "store"), small_mission)
     counter = submit(session, key_file, Command("near", {"near": 3}), None, 600)
     packet = Uplinker(session, 1000, INTERVAL_S).next_command(0.0)
@@ -176,14 +181,16 @@ def test_a_listener_that_starts_again_goes_on_with_what_is_left(session, key_fil
 
 
 def test_a_command_that_nobody_answers_expires_and_one_that_is_withdrawn_is_not_sent(session, key_file):
-    utc_ns = [10**18]
-    uplinker = Uplinker(session, 1000, INTERVAL_S, utc_ns=lambda: utc_ns[0])
+    late_ns = 0
+    uplinker = Uplinker(
+        session, 1000, INTERVAL_S, elapsed_ns=lambda: time.monotonic_ns() + late_ns, utc_ns=lambda: 10**19
+    )
     first, second = (submit(session, key_file, Command("ping", {}), None, 600) for _ in range(2))
     withdraw(session, second)
     assert uplinker.next_command(0.0) is not None
     assert uplinker.next_command(0.1) is None  # sent again after an interval, not before
     assert uplinker.next_command(2 * INTERVAL_S) is not None
-    utc_ns[0] = 10**19
+    late_ns = 601 * 10**9
     assert uplinker.next_command(10.0) is None
     end = outcome(session, first)
     assert end is not None and (end["stage"], end["text"]) == ("failed", "no answer in time")
@@ -192,16 +199,17 @@ def test_a_command_that_nobody_answers_expires_and_one_that_is_withdrawn_is_not_
 
 def test_a_model_s_file_that_is_under_way_is_sent_to_its_end(session, key_file, tmp_path, small_mission):
     (tmp_path / "m.onnx").write_bytes(bytes(range(256)) * 40)
-    utc_ns = [10**18]
-    uplinker = Uplinker(session, 200, INTERVAL_S, utc_ns=lambda: utc_ns[0])
+    late_ns = 0
+    uplinker = Uplinker(session, 200, INTERVAL_S, elapsed_ns=lambda: time.monotonic_ns() + late_ns)
     counter = submit(session, key_file, Command("model", {}), tmp_path / "m.onnx", 600)
     assert uplinker.next_command(0.0) is not None
-    uplinker.take_report(Report(0, counter, "accepted", ""), 0.1)
+    mark = digest(uplinker.jobs[counter].packet)
+    uplinker.take_report(Report(0, counter, mark, "accepted", ""), 0.1)
     assert uplinker.next_pdu(0.2) is not None
-    utc_ns[0] = 10**19
+    late_ns = 601 * 10**9
     uplinker.next_command(10.0)
     assert outcome(session, counter) is None and uplinker.next_pdu(10.1) is not None
-    uplinker.take_report(Report(0, counter, "completed", "in use"), 11.0)
+    uplinker.take_report(Report(0, counter, mark, "completed", "in use"), 11.0)
     end = outcome(session, counter)
     assert end is not None and end["stage"] == "completed"
 
@@ -216,19 +224,23 @@ def test_a_time_without_end_spends_no_counter(session, key_file, expires_s):
 def test_a_new_keys_first_command_is_not_answered_with_the_end_of_an_old_one(session, key_file, tmp_path):
     uplinker = Uplinker(session, 1000, INTERVAL_S)
     counter = submit(session, key_file, Command("ping", {}), None, 600)
-    uplinker.next_command(0.0)
-    uplinker.take_report(Report(0, counter, "completed", "alive"), 0.0)
-    assert outcome(session, counter)
+    packet = uplinker.next_command(0.0)
+    assert packet is not None
+    uplinker.take_report(Report(0, counter, digest(packet), "completed", "alive"), 0.0)
+    ended = outcome(session, counter)
+    assert ended and ended["reports"][0]["digest"] == digest(packet).hex()
     make_key(tmp_path / "new.key")
-    assert submit(session, tmp_path / "new.key", Command("ping", {}), None, 600) == counter
-    assert outcome(session, counter) is None
+    waiting = submit(session, tmp_path / "new.key", Command("ping", {}), None, 600)
+    third = submit(session, key_file, Command("ping", {}), None, 600)
+    assert len({counter, waiting, third}) == 3  # each has files of its own in the session
+    assert outcome(session, waiting) is None and outcome(session, counter) == ended
 
 
 @pytest.mark.parametrize(
     "content",
     [
         '{"packet": "zz"}',
-        '{"packet": "00", "command": "ping", "expires_utc_ns": Infinity}',
+        '{"packet": "00", "command": "ping", "boot": "", "expires_ns": Infinity}',
         "[" * 100_000,
         "7",
     ],
@@ -248,8 +260,10 @@ def test_strange_files_in_the_folder_are_left_alone_and_damaged_jobs_removed(ses
 def test_reports_of_commands_that_are_not_ours_change_nothing(session, key_file):
     uplinker = Uplinker(session, 1000, INTERVAL_S)
     counter = submit(session, key_file, Command("ping", {}), None, 600)
-    uplinker.next_command(0.0)
-    uplinker.take_report(Report(0, counter + 1, "completed", "forged"), 0.0)
+    packet = uplinker.next_command(0.0)
+    assert packet is not None
+    uplinker.take_report(Report(0, counter + 1, digest(packet), "completed", "another's"), 0.0)
+    uplinker.take_report(Report(0, counter, digest(packet[:-1]), "completed", "on another packet"), 0.0)
     assert outcome(session, counter) is None and outcome(session, counter + 1) is None
 
 
@@ -296,7 +310,7 @@ def test_a_script_stops_at_the_first_command_that_is_not_completed_and_one_histo
     session, key_file, tmp_path, small_mission
 ):
     """The real command line, listener's side and spacecraft's side, joined without a wire."""
-    replay, stop = ReplayCounter(key_file), threading.Event()
+    replay, stop = KeyRing([key_file]), threading.Event()
     commander = Commander(replay, FrameStore(tmp_path / "store"), small_mission)
 
     def listener() -> None:
@@ -330,3 +344,177 @@ def test_a_script_stops_at_the_first_command_that_is_not_completed_and_one_histo
         ("delete 0 9", "refused"),
         ("ping", "completed"),
     ]
+
+
+class Joined:
+    """Both sides of the command path, joined without a wire; each step is half a second."""
+
+    def __init__(self, session: Path, keys: KeyRing, store: Path, mission):
+        self.now_s = 0.0
+        self.commander = Commander(keys, FrameStore(store), mission, clock_s=lambda: self.now_s)
+        self.uplinker = Uplinker(session, 1000, INTERVAL_S)
+        self._session = session
+
+    def ask(self, key_file: Path, name: str, **arguments) -> tuple[str, str]:
+        """Return how a command ends, within ten seconds."""
+        counter = submit(self._session, key_file, Command(name, arguments), None, 600)
+        for _ in range(20):
+            self.now_s += 0.5
+            if (packet := self.uplinker.next_command(self.now_s)) is not None:
+                self.commander.receive(packet)
+            self.commander.poll()
+            for report in self.commander.reports:
+                self.uplinker.take_report(Report.unpack(report.pack()), self.now_s)
+            self.commander.reports.clear()
+            if (end := outcome(self._session, counter)) is not None:
+                return end["stage"], end["text"]
+        raise AssertionError(f"{name} has no end")
+
+
+def test_a_counter_from_a_backup_is_told_and_moved_forward(session, key_file, tmp_path, small_mission):
+    keys = KeyRing([key_file])
+    both = Joined(session, keys, tmp_path / "store", small_mission)
+    backup = {path: path.read_bytes() for path in tmp_path.glob("mission.key.sent*")}
+    assert both.ask(key_file, "ping") == ("completed", "alive")
+    assert both.ask(key_file, "near", near=2)[0] == "completed"
+    for path in tmp_path.glob("mission.key.sent*"):
+        path.unlink()
+    for path, content in backup.items():
+        path.write_bytes(content)
+    for done in (session / "uplink").iterdir():  # a second station has a session of its own
+        done.unlink()
+    for number in (1, 2):
+        stage, text = both.ask(key_file, "safe")
+        assert stage == "refused" and f"counter {number} was used by another command, the last is 2" in text
+    assert not both.commander.settings.safe_mode
+    moved = CliRunner().invoke(cli.app, ["key", str(key_file), "--counter", "2"])
+    assert moved.exit_code == 0 and str(2 + COUNTER_MARGIN + 1) in moved.output
+    assert both.ask(key_file, "safe")[0] == "completed" and both.commander.settings.safe_mode
+    keys.close()
+
+
+def test_a_lost_or_damaged_counter_is_made_anew_and_never_goes_back(session, key_file):
+    sent = key_file.with_name("mission.key.sent")
+    assert submit(session, key_file, Command("ping", {}), None, 60) == 1
+    sent.write_bytes(sent.read_bytes().replace(b"1", b"0", 1))  # one of two is enough
+    assert submit(session, key_file, Command("ping", {}), None, 60) == 2
+    assert move_counter(key_file, 0) == 2 + COUNTER_MARGIN  # a smaller number moves it forward all the same
+    for path in (sent, sent.with_name("mission.key.sent.copy")):
+        path.write_bytes(b"")
+    with pytest.raises(ConfigError, match=r"`ground key .* --counter N` makes it anew"):
+        submit(session, key_file, Command("ping", {}), None, 60)
+    assert move_counter(key_file, 41) == 41 + COUNTER_MARGIN
+    assert submit(session, key_file, Command("ping", {}), None, 60) == 42 + COUNTER_MARGIN
+    with pytest.raises(ConfigError, match="expected less than"):
+        move_counter(key_file, (1 << 64) - 2)
+
+
+@pytest.mark.parametrize("spi", [1, 2])
+def test_a_wrong_key_is_told_at_the_first_answer(session, key_file, tmp_path, small_mission, spi):
+    keys = KeyRing([key_file])
+    make_key(tmp_path / "other.key", spi)
+    both = Joined(session, keys, tmp_path / "store", small_mission)
+    stage, text = both.ask(tmp_path / "other.key", "ping")
+    assert stage == "refused" and keys.counters[0].key.fingerprint in text
+    assert both.now_s < 2 * INTERVAL_S
+    keys.close()
+
+
+def test_two_keys_command_through_one_session(session, key_file, tmp_path, small_mission):
+    new_file = tmp_path / "new.key"
+    make_key(new_file, 2)
+    keys = KeyRing([key_file, new_file])
+    both = Joined(session, keys, tmp_path / "store", small_mission)
+    for each in (key_file, new_file, new_file, key_file):
+        assert both.ask(each, "ping") == ("completed", "alive")
+    keys.close()
+
+
+@pytest.mark.parametrize("step_s", [-1e9, -600, 600, 1e9])
+def test_a_step_of_the_ground_s_clock_ends_no_command(session, key_file, step_s):
+    step_ns = 0
+    uplinker = Uplinker(session, 1000, INTERVAL_S, utc_ns=lambda: time.time_ns() + step_ns)
+    counter = submit(session, key_file, Command("ping", {}), None, 120)
+    packet = uplinker.next_command(0.0)
+    assert packet is not None
+    step_ns = int(step_s * 1e9)
+    assert uplinker.next_command(2 * INTERVAL_S) == packet
+    assert outcome(session, counter) is None and counter in uplinker.jobs
+
+
+def test_a_command_from_before_the_computer_started_is_not_sent(session, key_file):
+    """Elapsed time begins anew at each start: how long such a command may still be sent is not known."""
+    counter = submit(session, key_file, Command("ping", {}), None, 600)
+    path = session / "uplink" / f"{counter:020d}.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"boot": "another"}))
+    assert Uplinker(session, 1000, INTERVAL_S).next_command(0.0) is None
+    end = outcome(session, counter)
+    assert end is not None and end["stage"] == "failed"
+
+
+def test_a_folder_that_cannot_be_read_is_told_once_and_the_listener_goes_on(
+    session, key_file, monkeypatch, caplog
+):
+    first = submit(session, key_file, Command("ping", {}), None, 600)
+    uplinker = Uplinker(session, 1000, INTERVAL_S)
+    packet = uplinker.next_command(0.0)
+    real, is_refused = os.listdir, True
+
+    def listdir(path) -> list[str]:  # as root no right is missing: another user's folder refuses so
+        if is_refused:
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path)
+
+    monkeypatch.setattr("ground.uplink.os.listdir", listdir)
+    submit(session, key_file, Command("ping", {}), None, 600)
+    for step in range(1, 20):
+        assert uplinker.next_command(step * INTERVAL_S) in (None, packet)
+    assert list(uplinker.jobs) == [first]  # what is known already goes on
+    assert len([record for record in caplog.records if "may not look" in record.message]) == 1
+    is_refused = False
+    uplinker.next_command(99.0)
+    assert len(uplinker.jobs) == 2
+
+
+@pytest.mark.parametrize(
+    "kind", ["fifo", "folder", "full folder", "socket", "dangling", "endless", "long packet"]
+)
+def test_nothing_that_lies_in_the_folder_stops_the_listener(session, key_file, caplog, kind):
+    folder = session / "uplink"
+    folder.mkdir()
+    path = folder / f"{1:020d}.json"
+    if kind == "fifo":
+        os.mkfifo(path)
+    elif "folder" in kind:
+        (path / "within").mkdir(parents=True) if "full" in kind else path.mkdir()
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as server, contextlib.chdir(folder):
+            server.bind(path.name)
+    elif kind == "dangling":
+        path.symlink_to("nowhere")
+    elif kind == "endless":
+        path.symlink_to("/dev/zero")
+    else:
+        path.write_text(json.dumps({"packet": "00" * 5000, "command": "x", "boot": "", "expires_ns": 1}))
+    uplinker = Uplinker(session, 1000, INTERVAL_S)
+    counter = submit(session, key_file, Command("ping", {}), None, 600)
+    for step in range(9):
+        uplinker.next_command(step * INTERVAL_S)
+    assert list(uplinker.jobs) == [counter]
+    assert len(caplog.records) <= 2
+
+
+def test_a_result_that_cannot_be_written_is_not_sent_for_again(session, key_file, monkeypatch, caplog):
+    uplinker = Uplinker(session, 1000, INTERVAL_S)
+    counter = submit(session, key_file, Command("ping", {}), None, 600)
+    packet = uplinker.next_command(0.0)
+    assert packet is not None
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("ground.uplink.write_whole", refuse)
+        patched.setattr(Path, "unlink", refuse)
+        uplinker.take_report(Report(0, counter, digest(packet), "completed", "alive"), 0.1)
+    assert [uplinker.next_command(step) for step in range(1, 9)] == [None] * 8

@@ -121,7 +121,7 @@ def test_yamcs_makes_the_bytes_of_every_command_that_we_seal(yamcs: Yamcs):
 def test_a_command_s_verifiers_follow_our_reports(yamcs: Yamcs, stages, ending):
     issued = yamcs.ask("/processors/obbgs/realtime/commands/obbgs/ping", {"args": {}})
     for number, stage in enumerate(stages):
-        report = Report(utc_ns=number, counter=1, stage=stage, text="alive").pack()
+        report = Report(utc_ns=number, counter=1, digest=bytes(8), stage=stage, text="alive").pack()
         yamcs.send([pack_packet(TELEMETRY, APID_REPORTS, number, report)])
 
     def history() -> dict[str, Any]:

@@ -18,7 +18,7 @@ import imagecodecs
 import numpy as np
 import pytest
 
-from flightsw.commands import ReplayCounter
+from flightsw.commands import KeyRing
 from flightsw.downlink import DownlinkProgress, run_downlink
 from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.icd.command import Command
@@ -230,16 +230,14 @@ def test_commands_cross_a_line_that_loses_and_damages_packets_and_each_is_execut
 ):
     key, session, store = tmp_path / "k", tmp_path / "session", FrameStore(tmp_path / "store")
     make_key(key)
-    counter = ReplayCounter(key)
+    keys = KeyRing([key])
     for number in range(4):
         store.put(make_frame(number, size_px=200))
     with VirtualSerial(
         3_000_000, Faults(loss=0.1, bit_flip=0.02, duplicate=0.1, reorder=0.02), seed=4
     ) as line:
         with open_link(line.flight_url, FLIGHT_SIDE) as link:
-            flight = Side(
-                lambda stop: run_downlink(store, link, small_mission, should_stop=stop, counter=counter)
-            )
+            flight = Side(lambda stop: run_downlink(store, link, small_mission, should_stop=stop, keys=keys))
             with (
                 flight,
                 Side(
@@ -260,7 +258,7 @@ def test_commands_cross_a_line_that_loses_and_damages_packets_and_each_is_execut
                 wait_for(lambda: all(outcome(session, number) for number in counters))
                 # a frame of 200 px does not fit this mission, but its thumbnail is kept
                 wait_for(lambda: len(list((session / "thumbnails").glob("*.png"))) >= 2)
-        counter.close()
+        keys.close()
     ends = [outcome(session, number) for number in counters]
     assert [end["stage"] for end in ends if end] == [
         "completed",
@@ -283,12 +281,12 @@ def test_without_a_listener_the_command_opens_the_link_itself_and_without_a_link
 ):
     key, session, mission = tmp_path / "k", tmp_path / "session", tmp_path / "small.yaml"
     make_key(key)
-    counter = ReplayCounter(key)
+    keys = KeyRing([key])
     store = FrameStore(tmp_path / "store")
     with (
         VirtualSerial(460_800) as line,
         open_link(line.flight_url, FLIGHT_SIDE) as link,
-        Side(lambda stop: run_downlink(store, link, small_mission, should_stop=stop, counter=counter)),
+        Side(lambda stop: run_downlink(store, link, small_mission, should_stop=stop, keys=keys)),
         Tools(tmp_path) as tools,
     ):
         options = ("--session", session, "--key", key)
@@ -300,8 +298,8 @@ def test_without_a_listener_the_command_opens_the_link_itself_and_without_a_link
         assert (direct.returncode, direct.stdout.splitlines()[-1]) == (0, "completed: alive")
         wrong = tools.run("ground", "uplink", "near", "77", *options, "--link", line.ground_url)
         assert wrong.returncode == 2 and "near: expected 0 to 16 DN, got 77" in wrong.stderr
-    counter.close()
-    assert counter.last == 1
+    keys.close()
+    assert keys.counters[0].last == 1
 
 
 def test_on_a_terminal_listen_is_a_console_that_shows_the_spacecraft(tmp_path, small_mission, make_frame):

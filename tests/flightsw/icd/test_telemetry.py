@@ -80,8 +80,8 @@ def test_any_bytes_are_one_packet_exactly_or_a_packet_error(section, number, res
 def test_bytes_are_those_that_the_file_promises():
     exposures = struct.pack(">BBBdd", DICTIONARY.version, 2, 2, 0.05, 20.0)
     assert Command("bracket", {"exposure_times_ms": (0.05, 20.0)}).pack() == exposures
-    report = Report(utc_ns=-2, counter=7, stage="completed", text="é!")
-    assert report.pack() == struct.pack(">BBqQBB3s", DICTIONARY.version, 1, -2, 7, 7, 3, b"\xc3\xa9!")
+    report = Report(utc_ns=-2, counter=7, digest=b"packet#7", stage="completed", text="é!")
+    assert report.pack() == struct.pack(">BBqQ8sBB3s", 1, 1, -2, 7, b"packet#7", 7, 3, b"\xc3\xa9!")
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_every_packet_fits_the_smallest_link():
 def test_what_can_be_armed_is_what_must_be():
     command = DICTIONARY.commands["arm"].item("command")
     armed = {(layout.id, name) for name, layout in DICTIONARY.commands.items() if layout.armed}
-    assert set(command.states) == armed == {(7, "delete"), (9, "resume")}
+    assert set(command.states) == armed == {(7, "delete"), (9, "resume"), (12, "retire")}
 
 
 def test_every_event_has_a_sentence_of_its_values():
