@@ -16,7 +16,9 @@ from ground.cli_options import (
     Background,
     BackgroundGiven,
     ExportFormat,
+    ExposuresGiven,
     ImportFormat,
+    MasksGiven,
     PoseChoice,
     PosesGiven,
     PoseSigmaGiven,
@@ -26,7 +28,8 @@ from ground.cli_options import (
 
 if TYPE_CHECKING:
     from ground.formats.photographs import Registered
-    from ground.formats.views import PoseSigmas, View
+    from ground.formats.pictures import Light
+    from ground.formats.views import Exported, PoseSigmas, View
 
 MOST_NAMED = 30  # pictures in one line; --json names all
 
@@ -39,6 +42,8 @@ def import_command(
     format_: Annotated[ImportFormat, typer.Option("--format", help="The data set's format.")],
     values: ValuesGiven = None,
     background: BackgroundGiven = None,
+    exposures: ExposuresGiven = None,
+    masks: MasksGiven = None,
     pose_sigma: PoseSigmaGiven = None,
     poses: PosesGiven = PoseChoice.CHECK,
     frames: Annotated[
@@ -47,47 +52,41 @@ def import_command(
     ] = None,
     json_: AsJson = False,
 ) -> None:
-    """Make a session of pictures with known cameras (NeRF-synthetic, nerfstudio, COLMAP, SHIRT), or of photographs.
+    """Make a session of pictures with known cameras, or of photographs.
 
     Splits that the data set states are kept: `ground reconstruct` trains on train and holds out test, or val if there
     is no test. Of images, a folder of photographs by one camera, structure from motion finds the cameras; it takes
-    minutes, and goes on where it was interrupted.
+    minutes, and goes on where it was interrupted. Pictures are PNG, JPEG, TIFF, BMP, WebP, Radiance HDR, and with
+    obbgs[pictures] FITS, OpenEXR and DNG.
 
     Example: ground import --format shirt --from shirtv1/roe1/lightbox --frames 363 --session roe1
     """
-    from ground.formats.colmap import read_colmap
-    from ground.formats.nerf import read_nerf
-    from ground.formats.nerfstudio import read_nerfstudio
+    from ground.formats.exposures import UNKNOWN, estimated, read_table, with_exposures
+    from ground.formats.masks import with_masks
     from ground.formats.placement import placed
-    from ground.formats.shirt import read_shirt
-    from ground.formats.views import EXACT, Values, first_of_each_split, is_transparent, write_session
+    from ground.formats.views import EXACT, Values, first_of_each_split, write_session
 
-    exported = registration = None
-    sigmas = EXACT
     given_sigmas = None if pose_sigma is None else _pose_sigmas(pose_sigma)
-    white = None if background is None else background is Background.WHITE
-    match format_:
-        case ImportFormat.NERF:
-            views, exported = read_nerf(folder)
-            if exported is None and white is None:
-                white = is_transparent(views[0].image)
-        case ImportFormat.NERFSTUDIO:
-            views, exported = read_nerfstudio(folder)
-        case ImportFormat.COLMAP:
-            views = read_colmap(folder)
-        case ImportFormat.SHIRT:
-            views = read_shirt(folder)
-        case ImportFormat.IMAGES:
-            found = _photographs(folder, session, frames)
-            views, sigmas, registration = found.views, found.sigmas, found.described()
-    views, found_poses = first_of_each_split(views, frames), {}
+    table = None if exposures in (None, UNKNOWN) else read_table(Path(exposures))
+    sigmas, exported, registration = EXACT, None, None
+    if format_ is ImportFormat.IMAGES:
+        found = _photographs(folder, session, frames, table)
+        views, sigmas, registration = found.views, found.sigmas, found.described()
+    else:
+        views, exported = _read(format_, folder)
+        views = first_of_each_split(views, frames)
+        if exposures != UNKNOWN:
+            views = with_exposures(views, table)
+    views, found_poses = with_masks(views, masks), {}
     source = f"{format_.value}: {folder}"
+    given = None if values is None else Values(values.value)
+    if exposures == UNKNOWN:
+        views = estimated(views, given)
     if format_ is not ImportFormat.IMAGES and poses is not PoseChoice.STATED:
         views, found_poses = _checked_poses(views, given_sigmas or sigmas, poses is PoseChoice.MEND)
         if poses is PoseChoice.MEND:
             source += "".join(f", {len(pictures)} poses {kind}" for kind, pictures in found_poses.items())
     views, origin_moved = placed(views)
-    given = None if values is None else Values(values.value)
     with Progress(TextColumn("importing"), BarColumn(), TimeRemainingColumn(), console=stderr) as progress:
         task = progress.add_task("import", total=len(views))
         count = write_session(
@@ -95,12 +94,13 @@ def import_command(
             session,
             source,
             given,
-            white,
+            None if background is None else background is Background.WHITE,
             exported,
             lambda: progress.advance(task),
             given_sigmas or sigmas,
             registration,
             origin_moved,
+            transparent_on_white=format_ is ImportFormat.NERF,
         )
     if json_:
         print(json.dumps({"frames": count, "session": str(session), **(registration or {}), **found_poses}))
@@ -110,6 +110,27 @@ def import_command(
         print(f"left out, because they could not be registered: {', '.join(registration['left_out'])}")
     if registration and registration["turned"]:
         print(f"turned by 180 degrees against the others: {', '.join(registration['turned'])}")
+
+
+def _read(format_: ImportFormat, folder: Path) -> "tuple[list[View], Exported | None]":
+    """Return the pictures of a data set whose cameras are known, and what our own export says of them."""
+    from ground.formats.colmap import read_colmap
+    from ground.formats.llff import read_llff
+    from ground.formats.middlebury import read_middlebury
+    from ground.formats.nerf import read_nerf
+    from ground.formats.nerfstudio import read_nerfstudio
+    from ground.formats.shirt import read_shirt
+
+    described = {ImportFormat.NERF: read_nerf, ImportFormat.NERFSTUDIO: read_nerfstudio}
+    if format_ in described:
+        return described[format_](folder)
+    plain = {
+        ImportFormat.COLMAP: read_colmap,
+        ImportFormat.SHIRT: read_shirt,
+        ImportFormat.LLFF: read_llff,
+        ImportFormat.MIDDLEBURY: read_middlebury,
+    }
+    return plain[format_](folder), None
 
 
 def _checked_poses(
@@ -156,7 +177,9 @@ def _pose_sigmas(text: str) -> "PoseSigmas":
         ) from error
 
 
-def _photographs(folder: Path, session: Path, count: int | None) -> "Registered":
+def _photographs(
+    folder: Path, session: Path, count: int | None, table: "dict[str, Light] | None"
+) -> "Registered":
     """Return what structure from motion makes of a folder, with a bar; SIGINT and SIGTERM stop it at its next step."""
     from ground.formats.photographs import read_photographs
     from ground.session import SessionError
@@ -178,6 +201,7 @@ def _photographs(folder: Path, session: Path, count: int | None) -> "Registered"
                 lambda share: progress.update(task, completed=share),
                 stop.is_set,
                 count,
+                table,
             )
     finally:
         for number, handler in before.items():

@@ -39,6 +39,8 @@ class ImportFormat(StrEnum):
     NERFSTUDIO = "nerfstudio"
     COLMAP = "colmap"
     SHIRT = "shirt"
+    LLFF = "llff"
+    MIDDLEBURY = "middlebury"
     IMAGES = "images"
 
 
@@ -102,7 +104,8 @@ ValuesGiven = Annotated[
     typer.Option(
         "--values",
         help="linear: proportional to light; display: sRGB-coded, kept as they are, which is how published PSNR is "
-        "measured; decode: sRGB-coded, made linear. Default: display for colours of 8 bits, otherwise linear.",
+        "measured; decode: sRGB-coded, made linear. Default: for colours of 8 bits display, or decode where exposure "
+        "times differ; otherwise linear.",
     ),
 ]
 BackgroundGiven = Annotated[
@@ -111,6 +114,24 @@ BackgroundGiven = Annotated[
         "--background",
         help="What is seen where the target is not; transparent pictures are put on it. Default: white for transparent "
         "pictures of the format nerf, otherwise black.",
+    ),
+]
+ExposuresGiven = Annotated[
+    str | None,
+    typer.Option(
+        "--exposures",
+        metavar="FILE.csv|unknown",
+        help="Exposures that the pictures do not state: a table with the columns name and exposure_time_s, iso, "
+        "f_number or gain; unknown: estimated, one a picture, from features that neighbours share. Default: what the "
+        "data set or the pictures' headers state (EXIF, FITS).",
+    ),
+]
+MasksGiven = Annotated[
+    Path | None,
+    typer.Option(
+        "--masks",
+        help="A folder of pictures with the names of the pictures, white where the target is; what they leave out "
+        "counts as background.",
     ),
 ]
 PoseSigmaGiven = Annotated[

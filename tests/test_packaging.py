@@ -120,6 +120,7 @@ def test_every_extra_of_the_package_is_known_to_the_message():
     modules = {
         "opencv-contrib-python-headless": "cv2",
         "scikit-image": "skimage",
+        "pillow": "PIL",
     }  # where the package has another name
     listed = {extra: requirements(extra)[len(requirements()) :] for extra in EXTRAS}
     names = {extra: {modules.get(r.name, r.name) for r in wanted} for extra, wanted in listed.items()}

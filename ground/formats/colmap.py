@@ -3,6 +3,7 @@
 Source: colmap.github.io/format.html.
 """
 
+import logging
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,7 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from flightsw.icd.quaternion import quat_to_matrix
-from ground.formats.views import FormatError, Intrinsics, View
+from ground.formats.lens import Intrinsics
+from ground.formats.pictures import FormatError, within
+from ground.formats.view import View
+
+log = logging.getLogger(__name__)
 
 # Model number in binary files: its name and the names of its parameters (f is both focal lengths).
 MODELS = {
@@ -21,43 +26,72 @@ MODELS = {
     4: ("OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
 }
 PARAMETERS = dict(MODELS.values())
-PLACES = ("", "sparse/0", "sparse")  # where the model may lie in the folder
+SUFFIXES = (".bin", ".txt")
 
 
 def read_colmap(folder: Path) -> list[View]:
     """Return the registered pictures of a COLMAP model, in the order of their names.
 
-    A file test.txt beside the model, with the names of the test pictures, states the splits, as for 3DGS.
+    Of several models, as the mapper leaves them in sparse/0, sparse/1 and so on, the one with the most pictures is
+    taken and the others are named. A file test.txt beside the model, with the names of the test pictures, states the
+    splits, as for 3DGS.
 
     Args:
-        folder: holds images/, and the model itself or in sparse/0 or sparse/; binary files are preferred to text.
+        folder: holds images/, and the model itself or in sparse/ or a folder of it; binary files are preferred to text.
 
     Raises:
-        FormatError: there is no model, it is damaged, or it has a camera model that is not in `MODELS`.
+        FormatError: there is no model, it is damaged, has no pictures, a camera model that is not in `MODELS`, or names
+            a picture outside the folder.
     """
-    for place in PLACES:
-        model = folder / place
-        for suffix, cameras, images in (
-            (".bin", _cameras_bin, _images_bin),
-            (".txt", _cameras_txt, _images_txt),
-        ):
-            if (model / f"cameras{suffix}").is_file() and (model / f"images{suffix}").is_file():
-                try:
-                    known = dict(cameras(model / f"cameras{suffix}"))
-                    split_of = _splits(model / "test.txt")
-                    views = [
-                        View(
-                            folder / "images" / name,
-                            _world_to_camera(quat, t),
-                            known[camera_id],
-                            split=split_of(name),
-                        )
-                        for quat, t, camera_id, name in images(model / f"images{suffix}")
-                    ]
-                except (ValueError, IndexError, KeyError, struct.error, OSError) as error:
-                    raise FormatError(f"{model}: damaged or not a COLMAP model: {error}") from error
-                return sorted(views, key=lambda view: view.image.name)
-    raise FormatError(f"{folder}: no cameras and images files (.bin or .txt), nor in sparse/0")
+    found = {}
+    for model in _models(folder):
+        try:
+            found[model] = _read(model)
+        except (ValueError, IndexError, KeyError, struct.error, OSError, OverflowError) as error:
+            raise FormatError(f"{model}: damaged or not a COLMAP model: {error}") from error
+    if not found:
+        raise FormatError(f"{folder}: no cameras and images files (.bin or .txt), nor in sparse/0")
+    largest = max(found, key=lambda model: len(found[model]))
+    if not found[largest]:
+        raise FormatError(f"{largest}: the COLMAP model has no pictures; run its mapper again")
+    if others := [f"{model} has {len(images)}" for model, images in found.items() if model != largest]:
+        log.warning(
+            "%s: the model with the most pictures, %d, is taken; %s; `colmap model_merger` joins models",
+            *(largest, len(found[largest]), ", ".join(others)),
+        )
+    split_of = _splits(largest / "test.txt")
+    views = [
+        View(within(folder, f"images/{name}", largest), pose, lens, split=split_of(name))
+        for name, (pose, lens) in found[largest].items()
+    ]
+    return sorted(views, key=lambda view: view.image.name)
+
+
+def _models(folder: Path) -> Iterator[Path]:
+    """Return the folders that hold a model: the folder itself, sparse/ or the folders in it."""
+    below = sorted(path for path in (folder / "sparse").glob("*") if path.is_dir())
+    for place in (folder, folder / "sparse", *below):
+        if any(_has(place, suffix) for suffix in SUFFIXES):
+            yield place
+
+
+def _has(model: Path, suffix: str) -> bool:
+    return (model / f"cameras{suffix}").is_file() and (model / f"images{suffix}").is_file()
+
+
+def _read(model: Path) -> dict[str, tuple[np.ndarray, Intrinsics]]:
+    """Return pose and camera of each picture of a model by its name."""
+    suffix = next(suffix for suffix in SUFFIXES if _has(model, suffix))
+    cameras, images = (_cameras_bin, _images_bin) if suffix == ".bin" else (_cameras_txt, _images_txt)
+    known = dict(cameras(model / f"cameras{suffix}"))
+    read: dict[str, tuple[np.ndarray, Intrinsics]] = {}
+    for quat, t, camera_id, name in images(model / f"images{suffix}"):
+        if name in read:
+            raise ValueError(f"the picture {name} is listed twice")
+        if camera_id not in known:
+            raise ValueError(f"the picture {name} has camera {camera_id}, which is not listed")
+        read[name] = _world_to_camera(quat, t), known[camera_id]
+    return read
 
 
 def _splits(path: Path) -> Callable[[str], str | None]:
@@ -76,12 +110,38 @@ def _cameras_txt(path: Path) -> Iterator[tuple[int, Intrinsics]]:
 
 
 def _images_txt(path: Path) -> Iterator[tuple[np.ndarray, np.ndarray, int, str]]:
-    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
-    for line in lines[::2]:  # every second line lists the picture's points, and may be empty
-        if line.strip():
-            _, *numbers, camera_id, name = line.split(maxsplit=9)
+    """Return the pictures of images.txt: each has a line, and one of its points after it, which may be empty.
+
+    Files of tools that write no lines of points, or more empty lines than COLMAP, are understood: a picture's line is
+    known by its numbers, of which COLMAP's points have a multiple of three.
+    """
+    points_may_follow = False
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        if line.startswith("#"):
+            continue
+        if not line.strip() or (points_may_follow and _are_points(line)):
+            points_may_follow = False
+        else:
+            parts = line.split(maxsplit=9)
+            if len(parts) != 10:
+                raise ValueError(
+                    f"{path.name}, line {number}: expected a picture (number, quaternion, translation, camera, name), "
+                    f"got {line[:80]!r}"
+                )
+            _, *numbers, camera_id, name = parts
             values = np.array(numbers, dtype=np.float64)
-            yield values[:4], values[4:], int(camera_id), name
+            yield values[:4], values[4:], int(camera_id), name.strip()
+            points_may_follow = True
+
+
+def _are_points(line: str) -> bool:
+    """Return whether a line lists points (x, y and a whole number, again and again) and no picture."""
+    parts = line.split()
+    try:
+        np.array(parts, dtype=np.float64)
+        return len(parts) % 3 == 0 and all(int(part) >= -1 for part in parts[2::3])
+    except (ValueError, OverflowError):
+        return False
 
 
 def _cameras_bin(path: Path) -> Iterator[tuple[int, Intrinsics]]:
@@ -108,7 +168,10 @@ def _images_bin(path: Path) -> Iterator[tuple[np.ndarray, np.ndarray, int, str]]
 
 def _intrinsics(model: str, width: int, height: int, values: list[float]) -> Intrinsics:
     if model not in PARAMETERS:
-        raise ValueError(f"expected a camera model of {', '.join(PARAMETERS)}, got {model}")
+        raise ValueError(
+            f"expected a camera model of {', '.join(PARAMETERS)}, got {model}; undistort the pictures first, as with "
+            "`colmap image_undistorter`"
+        )
     given = dict(zip(PARAMETERS[model], values, strict=True))
     focal_px = given.get("f", 0.0)
     distortion = tuple(given.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ground.formats.views import EXACT, FormatError, PoseSigmas, View, read_grey
+from ground.formats.pictures import FormatError
+from ground.formats.views import EXACT, PoseSigmas, View, read_grey
 
 if TYPE_CHECKING:
     import cv2
@@ -49,7 +50,7 @@ class PoseCheck:
 
 
 @dataclass(frozen=True)
-class _Pair:
+class Pair:
     """Two pictures, by index, and the points [M, 2] px, of pinhole pictures of full size, at which both show the same.
 
     scale: of the pictures on which they were found.
@@ -111,11 +112,11 @@ def check_poses(
     Raises:
         FormatError: a picture cannot be read.
     """
-    pairs = _pairs(views, on_view)
+    pairs = matched_points(views, on_view)
     limits_px = [_limit_px(view, sigmas) for view in views]
     flipped = [turned(view) for view in views]
 
-    def agree(pair: _Pair, turning: set[int]) -> bool:
+    def agree(pair: Pair, turning: set[int]) -> bool:
         one, other = (flipped[i] if i in turning else views[i] for i in (pair.first, pair.second))
         distances_px = pair.scale * epipolar_distances_px(one, other, pair.at_first, pair.at_second)
         return float(np.median(distances_px)) <= max(limits_px[pair.first], limits_px[pair.second])
@@ -174,7 +175,12 @@ def _scale(view: View) -> float:
     return min(1.0, MOST_PX / max(view.intrinsics.width, view.intrinsics.height))
 
 
-def _pairs(views: Sequence[View], on_view: Callable[[], None]) -> list[_Pair]:
+def matched_points(views: Sequence[View], on_view: Callable[[], None] = lambda: None) -> list[Pair]:
+    """Return the pairs of neighbouring views with the points that both show.
+
+    Raises:
+        FormatError: a picture cannot be read.
+    """
     import cv2  # here and below: the ground station starts without it
 
     sift = cv2.SIFT.create(nfeatures=FEATURES)
@@ -202,6 +208,8 @@ def _features(sift: "cv2.SIFT", view: View) -> tuple[np.ndarray, np.ndarray | No
         return np.zeros((0, 2)), None
     at = (np.array([point.pt for point in found]) + 0.5) / scale  # OpenCV's pixel centres are whole numbers
     K = np.array(view.intrinsics.K)
+    if skew_px := view.intrinsics.skew_px:
+        at[:, 0] -= skew_px / view.intrinsics.fy_px * (at[:, 1] - view.intrinsics.cy_px)
     if any(view.intrinsics.distortion):
         at = cv2.undistortPoints(at[:, None], K, np.array(view.intrinsics.distortion), P=K)[:, 0]
     return at, descriptors
@@ -223,7 +231,7 @@ def _neighbours(views: Sequence[View]) -> list[tuple[int, int]]:
 
 def _matched(
     views: Sequence[View], features: list[tuple[np.ndarray, np.ndarray | None]], i: int, j: int, scale: float
-) -> _Pair | None:
+) -> Pair | None:
     """Return what two pictures share; nothing where that is too little to compare their cameras."""
     import cv2
 
@@ -241,10 +249,10 @@ def _matched(
     kept = fits.ravel() > 0
     if kept.sum() < max(FEWEST_MATCHES, FITTING * len(good)):
         return None
-    return _Pair(i, j, a[kept], b[kept], scale)
+    return Pair(i, j, a[kept], b[kept], scale)
 
 
-def _groups(count: int, pairs: list[_Pair]) -> list[set[int]]:
+def _groups(count: int, pairs: list[Pair]) -> list[set[int]]:
     """Return the sets of views that pairs connect; a view in no pair is a set of its own."""
     group_of = [{i} for i in range(count)]
     for pair in pairs:
@@ -255,7 +263,7 @@ def _groups(count: int, pairs: list[_Pair]) -> list[set[int]]:
     return list({id(group): group for group in group_of}.values())
 
 
-def _between(pairs: list[_Pair], group: set[int], known: set[int]) -> list[_Pair]:
+def _between(pairs: list[Pair], group: set[int], known: set[int]) -> list[Pair]:
     return [
         pair
         for pair in pairs

@@ -17,19 +17,20 @@ import numpy as np
 from flightsw.icd.config import ConfigError, build, keys_below, parse_json
 from flightsw.icd.mission import CameraSection
 from ground.formats.axes import opengl_to_world_to_camera, world_to_camera_to_opengl
-from ground.formats.views import (
-    Exported,
-    FormatError,
-    Intrinsics,
-    View,
-    image_size,
-)
+from ground.formats.lens import Intrinsics
+from ground.formats.pictures import KINDS, FormatError, read_header, within
+from ground.formats.views import Exported, View
 from ground.session import SPLITS, FrameRecord, Session
 from obbgs_base.files import write_whole
 
 log = logging.getLogger(__name__)
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
+# a fisheye, OpenCV's rational, thin-prism and tilted models, and instant-ngp's other lenses
+OTHER_LENSES = (
+    *("is_fisheye", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "ftheta_p0", "latlong"),
+    *("equirectangular", "rolling_shutter"),
+)
 # Of eleven brackets six are for training, two for validation, three for testing; 121 brackets of three frames give
 # 198, 66 and 99 frames, the published split.
 SPLIT_PATTERN = (0, 1, 0, 2, 0, 2, 0, 1, 0, 2, 0)
@@ -169,18 +170,20 @@ def load_transforms(path: Path) -> dict[str, Any]:
     frames = tree.get("frames") if isinstance(tree, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise FormatError(f'{path}: expected an object with a list "frames"')
-    if masked := sum("mask_path" in frame for frame in frames):
-        log.warning("%s: the masks of %d pictures are not read: all of their pixels count", path, masked)
+    if not frames:
+        raise FormatError(f"{path}: it has no frames")
     return tree
 
 
 def image_path(folder: Path, frame: dict[str, Any], where: Path) -> Path:
-    """Return the path of a frame's picture; NeRF-synthetic omits the suffix .png."""
+    """Return the path of a frame's picture, in the data set's folder; NeRF-synthetic omits the suffix .png."""
     name = frame.get("file_path")
     if not isinstance(name, str):
         raise FormatError(f"{where}: a frame has no file_path")
-    image = folder / name
-    return image if image.is_file() else image.with_name(image.name + ".png")
+    image = within(folder, name, where)
+    if image.is_file() or image.suffix.lower() in KINDS:
+        return image
+    return within(folder, f"{name}.png", where)
 
 
 def read_frame(frame: dict[str, Any], image: Path, intrinsics: Intrinsics, where: Path) -> View:
@@ -197,6 +200,9 @@ def read_frame(frame: dict[str, Any], image: Path, intrinsics: Intrinsics, where
         if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
             raise ValueError(f"pose_covariance: expected finite [6, 6], got {covariance.tolist()}")
         exposure_time_s = float(frame.get("exposure_time_s", 1.0))
+        mask = frame.get("mask_path")
+        if mask is not None and not isinstance(mask, str):
+            raise ValueError(f"mask_path: expected a file name, got {mask!r}")
         if sun.shape != (3,) or not 0 < exposure_time_s < math.inf:
             raise ValueError(f"exposure_time_s {exposure_time_s}, sun_dir_body {sun.tolist()}")
         return View(
@@ -204,6 +210,8 @@ def read_frame(frame: dict[str, Any], image: Path, intrinsics: Intrinsics, where
             pose,
             intrinsics,
             exposure_time_s=exposure_time_s,
+            exposure_stated="exposure_time_s" in frame,
+            mask=None if mask is None else within(where.parent, mask, where),
             mid_exposure_utc_ns=None if time_ns is None else int(time_ns),
             bracket=None if bracket is None else int(bracket),
             bracket_index=int(frame.get("bracket_index", 0)),
@@ -246,8 +254,12 @@ def distortion_of(keys: dict[str, Any], where: Path) -> tuple[float, ...]:
     model = keys.get("camera_model", "OPENCV")
     if model not in PINHOLE_MODELS:
         raise FormatError(f"{where}: expected a camera model of {', '.join(PINHOLE_MODELS)}, got {model!r}")
-    if keys.get("k4"):
-        raise FormatError(f"{where}: k4 belongs to a lens model that is not supported")
+    for name in OTHER_LENSES:
+        if keys.get(name):
+            raise FormatError(
+                f"{where}: {name} belongs to a lens model that is not supported; undistort the pictures first, as with "
+                "`colmap image_undistorter`"
+            )
     return tuple(float(keys.get(name, 0.0)) for name in DISTORTION_KEYS)
 
 
@@ -257,16 +269,21 @@ def _intrinsics(tree: dict[str, Any], image: Path, where: Path) -> Intrinsics:
         if "w" in tree and "h" in tree:
             width, height = int(tree["w"]), int(tree["h"])
         else:
-            width, height = image_size(image)
+            header = read_header(image)
+            width, height = header.width, header.height
         focal_px = tree.get("fl_x") or width / (2 * math.tan(tree["camera_angle_x"] / 2))
+        focal_y_px = tree.get("fl_y", focal_px)
+        if "fl_y" not in tree and "fl_x" not in tree and "camera_angle_y" in tree:
+            focal_y_px = height / (2 * math.tan(tree["camera_angle_y"] / 2))
         return Intrinsics(
             width,
             height,
             float(focal_px),
-            float(tree.get("fl_y", focal_px)),
+            float(focal_y_px),
             float(tree.get("cx", width / 2)),
             float(tree.get("cy", height / 2)),
             distortion_of(tree, where),
+            float(tree.get("skew", 0.0)),
         )
     except KeyError as error:
         raise FormatError(f"{where}: {error} is missing") from error

@@ -9,6 +9,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
+from ground.formats.lens import Intrinsics
 from ground.formats.nerf import (
     DISTORTION_KEYS,
     camera_keys,
@@ -22,7 +23,8 @@ from ground.formats.nerf import (
     read_frame,
     split_frames,
 )
-from ground.formats.views import Exported, FormatError, Intrinsics, View
+from ground.formats.pictures import FormatError
+from ground.formats.views import Exported, View
 from ground.session import SPLITS, Session
 from obbgs_base.files import write_whole
 
@@ -106,6 +108,7 @@ def _intrinsics(keys: dict[str, Any], where: Path) -> Intrinsics:
             float(keys["cx"]),
             float(keys["cy"]),
             distortion_of(keys, where),
+            float(keys.get("skew", 0.0)),
         )
     except KeyError as error:
         raise FormatError(f"{where}: {error} is missing") from error

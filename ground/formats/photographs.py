@@ -4,6 +4,7 @@ Source: Schönberger and Frahm, Structure-from-Motion Revisited, 2016, through i
 """
 
 import contextlib
+import dataclasses
 import hashlib
 import logging
 import math
@@ -15,20 +16,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ground.formats.brackets import alike, brackets_of, feature_name, write_for_features
 from ground.formats.epipolar import turned
+from ground.formats.exposures import with_exposures
+from ground.formats.lens import Intrinsics
+from ground.formats.pictures import FormatError, Light, pictures_in, read_header
 from ground.formats.turned_pictures import turned_back
-from ground.formats.views import FormatError, Intrinsics, PoseSigmas, View, image_size
+from ground.formats.view import View
+from ground.formats.views import PoseSigmas
 from obbgs_base.errors import Interrupted
 from obbgs_base.files import write_whole
 
 if TYPE_CHECKING:
     import pycolmap
 
-SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 SEED = 0
 FEWEST = 3  # pictures that a model must register
 PICTURES_AT_ONCE = 8  # between looks at whether to stop
 RADIUS_SHARE = 0.9  # of the points lie within one metre of the origin
+COLMAP_READS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
 PICTURES = "pictures.sha256"  # of the pictures that features and matches are of
 log = logging.getLogger(__name__)
 
@@ -62,13 +68,16 @@ class Registered:
         }
 
 
-def _keep_only_of(work: Path, folder: Path, names: Sequence[str]) -> None:
+def _keep_only_of(work: Path, folder: Path, names: Sequence[str], exposures: str) -> None:
     """Make the folder of features and matches, without those of other pictures: COLMAP knows pictures by name alone.
+
+    Args:
+        exposures: what is known of the pictures' exposures, by which their copies for the features are made.
 
     Raises:
         FormatError: there is a folder of that name that no import has made.
     """
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(exposures.encode())
     for name in names:
         content = (folder / name).read_bytes()
         digest.update(f"{name}\0{len(content)}\0".encode() + content)
@@ -90,8 +99,12 @@ def read_photographs(
     on_share: Callable[[float], None] = lambda share: None,
     should_stop: Callable[[], bool] = lambda: False,
     count: int | None = None,
+    table: dict[str, Light] | None = None,
 ) -> Registered:
     """Return the photographs of a folder, in the order of their names, with the cameras that took them.
+
+    Photographs of one bracket, as exposures that come again in the same order tell, have one camera (`brackets_of`).
+    Features are sought on pictures brought to one exposure where exposures differ.
 
     One camera with one focal length is assumed to have taken them all; its focal length and a radial distortion are
     estimated. Its line of sight is taken to meet the pictures' middle, which from a distance cannot be told from a turn
@@ -101,6 +114,7 @@ def read_photographs(
         work: keeps features and matches, so that the same call goes on after an interruption; removed at the end.
         on_share: is told how much is done, from 0 to 1.
         count: take only the first so many; None: all.
+        table: what is known of the photographs' exposures beside what they say themselves.
 
     Raises:
         FormatError: fewer than three pictures, different sizes, or no model is found that registers three of them.
@@ -108,14 +122,21 @@ def read_photographs(
     """
     import pycolmap
 
-    if not folder.is_dir():
-        raise FormatError(f"{folder} is not a folder: expected one with at least {FEWEST} photographs")
-    names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)[:count]
+    names = pictures_in(folder)[:count]
     if len(names) < FEWEST:
         raise FormatError(f"{folder}: expected at least {FEWEST} photographs, found {len(names)}")
-    if len(sizes := {image_size(folder / name) for name in names}) > 1:
+    stated = with_exposures([_unposed(folder / name) for name in names], table)
+    if len(sizes := {(view.intrinsics.width, view.intrinsics.height) for view in stated}) > 1:
         raise FormatError(f"{folder}: the pictures of a session have one size, found {sorted(sizes)}")
-    _keep_only_of(work, folder, names)
+    brackets = brackets_of(stated)
+    _keep_only_of(work, folder, names, repr([view.exposure_time_s for view in stated]))
+    originals, named = folder, {view.image.name: [view] for view in stated}
+    if not all(_as_colmap_reads_it(view) for view in stated) or not alike(stated):
+        folder, named = work / "pictures", {feature_name(group): group for group in brackets}
+        write_for_features(folder, brackets)
+    names = sorted(named)
+    if len(names) < FEWEST:
+        raise FormatError(f"{originals}: expected at least {FEWEST} brackets, found {len(names)}")
     database = work / "database.db"
 
     def step(share: float) -> None:
@@ -127,26 +148,7 @@ def read_photographs(
 
     with silent_colmap():
         pycolmap.set_random_seed(SEED)
-        extraction = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
-        with pycolmap.Database.open(database) as opened:
-            cameras = opened.read_all_cameras()
-        for start in range(0, len(names), PICTURES_AT_ONCE):
-            # the first pictures make the camera, the others share it
-            reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
-            if cameras:
-                reader.existing_camera_id = cameras[0].camera_id
-            pycolmap.extract_features(
-                database,
-                folder,
-                names[start : start + PICTURES_AT_ONCE],
-                pycolmap.CameraMode.SINGLE,
-                reader,
-                extraction,
-                pycolmap.Device.cpu,
-            )
-            with pycolmap.Database.open(database) as opened:
-                cameras = opened.read_all_cameras()
-            step(0.3 * min(1.0, (start + PICTURES_AT_ONCE) / len(names)))
+        _find_features(database, folder, names, step)
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = SEED
         matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
@@ -161,9 +163,35 @@ def read_photographs(
                 "cameras; take more of them, with more overlap, of a textured object"
             )
         model, upside_down = turned_back(model, lambda: step(0.95))
-    registered = _registered(model, folder, names, upside_down)
+    registered = _registered(model, named, upside_down)
     shutil.rmtree(work)
     return registered
+
+
+def _find_features(database: Path, folder: Path, names: list[str], step: Callable[[float], None]) -> None:
+    """Write the features of pictures to the database; those of all have one camera."""
+    import pycolmap
+
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
+    with pycolmap.Database.open(database) as opened:
+        cameras = opened.read_all_cameras()
+    for start in range(0, len(names), PICTURES_AT_ONCE):
+        # the first pictures make the camera, the others share it
+        reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+        if cameras:
+            reader.existing_camera_id = cameras[0].camera_id
+        pycolmap.extract_features(
+            database,
+            folder,
+            names[start : start + PICTURES_AT_ONCE],
+            pycolmap.CameraMode.SINGLE,
+            reader,
+            extraction,
+            pycolmap.Device.cpu,
+        )
+        with pycolmap.Database.open(database) as opened:
+            cameras = opened.read_all_cameras()
+        step(0.3 * min(1.0, (start + PICTURES_AT_ONCE) / len(names)))
 
 
 def _mapped(
@@ -197,26 +225,42 @@ def _mapped(
 
 
 def _registered(
-    model: "pycolmap.Reconstruction", folder: Path, names: list[str], upside_down: frozenset[str]
+    model: "pycolmap.Reconstruction", named: dict[str, list[View]], upside_down: frozenset[str]
 ) -> Registered:
+    """Return what was found of the pictures by the names under which COLMAP knows them, each of one or more frames."""
     points = np.array([point.xyz for point in model.points3D.values()])
     centre = np.median(points, axis=0)
     metre = float(np.quantile(np.linalg.norm(points - centre, axis=1), RADIUS_SHARE))
-    views, ranges_m = {}, []
+    posed, ranges_m = {}, []
     for image in model.images.values():
         if image.has_pose:
             pose = np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
             pose[:3, 3] = (pose[:3, 3] + pose[:3, :3] @ centre) / metre
-            view = View(folder / image.name, pose, _intrinsics(model.cameras[image.camera_id]))
-            views[image.name] = turned(view) if image.name in upside_down else view
+            lens = _intrinsics(model.cameras[image.camera_id])
+            for view in named[image.name]:
+                there = dataclasses.replace(view, world_to_camera=pose, intrinsics=lens)
+                posed[view.image.name] = turned(there) if image.name in upside_down else there
             ranges_m.append(np.linalg.norm(pose[:3, 3]))
     reprojection_px = model.compute_mean_reprojection_error()
-    focal_px = next(iter(views.values())).intrinsics.fx_px
+    focal_px = next(iter(posed.values())).intrinsics.fx_px
     sigma_rad = math.atan(reprojection_px / focal_px)
-    left_out = tuple(name for name in names if name not in views)
-    in_order = [views[name] for name in names if name in views]
+    frames = sorted(view.image.name for group in named.values() for view in group)
+    left_out = tuple(name for name in frames if name not in posed)
+    in_order = [posed[name] for name in frames if name in posed]
+    upside = sorted(view.image.name for name in upside_down for view in named[name])
     sigmas = PoseSigmas(sigma_rad, sigma_rad * float(np.median(ranges_m)))
-    return Registered(in_order, left_out, tuple(sorted(upside_down)), reprojection_px, sigmas)
+    return Registered(in_order, left_out, tuple(upside), reprojection_px, sigmas)
+
+
+def _unposed(image: Path) -> View:
+    header = read_header(image)
+    width, height = header.width, header.height
+    lens = Intrinsics(width, height, float(width), float(width), width / 2, height / 2)
+    return View(image, np.eye(4), lens)
+
+
+def _as_colmap_reads_it(view: View) -> bool:
+    return view.image.suffix.lower() in COLMAP_READS
 
 
 def _intrinsics(camera: "pycolmap.Camera") -> Intrinsics:

@@ -9,7 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ground.formats.views import View, read_grey
+from ground.formats.pictures import FormatError
+from ground.formats.view import View
+from ground.formats.views import read_grey
 
 log = logging.getLogger(__name__)
 IN_SIGHT = 0.5  # share of the pictures that show the origin where it can stay
@@ -24,8 +26,10 @@ def placed(views: Sequence[View]) -> tuple[list[View], np.ndarray | None]:
     through the middles of what departs from each picture's border, if they meet and it lies in front of all cameras.
 
     Raises:
-        FormatError: a picture cannot be read.
+        FormatError: there is no picture, or one cannot be read.
     """
+    if not views:
+        raise FormatError("the data set has no pictures")
     if _in_sight(views, np.zeros(3)) >= IN_SIGHT:
         return list(views), None
     across, towards = np.zeros((3, 3)), np.zeros(3)

@@ -10,7 +10,9 @@ import numpy as np
 
 from flightsw.icd.config import ConfigError, parse_json
 from flightsw.icd.quaternion import quat_to_matrix
-from ground.formats.views import FormatError, Intrinsics, View
+from ground.formats.lens import Intrinsics
+from ground.formats.pictures import FormatError
+from ground.formats.view import View
 
 
 def read_shirt(folder: Path) -> list[View]:

@@ -3,73 +3,36 @@
 import dataclasses
 import hashlib
 import json
+import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 
 import imagecodecs
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from flightsw.icd.frame import Frame, PoseTag
 from flightsw.icd.mission import CameraSection
 from flightsw.icd.quaternion import matrix_to_quat
+from ground.formats.judgement import Judgement, judge
+from ground.formats.lens import Intrinsics, pinhole_of, undistort
+from ground.formats.pictures import FormatError
 from ground.formats.srgb import from_srgb
+from ground.formats.view import View, colours_of, grey_light, read_image, read_mask
 from ground.session import ENCODINGS, SCHEMA_VERSION, SessionError
 from ground.session_writer import frame_line
 from obbgs_base.files import write_whole
 
+log = logging.getLogger(__name__)
 # Other data sets do not state their noise: a small one is assumed, the same in every pixel.
 FOREIGN_READ_NOISE = 2 / 255  # of full scale
 FOREIGN_ELECTRONS_PER_DN = 1e3
 FRAME_SPACING_NS = 1_000_000_000  # between pictures without a time
-
-
-class FormatError(SessionError):
-    """A folder is not in the expected format; the message names the file."""
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """A pinhole camera with OpenCV's lens distortion, px, pixel centres at +0.5."""
-
-    width: int
-    height: int
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
-
-    def __post_init__(self):
-        numbers = (*(value for row in self.K for value in row), *self.distortion)
-        if not (all(map(math.isfinite, numbers)) and self.fx_px > 0 and self.fy_px > 0):
-            raise ValueError(f"expected finite intrinsics with positive focal lengths, got {self}")
-
-    @property
-    def K(self) -> list[list[float]]:
-        """The 3x3 pinhole matrix, px."""
-        return [[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]]
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """One picture to import; what its format does not state has the default value."""
-
-    image: Path
-    world_to_camera: np.ndarray  # [4, 4], OpenCV axes
-    intrinsics: Intrinsics
-    exposure_time_s: float = 1.0
-    mid_exposure_utc_ns: int | None = None
-    bracket: int | None = None
-    bracket_index: int = 0
-    sun_dir_body: np.ndarray = field(default_factory=lambda: np.zeros(3))  # unit; zero where unknown
-    in_eclipse: bool = False
-    covariance: np.ndarray | None = None  # [6, 6] of the pose, as in a session's frames; None: not stated
-    split: str | None = None  # train, val or test; stated for all views or for none
+EQUAL_EXPOSURES = 0.01  # times that differ by less are one
+FULL_SCALE = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0}
 
 
 @dataclass(frozen=True)
@@ -121,34 +84,49 @@ def write_session(
     sigmas: PoseSigmas = EXACT,
     registration: dict | None = None,
     origin_moved: np.ndarray | None = None,
+    transparent_on_white: bool = False,
 ) -> int:
     """Write a new session from pictures and return the number of its frames.
 
-    Lens distortion is removed, and transparent pictures are put on the background. Radiance 1 is full scale at the
-    longest exposure, unless the pictures bring their calibration along.
+    Lens distortion is removed, and what is transparent or outside a mask is put on the background. Pixels that the lens
+    has not seen do not get into the session: focal lengths grow until there are none (`pinhole_of`). Radiance 1 is full
+    scale at the longest exposure, unless the pictures bring their calibration along. What the pictures are is judged on
+    all of them (`judge`).
 
     Args:
         source: what the session was made from; its digest takes the place of the mission file's.
         values: what the pixel values stand for; None: what the export says, otherwise display values where the
             pictures have colours of 8 bits, and linear ones where they have not.
         white_background: whether what is seen where the target is not has full scale at the longest exposure, or is
-            black; None: as the export says, otherwise black.
+            black; None: as the export says, otherwise black, or white as `transparent_on_white` says.
         exported: what our own export says of the pictures; their 8 bits span its camera's range from black level to
             full scale.
         sigmas: how far the poses can err; the training corrects what is not exact. If exact, what the views say counts.
         registration: what structure from motion says of the pictures, for the session to keep.
         origin_moved: [3] where in the data set's axes the session has its origin; None: in the same place.
+        transparent_on_white: whether transparent pictures, which no export of ours describes, are put on white.
 
     Raises:
-        FormatError: there are no views, their sizes differ, or a picture cannot be read or has another size.
+        FormatError: there are no views, their sizes differ, a picture cannot be read or has another size, or a lens
+            folds back.
         SessionError: the folder holds a session already.
     """
     if not views:
         raise FormatError(f"{source}: no pictures found")
     if (folder / "session.json").exists():
         raise SessionError(f"{folder} holds a session already; choose a new folder")
-    target = _target(views, values, white_background, exported)
+    views = _with_pinholes(views)
+    judged = judge(views)
+    if transparent_on_white and judged.transparent and white_background is None and exported is None:
+        white_background = True
+    target = _target(views, judged, values, white_background, exported)
     camera = target.camera
+    if judged.bright_borders > len(views) / 2 and not target.background:
+        log.warning(
+            "the borders of %d of %d pictures are bright (%.0f %% of full scale) where the background counts as black: "
+            "give --background white if it is white, or --masks if other things are in the pictures",
+            *(judged.bright_borders, len(views), 100 * judged.border),
+        )
     (folder / "frames").mkdir(parents=True, exist_ok=True)
     lines = []
     for number, view in enumerate(views):
@@ -159,26 +137,12 @@ def write_session(
         line = frame_line(_frame(view, number, dn, camera, sigmas), name, sha256)
         if view.split is not None:
             line["split"] = view.split
-        if view.intrinsics.K != camera.K:
-            line["K"] = view.intrinsics.K
+        if (K := pinhole_of(view.intrinsics).K) != camera.K:
+            line["K"] = K
         lines.append(json.dumps(line, allow_nan=False))
         on_view()
     write_whole(folder / "frames.jsonl", ("\n".join(lines) + "\n").encode())
-    header = {
-        "schema_version": SCHEMA_VERSION,
-        "mission_sha256": hashlib.sha256(source.encode()).hexdigest(),
-        "imported_from": source,
-        "camera": dataclasses.asdict(camera),
-        "background": target.background,
-        "encoding": target.encoding,
-        **({} if registration is None else {"registration": registration}),
-        **({} if origin_moved is None else {"origin_moved": origin_moved.tolist()}),
-        "tles": {},
-        "losses": {},
-        "frames_received": len(views),
-        "bytes_received": 0,
-        "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
+    header = _header(target, source, len(views), registration, origin_moved)
     write_whole(folder / "session.json", json.dumps(header, indent=2).encode() + b"\n")
     return len(views)
 
@@ -191,37 +155,98 @@ class _Target:
     background: float  # radiance
     encoding: str
     decode: bool  # whether the sRGB curve of the pictures is undone
+    full_scale: dict[str, float]  # value of full scale, by the pictures' type of numbers
+
+
+def _header(
+    target: "_Target",
+    source: str,
+    count: int,
+    registration: dict | None,
+    origin_moved: np.ndarray | None,
+) -> dict:
+    """Return what session.json holds; the arguments are those of `write_session`."""
+    camera = target.camera
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "mission_sha256": hashlib.sha256(source.encode()).hexdigest(),
+        "imported_from": source,
+        "camera": dataclasses.asdict(camera),
+        "background": target.background,
+        "encoding": target.encoding,
+        **({} if registration is None else {"registration": registration}),
+        **({} if origin_moved is None else {"origin_moved": origin_moved.tolist()}),
+        "tles": {},
+        "losses": {},
+        "frames_received": count,
+        "bytes_received": 0,
+        "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _with_pinholes(views: Sequence[View]) -> list[View]:
+    """Return the views, having checked their sizes and lenses; what a lens makes of the pictures is logged."""
+    first, zoomed = views[0].intrinsics, {}
+    for view in views:
+        lens = view.intrinsics
+        if (lens.width, lens.height) != (first.width, first.height):
+            raise FormatError(
+                f"{view.image}: the pictures of a session have one size, but this one is {lens.width}x{lens.height} "
+                f"and the first is {first.width}x{first.height}; make them equal, or import them as two sessions"
+            )
+        try:
+            zoomed[lens] = pinhole_of(lens).fx_px / lens.fx_px
+        except ValueError as error:
+            raise FormatError(
+                f"{view.image}: {error}; undistort the pictures first, as with `colmap image_undistorter`"
+            ) from error
+    if (largest := max(zoomed.values())) > 1.0:
+        log.warning(
+            "the lens's distortion leaves a border that it has not seen, or folds back: pictures are cropped to what "
+            "it saw, by focal lengths that are up to %.4g times longer",
+            largest,
+        )
+    return list(views)
 
 
 def _target(
-    views: Sequence[View], values: Values | None, white_background: bool | None, exported: Exported | None
+    views: Sequence[View],
+    judged: Judgement,
+    values: Values | None,
+    white_background: bool | None,
+    exported: Exported | None,
 ) -> _Target:
     """Return what the session will hold; the arguments are those of `write_session`."""
-    first = views[0].intrinsics
-    for view in views:
-        size = (view.intrinsics.width, view.intrinsics.height)
-        if size != (first.width, first.height):
-            raise FormatError(
-                f"{view.image}: the pictures of a session have one size, but this one is {size[0]}x{size[1]} and the "
-                f"first is {first.width}x{first.height}; make them equal, or import them as two sessions"
-            )
-    image = _read_image(views[0].image, first)
+    times_s = [view.exposure_time_s for view in views]
+    longest_s, differ = max(times_s), max(times_s) > (1 + EQUAL_EXPOSURES) * min(times_s)
     if values is None and exported is None:
-        coloured = _channels(image) == 3 and image.dtype == np.uint8
-        values = Values.DISPLAY if coloured else Values.LINEAR
+        values = Values.DISPLAY if judged.display else Values.LINEAR
+        if judged.display and differ:
+            values = Values.DECODE
+            log.warning(
+                "the pictures hold display values, and their exposure times differ (%.4g to %.4g ms): they are made "
+                "linear, as with --values decode, so that light is proportional to time",
+                *(1e3 * min(times_s), 1e3 * longest_s),
+            )
+    elif values is Values.DISPLAY and differ:
+        log.warning(
+            "display values are not proportional to light, but exposure times differ: --values decode makes them linear"
+        )
     decode = values is Values.DECODE
     encoding = "srgb" if values is Values.DISPLAY else "linear"
-    longest_s = max(view.exposure_time_s for view in views)
+    full_scale = judged.full_scale
     if exported is not None:
         camera, background = exported.camera, exported.background
         encoding = exported.encoding if values is None else encoding
+        full_scale = {name: FULL_SCALE[name] for name in full_scale}
     else:
-        bit_depth = 16 if decode or image.dtype == np.uint16 else 8
-        camera, background = _foreign_camera(first, _channels(image), bit_depth, longest_s), 0.0
+        bit_depth = 16 if decode else judged.bit_depth
+        camera = _foreign_camera(pinhole_of(views[0].intrinsics), judged.channels, bit_depth, longest_s)
+        background = 0.0
     if white_background is not None:
-        full_scale = (camera.white_dn - camera.black_dn) / (camera.dn_per_radiance_s * longest_s)
-        background = full_scale if white_background else 0.0
-    return _Target(camera, background, encoding, decode)
+        white = (camera.white_dn - camera.black_dn) / (camera.dn_per_radiance_s * longest_s)
+        background = white if white_background else 0.0
+    return _Target(camera, background, encoding, decode, full_scale)
 
 
 def first_of_each_split(views: Sequence[View], count: int | None) -> list[View]:
@@ -235,109 +260,41 @@ def first_of_each_split(views: Sequence[View], count: int | None) -> list[View]:
     return chosen
 
 
-def is_transparent(path: Path) -> bool:
-    """Return whether a picture has pixels that are not opaque.
-
-    Raises:
-        FormatError: it cannot be read.
-    """
-    image = _decode(path)
-    return image.shape[2] in (2, 4) and bool((image[..., -1] < np.iinfo(image.dtype).max).any())
-
-
-def undistort(image: np.ndarray, intrinsics: Intrinsics, empty: float = 0.0) -> np.ndarray:
-    """Return the picture [H, W, C] that a pinhole camera with the same K would take; `empty` outside the original.
-
-    Source: OpenCV's model, radial k1, k2, k3 and tangential p1, p2.
-    """
-    if not any(intrinsics.distortion):
-        return image
-    k1, k2, p1, p2, k3 = intrinsics.distortion
-    height, width = image.shape[:2]
-    y, x = np.mgrid[0.5:height, 0.5:width]
-    x, y = (x - intrinsics.cx_px) / intrinsics.fx_px, (y - intrinsics.cy_px) / intrinsics.fy_px
-    r2 = x**2 + y**2
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
-    bent_y = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
-    source = np.stack(
-        [
-            bent_y * intrinsics.fy_px + intrinsics.cy_px - 0.5,
-            bent_x * intrinsics.fx_px + intrinsics.cx_px - 0.5,
-        ]
-    )
-    channels = [
-        map_coordinates(image[..., c].astype(np.float64), source, order=1, cval=empty)
-        for c in range(image.shape[2])
-    ]
-    return np.stack(channels, axis=2)
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """Return width and height of a picture.
-
-    Raises:
-        FormatError: it cannot be read.
-    """
-    height, width = _decode(path).shape[:2]
-    return width, height
-
-
 def read_grey(view: View) -> np.ndarray:
-    """Return the mean colour [H, W] of a view's picture, 0..1, on black where it is transparent.
+    """Return the mean colour [H, W] of a view's picture, 0..1, on black where it is transparent or outside its mask.
 
     Raises:
         FormatError: it cannot be read, or has another size than its camera.
     """
-    image = _read_image(view.image, view.intrinsics)
-    image = image / float(np.iinfo(image.dtype).max)
-    colours = _channels(image)
-    grey = image[..., :colours].mean(axis=2)
-    return grey * image[..., -1] if image.shape[2] > colours else grey
-
-
-def _decode(path: Path) -> np.ndarray:
-    try:
-        image = np.asarray(imagecodecs.imread(path))
-    except (OSError, ValueError, RuntimeError) as error:
-        raise FormatError(f"{path}: the picture cannot be read: {error}") from error
-    if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3):
-        raise FormatError(f"{path}: expected a picture of 8 or 16 bits, got {image.dtype} {image.shape}")
-    return image.reshape(*image.shape[:2], -1)
-
-
-def _read_image(path: Path, intrinsics: Intrinsics) -> np.ndarray:
-    """Return a picture [H, W, 1 to 4]."""
-    image = _decode(path)
-    if image.shape[:2] != (intrinsics.height, intrinsics.width):
-        raise FormatError(
-            f"{path}: expected {intrinsics.width}x{intrinsics.height} pixels, got {image.shape[1]}x{image.shape[0]}"
-        )
-    return image
-
-
-def _channels(image: np.ndarray) -> int:
-    return 1 if image.shape[2] <= 2 else 3
+    image = read_image(view)
+    grey = grey_light(image, coded=False)
+    if image.shape[2] > colours_of(image):
+        grey = grey * (image[..., -1] / FULL_SCALE[image.dtype.name])
+    return grey if view.mask is None else grey * read_mask(view)
 
 
 def _digital_numbers(view: View, target: _Target) -> np.ndarray:
     """Return a picture as digital numbers [H, W] or [H, W, 3] of the session's camera."""
-    image, camera = _read_image(view.image, view.intrinsics), target.camera
-    colours = _channels(image)
-    if colours < camera.channels:
-        raise FormatError(f"{view.image}: expected {camera.channels} colours a pixel, got {colours}")
-    full = float(np.iinfo(image.dtype).max)
-    value = image[..., :colours] / full
+    image, camera = read_image(view), target.camera
+    colours = colours_of(image)
+    value = np.clip(image[..., :colours] / target.full_scale[image.dtype.name], 0, 1)
     if target.decode:
         value = from_srgb(value)
     empty_dn = target.background * camera.dn_per_radiance_s * view.exposure_time_s
     empty = min(1.0, empty_dn / (camera.white_dn - camera.black_dn))
+    alpha = None
     if image.shape[2] > colours:
-        alpha = image[..., colours:] / full
+        alpha = np.clip(image[..., colours:] / FULL_SCALE[image.dtype.name], 0, 1)
+    if view.mask is not None:
+        mask = read_mask(view)[..., None]
+        alpha = mask if alpha is None else mask * alpha
+    if alpha is not None:
         value = value * alpha + (1 - alpha) * empty
     if colours > camera.channels:  # pictures of a mono camera, exported with three equal colours
         value = value.mean(axis=2, keepdims=True)
-    value = undistort(value, view.intrinsics, empty)
+    elif colours < camera.channels:  # grey ones among coloured
+        value = np.repeat(value, camera.channels, axis=2)
+    value = undistort(value, view.intrinsics, empty, pinhole_of(view.intrinsics))
     dn = np.rint(camera.black_dn + value * (camera.white_dn - camera.black_dn)).astype(np.uint16)
     return np.ascontiguousarray(dn[..., 0] if camera.channels == 1 else dn)
 

@@ -11,33 +11,13 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
-
 from ground.formats.axes import world_to_camera_to_opengl
-from ground.formats.views import Intrinsics, View, image_size
-
-
-def published_views(folder: Path) -> list[View]:
-    """Return the pictures of a folder with their published cameras, by name."""
-    stated = list(folder.glob("*_par.txt"))
-    if len(stated) != 1:
-        raise SystemExit(f"{folder}: expected one file NAME_par.txt, the cameras; found {len(stated)}")
-    views = []
-    for line in sorted(stated[0].read_text().splitlines()[1:]):
-        name, *numbers = line.split()
-        values = np.array(numbers, float)
-        K, pose = values[:9].reshape(3, 3), np.eye(4)
-        pose[:3, :3], pose[:3, 3] = values[9:18].reshape(3, 3), values[18:]
-        lens = Intrinsics(
-            *image_size(folder / name), K[0, 0], K[1, 1], cx_px=K[0, 2] + 0.5, cy_px=K[1, 2] + 0.5
-        )
-        views.append(View(folder / name, pose, lens))
-    return views
+from ground.formats.middlebury import read_middlebury
 
 
 def convert(folder: Path, out: Path) -> int:
     """Write the pictures and transforms.json to `out` and return how many pictures there are."""
-    views, frames = published_views(folder), []
+    views, frames = read_middlebury(folder), []
     out.mkdir(parents=True, exist_ok=True)
     for view in views:
         shutil.copyfile(view.image, out / view.image.name)

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from ground import cli
 from ground.formats import epipolar
+from ground.formats.middlebury import read_middlebury
 from ground.formats.views import FormatError, Intrinsics, PoseSigmas, View
 from ground.session import open_session
 from tests import raycast
-from tests.benchmarks.temple import published_views
 
 SIZE_PX, FOCAL_PX = 200, 470.0
 TEMPLE = Path(__file__).parents[3] / "shared" / "real" / "templeRing"
@@ -152,7 +152,7 @@ def test_import_names_wrong_cameras_and_mends_them_when_told(views, tmp_path, ca
 @pytest.mark.skipif(not TEMPLE.is_dir(), reason="needs the photographs of templeRing")
 def test_some_published_cameras_of_a_real_ring_are_turned():
     """Pictures 6 to 10, 40 and 41, which stand near each other: the latter are turned against their cameras."""
-    views = published_views(TEMPLE)
+    views = read_middlebury(TEMPLE)
     given = [*views[5:10], *views[39:41]]
     check = epipolar.check_poses(given)
     names = [given[i].image.stem[-4:] for i in check.turned]

@@ -211,15 +211,23 @@ def test_poses_that_are_not_valid_are_not_exported_and_others_keep_how_far_they_
 
 
 @FORMATS
-def test_masks_are_not_read_and_that_is_said(tmp_path, session, export, read, caplog):
+def test_masks_of_the_frames_are_read(tmp_path, session, export, read):
     export(session, tmp_path / "out")
+    write_png(tmp_path / "out/masks/left.png", np.pad(np.full((48, 24), 255, np.uint8), ((0, 0), (0, 24))))
     for path in (tmp_path / "out").glob("transforms*.json"):
         tree = json.loads(path.read_text())
         for frame in tree["frames"]:
-            frame["mask_path"] = "masks/none.png"
+            frame["mask_path"] = "masks/left.png"
         path.write_text(json.dumps(tree))
-    read(tmp_path / "out")
-    assert "are not read: all of their pixels count" in caplog.text
+    views, exported = read(tmp_path / "out")
+    write_session(views, tmp_path / "again", "out", exported=exported, white_background=False)
+    again = open_session(tmp_path / "again")
+    for record in again.frames:
+        assert (again.dn(record)[:, 24:] == again.camera.black_dn).all()  # what they leave out is sky
+        assert (again.dn(record)[:, :24] > again.camera.black_dn).any()
+    (tmp_path / "out/masks/left.png").unlink()
+    with pytest.raises(FormatError, match=r"left\.png"):
+        write_session(views, tmp_path / "third", "out", exported=exported)
 
 
 @pytest.mark.parametrize("key", ["w", "bracket", "bracket_index", "mid_exposure_utc_ns", "pose_covariance"])

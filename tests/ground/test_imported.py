@@ -18,14 +18,16 @@ from ground.cli_options import PixelValues
 from ground.evaluate import evaluate
 from ground.formats.axes import world_to_camera_to_opengl
 from ground.formats.colmap import read_colmap
+from ground.formats.judgement import judge
 from ground.formats.nerf import export_nerf, read_nerf
 from ground.formats.nerfstudio import export_nerfstudio, read_nerfstudio
 from ground.formats.srgb import from_srgb, to_srgb
 from ground.formats.views import (
     FormatError,
+    Intrinsics,
     Values,
+    View,
     first_of_each_split,
-    is_transparent,
     write_session,
 )
 from ground.reconstruct import reconstruct
@@ -191,7 +193,9 @@ def test_only_pictures_that_are_seen_through_count_as_transparent(tmp_path):
         ("rgba", picture(rng, 4), True),
     ):
         save(tmp_path / f"{name}.png", image)
-        assert is_transparent(tmp_path / f"{name}.png") is expected
+        height, width = image.shape[:2]
+        view = View(tmp_path / f"{name}.png", np.eye(4), Intrinsics(width, height, 9.0, 9.0, 2.0, 2.0))
+        assert judge([view]).transparent is expected
 
 
 # --- sRGB ---
