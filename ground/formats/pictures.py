@@ -375,7 +375,7 @@ def _tiff(path: Path) -> np.ndarray:
     with tifffile.TiffFile(path) as file:
         page = file.pages.first
         if page.photometric not in TIFF_COLOURS:
-            raise ValueError(f"expected a TIFF of grey or RGB, got {page.photometric.name}")
+            raise ValueError(f"expected a TIFF of grey or RGB, got {page.photometric!r}")
         image = page.asarray()
         if page.planarconfig == 2 and image.ndim == 3:  # planes one after another
             image = np.moveaxis(image, 0, 2)
