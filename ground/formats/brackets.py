@@ -58,10 +58,9 @@ def write_for_features(folder: Path, brackets: Sequence[Sequence[View]]) -> None
     Each pixel is the mean of the light in the frames in which it is not saturated, weighted with exposure times.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    light = [_light(group) for group in brackets]
-    white = float(np.median([np.quantile(image, BRIGHT) for image in light])) / SHOWN_AS or 1.0
-    for group, image in zip(brackets, light, strict=True):
-        shown = np.rint(255 * to_srgb(np.clip(image / white, 0, 1))).astype(np.uint8)
+    white = float(np.median([np.quantile(_light(group), BRIGHT) for group in brackets])) / SHOWN_AS or 1.0
+    for group in brackets:
+        shown = np.rint(255 * to_srgb(np.clip(_light(group) / white, 0, 1))).astype(np.uint8)
         write_whole(folder / feature_name(group), bytes(imagecodecs.png_encode(shown, level=1)))
 
 

@@ -6,6 +6,7 @@ for it, its exposure time: that of a camera with the sensitivity and aperture th
 
 import csv
 import dataclasses
+import functools
 import logging
 import math
 from collections import Counter
@@ -24,6 +25,7 @@ COLUMNS = ("name", "exposure_time_s", "iso", "f_number", "gain")
 LARGEST_TABLE = 1 << 24  # bytes
 PATCH_PX = 2  # around a feature, on every side, whose mean is compared
 DARKEST, BRIGHTEST = 0.02, 0.95  # of full scale: values that are compared
+PICTURES_KEPT = 16  # in memory
 FEWEST_POINTS = 8  # of a pair of pictures
 UNKNOWN = "unknown"
 
@@ -163,11 +165,15 @@ def estimated(
     Raises:
         FormatError: no two pictures share enough, or a picture cannot be read.
     """
-    light = [_light_of(view, values) for view in views]
+
+    @functools.lru_cache(PICTURES_KEPT)
+    def light(number: int) -> np.ndarray:
+        return _light_of(views[number], values)
+
     rows, ratios, weights = [], [], []
     for pair in matched_points(views, on_view):
         one, other = (
-            _at(light[i], at, views[i])
+            _at(light(i), at, views[i])
             for i, at in ((pair.first, pair.at_first), (pair.second, pair.at_second))
         )
         good = (np.minimum(one, other) > DARKEST) & (np.maximum(one, other) < BRIGHTEST)
@@ -228,7 +234,8 @@ def _with_times(views: Sequence[View], lights: Sequence[Light]) -> list[View]:
 
 def _light_of(view: View, values: Values | None) -> np.ndarray:
     image = read_image(view)
-    return grey_light(image, has_display_values(image) if values is None else values is not Values.LINEAR)
+    coded = has_display_values(image) if values is None else values is not Values.LINEAR
+    return grey_light(image, coded).astype(np.float32)
 
 
 def _at(light: np.ndarray, at: np.ndarray, view: View) -> np.ndarray:

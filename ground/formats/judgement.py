@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ground.formats.view import View, colours_of, read_image
+from ground.formats.view import FULL_SCALE, View, colours_of, read_image
 
 log = logging.getLogger(__name__)
 DEPTHS = (8, 10, 12, 14, 16)  # bits that cameras have
@@ -72,7 +72,7 @@ def judge(views: Sequence[View], on_view: Callable[[], None] = lambda: None) -> 
         opaque = np.ones(image.shape[:2], bool)
         if image.shape[2] > count:
             opaque = image[..., -1] > 0
-            transparent |= bool((image[..., -1] < np.iinfo(image.dtype).max).any())
+            transparent |= bool((image[..., -1] < FULL_SCALE[image.dtype.name]).any())
         if view.mask is None:  # a mask says what the target is, also at the border
             borders.append(_border(values, opaque))
         on_view()

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from ground.formats.pictures import MOST_PX
+
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 LEAST_COEFFICIENT = 1e-9
 LARGEST_ZOOM = 4.0
@@ -34,6 +36,8 @@ class Intrinsics:
 
     def __post_init__(self):
         numbers = (*(value for row in self.K for value in row), *self.distortion, self.skew_px)
+        if not (1 <= self.width <= MOST_PX and 1 <= self.height <= MOST_PX):
+            raise ValueError(f"expected 1 to {MOST_PX} pixels a side, got {self.width}x{self.height}")
         if not (all(map(math.isfinite, numbers)) and self.fx_px > 0 and self.fy_px > 0):
             raise ValueError(f"expected finite intrinsics with positive focal lengths, got {self}")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ground.formats.lens import Intrinsics
-from ground.formats.pictures import FormatError, read_header, within
+from ground.formats.pictures import FormatError, image_size, within
 from ground.formats.view import View
 
 NUMBERS = 21  # of a picture: K, R and t
@@ -48,9 +48,9 @@ def _view(folder: Path, stated: Path, line: str) -> View:
         raise ValueError(f"{name}: expected K as [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}")
     pose[:3, :3], pose[:3, 3] = R, values[18:]
     image = within(folder, name, stated)
-    header = read_header(image)
     lens = Intrinsics(
-        *(header.width, header.height, float(K[0, 0]), float(K[1, 1])),
+        *image_size(image),
+        *(float(K[0, 0]), float(K[1, 1])),
         cx_px=float(K[0, 2]) + 0.5,
         cy_px=float(K[1, 2]) + 0.5,
         skew_px=float(K[0, 1]),

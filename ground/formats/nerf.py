@@ -18,7 +18,7 @@ from flightsw.icd.config import ConfigError, build, keys_below, parse_json
 from flightsw.icd.mission import CameraSection
 from ground.formats.axes import opengl_to_world_to_camera, world_to_camera_to_opengl
 from ground.formats.lens import Intrinsics
-from ground.formats.pictures import KINDS, FormatError, read_header, within
+from ground.formats.pictures import KINDS, FormatError, image_size, within
 from ground.formats.views import Exported, View
 from ground.session import SPLITS, FrameRecord, Session
 from obbgs_base.files import write_whole
@@ -269,8 +269,7 @@ def _intrinsics(tree: dict[str, Any], image: Path, where: Path) -> Intrinsics:
         if "w" in tree and "h" in tree:
             width, height = int(tree["w"]), int(tree["h"])
         else:
-            header = read_header(image)
-            width, height = header.width, header.height
+            width, height = image_size(image)
         focal_px = tree.get("fl_x") or width / (2 * math.tan(tree["camera_angle_x"] / 2))
         focal_y_px = tree.get("fl_y", focal_px)
         if "fl_y" not in tree and "fl_x" not in tree and "camera_angle_y" in tree:

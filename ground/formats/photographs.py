@@ -20,7 +20,7 @@ from ground.formats.brackets import alike, brackets_of, feature_name, write_for_
 from ground.formats.epipolar import turned
 from ground.formats.exposures import with_exposures
 from ground.formats.lens import Intrinsics
-from ground.formats.pictures import FormatError, Light, pictures_in, read_header
+from ground.formats.pictures import FormatError, Light, image_size, pictures_in
 from ground.formats.turned_pictures import turned_back
 from ground.formats.view import View
 from ground.formats.views import PoseSigmas
@@ -253,8 +253,7 @@ def _registered(
 
 
 def _unposed(image: Path) -> View:
-    header = read_header(image)
-    width, height = header.width, header.height
+    width, height = image_size(image)
     lens = Intrinsics(width, height, float(width), float(width), width / 2, height / 2)
     return View(image, np.eye(4), lens)
 

@@ -136,6 +136,16 @@ def read_header(path: Path) -> Header:
     return header
 
 
+def image_size(path: Path) -> tuple[int, int]:
+    """Return width and height of a picture, without decoding it.
+
+    Raises:
+        FormatError: as `read_header`.
+    """
+    header = read_header(path)
+    return header.width, header.height
+
+
 def decode(path: Path) -> np.ndarray:
     """Return a picture [H, W, 1 to 4], uint8, uint16 or float32 with values of at least 0.
 
@@ -404,10 +414,13 @@ def _exr(path: Path) -> np.ndarray:
     with OpenEXR.File(str(path)) as file:
         channels = {name: channel.pixels for name, channel in file.channels().items()}
     for names in ("RGBA", "RGB", "Y"):
-        if names in channels:  # the library puts these together
-            return channels[names].astype(np.float32)
-        if set(names) <= channels.keys():
-            return np.stack([channels[name] for name in names], axis=2).astype(np.float32)
+        if names not in channels and set(names) <= channels.keys():  # the library puts most of them together
+            channels[names] = np.stack([channels[name] for name in names], axis=2)
+        if names in channels:
+            image = channels[names].astype(np.float32)
+            if names == "RGBA":  # colours are stored times alpha
+                image[..., :3] /= np.where(image[..., 3:] > 0, image[..., 3:], 1)
+            return image
     raise ValueError(f"expected channels R, G, B or Y, got {', '.join(channels)}")
 
 

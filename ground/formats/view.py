@@ -9,6 +9,8 @@ from ground.formats.lens import Intrinsics
 from ground.formats.pictures import FormatError, decode
 from ground.formats.srgb import from_srgb
 
+FULL_SCALE = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0}  # of alpha and masks, and of display values
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -81,6 +83,6 @@ def read_mask(view: View) -> np.ndarray:
             f"{view.mask}: expected a mask of {lens.width}x{lens.height} pixels, that of its picture, got "
             f"{image.shape[1]}x{image.shape[0]}"
         )
-    full = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else 1.0
+    full = FULL_SCALE[image.dtype.name]
     colours = image[..., : colours_of(image)].mean(axis=2) / full
     return colours if colours.max() > 1 / full else np.minimum(1.0, colours * full)  # masks of 0 and 1 too

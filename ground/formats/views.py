@@ -21,7 +21,7 @@ from ground.formats.judgement import Judgement, judge
 from ground.formats.lens import Intrinsics, pinhole_of, undistort
 from ground.formats.pictures import FormatError
 from ground.formats.srgb import from_srgb
-from ground.formats.view import View, colours_of, grey_light, read_image, read_mask
+from ground.formats.view import FULL_SCALE, View, colours_of, grey_light, read_image, read_mask
 from ground.session import ENCODINGS, SCHEMA_VERSION, SessionError
 from ground.session_writer import frame_line
 from obbgs_base.files import write_whole
@@ -32,7 +32,6 @@ FOREIGN_READ_NOISE = 2 / 255  # of full scale
 FOREIGN_ELECTRONS_PER_DN = 1e3
 FRAME_SPACING_NS = 1_000_000_000  # between pictures without a time
 EQUAL_EXPOSURES = 0.01  # times that differ by less are one
-FULL_SCALE = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0}
 
 
 @dataclass(frozen=True)

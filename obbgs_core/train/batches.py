@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -14,6 +15,7 @@ from obbgs_core.model.cameras import Cameras
 from obbgs_core.train.windows import GRID_PX, common
 
 MOST_AT_ONCE = 3
+COMES_AGAIN = 3  # frames of one exposure time, at least, where brackets repeat
 
 
 @dataclass(frozen=True)
@@ -110,13 +112,35 @@ class Batches:
         return [shares.get(i, unknown) for i in range(len(self.frames))]
 
 
+def _by_exposure(frames: list[TrainingFrame], drawn: list[int]) -> list[list[int]]:
+    """Return the drawn frames in groups of one exposure time each, as brackets have them.
+
+    A time that at most half as many frames have as the commonest, as under automatic exposure, makes no group of its
+    own, whose few frames would be drawn far more often than others: its frames go to the nearest time that does. Where
+    no time comes again, as in automatic brackets, all frames are one group.
+    """
+    of_time: dict[float, list[int]] = {}
+    for index in drawn:
+        of_time.setdefault(frames[index].exposure_time_s, []).append(index)
+    most = max(map(len, of_time.values()), default=0)
+    groups: dict[float, list[int]] = {
+        time_s: [] for time_s, members in of_time.items() if 2 * len(members) > most >= COMES_AGAIN
+    }
+    if not groups:
+        return [drawn] if drawn else []
+    for time_s, members in of_time.items():
+        nearest = min(groups, key=lambda other: abs(math.log(other / time_s)))
+        groups[nearest] += members
+    return [sorted(members) for members in groups.values()]
+
+
 @dataclass
 class FrameOrder:
     """Draws frames at random without replacement, from each group in turn.
 
     One that joined late is drawn up to MOST_AT_ONCE times a round, until it has been drawn about as often as others.
 
-    groups: indices of the frames to train on, those of one exposure time in each group, or all in one.
+    groups: indices of the frames to train on, those of about one exposure time in each group, or all in one.
     validation_brackets: indices of the frames that are not drawn, by bracket.
     remaining: what is left of each group in this round, drawn from the end.
     turn: frames drawn so far.
@@ -144,11 +168,9 @@ class FrameOrder:
                 that frames which joined late are still drawn more often.
         """
         withheld = {index for bracket in validation_brackets for index in bracket} | set(left_out)
-        groups: dict[float, list[int]] = {}
-        for index, frame in enumerate(frames):
-            if index not in withheld:
-                groups.setdefault(frame.exposure_time_s if by_exposure else 0.0, []).append(index)
-        order = FrameOrder(list(groups.values()), validation_brackets, [[] for _ in groups])
+        drawn = [index for index in range(len(frames)) if index not in withheld]
+        groups = _by_exposure(frames, drawn) if by_exposure else [drawn] if drawn else []
+        order = FrameOrder(groups, validation_brackets, [[] for _ in groups])
         if earlier is not None:
             order.turn, order.visits = earlier.turn, dict(earlier.visits)
         return order

@@ -392,6 +392,13 @@ def test_skew_is_warped_away(tmp_path):
         np.testing.assert_allclose(seen, [fx * ray[0] + cx, fy * ray[1] + cy], atol=0.2)
 
 
+def test_a_camera_of_more_pixels_than_any_is_refused_before_it_costs_memory(tmp_path):
+    png(tmp_path / "a.png", np.zeros((16, 16), np.uint8))
+    transforms(tmp_path, [{"file_path": "a.png"}], w=10**9, h=10**9, k1=0.1)
+    with pytest.raises(FormatError, match="1 to 8192 pixels a side"):
+        read_nerfstudio(tmp_path)
+
+
 @pytest.mark.parametrize("keys", [{"is_fisheye": True}, {"k5": 0.1}, {"k6": 0.1}, {"k4": 0.1}, {"s1": 0.1}])
 def test_a_lens_that_is_not_modelled_is_refused_with_the_remedy(tmp_path, keys):
     png(tmp_path / "a.png", np.zeros((16, 16), np.uint8))
@@ -460,6 +467,50 @@ def test_the_larger_of_two_models_is_taken_and_the_other_named(tmp_path, caplog)
     colmap(tmp_path / "sparse/1", "\n\n".join(ROWS))
     assert len(read_colmap(tmp_path)) == 6
     assert "sparse/0 has 2" in caplog.text and "6, is taken" in caplog.text
+
+
+@pytest.fixture(scope="module")
+def binary_model(tmp_path_factory) -> dict[str, bytes]:
+    """A model of two cameras and five pictures as COLMAP's own library writes it, by file name."""
+    import pycolmap
+
+    folder = tmp_path_factory.mktemp("colmap")
+    colmap(folder, "\n\n".join(ROWS[:5]) + "\n\n")
+    (folder / "points3D.txt").write_text("")
+    pycolmap.Reconstruction(str(folder)).write_binary(str(folder))
+    return {path.name: path.read_bytes() for path in folder.glob("*.bin")}
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    name=st.sampled_from(["cameras.bin", "images.bin"]),
+    at=st.integers(0, 10_000),
+    bit=st.integers(0, 7),
+    kept=st.floats(0, 1) | st.just(1.0),
+)
+def test_no_damage_of_a_binary_model_ends_in_anything_but_a_named_error(
+    tmp_path_factory, binary_model, name, at, bit, kept
+):
+    folder = tmp_path_factory.mktemp("bits")
+    for other, content in binary_model.items():
+        (folder / other).write_bytes(content)
+    assert len(read_colmap(folder)) == 5
+    content = bytearray(binary_model[name])
+    content[at % len(content)] ^= 1 << bit
+    (folder / name).write_bytes(bytes(content[: round(kept * len(content))]))
+    with contextlib.suppress(FormatError):
+        read_colmap(folder)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    lines=st.lists(st.sampled_from(ROWS) | st.text(max_size=30) | st.just("") | st.just("1 2 -1"), max_size=6)
+)
+def test_no_text_of_a_model_ends_in_anything_but_a_named_error(tmp_path_factory, lines):
+    folder = colmap(tmp_path_factory.mktemp("text"), "")
+    (folder / "images.txt").write_text("\n".join(lines), encoding="utf-8", errors="replace")
+    with contextlib.suppress(FormatError):
+        read_colmap(folder)
 
 
 def llff(folder: Path, count: int = 3, size: int = 24, stated: int = 48) -> np.ndarray:
@@ -548,6 +599,20 @@ def test_linear_pictures_of_floats_stay_linear(tmp_path, suffix):
     assert session.encoding == "linear" and session.camera.bit_depth == 16
     share = session.dn(session.frames[0]) / session.camera.white_dn
     np.testing.assert_allclose(share, decode(path) / decode(path).max(), atol=1e-4)
+
+
+def test_transparent_exr_is_put_on_the_background_once(tmp_path):
+    exr = pytest.importorskip("OpenEXR")
+    image = np.zeros((8, 8, 4), np.float32)
+    image[2:6, 2:6] = (1.0, 0.5, 0.25, 0.5)  # colours times alpha, as the format has them
+    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    with exr.File(header, {"RGBA": image}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    np.testing.assert_allclose(decode(tmp_path / "a.exr")[4, 4], [2, 1, 0.5, 0.5])
+    session = session_of([view(tmp_path / "a.exr")], tmp_path / "s")
+    dn = session.dn(session.frames[0])
+    np.testing.assert_allclose(dn[4, 4] / session.camera.white_dn, [0.5, 0.25, 0.125], atol=1e-4)
+    assert dn[0, 0].tolist() == [0, 0, 0]
 
 
 def test_a_float_that_is_none_is_refused(tmp_path):

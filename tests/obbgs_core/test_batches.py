@@ -103,3 +103,34 @@ def test_frames_that_were_there_from_the_start_are_drawn_once_a_round():
     order, rng = FrameOrder.of(frames, True, []), torch.Generator().manual_seed(0)
     for _ in range(5):
         assert sorted(order.draw(12, rng)) == list(range(12))
+
+
+def exposed(times_s: list[float]) -> FrameOrder:
+    return FrameOrder.of(
+        [dataclasses.replace(photographed(target(5), 1, size_px=8)[0], exposure_time_s=t) for t in times_s],
+        True,
+        [],
+    )
+
+
+AUTOMATIC = [0.02] * 85 + [0.016] * 13 + [1 / 60] * 13 + [0.025] * 7 + [0.0125]
+
+
+@pytest.mark.parametrize(
+    "times_s", [AUTOMATIC, [0.01 * 1.1**i for i in range(40)], [0.01, 0.02] + [0.04] * 9]
+)
+def test_a_rare_exposure_time_is_drawn_as_often_as_any_frame(times_s):
+    order, rng = exposed(times_s), torch.Generator().manual_seed(0)
+    drawn = order.draw(3 * len(times_s), rng)
+    assert sorted(drawn) == sorted([*range(len(times_s))] * 3)
+
+
+def test_each_step_still_has_one_of_each_exposure_time_of_brackets_of_which_some_frames_are_missing():
+    times_s = [0.01, 0.02, 0.04] * 10
+    del times_s[3], times_s[10]
+    times_s.append(0.5)  # and one was taken by itself
+    order, rng = exposed(times_s), torch.Generator().manual_seed(0)
+    assert [len(group) for group in order.groups] == [9, 10, 10]
+    for _ in range(20):
+        step = {round(times_s[i], 2) for i in order.draw(3, rng)}
+        assert step in ({0.01, 0.02, 0.04}, {0.01, 0.02, 0.5})  # the single one stands in for its neighbour
