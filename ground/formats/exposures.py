@@ -26,6 +26,9 @@ LARGEST_TABLE = 1 << 24  # bytes
 PATCH_PX = 2  # around a feature, on every side, whose mean is compared
 DARKEST, BRIGHTEST = 0.02, 0.95  # of full scale: values that are compared
 PICTURES_KEPT = 16  # in memory
+LEAST_DEVIATION = 0.05  # of the logarithm of a ratio: surfaces are not matt
+USUAL_SPREAD = 1.0  # of logarithms of gains
+ROUNDS = 20
 FEWEST_POINTS = 8  # of a pair of pictures
 UNKNOWN = "unknown"
 
@@ -156,8 +159,8 @@ def estimated(
     """Return the views with an exposure time each that features say which neighbours share, the longest of 1 s.
 
     Two pictures show the same points equally bright but for their exposures: the median of the ratios of the light
-    about shared features is their ratio, and all ratios together give one gain a picture, by least squares weighted
-    with the number of features. Pictures that share too little with others count as 1 s, which is logged.
+    about shared features is their ratio, and all ratios together give one gain a picture. Surfaces that shine break
+    that assumption. Pictures that share too little with others take the mean, which is logged.
 
     Args:
         values: what the pixel values stand for; None: sRGB-coded where pictures have colours of 8 bits.
@@ -170,7 +173,7 @@ def estimated(
     def light(number: int) -> np.ndarray:
         return _light_of(views[number], values)
 
-    rows, ratios, weights = [], [], []
+    shared: list[tuple[int, int, float, float]] = []  # two pictures, logarithm of their ratio, its deviation
     for pair in matched_points(views, on_view):
         one, other = (
             _at(light(i), at, views[i])
@@ -178,33 +181,45 @@ def estimated(
         )
         good = (np.minimum(one, other) > DARKEST) & (np.maximum(one, other) < BRIGHTEST)
         if good.sum() >= FEWEST_POINTS:
-            rows.append((pair.first, pair.second))
-            ratios.append(float(np.median(np.log(one[good] / other[good]))))
-            weights.append(math.sqrt(good.sum()))
-    if not rows:
+            ratios = np.log(one[good] / other[good])
+            scatter = float(np.median(np.abs(ratios - np.median(ratios))))
+            deviation = max(LEAST_DEVIATION, 2 * scatter / math.sqrt(good.sum()))
+            shared.append((pair.first, pair.second, float(np.median(ratios)), deviation))
+    if not shared:
         raise FormatError(
             "no two pictures share enough features to estimate exposures; give --exposures FILE.csv"
         )
-    system, right = np.zeros((len(rows), len(views))), np.array(ratios) * weights
-    for number, ((first, second), weight) in enumerate(zip(rows, weights, strict=True)):
-        system[number, first], system[number, second] = weight, -weight
-    gains = np.exp(
-        np.linalg.lstsq(system, right, rcond=None)[0]
-    )  # the smallest solution: unconnected ones stay 1
-    connected = np.zeros(len(views), bool)
-    connected[np.unique(rows)] = True
-    seconds = gains / gains[connected].max()
-    seconds[~connected] = 1.0
-    if alone := [view.image.name for view, known in zip(views, connected, strict=True) if not known]:
+    gains = _gains(len(views), shared)
+    connected = {number for first, second, *_ in shared for number in (first, second)}
+    if alone := [view.image.name for number, view in enumerate(views) if number not in connected]:
         log.warning(
-            "the exposures of %d pictures could not be estimated, as they share too little with others: %s",
+            "%d pictures share too little with others to estimate their exposures, and take the mean of all: %s",
             *(len(alone), ", ".join(alone[:5])),
         )
-    log.warning("exposures were estimated, the longest called 1 s: %s", described(seconds.tolist()))
+    seconds = (gains / gains.max()).tolist()
+    log.warning("exposures were estimated, the longest called 1 s: %s", described(seconds))
     return [
-        dataclasses.replace(view, exposure_time_s=float(time_s), exposure_stated=True)
+        dataclasses.replace(view, exposure_time_s=time_s, exposure_stated=True)
         for view, time_s in zip(views, seconds, strict=True)
     ]
+
+
+def _gains(count: int, shared: list[tuple[int, int, float, float]]) -> np.ndarray:
+    """Return the gains [count] that explain ratios of pairs by least absolute deviations, as some may be far off.
+
+    Logarithms of gains are taken to scatter by `USUAL_SPREAD` about their mean, so that errors do not add up along a
+    chain of pictures without end.
+    """
+    first, second = (np.array([pair[k] for pair in shared]) for k in (0, 1))
+    ratio, deviation = (np.array([pair[k] for pair in shared]) for k in (2, 3))
+    system = np.zeros((len(shared), count))
+    system[np.arange(len(shared)), first], system[np.arange(len(shared)), second] = 1.0, -1.0
+    logs, weights = np.zeros(count), 1 / deviation**2
+    for _ in range(ROUNDS):
+        normal = system.T @ (weights[:, None] * system) + np.eye(count) / USUAL_SPREAD**2
+        logs = np.linalg.solve(normal, system.T @ (weights * ratio))
+        weights = 1 / (deviation * np.maximum(np.abs(system @ logs - ratio), deviation))
+    return np.exp(logs)
 
 
 def _positive(text: str, where: str) -> float:
