@@ -1,6 +1,7 @@
 """COLMAP models: cameras and images as text or binary; poses are world to camera in OpenCV axes, like ours.
 
-Source: colmap.github.io/format.html.
+COLMAP's own library, pycolmap 4.2.1, reads these files too, but never ends on some with one flipped bit; it is the
+oracle of the tests. Source: colmap.github.io/format.html.
 """
 
 import logging

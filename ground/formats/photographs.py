@@ -20,10 +20,10 @@ from ground.formats.brackets import alike, brackets_of, feature_name, write_for_
 from ground.formats.epipolar import turned
 from ground.formats.exposures import with_exposures
 from ground.formats.lens import Intrinsics
-from ground.formats.pictures import FormatError, Light, image_size, pictures_in
+from ground.formats.pictures import FormatError, Light, pictures_in
 from ground.formats.turned_pictures import turned_back
 from ground.formats.view import View
-from ground.formats.views import PoseSigmas
+from ground.formats.views import PoseSigmas, unposed
 from obbgs_base.errors import Interrupted
 from obbgs_base.files import write_whole
 
@@ -125,7 +125,7 @@ def read_photographs(
     names = pictures_in(folder)[:count]
     if len(names) < FEWEST:
         raise FormatError(f"{folder}: expected at least {FEWEST} photographs, found {len(names)}")
-    stated = with_exposures([_unposed(folder / name) for name in names], table)
+    stated = with_exposures([unposed(folder / name) for name in names], table)
     if len(sizes := {(view.intrinsics.width, view.intrinsics.height) for view in stated}) > 1:
         raise FormatError(f"{folder}: the pictures of a session have one size, found {sorted(sizes)}")
     brackets = brackets_of(stated)
@@ -250,12 +250,6 @@ def _registered(
     upside = sorted(view.image.name for name in upside_down for view in named[name])
     sigmas = PoseSigmas(sigma_rad, sigma_rad * float(np.median(ranges_m)))
     return Registered(in_order, left_out, tuple(upside), reprojection_px, sigmas)
-
-
-def _unposed(image: Path) -> View:
-    width, height = image_size(image)
-    lens = Intrinsics(width, height, float(width), float(width), width / 2, height / 2)
-    return View(image, np.eye(4), lens)
 
 
 def _as_colmap_reads_it(view: View) -> bool:

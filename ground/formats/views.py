@@ -19,7 +19,7 @@ from flightsw.icd.mission import CameraSection
 from flightsw.icd.quaternion import matrix_to_quat
 from ground.formats.judgement import Judgement, judge
 from ground.formats.lens import Intrinsics, pinhole_of, undistort
-from ground.formats.pictures import FormatError
+from ground.formats.pictures import FormatError, image_size
 from ground.formats.srgb import from_srgb
 from ground.formats.view import FULL_SCALE, View, colours_of, grey_light, read_image, read_mask
 from ground.session import ENCODINGS, SCHEMA_VERSION, SessionError
@@ -246,6 +246,17 @@ def _target(
         white = (camera.white_dn - camera.black_dn) / (camera.dn_per_radiance_s * longest_s)
         background = white if white_background else 0.0
     return _Target(camera, background, encoding, decode, full_scale)
+
+
+def unposed(image: Path) -> View:
+    """Return a picture by itself, with a camera that stands for one that is not known yet.
+
+    Raises:
+        FormatError: it cannot be read.
+    """
+    width, height = image_size(image)
+    lens = Intrinsics(width, height, float(width), float(width), width / 2, height / 2)
+    return View(image, np.eye(4), lens)
 
 
 def first_of_each_split(views: Sequence[View], count: int | None) -> list[View]:
