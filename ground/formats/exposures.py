@@ -17,7 +17,7 @@ import numpy as np
 
 from ground.formats.epipolar import matched_points
 from ground.formats.pictures import FormatError, Light, read_header
-from ground.formats.view import View, grey_light, has_display_values, read_image
+from ground.formats.view import View, colours_of, grey_light, has_display_values, read_image
 from ground.formats.views import Values
 
 log = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ UNKNOWN = "unknown"
 def read_table(path: Path) -> dict[str, Light]:
     """Return what a CSV file says of each picture, by its file name without folders.
 
-    The first line names the columns: name, and exposure_time_s, iso, f_number or gain, of which one may be left out.
+    The first line names the columns: name, and exposure_time_s, iso, f_number or gain, of which some may be left out.
 
     Raises:
         FormatError: it cannot be read, has another column, names a picture twice, or a value is no positive number.
@@ -169,9 +169,13 @@ def estimated(
         FormatError: no two pictures share enough, or a picture cannot be read.
     """
 
+    brightest = _brightest(views)
+
     @functools.lru_cache(PICTURES_KEPT)
     def light(number: int) -> np.ndarray:
-        return _light_of(views[number], values)
+        image = read_image(views[number])
+        coded = has_display_values(image) if values is None else values is not Values.LINEAR
+        return grey_light(image, coded, brightest[image.dtype.name]).astype(np.float32)
 
     shared: list[tuple[int, int, float, float]] = []  # two pictures, logarithm of their ratio, its deviation
     for pair in matched_points(views, on_view):
@@ -247,10 +251,14 @@ def _with_times(views: Sequence[View], lights: Sequence[Light]) -> list[View]:
     ]
 
 
-def _light_of(view: View, values: Values | None) -> np.ndarray:
-    image = read_image(view)
-    coded = has_display_values(image) if values is None else values is not Values.LINEAR
-    return grey_light(image, coded).astype(np.float32)
+def _brightest(views: Sequence[View]) -> dict[str, float]:
+    """Return the largest value of all pictures by their type of numbers; full scale of 8 bits, which they reach."""
+    brightest = {"uint8": 255.0}
+    for view in views:
+        image = read_image(view)
+        if (name := image.dtype.name) != "uint8":
+            brightest[name] = max(brightest.get(name, 1e-9), float(image[..., : colours_of(image)].max()))
+    return brightest
 
 
 def _at(light: np.ndarray, at: np.ndarray, view: View) -> np.ndarray:

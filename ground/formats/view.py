@@ -19,7 +19,7 @@ class View:
     image: Path
     world_to_camera: np.ndarray  # [4, 4], OpenCV axes
     intrinsics: Intrinsics
-    exposure_time_s: float = 1.0
+    exposure_time_s: float = 1.0  # proportional to light, as `exposures` makes it
     exposure_stated: bool = False  # whether anything states it
     mask: Path | None = None  # a picture that is white where the target is, for what else is in the picture
     mid_exposure_utc_ns: int | None = None
