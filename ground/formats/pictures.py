@@ -55,6 +55,8 @@ EXIF_SHUTTER, EXIF_APERTURE, EXIF_TAKEN, EXIF_SUBSECONDS, ORIENTATION = (
     0x9291,
     0x0112,
 )
+MOST_CHANNELS, MOST_BITS = 4, 64
+MOST_VALUES = 1 << 30  # of all channels
 TIFF_COLOURS = (0, 1, 2)  # white is zero, black is zero, RGB
 LARGEST_APEX = 64.0
 FITS_TIME_S = ("EXPTIME", "EXPOSURE", "EXPOSURE_DURATION", "EXPOSURE DURATION")
@@ -173,6 +175,8 @@ def decode(path: Path) -> np.ndarray:
 
 def _kind(path: Path) -> str:
     try:
+        if path.exists() and not path.is_file():  # a pipe would keep us waiting
+            raise FormatError(f"{path}: the picture cannot be read: it is no file")
         with open(path, "rb") as file:
             start = file.read(16)
         size = path.stat().st_size
@@ -210,8 +214,10 @@ def _named(path: Path):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
-    except (FormatError, ModuleNotFoundError, MemoryError):
+    except (FormatError, ModuleNotFoundError):
         raise
+    except MemoryError as error:
+        raise FormatError(f"{path}: the picture needs more memory than there is; make it smaller") from error
     except Exception as error:  # every decoder has errors of its own
         text = str(error).splitlines()
         raise FormatError(
@@ -290,6 +296,10 @@ def _header_of_tiff(path: Path) -> Header:
         exif = tags.get(EXIF_IFD)
         by_name = exif if isinstance(exif, dict) else {}
         numbered = {number: by_name.get(tifffile.TIFF.EXIF_TAGS[number]) for number in _EXIF_NUMBERS}
+        if page.samplesperpixel > MOST_CHANNELS or page.bitspersample > MOST_BITS:
+            raise ValueError(
+                f"{page.samplesperpixel} values of {page.bitspersample} bits a pixel are too many"
+            )
         light = _light({**tags, **{number: value for number, value in numbered.items() if value is not None}})
         return Header(page.imagewidth, page.imagelength, light)
 
@@ -309,6 +319,8 @@ def _header_of_exr(path: Path) -> Header:
         header = file.header()
         (left, top), (right, bottom) = header["dataWindow"]
         size = int(right) - int(left) + 1, int(bottom) - int(top) + 1
+        if (values := size[0] * size[1] * len(header["channels"])) > MOST_VALUES:
+            raise ValueError(f"{values} values in all its channels are too many")
         return Header(*size, Light(time_s=_number(header.get("expTime"))))
 
 

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import os
 import struct
 import tracemalloc
 import zlib
@@ -110,6 +111,22 @@ def test_a_picture_of_another_kind_than_its_suffix_says_is_refused_by_name(tmp_p
         decode(tmp_path / "a.img")
     with pytest.raises(FormatError, match="none\\.png: the picture cannot be read: No such file"):
         decode(tmp_path / "none.png")
+
+
+def test_what_is_no_file_does_not_keep_the_import_waiting(tmp_path):
+    os.mkfifo(tmp_path / "a.png")
+    (tmp_path / "b.png").mkdir()
+    for name in ("a.png", "b.png"):
+        with pytest.raises(FormatError, match="it is no file"):
+            decode(tmp_path / name)
+
+
+def test_a_tiff_of_more_values_a_pixel_than_pictures_have_is_refused_by_its_header(tmp_path):
+    tifffile.imwrite(
+        tmp_path / "a.tif", np.zeros((4, 4, 9), np.uint8), photometric="minisblack", planarconfig="contig"
+    )
+    with pytest.raises(FormatError, match="9 values of 8 bits a pixel are too many"):
+        read_header(tmp_path / "a.tif")
 
 
 @settings(max_examples=200, deadline=None)
