@@ -137,6 +137,8 @@ def _appearance(metrics: dict) -> list[str]:
 
 def _quality(metrics: dict) -> list[str]:
     lines = []
+    if isinstance(level := metrics.get("sky_level"), str):
+        lines.append(f"- Sky: {level}.")
     if isinstance(chi2 := metrics.get("chi2"), int | float) and math.isfinite(chi2):
         lines.append(f"- Residual chi² {chi2:.2f}: {chi2_explained(chi2)}")
     if isinstance(misfit := metrics.get("misfit"), float):

@@ -12,6 +12,7 @@ from ground.plots import histogram_figure, training_figures
 from ground.report_attitude import attitude_section
 from ground.report_frames import brightness, frames_section, scored_section
 from ground.report_poses import poses_section
+from ground.report_sky import sky_section
 from ground.runs import Run, open_run, read_config, written_to
 from ground.session import SessionError
 from ground.splat_view import splat_view
@@ -52,6 +53,7 @@ def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
             _registration(run),
             _training(run),
             _histogram(run),
+            sky_section(run),
             _losses(run),
             _telemetry(run),
             _simulation(truth),

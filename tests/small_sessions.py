@@ -20,10 +20,17 @@ SIZE_PX, FOCAL_PX, VIEWS = 40, 80.0, 24
 BORESIGHT_RAD, OWN_RAD = 0.06, 0.003  # 5 and a quarter of a pixel
 
 
-def small_session(folder: Path, seed: int = 0, views: int = VIEWS) -> Path:
-    """Write a session of 40x40 pixels in three exposure times, every eighth view held out, and return its folder."""
+def small_session(folder: Path, seed: int = 0, views: int = VIEWS, pedestal_dn: float = 0.0) -> Path:
+    """Write a session of 40x40 pixels in three exposure times, every eighth view held out, and return its folder.
+
+    pedestal_dn: added to all readings.
+    """
     gaussians = scenes.target(seed=seed)
-    _write(scenes.photographed(gaussians, views, seed, SIZE_PX, FOCAL_PX), gaussians, seed, folder)
+    frames = scenes.photographed(gaussians, views, seed, SIZE_PX, FOCAL_PX)
+    if pedestal_dn:
+        raised = [(f.dn + pedestal_dn).clamp(max=scenes.SENSOR.white_dn) for f in frames]
+        frames = [dataclasses.replace(f, dn=dn) for f, dn in zip(frames, raised, strict=True)]
+    _write(frames, gaussians, seed, folder)
     return folder
 
 

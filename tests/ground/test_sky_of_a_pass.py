@@ -1,0 +1,33 @@
+"""A pass whose empty sky is above the stated black level, from session to report."""
+
+import json
+
+import pytest
+
+from ground.evaluate import evaluate
+from ground.reconstruct import reconstruct
+from ground.report import write_report
+from tests.scenes import QUICK
+from tests.small_sessions import small_session
+
+PEDESTAL_DN = 40.0  # a hundredth of full scale
+
+
+def test_a_pedestal_is_measured_reported_and_costs_no_score(tmp_path):
+    metrics = {}
+    for name, pedestal_dn in (("plain", 0.0), ("raised", PEDESTAL_DN)):
+        session = small_session(tmp_path / name, pedestal_dn=pedestal_dn)
+        reconstruct(session, "run", "obbgs", QUICK | {"steps": 100})
+        metrics[name] = evaluate(session, "run")
+    plain, raised = metrics["plain"], metrics["raised"]
+    assert plain["sky_level"] is None and plain["sky_level_dn"] is None
+    for level_dn, sigma_dn in raised["sky_level_dn"].values():
+        assert level_dn == pytest.approx(PEDESTAL_DN, abs=max(5 * sigma_dn, 0.5))
+    for key in ("psnr_clean_db", "psnr_noisy_db"):  # 9 dB less where it is not taken off
+        assert raised[key] > plain[key] - 1.0, key
+    page = write_report(tmp_path / "raised", "run").read_text()
+    assert "Level of empty sky" in page and "more than the stated black level" in page
+    assert "- Sky: empty sky reads" in (tmp_path / "raised/runs/run/model_card.md").read_text()
+    assert "Level of empty sky" not in write_report(tmp_path / "plain", "run").read_text()
+    kept = json.loads((tmp_path / "raised/runs/run/metrics.json").read_text())
+    assert len(kept["sky_level_dn"]) == kept["frames_trained"]
