@@ -32,6 +32,22 @@ from obbgs_core.score.metrics import psnr_db
 from obbgs_core.score.shown import shown_points
 from obbgs_core.sky_level import field
 
+# of the keys of `evaluate`: an older score that cannot be measured any more is not kept
+SCORES = (
+    *(
+        "psnr_",
+        "ssim_",
+        "lpips_",
+        "interval_",
+        "chi2_held_out",
+        "chamfer",
+        "hausdorff",
+        "accuracy",
+        "completeness",
+    ),
+    *("surface_shown", "pose_error_", "size_error_", "similarity_", "scored_poses"),
+)
+
 
 def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     """Score a run, add the figures to its metrics.json, write its model card, and return all its metrics.
@@ -101,7 +117,8 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
         figures |= _radiance_figures(run, truth, shown) | _cloud_figures(clouds, seen, truth, motion)
     if states_errors:
         figures |= _interval_figures(run, truth, shown, estimate)
-    metrics = {**run.metrics, **{key: round(value, 5) for key, value in figures.items()}}
+    kept = {key: value for key, value in run.metrics.items() if not key.startswith(SCORES)}
+    metrics = kept | {key: round(value, 5) for key, value in figures.items()}
     if estimate is not None:
         metrics["scored_poses"] = "settled"
     keep_metrics(run, metrics)

@@ -1,7 +1,6 @@
 """What a run records of itself: figures in metrics.json, steps in metrics.jsonl, and config.yaml to repeat it."""
 
 import dataclasses
-import hashlib
 import importlib.metadata
 import json
 import math
@@ -13,6 +12,7 @@ import yaml
 
 from ground.cameras import median_sun_direction
 from ground.model_files import exposure_times_s
+from ground.runs import session_facts
 from ground.session import FrameRecord, Session
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import native_kernels
@@ -103,7 +103,6 @@ def write_history(results: dict[str, TrainResult | None], path: Path) -> None:
 
 def write_config(session: Session, config: MethodConfig, seed: int, path: Path) -> None:
     """Write everything needed to repeat a run: settings, seed, digests of its input, versions, machine."""
-    frames = (session.path / "frames.jsonl").read_bytes()
     versions = {name: importlib.metadata.version(name) for name in PACKAGES}
     kernels = native_kernels()
     tree = {
@@ -111,13 +110,7 @@ def write_config(session: Session, config: MethodConfig, seed: int, path: Path) 
         "seed": seed,
         "threads": torch.get_num_threads(),
         "rasterizer": f"native {kernels[0]}" if kernels else "reference",
-        "session": {
-            "mission_sha256": session.mission_sha256,
-            "frames_jsonl_sha256": hashlib.sha256(frames).hexdigest(),
-            "created_utc": session.created_utc,
-            "background": session.background,
-            "encoding": session.encoding,
-        },
+        "session": session_facts(session),
         "versions": {"python": platform.python_version(), **versions},
         "machine": platform.machine(),
     }

@@ -1,8 +1,10 @@
 """Run folders: their names, the lock and kept work of an unfinished run, and a finished run read again."""
 
 import contextlib
+import dataclasses
 import fcntl
 import functools
+import hashlib
 import json
 import logging
 import os
@@ -19,7 +21,7 @@ from ground import attitude
 from ground.attitude import FoundAttitude, in_body_axes
 from ground.cameras import sensor_of
 from ground.live_status import LIVE_CHECKPOINT, LIVE_STATUS
-from ground.session import FrameRecord, Session, SessionError, open_session
+from ground.session import FrameRecord, Session, SessionError, open_session, read_records
 from ground.training_frames import split, training_frame
 from obbgs_base.files import UNUSED
 from obbgs_core.errors import ReconstructionError
@@ -43,6 +45,14 @@ NEEDED_METRICS: dict[str, type] = {
     "frames_trained": int,
     "frames_held_out": int,
     "exposures_s": list,
+}
+NAMES_OF_FACTS = {  # of `session_facts`
+    "mission_sha256": "mission",
+    "frames_jsonl_sha256": "frames.jsonl",
+    "pictures_sha256": "pictures",
+    "created_utc": "time of creation",
+    "background": "background",
+    "encoding": "encoding",
 }
 KINDS = {str: "a text", int: "a whole number", float: "a number", list: "a list"}
 
@@ -91,9 +101,11 @@ def run_folder(session_dir: Path, name: str, out: Path | None = None) -> Path:
 def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
     """Return a finished run; `out` is the folder of runs if it is not the session's own.
 
+    Its session has the frames that it was made of, without those that came afterwards.
+
     Raises:
-        SessionError: there is no such session or run, it is a run of another session, its metrics.json is damaged, or
-            its model is missing.
+        SessionError: there is no such session or run, it is a run of another session or of one that has changed since,
+            its metrics.json is damaged, or its model is missing.
     """
     session = open_session(session_dir)
     folder = run_folder(session.path, name, out)
@@ -103,20 +115,21 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
         )
     if not (folder / "model.ply").is_file():
         raise SessionError(f"{folder} has lost its model.ply: make the run again with `ground reconstruct`")
-    if (found := FoundAttitude.read(folder / attitude.FILE)) is not None:
-        session = in_body_axes(session, found)
-    training, held_out = split(session)
     metrics = read_metrics(folder / "metrics.json")
-    if not metrics[
-        "frames_held_out"
-    ]:  # of a few brackets that came one by one, none was kept from the training
-        training, held_out = [*training, *held_out], []
-    metrics["scored_frames"] = "held_out" if held_out else "training"
     if metrics.get("session_created_utc", session.created_utc) != session.created_utc:
         raise SessionError(
             f"{folder} is a run of the session of {metrics['session_created_utc']}, but {session.path} is that of "
             f"{session.created_utc}"
         )
+    session = _as_it_was(session, folder, metrics["frames_received"])
+    if (found := FoundAttitude.read(folder / attitude.FILE)) is not None:
+        session = in_body_axes(session, found)
+    training, held_out = split(session)
+    if not metrics[
+        "frames_held_out"
+    ]:  # of a few brackets that came one by one, none was kept from the training
+        training, held_out = [*training, *held_out], []
+    metrics["scored_frames"] = "held_out" if held_out else "training"
     with_blind = (folder / "blind.ply").exists() and "blind_reference_exposure_s" in metrics
     return Run(
         folder,
@@ -128,6 +141,45 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
         load_ply(folder / "blind.ply") if with_blind else None,
         metrics,
     )
+
+
+def session_facts(session: Session) -> dict[str, str | float]:
+    """Return what says of a session that it is the same one: for config.yaml, and to compare with it."""
+    # frames that came later stand behind those that were read
+    lines = (session.path / "frames.jsonl").read_bytes().splitlines(keepends=True)[: len(session.frames)]
+    pictures = hashlib.sha256()
+    for record in session.frames:
+        pictures.update((session.path / record.file).read_bytes())
+    return {
+        "mission_sha256": session.mission_sha256,
+        "frames_jsonl_sha256": hashlib.sha256(b"".join(lines)).hexdigest(),
+        "pictures_sha256": pictures.hexdigest(),
+        "created_utc": session.created_utc,
+        "background": session.background,
+        "encoding": session.encoding,
+    }
+
+
+def _as_it_was(session: Session, folder: Path, count: int) -> Session:
+    """Return a session with its first `count` frames, of which a run was made.
+
+    Raises:
+        SessionError: they, or what else the run's config.yaml says of its session, are others now.
+    """
+    first = {record.id for record in read_records(session.path)[:count]}
+    then = dataclasses.replace(session, frames=tuple(r for r in session.frames if r.id in first))
+    if not (folder / "config.yaml").is_file():
+        return then
+    noted, now = read_config(folder).get("session"), session_facts(then)
+    if not isinstance(noted, dict):
+        return then
+    differing = [NAMES_OF_FACTS[key] for key, value in now.items() if noted.get(key, value) != value]
+    if differing:
+        raise SessionError(
+            f"{session.path} has changed since {folder.name} was made of it ({', '.join(differing)}), so the run is "
+            f"neither scored nor shown with it; `ground reconstruct --name {folder.name} --overwrite` makes it again"
+        )
+    return then
 
 
 def read_config(folder: Path) -> dict:

@@ -5,6 +5,7 @@ import math
 import shutil
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import pytest
 import torch
@@ -181,6 +182,57 @@ def test_a_run_without_its_model_is_named(session, tmp_path):
     (tmp_path / "session" / "runs" / "run" / "model.ply").unlink()
     with pytest.raises(SessionError, match=r"has lost its model\.ply: make the run again"):
         evaluate(tmp_path / "session", "run")
+
+
+def brighter(folder: Path) -> str:
+    """Change a picture of a session, and return what the error calls it."""
+    path = sorted((folder / "frames").iterdir())[3]
+    dn = imagecodecs.png_decode(path.read_bytes())
+    path.write_bytes(bytes(imagecodecs.png_encode(dn // 2, level=1)))
+    return r"\(pictures\)"
+
+
+def longer(folder: Path) -> str:
+    """Change an exposure time."""
+    lines = (folder / "frames.jsonl").read_text().splitlines()
+    first = json.loads(lines[0])
+    lines[0] = json.dumps(first | {"exposure_time_s": 2 * first["exposure_time_s"]})
+    (folder / "frames.jsonl").write_text("\n".join(lines) + "\n")
+    return r"\(frames\.jsonl\)"
+
+
+@pytest.mark.parametrize("change", [brighter, longer])
+def test_a_session_that_has_changed_since_the_run_scores_nothing(session, tmp_path, change):
+    folder = Path(shutil.copytree(session, tmp_path / "session"))
+    metrics = evaluate(folder, "run")
+    told = change(folder)
+    for used in (evaluate, write_report):
+        with pytest.raises(
+            SessionError, match=rf"has changed since run was made of it {told}, .*--overwrite"
+        ):
+            used(folder, "run")
+    assert json.loads((folder / "runs" / "run" / "metrics.json").read_text()) == metrics
+
+
+def test_a_session_that_has_grown_since_the_run_is_scored_as_it_was(tmp_path):
+    """Frames that come down while a run is made, or later, change nothing of its figures."""
+    whole = (GOLDEN / "frames.jsonl").read_text().splitlines(keepends=True)
+    folder = run_of(tmp_path, lambda frame: frame["id"] in {json.loads(line)["id"] for line in whole[:9]})
+    metrics = evaluate(folder, "run")
+    assert metrics["frames_received"] == 9
+    (folder / "frames.jsonl").write_text("".join(whole))
+    assert evaluate(folder, "run") == metrics
+
+
+def test_figures_against_a_truth_go_when_the_truth_has_gone(session, tmp_path):
+    folder = Path(shutil.copytree(session, tmp_path / "session"))
+    before = evaluate(folder, "run")
+    shutil.rmtree(folder / "truth")
+    after = evaluate(folder, "run")
+    gone = set(before) - set(after)
+    assert {"psnr_clean_db", "ssim_clean", "chamfer", "completeness_mesh", "surface_shown"} <= gone
+    assert not {key for key in after if "clean" in key} and {"chi2", "psnr_noisy_db", "misfit"} <= set(after)
+    assert "against noiseless" not in (folder / "runs/run/model_card.md").read_text()
 
 
 def distance_to_triangles(point: np.ndarray, triangles: np.ndarray) -> float:
