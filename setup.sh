@@ -1,13 +1,17 @@
 #!/usr/bin/env bash
-# Sets up from nothing: system libraries, the product's environment with its compiled module, and Blender's own environment.
-# Idempotent: what is up to date is left alone. PYTHON names another interpreter (3.11), PIP_ARGS adds arguments to pip.
+# Sets up from nothing: system libraries, the product's environment with its compiled module, and Blender.
+# Idempotent: what is up to date is left alone. PYTHON names another interpreter (3.11 to 3.14), PIP_ARGS adds arguments to pip.
 set -euo pipefail
 cd "$(dirname "$0")"
 
-python=${PYTHON:-$(command -v python3.11 || command -v python3 || true)}
-[ -n "$python" ] || { echo "setup: no python3.11 found; install it: apt-get install python3.11 python3-venv python3-dev" >&2; exit 2; }
-"$python" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || {
-  echo "setup: Python 3.11 is needed (bpy 4.5 has no other build), $python is $("$python" -V); set PYTHON=/path/to/python3.11" >&2; exit 2; }
+supported() { "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' 2>/dev/null; }
+python=${PYTHON:-}
+for name in python3.11 python3 python3.13 python3.12 python3.14; do
+  if [ -z "$python" ] && supported "$name"; then python=$(command -v "$name"); fi
+done
+[ -n "$python" ] || { echo "setup: no Python from 3.11 to 3.14 found; install one: apt-get install python3 python3-venv python3-dev" >&2; exit 2; }
+supported "$python" || {
+  echo "setup: Python 3.11 to 3.14 is needed, $python is $("$python" -V 2>&1); set PYTHON=/path/to/python3" >&2; exit 2; }
 
 # name of the Debian package = what proves that it is there
 missing=()
@@ -37,18 +41,42 @@ if [ ${#missing[@]} -gt 0 ]; then
 fi
 
 # A stamp holds the digest of everything that shaped an environment; a changed input sets it up again.
-environment() { # directory, files that shape it, command that fills it
-  local dir=$1 inputs=$2 fill=$3 digest
-  digest=$({ "$python" -V; cat $inputs; echo "$fill"; pwd; } | sha256sum)
+environment() { # directory, its Python, files that shape it, command that fills it
+  local dir=$1 own=$2 inputs=$3 fill=$4 digest
+  digest=$({ "$own" -V; cat $inputs; echo "$fill"; pwd; } | sha256sum)
   [ "$(cat "$dir/.ready" 2>/dev/null)" = "$digest" ] && return
   echo "setup: $dir (downloads on the first run)"
-  [ -x "$dir/bin/pip" ] || "$python" -m venv "$dir"
+  # an environment of another Python is made anew
+  "$dir/bin/python" -m pip --version >/dev/null 2>&1 && [ "$("$dir/bin/python" -V)" = "$("$own" -V)" ] || "$own" -m venv --clear "$dir"
   eval "$fill"
   echo "$digest" >"$dir/.ready"
 }
 
 pip_args="-q --disable-pip-version-check ${PIP_ARGS:-}"
-environment .venv "pyproject.toml constraints.txt CMakeLists.txt $(find obbgs_core/render/kernels -type f -not -name '*.pyc' | sort | tr '\n' ' ')" \
+environment .venv "$python" "pyproject.toml constraints.txt CMakeLists.txt $(find obbgs_core/render/kernels -type f -not -name '*.pyc' | sort | tr '\n' ' ')" \
   ".venv/bin/pip install $pip_args -c constraints.txt -e '.[dev]'"
-environment .venv-blender "hil/blender-requirements.txt" \
+
+# Blender comes as the package bpy, which exists for some Pythons only; else it is a `blender` that is there; else bpy in a
+# Python 3.11 of uv's. hil/sky/blender.py looks for it in this order, too.
+has_bpy() { "$1" -c 'import sys, ensurepip; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 13)))' >/dev/null 2>&1; }
+blender_python=
+for name in "$python" python3.11 python3.13; do
+  if [ -z "$blender_python" ] && has_bpy "$name"; then blender_python=$(command -v "$name"); fi
+done
+blender_version() { blender --version 2>/dev/null | sed -n 's/^Blender \([0-9]*\)\.\([0-9]*\).*/\1 \2/p' | head -1; }
+read -r major minor < <(blender_version) || true
+if [ -z "$blender_python" ] && [ "$((${major:-0} * 100 + ${minor:-0}))" -ge 401 ]; then
+  echo "setup: Blender is $(command -v blender), $major.$minor; there is no bpy for $("$python" -V)"
+  exit 0
+fi
+if [ -z "$blender_python" ] && command -v uv >/dev/null && uv python install -q 3.11; then
+  blender_python=$(uv python find 3.11)
+fi
+if [ -z "$blender_python" ]; then
+  echo "setup: everything but Blender is ready: there is no bpy for $("$python" -V), no python3.11 or python3.13 with venv, no" \
+    "\`blender\` of 4.1 or newer on the PATH, and no uv that can install Python 3.11. Provide one of them, such as" \
+    "\`apt-get install blender python3-numpy\` on Debian 13; without it the simulator cannot render" >&2
+  exit 2
+fi
+environment .venv-blender "$blender_python" "hil/blender-requirements.txt" \
   ".venv-blender/bin/pip install $pip_args -r hil/blender-requirements.txt"

@@ -167,7 +167,7 @@ def make_dataset(
             pose_at=lambda utc_ns: scene.state(utc_ns).pose,
             geometry=True,
         )
-        mesh_facts = farm.facts
+        mesh_facts, blender_version = farm.facts, farm.version
     session = open_session(out / "session")
     counts = export_nerf(session, out)
     facts = {
@@ -176,7 +176,7 @@ def make_dataset(
         "config": dataclasses.asdict(config),
         "mesh": {"name": mesh.name, "sha256": mesh_sha256(mesh), **mesh_facts},
         "scenario": {"name": config.scenario, "sha256": scenario.sha256},
-        "blender": blender.BPY_VERSION,
+        "blender": blender_version,
         "dn_per_radiance_s": gain,
         "frames": len(shots),
         "in_eclipse": sum(state.pose.in_eclipse for state in states),

@@ -5,6 +5,7 @@ import hashlib
 import json
 import logging
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -19,7 +20,7 @@ SOURCES = tuple(
     WORKER.with_name(f"{name}.py") for name in ("blender_worker", "blender_materials", "crinkles")
 )
 SAMPLES = 16  # a pixel, before denoising (OIDN); rendering time grows in proportion, quality hardly
-BPY_VERSION = "4.5.15"
+OLDEST = (4, 1)  # Blender; that of Debian 13 is 4.3
 RETRIES = 2  # of a request on which Blender crashed
 SIDE_FILES = (".mtl", ".bin", ".png", ".jpg", ".jpeg")  # files that an OBJ or glTF may refer to
 LIBRARIES = "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
@@ -47,17 +48,30 @@ def blender_command() -> list[str]:
     if Path(own).exists():
         return [own, str(WORKER)]
     if installed := shutil.which("blender"):
-        return [installed, "--background", "--factory-startup", "--python", str(WORKER)]
+        return [
+            installed,
+            "--background",
+            "--factory-startup",
+            "--python-exit-code",
+            "1",
+            "--python",
+            str(WORKER),
+        ]
     raise BlenderError(
-        "Blender is missing: run `make setup`, put a `blender` (4.5) on the PATH, or point OBBGS_BLENDER_PYTHON "
-        "at a Python 3.11 that has "
-        f"bpy=={BPY_VERSION}"
+        f"Blender is missing: run `make setup`, put a `blender` ({_dotted(OLDEST)} or newer) on the PATH, or point "
+        "OBBGS_BLENDER_PYTHON at a Python 3.11 or 3.13 into which `pip install bpy` has put Blender"
     )
+
+
+def _dotted(version: tuple[int, ...]) -> str:
+    return ".".join(map(str, version))
 
 
 def _remedy(reason: str) -> str:
     if "No module named 'bpy'" in reason:
-        return f"run `make setup`, or {blender_command()[0]} -m pip install bpy=={BPY_VERSION}"
+        return f"run `make setup`, or {blender_command()[0]} -m pip install bpy"
+    if "No module named 'numpy'" in reason:
+        return "on Debian: apt-get install -y --no-install-recommends python3-numpy"
     return f"on Debian: apt-get install -y --no-install-recommends {LIBRARIES}"
 
 
@@ -103,6 +117,12 @@ class Worker:
             self.close()
             raise BlenderError(f"Blender did not start: {reason}; {_remedy(reason)}")
         self.version = greeting["ready"]
+        if tuple(int(part) for part in re.findall(r"\d+", self.version)[:2]) < OLDEST:
+            self.close()
+            raise BlenderError(
+                f"{blender_command()[0]} is Blender {self.version}; expected {_dotted(OLDEST)} or newer: "
+                "run `make setup`, or point OBBGS_BLENDER_PYTHON at a Python 3.11 or 3.13 with bpy"
+            )
         load = {"op": "load", "mesh": str(self.mesh.resolve()), "samples": self.samples}
         digest = mesh_sha256(self.mesh)
         foil = digest == mesh_sha256(SHIPPED_FOIL)
@@ -115,7 +135,15 @@ class Worker:
             reason = reply["error"] if reply else self._end_of_log()
             self.close()
             raise MeshError(f"{self.mesh}: not a mesh that Blender can load: {reason}")
-        self.facts = {key: value for key, value in reply.items() if key != "ok"}
+        if not reply["denoises"]:
+            if not self.restarts:
+                log.warning(
+                    "Blender %s has no denoiser, as Debian's: it renders 16 times as many light paths instead, "
+                    "which is slower and differs from the usual pictures by the denoiser's smoothing",
+                    self.version,
+                )
+            self.version += " without denoiser"
+        self.facts = {key: value for key, value in reply.items() if key not in ("ok", "denoises")}
 
     def ask(self, **request) -> dict:
         """Return the worker's reply to a request; after a crash Blender is restarted and asked again.

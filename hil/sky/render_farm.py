@@ -50,6 +50,11 @@ class RenderFarm:
             worker.close()
 
     @property
+    def version(self) -> str:
+        """The version of the Blender that renders."""
+        return self._first.version
+
+    @property
     def facts(self) -> dict:
         """What the worker found in the mesh: largest_dimension_m, triangles, normals_recomputed."""
         return self._first.facts
