@@ -1,4 +1,4 @@
-"""The command line `flightsw`: selftest, plan, capture, downlink, serve, triage, fsck."""
+"""The command line `flightsw`: mission new, plan, selftest, capture, downlink, serve, service, triage, fsck."""
 
 import dataclasses
 import json
@@ -26,6 +26,8 @@ from obbgs_base.command_line import new_app, run
 
 log = logging.getLogger(__name__)
 app = new_app("The flight software: takes frames, stores them, sends them down and obeys commands.")
+mission_app = new_app("Mission files.")
+app.add_typer(mission_app, name="mission", help="Make a mission file.")
 stderr = Console(stderr=True)
 START_NOW_S = 2.0  # from the command to the first trigger of --start now: a camera takes a second to open
 
@@ -102,15 +104,15 @@ def serve(
     mission: MissionFile = Path("mission.yaml"),
     store: StoreDir = Path("store"),
     key: KeyFiles = None,
+    start: Start = None,
     json_: AsJson = False,
 ) -> None:
     """Take the planned brackets, send frames and obey commands until stopped (SIGTERM or Ctrl-C end it cleanly).
 
     Example: flightsw serve --camera gige://192.168.0.10 --link 'serial:///dev/ttyS1?baud=921600' --key mission.key
     """
-    _run(
-        load_mission(mission), store, camera, link, exit_when_empty=False, as_json=json_, key_files=key or ()
-    )
+    plan_of = with_bracket(load_mission(mission), None, None, None, start=start)
+    _run(plan_of, store, camera, link, exit_when_empty=False, as_json=json_, key_files=key or ())
 
 
 @app.command()
@@ -161,11 +163,12 @@ def triage(
 
 @app.command("plan")
 def plan_command(mission: MissionFile = Path("mission.yaml"), json_: AsJson = False) -> None:
-    """Print the planned brackets: time, range, light and the readings to expect; then sunlit passes and eclipses.
+    """Print field of view and planned brackets: time, range, light, readings to expect; then passes and eclipses.
 
-    Phase is the angle between Sun and camera as the target sees it, Sun the angle between line of sight and Sun, DN the
-    brightest reading to expect of a white target: that of a surface turned to the Sun up to a phase of 90 degrees, less
-    beyond it and where the target is smaller than a pixel, and the black level in eclipse.
+    Fills is the target's largest dimension as a share of the picture's smaller side. Phase is the angle between Sun
+    and camera as the target sees it, Sun the angle between line of sight and Sun, DN the brightest reading to expect of
+    a white target: that of a surface turned to the Sun up to a phase of 90 degrees, less beyond it and where the target
+    is smaller than a pixel, and the black level in eclipse.
 
     Example: flightsw plan --mission mission.yaml
     """
@@ -175,8 +178,12 @@ def plan_command(mission: MissionFile = Path("mission.yaml"), json_: AsJson = Fa
     if json_:
         print(json.dumps(dataclasses.asdict(planned)))
         return
+    print(f"camera: {planned.view}")
+    for problem in planned.problems:
+        print(f"warning: {problem}")
     print(
-        "bracket  UTC                       range m  phase deg  Sun deg  px/m  light    pose   exposures ms -> DN"
+        "bracket  UTC                       range m  phase deg  Sun deg  px/m  fills  light    pose   "
+        "exposures ms -> DN"
     )
     for b in planned.brackets:
         exposures = ", ".join(
@@ -184,6 +191,7 @@ def plan_command(mission: MissionFile = Path("mission.yaml"), json_: AsJson = Fa
         )
         print(
             f"{b.bracket:7d}  {b.utc}  {b.range_m:7.1f}  {b.phase_deg:9.1f}  {b.sun_deg:7.1f}  {b.px_per_m:4.1f}  "
+            f"{b.filled:5.0%}  "
             f"{'eclipse' if b.eclipse else 'sunlit '}  {'valid' if b.pose_valid else 'stale'}  {exposures}"
         )
     for p in planned.passes:
@@ -193,6 +201,64 @@ def plan_command(mission: MissionFile = Path("mission.yaml"), json_: AsJson = Fa
         )
     for utc, change in planned.shadow:
         print(f"shadow: the target {change} it at {utc}")
+
+
+@app.command("service")
+def service_command(
+    camera: CameraUrl,
+    link: LinkUrl,
+    mission: MissionFile = Path("/etc/obbgs/mission.yaml"),
+    key: Annotated[
+        Path | None, typer.Option(help="Where the key will lie; default: mission.key in /var/lib/obbgs.")
+    ] = None,
+    user: Annotated[str, typer.Option(help="The user that it runs as; it is not made here.")] = "obbgs",
+) -> None:
+    """Print the systemd unit that runs `flightsw serve` of this installation as a user of its own.
+
+    Frames are kept in /var/lib/obbgs/store. The unit's first lines say how to make the user and where to put the unit.
+
+    Example: flightsw service --camera gige://192.168.0.10 --link 'can://can0?fd=true' > obbgs-flight.service
+    """
+    from flightsw.service import unit
+
+    print(unit(camera, link, mission, key, user), end="")
+
+
+@mission_app.command("new")
+def mission_new(
+    out: Annotated[
+        Path, typer.Argument(help="The mission file to write; one that is there is not replaced.")
+    ],
+    target_tle: Annotated[Path, typer.Option(help="A file with the target's two-line elements.")],
+    chaser_tle: Annotated[Path, typer.Option(help="The same of the spacecraft with the camera.")],
+    target_size: Annotated[float, typer.Option(help="The target's largest dimension, m.")],
+    picture: Annotated[str, typer.Option(help="Width and height of the picture, px.")] = "1024x1024",
+    focal_length: Annotated[float, typer.Option(help="Of the lens, mm.")] = 100.0,
+    pixel_pitch: Annotated[float, typer.Option(help="From one pixel to the next, micrometres.")] = 5.5,
+    colour: Annotated[bool, typer.Option("--colour", help="The camera takes colour.")] = False,
+    start: Annotated[
+        str | None,
+        typer.Option(help="First trigger, UTC as 2026-07-21T10:52:30Z; default: an hour from now."),
+    ] = None,
+) -> None:
+    """Write a mission file, commented as the example is; then look at it with plan, and calibrate the camera.
+
+    Example: flightsw mission new mission.yaml --target-tle target.tle --chaser-tle chaser.tle --target-size 6
+    """
+    from flightsw.new_mission import write_mission
+
+    write_mission(
+        out,
+        target_tle,
+        chaser_tle,
+        target_size,
+        picture,
+        focal_length,
+        pixel_pitch,
+        3 if colour else 1,
+        start,
+    )
+    print(f"wrote {out}; next: flightsw plan --mission {out}, and the calibrated figures of the camera")
 
 
 @app.command()

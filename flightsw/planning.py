@@ -11,6 +11,9 @@ from flightsw.orbit import shadow_crossings
 from flightsw.pose import pose_tag
 from flightsw.sequencer import NS, plan
 
+WIDEST_DEG = 120.0  # a pinhole camera; lenses that see more are no pinholes
+FEWEST_PX = 8  # across the target, for a picture of it
+
 
 @dataclass(frozen=True)
 class PlannedBracket:
@@ -20,6 +23,7 @@ class PlannedBracket:
     phase_deg: float  # between Sun and camera, seen from the target: 0 is full light
     sun_deg: float  # between the camera's axis and the Sun: small is blinding
     px_per_m: float
+    filled: float  # the target's largest dimension as a share of the picture's smaller side
     target_px: int  # pixels a face of the target's largest dimension would cover
     eclipse: bool
     pose_valid: bool
@@ -43,6 +47,8 @@ class PlannedPass:
 
 @dataclass(frozen=True)
 class PassPlan:
+    view: str  # picture, field of view and how much of the picture the target fills, in words
+    problems: list[str]  # what makes the camera's figures implausible
     brackets: list[PlannedBracket]
     passes: list[PlannedPass]
     shadow: list[tuple[str, str]]  # UTC, "enters" or "leaves": the target and the Earth's shadow
@@ -63,7 +69,55 @@ def pass_plan(mission: Mission) -> PassPlan:
     end_ns = triggers[-1] + round(mission.bracket.interval_s * NS)
     crossings = shadow_crossings(mission.orbit.target_tle, triggers[0], end_ns)
     shadow = [(_utc(utc_ns), "enters" if enters else "leaves") for utc_ns, enters in crossings]
-    return PassPlan(brackets, passes, shadow)
+    ranges_m = [bracket.range_m for bracket in brackets]
+    view, problems = field_of_view(mission, min(ranges_m), max(ranges_m))
+    return PassPlan(view, problems, brackets, passes, shadow)
+
+
+def field_of_view(mission: Mission, least_m: float, greatest_m: float) -> tuple[str, list[str]]:
+    """Return in words the camera's field of view, how much of it the target fills, and what is implausible about it.
+
+    Args:
+        least_m, greatest_m: range of the target in the pass.
+    """
+    camera, extent_m = mission.camera, mission.bracket.target_extent_m
+    degrees = [
+        float(np.degrees(np.arctan((size - centre) / focal) + np.arctan(centre / focal)))
+        for size, centre, focal in (
+            (camera.width, camera.cx_px, camera.fx_px),
+            (camera.height, camera.cy_px, camera.fy_px),
+        )
+    ]
+    side_px = min(camera.width, camera.height)
+    most_px, least_px = (camera.fx_px * extent_m / range_m for range_m in (least_m, greatest_m))
+    view = (
+        f"{camera.width} x {camera.height} px see {degrees[0]:.3g} x {degrees[1]:.3g} degrees; "
+        f"a target of {extent_m:g} m is {most_px:.0f} px at {least_m:.0f} m "
+        f"and {least_px:.0f} px at {greatest_m:.0f} m, "
+        f"{most_px / side_px:.0%} and {least_px / side_px:.0%} of the picture's smaller side"
+    )
+    problems = []
+    for name, centre, size in (("cx_px", camera.cx_px, camera.width), ("cy_px", camera.cy_px, camera.height)):
+        if not 0 <= centre <= size:
+            problems.append(
+                f"camera.{name} is {centre:g} and the picture ends at {size}: "
+                "the line of sight lies outside the picture"
+            )
+    if max(degrees) > WIDEST_DEG:
+        problems.append(
+            f"the camera sees {max(degrees):.0f} degrees: is fx_px the focal length in pixels, not in millimetres?"
+        )
+    if most_px < FEWEST_PX:
+        problems.append(
+            f"the target is {most_px:.1f} px at {least_m:.0f} m, fewer than {FEWEST_PX} px show nothing: are fx_px and "
+            "bracket.target_extent_m right?"
+        )
+    if least_px > side_px:
+        problems.append(
+            f"the target does not fit into the picture even at {greatest_m:.0f} m: are fx_px and "
+            "bracket.target_extent_m right?"
+        )
+    return view, problems
 
 
 def _bracket(mission: Mission, number: int, trigger_ns: int) -> PlannedBracket:
@@ -88,6 +142,7 @@ def _bracket(mission: Mission, number: int, trigger_ns: int) -> PlannedBracket:
         phase_deg=_angle_deg(tag.position_body_m / range_m, tag.sun_dir_body),
         sun_deg=_angle_deg(boresight, tag.sun_dir_body),
         px_per_m=round(px_per_m, 2),
+        filled=round(px_per_m * section.target_extent_m / min(camera.width, camera.height), 4),
         target_px=round((px_per_m * section.target_extent_m) ** 2),
         eclipse=tag.in_eclipse,
         pose_valid=tag.valid,

@@ -19,14 +19,13 @@ import numpy as np
 
 from flightsw.errors import TriageError, TriageMissing
 from flightsw.icd.frame import FLAG_ECLIPSE, FLAG_POSE_VALID, Frame, decode_frame, read_header
+from flightsw.icd.model_file import MAX_MODEL_BYTES, SENSOR_METADATA, ModelUnfit, check_model
 from flightsw.icd.packet import PacketError
-from flightsw.model_file import verified_model
 from obbgs_base.extras import install_command
 
 log = logging.getLogger(__name__)
 
 TILE_ROWS, TILE_COLUMNS = 20, 40  # px, as in the ground's densification
-SENSOR_METADATA = ("black_dn", "white_dn", "dn_per_radiance_s", "electrons_per_dn", "read_noise_dn")
 # views so far apart share exp(-1/2) of what they show: about how far a face can be seen from
 SIMILAR_RAD = 0.7
 NOISE_CHI2 = 1.25  # below it is the worst tile of pure noise: 1 on average, a deviation of 0.05 for 800 px
@@ -57,6 +56,24 @@ class Ranked:
     def residual_sigmas(self) -> float:
         """The root mean square residual of the worst tile beyond what noise can do, in sigmas of a pixel's noise."""
         return math.sqrt(max(self.worst_chi2 - NOISE_CHI2, 0.0))
+
+
+def verified_model(path: Path) -> bytes:
+    """Return the bytes of a model file after looking at everything in it; one that is too large is not read.
+
+    Raises:
+        TriageError: unreadable, or not a model that may be run.
+    """
+    try:
+        if (size_bytes := path.stat().st_size) > MAX_MODEL_BYTES:
+            raise TriageError(f"{path} has {size_bytes} bytes; the limit is {MAX_MODEL_BYTES}")
+        content = path.read_bytes()
+        check_model(content)
+    except OSError as error:
+        raise TriageError(f"{path}: {error.strerror}") from error
+    except ModelUnfit as error:
+        raise TriageError(f"{path} {error}") from error
+    return content
 
 
 class Renderer:

@@ -66,6 +66,9 @@ def uplink_command(
         made = [uplinking.parse_command(command.value, arguments or [])]
     else:
         made = uplinking.parse_script(_text_of(script))
+    for _, model in made:
+        if model is not None:
+            uplinking.check_model(model)
     if link is None and not uplinking.is_listening(session):
         raise SessionError(f"no `ground listen` receives into {session}: start one, or give --link URL")
     for place, (each, model) in enumerate(made, start=1):
@@ -90,7 +93,8 @@ def _text_of(script: Path | None) -> str:
     try:
         return script.read_text()
     except (OSError, UnicodeDecodeError) as error:
-        raise SessionError(f"the script {script} cannot be read: {error}") from error
+        reason = (isinstance(error, OSError) and error.strerror) or error
+        raise SessionError(f"the script {script} cannot be read: {reason}") from error
 
 
 def _sent(

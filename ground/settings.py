@@ -6,6 +6,7 @@ Changes are named as in `preset`: `steps`, or `growth.interval` for a setting of
 import operator
 from collections.abc import Sequence
 
+from flightsw.icd.config import names_like
 from flightsw.icd.mission import ConfigError, ReconstructSection, build, parse_yaml
 from obbgs_core.settings import known_names
 from obbgs_core.train.config import MethodConfig
@@ -103,7 +104,7 @@ def checked_settings(tree: dict, path: str) -> dict:
     known = [name for name in known_names(MethodConfig) if name != "name"]
     groups = {name.partition(".")[0] for name in known}
     for name in sorted(given - {*known, *groups}):
-        raise ConfigError(f"{path}.{name}", f"unknown key; expected one of {', '.join(known)}")
+        raise ConfigError(f"{path}.{name}", f"unknown key; {names_like(name, known)}")
     try:
         config = build(MethodConfig, tree, path, name="")
     except ConfigError:

@@ -26,6 +26,7 @@ from typing import Any
 from flightsw.icd.auth import MAX_COUNTER, Key, digest, seal, seal_file
 from flightsw.icd.command import ENDED, Command, Report, model_file_name
 from flightsw.icd.mission import Checksum, ConfigError
+from flightsw.icd.model_file import MAX_MODEL_BYTES, ModelUnfit, check_for_triage
 from flightsw.icd.transfer import UPLINK, Sender
 from ground.session import SessionError
 from ground.telemetry import plain
@@ -34,7 +35,6 @@ from obbgs_base.files import append_line, write_whole
 
 log = logging.getLogger(__name__)
 JOB_NAME = re.compile(r"(\d{20})\.json", re.ASCII)
-MAX_MODEL_BYTES = 64 * 1024 * 1024  # as the dictionary's `model.size_bytes`
 MAX_JOB_BYTES = 64 * 1024  # of a command file
 COUNTER_MARGIN = 1 << 20  # that `move_counter` leaves for commands that were sent and never arrived
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # elapsed time counts from this start of the computer
@@ -199,8 +199,22 @@ def submit(session: Path, key_file: Path, command: Command, model: Path | None, 
             }
             write_whole(folder / f"{counter:020d}.json", json.dumps(job).encode())
     except OSError as error:
-        raise SessionError(f"cannot leave the command in {folder}: {error}") from error
+        raise SessionError(f"cannot leave the command in {folder}: {error.strerror or error}") from error
     return counter
+
+
+def check_model(model: Path) -> None:
+    """Look whether the spacecraft could use a model file, before it goes up.
+
+    Raises:
+        ConfigError: it cannot be read, or is no model of a run.
+    """
+    try:
+        check_for_triage(model.read_bytes())
+    except OSError as error:
+        raise ConfigError(str(model), f"cannot read the model: {error.strerror}") from error
+    except ModelUnfit as error:
+        raise ConfigError(str(model), f"{error}; expected a run's model.onnx") from error
 
 
 def _model_command(model: Path) -> tuple[bytes, Command]:

@@ -80,7 +80,14 @@ def run(app: typer.Typer, tool: str) -> None:
     except ValueError as error:
         _end(tool, str(error), 2)
     except OSError as error:
-        _end(tool, str(error), 1)
+        _end(tool, in_words(error), 1)
+
+
+def in_words(error: OSError) -> str:
+    """Return what an error of the system says, without its number: `FILE: No such file or directory`."""
+    if error.strerror is None:
+        return str(error)
+    return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
 
 
 def _end(tool: str, message: str, exit_code: int) -> None:

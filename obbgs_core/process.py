@@ -16,8 +16,16 @@ def prepare_process(threads: int | None = None) -> None:
     Each step of a training frees its images and asks for new ones of the same size. The GNU C library hands memory that
     was freed back to the system, which clears it anew for the next step; that takes a tenth of a training. With another
     C library that part does nothing.
+
+    Raises:
+        ValueError: more threads than four for each core, which would only wait for each other.
     """
-    torch.set_num_threads(threads or os.cpu_count() or 1)
+    cores = os.cpu_count() or 1
+    if threads is not None and not 1 <= threads <= 4 * cores:
+        raise ValueError(
+            f"--threads: expected 1 to {4 * cores}, four for each of this machine's {cores} cores, got {threads}"
+        )
+    torch.set_num_threads(threads or cores)
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT_BYTES)

@@ -2,11 +2,12 @@
 
 import contextlib
 import dataclasses
+import difflib
 import json
 import re
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +15,8 @@ from typing import Any, Literal
 import yaml
 
 from obbgs_base.errors import ObbgsError
+
+FEW_NAMES = 10  # that a message lists; of more it tells the nearest
 
 
 class ConfigError(ObbgsError, ValueError):
@@ -151,7 +154,7 @@ def build(section: type, tree: Any, path: str, **given: Any) -> Any:
     require(isinstance(tree, dict), path, f"expected a mapping of keys, got {_describe(tree)}")
     fields = {f.name: f for f in dataclasses.fields(section) if f.name not in given}
     for key in tree:
-        require(key in fields, f"{path}.{key}", f"unknown key; expected one of {', '.join(fields)}")
+        require(key in fields, f"{path}.{key}", f"unknown key; {names_like(str(key), fields)}")
     hints = typing.get_type_hints(section)
     values = dict(given)
     for name, f in fields.items():
@@ -160,6 +163,17 @@ def build(section: type, tree: Any, path: str, **given: Any) -> Any:
         elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
             raise ConfigError(f"{path}.{name}", "is missing")
     return section(**values)
+
+
+def names_like(given: str, known: Iterable[str]) -> str:
+    """Return what a wrong name could have been: `expected` with all names where they are few, else the nearest."""
+    names = list(known)
+    if len(names) <= FEW_NAMES:
+        return f"expected one of {', '.join(names)}"
+    nearest = difflib.get_close_matches(given, names, n=3, cutoff=0.5)
+    nearest += [name for name in names if name.endswith(f".{given}") and name not in nearest]
+    like = f"nearest to it: {', '.join(nearest)}" if nearest else f"such as {', '.join(names[:3])}"
+    return f"expected one of {len(names)} names, {like}"
 
 
 def _describe(value: Any) -> str:

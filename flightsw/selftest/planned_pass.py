@@ -10,6 +10,7 @@ from flightsw.icd.mission import Mission
 from flightsw.icd.pose_sections import NavigationSection
 from flightsw.navigation import NavigationStream
 from flightsw.orbit import propagate, sun_position_gcrs
+from flightsw.planning import field_of_view
 from flightsw.selftest.finding import Finding
 
 NS = 1_000_000_000
@@ -65,9 +66,17 @@ def check_orbit(mission: Mission) -> list[Finding]:
             f"{ages_days['the first trigger']:.1f} days old then, {ages_days['now']:.1f} now"
         )
         findings.append(Finding.ok("orbit", found))
+    findings += _view(mission, list(ranges_m.values())[:2])
     if not by_elements:
         findings += _navigation(mission.navigation)
     return findings
+
+
+def _view(mission: Mission, ranges_m: list[float]) -> list[Finding]:
+    """Look whether the camera's figures fit to the target: field of view, share of the picture, line of sight."""
+    view, problems = field_of_view(mission, min(ranges_m), max(ranges_m))
+    advice = "correct mission.camera and bracket.target_extent_m, and look at `flightsw plan`"
+    return [Finding.warning("view", problem, advice) for problem in problems] or [Finding.ok("view", view)]
 
 
 def _navigation(section: NavigationSection) -> list[Finding]:

@@ -66,6 +66,11 @@ def test_every_command_has_help_with_an_example(tool, command):
         (["triage", "--model", "nowhere.onnx", "--frames", "{tmp}"], 1, "nowhere.onnx"),
         (["serve", *NOWHERE, "--link", "serial:///dev/nowhere", "--store", "{tmp}"], 1, "/dev/nowhere"),
         (["serve", "--camera", "ftp://x", "--link", "can://nowhere", "--store", "{tmp}"], 1, "nowhere"),
+        (
+            ["serve", *NOWHERE, "--link", "can://x", "--start", "soon", "--store", "{tmp}"],
+            2,
+            "start_utc: expected",
+        ),
         (["fsck", "--store", "{tmp}"], 1, "is no frame store"),
         (["frobnicate"], 2, "frobnicate"),
     ],

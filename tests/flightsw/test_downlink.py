@@ -35,9 +35,9 @@ from flightsw.icd.packet import (
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import UPLINK, Sender, parse_pdu
 from flightsw.icd.transfer.checksum import TYPES
-from flightsw.model_file import verified_model
 from flightsw.settings import Settings, save_settings
 from flightsw.store import FrameStore
+from flightsw.triage import verified_model
 from ground.uplink import make_key
 
 

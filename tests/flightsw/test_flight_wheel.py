@@ -33,6 +33,7 @@ def test_it_holds_flight_and_what_it_shares_and_nothing_compiled(wheel):
     }
     assert {name for name in names if name.endswith(".py")} == expected
     beside = {"flightsw/icd/dictionary.yaml", "flightsw/obbgs-flight.service", f"flightsw/{EPHEMERIS.name}"}
+    beside |= {"flightsw/example_mission.yaml"}
     assert beside <= names
     assert not [name for name in names if name.endswith((".so", ".cpp", ".pyc"))]
 

@@ -20,8 +20,8 @@ from flightsw.errors import TriageError
 from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.icd.frame import HEADER, Frame, PoseTag, encode_frame
 from flightsw.icd.mission import load_mission
+from flightsw.icd.model_file import MAX_MODEL_BYTES
 from flightsw.icd.quaternion import quat_to_matrix
-from flightsw.model_file import MAX_MODEL_BYTES, verified_model
 from flightsw.ports import open_link
 from flightsw.pose import unknown_pose
 from flightsw.settings import Settings, save_settings
@@ -38,6 +38,7 @@ from flightsw.triage import (
     sending_order,
     sent_view,
     tile_means,
+    verified_model,
 )
 from ground.ingest import listen
 from hil.links.virtual_serial import VirtualSerial

@@ -14,7 +14,7 @@ from flightsw.run import run_pass
 from flightsw.watchdog import Watchdog, notify
 
 ROOT = Path(__file__).parents[2]
-UNIT = ROOT / "packaging" / "systemd" / "obbgs-flight.service"
+UNIT = ROOT / "flightsw" / "obbgs-flight.service"
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import threading
 import time
 from pathlib import Path
 
+import onnx
 import pytest
 from typer.testing import CliRunner
 
@@ -17,6 +18,8 @@ from flightsw.commands import Commander, KeyRing
 from flightsw.icd.auth import Key, digest, unseal, unseal_file
 from flightsw.icd.command import Command, Report
 from flightsw.icd.mission import ConfigError
+from flightsw.icd.model_file import SENSOR_METADATA
+from flightsw.icd.model_file import check_model as check_model_bytes
 from flightsw.store import FrameStore
 from ground import cli
 from ground.ingest import listen
@@ -24,6 +27,7 @@ from ground.session import SessionError
 from ground.uplink import (
     COUNTER_MARGIN,
     Uplinker,
+    check_model,
     in_words,
     is_listening,
     listening,
@@ -518,3 +522,38 @@ def test_a_result_that_cannot_be_written_is_not_sent_for_again(session, key_file
         patched.setattr(Path, "unlink", refuse)
         uplinker.take_report(Report(0, counter, digest(packet), "completed", "alive"), 0.1)
     assert [uplinker.next_command(step) for step in range(1, 9)] == [None] * 8
+
+
+def foreign_model(**metadata: str) -> bytes:
+    """Return a model of one standard operator, made by the onnx package."""
+    port = onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1])
+    out = onnx.helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [1])
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Abs", ["x"], ["y"])], "g", [port], [out])
+    model = onnx.helper.make_model(graph)
+    onnx.helper.set_model_props(model, metadata)
+    return model.SerializeToString()
+
+
+def test_metadata_is_read_from_a_model_s_bytes_as_the_onnx_package_wrote_it():
+    metadata = {"width": "64", "black_dn": "1.5", "größe": "ä", "empty": ""}
+    assert check_model_bytes(foreign_model(**metadata)) == metadata
+
+
+def test_a_file_that_is_no_model_of_a_run_does_not_go_up(tmp_path):
+    """Not even a counter is used, and no listener is asked."""
+    model = tmp_path / "model.onnx"
+    names = ("width", "height", *SENSOR_METADATA)
+    for content, message in (
+        (None, "cannot read the model: No such file or directory"),
+        (b"width: 256", "expected a run's model.onnx"),
+        (foreign_model(), "is no model.onnx of a run: it does not say width, height, black_dn"),
+        (foreign_model(**dict.fromkeys(names[1:], "1")), "it does not say width"),
+    ):
+        if content is not None:
+            model.write_bytes(content)
+        session = str(tmp_path / "session")
+        done = CliRunner().invoke(cli.app, ["uplink", "model", str(model), "--session", session])
+        assert isinstance(done.exception, ConfigError) and message in str(done.exception)
+        assert done.exception.exit_code == 2 and not (tmp_path / "session").exists()
+    model.write_bytes(foreign_model(**dict.fromkeys(names, "1")))
+    check_model(model)

@@ -164,8 +164,9 @@ def test_the_ground_changes_the_bracket_and_uplinks_a_model_and_the_downlink_fol
         assert command("bracket", "0.02,0.08") == everything
         assert command("priority", "triage") == everything
         assert command("delete", 0, 99) == (1, ["refused"])
-        code, stages = command("model", GOLDEN / "mission.yaml")
-        assert (code, stages) == (1, ["accepted", "started", "failed"])
+        unfit = ("model", GOLDEN / "mission.yaml", "--session", session, "--key", key)
+        done = tools.run("ground", "uplink", *unfit)
+        assert done.returncode == 2 and "expected a run's model.onnx" in done.stderr
         assert not list(store.glob("model*"))
         assert command("model", model) == everything
         assert (store / "model.onnx").read_bytes() == model.read_bytes()

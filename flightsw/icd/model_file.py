@@ -1,13 +1,12 @@
-"""What an uplinked model file may hold: standard operators, and all its data inside. No onnx package needed.
+"""What an uplinked model file may hold: standard operators, all its data inside, and what triage asks of it.
+
+The ground looks before it sends a file, the spacecraft before it runs one. No onnx package is needed.
 
 onnxruntime alone would not do: it runs its own com.microsoft operators, declared or not, and reads the other files that
 a tensor names.
 """
 
 from collections.abc import Iterator
-from pathlib import Path
-
-from flightsw.errors import TriageError
 
 MAX_MODEL_BYTES = 64 * 1024 * 1024
 STANDARD_DOMAINS = (b"", b"ai.onnx")
@@ -20,22 +19,24 @@ ONNX_FIELDS = {
     "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
     "sparse": {1: "tensor", 2: "tensor"},
 }
+MODEL_METADATA = 14  # metadata_props of a model: entries of a key (1) and a value (2)
+SENSOR_METADATA = ("black_dn", "white_dn", "dn_per_radiance_s", "electrons_per_dn", "read_noise_dn")
 NODE_DOMAIN, TENSOR_EXTERNAL_DATA, TENSOR_DATA_LOCATION = 7, 13, 14
 
 
-def verified_model(path: Path) -> bytes:
-    """Return the bytes of an ONNX file after checking every node and tensor in it.
+class ModelUnfit(ValueError):
+    """A file is no model for the spacecraft; the message goes on after the file's name."""
+
+
+def check_model(content: bytes) -> dict[str, str]:
+    """Check every node and tensor of an ONNX file; return its metadata.
 
     Raises:
-        TriageError: unreadable, too large, not ONNX, an operator that is not standard, or data outside the file.
+        ModelUnfit: too large, not ONNX, an operator that is not standard, or data outside the file.
     """
-    try:
-        size_bytes = path.stat().st_size
-        if size_bytes > MAX_MODEL_BYTES:
-            raise TriageError(f"{path} has {size_bytes} bytes; the limit is {MAX_MODEL_BYTES}")
-        content = path.read_bytes()
-    except OSError as error:
-        raise TriageError(f"{path}: {error.strerror}") from error
+    if len(content) > MAX_MODEL_BYTES:
+        raise ModelUnfit(f"has {len(content)} bytes; the limit is {MAX_MODEL_BYTES}")
+    metadata: dict[str, str] = {}
     pending = [("model", memoryview(content))]
     try:
         while pending:
@@ -43,17 +44,38 @@ def verified_model(path: Path) -> bytes:
             for number, value in _fields(message):
                 if kind == "node" and number == NODE_DOMAIN and value not in STANDARD_DOMAINS:
                     domain = value if isinstance(value, int) else bytes(value[:40])
-                    raise TriageError(f"{path} has an operator that is not standard ONNX: {domain}")
+                    raise ModelUnfit(f"has an operator that is not standard ONNX: {domain}")
                 if kind == "tensor" and number in (TENSOR_EXTERNAL_DATA, TENSOR_DATA_LOCATION) and value != 0:
-                    raise TriageError(f"{path} keeps tensors outside the file")
+                    raise ModelUnfit("keeps tensors outside the file")
+                if kind == "model" and number == MODEL_METADATA and not isinstance(value, int):
+                    entry = {field: v for field, v in _fields(value) if not isinstance(v, int)}
+                    metadata[_text(entry.get(1))] = _text(entry.get(2))
                 inner = ONNX_FIELDS.get(kind, {}).get(number)
                 if inner:
                     if isinstance(value, int):
                         raise ValueError(f"field {number} of a {kind} must be a message")
                     pending.append((inner, value))
+    except ModelUnfit:
+        raise
     except (IndexError, ValueError) as error:
-        raise TriageError(f"{path} is not an ONNX file") from error
-    return content
+        raise ModelUnfit("is not an ONNX file") from error
+    return metadata
+
+
+def check_for_triage(content: bytes) -> None:
+    """Check that a file is a model of the ground's that triage can use, as far as its bytes say.
+
+    Raises:
+        ModelUnfit: as of `check_model`, or it lacks the picture's size or the sensor.
+    """
+    metadata = check_model(content)
+    missing = [name for name in ("width", "height", *SENSOR_METADATA) if name not in metadata]
+    if missing:
+        raise ModelUnfit(f"is no model.onnx of a run: it does not say {', '.join(missing[:3])}")
+
+
+def _text(value: memoryview | None) -> str:
+    return bytes(value or b"").decode(errors="replace")
 
 
 def _fields(message: memoryview) -> Iterator[tuple[int, memoryview | int]]:

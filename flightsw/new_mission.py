@@ -1,0 +1,107 @@
+"""A mission file from the little that is known at first: orbits, the target's size, the camera's lens and colour."""
+
+import math
+import re
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from flightsw.icd.config import ConfigError, build, in_file, parse_yaml
+from flightsw.icd.mission import Mission
+from obbgs_base.files import write_whole
+
+EXAMPLE = Path(__file__).with_name(
+    "example_mission.yaml"
+)  # a copy of the project's mission.yaml, as tests check
+UNTIL_FIRST_TRIGGER = timedelta(hours=1)
+
+
+def write_mission(
+    out: Path,
+    target_tle: Path,
+    chaser_tle: Path,
+    target_size_m: float,
+    picture: str,
+    focal_length_mm: float,
+    pixel_pitch_um: float,
+    channels: int,
+    start_utc: str | None = None,
+) -> None:
+    """Write the example with these figures, after reading it as every part does.
+
+    Args:
+        target_tle, chaser_tle: files with two lines, or three with a name.
+        target_size_m: largest dimension.
+        picture: width and height, px, as 1024x1024; the line of sight meets its middle.
+        channels: 1 or 3.
+        start_utc: ISO 8601; None: an hour from now.
+
+    Raises:
+        ConfigError: an option or an element is wrong, or `out` is there already or cannot be written.
+    """
+    size = re.fullmatch(r"(\d{1,5})x(\d{1,5})", picture)
+    if size is None:
+        raise ConfigError(
+            "--picture", f"expected width and height in pixels, such as 1024x768, got {picture!r}"
+        )
+    for option, value in (
+        ("--target-size", target_size_m),
+        ("--focal-length", focal_length_mm),
+        ("--pixel-pitch", pixel_pitch_um),
+    ):
+        if not (math.isfinite(value) and value > 0):
+            raise ConfigError(option, f"must be positive, got {value:g}")
+    width, height = map(int, size.groups())
+    focal_px = 1e3 * focal_length_mm / pixel_pitch_um
+    field_deg = 2 * math.degrees(math.atan(width / 2 / focal_px))
+    if start_utc is None:
+        start_utc = (datetime.now(UTC) + UNTIL_FIRST_TRIGGER).strftime("%Y-%m-%dT%H:%M:00Z")
+    text = EXAMPLE.read_text()
+    text = re.sub(r"  # TanDEM-X .*\n", "", text)
+    for key, path in (("target_tle", target_tle), ("chaser_tle", chaser_tle)):
+        lines = "".join(f'    - "{line}"\n' for line in _elements(path))
+        text = re.sub(rf"(  {key}:\n)(?:    - .*\n){{2}}", lambda m, lines=lines: m[1] + lines, text)
+    lens = f"{focal_length_mm:g} mm / {pixel_pitch_um:g} um; {field_deg:.3g} degrees across {width} pixels"
+    for key, value, remark in (
+        ("start_utc", f'"{start_utc}"', "first bracket"),
+        ("width", str(width), ""),
+        ("height", str(height), ""),
+        ("fx_px", f"{focal_px:.1f}", lens),
+        ("fy_px", f"{focal_px:.1f}", ""),
+        ("cx_px", f"{width / 2:g}", None),
+        ("cy_px", f"{height / 2:g}", ""),
+        ("channels", str(channels), None),
+        ("target_extent_m", f"{target_size_m:g}", None),
+    ):
+        text = _set(text, key, value, remark)
+    with in_file(out):
+        build(Mission, parse_yaml(text.encode(), "mission"), "mission")
+    if out.exists():
+        raise ConfigError(str(out), "exists already; choose another name, or remove it first")
+    try:
+        write_whole(out, text.encode())
+    except OSError as error:
+        raise ConfigError(str(out), f"cannot be written: {error.strerror}") from error
+
+
+def _elements(path: Path) -> list[str]:
+    try:
+        lines = [line.rstrip() for line in path.read_text().splitlines() if line.strip()]
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise ConfigError(str(path), f"cannot read the two-line elements: {reason}") from error
+    elements = lines[-2:]
+    if len(lines) not in (2, 3) or any('"' in line or "\\" in line for line in elements):
+        raise ConfigError(
+            str(path), f"expected two lines of elements, with or without a name before, got {len(lines)}"
+        )
+    return elements
+
+
+def _set(text: str, key: str, value: str, remark: str | None) -> str:
+    """Return the file's text with another value of a key, also of one behind a #; a remark of None stays as it is."""
+    match = re.search(rf"^  (?:# )?{key}: [^#\n]*?( *)(#.*)?$", text, re.MULTILINE)
+    assert match is not None, f"the example has no {key}"
+    line = f"  {key}: {value}"
+    kept = (match[2] or "").removeprefix("# ") if remark is None else remark
+    line = f"{line:<36} # {kept}" if kept else line
+    return text[: match.start()] + line + text[match.end() :]
