@@ -82,13 +82,11 @@ class CameraSection:
             )
         for name in ("fx_px", "fy_px", "dn_per_radiance_s", "electrons_per_dn"):
             require(getattr(self, name) > 0, f"{path}.{name}", f"must be positive, got {getattr(self, name)}")
-        for name, size in (("cx_px", self.width), ("cy_px", self.height)):
-            # a part cut from a larger picture may lie beside the line of sight
+        for name in ("cx_px", "cy_px"):  # outside the picture where it was cut from a larger one
             require(
-                -size <= getattr(self, name) <= 2 * size,
+                -8192 <= getattr(self, name) <= 8192,
                 f"{path}.{name}",
-                f"expected the line of sight within a picture's width of the picture, {-size} to {2 * size}, got "
-                f"{getattr(self, name):g}",
+                f"expected where the line of sight meets the picture, -8192 to 8192, got {getattr(self, name):g}",
             )
         require(
             self.read_noise_dn >= 0,

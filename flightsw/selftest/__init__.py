@@ -8,7 +8,7 @@ from flightsw.icd.mission import Mission
 from flightsw.selftest.computer import check_clock, check_computer, check_disk, check_key
 from flightsw.selftest.devices import check_camera, check_link
 from flightsw.selftest.finding import Finding
-from flightsw.selftest.planned_pass import check_orbit
+from flightsw.selftest.planned_pass import check_orbit, check_view
 
 __all__ = ["Finding", "self_test"]
 
@@ -38,6 +38,7 @@ def self_test(
         lambda: check_disk(mission, store),
         lambda: check_computer(mission),
         lambda: check_orbit(mission),
+        lambda: check_view(mission),
     ]
     checks += [functools.partial(check_key, key_file) for key_file in key_files]
     if link_url is not None:

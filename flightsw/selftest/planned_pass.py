@@ -66,14 +66,25 @@ def check_orbit(mission: Mission) -> list[Finding]:
             f"{ages_days['the first trigger']:.1f} days old then, {ages_days['now']:.1f} now"
         )
         findings.append(Finding.ok("orbit", found))
-    findings += _view(mission, list(ranges_m.values())[:2])
     if not by_elements:
         findings += _navigation(mission.navigation)
     return findings
 
 
-def _view(mission: Mission, ranges_m: list[float]) -> list[Finding]:
-    """Look whether the camera's figures fit to the target: field of view, share of the picture, line of sight."""
+def check_view(mission: Mission) -> list[Finding]:
+    """Check that the camera's figures fit to the target: field of view, share of the picture, line of sight.
+
+    Says nothing where the orbits cannot be computed, which `check_orbit` tells.
+    """
+    orbit, bracket = mission.orbit, mission.bracket
+    span_ns = round((bracket.count - 1) * bracket.interval_s * NS)
+    ranges_m = []
+    for utc_ns in (orbit.start_utc_ns, orbit.start_utc_ns + span_ns):
+        try:
+            states = [propagate(tle, utc_ns) for tle in (orbit.target_tle, orbit.chaser_tle)]
+        except OrbitError:
+            return []
+        ranges_m.append(float(np.linalg.norm(states[0].position_m - states[1].position_m)))
     view, problems = field_of_view(mission, min(ranges_m), max(ranges_m))
     advice = "correct mission.camera and bracket.target_extent_m, and look at `flightsw plan`"
     return [Finding.warning("view", problem, advice) for problem in problems] or [Finding.ok("view", view)]

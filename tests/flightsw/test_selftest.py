@@ -102,13 +102,16 @@ def in_the_pass(small_mission, monkeypatch) -> None:
 
 
 def test_all_is_well(small_mission, in_the_pass, tmp_path):
+    lens = {"fx_px": 1200.0, "fy_px": 1200.0, "cx_px": 24.0, "cy_px": 24.0}  # sees as much as the demo's
+    camera_section = dataclasses.replace(small_mission.camera, **lens)
+    small_mission = dataclasses.replace(small_mission, camera=camera_section)
     with port(lambda data: data) as link, camera(noisy) as url:
         seen = []
         store = tmp_path / "not yet" / "store"
         findings = self_test(small_mission, store, url, link, loopback=True, on_finding=seen.append)
     assert seen == findings
     assert [(f.check, f.state) for f in findings] == [
-        (name, "ok") for name in ("clock", "disk", "computer", "orbit", "link", "camera")
+        (name, "ok") for name in ("clock", "disk", "computer", "orbit", "view", "link", "camera")
     ], findings
     texts = {f.check: f.found for f in findings}
     assert "came back unchanged" in texts["link"] and "0.05, 0.1, 0.2 ms" in texts["camera"]
