@@ -15,7 +15,8 @@ FLIGHT = ROOT / "packaging" / "flight"
 BUILD_FLIGHT = "import sys; from hatchling.build import build_wheel; print(build_wheel(sys.argv[1]))"
 # without the compiled module, which `installed` takes from where it is: compiling anew takes minutes
 BUILD_WHOLE = """
-import sys; from scikit_build_core.build import build_wheel; print(build_wheel(sys.argv[1], {"wheel.cmake": "false", "wheel.py-api": "py3"}))
+import sys; from scikit_build_core.build import build_wheel
+print(build_wheel(sys.argv[1], {"wheel.cmake": "false", "wheel.py-api": "py3"}))
 """
 
 
