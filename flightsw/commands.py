@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from flightsw.clock import utc_ns
 from flightsw.errors import FlightError, StoreError
 from flightsw.icd.auth import MAX_COUNTER, TAG_BYTES, AuthError, Key, claimed, digest, unseal, unseal_file
 from flightsw.icd.command import ENDED, Command, Report, model_file_name
@@ -207,7 +208,7 @@ class Commander:
         mission: Mission,
         on_refusal: Callable[[str], None] = lambda problem: None,
         clock_s: Callable[[], float] = time.monotonic,
-        utc_ns: Callable[[], int] = time.time_ns,
+        utc_ns: Callable[[], int] = utc_ns,
     ):
         self.settings = load_settings(store.folder, mission)
         self.upload: Upload | None = None

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from flightsw.clock import utc_ns
 from flightsw.commands import Commander, KeyRing, Upload
 from flightsw.errors import DownlinkError, FlightError
 from flightsw.frame_sender import FrameSender, SendingCounts
@@ -110,6 +111,7 @@ def run_downlink(
             try:
                 if now_s >= next_look_s:
                     next_look_s = now_s + OUTBOX_S
+                    utc_ns()  # so that a step of the clock is seen, and told, soon
                     downlink.look(now_s)
                     on_progress(downlink.progress())
                 if downlink.turn(now_s):
@@ -293,7 +295,7 @@ class _Downlink:
         progress, settings = self.progress(), self.settings
         frames_stored, bracket = len(self._store.frames), settings.bracket(self._mission)
         values = {
-            "utc_ns": time.time_ns(),
+            "utc_ns": utc_ns(),
             "boot": self._boot,
             "mode": "safe" if settings.safe_mode else "normal",
             "camera": "none",

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from flightsw.clock import utc_ns
 from flightsw.icd.telemetry import DICTIONARY
 
 MAX_EVENTS = 200  # waiting to be sent; the oldest are lost, and counted in the next one
@@ -21,7 +22,7 @@ class EventLog(logging.Handler):
     Any thread may write, one takes them out.
     """
 
-    def __init__(self, utc_ns: Callable[[], int] = time.time_ns):
+    def __init__(self, utc_ns: Callable[[], int] = utc_ns):
         super().__init__(logging.WARNING)
         self._utc_ns = utc_ns
         self._packets: deque[bytes] = deque()

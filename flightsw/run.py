@@ -13,6 +13,7 @@ from typing import Any
 from flightsw.boot_counter import count_boot
 from flightsw.cameras import open_camera
 from flightsw.cameras.reconnecting import PATIENCE_S, RETRY_S, ReconnectingCamera
+from flightsw.clock import utc_ns
 from flightsw.commands import KeyRing
 from flightsw.downlink import DownlinkProgress, run_downlink
 from flightsw.errors import CameraLost, CaptureError
@@ -170,7 +171,7 @@ def _awaited_camera(
     log.warning("no camera yet, it is tried again every %g s: %s", RETRY_S, error)
     try:
         while isinstance(error, CameraLost) and not stop.is_set():
-            if time.time_ns() > over_utc_ns and time.monotonic() > patient_until_s:
+            if utc_ns() > over_utc_ns and time.monotonic() > patient_until_s:
                 break
             watchdog.expect("capture", RETRY_S + EXPOSURE_WITHIN_S)
             stop.wait(RETRY_S)
@@ -194,10 +195,8 @@ def _capture(
     on_counts: Callable[[CaptureCounts], None],
     watchdog: Watchdog,
 ) -> CaptureCounts:
-    def wait_until(utc_ns: int) -> None:
-        while (
-            not camera.has_own_clock and not stop.is_set() and (left_s := (utc_ns - time.time_ns()) / 1e9) > 0
-        ):
+    def wait_until(due_ns: int) -> None:
+        while not camera.has_own_clock and not stop.is_set() and (left_s := (due_ns - utc_ns()) / 1e9) > 0:
             watchdog.expect("capture", RETRY_S + EXPOSURE_WITHIN_S)
             camera.reconnect()
             stop.wait(min(left_s, RETRY_S))  # not all of it: the clock may be set meanwhile

@@ -173,7 +173,7 @@ class _Ingest:
         forward: Forwarder | None,
     ):
         self.frames_received = 0
-        self.last_packet_s = float("-inf")
+        self.last_packet_s = self._housekeeping_s = float("-inf")
         # frames still to come, as housekeeping said after the last frame
         self.flight_outbox: int | None = None
         self._link, self._writer, self._on_event, self._forward = link, writer, on_event, forward
@@ -210,6 +210,7 @@ class _Ingest:
             else:
                 self._telemetry.add(apid, content)
                 if apid == APID_HOUSEKEEPING:
+                    self._housekeeping_s = now_s
                     self.flight_outbox = self._telemetry.housekeeping.get("outbox_frames")
         while self._link.ready and (pdu := self._receiver.next_pdu(now_s)) is not None:
             self._link.write(self._stream.encode(APID_FILES, pdu))
@@ -280,7 +281,7 @@ class _Ingest:
             quiet_s=now_s - self.last_packet_s,
             incoming=self._receiver.incoming(),
             housekeeping=telemetry.housekeeping,
-            housekeeping_age_s=(time.time_ns() - telemetry.housekeeping_utc_ns) / 1e9,
+            housekeeping_age_s=now_s - self._housekeeping_s,
             frame_header=telemetry.frame_header,
             events=list(telemetry.events),
             commands=[(job.counter, job.command, job.stage) for job in self._uplinker.jobs.values()],

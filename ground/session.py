@@ -281,7 +281,7 @@ def read_header(folder: Path) -> dict[str, Any]:
 def flight_counts(header: dict[str, Any]) -> FlightCounts | None:
     """Return what the spacecraft said of its frames; None without telemetry, and in sessions of older versions."""
     told = header.get("flight")
-    return None if told is None else FlightCounts(**told)
+    return None if told is None else FlightCounts.from_tree(told)
 
 
 def _background(header: dict[str, Any]) -> float:

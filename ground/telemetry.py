@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from flightsw.icd.command import Report
 from flightsw.icd.frame import read_header
@@ -21,8 +21,8 @@ from flightsw.icd.packet import (
 from flightsw.icd.telemetry import DICTIONARY
 
 EVENTS_KEPT = 200  # in memory; the file has all
-NS = 1_000_000_000
-SAME_START_NS = 2 * NS  # start times nearer than this are the same start: uptime comes in whole seconds
+EARLIER_COUNTS = ("run_utc_ns", "run_uptime_s")
+DRAWN_BOOTS = 1 << 31  # from here on the number of a start is drawn at random (flightsw/boot_counter.py)
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,23 @@ class FlightCounts:
     frames_refused: int = 0  # taken, but not stored for lack of room
     frames_failed: int = 0  # exposures that gave no frame
     frames_dropped: int = 0  # stored, then deleted before delivery to make room
-    # The newest housekeeping since flight software started; it counts refused and failed frames from that start.
-    run_utc_ns: int = 0
-    run_uptime_s: int = 0
+    # The newest start of flight software that was heard of, and its counts, which begin at that start.
+    run_boot: int = 0
     run_refused: int = 0
     run_failed: int = 0
 
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> Self:
+        """Return the counts in a session's header; earlier versions told starts of flight software apart by clocks.
+
+        Raises:
+            TypeError, ValueError: they are none.
+        """
+        return cls(**{name: value for name, value in tree.items() if name not in EARLIER_COUNTS})
+
     def __post_init__(self):
         for name, value in vars(self).items():
-            if type(value) is not int or (value < 0 and name != "run_utc_ns"):
+            if type(value) is not int or value < 0:
                 raise ValueError(f"flight.{name} must be a count, got {value!r}")
 
     def captured(self, last_frame_id: int = -1) -> int:
@@ -58,34 +66,31 @@ class FlightCounts:
     def after_housekeeping(self, values: Mapping[str, Any]) -> "FlightCounts":
         """Return the counts after a housekeeping packet.
 
-        It does not count frames that were deleted after delivery; those are known by the numbers in their headers.
+        Starts of flight software are told apart by their number `boot`, whatever its clock says; a packet of an earlier
+        start comes late and adds nothing to what that start's later ones said. Frames that were deleted after delivery
+        are not counted here; they are known by the numbers in their headers.
         """
-        utc_ns, uptime_s = values["utc_ns"], values["uptime_s"]
-        refused, failed = values["frames_refused"], values["frames_failed"]
-        if same_run := self._is_of_this_run(utc_ns, uptime_s):  # packets may overtake one another
-            utc_ns, uptime_s = max(utc_ns, self.run_utc_ns), max(uptime_s, self.run_uptime_s)
-            refused, failed = max(refused, self.run_refused), max(failed, self.run_failed)
+        boot, refused, failed = values.get("boot", 0), values["frames_refused"], values["frames_failed"]
+        before_refused = before_failed = 0
+        if boot == self.run_boot:
+            before_refused, before_failed = self.run_refused, self.run_failed
+            refused, failed = max(refused, before_refused), max(failed, before_failed)
+        elif self._is_late(boot):
+            boot, refused, failed = self.run_boot, self.run_refused, self.run_failed
+            before_refused, before_failed = refused, failed
         return FlightCounts(
             frames_stored=max(self.frames_stored, values["frames_stored"] + values["frames_dropped"]),
-            frames_refused=self.frames_refused + refused - (self.run_refused if same_run else 0),
-            frames_failed=self.frames_failed + failed - (self.run_failed if same_run else 0),
+            frames_refused=self.frames_refused + refused - before_refused,
+            frames_failed=self.frames_failed + failed - before_failed,
             frames_dropped=max(self.frames_dropped, values["frames_dropped"]),
-            run_utc_ns=utc_ns,
-            run_uptime_s=uptime_s,
+            run_boot=boot,
             run_refused=refused,
             run_failed=failed,
         )
 
-    def _is_of_this_run(self, utc_ns: int, uptime_s: int) -> bool:
-        """Tell whether a packet comes from the same start of flight software as the newest housekeeping.
-
-        It does not if its start lies after the newest packet, or if the uptime fell and the packets were not merely
-        received in another order. A step of the clock counts as a start only if it is longer than the uptime before.
-        """
-        started_since = utc_ns - (uptime_s + 1) * NS > self.run_utc_ns
-        start_moved_ns = (utc_ns - uptime_s * NS) - (self.run_utc_ns - self.run_uptime_s * NS)
-        uptime_fell = uptime_s < self.run_uptime_s and abs(start_moved_ns) > SAME_START_NS
-        return not started_since and not uptime_fell
+    def _is_late(self, boot: int) -> bool:
+        """Tell whether a start was before the newest one. Numbers that were drawn at random have no order."""
+        return boot < self.run_boot < DRAWN_BOOTS
 
 
 class TelemetryLog:
@@ -106,7 +111,6 @@ class TelemetryLog:
         self.refused = 0  # intact packets that the dictionary does not know
         self.write_failures = 0
         self.housekeeping: dict[str, Any] = {}  # the newest, {} before the first
-        self.housekeeping_utc_ns = 0  # when it was received
         self.frame_header: dict[str, Any] = {}
         self.headers_received = 0
         self.events: deque[dict[str, Any]] = deque(maxlen=EVENTS_KEPT)
@@ -118,7 +122,7 @@ class TelemetryLog:
         try:
             if apid == APID_HOUSEKEEPING:
                 layout, values = DICTIONARY.unpack("telemetry", data)
-                self.housekeeping, self.housekeeping_utc_ns = values, received["received_utc_ns"]
+                self.housekeeping = values
                 self.flight = (self.flight or FlightCounts()).after_housekeeping(values)
                 self._write("telemetry.jsonl", received | {"packet": layout.name} | values)
             elif apid == APID_FRAME_HEADERS:

@@ -18,6 +18,7 @@ from flightsw.cameras.aravis import (
     aravis,
 )
 from flightsw.cameras.camera import OWN_CLOCK_ANSWER_S, Exposure
+from flightsw.clock import utc_ns
 from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.mission import CameraSection
 
@@ -82,7 +83,7 @@ class GigeCamera:
             CaptureError: too late, no picture, a picture with packets missing, or of another size.
         """
         self.open()
-        late_s = (time.time_ns() - start_utc_ns) / NS
+        late_s = (utc_ns() - start_utc_ns) / NS
         if not self.has_own_clock and late_s > LATE_S:
             raise CaptureError(f"the exposure was due {late_s:.1f} s ago")
         try:
@@ -164,7 +165,7 @@ class GigeCamera:
         taken_s = call("arv_camera_get_exposure_time", self._camera) / 1e6
         if self.has_own_clock:
             call("arv_camera_set_integer", self._camera, START_TIME, start_utc_ns)
-        triggered_utc_ns = time.time_ns()
+        triggered_utc_ns = utc_ns()
         call("arv_camera_software_trigger", self._camera)
         wait_s = exposure_time_s + (OWN_CLOCK_ANSWER_S if self.has_own_clock else ANSWER_S)
         buffer = self._next_buffer(wait_s)

@@ -38,11 +38,12 @@ NS = 1_000_000_000
 START_NS = 1_784_631_150 * NS
 
 
-def packet(utc_s: float, uptime_s: float, stored: int, dropped=0, refused=0, failed=0) -> dict:
+def packet(utc_s: float, uptime_s: float, stored: int, dropped=0, refused=0, failed=0, boot=1) -> dict:
     """Return what FlightCounts takes of a housekeeping packet."""
     return {
         "utc_ns": START_NS + round(utc_s * NS),
         "uptime_s": int(uptime_s),
+        "boot": boot,
         "frames_stored": stored,
         "frames_dropped": dropped,
         "frames_refused": refused,
@@ -71,13 +72,20 @@ def test_frames_deleted_on_board_are_still_frames_that_were_taken():
 @pytest.mark.parametrize(
     "packets",
     [
-        [packet(100, 100, 9, refused=3, failed=1), packet(130, 5, 9, refused=2, failed=4)],
+        [packet(100, 100, 9, refused=3, failed=1), packet(130, 5, 9, refused=2, failed=4, boot=2)],
         # the ground was away: the new run is older than the old one was when it was last heard
-        [packet(5, 5, 9, refused=3, failed=1), packet(905, 600, 9, refused=2, failed=4)],
+        [packet(5, 5, 9, refused=3, failed=1), packet(905, 600, 9, refused=2, failed=4, boot=2)],
         # a computer without a clock starts in the past
-        [packet(100, 100, 9, refused=3, failed=1), packet(-9000, 5, 9, refused=2, failed=4)],
+        [packet(100, 100, 9, refused=3, failed=1), packet(-9000, 5, 9, refused=2, failed=4, boot=2)],
+        [packet(5, 5, 9, refused=3, failed=1), packet(9, 2, 9, refused=2, failed=4, boot=(1 << 31) + 7)],
+        [
+            packet(5, 5, 9, refused=3, failed=1),
+            packet(9, 2, 9, refused=2, failed=4, boot=2),
+            packet(5, 5, 9, refused=3, failed=1),
+            packet(9, 2, 9, refused=2, failed=4, boot=2),
+        ],
     ],
-    ids=["heard through", "unheard for long", "clock set back"],
+    ids=["heard through", "unheard for long", "clock set back", "number lost", "late"],
 )
 def test_counters_that_begin_anew_with_flight_are_added_up(packets):
     counts = told(*packets)
@@ -90,8 +98,9 @@ def test_counters_that_begin_anew_with_flight_are_added_up(packets):
         [packet(0.3, 0.3, 4, refused=1), packet(1.9, 1.9, 5, refused=2), packet(2.9, 2.9, 5, refused=2)],
         [packet(50, 50, 5, refused=2), packet(49, 49, 4, refused=1), packet(51, 51, 5, refused=2)],
         [packet(50, 50, 4, refused=1), packet(80, 51, 5, refused=2), packet(40, 52, 5, refused=2)],
+        [packet(-1.7e9, 59, 4, refused=1), packet(60, 60, 5, refused=2), packet(3660, 61, 5, refused=2)],
     ],
-    ids=["just started", "overtaken", "clock stepped"],
+    ids=["just started", "overtaken", "clock stepped", "clock set"],
 )
 def test_one_run_of_flight_is_not_counted_twice(packets):
     assert told(*packets).frames_refused == 2
@@ -101,22 +110,23 @@ def test_one_run_of_flight_is_not_counted_twice(packets):
 def test_the_count_is_never_more_than_was_taken_and_exact_once_all_is_heard(data):
     """Flight takes, refuses and fails, crashes and starts; the ground hears some of its packets."""
     now_s, stored, refused, failed = 0.0, 0, 0, 0
-    counts = FlightCounts()
+    counts, boot = FlightCounts(), 0
+    clock_s = st.floats(-1e9, 1e9)  # it is set, right or wrong
     for _ in range(data.draw(st.integers(1, 4))):
         now_s += data.draw(st.floats(2, 100))
-        began_s, run_refused, run_failed = now_s, 0, 0
+        began_s, run_refused, run_failed, boot = now_s, 0, 0, boot + 1
         for _ in range(data.draw(st.integers(1, 5))):
             now_s += data.draw(st.floats(1, 50))
             new = data.draw(st.tuples(*(st.integers(0, 5) for _ in range(3))))
             stored, run_refused, run_failed = stored + new[0], run_refused + new[1], run_failed + new[2]
             refused, failed = refused + new[1], failed + new[2]
             if heard := data.draw(st.booleans()):
-                values = packet(now_s, now_s - began_s, stored, refused=run_refused, failed=run_failed)
+                values = packet(data.draw(clock_s), now_s - began_s, stored, 0, run_refused, run_failed, boot)
                 counts = counts.after_housekeeping(values)
                 assert counts.frames_stored == stored
             assert counts.frames_refused <= refused and counts.frames_failed <= failed
         if not heard:  # each run's last packet, before it is killed
-            values = packet(now_s, now_s - began_s, stored, refused=run_refused, failed=run_failed)
+            values = packet(data.draw(clock_s), now_s - began_s, stored, 0, run_refused, run_failed, boot)
             counts = counts.after_housekeeping(values)
         assert (counts.frames_refused, counts.frames_failed) == (refused, failed)
         assert counts.captured() == stored + refused
@@ -140,6 +150,12 @@ def test_a_session_keeps_what_flight_told_when_the_ground_starts_again(tmp_path,
     assert again.flight is not None and open_session(tmp_path / "s").frames_captured == 11
     again.save({}, 0, again.flight.after_housekeeping(packet(51, 51, 10, refused=2)))
     assert open_session(tmp_path / "s").frames_captured == 12
+
+
+def test_counts_of_an_earlier_version_are_read():
+    """It told starts of flight software apart by clocks."""
+    told = {"frames_stored": 9, "frames_refused": 2, "run_utc_ns": -5, "run_uptime_s": 4, "run_refused": 2}
+    assert FlightCounts.from_tree(told) == FlightCounts(frames_stored=9, frames_refused=2, run_refused=2)
 
 
 @pytest.mark.parametrize(
