@@ -10,6 +10,7 @@ FROM_THE_PAGE = (
     "GuiUpdateMessage",
     "ViewerCameraMessage",
     "SceneNodeClickMessage",
+    "ScenePointerMessage",
     "GetRenderResponseMessage",
 )
 LARGEST_NUMBER = 1e12  # far above any that the page sends, and exact in JavaScript
@@ -31,8 +32,11 @@ def wrong(data: str | bytes) -> str | None:
         updates = message.get("updates")
         if not isinstance(updates, dict) or list(updates) != ["value"]:
             return "a page sets only the value of a control"
-        if not isinstance(updates["value"], bool | int | float | str):
-            return "the value of a control is a number or a text"
+        value = updates["value"]
+        parts = value if isinstance(value, list) and len(value) == 2 else [value]  # two: the ends of a range
+        kinds = int | float if parts is value else bool | int | float | str
+        if not all(isinstance(part, kinds) for part in parts):
+            return "the value of a control is a number, a text or two numbers"
     payload = message.pop("payload", b"")  # a picture
     return (
         None if isinstance(payload, bytes) and _is_small(message) else "a message holds values out of range"

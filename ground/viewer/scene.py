@@ -21,6 +21,7 @@ RADIUS = 10.0  # of the first model in the scene: large enough for the half-prec
 CAMERAS_AT = 2.0  # radii: true directions, but nearer, or the model could not be seen beside them
 MOST_CAMERAS = 60
 THUMBNAIL_PX = 64
+YEAR_2000_NS = 946_684_800 * 10**9
 SENSOR, ERROR, UNCERTAINTY = "as the sensor sees it", "misfit (chi²)", "uncertainty of radiance"
 COLOURS = (SENSOR, ERROR, UNCERTAINTY)
 
@@ -46,7 +47,8 @@ class Placed:
         centre, radius_m = extent(shown.gaussians)
         self.centre_m = centre.double().numpy()
         self.per_metre = RADIUS / radius_m if per_metre is None else per_metre
-        self._shapes = shapes(shown)
+        self.shapes = shapes(shown)
+        self.box_m: tuple[np.ndarray, np.ndarray] | None = None  # what is shown of it; None: all
         self._overlays: dict[str, np.ndarray] = {}
         self.handles: dict[str, list[Any]] = {"cameras": [], "sun": [], "mesh": []}
 
@@ -57,19 +59,35 @@ class Placed:
     def draw(self, record: FrameRecord, exposure_time_s: float, colour: str, visible: bool = True) -> None:
         """Put the splats into the scene, or give those there other colours."""
         rgb = colours(self.shown, record, exposure_time_s) if colour == SENSOR else self._overlay(colour)
+        opacities = (self.shapes.opacities * self.is_inside())[:, None].astype(np.float32)
         if "splats" in self.handles:  # drawn anew they would fade in again
             self.handles["splats"][0].rgbs = rgb.astype(np.float32) / 255
+            self.handles["splats"][0].opacities = opacities
             return
         self.handles["splats"] = [
             self._server.scene.add_gaussian_splats(
                 f"/{self._name}/splats",
-                self.place(self._shapes.means).astype(np.float32),
-                (self._shapes.covariances * self.per_metre**2).astype(np.float32),
+                self.place(self.shapes.means).astype(np.float32),
+                (self.shapes.covariances * self.per_metre**2).astype(np.float32),
                 rgb.astype(np.float32) / 255,
-                self._shapes.opacities[:, None].astype(np.float32),
+                opacities,
                 visible=visible,
             )
         ]
+
+    def is_inside(self) -> np.ndarray:
+        """Return which Gaussians [N] have their centres in the box that is shown."""
+        if self.box_m is None:
+            return np.ones(len(self.shapes.means), dtype=bool)
+        low, high = self.box_m
+        return np.all((self.shapes.means >= low) & (self.shapes.means <= high), axis=1)
+
+    def draw_name(self) -> None:
+        """Write the model's name above it, as is needed where two stand side by side."""
+        above = self.offset + np.array([0.0, 0.0, 1.15 * RADIUS])
+        self._server.scene.add_label(
+            f"/{self._name}/name", self.shown.name, position=tuple(above), anchor="bottom-center"
+        )
 
     def _overlay(self, colour: str) -> np.ndarray:
         if colour not in self._overlays:
@@ -140,6 +158,16 @@ class Placed:
         """Show or hide a part: splats, mesh, cameras, sun."""
         for handle in self.handles.get(part, ()):
             handle.visible = visible
+
+
+def states_time(session: Session, record: FrameRecord) -> bool:
+    """Return whether a frame's time is its own: pictures are imported in many formats that state none."""
+    return session.frames_imported is None or record.mid_exposure_utc_ns > YEAR_2000_NS
+
+
+def states_scale(session: Session) -> bool:
+    """Return whether the poses are in metres: those of a link are, and those that were exported from one."""
+    return session.frames_imported is None or all(states_time(session, record) for record in session.frames)
 
 
 def one_per_bracket(records: list[FrameRecord]) -> list[FrameRecord]:

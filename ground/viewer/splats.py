@@ -30,6 +30,11 @@ VIEWS = 12  # of the session's cameras over which the lowered peaks are averaged
 FRAMES = 24  # at most, that overlays are made of
 CHI2_SHOWN = (1.0, 100.0)  # from the darkest to the brightest colour
 DEVIATION_SHOWN = (0.003, 0.3)  # of full scale
+TARGET_SHARE, SEEN_FRAMES, NEAR_ENOUGH = (
+    0.6,
+    5,
+    2.5,
+)  # of full scale; frames looked at; factor between brackets
 NOT_SEEN = (90, 90, 110)  # colour of Gaussians that no frame shows
 RAMP = np.array(
     [[13, 8, 135], [126, 3, 168], [204, 71, 120], [248, 149, 64], [240, 249, 33]], dtype=float
@@ -109,6 +114,43 @@ def uncertainty_colours(shown: Shown) -> np.ndarray:
     radiance = C0 * deviations[:, 0].mean(dim=1)
     share = radiance / shown.sensor.full_scale_radiance(exposures_s[len(exposures_s) // 2])
     return _ramp(share, torch.ones(len(share), dtype=torch.bool), DEVIATION_SHOWN)
+
+
+def seen_exposure_s(shown: Shown) -> float:
+    """Return an exposure time at which the model is well seen: that of a bracket where one is near enough.
+
+    Well seen: nine tenths of what the middle frames show of the model are below TARGET_SHARE of full scale, and the
+    rest above.
+    """
+    session, sensor = shown.session, shown.sensor
+    radiances = []
+    for record in evenly_spread(session.frames, SEEN_FRAMES):
+        with torch.no_grad():
+            rendered = render(shown.gaussians, cameras_of(session, [record]))
+        radiances.append(
+            rendered.radiance[0].mean(dim=-1)[rendered.alpha[0].reshape(rendered.radiance.shape[1:3]) > 0.5]
+        )
+    lit = torch.cat(radiances)
+    exposures_s = sorted({record.exposure_time_s for record in session.frames})
+    if not len(lit) or not (bright := float(lit.quantile(0.9))) > 0:
+        return exposures_s[len(exposures_s) // 2]
+    wanted_s = TARGET_SHARE * sensor.full_scale_radiance(1.0) / bright
+    nearest_s = min(exposures_s, key=lambda time_s: abs(np.log(time_s / wanted_s)))
+    return nearest_s if 1 / NEAR_ENOUGH < nearest_s / wanted_s < NEAR_ENOUGH else wanted_s
+
+
+def legend(limits: tuple[float, float], unit: str) -> str:
+    """Return the scale of an overlay's colours as HTML: logarithmic, from its darkest to its brightest."""
+    stops = ", ".join(f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in RAMP)
+    low, high = limits
+    ticks = "".join(f"<span>{t:g}</span>" for t in (low, (low * high) ** 0.5, high))
+    grey = f"rgb{NOT_SEEN}"
+    return (
+        f'<div style="padding: 2px 14px 8px; font-size: 12px"><div style="height: 10px; border-radius: 3px; '
+        f'background: linear-gradient(90deg, {stops})"></div><div style="display: flex; '
+        f'justify-content: space-between">{ticks}</div>{unit}<br><span style="color: {grey}">■</span> seen by no frame'
+        "</div>"
+    )
 
 
 def _frames(session: Session) -> list:

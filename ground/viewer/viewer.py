@@ -2,6 +2,7 @@
 
 import logging
 import math
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -12,14 +13,25 @@ import numpy as np
 import torch
 import viser
 
-from ground.cameras import predicted_image, range_in_words
-from ground.exposures import offered_s
+from ground.cameras import predicted_image, range_in_words, sun_direction
+from ground.exposures import in_ms, offered_s
 from ground.pictures import ERROR_FULL_SCALE, heat, tone
-from ground.session import FrameRecord, SessionError
+from ground.session import FrameRecord, Session, SessionError
 from ground.turntable import VIEWS, circle, moving_png, pictures
 from ground.viewer.door import opened
-from ground.viewer.scene import COLOURS, RADIUS, SENSOR, Placed
+from ground.viewer.ruler import Ruler
+from ground.viewer.scene import (
+    COLOURS,
+    ERROR,
+    RADIUS,
+    SENSOR,
+    UNCERTAINTY,
+    Placed,
+    states_scale,
+    states_time,
+)
 from ground.viewer.source import Source
+from ground.viewer.splats import CHI2_SHOWN, DEVIATION_SHOWN, legend, seen_exposure_s
 from ground.viewer.waiting import awaited
 from obbgs_core.errors import ReconstructionError
 
@@ -36,6 +48,9 @@ REACH = 4.0
 DIGITS = 2  # that the exposure slider shows behind the first one of its shortest time
 PICTURE_PX = (1200, 800)
 TURNTABLE_PX = (480, 320)
+PHONE_PX = 600  # narrower screens are those of phones
+CHI2_WORDS = "chi²: mean squared residual over the variance of the noise; 1 is noise alone"
+DEVIATION_WORDS = "standard deviation of the radiance, as a share of full scale at the middle exposure"
 PARTS = ("splats", "cameras", "sun", "mesh")
 
 
@@ -89,7 +104,7 @@ class Viewer:
         self.frames = _in_time(placed[0])
         self._controls()
         self._start_camera()
-        server.on_client_connect(self._limit_zoom)
+        server.on_client_connect(self._welcome)
         for client in server.get_clients().values():  # who waited for the model
             self._reset(client)
         self.draw_all()
@@ -113,18 +128,23 @@ class Viewer:
         gui, session = self.server.gui, self.placed[0].shown.session
         self.status = gui.add_markdown("")
         exposures_s = sorted({record.exposure_time_s for record in session.frames})
-        middle_ms = 1e3 * exposures_s[len(exposures_s) // 2]
+        seen_s = float(
+            np.clip(seen_exposure_s(self.placed[0].shown), exposures_s[0] / REACH, exposures_s[-1] * REACH)
+        )
+        middle_ms = 1e3 * seen_s
         name = "Brightness, per mille" if session.nominal_exposures else "Exposure, ms"
         self.exposure = gui.add_slider(name, min=middle_ms, max=middle_ms, step=1.0, initial_value=middle_ms)
         self.exposure.on_update(lambda _: self.draw_splats())
         self.brackets = gui.add_button_group("Brackets, ms", [""], visible=not session.nominal_exposures)
         self.brackets.on_click(lambda _: self._expose(self.brackets.value))
         self.colouring = gui.add_dropdown("Colours", COLOURS, initial_value=SENSOR)
-        self.colouring.on_update(lambda _: self.draw_splats())
+        self.colouring.on_update(lambda _: self._colour_anew())
+        self.legend = gui.add_html("", visible=False)
         self.checks = {}
         for part in PARTS:
             self.checks[part] = gui.add_checkbox(part.capitalize(), initial_value=part in ("splats", "sun"))
             self.checks[part].on_update(lambda _: self._show())
+        self._measuring_controls()
         with gui.add_folder("Timeline of the pass"):
             self.timeline = gui.add_slider("Frame", min=0, max=1, step=1, initial_value=0)
             self.timeline.on_update(lambda _: self.draw_frame())
@@ -142,6 +162,57 @@ class Viewer:
         turntable.on_click(lambda event: self._save_turntable(event.client))
         self._fit_controls()
 
+    def _measuring_controls(self) -> None:
+        """Add the ruler and the box outside which nothing of the models is drawn."""
+        gui = self.server.gui
+        self.ruler = Ruler(self.server)
+        self.measuring = gui.add_checkbox("Ruler: click on two points", initial_value=False)
+        self.measuring.on_update(lambda _: self._measure())
+        self.length = gui.add_markdown("", visible=False)
+        self.crops = []
+        with gui.add_folder("Crop", expand_by_default=False):
+            reach_m = RADIUS / self.placed[0].per_metre
+            unit = "m" if states_scale(self.placed[0].shown.session) else "units"
+            for axis, middle in zip("xyz", self.placed[0].centre_m, strict=True):
+                ends = float(middle - 1.5 * reach_m), float(middle + 1.5 * reach_m)
+                crop = gui.add_multi_slider(f"{axis}, {unit}", *ends, step=reach_m / 100, initial_value=ends)
+                crop.on_update(lambda _: self._crop())
+                self.crops.append(crop)
+
+    def _colour_anew(self) -> None:
+        told = {ERROR: (CHI2_SHOWN, CHI2_WORDS), UNCERTAINTY: (DEVIATION_SHOWN, DEVIATION_WORDS)}.get(
+            self.colour
+        )
+        self.legend.visible = told is not None
+        if told is not None:
+            self.legend.content = legend(*told)
+        self.draw_splats()
+
+    def _measure(self) -> None:
+        """Take clicks for the ruler, or no longer."""
+        scene = self.server.scene
+        if self.measuring.value:
+            scene.on_click()(self._click)
+            self.length.content = "click on the first point"
+        else:
+            scene.remove_click_callback()
+            self.ruler.clear()
+        self.length.visible = bool(self.measuring.value)
+
+    def _click(self, event: viser.SceneClickEvent) -> None:
+        with self.lock:
+            origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+            if np.linalg.norm(direction) > 0:
+                self.length.content = self.ruler.click(self.placed, origin, direction)
+
+    def _crop(self) -> None:
+        ends = np.array([crop.value for crop in self.crops])
+        whole = np.array([(crop.min, crop.max) for crop in self.crops])
+        box_m = np.where(ends == whole, (-np.inf, np.inf), ends).T  # at a slider's end nothing is cut
+        for each in self.placed:
+            each.box_m = (box_m[0], box_m[1])
+        self.draw_splats()
+
     def _fit_controls(self) -> None:
         """Let the controls reach what there is to show; what was chosen stays where it still can be."""
         exposures_s = [record.exposure_time_s for record in self.frames]
@@ -153,6 +224,7 @@ class Viewer:
         self.offered_s = offered_s(exposures_s)
         self.brackets.options = tuple(self.offered_s)
         self.timeline.max = max(1, len(self.frames) - 1)
+        self.checks["sun"].visible = any(sun_direction(record) is not None for record in self.frames)
         self.checks["mesh"].visible = any(each.shown.mesh is not None for each in self.placed)
 
     def draw_all(self) -> None:
@@ -160,6 +232,8 @@ class Viewer:
         with self.lock:
             for each in self.placed:
                 each.draw_mesh(self._is_checked("mesh"))
+                if len(self.placed) > 1:
+                    each.draw_name()
             self.placed[0].draw_cameras(self.frames, self._choose, self._is_checked("cameras"))
             self.draw_frame()
             names = " | ".join(
@@ -178,7 +252,7 @@ class Viewer:
         """Draw what depends on the chosen frame: facts, pictures, the Sun and the splats' colours."""
         with self.lock:
             record, first = self.record, self.placed[0]
-            self.facts.content = _facts(record)
+            self.facts.content = _facts(first.shown.session, record)
             self.comparison.image = _compared(first, record)
             for each in self.placed:
                 each.draw_sun(record, self._is_checked("sun"))
@@ -189,6 +263,8 @@ class Viewer:
         shown, old = source.load(), self.placed[index]
         with self.lock:
             self.placed[index] = Placed(self.server, "ab"[index], shown, old.offset, old.per_metre)
+            self.placed[index].box_m = old.box_m
+            self.ruler.clear()
             old.clear()
             if index == 0:
                 self.frames = _in_time(self.placed[0])
@@ -220,6 +296,12 @@ class Viewer:
         camera.position, camera.look_at = self.start
         camera.near, camera.far = RADIUS / 10, 100 * RADIUS
 
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Limit a new viewer's zoom; on a narrow screen the panel starts folded, or it would hide the model."""
+        self._limit_zoom(client)
+        if 0 < client.camera.image_width < PHONE_PX:
+            client.gui.main_panel.minimize()
+
     def _limit_zoom(self, client: viser.ClientHandle) -> None:
         client.camera.max_orbit_distance = FARTHEST * RADIUS
         client.camera.min_orbit_distance = NEAREST * RADIUS
@@ -248,12 +330,19 @@ class Viewer:
         client.camera.position = position
         client.camera.look_at = position + distance * forward
 
+    def file_name(self, what: str) -> str:
+        """Return the name of a picture to save: of which models, frame and exposure time it is."""
+        names = "-and-".join(each.shown.name for each in self.placed)
+        exposure = "" if self.placed[0].shown.session.nominal_exposures else f"-{in_ms(self.exposure_s)}ms"
+        text = f"{names}-frame{self.record.id:06d}{exposure}-{what}.png"
+        return re.sub(r"[^A-Za-z0-9._-]+", "-", text)
+
     def _save_picture(self, client: viser.ClientHandle | None) -> None:
         if client is not None:
             width, height = PICTURE_PX
             image = client.get_render(height, width, transport_format="png", timeout=60)
             png = imagecodecs.png_encode(np.ascontiguousarray(on_black(image)))
-            client.send_file_download("view.png", bytes(png))
+            client.send_file_download(self.file_name("view"), bytes(png), save_immediately=True)
 
     def _save_turntable(self, client: viser.ClientHandle | None) -> None:
         """Send the first model's turntable, drawn by our own renderer at the chosen exposure."""
@@ -261,7 +350,7 @@ class Viewer:
             shown = self.placed[0].shown
             cameras = circle(shown.gaussians, shown.session, VIEWS, *TURNTABLE_PX)
             images = pictures(shown.gaussians, shown.session, shown.sensor, self.exposure_s, cameras)
-            client.send_file_download("turntable.png", moving_png(images))
+            client.send_file_download(self.file_name("turntable"), moving_png(images), save_immediately=True)
 
 
 def _in_time(placed: Placed) -> list[FrameRecord]:
@@ -283,12 +372,17 @@ def _fitting_distance(models: int) -> float:
     return 1.35 * width / np.tan(FIELD_RAD / 2)
 
 
-def _facts(record: FrameRecord) -> str:
-    taken = datetime.fromtimestamp(record.mid_exposure_utc_ns / 1e9, UTC)
-    return (
-        f"frame {record.id} of bracket {record.bracket}, {1e3 * record.exposure_time_s:g} ms, {taken:%H:%M:%S}, "
-        f"{range_in_words(record)}, {record.saturated:,} pixels saturated"
-    )
+def _facts(session: Session, record: FrameRecord) -> str:
+    """Return what is known of a frame; of imported pictures only what their format states."""
+    facts = [f"frame {record.id} of bracket {record.bracket}"]
+    if not session.nominal_exposures:
+        facts.append(f"{1e3 * record.exposure_time_s:g} ms")
+    if states_time(session, record):
+        facts.append(f"{datetime.fromtimestamp(record.mid_exposure_utc_ns / 1e9, UTC):%H:%M:%S}")
+    if states_scale(session):
+        facts.append(range_in_words(record))
+    facts.append(f"{record.saturated:,} pixels saturated")
+    return ", ".join(facts)
 
 
 def _compared(placed: Placed, record: FrameRecord) -> np.ndarray:

@@ -26,9 +26,9 @@ from ground.cameras import predicted_image
 from ground.live import reconstruct_live
 from ground.pictures import tone
 from ground.session import SessionError
-from ground.viewer import splats, viewer
+from ground.viewer import ruler, splats, viewer
 from ground.viewer.door import ViewError, opened, refused
-from ground.viewer.scene import Placed
+from ground.viewer.scene import UNCERTAINTY, Placed
 from ground.viewer.source import Shown, Source
 from obbgs_base.errors import Interrupted
 from obbgs_core.io.mesh import save_mesh
@@ -440,3 +440,128 @@ def waited_for(what, seconds: float = 100):
         assert time.monotonic() < end_s
         time.sleep(0.1)
     return value
+
+
+@pytest.fixture
+def bare(session):
+    """A server with the ball of `solid` in its scene, and the viewer of it."""
+    shown = dataclasses.replace(Source(session).load(), gaussians=solid("camera"))
+    server = opened("127.0.0.1", 0)
+    try:
+        yield viewer.Viewer(server, [Placed(server, "a", shown, np.zeros(3))])
+    finally:
+        server.stop()
+
+
+def test_the_ruler_measures_a_ball_along_its_diameter(bare):
+    """The ball has a radius of 0.9 m; rays along x and against it strike its two sides."""
+    placed = bare.placed[0]
+    far = np.array([5 * placed.per_metre, 0.0, 0.0])
+    middle = placed.place(np.zeros(3))
+    ends = [ruler.struck(placed, middle + sign * far, -sign * far) for sign in (1, -1)]
+    assert ends[0] is not None and ends[1] is not None
+    np.testing.assert_allclose(ends[0], [0.9, 0, 0], atol=0.1)  # the Gaussians are 0.05 m wide
+    np.testing.assert_allclose(ends[1], [-0.9, 0, 0], atol=0.1)
+    assert ruler.struck(placed, middle + far + [0, 2 * placed.per_metre, 0], -far) is None
+    assert bare.ruler.click(bare.placed, middle + far, -far) == "click on the second point"
+    told = bare.ruler.click(bare.placed, middle - far, far)
+    assert "± " in told and float(told.split()[0]) == pytest.approx(1.8, abs=0.2)
+    assert "/ruler/length" in bare.server.scene._handle_from_node_name
+    bare.ruler.clear()
+    assert "/ruler/length" not in bare.server.scene._handle_from_node_name
+
+
+def test_the_stated_error_of_sizes_is_that_of_the_ranges(session):
+    """Independent range errors average out over the brackets, those that all tags share do not."""
+    shown = Source(session).load()
+
+    def stated(correlation_time_s: float) -> float:
+        records = tuple(
+            dataclasses.replace(r, covariance=np.diag([0.08, 0.08, 0.08, 0, 0, 0]) ** 2)
+            for r in shown.session.frames
+        )
+        navigation = dataclasses.replace(shown.session.navigation, correlation_time_s=correlation_time_s)
+        tagged = dataclasses.replace(shown.tagged, frames=records, navigation=navigation)
+        return ruler.size_deviation(dataclasses.replace(shown, tagged=tagged))
+
+    assert ruler.size_deviation(shown) == 0  # these poses are exact
+    assert stated(0.0) == pytest.approx(0.01 / 24**0.5, rel=0.02)  # 0.08 m at 8 m, in 24 brackets
+    assert stated(1e12) == pytest.approx(0.01, rel=0.02)
+
+
+def test_a_crop_hides_what_lies_outside_and_a_slider_at_its_end_cuts_nothing(bare):
+    placed = bare.placed[0]
+    handle = placed.handles["splats"][0]
+    whole = np.asarray(handle.opacities).copy()
+    bare.crops[0].value = (0.0, bare.crops[0].max)
+    bare._crop()
+    right = placed.shapes.means[:, 0] >= 0
+    assert 0 < right.sum() < len(right)
+    assert (np.asarray(handle.opacities)[~right] == 0).all()
+    np.testing.assert_array_equal(np.asarray(handle.opacities)[right], whole[right])
+    bare.crops[0].value = (bare.crops[0].min, bare.crops[0].max)
+    bare._crop()
+    np.testing.assert_array_equal(np.asarray(handle.opacities), whole)
+
+
+def test_at_first_the_exposure_is_one_at_which_the_target_is_seen(session):
+    """A model a thousand times as faint is exposed longer than any frame was, a bright one less."""
+    shown = Source(session).load()
+    usual_s = splats.seen_exposure_s(shown)
+    assert usual_s in {record.exposure_time_s for record in shown.session.frames}
+    for factor in (1e-3, 1e3):
+        sensor = dataclasses.replace(shown.sensor, dn_per_radiance_s=factor * shown.sensor.dn_per_radiance_s)
+        seen_s = splats.seen_exposure_s(dataclasses.replace(shown, sensor=sensor))
+        assert usual_s / factor / 10 < seen_s < 10 * usual_s / factor
+
+
+def test_imported_pictures_show_no_time_range_or_sun_that_nobody_stated(session):
+    shown = Source(session).load()
+    record = dataclasses.replace(
+        shown.session.frames[3], sun_dir_body=np.zeros(3), mid_exposure_utc_ns=3 * 10**9
+    )
+    linked = dataclasses.replace(shown.session, frames_imported=None)
+    assert " m" in viewer._facts(linked, record) and "00:00:03" in viewer._facts(linked, record)
+    plain = tuple(dataclasses.replace(r, sun_dir_body=np.zeros(3), mid_exposure_utc_ns=r.id * 10**9,
+                                      exposure_time_s=1.0) for r in shown.session.frames)  # fmt: skip
+    imported = dataclasses.replace(shown.session, frames_imported=24, frames=plain)
+    facts = viewer._facts(imported, plain[3])
+    assert facts == f"frame 3 of bracket {plain[3].bracket}, {plain[3].saturated:,} pixels saturated"
+    server = opened("127.0.0.1", 0)
+    try:
+        shown = dataclasses.replace(shown, session=imported, tagged=imported)
+        page = viewer.Viewer(server, [Placed(server, "a", shown, np.zeros(3))])
+        assert not page.checks["sun"].visible and page.placed[0].handles["sun"] == []
+        assert "ms" not in page.file_name("view") and page.file_name("view").startswith("A-run-frame000000")
+        assert "units of the imported poses" in ruler.measured(shown, np.zeros(3), np.ones(3))
+    finally:
+        server.stop()
+
+
+def test_on_a_phone_the_panel_is_folded_two_runs_have_names_and_overlays_a_legend(session):
+    """In the browser: a narrow page shows no control, a wide one names and the legend; a picture is saved at once."""
+    shown = dataclasses.replace(Source(session).load(), gaussians=solid("camera"))
+    server = opened("127.0.0.1", 0)
+    try:
+        first = Placed(server, "a", shown, np.zeros(3))
+        second = Placed(
+            server, "b", dataclasses.replace(shown, name="A/other"), np.array([24.0, 0, 0]), first.per_metre
+        )
+        page_viewer = viewer.Viewer(server, [first, second])
+        url = f"http://127.0.0.1:{server.get_port()}"
+        with chromium() as browser:
+            with page_of(browser, url, 390, 700, known=VISERS) as page:
+                waited_for(server.get_clients)
+                page.get_by_text("Save picture").wait_for(state="hidden")
+            with page_of(browser, url, 800, 600, known=VISERS) as page:
+                page.get_by_text("A/other", exact=True).wait_for()
+                page.get_by_text("Save picture").wait_for()
+                assert page.get_by_text("seen by no frame").count() == 0
+                page_viewer.colouring.value = UNCERTAINTY
+                page_viewer._colour_anew()
+                page.get_by_text("seen by no frame").wait_for()
+                with page.expect_download() as saved:
+                    page.get_by_text("Save picture").click()
+                assert saved.value.suggested_filename == page_viewer.file_name("view")
+    finally:
+        server.stop()

@@ -20,6 +20,11 @@ CAMERA = {
     **{"fov": 0.4, "near": 0.1, "far": 100, "image_height": 700, "image_width": 900},
 }
 CLICK = {"type": "SceneNodeClickMessage", "name": "/a", "instance_index": None, "screen_pos": [0.1, 0.2]}
+POINTER = {
+    "type": "ScenePointerMessage",
+    **{"event_type": "click", "ray_origin": [0, 0, 9], "ray_direction": [0, 0, -1]},
+    **{"screen_pos": [[0.5, 0.5]], "modifier": None},
+}
 
 
 def update(**updates) -> dict:
@@ -27,9 +32,10 @@ def update(**updates) -> dict:
 
 
 GOOD = [
-    *(update(value=value) for value in (True, 3, 0.05, "misfit")),
+    *(update(value=value) for value in (True, 3, 0.05, "misfit", [-1.5, 2])),
     CAMERA,
     CLICK,
+    POINTER,
     {"type": "GetRenderResponseMessage", "payload": b"\0" * 100_000, "render_uuid": "r"},
 ]
 BAD = [
@@ -44,8 +50,11 @@ BAD = [
     (update(value=1, removed=True), "sets only the value"),
     (update(update_cb="x"), "sets only the value"),
     ({"type": "GuiUpdateMessage", "uuid": "u", "updates": []}, "sets only the value"),
-    (update(value=[1, 2]), "a number or a text"),
-    (update(value=None), "a number or a text"),
+    (update(value=[1, 2, 3]), "a number, a text or two numbers"),
+    (update(value=[1, "2"]), "a number, a text or two numbers"),
+    (update(value=[1, math.nan]), "out of range"),
+    (update(value=None), "a number, a text or two numbers"),
+    (POINTER | {"ray_origin": [0, 0, math.inf]}, "out of range"),
     (update(value=math.nan), "out of range"),
     (
         update(value=-1e300),
