@@ -4,8 +4,13 @@ import contextlib
 import dataclasses
 import json
 import math
+import os
+import select
+import sys
+import termios
+import tty
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -27,6 +32,10 @@ PLAIN_S, JSON_S = 10.0, 1.0  # between lines where there is no screen
 RATE_WINDOW_S = 5.0
 SILENT_S = 3.0  # without a packet the link counts as silent; housekeeping comes every second
 EVENTS_SHOWN = 10
+ALARMS_SHOWN = 8
+WIDE, HIGH = 120, 45  # columns and lines from which all panels have room at once; else keys switch them
+PANELS = ("alarms and events", "link", "spacecraft", "files", "picture", "model")
+TENDED = ("store_failures", "frames_rejected")  # counts of the ground that somebody has to look at
 FILES_SHOWN = 8
 HOUSEKEEPING = DICTIONARY.telemetry["housekeeping"]
 COLOURS = {"green": "green", "yellow": "yellow", "red": "bold red"}
@@ -50,13 +59,14 @@ def statuses_shown(console: Console, as_json: bool, link: str, session: Path) ->
     On a terminal they draw a screen; elsewhere they print a line every ten seconds and each event; with `as_json` a
     line of JSON on stdout every second and for each event.
     """
-    view, next_line_s = ConsoleView(link, session), float("-inf")
+    view, next_line_s, refused = ConsoleView(link, session), float("-inf"), ""
     live = console.is_terminal and not as_json
 
     def on_status(status: Status) -> None:
         nonlocal next_line_s
         if live:
-            screen.update(view.draw(status), refresh=True)
+            view.press(keys())
+            screen.update(view.draw(status, *console.size), refresh=True)
         elif status.now_s >= next_line_s:
             next_line_s = status.now_s + (JSON_S if as_json else PLAIN_S)
             if as_json:
@@ -68,16 +78,42 @@ def statuses_shown(console: Console, as_json: bool, link: str, session: Path) ->
                 console.print(view.line(status), markup=False, highlight=False, soft_wrap=True)
 
     def on_event(event: dict[str, Any]) -> None:
+        nonlocal refused
+        is_again = event.get("event") == "command_refused" and event["text"] == refused
+        refused = event["text"] if event.get("event") == "command_refused" else refused
         if as_json:
             print(json.dumps({"type": "event"} | event), flush=True)
-        elif not live:
+        elif (
+            not live and not is_again
+        ):  # a command that is resent is refused again; housekeeping counts how often
             text = f"{event['severity']}: {event['text']}"
             console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     # Refreshed by on_status, so that no thread of rich's can fail unseen.
     screen = Live(console=console, auto_refresh=False, transient=True)
-    with screen if live else contextlib.nullcontext():
+    with keys_pressed() as keys, screen if live else contextlib.nullcontext():
         yield on_status, on_event
+
+
+@contextlib.contextmanager
+def keys_pressed() -> Iterator[Callable[[], str]]:
+    """Give a function that returns what was typed since the last call, without waiting; "" where nobody can type."""
+    try:
+        descriptor = sys.stdin.fileno()
+        before = termios.tcgetattr(descriptor)
+    except (AttributeError, ValueError, OSError, termios.error):  # no terminal
+        yield lambda: ""
+        return
+
+    def typed() -> str:
+        ready, _, _ = select.select([descriptor], [], [], 0)
+        return os.read(descriptor, 100).decode(errors="ignore") if ready else ""
+
+    tty.setcbreak(descriptor)  # single keys; Ctrl-C still ends the command
+    try:
+        yield typed
+    finally:
+        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
 
 
 class ConsoleView:
@@ -87,6 +123,15 @@ class ConsoleView:
         self._link, self._session = link, session
         self._picture = LatestPicture(session)
         self._history: deque[tuple[float, int, int]] = deque()
+        self.panel = PANELS[0]  # the one that a small terminal shows
+
+    def press(self, keys: str) -> None:
+        """Switch the panel: 1, 2 ... name one, any other letter, space or tab goes to the next."""
+        for key in keys:
+            if key.isdigit():
+                self.panel = PANELS[min(max(int(key), 1), len(PANELS)) - 1]
+            elif key.isalpha() or key in " \t":
+                self.panel = PANELS[(PANELS.index(self.panel) + 1) % len(PANELS)]
 
     def rates(self, status: Status) -> tuple[float, float] | None:
         """Return bytes per second down and up since the latest status at least five seconds old; None at first.
@@ -101,9 +146,11 @@ class ConsoleView:
         elapsed_s = now[0] - then[0]
         return ((now[1] - then[1]) / elapsed_s, (now[2] - then[2]) / elapsed_s) if elapsed_s > 0 else None
 
-    def draw(self, status: Status) -> RenderableType:
-        """Return the screen."""
+    def draw(self, status: Status, width: int = 160, height: int = 60) -> RenderableType:
+        """Return the screen for a terminal of so many columns and lines."""
         down, up = self.rates(status) or (0.0, 0.0)
+        if width < WIDE or height < HIGH:
+            return self._draw_small(status, down, up, height)
         top = Table.grid(expand=True, padding=(0, 1))
         top.add_column(ratio=1)
         top.add_column(ratio=1)
@@ -113,15 +160,37 @@ class ConsoleView:
         name = Text.assemble("session ", (printable(str(self._session)), "bold"))
         model = [Panel(Text(model_line(status.model)), title="model")] if status.model else []
         left = Group(
+            Panel(_alarms_and_events(status, ALARMS_SHOWN + EVENTS_SHOWN), title="alarms and events"),
             Panel(_files(status, down), title=name),
             *model,
-            Panel(_commands_and_events(status), title="events"),
         )
         bottom = Table.grid(expand=True, padding=(0, 1))
         bottom.add_column(ratio=1)
         bottom.add_column(width=COLUMNS + 4)
         bottom.add_row(left, Panel(picture, title=self._picture.name or "latest picture"))
         return Group(top, bottom)
+
+    def _draw_small(self, status: Status, down: float, up: float, height: int) -> RenderableType:
+        """Return a line of the link's state, one panel, and a line of the keys that switch panels."""
+        state, colour = link_state(status)
+        summary = status.summary
+        head = Text.assemble(
+            (f"link {state}", colour),
+            f"  {size(down)}/s down, {size(up)}/s up  frames {summary.frames_in_session} / {captured(status)}",
+            no_wrap=True,
+            overflow="ellipsis",
+        )
+        body: dict[str, Callable[[], RenderableType]] = {
+            "alarms and events": lambda: _alarms_and_events(status, height - 4),
+            "link": lambda: _link(status, down, up),
+            "spacecraft": lambda: _flight(status),
+            "files": lambda: _files(status, down),
+            "picture": lambda: self._picture.after(summary.thumbnails_received, summary.frames_in_session),
+            "model": lambda: Text(model_line(status.model) if status.model else "none is made meanwhile"),
+        }
+        panel = Panel(body[self.panel](), title=self.panel, height=height - 2)
+        names = "  ".join(f"{number} {name}" for number, name in enumerate(PANELS, start=1))
+        return Group(head, panel, Text(names, "dim", no_wrap=True, overflow="ellipsis"))
 
     def line(self, status: Status) -> str:
         """Return the status in one line of text."""
@@ -234,12 +303,48 @@ def _files(status: Status, down: float) -> RenderableType:
     return table
 
 
-def _commands_and_events(status: Status) -> RenderableType:
-    lines = [Text(f"command {name} {counter}: {stage}", "cyan") for counter, name, stage in status.commands]
-    for event in status.events[-EVENTS_SHOWN:]:
-        seconds = event["received_utc_ns"] // 10**9
-        lines.append(Text(f"{utc(seconds)}  {printable(event['text'])}", SEVERITIES[event["severity"]]))
-    return Group(*lines) if lines else Text("none")
+def alarms(status: Status) -> list[tuple[str, str]]:
+    """Return what is wrong now and the colour of each: red before yellow."""
+    found = []
+    state, colour = link_state(status)
+    if colour != "green":
+        found.append((f"link {state}", colour))
+    for item in HOUSEKEEPING.items:
+        if item.name in status.housekeeping:
+            limit = item.limit(status.housekeeping[item.name])
+            if limit != "green":
+                value = shown(item.name, status.housekeeping[item.name])
+                found.append((f"{item.name.replace('_', ' ')} {value}", COLOURS[limit]))
+    for name in TENDED:
+        if count := getattr(status.summary, name):
+            found.append((f"{name.replace('_', ' ')} on the ground {count:,}", "yellow"))
+    return sorted(found, key=lambda alarm: "red" not in alarm[1])
+
+
+def events_once(events: list[dict[str, Any]]) -> list[tuple[dict[str, Any], int]]:
+    """Return events, the newest first, each sentence once with how often it came: resending repeats a refusal."""
+    counts: dict[str, int] = {}
+    newest: dict[str, dict[str, Any]] = {}
+    for event in reversed(events):
+        newest.setdefault(event["text"], event)
+        counts[event["text"]] = counts.get(event["text"], 0) + 1
+    return [(event, counts[text]) for text, event in newest.items()]
+
+
+def _alarms_and_events(status: Status, most: int) -> RenderableType:
+    """Return alarms, then commands under way, then events, the newest first; at most so many lines."""
+    lines = [Text(f"! {text}", colour) for text, colour in alarms(status)]
+    if len(lines) > ALARMS_SHOWN:
+        more = len(lines) - ALARMS_SHOWN + 1
+        lines = [*lines[: ALARMS_SHOWN - 1], Text(f"! {more} more: see link and spacecraft", "yellow")]
+    lines += [Text(f"command {name} {counter}: {stage}", "cyan") for counter, name, stage in status.commands]
+    for event, count in events_once(status.events):
+        times = f" ({count} times)" if count > 1 else ""
+        text = f"{utc(event['received_utc_ns'] // 10**9)}  {printable(event['text'])}{times}"
+        lines.append(Text(text, SEVERITIES[event["severity"]]))
+    for line in lines:
+        line.no_wrap, line.overflow = True, "ellipsis"
+    return Group(*lines[: max(1, most)]) if lines else Text("no alarm, no event")
 
 
 def _rows(rows: list[tuple[str, Text]]) -> Table:

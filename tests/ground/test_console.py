@@ -2,19 +2,23 @@
 
 import io
 import json
+import os
+import select
+import termios
 from pathlib import Path
 
 import imagecodecs
 import numpy as np
 import pytest
 from rich.console import Console
+from rich.text import Text
 
 from flightsw.icd.command import Report
 from flightsw.icd.frame import HEADER, encode_frame
 from flightsw.icd.packet import APID_EVENTS, APID_FRAME_HEADERS, APID_HOUSEKEEPING, APID_REPORTS
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import Incoming
-from ground.console import PLAIN_S, ConsoleView, link_state, shown, size
+from ground.console import PLAIN_S, ConsoleView, events_once, keys_pressed, link_state, shown, size
 from ground.ingest import ListenSummary, Status
 from ground.telemetry import TelemetryLog
 from ground.terminal_pictures import COLUMNS, LatestPicture, stretched
@@ -49,10 +53,12 @@ def status(**changes) -> Status:
     return Status(**values | changes)
 
 
-def screen(view: ConsoleView, now: Status) -> str:
+def screen(view: ConsoleView, now: Status, width: int = 160, height: int = 60) -> str:
     """Return the screen with its colours as a terminal gets it."""
-    console = Console(file=io.StringIO(), force_terminal=True, width=160, height=60, color_system="standard")
-    console.print(view.draw(now))
+    console = Console(
+        file=io.StringIO(), force_terminal=True, width=width, height=height, color_system="standard"
+    )
+    console.print(view.draw(now, width, height))
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
 
@@ -247,3 +253,58 @@ def test_pictures_of_any_shape_fit_the_panel(shape):
     image = stretched(rng.integers(0, 4096, shape, dtype=np.uint16))
     assert image.shape[0] % 2 == 0 and image.shape[1] <= COLUMNS and image.shape[2] == 3
     assert (stretched(np.full(shape, 7, np.uint16)) == 0).all()
+
+
+def test_a_terminal_of_80_columns_and_24_lines_shows_alarms_then_events_and_keys_switch_panels():
+    """Twenty newer events do not push a red alarm off the screen, and nothing is wider or higher than it."""
+    events = [{"received_utc_ns": n, "text": f"event {n} {'x' * 90}", "severity": "info"} for n in range(30)]
+    now = status(housekeeping=housekeeping(disk_free_bytes=10**7, cpu_percent=95.0), events=events)
+    view = ConsoleView(LINK, HERE)
+
+    def plain(now: Status) -> list[str]:
+        return Text.from_ansi(screen(view, now, 80, 24)).plain.splitlines()
+
+    lines = plain(now)
+    assert len(lines) <= 24 and max(map(len, lines)) <= 80
+    assert "disk free bytes 10.0 MB" in lines[2] and "cpu percent 95.0 %" in lines[3]
+    assert "event 29" in lines[4] and "event 28" in lines[5]
+    assert "2 link" in lines[-1]
+    for key, told in (
+        ("3", "outbox frames"),
+        ("2", "packets missing"),
+        ("4", "none in flight"),
+        ("1", "event 29"),
+    ):
+        view.press(key)
+        drawn = plain(now)
+        assert told in "\n".join(drawn) and len(drawn) <= 24
+    view.press("n")
+    assert "packets missing" in "\n".join(plain(now))
+
+
+def test_a_refusal_that_came_several_times_is_shown_once_and_counted():
+    refusal = {"received_utc_ns": 0, "text": "command refused: forged", "severity": "warning"}
+    other = refusal | {"text": "bracket 7 lost"}
+    now = status(events=[refusal, other, refusal, refusal])
+    drawn = screen(ConsoleView(LINK, HERE), now)
+    assert drawn.count("command refused: forged") == 1 and "forged (3 times)" in drawn
+    assert [count for _, count in events_once(now.events)] == [3, 1]
+
+
+def test_keys_are_read_from_a_terminal_one_by_one_and_it_is_left_as_it_was(monkeypatch):
+    master, slave = os.openpty()
+    try:
+        with open(slave, closefd=False) as stdin:
+            monkeypatch.setattr("sys.stdin", stdin)
+            before = termios.tcgetattr(slave)
+            with keys_pressed() as keys:
+                assert keys() == ""
+                os.write(master, b"3")  # no line feed
+                assert select.select([slave], [], [], 10)[0] and keys() == "3"
+            assert termios.tcgetattr(slave) == before
+        monkeypatch.setattr("sys.stdin", io.StringIO())
+        with keys_pressed() as keys:
+            assert keys() == ""
+    finally:
+        os.close(master)
+        os.close(slave)
