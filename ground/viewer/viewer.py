@@ -48,7 +48,6 @@ REACH = 4.0
 DIGITS = 2  # that the exposure slider shows behind the first one of its shortest time
 PICTURE_PX = (1200, 800)
 TURNTABLE_PX = (480, 320)
-PHONE_PX = 600  # narrower screens are those of phones
 CHI2_WORDS = "chi²: mean squared residual over the variance of the noise; 1 is noise alone"
 DEVIATION_WORDS = "standard deviation of the radiance, as a share of full scale at the middle exposure"
 PARTS = ("splats", "cameras", "sun", "mesh")
@@ -104,7 +103,7 @@ class Viewer:
         self.frames = _in_time(placed[0])
         self._controls()
         self._start_camera()
-        server.on_client_connect(self._welcome)
+        server.on_client_connect(self._limit_zoom)
         for client in server.get_clients().values():  # who waited for the model
             self._reset(client)
         self.draw_all()
@@ -295,12 +294,6 @@ class Viewer:
         camera.fov = FIELD_RAD
         camera.position, camera.look_at = self.start
         camera.near, camera.far = RADIUS / 10, 100 * RADIUS
-
-    def _welcome(self, client: viser.ClientHandle) -> None:
-        """Limit a new viewer's zoom; on a narrow screen the panel starts folded, or it would hide the model."""
-        self._limit_zoom(client)
-        if 0 < client.camera.image_width < PHONE_PX:
-            client.gui.main_panel.minimize()
 
     def _limit_zoom(self, client: viser.ClientHandle) -> None:
         client.camera.max_orbit_distance = FARTHEST * RADIUS
