@@ -5,6 +5,7 @@ What that page could not have said ends its connection before viser acts on it.
 
 import contextlib
 import functools
+import gzip
 import http
 import io
 import ipaddress
@@ -24,6 +25,17 @@ from obbgs_base.errors import ObbgsError
 
 log = logging.getLogger(__name__)
 POLICY_VIOLATION = 1008  # RFC 6455, section 7.4.1
+LABEL = "obbgs"  # of the panel
+# viser has no setting for it: its panel covers most of a narrow screen until its title is touched
+FOLD_ON_A_PHONE = b"""<script>
+if (innerWidth < 600) {
+  const look = setInterval(() => {
+    const isTitle = (e) => e.children.length === 0 && e.textContent.trim() === "obbgs";
+    const title = [...document.querySelectorAll("body *")].find(isTitle);
+    if (title) { clearInterval(look); title.click(); }
+  }, 300);
+}
+</script>"""
 LONGEST_REASON = 120  # bytes; section 5.5 allows 123
 
 
@@ -39,7 +51,7 @@ def opened(host: str, port: int) -> viser.ViserServer:
     """
     _check_free(host, port)
     with _guarded(host), contextlib.redirect_stdout(io.StringIO()):  # it prints its address, and we ours
-        server = viser.ViserServer(host=host, port=port, label="obbgs", verbose=False)
+        server = viser.ViserServer(host=host, port=port, label=LABEL, verbose=False)
     if port and server.get_port() != port:
         server.stop()
         raise ViewError(_taken(host, port, "it was taken meanwhile"))
@@ -80,7 +92,7 @@ def _guarded(host: str) -> Iterator[None]:
         def first(connection, request: Request) -> Response | None:
             if (reason := refused(request, host)) is not None:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
-            return process_request(connection, request)
+            return _folding(process_request(connection, request))
 
         return serve(checking, *args, process_request=first, **options)
 
@@ -89,6 +101,19 @@ def _guarded(host: str) -> Iterator[None]:
         yield
     finally:
         websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _folding(response: Response | None) -> Response | None:
+    """Return viser's page with a program that folds its panel on a phone; anything else as it is."""
+    if response is None or not response.headers.get("Content-Type", "").startswith("text/html"):
+        return response
+    zipped = response.headers.get("Content-Encoding") == "gzip"
+    page = gzip.decompress(response.body) if zipped else response.body
+    body = page.replace(b"</body>", FOLD_ON_A_PHONE + b"</body>", 1)
+    response.body = gzip.compress(body) if zipped else body
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
+    return response
 
 
 class _Checked:

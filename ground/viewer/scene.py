@@ -49,8 +49,9 @@ class Placed:
         self.per_metre = RADIUS / radius_m if per_metre is None else per_metre
         self.shapes = shapes(shown)
         self.box_m: tuple[np.ndarray, np.ndarray] | None = None  # what is shown of it; None: all
+        self._cropped_to = self.box_m  # as the splats in the scene are
         self._overlays: dict[str, np.ndarray] = {}
-        self.handles: dict[str, list[Any]] = {"cameras": [], "sun": [], "mesh": []}
+        self.handles: dict[str, list[Any]] = {"cameras": [], "sun": [], "mesh": [], "name": []}
 
     def place(self, point_m: np.ndarray) -> np.ndarray:
         """Return where a point [..., 3] of the body frame, m, lies in the scene."""
@@ -62,8 +63,11 @@ class Placed:
         opacities = (self.shapes.opacities * self.is_inside())[:, None].astype(np.float32)
         if "splats" in self.handles:  # drawn anew they would fade in again
             self.handles["splats"][0].rgbs = rgb.astype(np.float32) / 255
-            self.handles["splats"][0].opacities = opacities
+            if self._cropped_to is not self.box_m:
+                self.handles["splats"][0].opacities = opacities
+                self._cropped_to = self.box_m
             return
+        self._cropped_to = self.box_m
         self.handles["splats"] = [
             self._server.scene.add_gaussian_splats(
                 f"/{self._name}/splats",
@@ -85,9 +89,10 @@ class Placed:
     def draw_name(self) -> None:
         """Write the model's name above it, as is needed where two stand side by side."""
         above = self.offset + np.array([0.0, 0.0, 1.15 * RADIUS])
-        self._server.scene.add_label(
+        label = self._server.scene.add_label(
             f"/{self._name}/name", self.shown.name, position=tuple(above), anchor="bottom-center"
         )
+        self.handles["name"] = [label]
 
     def _overlay(self, colour: str) -> np.ndarray:
         if colour not in self._overlays:
@@ -146,7 +151,7 @@ class Placed:
 
     def clear(self) -> None:
         """Take the model out of the scene, but for its splats, which those of the next one replace without a gap."""
-        for part in ("cameras", "sun", "mesh"):
+        for part in ("cameras", "sun", "mesh", "name"):
             self._remove(part)
 
     def _remove(self, part: str) -> None:
@@ -155,7 +160,7 @@ class Placed:
         self.handles[part] = []
 
     def show(self, part: str, visible: bool) -> None:
-        """Show or hide a part: splats, mesh, cameras, sun."""
+        """Show or hide a part: splats, mesh, cameras, sun, name."""
         for handle in self.handles.get(part, ()):
             handle.visible = visible
 

@@ -263,6 +263,7 @@ def test_the_page_draws_the_splats_and_its_controls_work(session):
         second = Placed(server, "b", shown, np.array([24.0, 0, 0]), first.per_metre)
         page_viewer = viewer.Viewer(server, [first, second])
         second.show("splats", False)  # it stands in the picture that is compared
+        first.show("name", False)  # so does this
         with (
             chromium() as browser,
             page_of(browser, f"http://127.0.0.1:{server.get_port()}", 700, 700, known=VISERS) as page,
@@ -369,6 +370,7 @@ def test_controls_follow_a_run_that_gets_a_mesh_and_frames_of_other_exposures(se
     try:
         shown = viewer.Viewer(server, [Placed(server, "a", source.load(), np.zeros(3))])
         assert shown.brackets.options == ("0.05", "0.1", "0.2")
+        shown.exposure.value = 0.1
         with (
             chromium() as browser,
             page_of(browser, f"http://127.0.0.1:{server.get_port()}", known=VISERS) as page,
@@ -562,3 +564,14 @@ def test_two_runs_have_names_overlays_a_legend_and_a_picture_is_saved_at_once(se
             assert saved.value.suggested_filename == page_viewer.file_name("view")
     finally:
         server.stop()
+
+
+def test_on_a_phone_the_panel_starts_folded_and_a_touch_opens_it(bare):
+    """In the browser, 390 pixels wide: the model has the screen, and its controls are one touch away."""
+    url = f"http://127.0.0.1:{bare.server.get_port()}"
+    with chromium() as browser, page_of(browser, url, 390, 700, known=VISERS) as page:
+        title = page.get_by_text("obbgs", exact=True).first
+        title.wait_for()
+        waited_for(lambda: title.bounding_box()["y"] > 600)
+        title.click()
+        waited_for(lambda: title.bounding_box()["y"] < 600)
