@@ -263,7 +263,8 @@ def test_the_page_draws_the_splats_and_its_controls_work(session):
         second = Placed(server, "b", shown, np.array([24.0, 0, 0]), first.per_metre)
         page_viewer = viewer.Viewer(server, [first, second])
         second.show("splats", False)  # it stands in the picture that is compared
-        first.show("name", False)  # so does this
+        for placed in (first, second):
+            placed.show("name", False)  # these do too
         with (
             chromium() as browser,
             page_of(browser, f"http://127.0.0.1:{server.get_port()}", 700, 700, known=VISERS) as page,
