@@ -25,6 +25,7 @@ class Series:
     item: Item
     seconds: np.ndarray  # [N] since the first packet, by the spacecraft's clock
     values: np.ndarray  # [N]
+    start_utc_ns: int = 0  # of the first packet
 
     @property
     def limits(self) -> list[str]:
@@ -45,7 +46,8 @@ def housekeeping_series(session: Path) -> list[Series]:
     seconds = (utc_ns[order] - utc_ns.min()) / 1e9
     layout = DICTIONARY.telemetry["housekeeping"]
     values = {name: np.array([float(line[name]) for line in lines])[order] for name in SHOWN}
-    return [Series(layout.item(name), seconds, values[name]) for name in SHOWN]
+    start = int(utc_ns.min())
+    return [Series(layout.item(name), seconds, values[name], start) for name in SHOWN]
 
 
 def telemetry_figures(series: list[Series]) -> list[go.Figure]:
@@ -71,10 +73,20 @@ def telemetry_figures(series: list[Series]) -> list[go.Figure]:
         if each.values.min() == each.values.max():  # a scale of thousandths around a constant says nothing
             value = each.values[0] / factor
             figure.update_yaxes(range=[value - max(1.0, abs(value)), value + max(1.0, abs(value))])
-        title = {"text": f"{each.item.name.replace('_', ' ')}{_unit(each.item)}", "font": {"size": 12}}
+        title = {"text": f"{each.item.name.replace('_', ' ')}{unit_of(each.item)}", "font": {"size": 12}}
         figure.update_layout(height=HEIGHT_PX, title=title, margin={"l": 45, "r": 15, "t": 30, "b": 25})
         figures.append(figure)
     return figures
+
+
+def near_limits(series: Series) -> list[tuple[float, str]]:
+    """Return the limits that can be drawn without hiding how the values change, each with its colour."""
+    return [
+        (bound, LIMIT_COLOURS[limit])
+        for limit, bounds in (("yellow", series.item.yellow), ("red", series.item.red))
+        for bound in bounds
+        if _is_near(bound, series.values)
+    ]
 
 
 def broken_limits(series: list[Series]) -> list[tuple[str, str]]:
@@ -99,7 +111,8 @@ def _housekeeping(path: Path) -> list[dict]:
     return kept
 
 
-def _unit(item: Item) -> str:
+def unit_of(item: Item) -> str:
+    """Return an item's unit after a comma, bytes as MB; nothing where it has none."""
     return f", {'MB' if item.unit == 'B' else item.unit}" if item.unit else ""
 
 

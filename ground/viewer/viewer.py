@@ -19,6 +19,7 @@ from ground.pictures import ERROR_FULL_SCALE, heat, tone
 from ground.session import FrameRecord, Session, SessionError
 from ground.turntable import VIEWS, circle, moving_png, pictures
 from ground.viewer.door import opened
+from ground.viewer.pass_plots import PassPlots
 from ground.viewer.ruler import Ruler
 from ground.viewer.scene import (
     COLOURS,
@@ -36,7 +37,7 @@ from ground.viewer.waiting import awaited
 from obbgs_core.errors import ReconstructionError
 
 log = logging.getLogger(__name__)
-POLL_S = 1.0  # between looks for a renewed model
+POLL_S, TICK_S = 1.0, 0.25  # between looks for a renewed model, and between steps of a replay
 APART = 2.4  # radii between the centres of two models side by side
 FIELD_RAD = 0.4  # vertical field of view, about that of a telescope's picture of the model
 NEAREST, FARTHEST = (
@@ -82,14 +83,20 @@ def view(
         for other in shown[1:]:
             placed.append(Placed(server, "b", other, np.array([APART * RADIUS, 0.0, 0.0]), first.per_metre))
         viewer = Viewer(server, placed)
+        plots = PassPlots(server, sources[0].session_path, viewer.show_time)
+        looked_s = time.monotonic() - POLL_S
         while not should_stop():
+            plots.tick(TICK_S)
+            time.sleep(TICK_S)
+            if time.monotonic() < looked_s + POLL_S:
+                continue
+            looked_s = time.monotonic()
             for i, source in enumerate(sources):
                 if source.renewed():
                     try:
                         viewer.renew(i, source)
                     except (SessionError, ReconstructionError, OSError, ValueError) as error:
                         log.warning("%s is not shown anew: %s", source.name, error)
-            time.sleep(POLL_S)
     finally:
         server.stop()
 
@@ -256,6 +263,12 @@ class Viewer:
             for each in self.placed:
                 each.draw_sun(record, self._is_checked("sun"))
             self.draw_splats()
+
+    def show_time(self, utc_ns: int) -> None:
+        """Move the timeline to the frame that was taken last before a time of the pass."""
+        taken = [i for i, record in enumerate(self.frames) if record.mid_exposure_utc_ns <= utc_ns]
+        if taken and taken[-1] != self.timeline.value:
+            self.timeline.value = taken[-1]
 
     def renew(self, index: int, source: Source) -> None:
         """Read a run again and draw it in place of the one that was there, in the same scale."""

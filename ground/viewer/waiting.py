@@ -8,6 +8,7 @@ import viser
 
 from ground.live_status import line, read_status
 from ground.session import MissingFrames, Session, open_session
+from ground.viewer.pass_plots import PassPlots
 from ground.viewer.scene import RADIUS, add_camera, one_per_bracket, picture
 from ground.viewer.source import Source
 
@@ -31,6 +32,7 @@ def awaited(
             return False
         waiting = waiting or Waiting(server, sources)
         waiting.look()
+        waiting.plots.tick(poll_s)
         time.sleep(poll_s)
     if waiting is not None:
         server.gui.reset()
@@ -45,6 +47,7 @@ class Waiting:
         self._server, self._sources = server, sources
         self._frames = self._bytes_seen = 0  # in the session, and in its frames.jsonl
         self._drawn: set[int] = set()  # frames whose cameras stand in the scene
+        self.plots = PassPlots(server, sources[0].session_path)
         self.status = server.gui.add_markdown("")
         self.newest = server.gui.add_image(
             np.zeros((2, 2, 3), np.uint8), label="the newest frame", format="png"

@@ -1,0 +1,114 @@
+"""Telemetry beside the model: what is known at a time of the pass, and its replay, in the browser and without one."""
+
+import json
+
+import numpy as np
+import pytest
+
+from ground.telemetry_plots import LIMIT_COLOURS, housekeeping_series
+from ground.viewer.door import opened
+from ground.viewer.pass_plots import PassPlots, drawn_lines, pass_events, plotted, up_to
+from tests.browser import chromium
+from tests.browser import opened as page_of
+from tests.ground.test_telemetry_plots import packet, written
+
+
+@pytest.fixture
+def session(tmp_path):
+    """A pass of 100 s in which the disk fills at 60 s and a command is refused at 70 s."""
+    lines = [
+        packet(t, outbox_frames=t, disk_free_bytes=10**7 if t >= 60 else 5 * 10**9) for t in range(0, 101, 10)
+    ]
+    written(tmp_path, *lines)
+    events = [
+        {"utc_ns": t * 10**9, "severity": s, "text": f"<{s}> at {t}"}
+        for t, s in ((20, "info"), (65, "error"))
+    ]
+    (tmp_path / "events.jsonl").write_text("".join(f"{json.dumps(event)}\n" for event in events) + '{"half')
+    command = {
+        "ended_utc_ns": 70 * 10**9,
+        "counter": 1,
+        "given": "near 9",
+        "stage": "refused",
+        "text": "forged",
+    }
+    (tmp_path / "commands.jsonl").write_text(json.dumps(command) + "\n")
+    return tmp_path
+
+
+def test_events_and_commands_are_one_list_in_the_order_of_time(session):
+    found = pass_events(session, 10 * 10**9)
+    assert [(event.seconds, event.severity) for event in found] == [
+        (10, "info"),
+        (55, "error"),
+        (60, "warning"),
+    ]
+    assert found[-1].text == "command near 9 refused: forged"
+
+
+def test_a_plot_shows_what_was_known_and_the_limits_that_are_near(session):
+    whole = next(s for s in housekeeping_series(session) if s.item.name == "disk_free_bytes")
+    seconds, values, *limits = plotted(up_to(whole, 35), whole)
+    np.testing.assert_array_equal(seconds, [0, 10, 20, 30])
+    assert (values == 5000).all()  # MB
+    assert [set(limit) for limit in limits] == [{1000.0}, {100.0}]
+    assert len(drawn_lines(whole)) == 4
+
+
+def test_a_replay_goes_at_its_speed_shows_no_future_and_tells_the_time(session):
+    times: list[int] = []
+    server = opened("127.0.0.1", 0)
+    try:
+        plots = PassPlots(server, session, times.append)
+        plots.tick(0.25)
+        controls = plots.controls
+        assert controls is not None and len(controls.plots["outbox_frames"].data[0]) == 11
+        assert (
+            "disk free bytes 10 MB" in controls.told.content
+            and "&lt;error&gt; at 65" in controls.told.content
+        )
+        controls.replay.value, controls.speed.value = True, "100x"
+        plots.tick(0.25)
+        assert times == [25 * 10**9] and len(controls.plots["outbox_frames"].data[0]) == 3
+        assert "at 20" in controls.told.content and "at 65" not in controls.told.content
+        assert "disk free bytes" not in controls.told.content
+        for _ in range(8):
+            plots.tick(0.25)
+        assert times[-1] == 100 * 10**9 and controls.place.value == 100
+        assert LIMIT_COLOURS["red"] in controls.told.content and "near 9 refused" in controls.told.content
+        with open(session / "telemetry.jsonl", "a") as file:
+            file.write("\n" + json.dumps(packet(110)) + "\n")
+        controls.replay.value = False
+        plots.tick(0.25)  # live again: what has come is drawn
+        assert len(controls.plots["outbox_frames"].data[0]) == 12
+        with open(session / "telemetry.jsonl", "a") as file:
+            file.write(json.dumps(packet(120, outbox_frames=900)) + "\n")
+        lines = len(controls.plots["outbox_frames"].series)
+        plots.tick(0.25)  # the limit of 1,000 is near now
+        plot = controls.plots["outbox_frames"]
+        assert len(plot.series) == len(plot.data) == lines + 1
+    finally:
+        server.stop()
+
+
+def test_the_page_draws_a_plot_for_each_item_and_a_session_without_telemetry_has_no_panel(session, tmp_path):
+    server = opened("127.0.0.1", 0)
+    try:
+        empty = PassPlots(server, tmp_path / "nothing")
+        empty.tick(0.25)
+        assert empty.controls is None
+        plots = PassPlots(server, session)
+        plots.tick(0.25)
+        assert plots.controls is not None
+        with (
+            chromium() as browser,
+            page_of(browser, f"http://127.0.0.1:{server.get_port()}", 900, 800) as page,
+        ):
+            page.get_by_text("Replay the pass").wait_for()
+            page.wait_for_function(
+                f"document.querySelectorAll('.uplot canvas').length == {len(plots.controls.plots)}"
+            )
+            page.get_by_text("command near 9 refused: forged").wait_for()
+            page.screenshot(path="/tmp/pg/tel.png")
+    finally:
+        server.stop()
