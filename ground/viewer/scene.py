@@ -88,7 +88,7 @@ class Placed:
 
     def draw_name(self) -> None:
         """Write the model's name above it, as is needed where two stand side by side."""
-        above = self.offset + np.array([0.0, 0.0, 1.15 * RADIUS])
+        above = self.offset + np.array([0.0, 0.0, 1.45 * RADIUS])
         label = self._server.scene.add_label(
             f"/{self._name}/name", self.shown.name, position=tuple(above), anchor="bottom-center"
         )
