@@ -358,7 +358,7 @@ class Commander:
         values = command.arguments
         if command.name == "bracket":
             dataclasses.replace(self.settings, **values).bracket(self._mission)
-        elif command.name == "delete" and values["first_frame"] > values["last_frame"]:
+        elif command.name in ("delete", "resend") and values["first_frame"] > values["last_frame"]:
             raise ValueError(f"frames {values['first_frame']} to {values['last_frame']} are none")
         elif command.name == "retire":
             if values["key"] == received.spi:
@@ -403,6 +403,9 @@ class Commander:
                 assert retired is not None  # checked
                 retired.advance(MAX_COUNTER)
                 return f"key {retired.key} is retired"
+            case "resend":
+                count = self._store.put_back(values["first_frame"], values["last_frame"])
+                return f"{count} frames put into the outbox again"
             case "safe" | "resume":
                 self._change(safe_mode=command.name == "safe")
                 return "no exposures until resumed" if self.settings.safe_mode else "exposures go on"

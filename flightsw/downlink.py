@@ -27,7 +27,7 @@ from flightsw.icd.packet import (
     TELEMETRY,
 )
 from flightsw.icd.telemetry import DICTIONARY
-from flightsw.icd.transfer import UPLINK, Receiver, timer_s
+from flightsw.icd.transfer import UPLINK, Receiver, answer_key, timer_s
 from flightsw.ports import Link
 from flightsw.ranking import Ranking
 from flightsw.settings import Settings
@@ -61,6 +61,8 @@ class DownlinkProgress:
     segments_resent: int = 0
     transfers_failed: int = 0  # put again afterwards
     frames_unreadable: int = 0
+    frames_rejected: int = 0  # by the ground, and kept
+    rejected_waiting: int = 0  # of those that wait
     skipped_bytes: int = 0  # received and not part of a good packet
     crc_errors: int = 0
     packets_missing: int = 0
@@ -83,7 +85,7 @@ def run_downlink(
     capture_values: Callable[[], dict[str, Any]] = dict,
     boot: int = 0,
 ) -> DownlinkProgress:
-    """Send the outbox until told to stop, or until it is empty, and return the counts.
+    """Send the outbox until told to stop, or until the ground has or rejects all of it, and return the counts.
 
     A frame leaves the outbox only when the ground has reported it stored; a transfer that fails is put again.
     `on_progress` is called after each delivery and about five times a second. After a failure the downlink starts again
@@ -121,7 +123,7 @@ def run_downlink(
                 downlink.start_again(error)
                 next_look_s = float("-inf")
                 continue
-            if downlink.waiting:
+            if len(downlink.waiting) > downlink.rejected_waiting:
                 empty_since_s = None
             elif empty_since_s is None:
                 empty_since_s = now_s
@@ -153,6 +155,8 @@ class _Downlink:
         self._store, self._link, self._mission, self._clock_s = store, link, mission, clock_s
         self._capture_values, self._boot = capture_values, boot
         self._stream = PacketStream(TELEMETRY, mission.link.max_packet_bytes)
+        ring = keys or KeyRing([])
+        self._keys = [answer_key(own.key) for own in ring.counters if not own.is_retired]
         self._commander = Commander(keys, store, mission, self._note_refusal, clock_s)
         self._meter = ProcessMeter(clock_s)
         self._telemetry: deque[tuple[int, bytes]] = deque()
@@ -175,6 +179,7 @@ class _Downlink:
             self._stream.max_data_bytes,
             self.interval_s,
             self._mission.link,
+            self._keys,
         )
         self._uploads: Receiver | None = None  # of the model file that was announced last
         self._upload: Upload | None = None
@@ -218,6 +223,11 @@ class _Downlink:
         """The frames still to be delivered, those in flight included."""
         return self._frames.waiting
 
+    @property
+    def rejected_waiting(self) -> int:
+        """How many of them the ground did not take."""
+        return len(self._frames.rejected)
+
     def look(self, now_s: float) -> None:
         """Take in new frames and results of triage, and order the frames that wait."""
         for verified in self._ranking.collect():
@@ -248,7 +258,7 @@ class _Downlink:
             elif apid == APID_UPLINK_FILES:
                 self._receive_upload(content, now_s)
         self._commander.poll()
-        ended, failed = self._frames.outcomes()
+        ended, failed = self._frames.outcomes(now_s)
         for outcome in failed:
             self.events.add("transfer_failed", file=outcome.name, reason=outcome.reason)
         return bool(ended)
@@ -381,6 +391,8 @@ class _Downlink:
             segments_resent=counts.segments_resent + transfers.segments_resent,
             transfers_failed=counts.transfers_failed,
             frames_unreadable=counts.frames_unreadable,
+            frames_rejected=counts.frames_rejected,
+            rejected_waiting=len(self._frames.rejected),
             skipped_bytes=deframer.skipped_bytes,
             crc_errors=deframer.crc_errors,
             packets_missing=self._stream.packets_missing,

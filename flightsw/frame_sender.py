@@ -2,7 +2,10 @@
 
 import logging
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from spacepackets.cfdp import ConditionCode
 
 from flightsw.errors import StoreError
 from flightsw.icd.frame import decode_frame, encode_thumbnail, header_of
@@ -13,7 +16,12 @@ from flightsw.ranking import Ranking
 from flightsw.store import FrameStore
 
 log = logging.getLogger(__name__)
-RETRY_S = 5.0  # before a frame that cannot be read is tried again
+RETRY_S = 5.0  # before a frame that cannot be read, or that the ground cannot store, is tried again
+REJECTED_S = (
+    60.0,
+    3600.0,
+)  # the same after the first rejection by the ground; doubled up to the second value
+NOT_STORED = ConditionCode.FILESTORE_REJECTION.name  # the reason where the ground cannot store now
 AHEAD = 2  # files put before their data are on the wire: few, so that the order can change
 
 
@@ -27,6 +35,7 @@ class SendingCounts:
     segments_resent: int = 0
     transfers_failed: int = 0  # put again afterwards
     frames_unreadable: int = 0
+    frames_rejected: int = 0  # by the ground, and kept; each is counted once
 
 
 class FrameSender:
@@ -40,14 +49,25 @@ class FrameSender:
         max_pdu_bytes: int,
         interval_s: float,
         link: LinkSection,
+        keys: Sequence[bytes] = (),
     ):
         self.waiting: list[int] = []  # frames still to be delivered, those in flight included
-        self.transfers = Sender(max_pdu_bytes, interval_s, link.files_in_flight, checksum=link.checksum)
+        self.rejected: dict[int, int] = {}  # waiting frames that the ground did not take, and how often
+        self.transfers = Sender(
+            max_pdu_bytes,
+            interval_s,
+            link.files_in_flight,
+            checksum=link.checksum,
+            store=store.identity,
+            keys=keys,
+        )
         self._store, self._ranking, self._counts = store, ranking, counts
         self._queue: deque[int] = deque()  # frames to be put, in order
         self._thumbnails: deque[int] = deque()  # frames whose thumbnail is to be put
         self._sizes_bytes: dict[int, int] = {}  # of frames in flight
         self._retry_s: dict[int, float] = {}
+        self._unsure = set(store.in_flight())  # frames that may be on the ground without this side knowing
+        self._times_put_back = store.times_put_back
 
     def look(self) -> list[int]:
         """Read the outbox and return the frames in it."""
@@ -56,6 +76,10 @@ class FrameSender:
 
     def ready(self, now_s: float) -> list[int]:
         """Return the waiting frames that are not in flight and not known to be unreadable for now."""
+        if self._store.times_put_back != self._times_put_back:  # asked for by the ground: without delay
+            self._times_put_back = self._store.times_put_back
+            self._retry_s.clear()
+            self.rejected.clear()
         in_flight = set(self.transfers.in_flight)
         return [
             frame_id
@@ -77,13 +101,16 @@ class FrameSender:
             self._put_thumbnail(self._thumbnails.popleft(), now_s)
         while self._queue and transfers.unsent < AHEAD and transfers.has_room:
             frame_id = self._queue.popleft()
+            unsure = {*self._unsure.intersection(self.waiting), frame_id}
+            transaction = self._store.next_transaction(unsure)  # from now on it is not dropped for room
             container = self._read(frame_id, now_s)
             if container is not None:
+                self._unsure = unsure
                 self._sizes_bytes[frame_id] = len(container)
-                transfers.put(frame_file_name(frame_id), container, self._store.next_transaction(), now_s)
+                transfers.put(frame_file_name(frame_id), container, transaction, now_s)
                 self._ranking.note_sent(frame_id, header_of(container))
 
-    def outcomes(self) -> tuple[int, list[Outcome]]:
+    def outcomes(self, now_s: float) -> tuple[int, list[Outcome]]:
         """Take account of the transfers that ended; return how many did, and the frames' that failed."""
         outcomes = self.transfers.outcomes()
         failed = []
@@ -98,6 +125,7 @@ class FrameSender:
                 self._ranking.note_failed(frame_id)
                 log.info("%s: transfer failed (%s), put again", outcome.name, outcome.reason)
                 failed.append(outcome)
+                self._wait_after(frame_id, outcome, now_s)
         return len(outcomes), failed
 
     def stop(self) -> None:
@@ -125,14 +153,29 @@ class FrameSender:
             log.error("frame %d has no thumbnail: %s", frame_id, error)
             return
         if thumbnail is not None:
-            name, transaction = f"{frame_id:08d}.obt", self._store.next_transaction()
+            name, transaction = f"{frame_id:08d}.obt", self._store.next_transaction(self._unsure)
             self.transfers.put(name, thumbnail, transaction, now_s, urgent=True)
+
+    def _wait_after(self, frame_id: int, outcome: Outcome, now_s: float) -> None:
+        """Have a frame wait that the ground did not take: it is not sent for ever without a pause."""
+        if outcome.refused:
+            times = self.rejected.get(frame_id, 0) + 1
+            self.rejected[frame_id] = times
+            first_s, longest_s = REJECTED_S
+            self._retry_s[frame_id] = now_s + min(first_s * 2.0 ** min(times - 1, 30), longest_s)
+            if times == 1:
+                self._counts.frames_rejected += 1
+                log.warning("frame %d stays on board: %s by the ground", frame_id, outcome.reason)
+        elif outcome.reason == NOT_STORED:
+            self._retry_s[frame_id] = now_s + RETRY_S
 
     def _confirm(self, frame_id: int) -> None:
         if frame_id not in self.waiting:  # a late answer may confirm it twice
             return
         self._store.mark_delivered(frame_id)
         self.waiting.remove(frame_id)
+        self._unsure.discard(frame_id)
+        self.rejected.pop(frame_id, None)
         size_bytes = self._sizes_bytes.pop(frame_id, 0)
         self._counts.delivered += 1
         self._counts.payload_bytes += size_bytes

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from flightsw.errors import StoreError
 from flightsw.icd.packet import PacketError
-from flightsw.store import lock_store, quarantine, unused_transaction
+from flightsw.store import lock_store, quarantine
 from flightsw.store_index import StoredFrame, index_entry, parse_index_line
+from flightsw.transfer_numbers import FILE, numbers_line, parse_numbers, random_number
 from obbgs_base.files import sync_folder, write_whole
 
 
@@ -28,7 +29,7 @@ def fsck(folder: Path, repair: bool = True) -> FsckReport:
     Temporary files are deleted. A container is decoded whole (its own CRC-32, that of its pixels, the number in its
     name); what fails goes to quarantine/ and out of the outbox. The index is written again if a line is unreadable
     or repeated or contradicts the containers, which take precedence; the numbers of deleted frames are kept. A
-    damaged transfer number is replaced by the time in seconds, which no counter has reached. Unknown files are left.
+    damaged transfer number is replaced by one drawn at random. Unknown files are left.
 
     Raises:
         StoreError: there is no store here, or the disk refuses.
@@ -128,9 +129,10 @@ class _Check:
                 marker.unlink()
 
     def _transaction(self) -> None:
-        path = self.folder / "transaction"
-        text = path.read_text(errors="replace") if path.exists() else "0"
-        if not (text.strip().isdecimal() and int(text) < 1 << 32) and self._note(
-            f"transaction: holds no number but {text[:20]!r}; set to one that was never used"
-        ):
-            write_whole(path, f"{unused_transaction()}\n".encode())
+        path = self.folder / FILE
+        try:
+            if path.exists():
+                parse_numbers(path.read_bytes())
+        except ValueError as error:
+            if self._note(f"transaction: {error}; replaced by a number drawn at random"):
+                write_whole(path, numbers_line(random_number(), ()))

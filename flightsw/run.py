@@ -72,7 +72,7 @@ def run_pass(
     Args:
         stop: when set, capture and downlink end cleanly.
         key_files: the mission's keys; one that cannot be used is left out, and without any every command is refused.
-        exit_when_empty: end the downlink once every frame is confirmed, not only when stopped.
+        exit_when_empty: end the downlink once the ground has or rejects every frame, not only when stopped.
         on_captured: called after each planned exposure.
         on_sent: called from the downlink's thread, about five times a second.
 
@@ -290,8 +290,9 @@ class _DownlinkThread(threading.Thread):
 
     def _should_stop(self) -> bool:
         """Tell whether all is delivered; lingers a little, as the ground may ask for its last answer once more."""
-        waiting = self.capturing.is_set() or self.result.waiting or not self._exit_when_empty
-        if waiting or self._store.outbox():
+        rejected = self.result.rejected_waiting  # by the ground; they stay on board
+        waiting = self.capturing.is_set() or self.result.waiting > rejected or not self._exit_when_empty
+        if waiting or len(self._store.outbox()) > rejected:
             self._empty_since_s = None
         elif self._empty_since_s is None:
             self._empty_since_s = time.monotonic()

@@ -7,8 +7,7 @@ import hashlib
 import json
 import logging
 import os
-import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Literal
@@ -20,9 +19,11 @@ from flightsw.icd.frame import Frame, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.icd.packet import PacketError
 from flightsw.store_index import StoredFrame, index_entry, parse_index_line
+from flightsw.transfer_numbers import TransferNumbers, store_identity
 from obbgs_base.files import append_line, sync_folder, write_whole
 
 log = logging.getLogger(__name__)
+PUT_BACK = b"again\n"  # in the outbox: the frame was delivered once and put back by command
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 RESERVE = "reserve"  # the file that is given up for transfer numbers and settings
 RESERVE_BYTES = 64 * 1024  # so that a full disk cannot stop the downlink that empties it, nor commands
@@ -52,6 +53,8 @@ class FrameStore:
     ):
         self.folder, self.quota_bytes, self.when_full = folder, quota_bytes, when_full
         self.refused = 0  # frames of this run that found no room
+        self.times_put_back = 0  # frames into the outbox, by command
+        self._numbers, self._identity = TransferNumbers(folder, self._write_small), b""
         self._frames, self._outbox, self._index = folder / "frames", folder / "outbox", folder / "index.jsonl"
         self._forget_index()
         with _disk_errors("open the store"):
@@ -150,16 +153,39 @@ class FrameStore:
                 self._read_index()
         return [frame_id for frame_id in waiting if frame_id in self._stored]
 
-    def next_transaction(self) -> int:
-        """Return a file transfer's number, never given before, not even before a power cut."""
-        path = self.folder / "transaction"
+    @property
+    def identity(self) -> bytes:
+        """The random bytes by which the ground tells this store from any other."""
+        if not self._identity:
+            with _disk_errors("read the store's identity"), self.locked():
+                self._identity = store_identity(self.folder, self._write_small)
+        return self._identity
+
+    def next_transaction(self, in_flight: Iterable[int] = ()) -> int:
+        """Return a file transfer's number, never given before, not even before a power cut.
+
+        Args:
+            in_flight: frames that may arrive, or have arrived, without a confirmation; none is dropped for room.
+        """
         with _disk_errors("number a transfer"), self.locked():
-            text = path.read_text(errors="replace") if path.exists() else str(unused_transaction())
-            if not text.strip().isdecimal():
-                raise StoreError(f"{path} should hold a number, it holds {text[:20]!r}; run flightsw fsck")
-            number = (int(text) + 1) % (1 << 32)
-            write_with_reserve(path, f"{number}\n".encode(), self.folder / RESERVE)
-        return number
+            return self._numbers.give(in_flight)
+
+    def in_flight(self) -> frozenset[int]:
+        """Return the frames that `next_transaction` was told last."""
+        with _disk_errors("read the last transfer's number"), self.locked():
+            return self._numbers.in_flight
+
+    def put_back(self, first_frame: int, last_frame: int) -> int:
+        """Put the stored frames of these numbers into the outbox again and return how many were not in it."""
+        with _disk_errors("put frames into the outbox"), self.locked():
+            self._read_index()
+            waiting = set(self._waiting())
+            again = [n for n in self._stored if first_frame <= n <= last_frame and n not in waiting]
+            for frame_id in again:
+                (self._outbox / f"{frame_id:08d}").write_bytes(PUT_BACK)
+            sync_folder(self._outbox)
+        self.times_put_back += 1
+        return len(again)
 
     def hold_pass(self, first_trigger_utc_ns: int) -> None:
         """Note which pass the frames are of; exposures are told apart by their number in the pass.
@@ -188,6 +214,9 @@ class FrameStore:
         with _disk_errors(f"mark frame {frame_id}"):
             (self._outbox / f"{frame_id:08d}").unlink(missing_ok=True)
             sync_folder(self._outbox)
+
+    def _write_small(self, path: Path, content: bytes) -> None:
+        write_with_reserve(path, content, self.folder / RESERVE)
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -225,8 +254,12 @@ class FrameStore:
         if confirmed:
             log.info("frame %d deleted, the ground has it: %s is full", confirmed[0], what_is_full)
             self._drop(confirmed[0], "delivered")
-        elif self.when_full == "drop-oldest" and self._stored:
-            oldest = min(self._stored)
+        elif self.when_full == "drop-oldest" and (free := set(self._stored) - self._numbers.in_flight):
+            oldest = min(free)  # frames in flight may be on the ground already
+            if (self._outbox / f"{oldest:08d}").stat().st_size:  # delivered once; in the outbox by command
+                log.info("frame %d deleted, the ground had it: %s is full", oldest, what_is_full)
+                self._drop(oldest, "delivered")
+                return
             log.warning(
                 "frame %d deleted undelivered for frame %d: %s is full", oldest, for_frame, what_is_full
             )
@@ -337,14 +370,6 @@ def write_with_reserve(path: Path, data: bytes, reserve: Path) -> None:
             raise
         reserve.unlink(missing_ok=True)
         write_whole(path, data)
-
-
-def unused_transaction() -> int:
-    """Return a transfer's number that no counter has reached: the time in seconds.
-
-    A store begins with it, since a receiver that remembers the transfers of another store answers for those.
-    """
-    return int(time.time()) % (1 << 32)
 
 
 def open_store(folder: Path, mission: Mission) -> FrameStore:

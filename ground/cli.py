@@ -16,7 +16,7 @@ from ground.cli_compare import compare_command
 from ground.cli_formats import export_command, import_command
 from ground.cli_list import compare_runs_command, list_command
 from ground.cli_live import live_command
-from ground.cli_options import AsJson, SessionDir
+from ground.cli_options import AsJson, ListenKey, SessionDir, listening_key
 from ground.cli_runs import evaluate_command, mesh_command, reconstruct_command, report_command
 from ground.cli_systems import dictionary_command, yamcs_command
 from ground.cli_uplink import uplink_command
@@ -46,6 +46,7 @@ def listen_command(
             help="Pass every packet of the spacecraft on by UDP, to udp://HOST:PORT; default: to nobody."
         ),
     ] = None,
+    key_file: ListenKey = None,
     json_: AsJson = False,
 ) -> None:
     """Receive frames and telemetry into a session folder until stopped, send commands, show the state of the pass.
@@ -76,6 +77,7 @@ def listen_command(
             on_status=on_status,
             on_event=on_event,
             forward=forwarder,
+            key=listening_key(key_file),
         )
     if json_:
         print(json.dumps({"type": "summary"} | dataclasses.asdict(summary)))

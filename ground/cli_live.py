@@ -11,8 +11,18 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from flightsw.icd.auth import Key
 from flightsw.icd.mission import ConfigError, ReconstructSection, load_mission
-from ground.cli_options import AsJson, Overwrite, RunName, RunsDir, Seed, SessionDir, Threads
+from ground.cli_options import (
+    AsJson,
+    Overwrite,
+    RunName,
+    RunsDir,
+    Seed,
+    SessionDir,
+    Threads,
+    listening_key,
+)
 from ground.live_process import LiveProcess
 from ground.live_status import LiveStatus, line
 from ground.progress import Lines, Stop, say
@@ -43,7 +53,11 @@ def live_command(
         ),
     ] = False,
     key_file: Annotated[
-        Path, typer.Option("--key", help="The file of the mission's key; read with --triage only.")
+        Path,
+        typer.Option(
+            "--key",
+            help="The file of the mission's key, which authenticates answers to the spacecraft; needed for --triage.",
+        ),
     ] = Path("mission.key"),
     exit_after: Annotated[
         int | None,
@@ -87,7 +101,15 @@ def live_command(
     options = [str(part) for option, value in given.items() if value is not None for part in (option, value)]
     options += ["--triage"] * triage + ["--overwrite"] * overwrite
     _receive(
-        link, session, mission, (out or session / "runs") / name, options, exit_after, idle_timeout, json_
+        link,
+        session,
+        mission,
+        (out or session / "runs") / name,
+        options,
+        exit_after,
+        idle_timeout,
+        json_,
+        listening_key(key_file if key_file.exists() else None),
     )
 
 
@@ -100,6 +122,7 @@ def _receive(
     exit_after: int | None,
     idle_timeout: float | None,
     as_json: bool,
+    key: Key | None,
 ) -> None:
     """Receive a pass here, with the training in a process of its own, and wait for its model."""
     from ground.console import statuses_shown
@@ -125,6 +148,7 @@ def _receive(
                 should_stop=stop.is_set,
                 on_status=with_model,
                 on_event=on_event,
+                key=key,
             )
         stop.clear()  # the next signal ends the training
         if not as_json:

@@ -6,14 +6,38 @@ from typing import Annotated
 
 import typer
 
-from flightsw.icd.mission import METHODS, VARIANTS
+from flightsw.icd.auth import Key
+from flightsw.icd.mission import METHODS, VARIANTS, ConfigError
 
 SessionDir = Annotated[Path, typer.Option("--session", help="The session folder.")]
 RunName = Annotated[str, typer.Option("--name", help="The run's name: its folder below runs/.")]
 RunsDir = Annotated[
     Path | None, typer.Option("--out", help="The folder of runs; default: runs/ in the session.")
 ]
+ListenKey = Annotated[
+    Path | None,
+    typer.Option(
+        "--key",
+        help="The file of the mission's key: a spacecraft with a key believes no other listener that it has stored a "
+        "frame. Default: mission.key if it is there.",
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+
+def listening_key(file: Path | None) -> Key | None:
+    """Return the key of a listener; None where no file is named and mission.key is not there.
+
+    Raises:
+        ConfigError: the file cannot be read, or holds no key.
+    """
+    path = file or Path("mission.key")
+    if file is None and not path.exists():
+        return None
+    try:
+        return Key.parse(path.read_text(), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(str(path), f"cannot read the key: {error}") from error
 
 
 class Quality(StrEnum):
@@ -96,6 +120,7 @@ class UplinkCommand(StrEnum):
     SAFE = "safe"
     RESUME = "resume"
     RETIRE = "retire"
+    RESEND = "resend"
 
 
 # of `ground import`

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flightsw.icd.mission import load_mission
-from ground.cli_options import AsJson, UplinkCommand
+from ground.cli_options import AsJson, UplinkCommand, listening_key
 
 if TYPE_CHECKING:
     from flightsw.icd.command import Command
@@ -49,9 +49,10 @@ def uplink_command(
     """Send a command through the session's `ground listen`, or over --link, and wait for its result.
 
     ping · bracket 0.05,0.1,0.2 (exposure times, ms) · near 2 (largest coding error, DN) · priority oldest, triage or
-    thumbnail-first · model FILE (a run's model.onnx) · safe (no more exposures). `arm delete` and then delete FIRST
-    LAST (numbers of frames), `arm resume` and then resume, `arm retire` and then retire KEY (the number of
-    another key), each at most 30 s later. What became of all commands of a session stands in its commands.jsonl.
+    thumbnail-first · model FILE (a run's model.onnx) · safe (no more exposures) · resend FIRST LAST or all (frames that
+    are still on board, delivered once more). `arm delete` and then delete FIRST LAST (numbers of frames), `arm resume`
+    and then resume, `arm retire` and then retire KEY (the number of another key), each at most 30 s later. What became
+    of all commands of a session stands in its commands.jsonl.
 
     Example: ground uplink bracket 0.02,0.05,0.1 --session pass-12 --key mission.key
     """
@@ -129,7 +130,7 @@ def _sent(
         else:
             from ground.ingest import listen
 
-            listen(link, session, load_mission(mission), should_stop=ended)
+            listen(link, session, load_mission(mission), should_stop=ended, key=listening_key(key_file))
     finally:
         uplinking.withdraw(session, counter)
     result = uplinking.outcome(session, counter)

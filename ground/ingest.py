@@ -10,6 +10,7 @@ from typing import Any
 
 import imagecodecs
 
+from flightsw.icd.auth import Key
 from flightsw.icd.can import GROUND_SIDE
 from flightsw.icd.frame import Frame, decode_frame
 from flightsw.icd.framing import PacketStream
@@ -22,7 +23,7 @@ from flightsw.icd.packet import (
     TELECOMMAND,
     PacketError,
 )
-from flightsw.icd.transfer import Incoming, Receiver, timer_s
+from flightsw.icd.transfer import Incoming, Receiver, Verdict, answer_key, timer_s
 from flightsw.ports import Link, open_link
 from ground.forward import Forwarder
 from ground.session import SessionError
@@ -112,13 +113,15 @@ def listen(
     on_status: Callable[[Status], None] = lambda status: None,
     on_event: Callable[[dict[str, Any]], None] = lambda event: None,
     forward: Forwarder | None = None,
+    key: Key | None = None,
 ) -> ListenSummary:
     """Write what arrives over the link into a new or existing session and return the counts.
 
     Commands that `ground uplink` leaves in the session are sent. Ends when `should_stop` returns True, when the session
     holds `exit_after` frames, or when no packet has come for `idle_timeout_s`. `on_progress` is called after each frame
     and about once a second, `on_status` four times a second, `on_event` for each event as it comes. `forward` is
-    given every packet of the spacecraft.
+    given every packet of the spacecraft. `key` authenticates the answers by which frames leave the spacecraft's outbox;
+    a spacecraft with a key takes no others.
 
     Raises:
         ConfigError: the URL is not valid.
@@ -127,7 +130,7 @@ def listen(
     """
     with open_link(link_url, GROUND_SIDE) as link, listening(Path(session_dir)):
         writer = SessionWriter(session_dir, mission)
-        ingest = _Ingest(link, writer, mission, on_event, forward)
+        ingest = _Ingest(link, writer, mission, on_event, forward, key)
         interval_s = timer_s(link.baud_rate)
         now_s = clock_s()
         ingest.last_packet_s = last_save_s = last_status_s = now_s
@@ -171,6 +174,7 @@ class _Ingest:
         mission: Mission,
         on_event: Callable[[dict[str, Any]], None],
         forward: Forwarder | None,
+        key: Key | None = None,
     ):
         self.frames_received = 0
         self.last_packet_s = self._housekeeping_s = float("-inf")
@@ -181,7 +185,14 @@ class _Ingest:
         if forward is not None:
             self._stream.on_packet = forward.send
         interval_s, max_pdu_bytes = timer_s(link.baud_rate), self._stream.max_data_bytes
-        self._receiver = Receiver(max_pdu_bytes, interval_s, self._accept, checksum=mission.link.checksum)
+        self._receiver = Receiver(
+            max_pdu_bytes,
+            interval_s,
+            self._accept,
+            mission.camera.max_container_bytes,
+            checksum=mission.link.checksum,
+            key=None if key is None else answer_key(key),
+        )
         self._uplinker = Uplinker(
             writer.folder, max_pdu_bytes, interval_s, self._note_end, checksum=mission.link.checksum
         )
@@ -219,10 +230,11 @@ class _Ingest:
         if self._link.ready and (pdu := self._uplinker.next_pdu(now_s)) is not None:
             self._link.write(self._stream.encode(APID_UPLINK_FILES, pdu))
 
-    def _accept(self, name: str, container: bytes) -> bool:
-        """Store a file that has arrived whole; False if it should be sent again, because the disk failed.
+    def _accept(self, name: str, container: bytes) -> Verdict:
+        """Store a file that has arrived whole, and say what became of it.
 
-        A file that is not a frame of this mission would not be one the next time either: it is counted and accepted.
+        A file that is not a frame of this mission would not be one the next time either: it is counted and rejected,
+        and the spacecraft keeps it. UNSTORED: it should be sent again, because the disk failed.
         """
         try:
             match = FILE_NAME.fullmatch(name)
@@ -231,17 +243,17 @@ class _Ingest:
                 raise PacketError(f"frame {frame.frame_id} has the file name {name[:40]!r}")
             if match[2] == "obt":
                 self._keep_thumbnail(frame)
-                return True
+                return Verdict.STORED
             self.flight_outbox = None
             is_new = self._writer.add(frame, container)
         except (PacketError, SessionError) as error:
             self._rejected += 1
-            log.warning("frame rejected: %s", error)
-            return True
+            log.warning("frame rejected, the spacecraft keeps it: %s", error)
+            return Verdict.REJECTED
         except OSError as error:
             self._store_failures += 1
             log.error("frame %s cannot be written, the spacecraft keeps it: %s", name, error)
-            return False
+            return Verdict.UNSTORED
         if is_new:
             self.frames_received += 1
             self._payload_bytes += len(container)
@@ -249,7 +261,7 @@ class _Ingest:
         else:
             self._duplicates += 1
             log.info("frame %d was received before", frame.frame_id)
-        return True
+        return Verdict.STORED
 
     def _keep_thumbnail(self, frame: Frame) -> None:
         """Write a thumbnail as a 16-bit linear PNG like the frames; it is a few dozen pixels wide."""

@@ -77,7 +77,10 @@ class SessionWriter:
         known = self._sha256_of.get(frame.frame_id)
         if known is not None:
             if known != sha256:
-                raise SessionError(f"another frame {frame.frame_id} is in the session already")
+                raise SessionError(
+                    f"another frame {frame.frame_id} is in the session already; if the spacecraft has a new store, "
+                    "start `ground listen` with another --session"
+                )
             return False
         camera = self._mission.camera
         shape = (camera.height, camera.width) + ((3,) if camera.channels == 3 else ())

@@ -38,6 +38,7 @@ JOB_NAME = re.compile(r"(\d{20})\.json", re.ASCII)
 MAX_JOB_BYTES = 64 * 1024  # of a command file
 COUNTER_MARGIN = 1 << 20  # that `move_counter` leaves for commands that were sent and never arrived
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # elapsed time counts from this start of the computer
+LAST_FRAME = (1 << 32) - 1
 HISTORY = "commands.jsonl"
 POLL_S = 0.2  # between looks at the folder
 LOCK_TRIES = 5  # to become the session's listener
@@ -118,7 +119,9 @@ def parse_command(name: str, arguments: list[str]) -> tuple[Command, Path | None
             return Command(name, {}), Path(file)
         case "arm", [command]:
             return Command(name, {"command": command}), None
-        case "delete", [first, last]:
+        case "resend", ["all"]:
+            return Command(name, {"first_frame": 0, "last_frame": LAST_FRAME}), None
+        case "delete" | "resend", [first, last]:
             frames = {"first_frame": _number(first, int), "last_frame": _number(last, int)}
             return Command(name, frames), None
         case "retire", [key]:

@@ -112,6 +112,12 @@ class CameraSection:
         return (1 << self.bit_depth) - 1
 
     @property
+    def max_container_bytes(self) -> int:
+        """What no container of a frame exceeds: JPEG-LS makes pure noise a few per cent longer than its pixels."""
+        pixel_bytes = 2 * self.width * self.height * self.channels
+        return pixel_bytes + pixel_bytes // 8 + 4096  # header and markers
+
+    @property
     def K(self) -> list[list[float]]:
         """The 3x3 pinhole matrix, px."""
         return [[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]]

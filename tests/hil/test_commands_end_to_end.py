@@ -146,11 +146,11 @@ def test_the_ground_changes_the_bracket_and_uplinks_a_model_and_the_downlink_fol
         CameraServer(mission, sky.radiance, tmp_path / "camera.sock") as camera,
     ):
         assert tools.run("ground", "key", key).returncode == 0
-        common = ("--mission", mission_file)
+        common = ("--mission", mission_file, "--key", key)
         ground = tools.start(
             "ground", "listen", "--link", line.ground_url, "--session", session, *common, "--json"
         )
-        flight_options = ("--link", line.flight_url, "--store", store, "--key", key, *common)
+        flight_options = ("--link", line.flight_url, "--store", store, *common)
         flight = tools.start("flightsw", "serve", "--camera", camera.url, *flight_options)
         wait_for((session / "listener.lock").exists)
 

@@ -5,7 +5,20 @@ The side that has a file owns a Sender, the other a Receiver. Both take PDUs wit
 """
 
 from flightsw.icd.transfer.pdu import DOWNLINK, UPLINK, parse_pdu, timer_s
+from flightsw.icd.transfer.receipt import STORE_BYTES, Verdict, answer_key
 from flightsw.icd.transfer.receiver import Incoming, Receiver
 from flightsw.icd.transfer.sender import Outcome, Sender
 
-__all__ = ["DOWNLINK", "UPLINK", "Incoming", "Outcome", "Receiver", "Sender", "parse_pdu", "timer_s"]
+__all__ = [
+    "DOWNLINK",
+    "STORE_BYTES",
+    "UPLINK",
+    "Incoming",
+    "Outcome",
+    "Receiver",
+    "Sender",
+    "Verdict",
+    "answer_key",
+    "parse_pdu",
+    "timer_s",
+]

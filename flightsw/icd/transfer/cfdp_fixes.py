@@ -4,7 +4,9 @@ Each fix overrides a private method, so the version is pinned, and each has a te
 needed any more or no longer enough.
 """
 
-from collections.abc import Callable
+import hashlib
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +25,16 @@ from cfdppy.handler.source import TransactionStep as SourceStep
 from cfdppy.mib import CheckTimerProvider, DefaultFaultHandlerBase
 from cfdppy.user import CfdpUserBase
 from spacepackets.cfdp import ConditionCode
-from spacepackets.cfdp.pdu import EofPdu, FileDataPdu, FinishedPdu, MetadataPdu
+from spacepackets.cfdp.pdu import EofPdu, FileDataPdu, FinishedPdu, MetadataPdu, NakPdu
 from spacepackets.cfdp.pdu.finished import DeliveryCode, FileStatus, FinishedParams
+from spacepackets.cfdp.pdu.nak import get_max_seg_reqs_for_max_packet_size_and_pdu_cfg
 from spacepackets.cfdp.tlv import FilestoreResponseStatusCode
 from spacepackets.countdown import Countdown
 
 from flightsw.icd.transfer.checksum import file_checksum
+from flightsw.icd.transfer.receipt import Verdict, attach, receipt, store_of
+
+MAX_GAPS = 16_384  # of one file: 50 MB with 30 % of its segments lost have some 10,000
 
 
 def delivered(finished: FinishedParams) -> bool:
@@ -82,7 +88,8 @@ class OneFile(VirtualFilestore):
     def calculate_checksum(
         self, checksum_type: Any, file_path: Path, size_to_verify: int, segment_len: int = 4096
     ) -> bytes:
-        return file_checksum(checksum_type, self.content[:size_to_verify])
+        whole = size_to_verify == len(self.content)
+        return file_checksum(checksum_type, self.content if whole else self.content[:size_to_verify])
 
     def file_size(self, file: Path) -> int:
         return len(self.content)
@@ -112,10 +119,16 @@ class OneFile(VirtualFilestore):
 class Indications(CfdpUserBase):
     """Keeps what the handlers say about their one transaction."""
 
-    def __init__(self, vfs: OneFile, accept: Callable[[str, bytes], bool] | None = None):
+    def __init__(
+        self,
+        vfs: OneFile,
+        accept: Callable[[str, bytes], bool | Verdict] | None = None,
+        key: bytes | None = None,
+    ):
         super().__init__(vfs)
         self.file = vfs
-        self._accept = accept
+        self._accept, self._key = accept, key
+        self.store = b""  # that the file is from; empty if the sender does not say it
         self.dest_name: str | None = None
         self.finished: Any = None
 
@@ -123,7 +136,16 @@ class Indications(CfdpUserBase):
         self.finished = params.finished_params
         if self._accept is None or not delivered(self.finished):
             return
-        if not self._accept(self.dest_name or "", bytes(self.file.content)):
+        content = bytes(self.file.content)
+        verdict = self._accept(self.dest_name or "", content)
+        if not isinstance(verdict, Verdict):
+            verdict = Verdict.STORED if verdict else Verdict.UNSTORED
+        if self.store and verdict is not Verdict.UNSTORED:
+            transaction = params.transaction_id.seq_num.value
+            sha256 = hashlib.sha256(content).digest()
+            made = receipt(verdict, self.store, transaction, sha256, self._key)
+            attach(self.finished, verdict, made)
+        if not verdict:
             self.finished.condition_code = ConditionCode.FILESTORE_REJECTION
             self.finished.delivery_code = DeliveryCode.DATA_INCOMPLETE
             self.finished.file_status = FileStatus.DISCARDED_FILESTORE_REJECTION
@@ -163,18 +185,40 @@ class NoCheckTimer(CheckTimerProvider):
 
 
 class Gaps(LostSegmentTracker):
-    """The missing ranges of a file; any range can be taken out, the original refuses partial overlap."""
+    """The missing ranges of a file, sorted and apart from each other, `MAX_GAPS` at most.
+
+    Any range can be taken out; the original refuses partial overlap, and sorts all gaps for each PDU. Where one more
+    gap would be too many, the last two become one: what lies between them is asked for again.
+    """
+
+    def add_lost_segment(self, lost_seg: tuple[int, int]) -> None:
+        start, end = lost_seg
+        if start >= end:
+            return
+        gaps = self.lost_segments
+        first = bisect_left(gaps, start, key=lambda gap: gap[1])  # those that it touches follow each other
+        last = bisect_right(gaps, end, key=lambda gap: gap[0])
+        if first < last:
+            start, end = min(start, gaps[first][0]), max(end, gaps[last - 1][1])
+        gaps[first:last] = [(start, end)]
+        self._limit()
 
     def remove_lost_segment(self, segment_to_remove: tuple[int, int]) -> bool:
         start, end = segment_to_remove
-        kept = []
-        for gap_start, gap_end in self.lost_segments:
-            kept += [
-                (a, b) for a, b in ((gap_start, min(gap_end, start)), (max(gap_start, end), gap_end)) if a < b
-            ]
-        changed = sorted(kept) != sorted(self.lost_segments)
-        self.lost_segments = sorted(kept)
-        return changed
+        gaps = self.lost_segments
+        first = bisect_right(gaps, start, key=lambda gap: gap[1])  # of those that it overlaps
+        last = bisect_left(gaps, end, key=lambda gap: gap[0])
+        if start >= end or first >= last:
+            return False
+        before = gaps[first:last]
+        gaps[first:last] = [(a, b) for a, b in ((before[0][0], start), (end, before[-1][1])) if a < b]
+        self._limit()
+        return True  # also where it counts as missing again: the sender lives
+
+    def _limit(self) -> None:
+        gaps = self.lost_segments
+        if len(gaps) > MAX_GAPS:
+            gaps[-2:] = [(gaps[-2][0], gaps[-1][1])]
 
 
 class FixedDestHandler(DestHandler):
@@ -183,6 +227,7 @@ class FixedDestHandler(DestHandler):
     clock: Clock
     cfg: Any
     user: Indications  # pyright: ignore[reportIncompatibleVariableOverride]  # it is given no other
+    naks: Iterator[NakPdu] = iter(())  # still to be sent, of the last sequence
 
     def _common_first_packet_handler(self, pdu: Any) -> bool | None:
         # the original's default tracker is one object shared by all transactions: files get each other's gaps
@@ -207,21 +252,45 @@ class FixedDestHandler(DestHandler):
         self._handle_fd_pdu(fd_pdu)
 
     def _handle_metadata_packet(self, metadata_pdu: MetadataPdu) -> None:
+        self.user.store = store_of(metadata_pdu)
         super()._handle_metadata_packet(metadata_pdu)
         if self._params.acked_params.deferred_lost_segment_detection_active:
             # the original goes back to waiting for file data, and both sides wait forever
             self.states.step = DestStep.WAITING_FOR_MISSING_DATA
 
     def _deferred_lost_segment_handling(self) -> None:
-        super()._deferred_lost_segment_handling()
-        timer = self._params.acked_params.procedure_timer
-        if (
-            timer is not None
-            and not isinstance(timer, ClockCountdown)
-            and self._params.remote_cfg is not None
-        ):
-            timeout_s = self._params.remote_cfg.nak_timer_interval_seconds
-            self._params.acked_params.procedure_timer = ClockCountdown(self.clock, timeout_s)
+        # the original makes all NAK PDUs of a sequence at once, which takes long where gaps are many
+        acked, remote = self._params.acked_params, self._params.remote_cfg
+        assert remote is not None
+        timer, missing = acked.procedure_timer, bool(acked.lost_seg_tracker.lost_segments)
+        if not missing and not acked.metadata_missing:
+            super()._deferred_lost_segment_handling()  # all is there
+            return
+        if timer is None:
+            acked.procedure_timer = ClockCountdown(self.clock, remote.nak_timer_interval_seconds)
+        elif timer.busy():
+            return
+        elif acked.nak_activity_counter + 1 == remote.nak_timer_expiration_limit:
+            self._params.finished_params.delivery_code = DeliveryCode.DATA_INCOMPLETE
+            self._declare_fault(ConditionCode.NAK_LIMIT_REACHED)
+            return
+        else:
+            acked.nak_activity_counter += 1
+            timer.reset()
+        self.naks = self._nak_sequence()
+
+    def _nak_sequence(self) -> Iterator[NakPdu]:
+        """Give the NAK PDUs that ask for all that is missing now; their scopes follow each other to the file's end."""
+        params, acked = self._params, self._params.acked_params
+        remote, size_bytes = params.remote_cfg, params.fp.file_size
+        assert remote is not None and size_bytes is not None
+        most = get_max_seg_reqs_for_max_packet_size_and_pdu_cfg(remote.max_packet_len, params.pdu_conf)
+        wanted = [(0, 0)] * acked.metadata_missing + acked.lost_seg_tracker.lost_segments
+        for first in range(0, len(wanted), most):
+            batch = wanted[first : first + most]
+            start = batch[0][0] if first else 0
+            end = batch[-1][1] if first + most < len(wanted) else size_bytes
+            yield NakPdu(params.pdu_conf, start, end, batch)
 
     def _start_positive_ack_procedure(self) -> None:
         super()._start_positive_ack_procedure()

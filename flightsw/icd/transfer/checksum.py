@@ -1,5 +1,7 @@
 """The checksums of a file that CFDP knows and the mission file can choose (SANA registry of CFDP checksum types)."""
 
+import zlib
+
 import numpy as np
 from fastcrc import crc32
 from spacepackets.cfdp import ChecksumType
@@ -24,7 +26,7 @@ def file_checksum(kind: ChecksumType, content: bytes | bytearray) -> bytes:
     """
     match kind:
         case ChecksumType.CRC_32:
-            number = crc32.iso_hdlc(bytes(content))
+            number = zlib.crc32(content)
         case ChecksumType.CRC_32C:
             number = crc32.iscsi(bytes(content))
         case ChecksumType.MODULAR:

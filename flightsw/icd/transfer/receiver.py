@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from spacepackets.cfdp import Direction, DirectiveType
+from spacepackets.cfdp import ConditionCode, Direction, DirectiveType
 from spacepackets.cfdp.pdu import AckPdu, EofPdu, FileDataPdu, FinishedPdu, MetadataPdu
 
 from flightsw.icd.mission import Checksum
@@ -23,6 +23,7 @@ from flightsw.icd.transfer.pdu import (
     parse_pdu,
     remember,
 )
+from flightsw.icd.transfer.receipt import Verdict, store_of
 
 POLL_S = 0.02  # between looks at the timers of the transactions
 # of memory that all open files may take, in files of the largest size: a short packet can claim any byte of a file
@@ -46,25 +47,56 @@ class _Receiving:
     last_sign_s: float
     received_up_to: int = 0
     size_bytes: int | None = None
+    checksum: bytes | None = None  # as the EOF says
     finished_pdu: bytes | None = None
+
+    @property
+    def closed(self) -> "_Closed":
+        name, store = self.user.dest_name or "", self.user.store
+        return _Closed(name, store, self.size_bytes, self.checksum, self.finished_pdu or b"")
+
+
+@dataclass(frozen=True)
+class _Closed:
+    """What is known of a transaction that has ended: which file it was, and the answer."""
+
+    name: str
+    store: bytes
+    size_bytes: int | None
+    checksum: bytes | None
+    finished_pdu: bytes
+
+    def is_other(self, pdu: Any) -> bool:
+        """Tell whether a PDU is of another file, whose sender has used the number again."""
+        if isinstance(pdu, MetadataPdu):
+            return (pdu.dest_file_name or "", store_of(pdu), pdu.file_size) != (
+                self.name,
+                self.store,
+                self.size_bytes,
+            )
+        if isinstance(pdu, EofPdu) and pdu.condition_code == ConditionCode.NO_ERROR:
+            return (pdu.file_size, pdu.file_checksum) != (self.size_bytes, self.checksum)
+        return False
 
 
 class Receiver:
     """The receiving entity. `accept(name, content)` stores a whole, checked file before the sender is told.
 
-    `accept` returns False when it cannot store; the sender then keeps the file. The same file may come twice,
-    and the name is the sender's: it may be anything.
+    `accept` returns True or False, or a `Verdict`: False when it cannot store now, REJECTED when it would not take the
+    file the next time either; the sender then keeps it. The same file may come twice, and the name is the sender's:
+    it may be anything. With `key` the receipts of files that come from a store have a tag.
     """
 
     def __init__(
         self,
         max_pdu_bytes: int,
         interval_s: float,
-        accept: Callable[[str, bytes], bool],
+        accept: Callable[[str, bytes], bool | Verdict],
         max_file_bytes: int = 64 << 20,
         max_open: int = 32,
         route: Route = DOWNLINK,
         checksum: Checksum = "crc-32",
+        key: bytes | None = None,
     ):
         self.segments_received = 0
         self.segments_resent = 0  # came at or below what was there already: resent, late or twice
@@ -73,9 +105,10 @@ class Receiver:
         self._max_pdu_bytes, self._interval_s, self._accept = max_pdu_bytes, interval_s, accept
         self._max_file_bytes, self._max_open, self._route = max_file_bytes, max_open, route
         self._checksum: Checksum = checksum
+        self._key = key
         self._clock = Clock()
         self._receiving: OrderedDict[int, _Receiving] = OrderedDict()
-        self._closed: OrderedDict[int, bytes] = OrderedDict()  # transaction to its Finished PDU
+        self._closed: OrderedDict[int, _Closed] = OrderedDict()  # by transaction
         self._queue: deque[bytes] = deque()
         self._next_poll_s = float("-inf")
 
@@ -102,6 +135,7 @@ class Receiver:
         except PacketError:
             self.pdus_refused += 1
             return
+        self._forget_other(pdu, transaction)
         if transaction in self._closed:
             self._answer_late(pdu, transaction)
             return
@@ -118,6 +152,8 @@ class Receiver:
             receiving.received_up_to = max(receiving.received_up_to, pdu.offset + len(pdu.file_data))
         elif isinstance(pdu, EofPdu | MetadataPdu):
             receiving.size_bytes = pdu.file_size
+            if isinstance(pdu, EofPdu):
+                receiving.checksum = pdu.file_checksum
         again = isinstance(pdu, EofPdu) and receiving.handler.has_seen_eof
         self._step(transaction, receiving, None if again else pdu)
         if again and transaction in self._closed:
@@ -137,12 +173,24 @@ class Receiver:
                 self._step(transaction, receiving, None)
                 if now_s - receiving.last_sign_s > (TIMER_LIMIT + 2) * self._interval_s:
                     self._receiving.pop(transaction, None)  # not closed: if the sender lives it may go on
+        if not self._queue:
+            for receiving in self._receiving.values():
+                if (nak := next(receiving.handler.naks, None)) is not None:
+                    return bytes(nak.pack())
         return self._queue.popleft() if self._queue else None
+
+    def _forget_other(self, pdu: Any, transaction: int) -> None:
+        """Forget a file that was answered if its number now comes with another one."""
+        receiving = self._receiving.get(transaction)
+        if receiving is not None and receiving.finished_pdu is not None and receiving.closed.is_other(pdu):
+            del self._receiving[transaction]
+        elif transaction in self._closed and self._closed[transaction].is_other(pdu):
+            del self._closed[transaction]
 
     def _answer_late(self, pdu: Any, transaction: int) -> None:
         if isinstance(pdu, EofPdu):
             self._queue.append(acknowledgement(pdu, Direction.TOWARDS_SENDER))
-            self._queue.append(self._closed[transaction])
+            self._queue.append(self._closed[transaction].finished_pdu)
 
     def _check(self, pdu: Any, receiving: _Receiving | None) -> None:
         if pdu.direction != Direction.TOWARDS_RECEIVER:
@@ -167,7 +215,7 @@ class Receiver:
         source, destination = self._route
         nak_bytes = min(self._max_pdu_bytes, MAX_NAK_BYTES)
         config, remotes = configuration(destination, source, nak_bytes, self._interval_s, self._checksum)
-        user = Indications(OneFile(b"", self._max_file_bytes), self._accept)
+        user = Indications(OneFile(b"", self._max_file_bytes), self._accept, self._key)
         handler = FixedDestHandler(config, user, remotes, NoCheckTimer())
         handler.clock = self._clock
         receiving = _Receiving(handler, user, self._clock.now_s)
@@ -196,10 +244,11 @@ class Receiver:
         self._drain(receiving)
         if receiving.finished_pdu is not None:
             receiving.user.file.content.clear()  # stored or given up; only the answers are still needed
+            receiving.handler.naks = iter(())
         if receiving.handler.idle:
             self._receiving.pop(transaction, None)
             if receiving.finished_pdu is not None:
-                remember(self._closed, transaction, receiving.finished_pdu)
+                remember(self._closed, transaction, receiving.closed)
 
     def _drain(self, receiving: _Receiving) -> None:
         while holder := receiving.handler.get_next_packet():

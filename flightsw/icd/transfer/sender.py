@@ -1,12 +1,14 @@
 """The sending end of a file transfer."""
 
+import hashlib
 from collections import OrderedDict, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from cfdppy.request import PutRequest
-from spacepackets.cfdp import Direction, DirectiveType, TransmissionMode
+from spacepackets.cfdp import ConditionCode, Direction, DirectiveType, TransmissionMode
 from spacepackets.cfdp.pdu import FileDataPdu, FinishedPdu, NakPdu
 from spacepackets.seqcount import ProvidesSeqCount
 
@@ -31,10 +33,12 @@ from flightsw.icd.transfer.pdu import (
     parse_pdu,
     remember,
 )
+from flightsw.icd.transfer.receipt import Verdict, fits, receipt_in, store_message
 from flightsw.icd.transfer.rounds import NakRounds, SegmentLength, merged_ranges
 
 SILENCE_INTERVALS = 4  # a living receiver that owes us an answer sends something every interval
 SILENCE_S = 3.0  # at least: the receiver may be waiting for its disk
+RESENT_AT_ONCE = 32  # segments that are queued in one call, of those that the receiver asks for again
 
 
 class _OneNumber(ProvidesSeqCount):
@@ -51,16 +55,47 @@ class _OneNumber(ProvidesSeqCount):
 
 @dataclass(frozen=True)
 class Outcome:
-    """How the sending of a file ended. Only `delivered` means that the other side has stored it."""
+    """How the sending of a file ended. Only `delivered` means that the other side has stored it.
+
+    refused: the other side does not take it, or gives no receipt that fits; the next try will hardly end better.
+    """
 
     name: str
     delivered: bool
     reason: str
+    refused: bool = False
+
+
+@dataclass(frozen=True)
+class _File:
+    """Which file a transaction carries, as a receipt says it."""
+
+    name: str
+    store: bytes
+    transaction: int
+    sha256: bytes
+
+    def verdict(self, finished: FinishedPdu, keys: Sequence[bytes]) -> Verdict | None:
+        """Return what a Finished PDU says about this very file; None if it does not prove to be about it.
+
+        A receiver that knows no receipts is believed where there is no key.
+        """
+        params = finished.finished_params
+        given = receipt_in(params)
+        if delivered(params):
+            verdict = Verdict.STORED
+        elif given and params.condition_code == ConditionCode.FILESTORE_REJECTION:
+            verdict = Verdict.REJECTED
+        else:
+            return Verdict.UNSTORED
+        if not self.store or (not given and not keys):
+            return verdict
+        return verdict if fits(given, verdict, self.store, self.transaction, self.sha256, keys) else None
 
 
 @dataclass
 class _Sending:
-    name: str
+    file: _File
     size_bytes: int
     handler: FixedSourceHandler
     user: Indications
@@ -70,10 +105,24 @@ class _Sending:
     urgent: bool
     queue: deque[bytes] = field(default_factory=deque)
     sent_up_to: int = 0
+    wanted: deque[tuple[int, int]] = field(default_factory=deque)  # asked for again, not in the queue yet
+    nak: NakPdu | None = None  # that asked last
+    unproven: bool = False  # an answer came whose receipt does not fit
+    verdict: Verdict | None = None
+
+    @property
+    def name(self) -> str:
+        return self.file.name
 
 
 class Sender:
-    """The sending entity: several files in flight, the first put first on the wire."""
+    """The sending entity: several files in flight, the first put first on the wire.
+
+    Args:
+        store: the identity of the store that the files are from, of `STORE_BYTES`; with it the receiver's answers count
+            only with a receipt for the very file.
+        keys: one of these must have made each receipt.
+    """
 
     def __init__(
         self,
@@ -82,6 +131,8 @@ class Sender:
         max_in_flight: int = 8,
         route: Route = DOWNLINK,
         checksum: Checksum = "crc-32",
+        store: bytes = b"",
+        keys: Sequence[bytes] = (),
     ):
         self.segments_sent = 0
         self.segments_resent = 0
@@ -90,10 +141,11 @@ class Sender:
         self._max_pdu_bytes, self._interval_s, self._max_in_flight = max_pdu_bytes, interval_s, max_in_flight
         self._route = route
         self._checksum: Checksum = checksum
+        self._store, self._keys = store, keys
         self._segments = SegmentLength(max_pdu_bytes, interval_s)
         self._clock = Clock()
         self._sending: OrderedDict[int, _Sending] = OrderedDict()
-        self._closed: OrderedDict[int, str] = OrderedDict()  # transaction to name
+        self._closed: OrderedDict[int, _File] = OrderedDict()  # by transaction
         self._last_words: deque[bytes] = deque()  # PDUs of closed transactions
         self._outcomes: list[Outcome] = []
 
@@ -129,12 +181,16 @@ class Sender:
         handler = FixedSourceHandler(config, user, remotes, NoCheckTimer(), _OneNumber(transaction))
         handler.clock = self._clock
         path = Path(name)
-        handler.put_request(PutRequest(destination, path, path, TransmissionMode.ACKNOWLEDGED, True))
+        request = PutRequest(destination, path, path, TransmissionMode.ACKNOWLEDGED, True)
+        if self._store:
+            request.msgs_to_user = [store_message(self._store)]
+        handler.put_request(request)
         faults = config.default_fault_handlers
         assert isinstance(faults, Faults)
         rounds = NakRounds(len(content))
+        file = _File(name, self._store, transaction, hashlib.sha256(content).digest())
         self._sending[transaction] = _Sending(
-            name, len(content), handler, user, faults, now_s, rounds, urgent
+            file, len(content), handler, user, faults, now_s, rounds, urgent
         )
         if urgent:
             for number in [n for n, sending in self._sending.items() if not sending.urgent]:
@@ -158,15 +214,24 @@ class Sender:
         if sending is None:
             self._answer_late(pdu, transaction)
             return
+        if isinstance(pdu, FinishedPdu):
+            sending.verdict = sending.file.verdict(pdu, self._keys)
+            if sending.verdict is None:  # of another file, or of somebody without the key
+                self.pdus_refused += 1
+                sending.unproven = True
+                return
         sending.last_sign_s = now_s
         if isinstance(pdu, NakPdu):
-            if sending.queue and sending.rounds.is_repeated(pdu.start_of_scope):
+            if (sending.queue or sending.wanted) and sending.rounds.is_repeated(pdu.start_of_scope):
                 return  # what it asks for is on its way
             pdu.segment_requests = merged_ranges(pdu.segment_requests, sending.size_bytes)
             ended = sending.rounds.take_nak(pdu.start_of_scope, pdu.end_of_scope, pdu.segment_requests)
             if ended is not None:
                 self._segments.adapt(*ended, now_s)
             sending.handler.limit_segments(self._segments.length_bytes)
+            sending.nak = pdu
+            sending.wanted.extend(pdu.segment_requests)
+            return
         self._step(transaction, sending, pdu)
 
     def next_pdu(self, now_s: float) -> bytes | None:
@@ -174,7 +239,9 @@ class Sender:
         self._clock.now_s = now_s
         if self._last_words:
             return self._last_words.popleft()
-        for sending in self._sending.values():
+        for transaction, sending in list(self._sending.items()):
+            if not sending.queue and sending.wanted:
+                self._send_again(transaction, sending)
             if sending.queue:
                 sending.last_sign_s = now_s
                 return sending.queue.popleft()
@@ -186,7 +253,8 @@ class Sender:
                 sending.last_sign_s = now_s
                 return sending.queue.popleft()
             if now_s - sending.last_sign_s > max(SILENCE_INTERVALS * self._interval_s, SILENCE_S):
-                self._close(transaction, sending, "no answer")
+                reason = "answered without a fitting receipt" if sending.unproven else "no answer"
+                self._close(transaction, sending, reason, refused=sending.unproven)
         return None
 
     def outcomes(self) -> list[Outcome]:
@@ -209,24 +277,43 @@ class Sender:
                 sending.queue.append(bytes(outgoing.pack()))
         if sending.user.finished is not None:
             good = delivered(sending.user.finished)
+            refused = sending.verdict is Verdict.REJECTED
             if good:
                 self._segments.adapt(sending.rounds.sent_bytes, 0, self._clock.now_s)
-            self._close(transaction, sending, "" if good else sending.user.finished.condition_code.name, good)
+            reason = "" if good else sending.user.finished.condition_code.name
+            self._close(transaction, sending, "rejected" if refused else reason, good, refused)
         elif sending.faults.condition is not None:
             self._close(transaction, sending, sending.faults.condition.name)
         elif sending.handler.idle:
             self._close(transaction, sending, "abandoned")
 
-    def _close(self, transaction: int, sending: _Sending, reason: str, good: bool = False) -> None:
+    def _send_again(self, transaction: int, sending: _Sending) -> None:
+        """Queue a part of what was asked for again: all of it at once would take long where much was lost."""
+        assert sending.nak is not None
+        part, left_bytes = [], RESENT_AT_ONCE * self._segments.length_bytes
+        while sending.wanted and left_bytes > 0:
+            start, end = sending.wanted.popleft()
+            part.append((start, min(end, start + left_bytes)))
+            if end > start + left_bytes:
+                sending.wanted.appendleft((start + left_bytes, end))
+            left_bytes -= max(end - start, 1)
+        nak = sending.nak
+        nak.segment_requests = part
+        self._step(transaction, sending, nak)
+
+    def _close(
+        self, transaction: int, sending: _Sending, reason: str, good: bool = False, refused: bool = False
+    ) -> None:
         self._last_words.extend(sending.queue)
         del self._sending[transaction]
-        remember(self._closed, transaction, sending.name)
-        self._outcomes.append(Outcome(sending.name, good, reason))
+        remember(self._closed, transaction, sending.file)
+        self._outcomes.append(Outcome(sending.name, good, reason, refused))
 
     def _answer_late(self, pdu: Any, transaction: int) -> None:
         """Acknowledge a Finished that comes again, or too late: else the receiver keeps on sending it."""
         if not isinstance(pdu, FinishedPdu):
             return
-        if transaction in self._closed and delivered(pdu.finished_params):
-            self._outcomes.append(Outcome(self._closed[transaction], True, "told late"))
+        file = self._closed.get(transaction)
+        if file is not None and file.verdict(pdu, self._keys) is Verdict.STORED:
+            self._outcomes.append(Outcome(file.name, True, "told late"))
         self._last_words.append(acknowledgement(pdu, Direction.TOWARDS_RECEIVER))
