@@ -24,6 +24,7 @@ from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.icd.command import Command
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, load_mission
+from flightsw.icd.model_file import SENSOR_METADATA
 from flightsw.ports import open_link
 from flightsw.store import FrameStore
 from flightsw.triage import Renderer
@@ -35,6 +36,7 @@ from hil.links.faults import Faults
 from hil.links.virtual_serial import VirtualSerial
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.sensor import Sensor
+from tests.ground.test_uplink import foreign_model
 from tests.scenes import ball
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -167,6 +169,9 @@ def test_the_ground_changes_the_bracket_and_uplinks_a_model_and_the_downlink_fol
         unfit = ("model", GOLDEN / "mission.yaml", "--session", session, "--key", key)
         done = tools.run("ground", "uplink", *unfit)
         assert done.returncode == 2 and "expected a run's model.onnx" in done.stderr
+        other = tmp_path / "other.onnx"  # says what triage asks for, and is no renderer
+        other.write_bytes(foreign_model(**dict.fromkeys(("width", "height", *SENSOR_METADATA), "1")))
+        assert command("model", other) == (1, ["accepted", "started", "failed"])
         assert not list(store.glob("model*"))
         assert command("model", model) == everything
         assert (store / "model.onnx").read_bytes() == model.read_bytes()
