@@ -25,6 +25,7 @@ def count_boot(folder: Path) -> int:
         boot = LOST + secrets.randbits(31)
         log.error("the number of starts is lost, it goes on from %d: %s", boot, error)
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         write_twice(path, {"boot": boot}, lambda file, data: write_with_reserve(file, data, folder / RESERVE))
     except OSError as error:
         boot = LOST + secrets.randbits(31)

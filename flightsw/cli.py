@@ -320,10 +320,7 @@ def fsck_command(
     else:
         for problem in report.problems:
             print(problem)
-        print(
-            f"{report.frames} good frames, {report.waiting} to be delivered, {report.quarantined} quarantined, "
-            f"{report.missing} missing, {len(report.problems)} problems {'found' if check else 'repaired'}"
-        )
+        print(report.sentence("found" if check else "repaired"))
     if report.quarantined or report.missing or (check and report.problems):
         raise typer.Exit(1)
 

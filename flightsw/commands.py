@@ -20,6 +20,7 @@ from pathlib import Path
 
 from flightsw.clock import utc_ns
 from flightsw.errors import FlightError, StoreError
+from flightsw.fsck import RunningCheck
 from flightsw.icd.auth import MAX_COUNTER, TAG_BYTES, AuthError, Key, claimed, digest, unseal, unseal_file
 from flightsw.icd.command import ENDED, Command, Report, model_file_name
 from flightsw.icd.config import ConfigError
@@ -225,6 +226,7 @@ class Commander:
             deque()
         )  # with the frames, and how many they were
         self._last_used = next(iter(self._keys.counters), None)
+        self._check_of_store: tuple[Received, RunningCheck] | None = None  # the command that asked for it
         self._next_answer_s = float("-inf")
 
     @property
@@ -273,6 +275,7 @@ class Commander:
 
     def poll(self) -> None:
         """Go on with what commands have begun, for `DELETE_S` at most."""
+        self._poll_check()
         end_s = self._clock_s() + DELETE_S
         while self._deleting:
             received, frames, count = self._deleting[0]
@@ -342,6 +345,21 @@ class Commander:
             )
         return self._report(received, "refused", text)
 
+    def _poll_check(self) -> None:
+        """Report how the check of the store ended, once it has."""
+        if self._check_of_store is None:
+            return
+        received, check = self._check_of_store
+        try:
+            report = check.outcome()
+        except FlightError as error:
+            self._note(received, "failed", str(error))
+        else:
+            if report is None:
+                return
+            self._note(received, "completed", report.sentence())
+        self._check_of_store = None
+
     def _check_arming(self, command: Command) -> None:
         armed, self._armed = self._armed, None  # whatever comes next disarms
         if not command.layout.armed:
@@ -406,6 +424,11 @@ class Commander:
             case "resend":
                 count = self._store.put_back(values["first_frame"], values["last_frame"])
                 return f"{count} frames put into the outbox again"
+            case "fsck":
+                if self._check_of_store is not None:
+                    raise StoreError(f"command {self._check_of_store[0].counter} checks the store already")
+                self._check_of_store = (received, RunningCheck(self._store.folder))
+                return None
             case "safe" | "resume":
                 self._change(safe_mode=command.name == "safe")
                 return "no exposures until resumed" if self.settings.safe_mode else "exposures go on"

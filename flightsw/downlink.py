@@ -4,16 +4,16 @@ import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from flightsw.clock import utc_ns
 from flightsw.commands import Commander, KeyRing, Upload
-from flightsw.errors import DownlinkError, FlightError
+from flightsw.errors import DownlinkError, FlightError, StoreError
 from flightsw.frame_sender import FrameSender, SendingCounts
 from flightsw.housekeeping import EventLog, ProcessMeter, disk_values
-from flightsw.icd.frame import HEADER, header_of
+from flightsw.icd.frame import HEADER, header_of, read_header
 from flightsw.icd.framing import PacketStream
 from flightsw.icd.mission import Mission
 from flightsw.icd.packet import (
@@ -25,12 +25,13 @@ from flightsw.icd.packet import (
     APID_REPORTS,
     APID_UPLINK_FILES,
     TELEMETRY,
+    PacketError,
 )
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import UPLINK, Receiver, answer_key, timer_s
 from flightsw.ports import Link
 from flightsw.ranking import Ranking
-from flightsw.settings import Settings
+from flightsw.settings import Settings, load_settings
 from flightsw.store import FrameStore
 from flightsw.triage import ModelVerified
 
@@ -38,6 +39,10 @@ log = logging.getLogger(__name__)
 
 WAIT_S = 0.02  # longest wait for the port before timers and outbox are looked at again
 OUTBOX_S = 0.2  # between looks at the outbox, which another process may fill
+LINK_OVER_LOOK = 4.0  # the least that the link has of the time, over what looks at a slow disk take
+STORE_RETRY_S = 5.0  # between attempts at a store that cannot be read
+FRAMES_A_LOOK = 256  # queued, more than are sent between two looks: what waits in all does not matter
+VIEWS_A_LOOK = 100
 HEADERS_A_LOOK = 20  # frame headers queued at once: a full outbox must not hold the files back
 LAST_TELEMETRY_S = 0.5  # for sending the last telemetry at the end
 RESTART_S = 0.5  # from a failure to the new start
@@ -84,23 +89,28 @@ def run_downlink(
     keys: KeyRing | None = None,
     capture_values: Callable[[], dict[str, Any]] = dict,
     boot: int = 0,
+    events: EventLog | None = None,
+    store_may_open: Callable[[], bool] = lambda: True,
 ) -> DownlinkProgress:
     """Send the outbox until told to stop, or until the ground has or rejects all of it, and return the counts.
 
     A frame leaves the outbox only when the ground has reported it stored; a transfer that fails is put again.
     `on_progress` is called after each delivery and about five times a second. After a failure the downlink starts again
-    from what is on the disk, with an event to the ground; nothing on board may end the link while frames wait.
+    from what is on the disk, with an event to the ground; nothing on board may end the link while frames wait. Without
+    a store that can be read, telemetry is sent and commands are obeyed all the same; an event says why, and it is tried
+    again every `STORE_RETRY_S`.
 
     Args:
         keys: the keys and their replay counters; without one every command is refused.
         capture_values: what capture knows of the housekeeping packet's items.
         boot: the number of this start of the flight software, for the housekeeping packet.
+        events: where the flight software's warnings are already going; a new one without it.
+        store_may_open: whether a store that is not open yet may be opened, which takes long where it is to be repaired.
 
     Raises:
-        StoreError: the outbox cannot be read or changed, six times in a row.
         DownlinkError: an unforeseen error, six times in a row.
     """
-    downlink = _Downlink(store, link, mission, keys, capture_values, clock_s, boot)
+    downlink = _Downlink(store, link, mission, keys, capture_values, clock_s, boot, events or EventLog())
     logger = logging.getLogger("flightsw")
     logger.addHandler(downlink.events)
     for problem in keys.problems if keys is not None else ():
@@ -112,10 +122,13 @@ def run_downlink(
             now_s = clock_s()
             try:
                 if now_s >= next_look_s:
-                    next_look_s = now_s + OUTBOX_S
                     utc_ns()  # so that a step of the clock is seen, and told, soon
-                    downlink.look(now_s)
+                    if downlink.store_is_open(now_s, store_may_open):
+                        downlink.look(now_s)
                     on_progress(downlink.progress())
+                    looked_s = clock_s()
+                    # where a look takes long, most of the time is the link's all the same
+                    next_look_s = looked_s + max(OUTBOX_S, LINK_OVER_LOOK * (looked_s - now_s))
                 if downlink.turn(now_s):
                     on_progress(downlink.progress())
                 downlink.fill(now_s)
@@ -123,7 +136,7 @@ def run_downlink(
                 downlink.start_again(error)
                 next_look_s = float("-inf")
                 continue
-            if len(downlink.waiting) > downlink.rejected_waiting:
+            if len(downlink.waiting) > downlink.rejected_waiting or not store.is_open:
                 empty_since_s = None
             elif empty_since_s is None:
                 empty_since_s = now_s
@@ -149,9 +162,10 @@ class _Downlink:
         capture_values: Callable[[], dict[str, Any]],
         clock_s: Callable[[], float],
         boot: int,
+        events: EventLog,
     ):
         self.interval_s = timer_s(link.baud_rate)
-        self.events = EventLog()
+        self.events = events
         self._store, self._link, self._mission, self._clock_s = store, link, mission, clock_s
         self._capture_values, self._boot = capture_values, boot
         self._stream = PacketStream(TELEMETRY, mission.link.max_packet_bytes)
@@ -161,19 +175,31 @@ class _Downlink:
         self._meter = ProcessMeter(clock_s)
         self._telemetry: deque[tuple[int, bytes]] = deque()
         self._next_housekeeping_s = self._next_refusal_s = float("-inf")
-        self._announced: set[int] = set()
+        self._announced: set[int] = set()  # and those still to be, over restarts
+        self._to_announce: deque[int] = deque()
+        self._store_retry_s = float("-inf")
+        self._store_problem = ""  # of which the ground was told last
         self._counts = SendingCounts()
         self._restarts = self._restarts_in_a_row = 0
         self._start()
-        self.events.add("started", frames_stored=len(store.frames), outbox_frames=len(self.waiting))
+        self.events.add("started", frames_stored=store.frame_count, outbox_frames=len(self.waiting))
 
     def _start(self) -> None:
         """Begin with what is on the disk: no file in flight, no frame ranked."""
         store = self._store
         self._started_s = self._clock_s()
         self._ranking = Ranking(store, self._mission.camera, self._clock_s)
-        self._frames = FrameSender(
-            store,
+        self._frames = self._new_sender()
+        self._uploads: Receiver | None = None  # of the model file that was announced last
+        self._upload: Upload | None = None
+        self._views_to_note: deque[int] = deque()  # of frames that were delivered in earlier runs
+        self._commander.end_models("the downlink failed before the model was in use")
+        if store.is_open:
+            self._begin_with_store()
+
+    def _new_sender(self) -> FrameSender:
+        return FrameSender(
+            self._store,
             self._ranking,
             self._counts,
             self._stream.max_data_bytes,
@@ -181,14 +207,39 @@ class _Downlink:
             self._mission.link,
             self._keys,
         )
-        self._uploads: Receiver | None = None  # of the model file that was announced last
-        self._upload: Upload | None = None
-        self._ranking.start()
-        self._commander.end_models("the downlink failed before the model was in use")
-        self._frames.look()
-        for frame_id in {frame.frame_id for frame in store.frames}.difference(self.waiting):
-            with contextlib.suppress(OSError), open(store.path(frame_id), "rb") as container:
-                self._ranking.note_sent(frame_id, header_of(container.read(HEADER.size)))
+
+    def _begin_with_store(self) -> None:
+        try:
+            self._ranking.start()
+            self._take_in(self._frames.look())
+        except (OSError, StoreError) as error:
+            self._store_failed(error, self._clock_s())
+        waiting = self.waiting
+        self._views_to_note.extend(f.frame_id for f in self._store.frames if f.frame_id not in waiting)
+
+    def store_is_open(self, now_s: float, may_open: Callable[[], bool]) -> bool:
+        """Tell whether there is a store to look at, after opening it if that is due."""
+        if now_s < self._store_retry_s:
+            return False
+        if not self._store.is_open:
+            if not may_open():
+                return False
+            try:
+                self._store.open()
+            except StoreError as error:
+                self._store_failed(error, now_s)
+                return False
+            self._commander.settings = load_settings(self._store.folder, self._mission)
+            self._frames = self._new_sender()  # of this store's identity
+            self._begin_with_store()
+        return True
+
+    def _store_failed(self, error: Exception, now_s: float) -> None:
+        """Say why there are no frames to send, once for each reason, and leave the store alone for a while."""
+        self._store_retry_s = now_s + STORE_RETRY_S
+        if str(error) != self._store_problem:
+            self._store_problem = str(error)
+            log.error("%s; commands are obeyed, and it is tried again every %g s", error, STORE_RETRY_S)
 
     def start_again(self, error: Exception) -> None:
         """Begin anew after a failure and a pause; the log's error is an event to the ground.
@@ -219,7 +270,7 @@ class _Downlink:
         return self._commander.settings
 
     @property
-    def waiting(self) -> list[int]:
+    def waiting(self) -> Collection[int]:
         """The frames still to be delivered, those in flight included."""
         return self._frames.waiting
 
@@ -232,17 +283,25 @@ class _Downlink:
         """Take in new frames and results of triage, and order the frames that wait."""
         for verified in self._ranking.collect():
             self._report_model(verified)
-        waiting = self._frames.look()
+        try:
+            self._take_in(self._frames.look())
+        except StoreError as error:
+            self._store_failed(error, now_s)
+            return
         self._announce()
-        self._ranking.rank(waiting)
-        ready = self._frames.ready(now_s)
-        self._frames.queue(
-            self._ranking.ordered(ready, now_s) if self.settings.priority == "triage" else ready
-        )
+        self._note_views()
+        self._ranking.rank(self.waiting)
+        if self.settings.priority == "triage":
+            self._frames.queue(self._ranking.ordered(self._frames.ready(now_s), now_s))
+        else:
+            self._frames.queue(self._frames.ready(now_s, FRAMES_A_LOOK))
 
     def fill(self, now_s: float) -> None:
         """Put the next files in flight."""
-        self._frames.fill(now_s)
+        try:
+            self._frames.fill(now_s)
+        except StoreError as error:
+            self._store_failed(error, now_s)
 
     def turn(self, now_s: float) -> bool:
         """Send and receive what the port takes and gives at once; tell whether a transfer ended."""
@@ -303,7 +362,7 @@ class _Downlink:
 
     def _housekeeping(self) -> bytes:
         progress, settings = self.progress(), self.settings
-        frames_stored, bracket = len(self._store.frames), settings.bracket(self._mission)
+        frames_stored, bracket = self._store.frame_count, settings.bracket(self._mission)
         values = {
             "utc_ns": utc_ns(),
             "boot": self._boot,
@@ -326,15 +385,34 @@ class _Downlink:
         values |= self._meter.values() | disk_values(self._store.folder, self._store.used_bytes)
         return DICTIONARY.telemetry["housekeeping"].pack(**values | self._capture_values())
 
+    def _take_in(self, arrived: list[int]) -> None:
+        """Have frames announced that have come into the outbox, once each."""
+        self._to_announce.extend(frame_id for frame_id in arrived if frame_id not in self._announced)
+        self._announced.update(arrived)
+
     def _announce(self) -> None:
         """Send each new frame's header at once, and its thumbnail if those go first."""
-        new = [frame_id for frame_id in self.waiting if frame_id not in self._announced]
-        for frame_id in new[:HEADERS_A_LOOK]:
-            self._announced.add(frame_id)
-            with contextlib.suppress(OSError), open(self._store.path(frame_id), "rb") as container:
-                self._telemetry.append((APID_FRAME_HEADERS, header_of(container.read(HEADER.size))))
+        for frame_id in taken(self._to_announce, HEADERS_A_LOOK):
+            if frame_id not in self.waiting:
+                continue
+            with contextlib.suppress(
+                OSError, PacketError
+            ):  # of a damaged one nothing: it is counted when it is sent
+                header = self._header(frame_id)
+                read_header(header)
+                self._telemetry.append((APID_FRAME_HEADERS, header))
             if self.settings.priority == "thumbnail-first":
                 self._frames.queue_thumbnail(frame_id)
+
+    def _note_views(self) -> None:
+        """Have the ranking know the views of frames that earlier runs have delivered, some at a time."""
+        for frame_id in taken(self._views_to_note, VIEWS_A_LOOK):
+            with contextlib.suppress(OSError):
+                self._ranking.note_sent(frame_id, self._header(frame_id))
+
+    def _header(self, frame_id: int) -> bytes:
+        with open(self._store.path(frame_id), "rb") as container:
+            return header_of(container.read(HEADER.size))
 
     def _receive_upload(self, pdu: bytes, now_s: float) -> None:
         """Take a PDU of the announced file; without an announcement there is nothing to keep it in."""
@@ -402,3 +480,9 @@ class _Downlink:
             commands_repeated=self._commander.repeated,
             restarts=self._restarts,
         )
+
+
+def taken(queue: deque[int], count: int) -> Iterator[int]:
+    """Take up to `count` numbers out of a queue."""
+    for _ in range(min(count, len(queue))):
+        yield queue.popleft()

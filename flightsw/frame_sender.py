@@ -1,8 +1,9 @@
 """The frames of the outbox as file transfers: what is put in flight next, and what became of each."""
 
+import itertools
 import logging
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from spacepackets.cfdp import ConditionCode
@@ -51,7 +52,6 @@ class FrameSender:
         link: LinkSection,
         keys: Sequence[bytes] = (),
     ):
-        self.waiting: list[int] = []  # frames still to be delivered, those in flight included
         self.rejected: dict[int, int] = {}  # waiting frames that the ground did not take, and how often
         self.transfers = Sender(
             max_pdu_bytes,
@@ -69,23 +69,32 @@ class FrameSender:
         self._unsure = set(store.in_flight())  # frames that may be on the ground without this side knowing
         self._times_put_back = store.times_put_back
 
-    def look(self) -> list[int]:
-        """Read the outbox and return the frames in it."""
-        self.waiting = self._store.outbox()
-        return self.waiting
+    @property
+    def waiting(self) -> Collection[int]:
+        """The frames still to be delivered, those in flight included, oldest first."""
+        return self._store.waiting
 
-    def ready(self, now_s: float) -> list[int]:
-        """Return the waiting frames that are not in flight and not known to be unreadable for now."""
+    def look(self) -> list[int]:
+        """Look at the outbox and return the frames that are new in it.
+
+        Raises:
+            StoreError: the disk refuses.
+        """
+        return self._store.look()
+
+    def ready(self, now_s: float, at_most: int | None = None) -> list[int]:
+        """Return the first waiting frames that are not in flight and not known to be unreadable for now."""
         if self._store.times_put_back != self._times_put_back:  # asked for by the ground: without delay
             self._times_put_back = self._store.times_put_back
             self._retry_s.clear()
             self.rejected.clear()
         in_flight = set(self.transfers.in_flight)
-        return [
+        ready = (
             frame_id
             for frame_id in self.waiting
             if frame_file_name(frame_id) not in in_flight and self._retry_s.get(frame_id, now_s) <= now_s
-        ]
+        )
+        return list(itertools.islice(ready, at_most))
 
     def queue(self, frame_ids: list[int]) -> None:
         """Send these frames next, in this order; it replaces the order given before."""
@@ -101,7 +110,7 @@ class FrameSender:
             self._put_thumbnail(self._thumbnails.popleft(), now_s)
         while self._queue and transfers.unsent < AHEAD and transfers.has_room:
             frame_id = self._queue.popleft()
-            unsure = {*self._unsure.intersection(self.waiting), frame_id}
+            unsure = {*(other for other in self._unsure if other in self.waiting), frame_id}
             transaction = self._store.next_transaction(unsure)  # from now on it is not dropped for room
             container = self._read(frame_id, now_s)
             if container is not None:
@@ -137,7 +146,7 @@ class FrameSender:
         try:
             return self._store.read(frame_id)
         except StoreError as error:
-            if frame_id not in self._store.outbox():  # deleted since the order was given
+            if frame_id not in self.waiting:  # deleted since the order was given
                 return None
             if frame_id not in self._retry_s:
                 log.error("%s", error)
@@ -173,7 +182,6 @@ class FrameSender:
         if frame_id not in self.waiting:  # a late answer may confirm it twice
             return
         self._store.mark_delivered(frame_id)
-        self.waiting.remove(frame_id)
         self._unsure.discard(frame_id)
         self.rejected.pop(frame_id, None)
         size_bytes = self._sizes_bytes.pop(frame_id, 0)

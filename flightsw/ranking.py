@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +75,7 @@ class Ranking:
                 self._scores[score.frame_id] = score
         return verified
 
-    def rank(self, frame_ids: list[int]) -> None:
+    def rank(self, frame_ids: Iterable[int]) -> None:
         """Have each frame ranked once by the model in use."""
         if not self.model_sha256:
             return

@@ -16,7 +16,8 @@ from flightsw.cameras.reconnecting import PATIENCE_S, RETRY_S, ReconnectingCamer
 from flightsw.clock import utc_ns
 from flightsw.commands import KeyRing
 from flightsw.downlink import DownlinkProgress, run_downlink
-from flightsw.errors import CameraLost, CaptureError
+from flightsw.errors import CameraLost, CaptureError, StoreError
+from flightsw.housekeeping import EventLog
 from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.icd.mission import Mission
 from flightsw.ports import Link, open_link
@@ -67,7 +68,8 @@ def run_pass(
 
     Key, link and camera are opened before the store, so that wrong ones leave no store behind. Where there is a link,
     stored frames are sent without a camera that answers; it is tried again until the pass is over, and if it never
-    answered its error is raised afterwards.
+    answered its error is raised afterwards. A link that is not there yet is awaited while frames are taken, and a store
+    that cannot be read while commands are answered; with `exit_when_empty` the store must be there.
 
     Args:
         stop: when set, capture and downlink end cleanly.
@@ -82,7 +84,9 @@ def run_pass(
     """
     captured, camera, no_camera, thread, alive = CaptureCounts(), None, None, None, Watchdog()
     with contextlib.ExitStack() as opened:
-        link, keys = _open_link(link_url, key_files, opened)
+        events = _events(opened)  # from here on, so that the ground hears of all that is found at the start
+        must_be_there = exit_when_empty and camera_url is None
+        link, keys = _open_link(link_url, key_files, must_be_there, opened)
         if camera_url is not None:
             try:
                 camera = _open_camera(camera_url, mission, stop, opened)
@@ -90,11 +94,12 @@ def run_pass(
                 if link is None:
                     raise
                 no_camera = error  # what is stored is sent all the same
-        store = open_store(store_dir, mission)
+        is_patient = link is not None and not exit_when_empty
+        store = open_store(store_dir, mission, open_now=not is_patient)
         if link is not None:
             waiting = (exit_when_empty, stop, on_sent, alive)
-            thread = _DownlinkThread(FrameStore(store_dir), link, mission, keys, *waiting)
-            thread.camera, thread.boot = camera, count_boot(store_dir)
+            thread = _DownlinkThread(store, link, mission, keys, *waiting)
+            thread.camera, thread.boot, thread.events = camera, count_boot(store_dir), events
             if camera_url is not None:
                 thread.capturing.set()
             thread.start()
@@ -106,6 +111,9 @@ def run_pass(
             on_captured(counts)
 
         try:
+            if thread is not None:
+                _wait_for_store(store, stop)
+                thread.store_is_made.set()
             if camera_url is not None and thread is not None and no_camera is not None:
                 thread.camera = camera = _awaited_camera(camera_url, mission, stop, opened, alive, no_camera)
             if camera is not None:
@@ -122,26 +130,62 @@ def run_pass(
             notify("STOPPING=1")
         if thread is not None and thread.error is not None:
             raise thread.error
+    sent = thread.result if thread is not None else None
+    return _result(store_dir, captured if camera_url is not None else None, camera, sent)
+
+
+def _result(
+    store_dir: Path,
+    captured: CaptureCounts | None,
+    camera: ReconnectingCamera | None,
+    sent: DownlinkProgress | None,
+) -> RunResult:
     left = FrameStore(store_dir)  # opened again: the downlink has its own
     return RunResult(
         frames_stored=len(left.frames),
         outbox=len(left.outbox()),
-        captured=captured if camera_url is not None else None,
+        captured=captured,
         camera_losses=camera.losses if camera is not None else 0,
         camera_is_lost=camera is not None and camera.lost,
-        sent=thread.result if thread is not None else None,
+        sent=sent,
     )
 
 
+def _events(opened: contextlib.ExitStack) -> EventLog:
+    """Return where warnings and errors of the flight software go until `opened` ends."""
+    events, logger = EventLog(), logging.getLogger("flightsw")
+    logger.addHandler(events)
+    opened.callback(logger.removeHandler, events)
+    return events
+
+
 def _open_link(
-    link_url: str | None, key_files: Sequence[Path], opened: contextlib.ExitStack
+    link_url: str | None, key_files: Sequence[Path], must_be_there: bool, opened: contextlib.ExitStack
 ) -> tuple[Link | None, KeyRing]:
     """Return the link, None if it was not asked for, and the keys; `opened` closes them."""
     if link_url is None:
         return None, KeyRing([])
     keys = KeyRing(key_files)
     opened.callback(keys.close)
-    return opened.enter_context(open_link(link_url, FLIGHT_SIDE)), keys
+    return opened.enter_context(open_link(link_url, FLIGHT_SIDE, must_be_there)), keys
+
+
+def _wait_for_store(store: FrameStore, stop: threading.Event) -> None:
+    """Open a store that is not open yet; where it cannot be read, try again until it can or the run is stopped.
+
+    Raises:
+        StoreError: it could not be read before the run was stopped.
+    """
+    problem: StoreError | None = None
+    while not store.is_open:
+        try:
+            store.open()
+        except StoreError as error:
+            if problem is None or str(problem) != str(error):
+                log.error("%s; commands are obeyed, and it is tried again every %g s", error, RETRY_S)
+            problem = error
+            if stop.wait(RETRY_S):
+                raise
 
 
 def _open_camera(
@@ -229,7 +273,7 @@ class _DownlinkThread(threading.Thread):
 
     def __init__(
         self,
-        store: FrameStore,
+        captured_to: FrameStore,
         link: Link,
         mission: Mission,
         keys: KeyRing,
@@ -244,9 +288,13 @@ class _DownlinkThread(threading.Thread):
         self.camera: ReconnectingCamera | None = None  # until it answers
         self.camera_failed = False
         self.boot = 0  # the number of this start
+        self.events: EventLog | None = None
+        self.store_is_made = threading.Event()  # set once it is open, and what was damaged is repaired
         self.result = DownlinkProgress()
         self.error: Exception | None = None
-        self._store, self._link, self._mission, self._keys = store, link, mission, keys
+        # another one than that of capture: each is for one thread, and what they share is on the disk
+        self._store = FrameStore(captured_to.folder, open_now=False)
+        self._link, self._mission, self._keys = link, mission, keys
         self._exit_when_empty, self._stop_event = exit_when_empty, stop
         self._on_progress, self._watchdog = on_progress, watchdog
         self._empty_since_s: float | None = None
@@ -262,6 +310,8 @@ class _DownlinkThread(threading.Thread):
                 keys=self._keys,
                 capture_values=self._capture_values,
                 boot=self.boot,
+                events=self.events,
+                store_may_open=self.store_is_made.is_set,
             )
         except Exception as error:  # it would be lost with this thread; the main thread raises it
             self.error = error
@@ -292,7 +342,7 @@ class _DownlinkThread(threading.Thread):
         """Tell whether all is delivered; lingers a little, as the ground may ask for its last answer once more."""
         rejected = self.result.rejected_waiting  # by the ground; they stay on board
         waiting = self.capturing.is_set() or self.result.waiting > rejected or not self._exit_when_empty
-        if waiting or len(self._store.outbox()) > rejected:
+        if waiting or not self._store.is_open or len(self._store.outbox()) > rejected:
             self._empty_since_s = None
         elif self._empty_since_s is None:
             self._empty_since_s = time.monotonic()

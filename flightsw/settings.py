@@ -1,7 +1,7 @@
 """Settings that the ground has commanded, kept in the store's folder so that they survive a restart."""
 
+import contextlib
 import dataclasses
-import json
 import logging
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +10,11 @@ from flightsw.errors import StoreError
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import BracketSection, Mission
 from flightsw.store import RESERVE, write_with_reserve
+from obbgs_base.checked import copy_of, read_twice, write_twice
+from obbgs_base.files import set_aside
 
 log = logging.getLogger(__name__)
+FILE = "settings.json"  # in the store's folder
 ORDERS = ("oldest", "triage", "thumbnail-first")
 
 
@@ -44,20 +47,33 @@ class Settings:
 
 
 def load_settings(folder: Path, mission: Mission) -> Settings:
-    """Return what was commanded last, the mission's own settings when nothing was or the file is damaged."""
+    """Return what was commanded last, the mission's own settings when nothing was.
+
+    They stand twice, with checksums. Where neither copy is good, flight is in safe mode with the mission's own
+    settings: an unreadable safe mode means safe. That is kept, so that it is said once, and the damaged files are set
+    aside.
+    """
     default = Settings(mission.link.priority)
-    path = folder / "settings.json"
+    path = folder / FILE
     try:
-        tree = json.loads(path.read_bytes())
+        tree = read_twice(path, log.warning)
+        if tree is None:
+            return default
         if tree["exposure_times_ms"] is not None:
             tree["exposure_times_ms"] = tuple(map(float, tree["exposure_times_ms"]))
         tree["max_error_dn"] = tree.pop("near")
         settings = Settings(**tree)
-    except FileNotFoundError:
-        return default
     except (OSError, ValueError, TypeError, KeyError) as error:
-        log.error("%s is not usable, the mission's own settings are used: %s", path, error)
-        return default
+        log.error("%s is not usable: safe mode, and the mission's own settings: %s", path, error)
+        safe = dataclasses.replace(default, safe_mode=True)
+        if isinstance(error, OSError):  # the disk may be read again later
+            return safe
+        with contextlib.suppress(OSError, StoreError):  # on a disk that cannot be written to it is said again
+            for each in (path, copy_of(path)):
+                if each.exists():
+                    set_aside(each)
+            save_settings(folder, safe)
+        return safe
     try:
         settings.bracket(mission)
     except ConfigError as error:  # the others still hold, safe mode above all
@@ -75,6 +91,6 @@ def save_settings(folder: Path, settings: Settings) -> None:
     tree = dataclasses.asdict(settings)
     tree["near"] = tree.pop("max_error_dn")
     try:
-        write_with_reserve(folder / "settings.json", json.dumps(tree).encode(), folder / RESERVE)
+        write_twice(folder / FILE, tree, lambda file, data: write_with_reserve(file, data, folder / RESERVE))
     except OSError as error:
         raise StoreError(f"cannot keep the settings: {error}") from error

@@ -4,9 +4,10 @@ import contextlib
 import errno
 import fcntl
 import hashlib
-import json
+import itertools
 import logging
 import os
+import secrets
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -18,8 +19,19 @@ from flightsw.errors import StoreError, StoreFull
 from flightsw.icd.frame import Frame, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.icd.packet import PacketError
-from flightsw.store_index import StoredFrame, index_entry, parse_index_line
-from flightsw.transfer_numbers import TransferNumbers, store_identity
+from flightsw.icd.transfer import STORE_BYTES
+from flightsw.store_index import (
+    DELETED_FOR_GOOD,
+    DroppedFrame,
+    Entry,
+    IndexState,
+    StoredFrame,
+    entries_of,
+    index_entry,
+    parse_entry,
+)
+from flightsw.transfer_numbers import TransferNumbers, random_number, store_identity
+from obbgs_base.checked import checked_line, read_twice, write_twice
 from obbgs_base.files import append_line, sync_folder, write_whole
 
 log = logging.getLogger(__name__)
@@ -32,17 +44,22 @@ RESERVE_BYTES = 64 * 1024  # so that a full disk cannot stop the downlink that e
 class FrameStore:
     """A folder of frame containers, their index, and the outbox: what the ground has not confirmed yet.
 
-    frames/00000012.obf holds the container, index.jsonl a line for each stored frame and one for each that was deleted
-    (`{"frame_id": 12, "dropped": REASON}`), outbox/00000012 an empty file for each frame still to be delivered. After a
-    power cut the store opens again: an unfinished line is cut off, a whole container without its line gets one, a torn
-    one goes to quarantine/. One process may capture, another send.
+    frames/00000012.obf holds the container, index.jsonl a line for each stored frame and one for each that was deleted,
+    outbox/00000012 an empty file for each frame still to be delivered. Each line has a checksum. The lines of deleted
+    frames stand in deleted.jsonl as well; all else of the index is made again from the containers, which have checksums
+    of their own, where a line is damaged or missing: the damaged index then goes to quarantine/. After a power cut the
+    store opens again; a torn container goes to quarantine/. One process may capture, another send.
+
+    On a disk that cannot be written to, what can be read is sent all the same: see `next_transaction` and
+    `mark_delivered`.
 
     Args:
         quota_bytes: what the containers may take in all; None: what the disk holds.
         when_full: what is deleted for a new frame after all confirmed frames: nothing, or the oldest waiting ones.
+        open_now: whether to call `open` at once; before it, the store is as if empty.
 
     Raises:
-        StoreError: the disk refuses, or the index is damaged other than at its end.
+        StoreError: the store cannot be read.
     """
 
     def __init__(
@@ -50,34 +67,58 @@ class FrameStore:
         folder: Path,
         quota_bytes: int | None = None,
         when_full: Literal["refuse", "drop-oldest"] = "refuse",
+        open_now: bool = True,
     ):
         self.folder, self.quota_bytes, self.when_full = folder, quota_bytes, when_full
         self.refused = 0  # frames of this run that found no room
         self.times_put_back = 0  # frames into the outbox, by command
         self._numbers, self._identity = TransferNumbers(folder, self._write_small), b""
         self._frames, self._outbox, self._index = folder / "frames", folder / "outbox", folder / "index.jsonl"
+        self._deleted = folder / "deleted.jsonl"  # the second copy of the lines of deleted frames
+        self.is_open = self._is_locked = self._refusal_told = False
+        self.waiting: dict[int, None] = {}  # the outbox as of the last look, in the order of the numbers
+        self._listed = False  # whether `waiting` follows from the outbox by what the index has gained
+        self._arrived: list[int] = []  # stored since the last look
+        self._confirmed: set[int] = set()  # whose markers the disk would not let go
         self._forget_index()
+        if open_now:
+            self.open()
+
+    def open(self) -> None:
+        """Make or open the store; what a power cut or a flipped bit has left is put in order.
+
+        Raises:
+            StoreError: the disk refuses to be read.
+        """
         with _disk_errors("open the store"):
             self._frames.mkdir(parents=True, exist_ok=True)
             self._outbox.mkdir(exist_ok=True)
             with self.locked():
-                for part in self._frames.glob("*.part"):
-                    part.unlink()
-                self._read_index()
-                if self._index_read_bytes < self._index_bytes:  # the power went in the middle of a line
-                    os.truncate(self._index, self._index_read_bytes)
-                self._index_unindexed()
-                try:
+                with self._told("delete what unfinished writes have left"):
+                    for part in self._frames.glob("*.part"):
+                        part.unlink()
+                self._load()
+                with self._told("keep a reserve for transfer numbers and settings"):
                     keep_reserve(self.folder / RESERVE, RESERVE_BYTES)
-                except OSError as error:
-                    log.warning("no reserve for transfer numbers and settings: %s", error)
+        self.is_open = True
 
     @property
     def next_frame_id(self) -> int:
         return self._last_id + 1
 
     @property
+    def frame_count(self) -> int:
+        return len(self._stored)
+
+    @property
     def frames(self) -> list[StoredFrame]:
+        """The frames on the disk, in the order of their numbers.
+
+        Raises:
+            StoreError: the store is not open.
+        """
+        if not self.is_open:
+            raise StoreError("the frame store is not open; the events say why")
         return [self._stored[frame_id] for frame_id in sorted(self._stored)]
 
     def holds(self, bracket_id: int, bracket_index: int) -> bool:
@@ -148,14 +189,36 @@ class FrameStore:
     def outbox(self) -> list[int]:
         """Return the numbers of the frames still to be delivered, oldest first."""
         with _disk_errors("read the outbox"):
-            waiting = self._waiting()
+            waiting = self._markers()
             if any(frame_id not in self._stored for frame_id in waiting):  # another process captures
                 self._read_index()
         return [frame_id for frame_id in waiting if frame_id in self._stored]
 
+    def look(self) -> list[int]:
+        """Bring `waiting` up to date and return the numbers that are new in it, oldest first.
+
+        Only the first look lists the outbox; later ones read what the index has gained, however many frames wait.
+
+        Raises:
+            StoreError: the disk refuses.
+        """
+        with _disk_errors("read the outbox"):
+            self._read_index()
+            if self._listed:
+                arrived = [frame_id for frame_id in self._arrived if frame_id in self._stored]
+            else:
+                arrived = [frame_id for frame_id in self._markers() if frame_id in self._stored]
+                known, self.waiting = self.waiting, dict.fromkeys(arrived)
+                arrived = [frame_id for frame_id in arrived if frame_id not in known]
+        self._listed, self._arrived = True, []
+        self.waiting.update(dict.fromkeys(arrived))
+        return arrived
+
     @property
     def identity(self) -> bytes:
-        """The random bytes by which the ground tells this store from any other."""
+        """The random bytes by which the ground tells this store from any other; before it is open they do not last."""
+        if not self.is_open:
+            return secrets.token_bytes(STORE_BYTES)
         if not self._identity:
             with _disk_errors("read the store's identity"), self.locked():
                 self._identity = store_identity(self.folder, self._write_small)
@@ -164,14 +227,22 @@ class FrameStore:
     def next_transaction(self, in_flight: Iterable[int] = ()) -> int:
         """Return a file transfer's number, never given before, not even before a power cut.
 
+        Where the disk does not keep it, it is drawn at random.
+
         Args:
             in_flight: frames that may arrive, or have arrived, without a confirmation; none is dropped for room.
         """
-        with _disk_errors("number a transfer"), self.locked():
-            return self._numbers.give(in_flight)
+        try:
+            with self.locked():
+                return self._numbers.give(in_flight)
+        except OSError as error:
+            self._tell_refusal("number a transfer", error)
+            return random_number()
 
     def in_flight(self) -> frozenset[int]:
         """Return the frames that `next_transaction` was told last."""
+        if not self.is_open:
+            return frozenset()
         with _disk_errors("read the last transfer's number"), self.locked():
             return self._numbers.in_flight
 
@@ -179,11 +250,13 @@ class FrameStore:
         """Put the stored frames of these numbers into the outbox again and return how many were not in it."""
         with _disk_errors("put frames into the outbox"), self.locked():
             self._read_index()
-            waiting = set(self._waiting())
+            waiting = set(self._markers())
             again = [n for n in self._stored if first_frame <= n <= last_frame and n not in waiting]
             for frame_id in again:
                 (self._outbox / f"{frame_id:08d}").write_bytes(PUT_BACK)
             sync_folder(self._outbox)
+        self._confirmed.difference_update(again)
+        self._listed = False
         self.times_put_back += 1
         return len(again)
 
@@ -196,9 +269,10 @@ class FrameStore:
         path, begins = self.folder / "pass.json", _iso(first_trigger_utc_ns)
         with _disk_errors("note the pass"), self.locked():
             try:
-                known = json.loads(path.read_bytes())["first_trigger_utc"] if path.exists() else None
-            except (ValueError, TypeError, KeyError) as error:
-                log.warning("%s is damaged and written again: %r", path, error)
+                tree = read_twice(path, log.warning)
+                known = None if tree is None else str(tree["first_trigger_utc"])
+            except (ValueError, KeyError) as error:
+                log.error("%s and its copy are damaged and written again: %r", path, error)
                 known = None
             if known is not None and known != begins and self._exposures:
                 raise StoreError(
@@ -206,14 +280,25 @@ class FrameStore:
                     f"{begins}: name another --store, or go on with that pass by --start {known}"
                 )
             if known != begins:
-                content = json.dumps({"first_trigger_utc": begins}).encode()
-                write_with_reserve(path, content, self.folder / RESERVE)
+                write_twice(
+                    path,
+                    {"first_trigger_utc": begins},
+                    lambda file, data: write_with_reserve(file, data, self.folder / RESERVE),
+                )
 
     def mark_delivered(self, frame_id: int) -> None:
-        """Take a frame out of the outbox; the frame itself stays until its room is needed."""
-        with _disk_errors(f"mark frame {frame_id}"):
-            (self._outbox / f"{frame_id:08d}").unlink(missing_ok=True)
-            sync_folder(self._outbox)
+        """Take a frame out of the outbox; the frame itself stays until its room is needed.
+
+        Where the disk refuses, it is known for this run only and sent again in the next one.
+        """
+        self.waiting.pop(frame_id, None)
+        with self._told(f"take frame {frame_id} out of the outbox"):
+            try:
+                (self._outbox / f"{frame_id:08d}").unlink(missing_ok=True)
+                sync_folder(self._outbox)
+            except OSError:
+                self._confirmed.add(frame_id)
+                raise
 
     def _write_small(self, path: Path, content: bytes) -> None:
         write_with_reserve(path, content, self.folder / RESERVE)
@@ -221,11 +306,32 @@ class FrameStore:
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
         """Keep other processes from writing to the store at the same time."""
-        with lock_store(self.folder):
+        if self._is_locked:
             yield
+            return
+        with lock_store(self.folder):
+            self._is_locked = True
+            try:
+                yield
+            finally:
+                self._is_locked = False
 
-    def _waiting(self) -> list[int]:
-        return sorted(int(path.name) for path in self._outbox.iterdir() if path.name.isdigit())
+    @contextlib.contextmanager
+    def _told(self, action: str) -> Iterator[None]:
+        """Go on where the disk refuses to be written to; an event says so once."""
+        try:
+            yield
+        except OSError as error:
+            self._tell_refusal(action, error)
+
+    def _tell_refusal(self, action: str, error: OSError) -> None:
+        if not self._refusal_told:
+            self._refusal_told = True
+            log.error("the store cannot be written to, what it holds is sent: cannot %s: %s", action, error)
+
+    def _markers(self) -> list[int]:
+        names = (entry.name for entry in os.scandir(self._outbox))
+        return sorted({int(name) for name in names if name.isdigit()} - self._confirmed)
 
     def _write(self, frame: Frame, container: bytes) -> StoredFrame:
         marker, path = self._outbox / f"{frame.frame_id:08d}", self.path(frame.frame_id)
@@ -249,7 +355,7 @@ class FrameStore:
 
     def _make_room(self, for_frame: int, what_is_full: str) -> None:
         """Delete one frame: the oldest confirmed one, or if there is none what the policy says."""
-        waiting = set(self._waiting())
+        waiting = set(self._markers())
         confirmed = sorted(frame_id for frame_id in self._stored if frame_id not in waiting)
         if confirmed:
             log.info("frame %d deleted, the ground has it: %s is full", confirmed[0], what_is_full)
@@ -272,15 +378,32 @@ class FrameStore:
         raise StoreFull(f"frame {frame_id} refused: {reason}, policy {self.when_full}")
 
     def _drop(self, frame_id: int, reason: str) -> None:
-        (self._outbox / f"{frame_id:08d}").unlink(missing_ok=True)
-        self.path(frame_id).unlink(missing_ok=True)
-        # a line that is lost here is written at the next start
-        self._append({"frame_id": frame_id, "dropped": reason})
+        """Delete a frame; its line is on the disk first, so that the reason is never lost."""
+        stored = self._stored[frame_id]
+        entry = DroppedFrame(frame_id, reason, stored.bracket_id, stored.bracket_index)
+        try:
+            self._append_dropped(entry)
+        except OSError as error:
+            if error.errno not in DISK_FULL:
+                raise
+            self._unlink(frame_id)  # without any room the file makes it
+            self._append_dropped(entry)
+        self._unlink(frame_id)
         self._read_index()
 
-    @property
-    def _index_bytes(self) -> int:
-        return self._index.stat().st_size if self._index.exists() else 0
+    def _unlink(self, frame_id: int) -> None:
+        (self._outbox / f"{frame_id:08d}").unlink(missing_ok=True)
+        self.path(frame_id).unlink(missing_ok=True)
+
+    def _append_dropped(self, entry: DroppedFrame) -> None:
+        for path in (self._deleted, self._index):
+            try:
+                append_line(path, checked_line(vars(entry)))
+            except OSError as error:
+                if error.errno not in DISK_FULL:
+                    raise
+                (self.folder / RESERVE).unlink(missing_ok=True)
+                append_line(path, checked_line(vars(entry)))
 
     def _forget_index(self) -> None:
         self.used_bytes = 0
@@ -289,62 +412,116 @@ class FrameStore:
         self._exposures: set[tuple[int, int]] = set()
         self._last_id = -1
         self._index_read_bytes = self._index_inode = 0
+        self._listed = False
 
-    def _read_index(self) -> None:
-        """Read what the index has gained, whole lines only."""
-        if not self._index.exists():
-            return
-        with open(self._index, "rb") as index:
-            inode = os.fstat(index.fileno()).st_ino
-            if inode != self._index_inode:  # the first time, or fsck has written it again
-                self._forget_index()
-                self._index_inode = inode
-            index.seek(self._index_read_bytes)
-            *lines, _unfinished = index.read().split(b"\n")
-        for line in lines:
-            try:
-                entry = parse_index_line(line)
-            except ValueError as error:
-                at = self._index_read_bytes
-                raise StoreError(
-                    f"{self._index} is damaged at byte {at}: {error}; run flightsw fsck"
-                ) from error
-            if isinstance(entry, StoredFrame):
-                self._stored[entry.frame_id] = entry
-                self._exposures.add((entry.bracket_id, entry.bracket_index))
-                self.used_bytes += entry.size_bytes
-                self._last_id = max(self._last_id, entry.frame_id)
-            else:
-                frame_id, reason = entry
-                dropped = self._stored.pop(frame_id, None)
-                self.used_bytes -= dropped.size_bytes if dropped else 0
-                self.dropped_undelivered += reason == "oldest"
-                self._last_id = max(self._last_id, frame_id)
-            self._index_read_bytes += len(line) + 1
+    def _load(self) -> None:
+        """Read index and containers; where the index is not as they are it is written again."""
+        content, deleted = _content(self._index), _content(self._deleted)
+        listed, problems = entries_of(content)
+        gone, gone_problems = entries_of(deleted)
+        state = IndexState.of(listed, gone)
+        if not content and (gone or next(self._frames.glob("*.obf"), None)):
+            problems = ["it is empty or gone"]
+        self._compare_with_containers(state, bool(problems))
+        added = state.added_to(listed)
+        if problems:
+            log.error("%s is made again from the containers: %s", self._index.name, problems[0])
+        if problems or added or (content and not content.endswith(b"\n")):
+            self._write_again(self._index, content if problems else b"", [*listed, *added])
+        missing = state.missing_from(gone)
+        if gone_problems:
+            log.error("%s is made again from the index: %s", self._deleted.name, gone_problems[0])
+        if gone_problems or missing or (deleted and not deleted.endswith(b"\n")):
+            self._write_again(self._deleted, deleted if gone_problems else b"", [*gone, *missing])
+        self._forget_index()
+        for entry in [*listed, *added]:
+            self._take(entry)
+        if self._index.exists():
+            status = self._index.stat()
+            self._index_inode, self._index_read_bytes = status.st_ino, status.st_size
 
-    def _index_unindexed(self) -> None:
-        """Give a line to each container whose line never reached the disk, and to each line whose container is gone."""
-        for path in sorted(self._frames.glob("*.obf")):
-            if not path.stem.isdigit() or int(path.stem) in self._stored:
+    def _compare_with_containers(self, state: IndexState, is_damaged: bool) -> None:
+        """Bring what the index says into line with the containers, which take precedence."""
+        present = {int(path.stem): path for path in self._frames.glob("*.obf") if path.stem.isdigit()}
+        for frame_id, path in sorted(present.items()):
+            dropped = state.dropped.get(frame_id)
+            if (
+                dropped is not None and dropped.dropped in DELETED_FOR_GOOD
+            ):  # the power went before the file did
+                with self._told(f"delete frame {frame_id}"):
+                    self._unlink(frame_id)
                 continue
-            container = path.read_bytes()
+            if frame_id in state.stored and dropped is None:
+                continue
             try:
-                self._add_line(index_entry(path, container))
+                state.add(index_entry(path, path.read_bytes()))
+            except OSError as error:  # a bad sector costs this frame alone
+                log.warning("frame %d cannot be read: %s", frame_id, error)
+                if dropped is None:
+                    state.add(DroppedFrame(frame_id, "damaged"))
             except PacketError as error:
                 log.warning("%s goes to quarantine: %s", path, error)
-                quarantine(self.folder, path)
-        for frame_id in list(self._stored):
-            if not self.path(frame_id).exists():
+                with self._told(f"move {path.name} to quarantine"):
+                    quarantine(self.folder, path)
+                if is_damaged and dropped is None:  # it may have been sent under this number
+                    state.add(DroppedFrame(frame_id, "damaged"))
+        for frame_id, stored in state.stored.items():
+            if frame_id not in present and frame_id not in state.dropped:
                 log.warning("frame %d is gone from the disk", frame_id)
-                self._drop(frame_id, "lost")
+                state.add(DroppedFrame(frame_id, "lost", stored.bracket_id, stored.bracket_index))
+
+    def _write_again(self, path: Path, damaged: bytes, entries: Iterable[Entry]) -> None:
+        """Write a file of lines whole; what was damaged goes to quarantine/ first."""
+        with self._told(f"write {path.name} again"):
+            if damaged:
+                with contextlib.suppress(OSError):  # a disk that is full has no room for it
+                    write_whole(quarantine_place(self.folder, path), damaged)
+            content = b"".join(checked_line(vars(entry)) + b"\n" for entry in entries)
+            write_with_reserve(path, content, self.folder / RESERVE)
+
+    def _read_index(self) -> None:
+        """Read what the index has gained, whole lines only; all of it where it was written again or is damaged."""
+        try:
+            with open(self._index, "rb") as index:
+                inode = os.fstat(index.fileno()).st_ino
+                index.seek(self._index_read_bytes)
+                *lines, _unfinished = index.read().split(b"\n")
+        except FileNotFoundError:
+            if self._index_inode == 0:
+                return  # nothing was stored yet
+            inode, lines = -1, []
+        try:
+            entries = [parse_entry(line) for line in lines]
+        except ValueError:
+            entries = None
+        if entries is None or (self._index_inode and inode != self._index_inode):
+            with self.locked():
+                self._load()
+            return
+        self._index_inode = inode
+        for line, entry in zip(lines, entries, strict=True):
+            self._take(entry)
+            self._index_read_bytes += len(line) + 1
+
+    def _take(self, entry: Entry) -> None:
+        frame_id = entry.frame_id
+        self._last_id = max(self._last_id, frame_id)
+        before = self._stored.pop(frame_id, None)
+        self.used_bytes -= before.size_bytes if before else 0
+        if entry.bracket_id is not None and entry.bracket_index is not None:
+            self._exposures.add((entry.bracket_id, entry.bracket_index))
+        if isinstance(entry, StoredFrame):
+            self._stored[frame_id] = entry
+            self.used_bytes += entry.size_bytes
+            self._arrived.append(frame_id)
+        else:
+            self.dropped_undelivered += entry.dropped == "oldest"
+            self.waiting.pop(frame_id, None)
 
     def _add_line(self, stored: StoredFrame) -> StoredFrame:
-        self._append(vars(stored))
+        append_line(self._index, checked_line(vars(stored)))
         self._read_index()
         return stored
-
-    def _append(self, entry: dict) -> None:
-        append_line(self._index, json.dumps(entry).encode())
 
 
 def keep_reserve(reserve: Path, size_bytes: int) -> None:
@@ -372,28 +549,49 @@ def write_with_reserve(path: Path, data: bytes, reserve: Path) -> None:
         write_whole(path, data)
 
 
-def open_store(folder: Path, mission: Mission) -> FrameStore:
+def open_store(folder: Path, mission: Mission, open_now: bool = True) -> FrameStore:
     """Return the store with the mission's quota and policy."""
-    return FrameStore(folder, mission.store.quota_bytes, mission.store.when_full)
+    return FrameStore(folder, mission.store.quota_bytes, mission.store.when_full, open_now)
 
 
 def quarantine(store: Path, path: Path) -> Path:
     """Move a damaged file to the store's quarantine folder, where nothing is ever overwritten, and return its place."""
+    moved = quarantine_place(store, path)
+    os.replace(path, moved)
+    sync_folder(moved.parent)
+    return moved
+
+
+def quarantine_place(store: Path, path: Path) -> Path:
+    """Return a name in the store's quarantine folder that nothing has."""
     folder = store / "quarantine"
     folder.mkdir(exist_ok=True)
-    number = sum(1 for _ in folder.iterdir())
-    moved = folder / f"{number:04d}-{path.name}"
-    os.replace(path, moved)
-    sync_folder(folder)
-    return moved
+    places = (
+        folder / f"{number:04d}-{path.name}" for number in itertools.count(sum(1 for _ in folder.iterdir()))
+    )
+    return next(place for place in places if not place.exists())
 
 
 @contextlib.contextmanager
 def lock_store(folder: Path) -> Iterator[None]:
     """Hold the store's lock; waits for another process that holds it."""
-    with open(folder / "lock", "wb") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with contextlib.ExitStack() as opened:
+        try:
+            lock = opened.enter_context(open(folder / "lock", "wb"))
+        except OSError:  # the disk cannot be written to
+            with contextlib.suppress(FileNotFoundError):  # then nobody can hold it
+                lock = opened.enter_context(open(folder / "lock", "rb"))
+                fcntl.flock(lock, fcntl.LOCK_EX)
+        else:
+            fcntl.flock(lock, fcntl.LOCK_EX)
         yield
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        return b""
 
 
 def _iso(utc_ns: int) -> str:

@@ -121,6 +121,7 @@ class UplinkCommand(StrEnum):
     RESUME = "resume"
     RETIRE = "retire"
     RESEND = "resend"
+    FSCK = "fsck"
 
 
 # of `ground import`

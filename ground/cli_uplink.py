@@ -50,9 +50,10 @@ def uplink_command(
 
     ping · bracket 0.05,0.1,0.2 (exposure times, ms) · near 2 (largest coding error, DN) · priority oldest, triage or
     thumbnail-first · model FILE (a run's model.onnx) · safe (no more exposures) · resend FIRST LAST or all (frames that
-    are still on board, delivered once more). `arm delete` and then delete FIRST LAST (numbers of frames), `arm resume`
-    and then resume, `arm retire` and then retire KEY (the number of another key), each at most 30 s later. What became
-    of all commands of a session stands in its commands.jsonl.
+    are still on board, delivered once more) · fsck (check and repair the frame store while flight goes on). `arm
+    delete` and then delete FIRST LAST (numbers of frames), `arm resume` and then resume, `arm retire` and then retire
+    KEY (the number of another key), each at most 30 s later. What became of all commands of a session stands in its
+    commands.jsonl.
 
     Example: ground uplink bracket 0.02,0.05,0.1 --session pass-12 --key mission.key
     """

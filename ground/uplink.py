@@ -105,7 +105,7 @@ def parse_command(name: str, arguments: list[str]) -> tuple[Command, Path | None
         ValueError: no such command, or not its arguments.
     """
     match name, arguments:
-        case "ping" | "safe" | "resume", []:
+        case "ping" | "safe" | "resume" | "fsck", []:
             return Command(name, {}), None
         case "bracket", [times]:
             return Command(

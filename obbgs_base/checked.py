@@ -3,6 +3,7 @@
 A checked line is a JSON object whose last key, `crc32`, holds the CRC-32 of the bytes before it in eight digits.
 """
 
+import contextlib
 import json
 import re
 import zlib
@@ -12,7 +13,7 @@ from typing import Any
 
 from obbgs_base.files import write_whole
 
-CHECKED = re.compile(rb'(\{.*), "crc32": "([0-9a-f]{8})"\}', re.DOTALL)
+CHECKED = re.compile(rb'(\{.*),(?: |\n  )"crc32": "([0-9a-f]{8})"\n?\}', re.DOTALL)
 
 
 def checked_line(tree: Mapping[str, Any]) -> bytes:
@@ -23,6 +24,12 @@ def checked_line(tree: Mapping[str, Any]) -> bytes:
     """
     content = json.dumps(tree, allow_nan=False).encode()[:-1]
     return content + b', "crc32": "%08x"}' % zlib.crc32(content)
+
+
+def checked_text(tree: Mapping[str, Any]) -> bytes:
+    """Return an object as a checked line does, but in lines that a person reads."""
+    content = json.dumps(tree, allow_nan=False, indent=2).encode()[:-2]
+    return content + b',\n  "crc32": "%08x"\n}' % zlib.crc32(content)
 
 
 def has_checksum(line: bytes) -> bool:
@@ -50,14 +57,17 @@ def copy_of(path: Path) -> Path:
 
 
 def write_twice(
-    path: Path, tree: Mapping[str, Any], write: Callable[[Path, bytes], None] = write_whole
+    path: Path,
+    tree: Mapping[str, Any],
+    write: Callable[[Path, bytes], None] = write_whole,
+    form: Callable[[Mapping[str, Any]], bytes] = checked_line,
 ) -> None:
-    """Write an object as a checked line to a file and then to its copy.
+    """Write an object with its checksum to a file and then to its copy.
 
     Raises:
         OSError: the disk refuses; each of the two holds what it held before, or the new object.
     """
-    content = checked_line(tree) + b"\n"
+    content = form(tree) + b"\n"
     write(path, content)
     write(copy_of(path), content)
 
@@ -66,35 +76,37 @@ def read_twice(path: Path, on_damage: Callable[[str], None]) -> dict[str, Any] |
     """Return the object that `write_twice` wrote, None where neither file is there.
 
     Where one of the two is damaged or gone, or older than the other since the power went between them, it is written
-    again if the disk lets it, and `on_damage` is told of damage.
+    again if the disk lets it, and `on_damage` is told of damage. A file of an earlier version, which has neither a
+    checksum nor a copy, is taken as it is.
 
     Raises:
         ValueError: neither of them is whole.
         OSError: neither of them can be read.
     """
-    contents: list[bytes] = []
+    both = (path, copy_of(path))
+    contents: list[bytes | None] = []  # None: damaged or not there
     problems: list[Exception] = []
-    for each in (path, copy_of(path)):
+    for each in both:
         try:
             content = each.read_bytes()
             parse_checked_line(content.removesuffix(b"\n"))
-            contents.append(content)
         except FileNotFoundError:
-            contents.append(b"")
+            contents.append(None)
         except (OSError, ValueError) as error:
+            contents.append(None)
             problems.append(error)
-            contents.append(b"")
-    good = next((content for content in contents if content), None)
+        else:
+            contents.append(content)
+    good = next((content for content in contents if content is not None), None)
     if good is None:
-        if problems:
+        earlier = _without_checksum(*both)
+        if problems and earlier is None:
             raise problems[0]
-        return None
-    for each, content in zip((path, copy_of(path)), contents, strict=True):
+        return earlier
+    for each, content in zip(both, contents, strict=True):
         if content != good:
-            try:
+            with contextlib.suppress(OSError):  # on a disk that is full or read-only one is enough
                 write_whole(each, good)
-            except OSError as error:
-                problems.append(error)
     if problems:
         on_damage(f"{path.name} or its copy was damaged ({problems[0]}); the good one of the two is used")
     return parse_checked_line(good.removesuffix(b"\n"))
@@ -114,3 +126,13 @@ def each_copy(path: Path, parse: Callable[[str], int]) -> tuple[list[int], list[
             if each == path or not isinstance(error, FileNotFoundError):
                 problems.append(error)
     return values, problems
+
+
+def _without_checksum(path: Path, copy: Path) -> dict[str, Any] | None:
+    """Return the object of a file of an earlier version, None if this is none."""
+    try:
+        content = path.read_bytes()
+        tree = json.loads(content)
+    except (OSError, ValueError):
+        return None
+    return tree if isinstance(tree, dict) and b"crc32" not in content and not copy.exists() else None

@@ -1,4 +1,4 @@
-"""A disk that is small enough to become truly full."""
+"""Disks that misbehave: one that is small enough to become truly full, one that cannot be written to."""
 
 import contextlib
 import subprocess
@@ -30,3 +30,18 @@ def fill_disk(file: Path) -> None:
     with open(file, "wb", buffering=0) as opened, contextlib.suppress(OSError):
         while True:
             opened.write(bytes(512))
+
+
+@contextlib.contextmanager
+def read_only(folder: Path) -> Iterator[None]:
+    """Let the kernel refuse every write below the folder while in the context.
+
+    The test is skipped where mounting is not permitted.
+    """
+    if subprocess.run(["mount", "--bind", folder, folder], check=False).returncode:
+        pytest.skip("no right to mount here")
+    try:
+        subprocess.run(["mount", "-o", "remount,ro,bind", folder], check=True)
+        yield
+    finally:
+        subprocess.run(["umount", folder], check=True)

@@ -13,20 +13,21 @@ from flightsw.ports.socketcan import SocketCanLink
 __all__ = ["Link", "LinkError", "SerialLink", "SlcanLink", "SocketCanLink", "open_link"]
 
 
-def open_link(url: str, side: CanSide) -> Link:
+def open_link(url: str, side: CanSide, must_be_there: bool = True) -> Link:
     """Return the open link that a URL names: serial:///dev/..., slcan:///dev/... or can://can0.
 
     Args:
         side: whose end this is, FLIGHT_SIDE or GROUND_SIDE; on CAN it decides which identifiers are sent.
+        must_be_there: otherwise a port that cannot be opened is tried again with each `exchange`, as after a hang-up.
 
     Raises:
         ConfigError: the URL is not usable.
-        LinkError: the port cannot be opened.
+        LinkError: the port must be there and cannot be opened.
     """
     match parse_link_url(url).scheme:
         case "serial":
-            return SerialLink(url)
+            return SerialLink(url, must_be_there=must_be_there)
         case "slcan":
-            return SlcanLink(url, side)
+            return SlcanLink(url, side, must_be_there=must_be_there)
         case _:
-            return SocketCanLink(url, side)
+            return SocketCanLink(url, side, must_be_there=must_be_there)

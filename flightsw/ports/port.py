@@ -18,6 +18,7 @@ from obbgs_base.errors import ObbgsError
 log = logging.getLogger(__name__)
 
 REOPEN_S = 0.2  # between attempts to open a port that hung up
+STEADY_S = 1.0  # a port that took bytes for so long after an outage works again
 CLOSE_S = 1.5  # for what was sent last to reach the other side, when a CAN port is closed
 CLOSE_STEP_S = 0.01
 ADAPTER_FRAMES = 128  # that an adapter may hold for the bus
@@ -66,14 +67,17 @@ class Link(Protocol):
 class Port:
     """A port that is opened again after it hung up. CFDP sends again what was lost meanwhile.
 
+    An outage is one hang-up, however often the port can be opened meanwhile: it is over when a byte comes in, or when
+    bytes go out for `STEADY_S`.
+
     Raises:
         ConfigError: the URL is not usable.
-        LinkError: the port cannot be opened the first time.
+        LinkError: the port must be there and cannot be opened the first time.
     """
 
     OPEN_ERRORS = (OSError, ValueError, can.CanError)  # SerialException is an OSError
 
-    def __init__(self, url: str, clock_s: Callable[[], float] = time.monotonic):
+    def __init__(self, url: str, clock_s: Callable[[], float] = time.monotonic, must_be_there: bool = True):
         self.url = parse_link_url(url)
         self.baud_rate = self.url.payload_baud_rate
         self.bytes_read = 0
@@ -81,10 +85,16 @@ class Port:
         self.hang_ups = 0
         self._clock_s = clock_s
         self._next_open_s = float("-inf")
+        self._opened_s = clock_s()
+        self._is_outage = False  # until it is known that the port works again
+        self._bytes_at_outage = (0, 0)  # read and written
         try:
             self._open()
         except self.OPEN_ERRORS as error:
-            raise LinkError(f"cannot open {self.url.device}: {error}") from error
+            if must_be_there:
+                raise LinkError(f"cannot open {self.url.device}: {error}") from error
+            self._is_outage = True
+            log.warning("%s is awaited: it cannot be opened yet: %s", self.url.device, error)
 
     def __enter__(self) -> Self:
         return self
@@ -109,20 +119,35 @@ class Port:
     def _wait_for_port(self, timeout_s: float) -> bool:
         """Tell whether the port is open, after an attempt to open it if one is due."""
         if self.connected:
+            self._note_bytes()
             return True
         now_s = self._clock_s()
         if now_s >= self._next_open_s:
             self._next_open_s = now_s + REOPEN_S
             with contextlib.suppress(*self.OPEN_ERRORS):
                 self._open()
-                log.info("%s is open again", self.url.device)
+                self._opened_s = now_s
                 return True
         time.sleep(min(timeout_s, REOPEN_S))
         return False
 
+    def _note_bytes(self) -> None:
+        """End an outage once the port works."""
+        if not self._is_outage:
+            return
+        read, written = self._bytes_at_outage
+        steady = self.bytes_written > written and self._clock_s() - self._opened_s > STEADY_S
+        if self.bytes_read > read or steady:
+            self._is_outage = False
+            log.info("%s works again", self.url.device)
+
     def _hang_up(self, error: Exception) -> None:
-        log.warning("%s hung up: %s", self.url.device, error)
-        self.hang_ups += 1
+        self._note_bytes()
+        if not self._is_outage:
+            log.warning("%s hung up: %s", self.url.device, error)
+            self.hang_ups += 1
+        self._is_outage = True
+        self._bytes_at_outage = (self.bytes_read, self.bytes_written)
         self._drop()
 
 

@@ -17,12 +17,18 @@ SILENT_S = 5.0  # without a byte from the adapter before it is set up again: it 
 class SlcanLink(SerialLink, IsoTpPort):
     """A CAN bus behind an slcan adapter on a serial port: each packet is one ISO-TP message."""
 
-    def __init__(self, url: str, side: CanSide, clock_s: Callable[[], float] = time.monotonic):
+    def __init__(
+        self,
+        url: str,
+        side: CanSide,
+        clock_s: Callable[[], float] = time.monotonic,
+        must_be_there: bool = True,
+    ):
         self._channels = IsoTpChannels(*side, parse_link_url(url))
         self._text = SlcanText()
         self._frames_given = 0
         self._last_byte_s = clock_s()
-        super().__init__(url, clock_s)
+        super().__init__(url, clock_s, must_be_there)
 
     def close(self) -> None:
         self._finish()

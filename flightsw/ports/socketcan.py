@@ -19,10 +19,16 @@ class SocketCanLink(IsoTpPort):
 
     _bus: can.BusABC | None = None
 
-    def __init__(self, url: str, side: CanSide, clock_s: Callable[[], float] = time.monotonic):
+    def __init__(
+        self,
+        url: str,
+        side: CanSide,
+        clock_s: Callable[[], float] = time.monotonic,
+        must_be_there: bool = True,
+    ):
         self._channels = IsoTpChannels(*side, parse_link_url(url))
         self._unsent: deque[CanMessage] = deque()
-        super().__init__(url, clock_s)
+        super().__init__(url, clock_s, must_be_there)
 
     def close(self) -> None:
         self._finish()

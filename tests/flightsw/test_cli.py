@@ -1,8 +1,10 @@
 """The flight command line: help with examples, exit codes, one clear line for what went wrong."""
 
+import os
 import subprocess
 import sys
 import threading
+import tty
 from pathlib import Path
 
 import pytest
@@ -61,11 +63,21 @@ def test_every_command_has_help_with_an_example(tool, command):
             2,
             "--for: expected a time in seconds, got inf",
         ),
-        (["downlink", "--link", "serial:///dev/nowhere?baud=9600", "--store", "{tmp}"], 1, "/dev/nowhere"),
+        (
+            [
+                "downlink",
+                "--link",
+                "serial:///dev/nowhere?baud=9600",
+                "--exit-when-empty",
+                "--store",
+                "{tmp}",
+            ],
+            1,
+            "/dev/nowhere",
+        ),
         (["downlink", "--link", "carrier://pigeon", "--store", "{tmp}"], 2, "carrier://pigeon"),
         (["triage", "--model", "nowhere.onnx", "--frames", "{tmp}"], 1, "nowhere.onnx"),
-        (["serve", *NOWHERE, "--link", "serial:///dev/nowhere", "--store", "{tmp}"], 1, "/dev/nowhere"),
-        (["serve", "--camera", "ftp://x", "--link", "can://nowhere", "--store", "{tmp}"], 1, "nowhere"),
+        (["serve", "--camera", "ftp://x", "--link", "can://nowhere", "--store", "{tmp}"], 2, "ftp://x"),
         (
             ["serve", *NOWHERE, "--link", "can://x", "--start", "soon", "--store", "{tmp}"],
             2,
@@ -90,3 +102,26 @@ def test_a_thread_that_dies_is_an_error_in_the_log(monkeypatch, caplog):
     (record,) = caplog.records
     assert record.levelname == "ERROR" and record.name.startswith("flightsw")  # so an event for the ground
     assert record.getMessage() == "the thread farewell has ended: ZeroDivisionError('division by zero')"
+
+
+def test_flight_that_serves_waits_for_its_link(tmp_path, small_mission):
+    """A radio that its bus finds late: the pass is not given up for it."""
+    arguments = ["serve", *NOWHERE, "--link", f"serial://{tmp_path}/tty", "--store", str(tmp_path / "store")]
+    flight = subprocess.Popen(
+        [sys.executable, "-m", "flightsw.cli", *arguments, "--mission", str(tmp_path / "small.yaml")],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    try:
+        assert flight.stderr is not None
+        while "is awaited" not in (line := flight.stderr.readline()):
+            assert line, "flight has ended"
+        (tmp_path / "tty").symlink_to(os.ttyname(slave))
+        assert os.read(master, 1) == b"\0"  # the end of whatever came before: flight has opened it
+    finally:
+        flight.terminate()
+        flight.communicate(timeout=60)
+        for descriptor in (master, slave):
+            os.close(descriptor)

@@ -16,7 +16,7 @@ from flightsw.icd.auth import MAX_COUNTER, Key, digest, seal, seal_file
 from flightsw.icd.command import Command
 from flightsw.icd.config import ConfigError
 from flightsw.icd.telemetry import DICTIONARY
-from flightsw.settings import Settings, load_settings, save_settings
+from flightsw.settings import load_settings
 from flightsw.store import FrameStore
 from ground.uplink import make_key
 from obbgs_base.files import write_whole
@@ -389,22 +389,6 @@ def test_without_a_trustworthy_counter_no_command_is_taken_at_all(tmp_path, dama
 def test_two_processes_cannot_share_a_counter(spacecraft):
     with pytest.raises(ConfigError, match="another process takes commands"):
         ReplayCounter(spacecraft.key_file)
-
-
-def test_damaged_settings_fall_back_to_the_mission(tmp_path, small_mission):
-    default = Settings(small_mission.link.priority)
-    assert load_settings(tmp_path, small_mission) == default
-    save_settings(tmp_path, replace(default, max_error_dn=3))
-    assert load_settings(tmp_path, small_mission).max_error_dn == 3
-    for text in (
-        "",
-        "{",
-        "[]",
-        '{"priority": "newest"}',
-        '{"priority": "oldest", "exposure_times_ms": [9e9]}',
-    ):
-        (tmp_path / "settings.json").write_text(text)
-        assert load_settings(tmp_path, small_mission) == default
 
 
 def test_frames_are_deleted_some_a_turn_and_the_command_ends_when_all_are(spacecraft, make_frame):

@@ -4,7 +4,6 @@ import dataclasses
 import hashlib
 import logging
 import os
-import shutil
 import subprocess
 import sys
 import threading
@@ -16,7 +15,7 @@ from spacepackets.cfdp.pdu import FileDataPdu, MetadataPdu
 
 from flightsw.commands import KeyRing
 from flightsw.downlink import LAST_TELEMETRY_S, RESTARTS, WAIT_S, run_downlink
-from flightsw.errors import DownlinkError, StoreError
+from flightsw.errors import DownlinkError
 from flightsw.housekeeping import MAX_EVENTS, EventLog, ProcessMeter
 from flightsw.icd.auth import Key, seal, seal_file
 from flightsw.icd.command import Command, model_file_name
@@ -395,15 +394,63 @@ def test_rare_failures_never_end_the_downlink(store, small_mission, no_pause, mo
     assert fly(link, store, small_mission, 1.5 * (RESTARTS + 3)).restarts == RESTARTS + 2
 
 
-def test_an_outbox_that_stays_unreadable_ends_with_the_stores_error(store, small_mission, no_pause):
+def test_without_a_store_that_can_be_read_commands_are_obeyed_and_it_is_told_why(
+    tmp_path, make_frame, small_mission
+):
+    (tmp_path / "store").write_text("no folder")
+    key, keys = make_key(tmp_path / "k"), KeyRing([tmp_path / "k"])
+    link, ground = ListLink(), PacketStream(TELECOMMAND, 1100)
+    for number, command in enumerate([Command("ping", {}), Command("fsck", {})], start=1):
+        link.incoming.append(ground.encode(APID_COMMANDS, seal(key, number, command.pack())))
+
+    def mount(_progress) -> None:
+        if link.now_s > 20 and (tmp_path / "store").is_file():
+            (tmp_path / "store").unlink()
+            FrameStore(tmp_path / "store").put(make_frame(0))
+
+    store = FrameStore(tmp_path / "store", open_now=False)
+    progress = fly(link, store, small_mission, 30.0, on_progress=mount, keys=keys)
+    keys.close()
+    assert ends(link)[1] == ("completed", "alive")
+    assert ends(link)[2][0] == "failed" and "no frame store" in ends(link)[2][1]
+    errors = [values["problem"] for name, values in link.unpacked(APID_EVENTS, "events") if name == "error"]
+    assert sum("cannot open the store" in problem for problem in errors) == 1  # once, not at each attempt
+    assert progress.restarts == 0 and link.files()[-1] == "00000000.obf"  # it is sent once it can be read
+    housekeeping = [values for _, values in link.unpacked(APID_HOUSEKEEPING, "telemetry")]
+    assert (housekeeping[0]["frames_stored"], housekeeping[-1]["frames_stored"]) == (0, 1)
+
+
+def test_containers_that_read_as_zeros_cost_these_frames_alone(store, small_mission):
+    """As after a power cut on XFS, or ext4 with data=writeback: index and outbox have them."""
+    store.path(0).write_bytes(bytes(store.path(0).stat().st_size))
+    store.path(1).write_bytes(b"")
     link = ListLink()
+    progress = fly(link, store, small_mission, 2.0)
+    assert (progress.restarts, progress.frames_unreadable) == (0, 2)
+    assert link.files() == ["00000002.obt", "00000002.obf"]
+    headers = [read_header(data) for apid, data in link.packets() if apid == APID_FRAME_HEADERS]
+    assert [header["frame_id"] for header in headers] == [2]
 
-    def damage(_progress) -> None:
-        if link.now_s > 0.5 and (store.folder / "outbox").is_dir():
-            shutil.rmtree(store.folder / "outbox")
 
-    with pytest.raises(StoreError, match="cannot read the outbox"):
-        fly(link, store, small_mission, 60.0, on_progress=damage)
+def test_fsck_by_command_repairs_the_store_while_flight_goes_on(store, small_mission, tmp_path):
+    save_settings(store.folder, Settings("oldest"))
+    store.path(1).write_bytes(b"damaged")
+    key, keys = make_key(tmp_path / "k"), KeyRing([tmp_path / "k"])
+    link, ground = ListLink(), PacketStream(TELECOMMAND, 1100)
+    link.incoming.append(ground.encode(APID_COMMANDS, seal(key, 1, Command("fsck", {}).pack())))
+
+    def should_stop() -> bool:
+        time.sleep(0.001)  # the check has a thread and a clock of its own
+        return link.now_s > 600 or (1 in ends(link) and len(store.waiting) < 3)
+
+    progress = run_downlink(
+        store, link, small_mission, should_stop=should_stop, clock_s=lambda: link.now_s, keys=keys
+    )
+    keys.close()
+    stage, text = ends(link)[1]
+    assert stage == "completed" and text.startswith("2 good frames, 2 to be delivered, 1 quarantined")
+    assert progress.waiting == 2 and store.outbox() == [0, 2]
+    assert not store.path(1).exists() and (store.next_frame_id, store.holds(0, 1)) == (3, True)
 
 
 def test_a_dead_downlink_is_no_success_of_the_program(tmp_path, small_mission):

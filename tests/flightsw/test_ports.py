@@ -19,7 +19,7 @@ from flightsw.icd.config import ConfigError
 from flightsw.icd.framing import frame_packet
 from flightsw.icd.link_url import LinkUrl, parse_link_url
 from flightsw.icd.slcan import format_slcan
-from flightsw.ports import LinkError, SlcanLink, open_link
+from flightsw.ports import LinkError, SlcanLink, SocketCanLink, open_link
 from flightsw.ports.slcan import SILENT_S
 
 BOTH_SIDES = pytest.mark.parametrize("side", [FLIGHT_SIDE, GROUND_SIDE], ids=["flight", "ground"])
@@ -364,3 +364,54 @@ def test_a_real_virtual_can_interface_carries_packets():
             assert pass_packets(flight, own, packets) == b"".join(packets)
     finally:
         subprocess.run(["ip", "link", "del", "obbgs0"], check=True)
+
+
+def test_a_port_that_is_not_there_yet_is_awaited(terminal, caplog):
+    master, _, name = terminal
+    url, target = f"serial://{name}", os.readlink(name)
+    name.unlink()
+    with pytest.raises(LinkError, match="cannot open"):
+        open_link(url, FLIGHT_SIDE)
+    with open_link(url, FLIGHT_SIDE, must_be_there=False) as link:
+        assert link.exchange(0.0) == b"" and not link.ready
+        assert caplog.text.count("is awaited") == 1
+        name.symlink_to(target)
+        exchange_until(link, lambda data: link.connected)
+        os.write(master, b"hello")
+        assert exchange_until(link, lambda data: data == b"hello") == b"hello"
+        assert link.hang_ups == 0
+
+
+def test_an_interface_that_is_down_is_one_outage_however_long(monkeypatch, caplog):
+    """Linux lets a socket bind to a CAN interface that is down; each receive then says ENETDOWN."""
+    is_up, now_s = [True], [0.0]
+
+    class Bus:
+        def __init__(self, *_, **__): ...
+        def shutdown(self) -> None: ...
+
+        def recv(self, timeout=None):
+            if not is_up[0]:
+                raise can.CanOperationError("Error receiving: Network is down", errno.ENETDOWN)
+            return None
+
+        def send(self, *_, **__) -> None:
+            self.recv()
+
+    monkeypatch.setattr("can.Bus", Bus)
+    monkeypatch.setattr("flightsw.ports.port.time.sleep", lambda _: None)
+    link = SocketCanLink("can://can0", FLIGHT_SIDE, clock_s=lambda: now_s[0])
+    for expected in (1, 2):
+        is_up[0] = False
+        for _ in range(500):
+            now_s[0] += 0.02
+            link.exchange(0.0)
+        assert link.hang_ups == expected == caplog.text.count("hung up")
+        is_up[0] = True
+        for _ in range(100):
+            now_s[0] += 0.05
+            link.exchange(0.0)
+            if link.ready:
+                link.write(frame_packet(bytes(7)))
+        assert link.bytes_written
+    link._drop()

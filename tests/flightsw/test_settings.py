@@ -22,8 +22,28 @@ def test_exposure_times_that_do_not_fit_a_new_mission_do_not_end_safe_mode(tmp_p
     assert loaded == dataclasses.replace(COMMANDED, exposure_times_ms=None)
 
 
+def test_one_damaged_copy_changes_nothing_and_is_told_once(tmp_path, small_mission, caplog):
+    save_settings(tmp_path, COMMANDED)
+    for path in (tmp_path / "settings.json", tmp_path / "settings.json.copy"):
+        caplog.clear()
+        damaged = bytearray(path.read_bytes())
+        damaged[damaged.index(b"triage")] ^= 1
+        path.write_bytes(damaged)
+        assert [load_settings(tmp_path, small_mission) for _ in range(2)] == [COMMANDED] * 2
+        assert caplog.text.count("was damaged") == 1
+
+
 @pytest.mark.parametrize("text", ["", "[]", '{"priority": "triage"}', '{"near": 999}'])
-def test_a_damaged_file_is_reported_and_the_mission_decides(tmp_path, small_mission, text, caplog):
+def test_settings_that_cannot_be_read_mean_safe_mode_and_that_is_kept(tmp_path, small_mission, text, caplog):
+    safe = Settings(small_mission.link.priority, safe_mode=True)
+    for path in (tmp_path / "settings.json", tmp_path / "settings.json.copy"):
+        path.write_text(text)
+    assert [load_settings(tmp_path, small_mission) for _ in range(2)] == [safe] * 2
+    assert caplog.text.count("is not usable: safe mode, and the mission's own settings") == 1
+    assert len(list(tmp_path.glob("settings.json*unused*"))) == 2  # for whoever wants to know
+
+
+def test_settings_of_an_earlier_version_are_taken(tmp_path, small_mission):
+    text = '{"priority": "triage", "exposure_times_ms": null, "safe_mode": true, "near": 2}'
     (tmp_path / "settings.json").write_text(text)
-    assert load_settings(tmp_path, small_mission) == Settings(small_mission.link.priority)
-    assert "is not usable, the mission's own settings are used" in caplog.text
+    assert load_settings(tmp_path, small_mission) == Settings("triage", max_error_dn=2, safe_mode=True)

@@ -15,7 +15,7 @@ from flightsw.icd.frame import decode_frame, encode_frame
 from flightsw.settings import Settings, load_settings, save_settings
 from flightsw.store import RESERVE_BYTES, FrameStore
 from obbgs_base.files import write_whole
-from tests.small_disk import fill_disk, small_disk
+from tests.small_disk import fill_disk, read_only, small_disk
 
 
 def fill(store: FrameStore, make_frame, count: int) -> None:
@@ -81,12 +81,99 @@ def test_one_process_sends_what_another_captures(tmp_path, make_frame):
     assert capturing.outbox() == [1]
 
 
-def test_damage_in_the_middle_of_the_index_is_reported_not_guessed_at(tmp_path, make_frame):
-    fill(FrameStore(tmp_path), make_frame, 2)
+def test_any_flipped_bit_of_the_index_is_mended_from_the_containers_and_told(tmp_path, make_frame, caplog):
+    fill(FrameStore(tmp_path), make_frame, 4)
+    FrameStore(tmp_path).drop(1)
+    FrameStore(tmp_path).mark_delivered(2)
+    for name in ("index.jsonl", "deleted.jsonl"):
+        path = tmp_path / name
+        whole = path.read_bytes()
+        for bit in range(0, 8 * len(whole), 41):
+            caplog.clear()
+            damaged = bytearray(whole)
+            damaged[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(damaged)
+            store = FrameStore(tmp_path)
+            assert (
+                "is made again from" in caplog.text or bit // 8 == len(whole) - 1
+            )  # an unfinished last line
+            assert [f.frame_id for f in store.frames] == [0, 2, 3] and store.outbox() == [0, 3]
+            assert store.next_frame_id == 4 and store.holds(0, 1)  # that of the deleted frame
+            assert fsck(tmp_path, repair=False).problems == []
+            path.write_bytes(whole)
+    assert len(list((tmp_path / "quarantine").glob("*-index.jsonl"))) > 10
+
+
+@pytest.mark.parametrize("content", [b"", bytes(300), None], ids=["empty", "zeros", "gone"])
+def test_an_index_that_is_lost_is_made_again(tmp_path, make_frame, content):
+    running = FrameStore(tmp_path)
+    fill(running, make_frame, 5)
+    running.drop(4)
+    running.path(3).write_bytes(bytes(200))
     index = tmp_path / "index.jsonl"
-    index.write_bytes(b"?" + index.read_bytes())
-    with pytest.raises(StoreError, match="damaged at byte 0"):
-        FrameStore(tmp_path)
+    index.unlink() if content is None else index.write_bytes(content)
+    store = FrameStore(tmp_path)
+    assert [f.frame_id for f in store.frames] == [0, 1, 2]
+    assert store.next_frame_id == 5  # frame 3 may have been sent under its number
+    running.look()
+    assert [f.frame_id for f in running.frames] == [0, 1, 2]  # a process that had it open reads it again
+    running.put(make_frame(5))
+    assert FrameStore(tmp_path).outbox() == [0, 1, 2, 5]
+
+
+def test_an_index_of_an_earlier_version_is_taken(tmp_path, make_frame):
+    fill(FrameStore(tmp_path), make_frame, 3)
+    index = tmp_path / "index.jsonl"
+    lines = [json.loads(line) for line in index.read_bytes().splitlines()]
+    for line in lines:
+        del line["crc32"]
+    lines += [{"frame_id": 7, "dropped": "oldest"}]
+    index.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    store = FrameStore(tmp_path)
+    assert (store.outbox(), store.next_frame_id, store.dropped_undelivered) == ([0, 1, 2], 8, 1)
+
+
+def test_a_deletion_that_a_power_cut_interrupted_is_ended(tmp_path, make_frame, monkeypatch):
+    store = FrameStore(tmp_path)
+    fill(store, make_frame, 3)
+    monkeypatch.setattr(
+        FrameStore, "_unlink", lambda self, frame_id: (_ for _ in ()).throw(OSError(5, "cut"))
+    )
+    with pytest.raises(StoreError, match="cut"):
+        store.drop(1)
+    monkeypatch.undo()
+    again = FrameStore(tmp_path)
+    assert again.outbox() == [0, 2] and not again.path(1).exists()
+
+
+def test_a_store_that_cannot_be_written_to_is_sent_from(tmp_path, make_frame, caplog):
+    """A file system that is mounted read-only, as the kernel does after errors of a flash card."""
+    fill(FrameStore(tmp_path / "store"), make_frame, 3)
+    with read_only(tmp_path / "store"):
+        store = FrameStore(tmp_path / "store")
+        assert store.look() == [0, 1, 2]
+        numbers = {store.next_transaction() for _ in range(20)}
+        assert len(numbers) == 20 and decode_frame(store.read(0)).frame_id == 0
+        store.mark_delivered(0)
+        assert (list(store.waiting), store.outbox()) == ([1, 2], [1, 2])
+        with pytest.raises(StoreError, match="Read-only"):
+            store.put(make_frame(3))
+        assert caplog.text.count("the store cannot be written to") == 1
+    store.put(make_frame(3))
+    assert store.look() == [3]
+
+
+def test_looks_say_what_came_and_what_went_without_listing_the_outbox(tmp_path, make_frame, monkeypatch):
+    capturing, sending = FrameStore(tmp_path), FrameStore(tmp_path)
+    fill(capturing, make_frame, 2)
+    assert sending.look() == [0, 1]
+    monkeypatch.setattr(FrameStore, "_markers", lambda self: pytest.fail("listed"))
+    assert sending.look() == []
+    fill(capturing, make_frame, 2)
+    sending.mark_delivered(1)
+    assert sending.look() == [2, 3] and list(sending.waiting) == [0, 2, 3]
+    capturing.drop(2)
+    assert sending.look() == [] and list(sending.waiting) == [0, 3]
 
 
 def test_a_container_that_changed_on_the_disk_is_not_sent(tmp_path, make_frame):
@@ -190,6 +277,9 @@ def test_a_store_holds_one_pass(tmp_path, make_frame):
     ):
         FrameStore(tmp_path).hold_pass(9 * second_ns)
     (tmp_path / "pass.json").write_text("[")
+    FrameStore(tmp_path).hold_pass(7 * second_ns)  # it stands twice
+    for damaged in ("pass.json", "pass.json.copy"):
+        (tmp_path / damaged).write_text("[")
     FrameStore(tmp_path).hold_pass(9 * second_ns)
     with pytest.raises(StoreError, match="00:00:09"):
         FrameStore(tmp_path).hold_pass(7 * second_ns)

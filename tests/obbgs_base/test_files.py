@@ -1,0 +1,26 @@
+"""Files written whole on file systems that cannot do everything."""
+
+import errno
+import os
+import stat
+
+import pytest
+
+from obbgs_base.files import append_line, write_whole
+
+
+def test_a_folder_that_cannot_be_synced_is_written_to_all_the_same(tmp_path, monkeypatch):
+    real, answer = os.fsync, [errno.EINVAL]
+
+    def fsync(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(answer[0], os.strerror(answer[0]))
+        real(descriptor)
+
+    monkeypatch.setattr("obbgs_base.files.os.fsync", fsync)
+    write_whole(tmp_path / "session.json", b"{}")
+    append_line(tmp_path / "frames.jsonl", b"{}")
+    assert (tmp_path / "session.json").read_bytes() == b"{}"
+    answer[0] = errno.EIO  # the disk has failed
+    with pytest.raises(OSError, match="Input/output"):
+        write_whole(tmp_path / "session.json", b"[]")
