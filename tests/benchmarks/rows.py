@@ -73,6 +73,13 @@ FIGURES = {  # key of a row: column title and format
     "passes_repeating": ("of them sent segments twice", "{:.0f}"),
     "passes_losing_the_end": ("lost their last packets", "{:.0f}"),
     "segments_resent": ("segments sent again", "{:.0f}"),
+    "rss_mb": ("resident memory", "{:.1f} MB"),
+    "handles": ("open handles", "{:.0f}"),
+    "store_files": ("files of the store", "{:.0f}"),
+    "session_files_besides_frames": ("files of the session besides frames", "{:.0f}"),
+    "frames_taken": ("frames taken", "{:.0f}"),
+    "frames_received": ("received", "{:.0f}"),
+    "events_of_the_clock": ("events of the clock", "{:.0f}"),
 }
 
 
