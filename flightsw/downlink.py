@@ -169,8 +169,9 @@ class _Downlink:
         self._store, self._link, self._mission, self._clock_s = store, link, mission, clock_s
         self._capture_values, self._boot = capture_values, boot
         self._stream = PacketStream(TELEMETRY, mission.link.max_packet_bytes)
-        ring = keys or KeyRing([])
-        self._keys = [answer_key(own.key) for own in ring.counters if not own.is_retired]
+        self._key_ring = keys or KeyRing([])
+        self._answer_keys: list[bytes] = []
+        self._renew_answer_keys()
         self._commander = Commander(keys, store, mission, self._note_refusal, clock_s)
         self._meter = ProcessMeter(clock_s)
         self._telemetry: deque[tuple[int, bytes]] = deque()
@@ -205,7 +206,7 @@ class _Downlink:
             self._stream.max_data_bytes,
             self.interval_s,
             self._mission.link,
-            self._keys,
+            self._answer_keys,
         )
 
     def _begin_with_store(self) -> None:
@@ -314,6 +315,7 @@ class _Downlink:
                 self._frames.transfers.receive(content, now_s)
             elif apid == APID_COMMANDS:
                 self._commander.receive(content)
+                self._renew_answer_keys()
             elif apid == APID_UPLINK_FILES:
                 self._receive_upload(content, now_s)
         self._commander.poll()
@@ -321,6 +323,11 @@ class _Downlink:
         for outcome in failed:
             self.events.add("transfer_failed", file=outcome.name, reason=outcome.reason)
         return bool(ended)
+
+    def _renew_answer_keys(self) -> None:
+        """Have frames delivered by no receipt that was made with a key that is retired now."""
+        valid = [own.key for own in self._key_ring.counters if not own.is_retired]
+        self._answer_keys[:] = map(answer_key, valid)
 
     def send_last_telemetry(self) -> None:
         """Send the queued telemetry and the event that the software stops."""

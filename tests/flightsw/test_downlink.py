@@ -32,7 +32,7 @@ from flightsw.icd.packet import (
     TELECOMMAND,
 )
 from flightsw.icd.telemetry import DICTIONARY
-from flightsw.icd.transfer import UPLINK, Sender, parse_pdu
+from flightsw.icd.transfer import UPLINK, Receiver, Sender, Verdict, answer_key, parse_pdu
 from flightsw.icd.transfer.checksum import TYPES
 from flightsw.settings import Settings, save_settings
 from flightsw.store import FrameStore
@@ -473,3 +473,39 @@ main()
     os.close(ground)
     assert done.returncode == 1, done.stderr
     assert "flightsw: the downlink failed 6 times in a row" in done.stderr
+
+
+class AnsweringLink(ListLink):
+    """Has the ground at its other end, which stores every file and answers with a key."""
+
+    def __init__(self, key: Key):
+        super().__init__()
+        self.ground = PacketStream(TELECOMMAND, 1100)
+        self._receiver = Receiver(
+            self.ground.max_data_bytes, 1.0, lambda name, content: Verdict.STORED, key=answer_key(key)
+        )
+
+    def write(self, data: bytes) -> None:
+        super().write(data)
+        for apid, content in self.ground.decode(data):
+            if apid == APID_FILES:
+                self._receiver.receive(content, self.now_s)
+                while (answer := self._receiver.next_pdu(self.now_s)) is not None:
+                    self.incoming.append(self.ground.encode(APID_FILES, answer))
+
+
+@pytest.mark.parametrize("is_retired", [False, True])
+def test_a_retired_key_makes_no_receipts_any_more_from_that_moment(
+    store, small_mission, tmp_path, is_retired
+):
+    save_settings(store.folder, Settings("oldest"))
+    old, new = make_key(tmp_path / "old"), make_key(tmp_path / "new", 2)
+    keys, link = KeyRing([tmp_path / "old", tmp_path / "new"]), AnsweringLink(old)
+    commands = [Command("arm", {"command": "retire"}), Command("retire", {"key": 1})]
+    if is_retired:  # the commands come before the first answer
+        for number, command in enumerate(commands, start=1):
+            link.incoming.append(link.ground.encode(APID_COMMANDS, seal(new, number, command.pack())))
+    progress = fly(link, store, small_mission, 20.0, keys=keys)
+    keys.close()
+    assert progress.delivered == (0 if is_retired else 3)
+    assert len(store.outbox()) == 3 - progress.delivered
