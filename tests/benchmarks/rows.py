@@ -77,8 +77,6 @@ FIGURES = {  # key of a row: column title and format
     "handles": ("open handles", "{:.0f}"),
     "store_files": ("files of the store", "{:.0f}"),
     "session_files_besides_frames": ("files of the session besides frames", "{:.0f}"),
-    "frames_taken": ("frames taken", "{:.0f}"),
-    "frames_received": ("received", "{:.0f}"),
     "events_of_the_clock": ("events of the clock", "{:.0f}"),
 }
 
