@@ -422,15 +422,24 @@ class FrameStore:
         state = IndexState.of(listed, gone)
         if not content and (gone or next(self._frames.glob("*.obf"), None)):
             problems = ["it is empty or gone"]
+        if b"\0" in content.rpartition(b"\n")[2]:  # a power cut leaves the beginning of a line
+            problems = [*problems, "it ends with zeros"]
         self._compare_with_containers(state, bool(problems))
         added = state.added_to(listed)
         if problems:
             log.error("%s is made again from the containers: %s", self._index.name, problems[0])
+        elif added:
+            numbers = sorted({entry.frame_id for entry in added})
+            log.warning(
+                "%s lacked frames %s, the containers say what they are", self._index.name, numbers[:20]
+            )
         if problems or added or (content and not content.endswith(b"\n")):
             self._write_again(self._index, content if problems else b"", [*listed, *added])
         missing = state.missing_from(gone)
-        if gone_problems:
-            log.error("%s is made again from the index: %s", self._deleted.name, gone_problems[0])
+        lacked = sum(entry in listed for entry in missing)
+        if gone_problems or lacked:
+            problem = gone_problems[0] if gone_problems else f"it lacked {lacked} frames"
+            log.error("%s is made again from the index: %s", self._deleted.name, problem)
         if gone_problems or missing or (deleted and not deleted.endswith(b"\n")):
             self._write_again(self._deleted, deleted if gone_problems else b"", [*gone, *missing])
         self._forget_index()

@@ -78,6 +78,8 @@ FIGURES = {  # key of a row: column title and format
     "store_files": ("files of the store", "{:.0f}"),
     "session_files_besides_frames": ("files of the session besides frames", "{:.0f}"),
     "events_of_the_clock": ("events of the clock", "{:.0f}"),
+    "trials": ("trials", "{:,.0f}"),
+    "trials_failed": ("of them failed", "{:.0f}"),
 }
 
 
