@@ -179,6 +179,7 @@ class _Downlink:
         self._announced: set[int] = set()  # and those still to be, over restarts
         self._to_announce: deque[int] = deque()
         self._store_retry_s = float("-inf")
+        self._has_store = False  # since the store is open, here or by who owns it
         self._store_problem = ""  # of which the ground was told last
         self._counts = SendingCounts()
         self._restarts = self._restarts_in_a_row = 0
@@ -210,6 +211,7 @@ class _Downlink:
         )
 
     def _begin_with_store(self) -> None:
+        self._has_store = True
         try:
             self._ranking.start()
             self._take_in(self._frames.look())
@@ -230,6 +232,7 @@ class _Downlink:
             except StoreError as error:
                 self._store_failed(error, now_s)
                 return False
+        if not self._has_store:
             self._commander.settings = load_settings(self._store.folder, self._mission)
             self._frames = self._new_sender()  # of this store's identity
             self._begin_with_store()

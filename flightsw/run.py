@@ -112,8 +112,7 @@ def run_pass(
 
         try:
             if thread is not None:
-                _wait_for_store(store, stop)
-                thread.store_is_made.set()
+                _wait_for_stores(store, thread, stop)
             if camera_url is not None and thread is not None and no_camera is not None:
                 thread.camera = camera = _awaited_camera(camera_url, mission, stop, opened, alive, no_camera)
             if camera is not None:
@@ -170,22 +169,27 @@ def _open_link(
     return opened.enter_context(open_link(link_url, FLIGHT_SIDE, must_be_there)), keys
 
 
-def _wait_for_store(store: FrameStore, stop: threading.Event) -> None:
-    """Open a store that is not open yet; where it cannot be read, try again until it can or the run is stopped.
+def _wait_for_stores(store: FrameStore, thread: "_DownlinkThread", stop: threading.Event) -> None:
+    """Open the stores of capture and downlink, which takes seconds where many frames wait.
+
+    Where they cannot be read, it is tried again until they can or the run is stopped.
 
     Raises:
-        StoreError: it could not be read before the run was stopped.
+        StoreError: they could not be read before the run was stopped.
     """
-    problem: StoreError | None = None
-    while not store.is_open:
+    problem = ""
+    while not (store.is_open and thread.store.is_open):
         try:
-            store.open()
+            for each in (store, thread.store):
+                if not each.is_open:
+                    each.open()
         except StoreError as error:
-            if problem is None or str(problem) != str(error):
+            if problem != str(error):
                 log.error("%s; commands are obeyed, and it is tried again every %g s", error, RETRY_S)
-            problem = error
+            problem = str(error)
             if stop.wait(RETRY_S):
                 raise
+    thread.store_is_made.set()
 
 
 def _open_camera(
@@ -293,7 +297,7 @@ class _DownlinkThread(threading.Thread):
         self.result = DownlinkProgress()
         self.error: Exception | None = None
         # another one than that of capture: each is for one thread, and what they share is on the disk
-        self._store = FrameStore(captured_to.folder, open_now=False)
+        self.store = FrameStore(captured_to.folder, open_now=False)
         self._link, self._mission, self._keys = link, mission, keys
         self._exit_when_empty, self._stop_event = exit_when_empty, stop
         self._on_progress, self._watchdog = on_progress, watchdog
@@ -302,7 +306,7 @@ class _DownlinkThread(threading.Thread):
     def run(self) -> None:
         try:
             self.result = run_downlink(
-                self._store,
+                self.store,
                 self._link,
                 self._mission,
                 on_progress=self._keep,
@@ -342,7 +346,7 @@ class _DownlinkThread(threading.Thread):
         """Tell whether all is delivered; lingers a little, as the ground may ask for its last answer once more."""
         rejected = self.result.rejected_waiting  # by the ground; they stay on board
         waiting = self.capturing.is_set() or self.result.waiting > rejected or not self._exit_when_empty
-        if waiting or not self._store.is_open or len(self._store.outbox()) > rejected:
+        if waiting or not self.store.is_open or len(self.store.outbox()) > rejected:
             self._empty_since_s = None
         elif self._empty_since_s is None:
             self._empty_since_s = time.monotonic()
