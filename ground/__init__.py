@@ -1,1 +1,22 @@
-"""The ground station: receives frames into sessions, reconstructs models from them, scores and shows these."""
+"""The ground station: from frames to models, and the sessions in which frames lie, for programs too.
+
+The names in `__all__` can be imported from `ground`; their modules are imported when they are first used.
+"""
+
+import importlib
+from typing import Any
+
+_MODULES = {  # public name: the module that defines it
+    "frames_of": "training_frames",
+    "open_session": "session",
+    "predicted_image": "cameras",
+    "sensor_of": "cameras",
+    "split": "training_frames",
+}
+__all__ = list(_MODULES)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -24,7 +24,7 @@ from ground.runs import (
     written_to,
 )
 from ground.session import FrameRecord, Session, open_session
-from ground.training_frames import split, training_frame
+from ground.training_frames import frames_of, split
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.presets import preset
@@ -103,7 +103,7 @@ def reconstruct(
             session = in_body_axes(session, found)
             training, held_out = split(session)
             configs = {label: _refining(config) for label, config in configs.items()}
-        frames = [training_frame(session, record) for record in training]
+        frames = frames_of(session, training)
 
         def trained(label: str, config: MethodConfig) -> TrainResult:
             def on_step(info: StepInfo) -> None:

@@ -47,7 +47,9 @@ def frames_section(run: Run) -> str:
                 caption += f", {_exposure(run, record)}"
             if record.saturated:
                 caption += f"<br>{record.saturated:,} px saturated"
-            cells.append(picture(_tone(run, noisy_image(run, record).numpy()), f"frame {record.id}", caption))
+            received = run.session.dn(record).astype(np.float32) / run.sensor.white_dn
+            image = _tone(run, received.reshape(*received.shape[:2], -1))
+            cells.append(picture(image, f"frame {record.id}", caption))
     return section(
         "Pictures" if nominal else "Frames by exposure",
         f"{len(picked)} of the {len(run.session.frames):,} imported pictures, {brightness(run)}."

@@ -69,6 +69,19 @@ def is_held_out(record: FrameRecord) -> bool:
     return record.bracket % TEST_INTERVAL == TEST_INTERVAL - 1
 
 
+def frames_of(session: Session, records: Sequence[FrameRecord] | None = None) -> list[TrainingFrame]:
+    """Return frames of a session with their pictures, poses and calibration, as `obbgs_core.train.train` takes them.
+
+    Args:
+        records: frames of `session.frames`, such as those of `split`; None: all that are `usable`.
+
+    Raises:
+        MissingFrames, SessionCorrupt: a picture cannot be read.
+    """
+    records = usable(session.frames) if records is None else records
+    return [training_frame(session, record) for record in records]
+
+
 def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
     """Return a frame with its picture, pose and calibration in the library's form.
 

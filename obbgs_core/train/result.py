@@ -49,9 +49,9 @@ class Exposing:
         return (sensor.expected_dn(radiance, exposure_s) / sensor.white_dn).clamp(0, 1)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class TrainResult:
-    """A finished model, and how its training went."""
+    """A finished model, and how its training went; printed it is one line."""
 
     gaussians: Gaussians
     config: MethodConfig  # as used: with no more Gaussians than the budget allows
@@ -76,6 +76,13 @@ class TrainResult:
     removed_outliers: int
     removed_not_finite: int  # Gaussians removed because a parameter became NaN or infinite
     seconds: float
+
+    def __repr__(self) -> str:
+        last = f"PSNR {self.history[-1].psnr_db:.1f} dB of its last frames, " if self.history else ""
+        return (
+            f"<{self.config.name}: {len(self.gaussians):,} Gaussians, {last}{len(self.history):,} steps in "
+            f"{self.seconds:.1f} s: {self.stop_reason}>"
+        )
 
     @property
     def reference_exposure_s(self) -> float | None:
