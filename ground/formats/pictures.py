@@ -292,6 +292,9 @@ def _header_of_tiff(path: Path) -> Header:
 
     with tifffile.TiffFile(path) as file:
         page = file.pages.first
+        sizes = (page.imagewidth, page.imagelength, page.samplesperpixel, page.bitspersample)
+        if not all(isinstance(size, int) for size in sizes):
+            raise ValueError(f"expected whole numbers for width, height, channels and bits, got {sizes}")
         tags = {tag.code: tag.value for tag in page.tags.values()}
         exif = tags.get(EXIF_IFD)
         by_name = exif if isinstance(exif, dict) else {}

@@ -9,7 +9,7 @@ import onnxruntime
 import pytest
 import torch
 
-from flightsw import model_file
+from flightsw.icd import model_file
 from obbgs_core.errors import ExportError
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.model.cameras import Cameras
