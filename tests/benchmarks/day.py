@@ -2,7 +2,7 @@
 
 The loops of `flightsw downlink` and `ground listen` run in one process, turn by turn, over a link that loses one packet
 in a hundred and is cut for a minute in each hour. A small frame comes each minute, a command every ten; the store has a
-quota. UTC is an hour ahead for two seconds every six hours, and set by 100 s at noon. There is a row for each hour.
+quota. UTC is an hour ahead for two seconds every six hours, and set by 100 s a quarter past noon. There is a row for each hour.
 """
 
 import argparse
@@ -36,8 +36,10 @@ class DrivenTime:
         self._real = {name: getattr(time, name) for name in ("monotonic", "monotonic_ns", "time", "time_ns")}
 
     def utc_s(self) -> float:
-        is_wrong = self.now_s % (6 * HOUR_S) >= 6 * HOUR_S - 2
-        return BEGIN_UTC_S + self.now_s + HOUR_S * is_wrong + 100 * (self.now_s >= 12 * HOUR_S)
+        is_wrong = (
+            3 * HOUR_S <= self.now_s % (6 * HOUR_S) - HOUR_S / 2 < 3 * HOUR_S + 2
+        )  # not while the link is cut
+        return BEGIN_UTC_S + self.now_s + HOUR_S * is_wrong + 100 * (self.now_s >= 12.25 * HOUR_S)
 
     def __enter__(self) -> "DrivenTime":
         time.monotonic, time.monotonic_ns = lambda: self.now_s, lambda: round(self.now_s * 1e9)
