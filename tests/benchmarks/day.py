@@ -2,7 +2,7 @@
 
 The loops of `flightsw downlink` and `ground listen` run in one process, turn by turn, over a link that loses one packet
 in a hundred and is cut for a minute in each hour. A small frame comes each minute, a command every ten; the store has a
-quota. UTC is an hour ahead for two seconds every six hours, and set by 100 s a quarter past noon. There is a row for each hour.
+quota. UTC is an hour ahead for two seconds every six hours, and set by 100 s after noon. There is a row for each hour.
 """
 
 import argparse
