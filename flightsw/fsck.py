@@ -211,8 +211,13 @@ class _Check:
             if path.exists():
                 parse_numbers(path.read_bytes())
         except ValueError as error:
-            if self._note(f"transaction: {error}; replaced by a number drawn at random"):
-                write_whole(path, numbers_line(random_number(), ()))
+            if self._note(
+                f"transaction: {error}; replaced by a number drawn at random, all waiting frames as sent"
+            ):
+                waiting = [
+                    int(marker.name) for marker in (self.folder / "outbox").iterdir() if marker.name.isdigit()
+                ]
+                write_whole(path, numbers_line(random_number(), waiting))
 
     def _files_that_stand_twice(self) -> None:
         for name in TWICE:

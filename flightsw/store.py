@@ -240,11 +240,12 @@ class FrameStore:
             return random_number()
 
     def in_flight(self) -> frozenset[int]:
-        """Return the frames that `next_transaction` was told last."""
+        """Return the frames that `next_transaction` was told last; all that wait where this cannot be read."""
         if not self.is_open:
             return frozenset()
         with _disk_errors("read the last transfer's number"), self.locked():
-            return self._numbers.in_flight
+            in_flight = self._numbers.in_flight
+            return frozenset(self._markers()) if in_flight is None else in_flight
 
     def put_back(self, first_frame: int, last_frame: int) -> int:
         """Put the stored frames of these numbers into the outbox again and return how many were not in it."""
@@ -360,7 +361,7 @@ class FrameStore:
         if confirmed:
             log.info("frame %d deleted, the ground has it: %s is full", confirmed[0], what_is_full)
             self._drop(confirmed[0], "delivered")
-        elif self.when_full == "drop-oldest" and (free := set(self._stored) - self._numbers.in_flight):
+        elif self.when_full == "drop-oldest" and (free := self._not_in_flight()):
             oldest = min(free)  # frames in flight may be on the ground already
             if (self._outbox / f"{oldest:08d}").stat().st_size:  # delivered once; in the outbox by command
                 log.info("frame %d deleted, the ground had it: %s is full", oldest, what_is_full)
@@ -372,6 +373,11 @@ class FrameStore:
             self._drop(oldest, "oldest")
         else:
             self._refuse(for_frame, f"{what_is_full} is full")
+
+    def _not_in_flight(self) -> set[int]:
+        """Return the stored frames that cannot have arrived yet; none where it cannot be read which are in flight."""
+        in_flight = self._numbers.in_flight
+        return set() if in_flight is None else set(self._stored) - in_flight
 
     def _refuse(self, frame_id: int, reason: str) -> None:
         self.refused += 1

@@ -61,22 +61,24 @@ class TransferNumbers:
         return number
 
     @property
-    def in_flight(self) -> frozenset[int]:
+    def in_flight(self) -> frozenset[int] | None:
         """The frames that may have arrived without this side knowing; those of a run that was killed too.
+
+        None where the file is damaged: then it may be any.
 
         Raises:
             OSError: the disk refuses.
         """
         return self._read()[1]
 
-    def _read(self) -> tuple[int, frozenset[int]]:
+    def _read(self) -> tuple[int, frozenset[int] | None]:
         try:
             return parse_numbers(self._path.read_bytes())
         except FileNotFoundError:
             return random_number(), frozenset()
         except ValueError as error:
             log.warning("the number of the last transfer is damaged, they go on at random: %s", error)
-            return random_number(), frozenset()
+            return random_number(), None
 
 
 def store_identity(folder: Path, write: Write) -> bytes:

@@ -253,6 +253,32 @@ def test_what_may_have_arrived_is_not_dropped_for_room(tmp_path, make_frame):
     assert killed.outbox() == [2, 3, 4] and killed.dropped_undelivered == 1
 
 
+@pytest.mark.parametrize("repaired", [False, True])
+def test_where_it_cannot_be_read_what_is_in_flight_it_may_be_any_frame_that_waits(
+    tmp_path, make_frame, repaired
+):
+    room = round(3.5 * container_bytes(make_frame))
+    store = FrameStore(tmp_path, room, "drop-oldest")
+    fill(store, make_frame, 3)
+    store.mark_delivered(1)
+    store.next_transaction([0, 2])
+    content = bytearray((tmp_path / "transaction").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "transaction").write_bytes(content)
+    if repaired:
+        assert len(fsck(tmp_path).problems) == 1
+    killed = FrameStore(tmp_path, room, "drop-oldest")
+    assert killed.in_flight() == {0, 2}
+    killed.put(make_frame(3))  # takes the room of frame 1, which the ground has
+    if not repaired:
+        assert killed.in_flight() == {0, 2, 3}
+        with pytest.raises(StoreFull):
+            killed.put(make_frame(4))
+        killed.next_transaction([0, 2])  # from now on it is known
+    killed.put(make_frame(4))
+    assert killed.outbox() == [0, 2, 4] and killed.dropped_undelivered == 1
+
+
 def test_frames_are_put_back_into_the_outbox_and_count_as_delivered_once(tmp_path, make_frame):
     room = round(3.5 * container_bytes(make_frame))
     store = FrameStore(tmp_path, room, "drop-oldest")
