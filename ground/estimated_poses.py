@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from ground.session import FrameRecord, Session, SessionError
 from ground.training_frames import training_frame
 from ground.truth import Truth
 from obbgs_base.files import write_whole
+from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.pose_corrections import with_estimate
 from obbgs_core.pose_estimate import PoseEstimate
@@ -91,15 +93,16 @@ def scored_records(
     """
     estimate, records = read_estimate(run.folder), run.scored if records is None else records
     if truth is None:
-        return settled_records(run.gaussians, run.session, records, run.sensor, estimate)
+        frames = map(run.without_sky_level, records)
+        return settled_records(run.gaussians, records, frames, run.sensor, estimate)
     motion = None if estimate is None else Alignment.of(estimate, run.session, truth).motion.numpy()
     return [truth.posed(record, motion) for record in records]
 
 
 def settled_records(
     gaussians: Gaussians,
-    session: Session,
     records: list[FrameRecord],
+    frames: Iterable[TrainingFrame],
     sensor: Sensor,
     estimate: PoseEstimate | None,
 ) -> list[FrameRecord]:
@@ -108,12 +111,11 @@ def settled_records(
     They are as they were where the training left its poses as tagged.
 
     Args:
-        session: with the poses as tagged.
+        frames: the same with their pictures, and the poses as tagged; looked at only where poses were refined.
     """
     if estimate is None or not records:
         return records
-    frames = with_estimate([training_frame(session, record) for record in records], estimate)
-    poses = settled_poses(gaussians, frames, sensor)
+    poses = settled_poses(gaussians, with_estimate(list(frames), estimate), sensor)
     return [_placed(record, pose.double().numpy()) for record, pose in zip(records, poses, strict=True)]
 
 

@@ -23,14 +23,12 @@ from ground.scores import (
     of_similarity,
 )
 from ground.session import FrameRecord
-from ground.training_frames import training_frame
 from ground.truth import Truth, read_points
 from obbgs_base.files import write_whole
 from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.score.shown import shown_points
-from obbgs_core.sky_level import field
 
 # of the keys of `evaluate`: an older score that cannot be measured any more is not kept
 SCORES = (
@@ -96,7 +94,7 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     }
     states_errors = run.metrics["scored_frames"] == "held_out" and not run.metrics.get("reference_exposure_s")
     if states_errors:
-        frames = run.without_sky_level(shown)
+        frames = map(run.without_sky_level, shown)
         figures |= stated_error_scores(run.gaussians, run.sensor, frames, run.metrics.get("misfit"))
     if run.session.frames_imported is not None and run.session.camera.channels == 3:
         pairs = ((model_image(run, record), noisy_image(run, record)) for record in shown)
@@ -145,7 +143,7 @@ def _geometry(run: Run, truth: Truth) -> tuple[dict[str, np.ndarray], np.ndarray
         clouds["_mesh"] = read_mesh_points(run.folder / "model.glb", SURFACE_POINTS)
     if run.session.background:
         return clouds, None
-    training = [training_frame(run.session, truth.posed(record)) for record in run.training]
+    training = [run.without_sky_level(truth.posed(record)) for record in run.training]
     return clouds, shown_points(truth.cloud_m, training, run.sensor)
 
 
@@ -164,7 +162,7 @@ def _interval_figures(
     """Return how often the intervals hold that the model states of the held-out frames."""
     radiance = [] if truth is None else [torch.from_numpy(truth.radiance(record)[0]) for record in shown]
     training = estimated_records(run.training, estimate)
-    known, scored = (run.without_sky_level(records) for records in (training, shown))
+    known, scored = ([run.without_sky_level(r) for r in records] for records in (training, shown))
     return interval_scores(run.gaussians, known, run.sensor, scored, radiance)
 
 
@@ -212,8 +210,4 @@ def _exposure_s(run: Run, record: FrameRecord) -> float:
 
 def noisy_image(run: Run, record: FrameRecord) -> torch.Tensor:
     """Return a frame as received [H, W, C], without what empty sky reads above black, as a fraction of full scale."""
-    dn = torch.from_numpy(run.session.dn(record).astype(np.float32))
-    dn = dn.reshape(*dn.shape[:2], -1)
-    if (planes := run.sky_planes_dn.get(record.id)) is not None:
-        dn = (dn - field(planes, *dn.shape[:2])).clamp(min=0)
-    return dn / run.sensor.white_dn
+    return run.without_sky_level(record).dn / run.sensor.white_dn

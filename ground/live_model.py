@@ -13,6 +13,7 @@ from ground.estimated_poses import settled_records, write_estimate
 from ground.model_files import exposure_times_s
 from ground.runs import is_live
 from ground.session import FrameRecord
+from ground.training_frames import training_frame
 from obbgs_core.io.ply import save_ply
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.pose_estimate import PoseEstimate
@@ -78,7 +79,8 @@ class ShownModel:
             return math.nan
         sensor, values = sensor_of(session.camera), []
         scored = held_out[:: math.ceil(len(held_out) / (SCORED if estimate is None else SETTLED))]
-        scored = settled_records(gaussians, session, scored, sensor, estimate)
+        frames = (training_frame(session, record) for record in scored)
+        scored = settled_records(gaussians, scored, frames, sensor, estimate)
         for record in scored:
             if record.id not in self._images:
                 dn = torch.from_numpy(session.dn(record).astype("float32"))

@@ -13,7 +13,6 @@ from ground.estimated_poses import read_estimate
 from ground.page import legend, plot, section, two_tables
 from ground.runs import Run
 from ground.spread import evenly_spread
-from ground.training_frames import training_frame
 from obbgs_base.navigation_errors import LENGTHS, jacobian
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.losses import fit_figures
@@ -81,7 +80,7 @@ def pose_history(run: Run, estimate: PoseEstimate) -> PoseHistory:
     rows = sorted(longest, key=lambda row: records[estimate.frame_ids[longest[row]]].mid_exposure_utc_ns)
     places = [longest[row] for row in rows]
     ids = [estimate.frame_ids[place] for place in places]
-    frames = [training_frame(run.session, records[number]) for number in ids]
+    frames = [run.without_sky_level(records[number]) for number in ids]
     tagged, estimated = (torch.from_numpy(poses[places]) for poses in (estimate.tagged, estimate.estimated))
     posterior = np.stack([np.diag(deviations**2) for deviations in estimate.own_posterior[rows]])
     if frames[0].navigation is not None:

@@ -29,7 +29,7 @@ from obbgs_core.frames import TrainingFrame
 from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
-from obbgs_core.sky_level import levelled
+from obbgs_core.sky_level import field, levelled
 
 LOG = "log"
 LOCK = "lock"  # in the folder of an unfinished run; holds the name of the process that works on it
@@ -70,21 +70,27 @@ class Run:
     blind: Gaussians | None  # of the training that ignored exposure times
     metrics: dict
 
-    def without_sky_level(self, records: list[FrameRecord]) -> list[TrainingFrame]:
-        """Return frames of the run, without what empty sky reads above black where its training took that off."""
-        frames = [training_frame(self.session, record) for record in records]
-        return levelled(frames, self.sensor)[0] if self.metrics.get("sky_level") else frames
+    def without_sky_level(self, record: FrameRecord) -> TrainingFrame:
+        """Return a frame as if empty sky read the stated black level, where the training found that it does not."""
+        frame = training_frame(self.session, record)
+        if (planes_dn := self._sky_planes_dn.get(record.id)) is None:
+            return frame
+        dn = (frame.dn - field(planes_dn, *frame.dn.shape[:2])).clamp(min=0)
+        dn[frame.dn >= self.sensor.white_dn] = (
+            self.sensor.white_dn
+        )  # still says no more than "at least this much"
+        return dataclasses.replace(frame, dn=dn)
 
     @functools.cached_property
-    def sky_planes_dn(self) -> dict[int, Tensor]:
-        """What empty sky reads above the stated black in the scored frames: planes [C, 3] as in `SkyLevel`, by frame.
-
-        None are there where the training found that the stated level fits.
-        """
-        if not self.metrics.get("sky_level"):
-            return {}
-        level = levelled([training_frame(self.session, record) for record in self.scored], self.sensor)[2]
-        return dict(zip(level.frame_ids, level.planes_dn, strict=True))
+    def _sky_planes_dn(self) -> dict[int, Tensor]:
+        """What empty sky reads above the stated black: planes [C, 3] as in `SkyLevel`, by frame; none where it fits."""
+        planes_dn = {}
+        if self.metrics.get("sky_level"):
+            for records in (self.training, self.scored):
+                frames = [training_frame(self.session, record) for record in records]
+                level = levelled(frames, self.sensor)[2]
+                planes_dn |= dict(zip(level.frame_ids, level.planes_dn, strict=True))
+        return planes_dn
 
 
 def run_folder(session_dir: Path, name: str, out: Path | None = None) -> Path:

@@ -9,6 +9,7 @@ from ground.attitude import FoundAttitude
 from ground.cameras import sensor_of
 from ground.estimated_poses import as_estimated, read_estimate, settled_records
 from ground.session import FrameRecord, Session, SessionError, open_session
+from ground.training_frames import training_frame
 from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.pose_estimate import PoseEstimate
@@ -46,7 +47,8 @@ class Shown:
         if record.id not in self._compared:
             seen = set(self.estimate.frame_ids)
             bracket = [r for r in self.tagged.frames if r.bracket == record.bracket and r.id not in seen]
-            settled = settled_records(self.gaussians, self.tagged, bracket, self.sensor, self.estimate)
+            frames = (training_frame(self.tagged, record) for record in bracket)
+            settled = settled_records(self.gaussians, bracket, frames, self.sensor, self.estimate)
             self._compared.update({r.id: r for r in settled})
         return self._compared[record.id]
 

@@ -13,6 +13,18 @@ from tests.small_sessions import small_session
 PEDESTAL_DN = 40.0  # a hundredth of full scale
 
 
+def test_stated_errors_do_not_depend_on_whether_black_is_stated_too_high_or_too_low(tmp_path):
+    """Readings of frames, and what is expected of them, are compared above the same black level."""
+    chi2 = []
+    for name, pedestal_dn in (("low", -PEDESTAL_DN), ("high", PEDESTAL_DN)):
+        session = small_session(tmp_path / name, pedestal_dn=pedestal_dn)
+        reconstruct(session, "run", "obbgs", QUICK | {"steps": 100})
+        metrics = evaluate(session, "run")
+        assert metrics["sky_level"] is not None
+        chi2.append(metrics["chi2_held_out"])
+    assert chi2[0] == pytest.approx(chi2[1], rel=0.15)  # 30 % apart where the levels differ by the pedestal
+
+
 def test_a_pedestal_is_measured_reported_and_costs_no_score(tmp_path):
     metrics = {}
     for name, pedestal_dn in (("plain", 0.0), ("raised", PEDESTAL_DN)):
