@@ -3,8 +3,7 @@
 The names in `__all__` can be imported from `ground`; their modules are imported when they are first used.
 """
 
-import importlib
-from typing import Any
+from obbgs_base.lazy import lazily
 
 _MODULES = {  # public name: the module that defines it
     "frames_of": "training_frames",
@@ -14,9 +13,4 @@ _MODULES = {  # public name: the module that defines it
     "split": "training_frames",
 }
 __all__ = list(_MODULES)  # pyright: ignore[reportUnsupportedDunderAll]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+__getattr__ = lazily(__name__, _MODULES)

@@ -20,8 +20,7 @@ The names in `__all__` can be imported from `obbgs_core`; the function `render` 
 seconds to load.
 """
 
-import importlib
-from typing import Any
+from obbgs_base.lazy import lazily
 
 _MODULES = {  # public name: the module that defines it
     "Cameras": "model.cameras",
@@ -43,9 +42,4 @@ _MODULES = {  # public name: the module that defines it
     "surface_points": "score.surface",
 }
 __all__ = list(_MODULES)  # pyright: ignore[reportUnsupportedDunderAll]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+__getattr__ = lazily(__name__, _MODULES)
