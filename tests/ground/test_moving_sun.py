@@ -8,7 +8,6 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-import yaml
 from scipy.spatial.transform import Rotation
 
 from flightsw.errors import TriageError
@@ -42,6 +41,7 @@ from obbgs_core.train.parsimony import next_degree_gain
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
 from tests import ply_by_trimesh
+from tests.session_frames import forget_session_facts
 
 SIZE_PX, RANGE_M = 48, 60.0
 SEMI_AXES_M = np.array([1.5, 1.0, 0.7])
@@ -450,10 +450,7 @@ def test_a_session_under_a_moving_sun_gives_outputs_that_know_it(tmp_path, small
     for entry in wrong:  # each frame is given the opposite Sun: the held-out views must suffer
         entry["sun_dir_body"] = [-x for x in entry["sun_dir_body"]]
     (tmp_path / "session" / "frames.jsonl").write_text("".join(json.dumps(e) + "\n" for e in wrong))
-    # a run of before the digest of its session was noted: a changed session is refused otherwise
-    noted = yaml.safe_load((folder / "config.yaml").read_text())
-    del noted["session"]
-    (folder / "config.yaml").write_text(yaml.safe_dump(noted))
+    forget_session_facts(folder)
     assert evaluate(tmp_path / "session", "run")["psnr_noisy_db"] < known - 3
     card = model_card("2026-07-21T00:00:00+00:00", metrics)
     assert "Radiance: follows Lambert's law with cast shadows, ambient 0." in card

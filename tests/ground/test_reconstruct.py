@@ -32,6 +32,7 @@ from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.io.ply import load_ply
 from obbgs_core.train.presets import PRESETS
 from tests import ply_by_trimesh
+from tests.session_frames import forget_session_facts
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
 TRAINED = {"steps": 700, "start.count": 2500, "growth.max_gaussians": 3000}
@@ -89,11 +90,7 @@ def test_errors_of_held_out_tags_do_not_count_as_the_models(trained, tmp_path):
         record["world_to_camera"][0][3] += 5.0  # m, several pixels
         lines.append(json.dumps(record))
     (tmp_path / "session" / "frames.jsonl").write_text("\n".join(lines) + "\n")
-    # a run of before the digest of its session was noted: a changed session is refused otherwise
-    config = tmp_path / "session/runs/run/config.yaml"
-    noted = yaml.safe_load(config.read_text())
-    del noted["session"]
-    config.write_text(yaml.safe_dump(noted))
+    forget_session_facts(tmp_path / "session/runs/run")
     wrong = evaluate(tmp_path / "session", "run")
     assert wrong["psnr_clean_db"] == pytest.approx(metrics["psnr_clean_db"], abs=0.05)
     assert wrong["psnr_noisy_db"] < metrics["psnr_noisy_db"] - 3

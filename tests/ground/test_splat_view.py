@@ -27,6 +27,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from tests.browser import as_url, chromium, opened, pixels
 from tests.scenes import random_gaussians
+from tests.session_frames import forget_session_facts
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
 QUICK = {"steps": 30, "start.count": 500, "growth.max_gaussians": 600, "light.sh_degree": 0}
@@ -251,6 +252,7 @@ def with_automatic_brackets(session: Path, folder: Path, lost: tuple[int, ...] =
         line["exposure_time_s"] *= 1.0123 ** line["bracket"]
     kept = [line for line in lines if line["id"] not in lost]
     (folder / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in kept))
+    forget_session_facts(folder / "runs" / "run")
     return folder
 
 
@@ -262,7 +264,7 @@ def test_the_report_shows_every_frame_of_automatic_brackets_with_its_time(sessio
     assert all(f"exposure {place}<" in page for place in (1, 2, 3)) and "exposure 4" not in page
     for record in (run.session.frames[0], run.session.frames[-1]):
         shown = f"{float(f'{1e3 * record.exposure_time_s:.4g}'):g} ms"
-        assert f"frame {record.id}, {np.linalg.norm(record.position_body_m):.0f} m, {shown}" in page
+        assert f"frame {record.id}, {np.linalg.norm(record.position_body_m):.4g} m, {shown}" in page
     held_out = scored_section(run, None)
     assert held_out.count('alt="render"') == len(run.scored) == 6
 
@@ -291,6 +293,7 @@ def imported(session: Path, folder: Path) -> Path:
     for line in lines:
         line |= {"exposure_time_s": 1.0, "sun_dir_body": [0.0, 0.0, 0.0]}
     (folder / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    forget_session_facts(folder / "runs" / "run")
     return folder
 
 
