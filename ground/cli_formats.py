@@ -214,18 +214,35 @@ def export_command(
     format_: Annotated[
         ExportFormat, typer.Option("--format", help="The format to write.")
     ] = ExportFormat.NERF,
+    run: Annotated[
+        str | None,
+        typer.Option(
+            help="Write the poses of this run, refined as it refined them, and its split into train and test; frames "
+            "that it left out are not written."
+        ),
+    ] = None,
     json_: AsJson = False,
 ) -> None:
     """Write a session's frames for other software, whole brackets split into train, val and test (6:2:3).
 
-    Example: ground export --session pass-12 --format nerfstudio --out pass-12-nerfstudio
+    Pictures have 8 bits. Beside them lie the readings of 16 bits, which `ground import` takes with the sensor's figures
+    (a COLMAP folder is a nerfstudio folder too: import it as that).
+
+    Example: ground export --session pass-12 --run first --format nerfstudio --out pass-12-nerfstudio
     """
+    from ground.estimated_poses import refined_session
+    from ground.formats.colmap_export import export_colmap
     from ground.formats.nerf import export_nerf
     from ground.formats.nerfstudio import export_nerfstudio
+    from ground.runs import open_run
     from ground.session import SessionError, open_session
 
-    exporters = {ExportFormat.NERF: export_nerf, ExportFormat.NERFSTUDIO: export_nerfstudio}
-    read = open_session(session)
+    exporters = {
+        ExportFormat.NERF: export_nerf,
+        ExportFormat.NERFSTUDIO: export_nerfstudio,
+        ExportFormat.COLMAP: export_colmap,
+    }
+    read = open_session(session) if run is None else refined_session(open_run(session, run))
     read.check_body_axes()
     if (out.exists() and not out.is_dir()) or (out / "session.json").exists():
         kind = "a session" if out.is_dir() else "a file"

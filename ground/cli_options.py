@@ -96,6 +96,7 @@ class ExportFormat(StrEnum):
 
     NERF = "nerf"
     NERFSTUDIO = "nerfstudio"
+    COLMAP = "colmap"
 
 
 class MeshFormatName(StrEnum):

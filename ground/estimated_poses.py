@@ -13,12 +13,13 @@ from torch import Tensor
 from flightsw.icd.quaternion import matrix_to_quat
 from ground.runs import Run
 from ground.session import FrameRecord, Session, SessionError
-from ground.training_frames import training_frame
+from ground.training_frames import frames_of, tag_covariance, training_frame
 from ground.truth import Truth
 from obbgs_base.files import write_whole
+from obbgs_base.navigation_errors import SharedParameters, jacobian
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.pose_corrections import with_estimate
+from obbgs_core.pose_corrections import motion_of, with_estimate
 from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.pose_gauge import best_motion, size_of
 from obbgs_core.score.poses import PoseErrors, pose_errors, settled_poses
@@ -97,6 +98,55 @@ def scored_records(
         return settled_records(run.gaussians, records, frames, run.sensor, estimate)
     motion = None if estimate is None else Alignment.of(estimate, run.session, truth).motion.numpy()
     return [truth.posed(record, motion) for record in records]
+
+
+def refined_session(run: Run) -> Session:
+    """Return a run's session with the frames that it was trained and scored on, from the poses that go with its model.
+
+    They state their splits. Poses that were refined are those of the training, and of held-out frames those that
+    settled on their pictures; their covariances are what the estimate leaves in doubt, frame by frame. Frames that the
+    training left out are not there.
+    """
+    estimate = read_estimate(run.folder)
+    of_split = {"train": estimated_records(run.training, estimate)}
+    if run.metrics["scored_frames"] == "held_out":
+        of_split["test"] = scored_records(run)
+    records = [dataclasses.replace(r, split=split) for split, of in of_split.items() for r in of]
+    if estimate is not None:
+        left = doubts_left(run.session, records, estimate)
+        records = [
+            dataclasses.replace(r, covariance=tag_covariance(c, r.world_to_camera[:3, :3]))
+            for r, c in zip(records, left, strict=True)
+        ]
+    frames = tuple(sorted(records, key=lambda record: record.id))
+    navigation = run.session.navigation
+    if estimate is not None:
+        navigation = dataclasses.replace(navigation, sigmas=SharedParameters())
+    return dataclasses.replace(run.session, frames=frames, navigation=navigation)
+
+
+def doubts_left(session: Session, records: list[FrameRecord], estimate: PoseEstimate) -> np.ndarray:
+    """Return the covariances [F, 6, 6] of the correcting motions of frames' poses that an estimate leaves in doubt.
+
+    They are those of the shared parameters and of the frames' brackets; of frames that the training did not see those
+    that their tags state.
+
+    Args:
+        session: with the poses as tagged.
+    """
+    tagged = {record.id: record for record in session.frames}
+    frames = frames_of(session, [tagged[record.id] for record in records])
+    row_of = dict(zip(estimate.frame_ids, estimate.brackets, strict=True))
+    own = np.zeros((len(frames), 6, 6))
+    for place, frame in enumerate(frames):
+        if frame.id in row_of:
+            own[place] = np.diag(estimate.own_posterior[row_of[frame.id]] ** 2)
+        elif frame.pose_covariance is not None:
+            own[place] = frame.pose_covariance.numpy()
+    if frames[0].navigation is None:
+        return own
+    columns = jacobian(motion_of(frames), estimate.shared)
+    return own + columns @ estimate.shared_covariance @ columns.transpose(0, 2, 1)
 
 
 def settled_records(

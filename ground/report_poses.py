@@ -9,15 +9,15 @@ import plotly.graph_objects as go
 import torch
 from plotly.subplots import make_subplots
 
-from ground.estimated_poses import read_estimate
+from ground.estimated_poses import doubts_left, read_estimate
 from ground.page import legend, plot, section, two_tables
 from ground.runs import Run
 from ground.spread import evenly_spread
-from obbgs_base.navigation_errors import LENGTHS, jacobian
+from obbgs_base.navigation_errors import LENGTHS
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.losses import fit_figures
 from obbgs_core.model.motions import motion_vectors
-from obbgs_core.pose_corrections import PoseCorrections, motion_of
+from obbgs_core.pose_corrections import PoseCorrections
 from obbgs_core.pose_estimate import PoseEstimate
 from obbgs_core.render import render
 
@@ -82,17 +82,13 @@ def pose_history(run: Run, estimate: PoseEstimate) -> PoseHistory:
     ids = [estimate.frame_ids[place] for place in places]
     frames = [run.without_sky_level(records[number]) for number in ids]
     tagged, estimated = (torch.from_numpy(poses[places]) for poses in (estimate.tagged, estimate.estimated))
-    posterior = np.stack([np.diag(deviations**2) for deviations in estimate.own_posterior[rows]])
-    if frames[0].navigation is not None:
-        columns = jacobian(motion_of(frames), estimate.shared)
-        posterior = posterior + columns @ estimate.shared_covariance @ columns.transpose(0, 2, 1)
     times_ns = np.array([records[number].mid_exposure_utc_ns for number in ids])
     return PoseHistory(
         ids,
         (times_ns - times_ns[0]) / 60e9,
         motion_vectors(estimated @ torch.linalg.inv(tagged)).numpy(),
         PoseCorrections(frames).covariances.numpy(),
-        posterior,
+        doubts_left(run.session, [records[number] for number in ids], estimate),
         _residuals(run, frames, tagged),
         _residuals(run, frames, estimated),
     )

@@ -136,3 +136,14 @@ def motion_covariance(tag_covariance: np.ndarray, body_to_camera: np.ndarray) ->
     motion_by_tag[:3, 3:] = -np.eye(3)
     motion_by_tag[3:, :3] = body_to_camera
     return motion_by_tag @ tag_covariance @ motion_by_tag.T
+
+
+def tag_covariance(covariance: np.ndarray, body_to_camera: np.ndarray) -> np.ndarray:
+    """Return the covariance [6, 6] that a tag states of whose pose's correcting motion one is given.
+
+    It is the inverse of `motion_covariance`.
+    """
+    tag_by_motion = np.zeros((6, 6))
+    tag_by_motion[:3, 3:] = body_to_camera.T
+    tag_by_motion[3:, :3] = -np.eye(3)
+    return tag_by_motion @ covariance @ tag_by_motion.T

@@ -61,32 +61,36 @@ def read_nerf(folder: Path) -> tuple[list[View], Exported | None]:
             numbered.append((number, dataclasses.replace(view, split=split)))
     if not numbered:
         raise FormatError(f"{folder}: no transforms_train.json, transforms_val.json or transforms_test.json")
-    return [view for _, view in sorted(numbered, key=lambda entry: entry[0])], exported
+    return as_exported([view for _, view in sorted(numbered, key=lambda entry: entry[0])], exported)
 
 
 def export_nerf(session: Session, out: Path) -> dict[str, int]:
     """Write a session's frames with a valid pose as a NeRF-synthetic folder, and return their number in each split.
 
-    Pictures are opaque: black level to full scale becomes 0 to 255. Frames are in the splits of `split_frames`.
+    Pictures are opaque: black level to full scale becomes 0 to 255. Beside them, in readings/, lie the digital numbers
+    of 16 bits as the session has them, which our import takes. Frames are in the splits of `split_frames`.
     """
     split_of, posed = split_frames(session), posed_frames(session)
     camera = session.camera
     counts = {}
     for split in SPLITS:
-        (out / split).mkdir(parents=True, exist_ok=True)
         records = [record for record in posed if split_of[record.id] == split]
+        counts[split] = len(records)
+        if not records:
+            continue
+        (out / split).mkdir(parents=True, exist_ok=True)
         frames = []
         for record in records:
             name = f"{split}/r_{record.id:04d}"
             write_whole(out / f"{name}.png", picture(session, record))
-            frames.append({"file_path": f"./{name}", "rotation": 0.0, **frame_keys(session, record)})
+            keys = {**frame_keys(session, record), **write_readings(session, record, out)}
+            frames.append({"file_path": f"./{name}", "rotation": 0.0, **keys})
         tree = {
             "camera_angle_x": 2 * math.atan(camera.width / (2 * camera.fx_px)),
             **camera_keys(session),
             "frames": frames,
         }
         write_whole(out / f"transforms_{split}.json", json.dumps(tree, indent=1).encode() + b"\n")
-        counts[split] = len(records)
     return counts
 
 
@@ -118,6 +122,14 @@ def picture(session: Session, record: FrameRecord) -> bytes:
     rgba = np.full((*dn.shape[:2], 4), 255, dtype=np.uint8)
     rgba[..., :3] = np.rint(255 * value.reshape(*dn.shape[:2], -1))
     return bytes(imagecodecs.png_encode(rgba, level=6))
+
+
+def write_readings(session: Session, record: FrameRecord, out: Path) -> dict[str, str]:
+    """Write a frame's digital numbers as the session has them, and return the key of a frame that names their file."""
+    name = f"readings/frame_{record.id:06d}.png"
+    (out / "readings").mkdir(exist_ok=True)
+    write_whole(out / name, (session.path / record.file).read_bytes())
+    return {"readings": name}
 
 
 def frame_keys(session: Session, record: FrameRecord) -> dict[str, Any]:
@@ -218,13 +230,45 @@ def read_frame(frame: dict[str, Any], image: Path, intrinsics: Intrinsics, where
             sun_dir_body=sun,
             in_eclipse=bool(frame.get("in_eclipse", False)),
             covariance=covariance,
+            readings=_readings_path(frame, where),
         )
     except (ValueError, TypeError, OverflowError) as error:
         raise FormatError(f"{where}: {image.name}: {error}") from error
 
 
+def _readings_path(frame: dict[str, Any], where: Path) -> Path | None:
+    """Return the path of a frame's readings, in the data set's folder; None where there are none."""
+    name = frame.get("readings")
+    if name is None:
+        return None
+    if not isinstance(name, str):
+        raise ValueError(f"readings: expected a file name, got {name!r}")
+    path = within(where.parent, name, where)
+    return path if path.is_file() else None
+
+
+def as_exported(views: list[View], exported: Exported | None) -> tuple[list[View], Exported | None]:
+    """Return the pictures of an export of ours with their readings, where all have them.
+
+    Otherwise they are the pictures of 8 bits, whose rounding is added to the noise that the export states.
+    """
+    if exported is not None and all(view.readings is not None for view in views):
+        return views, exported
+    views = [dataclasses.replace(view, readings=None) for view in views]
+    return views, None if exported is None else _rounded(exported)
+
+
+def _rounded(exported: Exported) -> Exported:
+    camera = exported.camera
+    step_dn = (camera.white_dn - camera.black_dn) / 255
+    if step_dn <= 1:
+        return exported
+    noise_dn = math.hypot(camera.read_noise_dn, step_dn / math.sqrt(12))
+    return dataclasses.replace(exported, camera=dataclasses.replace(camera, read_noise_dn=noise_dn))
+
+
 def read_exported(tree: dict[str, Any], where: Path) -> Exported | None:
-    """Return what our export says of its pictures, the rounding to 8 bits added to the noise; None if it is not ours.
+    """Return what our export says of its pictures; None if it is not ours.
 
     Raises:
         FormatError: it is damaged.
@@ -234,14 +278,9 @@ def read_exported(tree: dict[str, Any], where: Path) -> Exported | None:
     try:
         with keys_below("transforms.calibration", "mission.camera"):
             camera: CameraSection = build(CameraSection, tree["calibration"], "transforms.calibration")
-        exported = Exported(camera, tree.get("background", 0.0), tree.get("encoding", "linear"))
+        return Exported(camera, tree.get("background", 0.0), tree.get("encoding", "linear"))
     except (ConfigError, ValueError) as error:
         raise FormatError(f"{where}: {error}") from error
-    step_dn = (camera.white_dn - camera.black_dn) / 255
-    if step_dn <= 1:
-        return exported
-    noise_dn = math.hypot(camera.read_noise_dn, step_dn / math.sqrt(12))
-    return dataclasses.replace(exported, camera=dataclasses.replace(camera, read_noise_dn=noise_dn))
 
 
 def distortion_of(keys: dict[str, Any], where: Path) -> tuple[float, ...]:

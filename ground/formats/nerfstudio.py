@@ -12,6 +12,7 @@ from typing import Any
 from ground.formats.lens import Intrinsics
 from ground.formats.nerf import (
     DISTORTION_KEYS,
+    as_exported,
     camera_keys,
     distortion_of,
     frame_keys,
@@ -22,6 +23,7 @@ from ground.formats.nerf import (
     read_exported,
     read_frame,
     split_frames,
+    write_readings,
 )
 from ground.formats.pictures import FormatError
 from ground.formats.views import Exported, View
@@ -52,7 +54,7 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], Exported | None]:
         views.append(dataclasses.replace(view, split=split_of.get(image)))
     if left_out := len(tree["frames"]) - len(views):
         log.warning("%s: %d pictures are in none of its splits and left out", path, left_out)
-    return views, read_exported(tree, path)
+    return as_exported(views, read_exported(tree, path))
 
 
 def export_nerfstudio(session: Session, out: Path) -> dict[str, int]:
@@ -63,7 +65,8 @@ def export_nerfstudio(session: Session, out: Path) -> dict[str, int]:
     for record in posed_frames(session):
         name = f"images/frame_{record.id:06d}.png"
         write_whole(out / name, picture(session, record))
-        frames.append({"file_path": name, **frame_keys(session, record)})
+        keys = {**frame_keys(session, record), **write_readings(session, record, out)}
+        frames.append({"file_path": name, **keys})
         splits[split_of[record.id]].append(name)
     tree = {
         "camera_model": "OPENCV",

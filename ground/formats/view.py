@@ -29,6 +29,7 @@ class View:
     in_eclipse: bool = False
     covariance: np.ndarray | None = None  # [6, 6] of the pose, as in a session's frames; None: not stated
     split: str | None = None  # train, val or test; stated for all views or for none
+    readings: Path | None = None  # of our own export: the digital numbers of the session that it was made of
 
 
 def colours_of(image: np.ndarray) -> int:

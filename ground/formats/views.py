@@ -19,7 +19,7 @@ from flightsw.icd.mission import CameraSection
 from flightsw.icd.quaternion import matrix_to_quat
 from ground.formats.judgement import Judgement, judge
 from ground.formats.lens import Intrinsics, pinhole_of, undistort
-from ground.formats.pictures import FormatError, image_size
+from ground.formats.pictures import FormatError, decode, image_size
 from ground.formats.srgb import from_srgb
 from ground.formats.view import FULL_SCALE, View, colours_of, grey_light, read_image, read_mask
 from ground.session import ENCODINGS, SCHEMA_VERSION, SessionError
@@ -285,6 +285,8 @@ def read_grey(view: View) -> np.ndarray:
 
 def _digital_numbers(view: View, target: _Target) -> np.ndarray:
     """Return a picture as digital numbers [H, W] or [H, W, 3] of the session's camera."""
+    if view.readings is not None and not target.decode:
+        return _readings(view, view.readings, target)
     image, camera = read_image(view), target.camera
     colours = colours_of(image)
     value = np.clip(image[..., :colours] / target.full_scale[image.dtype.name], 0, 1)
@@ -306,6 +308,22 @@ def _digital_numbers(view: View, target: _Target) -> np.ndarray:
         value = np.repeat(value, camera.channels, axis=2)
     value = undistort(value, view.intrinsics, empty, pinhole_of(view.intrinsics))
     dn = np.rint(camera.black_dn + value * (camera.white_dn - camera.black_dn)).astype(np.uint16)
+    return np.ascontiguousarray(dn[..., 0] if camera.channels == 1 else dn)
+
+
+def _readings(view: View, path: Path, target: _Target) -> np.ndarray:
+    """Return the digital numbers that our own export keeps of a picture, the background where a mask leaves it out."""
+    dn, camera = decode(path), target.camera
+    expected = (camera.height, camera.width, camera.channels)
+    if dn.shape != expected or dn.dtype != np.uint16 or dn.max() > camera.white_dn:
+        raise FormatError(
+            f"{path}: expected readings of 16 bits {expected}, at most {camera.white_dn:g}, got {dn.dtype} {dn.shape}; "
+            "export again"
+        )
+    if view.mask is not None:
+        mask = read_mask(view)[..., None]
+        empty_dn = camera.black_dn + target.background * camera.dn_per_radiance_s * view.exposure_time_s
+        dn = np.rint(dn * mask + min(empty_dn, camera.white_dn) * (1 - mask)).astype(np.uint16)
     return np.ascontiguousarray(dn[..., 0] if camera.channels == 1 else dn)
 
 

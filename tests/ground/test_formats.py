@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shutil
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,7 @@ from flightsw.icd.frame import encode_frame
 from flightsw.icd.quaternion import quat_to_matrix
 from ground.formats.axes import opengl_to_world_to_camera, world_to_camera_to_opengl
 from ground.formats.colmap import read_colmap
+from ground.formats.colmap_export import export_colmap
 from ground.formats.nerf import export_nerf, read_nerf, split_frames
 from ground.formats.nerfstudio import export_nerfstudio, read_nerfstudio
 from ground.formats.placement import placed
@@ -154,6 +156,13 @@ def test_a_session_survives_export_and_import(tmp_path, session):
     counts = export_nerf(session, tmp_path / "nerf")
     assert counts == {"train": 6, "val": 3, "test": 3}
     views, exported = read_nerf(tmp_path / "nerf")
+    write_session(views, tmp_path / "exact", "nerf", exported=exported)
+    exact = open_session(tmp_path / "exact")
+    assert exact.camera == session.camera
+    for a, b in zip(session.frames, exact.frames, strict=True):
+        np.testing.assert_array_equal(session.dn(a), exact.dn(b))
+    shutil.rmtree(tmp_path / "nerf" / "readings")  # then the pictures of 8 bits are all there is
+    views, exported = read_nerf(tmp_path / "nerf")
     write_session(views, tmp_path / "again", "nerf", exported=exported)
     again = open_session(tmp_path / "again")
     step_dn = (session.camera.white_dn - session.camera.black_dn) / 255
@@ -173,6 +182,47 @@ def test_a_session_survives_export_and_import(tmp_path, session):
         assert np.abs(above_black - again.dn(b)).max() <= step_dn / 2 + 0.5
     assert again.camera.dn_per_radiance_s == session.camera.dn_per_radiance_s
     assert again.camera.read_noise_dn == pytest.approx(math.hypot(8.0, step_dn / math.sqrt(12)))
+
+
+def test_damaged_readings_are_named(tmp_path, session):
+    export_nerf(session, tmp_path / "nerf")
+    views, exported = read_nerf(tmp_path / "nerf")
+    path = next((tmp_path / "nerf" / "readings").iterdir())
+    path.write_bytes(bytes(imagecodecs.png_encode(np.full((48, 48), 60_000, np.uint16))))
+    with pytest.raises(
+        FormatError, match=rf"{path.name}: expected readings of 16 bits .* at most 4095.*again"
+    ):
+        write_session(views, tmp_path / "again", "nerf", exported=exported)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_colmap_reads_what_we_export(tmp_path, session, cameras):
+    """pycolmap, COLMAP's own library, finds our poses, lenses and pictures; so do our two readers."""
+
+    def change(number, line):
+        if cameras == 2 and number % 2:
+            line["K"] = [[90.0, 0, 24.0], [0, 91.0, 23.0], [0, 0, 1]]
+
+    session = changed_frames(session, change)
+    counts = export_colmap(session, tmp_path / "c")
+    model = pycolmap.Reconstruction(str(tmp_path / "c" / "sparse" / "0"))
+    assert len(model.images) == len(session.frames) == sum(counts.values())
+    assert len(model.cameras) == cameras and len(model.points3D) == 0
+    for record in session.frames:
+        image = model.images[record.id + 1]
+        np.testing.assert_allclose(image.cam_from_world().matrix(), record.world_to_camera[:3], atol=1e-9)
+        lens = model.cameras[image.camera_id]
+        np.testing.assert_allclose(lens.calibration_matrix(), session.K(record), rtol=1e-6)
+        assert (lens.width, lens.height) == (48, 48)
+        assert pycolmap.Bitmap.read(str(tmp_path / "c" / "images" / image.name), True) is not None
+    views = {view.image.name: view for view in read_colmap(tmp_path / "c")}
+    assert {view.split for view in views.values()} == {"train", "test"}
+    exact, exported = read_nerfstudio(tmp_path / "c")
+    assert exported is not None and exported.camera == session.camera
+    for view in exact:
+        same = views[view.image.name]
+        np.testing.assert_allclose(same.world_to_camera, view.world_to_camera, atol=1e-9)
+        assert same.split == ("train" if view.split == "train" else "test")
 
 
 def changed_frames(session, change):

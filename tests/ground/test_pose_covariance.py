@@ -18,7 +18,7 @@ from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.navigation import RelativePose, SatelliteStates, interpolate, parse_state
 from flightsw.pose import navigation_tag
 from ground.session import open_session
-from ground.training_frames import motion_covariance, training_frame
+from ground.training_frames import motion_covariance, tag_covariance, training_frame
 from obbgs_core.model.pose_covariance import flaw
 from obbgs_core.pose_corrections import PoseCorrections
 
@@ -149,3 +149,12 @@ def test_what_flight_sends_is_always_a_covariance_to_the_ground(seed, rank, miss
     tag = navigation_tag(MISSION, interpolate(*states, START_NS + 3 * 10**8))
     covariance = motion_covariance(tag.covariance, tag.world_to_camera[:3, :3])
     assert not flaw(torch.from_numpy(covariance))
+
+
+@given(st.integers(0, 10_000))
+def test_what_a_tag_states_of_a_motion_is_the_motions_covariance_again(seed):
+    rng = np.random.default_rng(seed)
+    factor, turn = rng.normal(size=(6, 6)), Rotation.random(rng=rng).as_matrix()
+    covariance = factor @ factor.T
+    there_and_back = motion_covariance(tag_covariance(covariance, turn), turn)
+    np.testing.assert_allclose(there_and_back, covariance, atol=1e-12)

@@ -1,7 +1,9 @@
 """A run that refined its poses: its figures, report, views and pictures are of the same poses, and read on a phone."""
 
 import base64
+import dataclasses
 import importlib.util
+import json
 import re
 import shutil
 from itertools import combinations
@@ -13,17 +15,22 @@ import imagecodecs
 import numpy as np
 import pytest
 from scipy.ndimage import center_of_mass
+from typer.testing import CliRunner
 
+from ground import cli, frames_of, predicted_image, sensor_of, split
 from ground.cameras import range_in_words
+from ground.estimated_poses import read_estimate, write_estimate
 from ground.evaluate import evaluate
 from ground.reconstruct import reconstruct
 from ground.report import write_report
+from ground.session import open_session
 from ground.viewer.source import Source
 from ground.viewer.viewer import _compared
+from obbgs_core.score.metrics import psnr_db
 from tests.browser import as_url, chromium, opened
 from tests.ground.test_telemetry_plots import packet, written
 from tests.scenes import move_poses_in
-from tests.small_sessions import SIZE_PX, erring_session
+from tests.small_sessions import BORESIGHT_RAD, SIZE_PX, erring_session, small_session
 
 STEPS = {"steps": 60, "start.count": 400, "growth.max_gaussians": 600}
 BRACKETS, HELD_OUT = 16, 6  # frames of the brackets 7 and 15
@@ -158,6 +165,75 @@ def test_pictures_of_the_documents_are_of_the_scored_poses(refined, tmp_path):
             assert truth.max() > 50 and shift_px(truth, render) < ZOOM * A_PIXEL
     script("make_turntable").main(refined, "run", tmp_path / "turntable.gif")
     assert (tmp_path / "turntable.gif").read_bytes().startswith(b"GIF89a")
+
+
+def test_an_exported_run_has_the_poses_that_go_with_its_model_and_all_readings(refined, tmp_path):
+    """Its model shows the frames of the imported session as well as those that it was made of."""
+    out, again = tmp_path / "out", tmp_path / "again"
+    assert called("export", "--session", refined, "--run", "run", "--format", "colmap", "--out", out) == {
+        "train": 3 * BRACKETS - HELD_OUT,
+        "val": 0,
+        "test": HELD_OUT,
+    }
+    called("import", "--format", "nerfstudio", "--from", out, "--session", again, "--poses", "stated")
+    before, after = open_session(refined), open_session(again)
+    assert after.camera == before.camera and not after.navigation.sigmas.vector().any()
+    shown = Source(refined / "runs" / "run").load()
+    for was, now in zip(shown.session.frames, after.frames, strict=True):
+        seen_from = shown.compared(was)
+        np.testing.assert_allclose(now.world_to_camera, seen_from.world_to_camera, atol=1e-5)  # float32
+        assert now.exposure_time_s == was.exposure_time_s
+        assert 0 < now.covariance[3, 3] < (BORESIGHT_RAD / 10) ** 2  # what is left in doubt
+        np.testing.assert_array_equal(after.dn(now), before.dn(was))
+    _, held_out = split(after)
+    sensor, scores = sensor_of(after.camera), []
+    for record, frame in zip(held_out, frames_of(after, held_out), strict=True):
+        image = predicted_image(shown.gaussians, after, record, sensor, record.exposure_time_s)
+        scores.append(psnr_db(image, frame.dn / sensor.white_dn))
+    assert np.mean(scores) == pytest.approx(evaluate(refined, "run")["psnr_noisy_db"], abs=0.01)
+
+
+def test_frames_that_a_run_left_out_are_not_exported(refined, tmp_path):
+    """A frame without a refined pose is not exported with a tag in its place."""
+    session = Path(shutil.copytree(refined, tmp_path / "session"))
+    path = session / "runs" / "run" / "poses_estimated.json"
+    estimate = read_estimate(path.parent)
+    assert estimate is not None
+    kept = range(3, len(estimate.frame_ids))
+    fewer = {name: [getattr(estimate, name)[i] for i in kept] for name in ("frame_ids", "brackets")}
+    poses = {name: getattr(estimate, name)[3:] for name in ("tagged", "estimated")}
+    write_estimate(path.parent, dataclasses.replace(estimate, **fewer, **poses))
+    counts = called("export", "--session", session, "--run", "run", "--out", tmp_path / "out")
+    assert counts == {"train": 3 * BRACKETS - HELD_OUT - 3, "val": 0, "test": HELD_OUT}
+    assert not (tmp_path / "out" / "transforms_val.json").exists()  # of no frames
+
+
+def test_a_run_that_is_exported_imported_and_trained_again_is_the_same(tmp_path):
+    """Frames, sensor, poses and split survive to the last bit that a training sees, so its figures are the same."""
+    made, session, again = (
+        small_session(tmp_path / "made", views=16),
+        tmp_path / "session",
+        tmp_path / "again",
+    )
+    called("export", "--session", made, "--out", tmp_path / "a")
+    called("import", "--format", "nerf", "--from", tmp_path / "a", "--session", session, "--poses", "stated")
+    reconstruct(session, "run", "obbgs", STEPS)
+    called("export", "--session", session, "--run", "run", "--format", "nerfstudio", "--out", tmp_path / "b")
+    called(
+        "import", "--format", "nerfstudio", "--from", tmp_path / "b", "--session", again, "--poses", "stated"
+    )
+    reconstruct(again, "run", "obbgs", STEPS)
+    first, second = evaluate(session, "run"), evaluate(again, "run")
+    for key in ("frames_trained", "frames_held_out", "gaussians"):
+        assert second[key] == first[key]
+    assert second["psnr_noisy_db"] == pytest.approx(first["psnr_noisy_db"], abs=0.3)
+
+
+def called(*arguments) -> dict:
+    """Return what a command of `ground` prints as JSON."""
+    done = CliRunner().invoke(cli.app, [*map(str, arguments), "--json"], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)
 
 
 def script(name: str) -> Any:

@@ -1,0 +1,52 @@
+"""A session as a COLMAP folder, which trainers of Gaussian splats read: images/ and a model in sparse/0.
+
+It is a nerfstudio folder too, as nerfstudio's own ones are: transforms.json keeps what COLMAP has no place for.
+
+Source: colmap.github.io/format.html.
+"""
+
+import struct
+from pathlib import Path
+
+from flightsw.icd.quaternion import matrix_to_quat
+from ground.formats.nerf import posed_frames, split_frames
+from ground.formats.nerfstudio import export_nerfstudio
+from ground.session import Session
+from obbgs_base.files import write_whole
+
+PINHOLE = 1  # the number of COLMAP's camera model
+
+
+def export_colmap(session: Session, out: Path) -> dict[str, int]:
+    """Write a session as a COLMAP folder, frames and pictures as in `export_nerfstudio`; return the frames per split.
+
+    The model has no points. Its test.txt names the pictures that are not for training, as for 3DGS.
+    """
+    counts = export_nerfstudio(session, out)
+    width, height = session.camera.width, session.camera.height
+    camera_of: dict[tuple[float, ...], int] = {}
+    split_of, images, held_out = split_frames(session), [], []
+    for record in posed_frames(session):
+        K = session.camera.K if record.K is None else record.K.tolist()
+        lens = (float(K[0][0]), float(K[1][1]), float(K[0][2]), float(K[1][2]))
+        camera = camera_of.setdefault(lens, len(camera_of) + 1)
+        name = f"frame_{record.id:06d}.png"
+        quat = matrix_to_quat(record.world_to_camera[:3, :3])
+        motion = (*quat, *record.world_to_camera[:3, 3])
+        images.append(
+            struct.pack("<i7di", record.id + 1, *motion, camera)
+            + name.encode()
+            + b"\0"
+            + struct.pack("<Q", 0)
+        )
+        if split_of[record.id] != "train":
+            held_out.append(f"{name}\n")
+    cameras = [
+        struct.pack("<iiQQ4d", number, PINHOLE, width, height, *lens) for lens, number in camera_of.items()
+    ]
+    model = out / "sparse" / "0"
+    model.mkdir(parents=True, exist_ok=True)
+    for name, entries in (("cameras", cameras), ("images", images), ("points3D", [])):
+        write_whole(model / f"{name}.bin", struct.pack("<Q", len(entries)) + b"".join(entries))
+    write_whole(model / "test.txt", "".join(held_out).encode())
+    return counts
