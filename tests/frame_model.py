@@ -284,8 +284,9 @@ class FrameModel(RuleBasedStateMachine):
             return
         try:
             self.new_session()
-            self.pause_of_hours()
-            for _ in range(200):
+            for turn in range(1000):
+                if turn % 200 == 0:  # an answer that was late on the wire may have begun another pause
+                    self.pause_of_hours()
                 self.run(10, CALM)
                 if not self.flight.waiting:
                     break
