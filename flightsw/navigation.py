@@ -221,6 +221,7 @@ class NavigationStream:
         # the newest state where it does not follow those, until the next comes
         self._doubtful: NavigationState | None = None
         self._pending = b""
+        self._lacked_line_feed = False  # the last line that was read, so that it may still come
         self._descriptor: int | None = None
         self._socket: socket.socket | None = None
         if section.source.startswith("file://"):
@@ -308,13 +309,20 @@ class NavigationStream:
 
     def _read(self, until_utc_ns: int) -> bool:
         """Take in lines up to the first state that is not older; tell whether there was anything to read."""
+        lacking = False
         if b"\n" not in self._pending:
             data = self._receive()
             if not data:
-                return False
+                if not self._is_whole(self._pending):
+                    return False
+                data, lacking = b"\n", True  # the last line of a file may lack it
             self._pending += data
         while b"\n" in self._pending:
             line, _, self._pending = self._pending.partition(b"\n")
+            if not line and self._lacked_line_feed:  # that of a state which was whole without it
+                self._lacked_line_feed = False
+                continue
+            self._lacked_line_feed = lacking
             try:
                 state = parse_state(line)
             except NavigationError:
@@ -326,6 +334,15 @@ class NavigationStream:
         if len(self._pending) > MAX_LINE_BYTES and b"\n" not in self._pending:
             self._pending = b""
             self.bad_lines += 1
+        return True
+
+    @staticmethod
+    def _is_whole(line: bytes) -> bool:
+        """Tell whether a line without a line feed is a state: a JSON object that is cut anywhere is none."""
+        try:
+            parse_state(line)
+        except NavigationError:
+            return False
         return True
 
     def _receive(self) -> bytes:
@@ -349,6 +366,8 @@ class NavigationStream:
             raise ConnectionError("the navigation port closed the connection")
         except OSError:
             self.hang_ups += self._socket is not None
+            rest = self._pending
             self.close()
+            self._pending = rest if self._is_whole(rest) else b""
             time.sleep(POLL_S)
             return b""

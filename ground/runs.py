@@ -14,16 +14,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
 from torch import Tensor
 
+from flightsw.icd.config import MAX_YAML_BYTES, ConfigError, parse_yaml
 from ground import attitude
 from ground.attitude import FoundAttitude, in_body_axes
 from ground.cameras import sensor_of
 from ground.live_status import LIVE_CHECKPOINT, LIVE_STATUS
 from ground.session import FrameRecord, Session, SessionError, open_session, read_records
 from ground.training_frames import split, training_frame
-from obbgs_base.files import UNUSED
+from obbgs_base.files import UNUSED, read_bounded
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.io.ply import load_ply
@@ -199,8 +199,8 @@ def read_config(folder: Path) -> dict:
         example = "give the folder of one, such as SESSION/runs/run"
         raise SessionError(f"{folder} is not a finished run: it has no {path.name}; {example}")
     try:
-        settings = yaml.safe_load(path.read_text())
-    except (OSError, ValueError, yaml.YAMLError) as error:
+        settings = parse_yaml(read_bounded(path, MAX_YAML_BYTES), "config")
+    except (OSError, ConfigError) as error:
         raise SessionError(f"{path} cannot be read: {error}; make the run again") from error
     if not (isinstance(settings, dict) and isinstance(settings.get("method"), dict)):
         raise SessionError(

@@ -27,11 +27,12 @@ from typing import Any
 import imagecodecs
 import numpy as np
 
-from flightsw.icd.config import ConfigError, build, keys_below, parse_json, require
+from flightsw.icd.config import MAX_JSON_BYTES, ConfigError, build, keys_below, parse_json, require
 from flightsw.icd.frame import Attitude
 from flightsw.icd.mission import CameraSection
 from ground.telemetry import FlightCounts
 from obbgs_base.errors import ObbgsError
+from obbgs_base.files import read_bounded
 from obbgs_base.navigation_errors import SharedParameters
 
 SCHEMA_VERSION = 1
@@ -261,7 +262,7 @@ def read_header(folder: Path) -> dict[str, Any]:
     """
     path = folder / "session.json"
     try:
-        header = parse_json(path.read_bytes(), "session")
+        header = parse_json(read_bounded(path, MAX_JSON_BYTES), "session")
     except (FileNotFoundError, NotADirectoryError) as error:
         raise SessionError(f"{folder} is not a session: it has no session.json") from error
     except OSError as error:

@@ -1,8 +1,10 @@
 """Writes files whole or not at all, even through a power cut; every part writes with these functions."""
 
+import contextlib
 import errno
 import itertools
 import os
+import stat
 from pathlib import Path
 
 UNUSED = ".unused-"  # between the name of a file that was set aside and a number
@@ -11,12 +13,16 @@ UNUSED = ".unused-"  # between the name of a file that was set aside and a numbe
 def write_whole(path: Path, content: bytes) -> None:
     """Write under a temporary name beside `path`, sync, rename, and sync the folder.
 
+    A file that is written anew keeps its mode, and its owner where this user may give files away.
+
     Raises:
         OSError: the disk does not take it; then nothing is left behind, and what `path` held before is still there.
     """
     part = path.with_name(path.name + ".part")
     try:
+        part.unlink(missing_ok=True)  # of a command that was killed, with whatever mode
         with open(part, "wb") as file:
+            keep_mode(path, part)  # before there is anything to read in it
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -25,6 +31,31 @@ def write_whole(path: Path, content: bytes) -> None:
         part.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+def read_bounded(path: Path, most_bytes: int) -> bytes:
+    """Return the content of a file; of one that has more than `most_bytes`, so many and one more.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with open(path, "rb") as file:
+        return file.read(most_bytes + 1)
+
+
+def keep_mode(path: Path, part: Path) -> None:
+    """Give a file that is about to replace `path` the mode and the owner of what is there, as far as that is allowed.
+
+    Some file systems have no modes, and only root gives files away: then the file has those of a new one.
+    """
+    try:
+        before = path.stat()
+    except FileNotFoundError:
+        return
+    with contextlib.suppress(PermissionError):
+        os.chown(part, before.st_uid, before.st_gid)
+    with contextlib.suppress(PermissionError):
+        os.chmod(part, stat.S_IMODE(before.st_mode))
 
 
 def set_aside(path: Path) -> Path:

@@ -1,10 +1,12 @@
 """Strict reader of the YAML and JSON that a person writes: each file becomes frozen dataclasses, key by key."""
 
+import collections
 import contextlib
 import dataclasses
 import difflib
 import json
 import re
+import reprlib
 import types
 import typing
 from collections.abc import Iterable, Iterator
@@ -16,6 +18,10 @@ import yaml
 
 from obbgs_base.errors import ObbgsError
 
+# of a file that a person writes; the largest that is shipped has 12 kB, and reading takes some 100 times its size
+MAX_YAML_BYTES = 256 * 1024
+MAX_JSON_BYTES = 64 * 1024 * 1024  # transforms.json names some 100,000 pictures in so many
+MAX_VALUES = 20_000  # of a YAML text with its aliases written out
 FEW_NAMES = 10  # that a message lists; of more it tells the nearest
 
 
@@ -76,13 +82,20 @@ def parse_yaml(content: bytes, path: str) -> Any:
     Numbers with an exponent may be written as everywhere else, such as 4.0e7.
 
     Raises:
-        ConfigError: not YAML, or a key is written twice; the path of the key starts with `path`.
+        ConfigError: not YAML, too large, or a key is written twice; the path of the key starts with `path`.
     """
+    _refuse_large(content, MAX_YAML_BYTES, path)
     try:
         loader = _Loader(content)
         try:
             node = loader.get_single_node()
             _refuse_repeated_keys(node, path, set())
+            values = _count(node, {}) if node is not None else 0
+            require(
+                values <= MAX_VALUES,
+                path,
+                f"holds {values:.3g} values with its aliases, at most {MAX_VALUES}",
+            )
             return None if node is None else loader.construct_document(node)
         finally:
             loader.dispose()
@@ -90,6 +103,26 @@ def parse_yaml(content: bytes, path: str) -> Any:
         raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # 2026-13-01 is a ValueError of PyYAML's
         raise ConfigError(path, f"is not valid YAML: {' '.join(str(error).split())}") from error
+
+
+def _refuse_large(content: bytes, most: int, path: str) -> None:
+    require(len(content) <= most, path, f"has {len(content)} bytes, at most {most} are read")
+
+
+def _count(node: yaml.Node, counts: dict[int, float]) -> float:
+    """Return how many values a node holds when its aliases are written out; infinity for one that holds itself.
+
+    A few hundred bytes of aliases to aliases can stand for billions of values, which would be visited one by one.
+    """
+    if id(node) not in counts:
+        counts[id(node)] = float("inf")  # while it is being counted: who meets it now is inside of it
+        inner: list[yaml.Node] = []
+        if isinstance(node, yaml.MappingNode):
+            inner = [part for pair in node.value for part in pair]
+        elif isinstance(node, yaml.SequenceNode):
+            inner = node.value
+        counts[id(node)] = 1 + sum(_count(part, counts) for part in inner)
+    return counts[id(node)]
 
 
 def _refuse_repeated_keys(node: yaml.Node | None, path: str, seen: set[int]) -> None:
@@ -113,14 +146,16 @@ def parse_json(content: bytes, path: str) -> Any:
     """Return what a JSON text holds.
 
     Raises:
-        ConfigError: not JSON, or a key is written twice; the path of the key starts with `path`.
+        ConfigError: not JSON, too large, or a key is written twice; the path of the key starts with `path`.
     """
+    _refuse_large(content, MAX_JSON_BYTES, path)
     repeated: list[tuple[dict, str]] = []  # an object and a key that it has twice, inner objects first
 
     def collect(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        names = [name for name, _ in pairs]
         tree = dict(pairs)
-        repeated.extend((tree, name) for name in tree if names.count(name) > 1)
+        if len(tree) < len(pairs):
+            counts = collections.Counter(name for name, _ in pairs)
+            repeated.extend((tree, name) for name in tree if counts[name] > 1)
         return tree
 
     try:
@@ -176,8 +211,14 @@ def names_like(given: str, known: Iterable[str]) -> str:
     return f"expected one of {len(names)} names, {like}"
 
 
+_SHORT = reprlib.Repr()  # without writing all of a large value first
+_SHORT.maxlevel = 3
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 12
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 200
+
+
 def _describe(value: Any) -> str:
-    return "nothing" if value is None else repr(value)[:80]
+    return "nothing" if value is None else _SHORT.repr(value)[:80]
 
 
 def _convert(value: Any, hint: Any, path: str) -> Any:

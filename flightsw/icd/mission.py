@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from flightsw.icd.config import ConfigError, build, in_file, parse_yaml, require
+from flightsw.icd.config import MAX_YAML_BYTES, ConfigError, build, in_file, parse_yaml, require
 from flightsw.icd.pose_sections import (
     NavigationErrorsSection,
     NavigationSection,
@@ -14,6 +14,7 @@ from flightsw.icd.pose_sections import (
     TargetAttitudeSection,
 )
 from flightsw.icd.tle import check_tle
+from obbgs_base.files import read_bounded
 
 Checksum = Literal["crc-32", "crc-32c", "modular"]  # of CFDP
 
@@ -294,7 +295,7 @@ def load_mission(path: str | Path) -> Mission:
             checksum is wrong. The message names the file and the key's path.
     """
     try:
-        content = Path(path).read_bytes()
+        content = read_bounded(Path(path), MAX_YAML_BYTES)
     except OSError as error:
         raise ConfigError(str(path), f"cannot read the mission file: {error.strerror}") from error
     with in_file(path):

@@ -13,15 +13,21 @@ from flightsw.icd.link_url import SLCAN_BITRATES, LinkUrl
 
 FD_SIZES = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)  # bytes by length code, ISO 11898-1
 
+# of a time stamp after a frame's data: none, milliseconds (LAWICEL's Z1), microseconds (Z2 of newer firmware)
+STAMP_DIGITS = (0, 4, 8)
+
 
 class SlcanText(DelimitedBytes):
     """CAN frames from an slcan adapter's bytes (LAWICEL CANUSB, with CANable's d, D, b, B for CAN FD).
+
+    Lines may end with CR or CR LF, and a time stamp may follow a frame's data: adapters keep in their memory what an
+    earlier program has switched on.
 
     At all times `frame_bytes + reply_bytes + skipped_bytes + pending_bytes` is the number of bytes fed.
     """
 
     LINE = re.compile(rb"([tdb])([0-7][0-9A-Fa-f]{2})|([TDB])([01][0-9A-Fa-f]{7})")
-    MAX_LINE_BYTES = 10 + 2 * 64
+    MAX_LINE_BYTES = 1 + 10 + 2 * 64 + max(STAMP_DIGITS)
 
     def __init__(self):
         super().__init__(b"\r", self.MAX_LINE_BYTES)
@@ -40,8 +46,9 @@ class SlcanText(DelimitedBytes):
         return [frame for frame in frames if frame is not None]
 
     def _frame_of(self, line: bytes | None) -> isotp.CanMessage | None:
-        frame = None if line is None else parse_slcan(line)
         size_bytes = len(line or b"") + 1
+        line = line and line.removeprefix(b"\n")  # of the line before
+        frame = None if line is None else parse_slcan(line)
         if frame is not None:
             self.frame_bytes += size_bytes
         elif line in (b"", b"z", b"Z"):
@@ -54,7 +61,7 @@ class SlcanText(DelimitedBytes):
 
 
 def parse_slcan(line: bytes) -> isotp.CanMessage | None:
-    """Return the data frame in a line without its carriage return; None if it is not exactly one."""
+    """Return the data frame in a line, before a time stamp if there is one; None if the line is anything else."""
     match = SlcanText.LINE.match(line)
     if match is None:
         return None
@@ -64,10 +71,10 @@ def parse_slcan(line: bytes) -> isotp.CanMessage | None:
     if code not in (b"0123456789ABCDEFabcdef" if fd else b"012345678") or not code:
         return None
     size = FD_SIZES[int(code, 16)]
-    if len(text) != 2 * size or (size and not text.isalnum()):
+    if len(text) - 2 * size not in STAMP_DIGITS or (text and not text.isalnum()):
         return None
     try:
-        data = bytes.fromhex(text.decode())
+        data = bytes.fromhex(text.decode())[:size]
     except ValueError:
         return None
     return isotp.CanMessage(int(digits, 16), int(code, 16), data, kind.isupper(), fd, kind in "bB")

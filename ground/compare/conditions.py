@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from flightsw.icd.config import ConfigError, build, in_file, parse_yaml, require
+from flightsw.icd.config import MAX_YAML_BYTES, ConfigError, build, in_file, parse_yaml, require
 from ground.compare.case import Case
 from ground.compare.errors import CompareError
 from ground.settings import checked_settings
+from obbgs_base.files import read_bounded
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.motions import rigid_motions
 from obbgs_core.sensor import Sensor
@@ -134,7 +135,7 @@ def load_conditions(path: Path) -> dict[str, Condition]:
     if not path.is_file():
         raise CompareError(f"{path} is not there: --conditions takes a YAML file of names and conditions")
     with in_file(path):
-        tree = parse_yaml(path.read_bytes(), "conditions")
+        tree = parse_yaml(read_bounded(path, MAX_YAML_BYTES), "conditions")
         require(
             isinstance(tree, dict) and bool(tree), "conditions", "expected a mapping of names to conditions"
         )

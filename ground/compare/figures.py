@@ -16,6 +16,7 @@ from ground.compare.page import error_of, shown_view
 from ground.compare.results import VERDICTS, Results, pareto
 from ground.compare.rows import Rows
 from ground.pictures import heat, tone
+from obbgs_base.files import keep_mode
 
 DPI = 110
 
@@ -49,6 +50,7 @@ def write_figures(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxy
         path = out / f"{_file_name(name)}.png"
         part = path.with_suffix(".part")
         figure.savefig(part, dpi=DPI, format="png")
+        keep_mode(path, part)
         part.replace(path)
         paths.append(path)
     return paths

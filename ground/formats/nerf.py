@@ -14,14 +14,14 @@ from typing import Any
 import imagecodecs
 import numpy as np
 
-from flightsw.icd.config import ConfigError, build, keys_below, parse_json
+from flightsw.icd.config import MAX_JSON_BYTES, ConfigError, build, keys_below, parse_json
 from flightsw.icd.mission import CameraSection
 from ground.formats.axes import opengl_to_world_to_camera, world_to_camera_to_opengl
 from ground.formats.lens import Intrinsics
 from ground.formats.pictures import KINDS, FormatError, image_size, within
 from ground.formats.views import Exported, View
 from ground.session import SPLITS, FrameRecord, Session
-from obbgs_base.files import write_whole
+from obbgs_base.files import read_bounded, write_whole
 
 log = logging.getLogger(__name__)
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
@@ -176,7 +176,7 @@ def load_transforms(path: Path) -> dict[str, Any]:
         FormatError: it cannot be read, or its "frames" is not a list of objects.
     """
     try:
-        tree = parse_json(path.read_bytes(), "transforms")
+        tree = parse_json(read_bounded(path, MAX_JSON_BYTES), "transforms")
     except (OSError, ConfigError) as error:
         raise FormatError(f"{path}: {error}") from error
     frames = tree.get("frames") if isinstance(tree, dict) else None

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from flightsw.icd.config import ConfigError, parse_json
+from flightsw.icd.config import MAX_JSON_BYTES, ConfigError, parse_json
 from flightsw.icd.quaternion import quat_to_matrix
 from ground.formats.lens import Intrinsics
 from ground.formats.pictures import FormatError
 from ground.formats.view import View
+from obbgs_base.files import read_bounded
 
 
 def read_shirt(folder: Path) -> list[View]:
@@ -53,7 +54,7 @@ def _load(folder: Path, name: str) -> Any:
     for place in places:
         if (place / name).is_file():
             try:
-                return parse_json((place / name).read_bytes(), Path(name).stem)
+                return parse_json(read_bounded(place / name, MAX_JSON_BYTES), Path(name).stem)
             except ConfigError as error:
                 raise FormatError(f"{place / name}: {error}") from error
     raise FormatError(f"{folder}: {name} is neither in it nor in the two folders above")

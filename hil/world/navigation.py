@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from flightsw.icd.config import ConfigError
+from flightsw.icd.config import MAX_YAML_BYTES, ConfigError, parse_yaml
 from flightsw.icd.mission import Mission, NavigationSection
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.icd.tle import orbit_axes
@@ -18,7 +18,7 @@ from flightsw.orbit import OrbitState, propagate
 from flightsw.pose import look_along
 from hil.world.navigation_errors import NOISE_DEG, NavigationErrors, draw, stated_sigmas, turned
 from hil.world.world import World
-from obbgs_base.files import write_whole
+from obbgs_base.files import read_bounded, write_whole
 
 NS = 1_000_000_000
 MARGIN_S = 10.0  # the states end so long after the last exposure
@@ -69,8 +69,8 @@ def write_flight_inputs(world: World, folder: Path, seed: int | None) -> FlightI
 def _reads(path: Path, source: str) -> bool:
     """Return whether a mission file has this navigation source."""
     try:
-        return yaml.safe_load(path.read_bytes())["navigation"]["source"] == source
-    except (yaml.YAMLError, KeyError, TypeError):
+        return parse_yaml(read_bounded(path, MAX_YAML_BYTES), "mission")["navigation"]["source"] == source
+    except (ConfigError, KeyError, TypeError):
         return False
 
 

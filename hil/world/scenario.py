@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flightsw.icd.config import ConfigError, build, in_file, keys_below, parse_yaml
+from flightsw.icd.config import MAX_YAML_BYTES, ConfigError, build, in_file, keys_below, parse_yaml
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import BracketSection, Mission, OrbitSection, PoseSection
 from flightsw.icd.quaternion import matrix_to_quat
@@ -18,6 +18,7 @@ from flightsw.pose import look_along, pose_tag
 from flightsw.sequencer import plan
 from hil.world.attitude import Attitude, AttitudeSection, attitude
 from hil.world.fly_around import Design, FlyAround, RelativeElements, design
+from obbgs_base.files import read_bounded
 
 SCENARIOS = Path(__file__).parent / "scenarios"
 HORIZON_MARGIN_S = 3600.0  # a tumble is integrated so much further than the scenario lasts
@@ -234,7 +235,7 @@ def ready_made(name: str | Path, folder: Path, what: str) -> tuple[Path, bytes]:
     if not path.is_file():
         path = Path(name)
     try:
-        return path, path.read_bytes()
+        return path, read_bounded(path, MAX_YAML_BYTES)
     except OSError as error:
         names = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
         raise ConfigError(str(name), f"no such {what}: expected a YAML file or one of {names}") from error

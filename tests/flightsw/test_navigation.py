@@ -385,6 +385,34 @@ def test_a_line_without_end_does_not_fill_the_memory(tmp_path):
     stream.close()
 
 
+@given(st.integers(1, 400))
+def test_the_last_state_needs_no_line_feed_but_must_be_whole(tmp_path_factory, cut):
+    path = tmp_path_factory.mktemp("navigation") / "states.jsonl"
+    last = states_line(START_NS + NS).rstrip(b"\n")
+    for lacking, content in ((0, last), (cut, last[: -(cut % (len(last) - 1)) - 1])):
+        path.write_bytes(states_line(START_NS) + content)
+        stream = NavigationStream(NavigationSection(f"file://{path}", wait_s=0.0))
+        if lacking:
+            with pytest.raises(NavigationError):
+                stream.at(START_NS + NS // 2)
+        else:
+            assert isinstance(stream.at(START_NS + NS // 2), SatelliteStates)
+        assert stream.bad_lines == 0
+        stream.close()
+
+
+def test_a_line_feed_that_comes_after_its_state_is_no_bad_line(tmp_path):
+    path = tmp_path / "states.jsonl"
+    path.write_bytes(states_line(START_NS) + states_line(START_NS + NS).rstrip(b"\n"))
+    stream = NavigationStream(NavigationSection(f"file://{path}", wait_s=0.0))
+    assert isinstance(stream.at(START_NS + NS // 2), SatelliteStates)
+    with path.open("ab") as file:
+        file.write(b"\n" + states_line(START_NS + 2 * NS))
+    assert isinstance(stream.at(START_NS + NS + NS // 2), SatelliteStates)
+    assert stream.bad_lines == 0
+    stream.close()
+
+
 def test_a_missing_file_is_named():
     with pytest.raises(NavigationError, match=r"/nowhere/states\.jsonl"):
         NavigationStream(NavigationSection("file:///nowhere/states.jsonl"))

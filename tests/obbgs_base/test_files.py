@@ -24,3 +24,18 @@ def test_a_folder_that_cannot_be_synced_is_written_to_all_the_same(tmp_path, mon
     answer[0] = errno.EIO  # the disk has failed
     with pytest.raises(OSError, match="Input/output"):
         write_whole(tmp_path / "session.json", b"[]")
+
+
+def test_a_file_that_is_written_anew_keeps_its_mode_and_leaves_none_of_a_killed_command(tmp_path):
+    path = tmp_path / "mission.key"
+    path.write_bytes(b"old")
+    path.chmod(0o600)
+    part = tmp_path / "mission.key.part"  # of a command that was killed
+    part.write_bytes(b"half")
+    part.chmod(0o400)
+    write_whole(path, b"new")
+    assert path.read_bytes() == b"new" and stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert not part.exists()
+    path.chmod(0o664)
+    write_whole(path, b"newer")
+    assert stat.S_IMODE(path.stat().st_mode) == 0o664

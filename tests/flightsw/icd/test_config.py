@@ -143,3 +143,18 @@ def test_a_wrong_camera_of_a_session_is_named_by_the_sessions_own_key(tmp_path):
     (tmp_path / "session.json").write_text(json.dumps(golden))
     with pytest.raises(SessionCorrupt, match=r"session\.json: session\.camera\.width: expected 1 to 8192"):
         open_session(tmp_path)
+
+
+def test_aliases_that_stand_for_billions_of_values_are_refused_without_writing_them_out():
+    lists = "\n".join(f"a{k}: &a{k} [" + ", ".join([f"*a{k - 1}"] * 10) + "]" for k in range(1, 10))
+    with pytest.raises(ConfigError, match="values with its aliases, at most 20000"):
+        parse_yaml(f"a0: &a0 [x]\n{lists}\n".encode(), "mission")
+
+
+def test_large_files_are_refused_by_their_size(tmp_path):
+    with pytest.raises(ConfigError, match="mission: has 300000 bytes, at most 262144 are read"):
+        parse_yaml(b"#" * 300_000, "mission")
+    path = tmp_path / "mission.yaml"
+    path.write_bytes(b"#" * 300_000)
+    with pytest.raises(ConfigError, match="at most 262144 are read"):
+        load_mission(path)

@@ -107,3 +107,20 @@ def test_an_adapter_s_answers_are_no_errors_but_its_bell_is():
     assert (text.reply_bytes, text.skipped_bytes, text.adapter_errors) == (6, 0, 0)
     text.feed(b"\a")
     assert text.adapter_errors == 1
+
+
+@given(
+    st.lists(st.tuples(can_frames(), st.sampled_from([b"", b"1A2B", b"00C0FFEE"])), max_size=6),
+    st.sampled_from([b"\r", b"\r\n"]),
+)
+def test_frames_are_taken_with_a_time_stamp_behind_them_and_a_line_feed_before_the_next(sent, ending):
+    stream = b"".join(format_slcan(frame).removesuffix(b"\r") + stamp + ending for frame, stamp in sent)
+    text = SlcanText()
+    received = text.feed(stream + b"z\r")
+    assert list(map(fields, received)) == [fields(frame) for frame, _ in sent]
+    assert text.skipped_bytes == text.adapter_errors == 0
+
+
+def test_what_is_no_stamp_behind_the_data_is_no_frame():
+    for tail in (b"1", b"12", b"123", b"12345", b"12 4", b"12G4"):
+        assert parse_slcan(b"t12320102" + tail) is None
