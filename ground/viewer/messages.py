@@ -33,9 +33,10 @@ def wrong(data: str | bytes) -> str | None:
         if not isinstance(updates, dict) or list(updates) != ["value"]:
             return "a page sets only the value of a control"
         value = updates["value"]
-        parts = value if isinstance(value, list) and len(value) == 2 else [value]  # two: the ends of a range
-        kinds = int | float if parts is value else bool | int | float | str
-        if not all(isinstance(part, kinds) for part in parts):
+        is_range = (
+            isinstance(value, list) and len(value) == 2 and all(type(end) in (int, float) for end in value)
+        )
+        if not (is_range or isinstance(value, bool | int | float | str)):
             return "the value of a control is a number, a text or two numbers"
     payload = message.pop("payload", b"")  # a picture
     return (
