@@ -15,6 +15,9 @@ PAGES = [
 ]
 LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
 WIDEST_README = 100  # columns
+LARGEST_README = 8192  # bytes
+MOST_WORDS = 60_000  # of all pages in docs/
+LONGEST_RELEASE = 40  # lines of CHANGELOG.md
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -29,6 +32,13 @@ def test_every_link_of_a_page_leads_to_a_file(page):
 def test_the_readme_fits_a_terminal():
     wide = [line for line in (ROOT / "README.md").read_text().splitlines() if len(line) > WIDEST_README]
     assert wide == []
+
+
+def test_the_documents_are_short_enough_to_be_read():
+    assert (ROOT / "README.md").stat().st_size <= LARGEST_README
+    assert sum(len(page.read_text().split()) for page in (ROOT / "docs").rglob("*.md")) <= MOST_WORDS
+    _, *releases = re.split(r"(?m)^(?=## )", (ROOT / "CHANGELOG.md").read_text())
+    assert [r.splitlines()[0] for r in releases if len(r.strip().splitlines()) > LONGEST_RELEASE] == []
 
 
 def test_the_page_of_commands_is_that_of_the_command_lines():
