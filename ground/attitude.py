@@ -18,7 +18,7 @@ from obbgs_core.attitude.estimate import estimate_motion
 from obbgs_core.attitude.outlines import centred
 from obbgs_core.attitude.target_motion import TargetMotion
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.estimate import PoseEstimate
 
 FILE = "attitude.json"
 

@@ -19,9 +19,9 @@ from obbgs_base.files import write_whole
 from obbgs_base.navigation_errors import SharedParameters, jacobian
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.pose_corrections import motion_of, with_estimate
-from obbgs_core.pose_estimate import PoseEstimate
-from obbgs_core.pose_gauge import best_motion, size_of
+from obbgs_core.poses.corrections import motion_of, with_estimate
+from obbgs_core.poses.estimate import PoseEstimate
+from obbgs_core.poses.gauge import best_motion, size_of
 from obbgs_core.score.poses import PoseErrors, pose_errors, settled_poses
 from obbgs_core.sensor import Sensor
 

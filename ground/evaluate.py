@@ -25,7 +25,7 @@ from ground.scores import (
 from ground.session import FrameRecord
 from ground.truth import Truth, read_points
 from obbgs_base.files import write_whole
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.score.shown import shown_points

@@ -26,7 +26,7 @@ from obbgs_core.compiled import Background
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.frames import FEWEST_FRAMES
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.joining import check_joinable
 from obbgs_core.train.presets import preset

@@ -16,7 +16,7 @@ from ground.session import FrameRecord
 from ground.training_frames import training_frame
 from obbgs_core.io.ply import save_ply
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.score.metrics import psnr_db
 
 log = logging.getLogger(__name__)

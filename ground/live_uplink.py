@@ -15,7 +15,7 @@ from ground.session import FrameRecord, Session
 from ground.uplink import outcome, submit
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.estimate import PoseEstimate
 
 log = logging.getLogger(__name__)
 GAIN_DB = 1.0  # over the model on board, on held-out frames: less is not worth the time of the uplink

@@ -17,8 +17,8 @@ from obbgs_base.navigation_errors import LENGTHS
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.losses import fit_figures
 from obbgs_core.model.motions import motion_vectors
-from obbgs_core.pose_corrections import PoseCorrections
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.corrections import PoseCorrections
+from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.render import render
 
 MARGINS_PX = {"l": 60, "r": 20, "t": 20, "b": 45}

@@ -94,7 +94,7 @@ class Sensor:
 
         A mean of `averaged_pixels` readings is no clipped normal variable: its expectation is that of readings clipped
         at zero, its noise is smaller by the root of their number. One that holds a saturated reading is given as full
-        scale (`train.batches.averaged`), and a prediction above it has no residual.
+        scale (`frames.averaged`), and a prediction above it has no residual.
 
         Source: Tobin, Estimation of relationships for limited dependent variables, 1958.
         """

@@ -12,8 +12,8 @@ from hil.sky import SHIPPED
 from hil.world.scenario import load_scenario
 from obbgs_base.navigation_errors import SharedParameters
 from obbgs_core.frames import sun_span_deg
-from obbgs_core.pose_corrections import PoseCorrections
-from obbgs_core.pose_gauge import best_motion
+from obbgs_core.poses.corrections import PoseCorrections
+from obbgs_core.poses.gauge import best_motion
 from obbgs_core.score.poses import pose_errors
 from tests import raycast
 from tests.benchmarks import passes, poses, unknown_attitude

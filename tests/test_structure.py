@@ -11,7 +11,9 @@ ROOT = Path(__file__).parents[1]
 PARTS = ("obbgs_base", "obbgs_core", "flightsw", "ground", "hil")
 LONGEST_FILE, LONGEST_FUNCTION = 800, 80  # lines
 CORE = {"obbgs_base", "obbgs_core.model", "obbgs_core"}  # what every room of the library may use
-LIBRARY = {f"obbgs_core.{room}" for room in ("model", "render", "train", "io", "score")} | {"obbgs_core"}
+LIBRARY = {f"obbgs_core.{room}" for room in ("model", "render", "poses", "train", "io", "score")} | {
+    "obbgs_core"
+}
 CONTRACT = {"obbgs_base", "flightsw.icd", "flightsw.icd.transfer"}
 SESSIONS = {"ground.session", "ground.session_writer", "ground.telemetry"}
 ARROWS = {  # room: the rooms that its modules may import besides their own; a module stands in the innermost one
@@ -22,11 +24,12 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
         "obbgs_core.model",
     },  # the flat modules: errors, sensor, losses, obb, frames, ...
     "obbgs_core.render": CORE,
-    "obbgs_core.start": CORE,
-    "obbgs_core.attitude": CORE | {"obbgs_core.start"},
-    "obbgs_core.train": CORE | {"obbgs_core.render", "obbgs_core.start"},
+    "obbgs_core.poses": CORE | {"obbgs_core.render"},
+    "obbgs_core.start": CORE | {"obbgs_core.poses"},
+    "obbgs_core.attitude": CORE | {"obbgs_core.poses", "obbgs_core.start"},
+    "obbgs_core.train": CORE | {"obbgs_core.render", "obbgs_core.poses", "obbgs_core.start"},
     "obbgs_core.io": CORE | {"obbgs_core.render"},
-    "obbgs_core.score": CORE | {"obbgs_core.render"},
+    "obbgs_core.score": CORE | {"obbgs_core.render", "obbgs_core.poses"},
     "flightsw.icd": {"obbgs_base"},
     "flightsw.icd.transfer": {"obbgs_base", "flightsw.icd"},
     "flightsw.ports": {"obbgs_base", "flightsw.icd"},
@@ -38,7 +41,7 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     "ground.session": {"obbgs_base", "flightsw.icd", "ground.telemetry"},
     "ground.session_writer": {"obbgs_base", "flightsw.icd", "ground.session", "ground.telemetry"},
     "ground.formats": {"obbgs_base", "flightsw.icd", "ground.session", "ground.session_writer"},
-    "ground.baselines": CORE | {"obbgs_core.start", "obbgs_core.score", "ground.formats"},
+    "ground.baselines": CORE | {"obbgs_core.poses", "obbgs_core.start", "obbgs_core.score", "ground.formats"},
     "ground.compare": {"obbgs_base", "flightsw.icd", "ground", "ground.baselines", "ground.session"}
     | LIBRARY,
     "ground.viewer": {"obbgs_base", "flightsw.icd", "ground", "ground.session"}

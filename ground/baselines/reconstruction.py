@@ -10,7 +10,7 @@ from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.cameras import Cameras
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.estimate import PoseEstimate
 
 
 @dataclass(frozen=True)

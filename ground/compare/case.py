@@ -20,7 +20,7 @@ from ground.session import FrameRecord, Session, open_session, read_header
 from ground.training_frames import split, training_frame
 from ground.truth import Truth
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.pose_gauge import seen_after, size_of
+from obbgs_core.poses.gauge import seen_after, size_of
 from obbgs_core.score.shown import shown_points
 from obbgs_core.sensor import Sensor
 

@@ -17,8 +17,8 @@ from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.io.ply import save_ply
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.pose_corrections import with_estimate
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.corrections import with_estimate
+from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.render import render
 from obbgs_core.score.poses import settled_poses
 from obbgs_core.score.surface import surface_positions

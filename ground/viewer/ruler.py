@@ -11,7 +11,7 @@ from ground.turntable import metres_per_pixel
 from ground.viewer.scene import RADIUS, Placed, states_scale
 from ground.viewer.source import Shown
 from obbgs_base.navigation_errors import SharedParameters, jacobian
-from obbgs_core.pose_corrections import motion_of
+from obbgs_core.poses.corrections import motion_of
 
 LEAST_ALPHA = 1 / 255  # a Gaussian that covers less of a ray's light is not in its way
 FRAMES = 60  # at most, over which the size's deviation is worked out

@@ -12,7 +12,7 @@ from ground.session import FrameRecord, Session, SessionError, open_session
 from ground.training_frames import training_frame
 from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.sensor import Sensor
 
 HEADER, MODEL, MESH = "session.json", "model.ply", "model.glb"

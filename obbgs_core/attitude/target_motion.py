@@ -17,7 +17,7 @@ from obbgs_core.attitude.motion import (
     of_principal,
     principal,
 )
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.estimate import PoseEstimate
 
 ROTATIONAL = slice(6, 6 + TUMBLE)  # attitude, rate and inertia ratios among the shared parameters
 # deviations that a training leaves at least, as a share of those before it: it states them for a model without error

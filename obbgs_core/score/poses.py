@@ -17,9 +17,9 @@ from obbgs_core.losses import likelihood_loss
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.motions import motion_vectors
 from obbgs_core.model.rotations import from_rotation_vectors, multiply
-from obbgs_core.pose_corrections import PoseCorrections
-from obbgs_core.pose_gauge import seen_after, seen_points
-from obbgs_core.registration import pose_information
+from obbgs_core.poses.corrections import PoseCorrections
+from obbgs_core.poses.gauge import seen_after, seen_points
+from obbgs_core.poses.registration import pose_information
 from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.sensor import Sensor
 

@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from obbgs_core.batches import Batches
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import shadow_map
@@ -15,7 +16,6 @@ from obbgs_core.render.lighting import lambertian
 from obbgs_core.render.shadows import ShadowMap, lit_shares
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check, number
-from obbgs_core.train.batches import Batches
 from obbgs_core.train.parsimony import next_degree_gain, padded
 
 SHADOW_INTERVAL = 120  # steps between two computations of the shadow maps

@@ -8,14 +8,15 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from obbgs_core.batches import Batch, Batches
 from obbgs_core.errors import Diverged
 from obbgs_core.losses import ON_TARGET_ALPHA
 from obbgs_core.misfit import Compared, sampled, stated_misfit
-from obbgs_core.pose_corrections import PoseCorrections
+from obbgs_core.poses.corrections import PoseCorrections
+from obbgs_core.poses.evidence import correction_evidence
 from obbgs_core.render import Rendered, render
 from obbgs_core.train import pose_rounds
 from obbgs_core.train.appearance import SUN_FROM, described, raised_degree
-from obbgs_core.train.batches import Batch, Batches, FrameOrder
 from obbgs_core.train.config import Moment
 from obbgs_core.train.glints import FEWEST_STEPS, HIGHLIGHTS_FROM, MORE_FRAMES, along_normals, lobed
 from obbgs_core.train.growth import (
@@ -30,12 +31,12 @@ from obbgs_core.train.growth import (
     worst_boxes,
 )
 from obbgs_core.train.multi_view import crossing_boxes, inside, threshold_factor
+from obbgs_core.train.order import FrameOrder
 from obbgs_core.train.parsimony import justified
 from obbgs_core.train.poses import HELD_AT, HOLDS, PoseDecision
 from obbgs_core.train.setup import TrainingSetup
 from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import TrainingState
-from obbgs_core.train.validation import correction_evidence
 
 # share of the steps from which brackets that were kept back are trained on (docs/experiments/093)
 UNSEEN_UNTIL = 0.6

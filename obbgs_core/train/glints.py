@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from obbgs_core.batches import Batches
 from obbgs_core.frames import TrainingFrame, bracket_numbers, cameras_of
 from obbgs_core.misfit import mean_light2
 from obbgs_core.model.cameras import stacked_suns
@@ -22,7 +23,6 @@ from obbgs_core.render import render, weighted_gradient
 from obbgs_core.render.highlights import brightest_axes, lobe
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.appearance import Shadows
-from obbgs_core.train.batches import Batches
 from obbgs_core.train.parsimony import shown_frames
 
 # share of the steps at which highlights are tested; later they gain less (experiment 069)

@@ -10,20 +10,20 @@ from torch import Tensor
 
 from obbgs_core.model.cameras import stacked_suns
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.poses.evidence import every_seventh_bracket
 from obbgs_core.render.lighting import constant_towards
 from obbgs_core.start import hull
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.appearance import SUN_FROM
-from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.decisions import is_keeping_unseen, is_undecided, smooth
 from obbgs_core.train.glints import first_lobes
 from obbgs_core.train.growth import Growth
+from obbgs_core.train.order import FrameOrder
 from obbgs_core.train.parsimony import padded_to
 from obbgs_core.train.poses import HELD_FROM, HOLDS, PoseDecision
 from obbgs_core.train.setup import TrainingSetup
 from obbgs_core.train.state import TrainingState
-from obbgs_core.train.validation import every_seventh_bracket
 
 log = logging.getLogger(__name__)
 # A Gaussian stays while so many of the silhouettes see light near its centre: fewer than carve the hull, because

@@ -6,12 +6,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from obbgs_core.batches import Batch
 from obbgs_core.losses import likelihood_loss, published_loss
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import Rendered
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check
-from obbgs_core.train.batches import Batch
 from obbgs_core.train.neighbours import normals_apart
 
 

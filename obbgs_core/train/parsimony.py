@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from obbgs_core.batches import Batch, Batches
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render, weighted_gradient
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check, fraction
-from obbgs_core.train.batches import Batch, Batches
 from obbgs_core.train.smoothing import sampling_rates
 
 VIEWS = 36  # training frames that are rendered at most, spread evenly; gains are scaled to all frames

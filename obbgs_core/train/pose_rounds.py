@@ -6,10 +6,10 @@ import logging
 import torch
 from torch import Tensor
 
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.answers import PoseRound, Question
+from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.train.adam import learning_rates
-from obbgs_core.train.batches import FrameOrder
-from obbgs_core.train.pose_answers import PoseRound, Question
+from obbgs_core.train.order import FrameOrder
 from obbgs_core.train.poses import (
     ALIGNED_FROM,
     EARLY_ROUNDS,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.sensor import Sensor
 from obbgs_core.sky_level import SkyLevel
 from obbgs_core.train.compensation import mapped, nearest

@@ -14,6 +14,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
+from obbgs_core.batches import Batches, windows
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import (
     FEWEST_FRAMES,
@@ -25,7 +26,8 @@ from obbgs_core.frames import (
     usable,
 )
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.pose_corrections import PoseCorrections
+from obbgs_core.poses.corrections import PoseCorrections
+from obbgs_core.poses.evidence import validation_brackets
 from obbgs_core.sensor import Sensor, dark_reading, noise_excess
 from obbgs_core.settings import flat
 from obbgs_core.sky_level import SkyLevel, levelled
@@ -34,15 +36,13 @@ from obbgs_core.start.hull import Silhouette, light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
 from obbgs_core.train.adam import FIRST_MEMORY, SECOND_MEMORY, Adam
 from obbgs_core.train.appearance import TURNING_SPAN_DEG
-from obbgs_core.train.batches import Batches, FrameOrder
 from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import Growth
+from obbgs_core.train.order import FrameOrder
 from obbgs_core.train.poses import HOLDS, PoseDecision
 from obbgs_core.train.smoothing import sampling_deviation_m
 from obbgs_core.train.state import Identity, TrainingState
-from obbgs_core.train.validation import validation_brackets
-from obbgs_core.train.windows import windows
 
 log = logging.getLogger(__name__)
 NOISE_FRAMES = 12  # about so many, spread evenly, by which the noise is measured
@@ -144,7 +144,6 @@ def prepare(
     seen = silhouettes(lit, sensor, known)
     outlines, poses, why = settled(lit, seen, config.poses.refine != "never", refined)
     posed = lit if poses is None else poses.frames(lit)
-    noise += _unusual_unit(lit, sensor)
     config, budget = _limited(config, [int(outline.certain.sum()) for outline in outlines.values()])
     given = (posed, list(outlines.values()), sensor, config.start, config.light.sh_degree, rng)
     gaussians, radius_m, start = first_gaussians(*given)
@@ -152,7 +151,8 @@ def prepare(
     gaussians = dataclasses.replace(gaussians, footprint=config.footprint)
     span_deg = sun_span_deg(lit)
     sky, solid = _masks(outlines, config, span_deg, lit[0].background)
-    shown_part = windows(posed, gaussians.means.detach(), outlines) if config.windows else None
+    certain = {i: outline.certain for i, outline in outlines.items()}
+    shown_part = windows(posed, gaussians.means.detach(), certain) if config.windows else None
     setup = TrainingSetup(
         frames=lit,
         sensor=sensor,
@@ -164,7 +164,7 @@ def prepare(
         unit_m=camera_extent_m(lit) if config.length_unit == "cameras" else radius_m,
         radiance_unit=_radiance_unit(config, sensor, lit),
         sun_span_deg=span_deg,
-        start=start + noise,
+        start=start + noise + _unusual_unit(lit, sensor),
         budget=budget,
         reference_exposure_s=reference_exposure_s,
         dark_frames=len(checked) - len(lit),

@@ -17,17 +17,17 @@ from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.pose_covariance import Whitening
 from obbgs_core.obb import Obb
-from obbgs_core.pose_corrections import PoseCorrections
+from obbgs_core.poses.answers import SAVED as ROUND_SAVED
+from obbgs_core.poses.answers import PoseRound
+from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.render.shadows import ShadowMap
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.appearance import Shadows
 from obbgs_core.train.averaging import Average
-from obbgs_core.train.batches import FrameOrder
 from obbgs_core.train.compensation import Compensation
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.neighbours import Neighbours
-from obbgs_core.train.pose_answers import SAVED as ROUND_SAVED
-from obbgs_core.train.pose_answers import PoseRound
+from obbgs_core.train.order import FrameOrder
 from obbgs_core.train.poses import PoseDecision
 from obbgs_core.train.result import StepInfo
 from obbgs_core.train.smoothing import log_lowering, smoothed

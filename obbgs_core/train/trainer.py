@@ -10,21 +10,21 @@ from pathlib import Path
 import torch
 
 from obbgs_base.errors import Interrupted
+from obbgs_core.batches import Batch
 from obbgs_core.compiled import torch_on_one_thread
 from obbgs_core.errors import Diverged
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.losses import fit_figures
 from obbgs_core.misfit import sampled
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.pose_corrections import PoseCorrections
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.corrections import PoseCorrections
+from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train import decisions, pose_rounds
 from obbgs_core.train.adam import learning_rates
 from obbgs_core.train.appearance import described, freeze_later_degrees
 from obbgs_core.train.averaging import Average
-from obbgs_core.train.batches import Batch
 from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.growth import outliers
 from obbgs_core.train.joining import begun_again, check_joinable, join, release, withhold

@@ -72,8 +72,8 @@ def highlights() -> Trainer:
     return trained(photographed(shiny, 36, suns=sun), "obbgs", steps=1000)
 
 
-def refined(refine: str, wrong: bool = True) -> Trainer:
-    return trained(tagged(photographed(target(), 36), wrong, 0.02), "obbgs", **{"poses.refine": refine})
+def refined(refine: str, wrong: bool = True, sigma_rad: float = 0.02) -> Trainer:
+    return trained(tagged(photographed(target(), 36), wrong, sigma_rad), "obbgs", **{"poses.refine": refine})
 
 
 def navigated() -> Trainer:
@@ -130,7 +130,8 @@ RUNS: dict[str, Callable[[], Trainer]] = {
     "highlights": highlights,
     "poses-never": lambda: refined("never"),
     "poses-auto": lambda: refined("auto"),
-    "poses-exact": lambda: refined("auto", wrong=False),
+    "poses-doubted": lambda: refined("auto", wrong=False),
+    "poses-hold": lambda: refined("auto", wrong=False, sigma_rad=0.001),
     "poses-always": lambda: refined("always"),
     "navigation": navigated,
     "joined": lambda: joined("never", False),

@@ -30,9 +30,9 @@ from obbgs_base.navigation_errors import (
 )
 from obbgs_core.frames import Navigation, TrainingFrame, cameras_of
 from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
-from obbgs_core.pose_corrections import with_estimate
-from obbgs_core.pose_estimate import PoseEstimate
-from obbgs_core.pose_gauge import best_motion, seen_after, size_of
+from obbgs_core.poses.corrections import with_estimate
+from obbgs_core.poses.estimate import PoseEstimate
+from obbgs_core.poses.gauge import best_motion, seen_after, size_of
 from obbgs_core.render import render
 from obbgs_core.score.poses import pose_errors, settled_poses
 from obbgs_core.train import train

@@ -28,8 +28,8 @@ from obbgs_core.attitude.estimate import AttitudeUndetermined
 from obbgs_core.attitude.motion import at_epoch, attitudes, principal
 from obbgs_core.attitude.search import mirrored
 from obbgs_core.attitude.target_motion import TargetMotion
-from obbgs_core.pose_corrections import motion_of
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.corrections import motion_of
+from obbgs_core.poses.estimate import PoseEstimate
 from tests import scenes
 from tests.small_sessions import small_session
 

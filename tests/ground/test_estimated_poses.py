@@ -20,7 +20,7 @@ from obbgs_base.navigation_errors import SharedParameters
 from obbgs_core.frames import cameras_of
 from obbgs_core.io.ply import save_ply
 from obbgs_core.model.motions import rigid_motions
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.render import render
 from obbgs_core.score.poses import moved
 from tests.scenes import random_gaussians

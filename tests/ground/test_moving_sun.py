@@ -23,6 +23,7 @@ from ground.report import write_report
 from ground.session import open_session
 from ground.session_writer import SessionWriter
 from ground.training_frames import training_frame
+from obbgs_core.batches import Batches
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame, sun_span_deg
 from obbgs_core.io.onnx import export_onnx
@@ -35,7 +36,6 @@ from obbgs_core.score.metrics import psnr_db
 from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.appearance import TURNING_SPAN_DEG
-from obbgs_core.train.batches import Batches
 from obbgs_core.train.neighbours import Neighbours, normals_apart
 from obbgs_core.train.parsimony import next_degree_gain
 from obbgs_core.train.presets import preset

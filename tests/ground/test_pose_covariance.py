@@ -20,7 +20,7 @@ from flightsw.pose import navigation_tag
 from ground.session import open_session
 from ground.training_frames import motion_covariance, tag_covariance, training_frame
 from obbgs_core.model.pose_covariance import flaw
-from obbgs_core.pose_corrections import PoseCorrections
+from obbgs_core.poses.corrections import PoseCorrections
 
 ROOT = Path(__file__).parents[2]
 GOLDEN = ROOT / "tests" / "golden" / "session"

@@ -13,7 +13,7 @@ from ground.runs import Run
 from ground.session import Navigation, open_session
 from ground.training_frames import split
 from obbgs_base.navigation_errors import SIZE, SharedParameters
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.estimate import PoseEstimate
 from tests import scenes
 from tests.small_sessions import small_session
 

@@ -8,9 +8,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from obbgs_core.batches import Batches
 from obbgs_core.frames import averaged
-from obbgs_core.train.batches import Batches, FrameOrder
-from obbgs_core.train.validation import validation_brackets
+from obbgs_core.poses.evidence import validation_brackets
+from obbgs_core.train.order import FrameOrder
 from tests.scenes import SENSOR, photographed, target
 
 WHITE_DN = SENSOR.white_dn

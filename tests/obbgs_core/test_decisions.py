@@ -5,13 +5,14 @@ import dataclasses
 import pytest
 import torch
 
+from obbgs_core.batches import Batches
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.misfit import Compared, stated_misfit
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import from_radiance
+from obbgs_core.poses.evidence import CorrectionEvidence
 from obbgs_core.render import render
 from obbgs_core.train import decisions
-from obbgs_core.train.batches import Batches
 from obbgs_core.train.parsimony import (
     SHOWN_RADII,
     SHOWN_RADII_LAMBERT,
@@ -26,7 +27,6 @@ from obbgs_core.train.poses import HELD_FROM, PoseDecision
 from obbgs_core.train.presets import preset
 from obbgs_core.train.smoothing import sampling_rates
 from obbgs_core.train.trainer import Trainer, train
-from obbgs_core.train.validation import CorrectionEvidence
 from tests.scenes import QUICK, SENSOR, move_poses_in, photographed, tagged, target
 
 

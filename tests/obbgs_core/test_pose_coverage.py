@@ -11,8 +11,8 @@ from scipy.stats import chi2
 
 from obbgs_base.navigation_errors import NominalMotion, SharedParameters
 from obbgs_core.frames import Navigation, TrainingFrame
-from obbgs_core.pose_corrections import DOUBT, PoseCorrections
-from obbgs_core.registration import PoseInformation, _cell_information
+from obbgs_core.poses.corrections import DOUBT, PoseCorrections
+from obbgs_core.poses.registration import PoseInformation, _cell_information
 from tests import scenes
 
 FRAMES, CUBES, DRAWS = 12, 5, 60

@@ -11,17 +11,17 @@ from scipy.spatial.transform import Rotation
 from skimage import transform
 
 from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displaced_motion
-from obbgs_core import pose_corrections, registration
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import Navigation, TrainingFrame, cameras_of, usable
 from obbgs_core.losses import likelihood_loss
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
 from obbgs_core.model.sh import from_radiance
-from obbgs_core.normal_equations import NormalEquations, ReducedEquations
-from obbgs_core.pose_corrections import PoseCorrections, with_estimate
-from obbgs_core.pose_gauge import best_motion, joined, seen_after, size_of
-from obbgs_core.registration import CellShifts, pose_information
+from obbgs_core.poses import corrections, registration
+from obbgs_core.poses.corrections import PoseCorrections, with_estimate
+from obbgs_core.poses.gauge import best_motion, joined, seen_after, size_of
+from obbgs_core.poses.normal_equations import NormalEquations, ReducedEquations
+from obbgs_core.poses.registration import CellShifts, pose_information
 from obbgs_core.render import render
 from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.score.poses import moved, pose_errors, settled_poses
@@ -569,8 +569,8 @@ def test_pictures_that_count_less_leave_more_open_but_no_more_than_the_prior(see
         rng.exponential(size=size) * 10 ** rng.uniform(-3, 4),
     )
     covariance = torch.from_numpy(turn / (1 + told) @ turn.T)
-    expected = turn / (1 + told / pose_corrections.DOUBT**2) @ turn.T
-    np.testing.assert_allclose(pose_corrections._doubted(covariance), expected, atol=1e-8)
+    expected = turn / (1 + told / corrections.DOUBT**2) @ turn.T
+    np.testing.assert_allclose(corrections._doubted(covariance), expected, atol=1e-8)
 
 
 def test_frames_of_two_passes_are_refused(erring):

@@ -12,22 +12,22 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from obbgs_core.batches import Batches
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame, usable
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.motions import motion_vectors, rigid_motions
 from obbgs_core.model.pose_covariance import flaw, whitening
-from obbgs_core.pose_corrections import PoseCorrections, _null_space
-from obbgs_core.registration import pose_information
+from obbgs_core.poses.corrections import PoseCorrections, _null_space
+from obbgs_core.poses.evidence import CorrectionEvidence, correction_evidence
+from obbgs_core.poses.registration import pose_information
 from obbgs_core.render import render
 from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.start.alignment import MOST_DILATION_PX, _error_px, settled
 from obbgs_core.start.initialisation import silhouettes
-from obbgs_core.train.batches import Batches
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
-from obbgs_core.train.validation import CorrectionEvidence, correction_evidence
 from tests import scenes
 from tests.scenes import QUICK, RANGE_M, SENSOR, intrinsics, target
 

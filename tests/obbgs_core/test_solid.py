@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from obbgs_core import preset
+from obbgs_core.batches import Batches
 from obbgs_core.frames import cameras_of
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
 from obbgs_core.start.hull import Silhouette
-from obbgs_core.train.batches import Batches
 from obbgs_core.train.objective import LossSettings, priors
 from obbgs_core.train.trainer import Trainer
 from tests.scenes import QUICK, SENSOR, photographed, target

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from obbgs_base.navigation_errors import SIZE, NominalMotion, SharedParameters, displaced_motion
 from obbgs_core.attitude.motion import attitudes, of_principal, principal
 from obbgs_core.attitude.target_motion import LEAST_LEFT, TargetMotion
-from obbgs_core.pose_estimate import PoseEstimate
+from obbgs_core.poses.estimate import PoseEstimate
 
 TIMES_S = np.array([-400.0, -150.0, 0.0, 80.0, 400.0])
 MOMENTS = np.array([0.385, 0.77, 1.0])

@@ -7,15 +7,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from obbgs_core.batches import GRID_PX, Batches, common, windows
 from obbgs_core.frames import cameras_of
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.start.initialisation import silhouettes
 from obbgs_core.train import train
-from obbgs_core.train.batches import Batches
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
-from obbgs_core.train.windows import GRID_PX, common, windows
 from tests.scenes import SENSOR, photographed, target
 
 SIZE_PX = 150  # no multiple of the grid
@@ -23,7 +22,7 @@ SMALL = dataclasses.replace(target(40), means=target(40).means * 0.4)
 
 
 def shown_of(frames) -> torch.Tensor:
-    return windows(frames, SMALL.means, silhouettes(frames, SENSOR))
+    return windows(frames, SMALL.means, {i: s.certain for i, s in silhouettes(frames, SENSOR).items()})
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5, 0.25])
@@ -49,11 +48,11 @@ def test_a_window_shows_what_the_whole_picture_shows_there(scale):
 
 def test_windows_hold_light_that_the_start_lacks():
     frames = photographed(SMALL, 12, size_px=SIZE_PX, focal_px=90.0)
-    lit = silhouettes(frames, SENSOR)
+    lit = {i: outline.certain for i, outline in silhouettes(frames, SENSOR).items()}
     core = SMALL.means[SMALL.means.norm(dim=1) < 0.15]
     tight, shown = windows(frames, core, {}), windows(frames, core, lit)
-    for i, outline in lit.items():
-        rows, columns = torch.nonzero(outline.certain).unbind(dim=1)
+    for i, certain in lit.items():
+        rows, columns = torch.nonzero(certain).unbind(dim=1)
         left, top, right, bottom = shown[i].tolist()
         assert left <= columns.min() and columns.max() < right and top <= rows.min() and rows.max() < bottom
     areas = [(w[:, 2:] - w[:, :2]).prod(dim=1).sum() for w in (tight, shown)]

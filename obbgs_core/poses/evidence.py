@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from obbgs_core.batches import Batch
 from obbgs_core.frames import TrainingFrame, bracket_numbers
 from obbgs_core.losses import likelihood_loss
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.pose_corrections import PoseCorrections
-from obbgs_core.registration import PoseInformation, pose_information
+from obbgs_core.poses.corrections import PoseCorrections
+from obbgs_core.poses.registration import PoseInformation, pose_information
 from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.batches import Batch
 
 # One bracket in seven, at least three in all; a prime number, so that no cycle of the capture repeats with it.
 INTERVAL, FEWEST = 7, 3

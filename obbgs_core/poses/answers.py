@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from obbgs_core.batches import Batches
 from obbgs_core.compiled import Background
 from obbgs_core.misfit import relative_misfit, sampled
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.registration import CellInformation, PoseInformation, pose_information
+from obbgs_core.poses.registration import CellInformation, PoseInformation, pose_information
 from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.batches import Batches
 
 RENDERED = 6  # frames at a time
 _asking = Background("poses")  # of all trainings of this process

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from obbgs_core.registration import CellInformation, CellShifts
+from obbgs_core.poses.registration import CellInformation, CellShifts
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,9 @@
-"""The frames of each step: which are drawn, and their images at the scale of the step."""
+"""The training frames as a step takes them: averaged images, and of each the window that shows the target."""
 
 import copy
 import dataclasses
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -12,10 +11,10 @@ from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame, averaged, cameras_of
 from obbgs_core.model.cameras import Cameras
-from obbgs_core.train.windows import GRID_PX, common
 
-MOST_AT_ONCE = 3
-COMES_AGAIN = 3  # frames of one exposure time, at least, where brackets repeat
+# windows begin at multiples of it, so that the pixels averaged for a coarse image lie in one window
+GRID_PX = 16
+MARGIN_PX = 8.0  # around the start, besides what silhouettes show beyond it
 
 
 @dataclass(frozen=True)
@@ -112,90 +111,56 @@ class Batches:
         return [shares.get(i, unknown) for i in range(len(self.frames))]
 
 
-def _by_exposure(frames: list[TrainingFrame], drawn: list[int]) -> list[list[int]]:
-    """Return the drawn frames in groups of one exposure time each, as brackets have them.
+def windows(frames: Sequence[TrainingFrame], means: Tensor, certain: Mapping[int, Tensor]) -> Tensor:
+    """Return the window [F, 4] of each frame that the target lies in: left, top, right and bottom, px, int64.
 
-    A time that at most half as many frames have as the commonest, as under automatic exposure, makes no group of its
-    own, whose few frames would be drawn far more often than others: its frames go to the nearest time that does. Where
-    no time comes again, as in automatic brackets, all frames are one group.
+    It holds the start of the training as the frame's pose projects it. All are wider by as much as the certain light
+    of any silhouette goes beyond that, since a start may lack thin parts. Where a point of the start is not in front
+    of the camera the window is the whole frame.
+
+    Args:
+        frames: of one size.
+        means: [N, 3] m, centres of the first Gaussians, body frame.
+        certain: [H, W], where silhouettes of some of the frames show light for certain, by the index of the frame.
     """
-    of_time: dict[float, list[int]] = {}
-    for index in drawn:
-        of_time.setdefault(frames[index].exposure_time_s, []).append(index)
-    most = max(map(len, of_time.values()), default=0)
-    groups: dict[float, list[int]] = {
-        time_s: [] for time_s, members in of_time.items() if 2 * len(members) > most >= COMES_AGAIN
-    }
-    if not groups:
-        return [drawn] if drawn else []
-    for time_s, members in of_time.items():
-        nearest = min(groups, key=lambda other: abs(math.log(other / time_s)))
-        groups[nearest] += members
-    return [sorted(members) for members in groups.values()]
+    height, width = frames[0].dn.shape[:2]
+    reached = torch.stack([_projected(frame, means) for frame in frames])
+    whole = torch.tensor([0, 0, width, height])
+    outwards = torch.tensor([-1, -1, 1, 1])
+    beyond = [
+        ((_bounds(light) - reached[i]) * outwards).amax() for i, light in certain.items() if light.any()
+    ]
+    margin = MARGIN_PX + max([0.0, *(float(b) for b in beyond if b.isfinite())])
+    begin = ((reached[:, :2] - margin) / GRID_PX).floor() * GRID_PX
+    end = ((reached[:, 2:] + margin) / GRID_PX).ceil() * GRID_PX
+    found = torch.cat([begin, end], dim=1).clamp(min=torch.zeros(4), max=whole[[2, 3, 2, 3]].float())
+    inside = (found.isfinite().all(dim=1) & (found[:, 2:] > found[:, :2]).all(dim=1))[:, None]
+    return torch.where(inside, found.nan_to_num(), whole.float()).long()
 
 
-@dataclass
-class FrameOrder:
-    """Draws frames at random without replacement, from each group in turn.
+def common(windows: Tensor, width: int, height: int) -> Tensor:
+    """Return windows [B, 4] of one size that hold the given ones, moved and widened as little as possible.
 
-    One that joined late is drawn up to MOST_AT_ONCE times a round, until it has been drawn about as often as others.
-
-    groups: indices of the frames to train on, those of about one exposure time in each group, or all in one.
-    validation_brackets: indices of the frames that are not drawn, by bracket.
-    remaining: what is left of each group in this round, drawn from the end.
-    turn: frames drawn so far.
-    visits: how often each frame was drawn, by its index.
+    They still begin at multiples of the grid, inside of pictures of that width and height, px.
     """
+    size = torch.tensor([width, height])
+    needed = (windows[:, 2:] - windows[:, :2]).amax(dim=0)
+    common_size = size - (size - needed) // GRID_PX * GRID_PX
+    begin = torch.minimum(windows[:, :2], size - common_size)
+    return torch.cat([begin, begin + common_size], dim=1)
 
-    groups: list[list[int]]
-    validation_brackets: list[list[int]]
-    remaining: list[list[int]]
-    turn: int = 0
-    visits: dict[int, int] = field(default_factory=dict)
 
-    @staticmethod
-    def of(
-        frames: list[TrainingFrame],
-        by_exposure: bool,
-        validation_brackets: list[list[int]],
-        left_out: Sequence[int] = (),
-        earlier: "FrameOrder | None" = None,
-    ) -> "FrameOrder":
-        """Return the order of all frames but those of the validation brackets, and those that are left out for good.
+def _projected(frame: TrainingFrame, points: Tensor) -> Tensor:
+    """Return the bounds [4] of the projections of points [N, 3], px; not finite where one is behind the camera."""
+    pose = frame.world_to_camera
+    seen = points @ pose[:3, :3].T + pose[:3, 3]
+    if not (seen[:, 2] > 0).all():
+        return torch.full((4,), torch.nan)
+    pixels = (seen @ frame.K.T)[:, :2] / seen[:, 2:]
+    return torch.cat([pixels.amin(dim=0), pixels.amax(dim=0)])
 
-        Args:
-            earlier: the order by which frames were drawn until now. Its turn and how often it drew each frame go on, so
-                that frames which joined late are still drawn more often.
-        """
-        withheld = {index for bracket in validation_brackets for index in bracket} | set(left_out)
-        drawn = [index for index in range(len(frames)) if index not in withheld]
-        groups = _by_exposure(frames, drawn) if by_exposure else [drawn] if drawn else []
-        order = FrameOrder(groups, validation_brackets, [[] for _ in groups])
-        if earlier is not None:
-            order.turn, order.visits = earlier.turn, dict(earlier.visits)
-        return order
 
-    def draw(self, count: int, rng: torch.Generator) -> list[int]:
-        """Return the indices of the next frames."""
-        drawn = []
-        for _ in range(count):
-            group = self.turn % len(self.groups)
-            if not self.remaining[group]:
-                members = self._round(self.groups[group])
-                self.remaining[group] = [
-                    members[i] for i in torch.randperm(len(members), generator=rng).tolist()
-                ]
-            drawn.append(self.remaining[group].pop())
-            self.visits[drawn[-1]] = self.visits.get(drawn[-1], 0) + 1
-            self.turn += 1
-        return drawn
-
-    def _round(self, members: list[int]) -> list[int]:
-        """Return the frames of a group's next round, those that were drawn less than others several times."""
-        visits = [self.visits.get(i, 0) for i in members]
-        most = max(visits)
-        return [
-            i
-            for i, n in zip(members, visits, strict=True)
-            for _ in range(min(MOST_AT_ONCE, (most + 1) // (n + 1)))
-        ]
+def _bounds(mask: Tensor) -> Tensor:
+    """Return the bounds [4] of the true pixels of a mask [H, W] that has some."""
+    rows, columns = torch.nonzero(mask.any(dim=1))[:, 0], torch.nonzero(mask.any(dim=0))[:, 0]
+    return torch.stack([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1]).float()

@@ -15,9 +15,9 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
 from obbgs_core.model.pose_covariance import whitening
 from obbgs_core.model.rotations import from_rotation_vectors, multiply
-from obbgs_core.normal_equations import NormalEquations, ReducedEquations, times
-from obbgs_core.pose_estimate import PoseEstimate
-from obbgs_core.registration import CellInformation, CellShifts, PoseInformation
+from obbgs_core.poses.estimate import PoseEstimate
+from obbgs_core.poses.normal_equations import NormalEquations, ReducedEquations, times
+from obbgs_core.poses.registration import CellInformation, CellShifts, PoseInformation
 
 NULL = 1e-9  # a singular value of rows of unit length that is zero up to rounding
 LINEAR = 0.1  # prior deviations by which shared parameters move before their effect is linearised anew
