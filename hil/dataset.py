@@ -22,15 +22,16 @@ from ground.session_writer import SessionWriter
 from ground.telemetry import FlightCounts
 from hil import truth
 from hil.choices import SensorKind
-from hil.sky import Materials, blender, motion, sensor, stars
+from hil.sky import Materials, blender, motion, sensor
 from hil.sky.blender import mesh_sha256
 from hil.sky.motion import image_velocity, smear
 from hil.sky.render_farm import RenderFarm
 from hil.sky.sensor import PRESETS, SensorModel, read_out
-from hil.sky.stars import star_radiance
 from hil.world.scenario import Scene, SceneState, load_scenario, ready_made
+from obbgs_base import stars
 from obbgs_base.errors import ObbgsError
 from obbgs_base.files import write_whole
+from obbgs_base.stars import star_radiance
 
 DATASETS = Path(__file__).parent / "datasets"
 MARKER = "dataset.json"

@@ -56,6 +56,8 @@ class TrainingFrame:
     psf_sigma_px: of the optics, as in `Cameras`, the same in all frames; None: not calibrated, a method whose footprint
         is the camera's learns it.
     navigation: errors that all frames of the pass share, the same in all of them; None: there are none.
+    earth_m: [3] m, from the camera to the Earth's centre, in the camera's axes; None: it is not in the picture, or not
+        known.
     time_s: since the navigation's epoch; inertial_to_body: [3, 3] float64, the attitude that the pose assumes; None:
         the body's axes are inertial. Only the navigation needs them.
     """
@@ -73,6 +75,7 @@ class TrainingFrame:
     navigation: Navigation | None = None
     time_s: float = 0.0
     inertial_to_body: Tensor | None = None
+    earth_m: Tensor | None = None
 
 
 def sun_span_deg(frames: list[TrainingFrame]) -> float:

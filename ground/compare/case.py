@@ -129,8 +129,8 @@ class Case:
         clouds = {"": points_m.double().numpy(), "_surface": surface_m.double().numpy()}
         return cloud_scores(clouds, self.cloud_m, self.units_per_m, self.shown)
 
-    def true_radiance(self) -> Callable[[TrainingFrame], Tensor]:
-        """Return a function from a training frame to its true radiance [H, W, C].
+    def true_views(self) -> Callable[[TrainingFrame], tuple[np.ndarray, np.ndarray]]:
+        """Return a function from a training frame to its true radiance [H, W, C] and coverage [H, W] in 0..1.
 
         Raises:
             CompareError: the session has no truth.
@@ -142,7 +142,7 @@ class Case:
                 "exposures, noise or response, or take a simulated session"
             )
         truth, records = Truth(session), {record.id: record for record in session.frames}
-        return lambda frame: torch.from_numpy(truth.radiance(records[frame.id])[0])
+        return lambda frame: truth.radiance(records[frame.id])
 
 
 def load_case(folder: Path, sector_deg: float = 0.0) -> Case:

@@ -16,8 +16,10 @@ import torch
 from flightsw.icd.config import MAX_YAML_BYTES, ConfigError, build, in_file, parse_yaml, require
 from ground.compare.case import Case
 from ground.compare.errors import CompareError
+from ground.compare.sky_behind import behind
 from ground.settings import checked_settings
 from obbgs_base.files import read_bounded
+from obbgs_base.stars import star_irradiance
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.motions import rigid_motions
 from obbgs_core.sensor import Sensor
@@ -38,6 +40,10 @@ class Condition:
     - exposure_error: standard deviation of ln(true / tagged exposure time), frame by frame.
     - response_gamma: the readings follow signal ** gamma (full scale 1), while the method takes them for linear.
     - pedestal: share of full scale that is added to every reading before it is clipped, while no method is told of it.
+    - earth: share of the frames that have the Earth or its limb behind the target, by day and from a height of 500 km,
+      each at another place (`ground.compare.sky_behind`); methods are told where the Earth is, as navigation would.
+    - stars: a field of stars behind the target, where one of magnitude 6 reads so many deviations of the noise in the
+      longest exposure; real ones are far fainter than that beside a target in sunlight.
     - stray_gradient: the same, from 0 at one corner of the picture to this share at another, in a direction at random.
 
     These need no truth:
@@ -60,6 +66,8 @@ class Condition:
     response_gamma: float = 1.0
     pedestal: float = 0.0
     stray_gradient: float = 0.0
+    earth: float = 0.0
+    stars: float = 0.0
     synthetic_bracket: tuple[float, ...] = ()
     believed_noise: float = 1.0
     believed_gain: float = 1.0
@@ -74,7 +82,7 @@ class Condition:
     def __post_init__(self):
         for name in ("noise", "response_gamma", "believed_noise", "believed_gain"):
             require(getattr(self, name) > 0, name, f"expected more than 0, got {getattr(self, name):g}")
-        for name in ("exposure_error", "frames", "missing_exposure", "pose_error_deg"):
+        for name in ("exposure_error", "stars", "frames", "missing_exposure", "pose_error_deg"):
             require(getattr(self, name) >= 0, name, f"expected 0 or more, got {getattr(self, name):g}")
         require(
             self.exposure_error <= MOST_EXPOSURE_ERROR,
@@ -86,6 +94,7 @@ class Condition:
             require(
                 0 <= share < 1, name, f"expected a share of full scale from 0 to less than 1, got {share:g}"
             )
+        require(0 <= self.earth <= 1, "earth", f"expected a share of the frames from 0 to 1, got {self.earth:g}")
         require(
             0 <= self.lost_percent < 100,
             "lost_percent",
@@ -111,6 +120,7 @@ class Condition:
     def exposes_anew(self) -> bool:
         """Whether frames are made from the truth."""
         changed = (self.exposure_ratios, self.exposure_error, self.pedestal, self.stray_gradient)
+        changed += (self.earth, self.stars)
         return any(changed) or (self.noise, self.response_gamma) != (1, 1)
 
     def stated(self) -> dict[str, Any]:
@@ -206,16 +216,30 @@ def _exposed_anew(case: Case, condition: Condition) -> list[TrainingFrame]:
     tagged_s = (
         {old_s: times_s[0] * ratio for old_s, ratio in zip(times_s, ratios, strict=True)} if ratios else {}
     )
-    radiance, frames = case.true_radiance(), []
+    view, frames = case.true_views(), []
+    star_gain = _star_gain(case.sensor, condition, max(times_s))
     for frame in case.training:
         exposure_s = tagged_s.get(frame.exposure_time_s, frame.exposure_time_s)
         longer = math.exp(_random(SHUTTER, frame).normal(0, condition.exposure_error))
-        light = radiance(frame).double().numpy()
+        light, coverage = view(frame)
+        scene = behind(frame, condition.earth, star_gain)
+        light = light.astype(float) + (1 - coverage[..., None]) * scene.radiance
         added_dn = _added_dn(frame, case.sensor, condition)
         dn = read_out(light, exposure_s * longer, case.sensor, condition, _random(NOISE, frame), added_dn)
         dn = torch.from_numpy(dn.astype(np.float32))
-        frames.append(dataclasses.replace(frame, dn=dn, exposure_time_s=exposure_s))
+        frames.append(
+            dataclasses.replace(frame, dn=dn, exposure_time_s=exposure_s, earth_m=scene.earth_m)
+        )
     return frames
+
+
+def _star_gain(sensor: Sensor, condition: Condition, longest_s: float) -> float:
+    """Return how many times brighter the stars are than real ones, for one of magnitude 6 to read as a condition says.
+
+    Times the solid angle of a pixel, which `behind` divides by.
+    """
+    wanted = condition.stars * sensor.read_noise_dn / (sensor.dn_per_radiance_s * longest_s)
+    return wanted / star_irradiance(6.0)
 
 
 def _bracketed(case: Case, condition: Condition) -> list[TrainingFrame]:

@@ -33,7 +33,7 @@ from ground.session import SCHEMA_VERSION
 from ground.session_writer import frame_line
 from ground.truth import TrueFrame, write_truth
 from hil.sky.sensor import PRESETS, RENDERED_PSF_SIGMA_PX, SensorModel, converted, read_out, through_lens
-from hil.sky.stars import star_radiance
+from obbgs_base.stars import star_radiance
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
 

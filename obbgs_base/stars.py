@@ -1,4 +1,4 @@
-"""Stars behind the target: random positions, with the number and brightness of the real sky's."""
+"""Stars behind the target, not a catalogue: random positions, with the number and brightness of the real sky's."""
 
 import functools
 
@@ -21,7 +21,12 @@ def catalogue() -> tuple[np.ndarray, np.ndarray]:
     directions = rng.standard_normal((count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     magnitudes = FAINTEST_MAGNITUDE + np.log10(rng.random(count)) / 0.51
-    return directions, SUN_IRRADIANCE * 10 ** (-0.4 * (magnitudes - SUN_MAGNITUDE))
+    return directions, star_irradiance(magnitudes)
+
+
+def star_irradiance(magnitude):
+    """Return the irradiance of stars of a visual magnitude, a number or an array, in the renderer's unit."""
+    return SUN_IRRADIANCE * 10 ** (-0.4 * (magnitude - SUN_MAGNITUDE))
 
 
 def star_radiance(gcrs_to_camera: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:
