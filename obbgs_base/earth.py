@@ -154,7 +154,7 @@ def _value_noise(points: np.ndarray, seed: int) -> np.ndarray:
             )
             for dz in (0, 1):
                 weight = weight_xy * (smooth[:, 2] if dz else 1 - smooth[:, 2])
-                total += weight * _hashed(corner + (dx, dy, dz), seed)
+                total += weight * _hashed(corner + np.array([dx, dy, dz]), seed)
     return total / VALUE_NOISE_SIGMA
 
 

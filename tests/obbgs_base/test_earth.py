@@ -84,7 +84,7 @@ def test_the_earth_reflects_what_is_measured():
     places = rng.standard_normal((4000, 3))
     places /= np.linalg.norm(places, axis=1, keepdims=True)
     albedo = clouded_albedo(places, 1e-4)
-    assert 0.06 <= albedo.min() and albedo.max() <= 0.8
+    assert albedo.min() >= 0.06 and albedo.max() <= 0.8
     assert 0.25 < albedo.mean() < 0.35
     assert 0.2 < (albedo > 0.4).mean() < 0.67  # opaque clouds; with thin ones 0.67 (MODIS)
 
