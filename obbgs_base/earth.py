@@ -24,7 +24,9 @@ CLOUD_SHARE = 0.45
 CLOUD_EDGE = 0.25  # of a cloud's border, in deviations of the noise
 COARSEST = 2.0  # cells of the coarsest octave in a radius of the Earth
 OCTAVES = 18  # each half as large as the one before: from 3,000 km to 25 m
-ROUGHNESS = 2 ** (-1 / 3)  # of an octave over the one before: variance as wavenumber^(-5/3), as satellites see clouds
+ROUGHNESS = 2 ** (
+    -1 / 3
+)  # of an octave over the one before: variance as wavenumber^(-5/3), as satellites see clouds
 # Radiance of stray light where the Sun is 30 degrees off the axis; it falls with the angle squared, as in a lens with a
 # plain hood, and from one side of the picture to the other by what the angles differ.
 STRAY_AT_30_DEG = 0.01
@@ -161,7 +163,11 @@ def _value_noise(points: np.ndarray, seed: int) -> np.ndarray:
 def _hashed(lattice: np.ndarray, seed: int) -> np.ndarray:
     """Return numbers [N] even in -1..1 that depend on lattice points [N, 3] only (SplitMix64's finaliser)."""
     x, y, z = lattice.astype(np.uint64).T
-    mixed = x * np.uint64(0x9E3779B97F4A7C15) ^ y * np.uint64(0xC2B2AE3D27D4EB4F) ^ z * np.uint64(0x165667B19E3779F9)
+    mixed = (
+        x * np.uint64(0x9E3779B97F4A7C15)
+        ^ y * np.uint64(0xC2B2AE3D27D4EB4F)
+        ^ z * np.uint64(0x165667B19E3779F9)
+    )
     mixed = mixed + np.uint64((seed * 0xD6E8FEB86659FD93) % 2**64)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)

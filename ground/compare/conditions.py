@@ -94,7 +94,9 @@ class Condition:
             require(
                 0 <= share < 1, name, f"expected a share of full scale from 0 to less than 1, got {share:g}"
             )
-        require(0 <= self.earth <= 1, "earth", f"expected a share of the frames from 0 to 1, got {self.earth:g}")
+        require(
+            0 <= self.earth <= 1, "earth", f"expected a share of the frames from 0 to 1, got {self.earth:g}"
+        )
         require(
             0 <= self.lost_percent < 100,
             "lost_percent",
@@ -227,9 +229,7 @@ def _exposed_anew(case: Case, condition: Condition) -> list[TrainingFrame]:
         added_dn = _added_dn(frame, case.sensor, condition)
         dn = read_out(light, exposure_s * longer, case.sensor, condition, _random(NOISE, frame), added_dn)
         dn = torch.from_numpy(dn.astype(np.float32))
-        frames.append(
-            dataclasses.replace(frame, dn=dn, exposure_time_s=exposure_s, earth_m=scene.earth_m)
-        )
+        frames.append(dataclasses.replace(frame, dn=dn, exposure_time_s=exposure_s, earth_m=scene.earth_m))
     return frames
 
 
