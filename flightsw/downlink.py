@@ -33,7 +33,7 @@ from flightsw.ports import Link
 from flightsw.ranking import Ranking
 from flightsw.settings import Settings, load_settings
 from flightsw.store import FrameStore
-from flightsw.triage import ModelVerified
+from flightsw.triage_worker import ModelVerified
 
 log = logging.getLogger(__name__)
 

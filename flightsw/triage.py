@@ -6,11 +6,7 @@ will receive earlier. Needs onnxruntime and numpy only.
 """
 
 import hashlib
-import logging
 import math
-import os
-import queue
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,14 +19,11 @@ from flightsw.icd.model_file import MAX_MODEL_BYTES, SENSOR_METADATA, ModelUnfit
 from flightsw.icd.packet import PacketError
 from obbgs_base.extras import install_command
 
-log = logging.getLogger(__name__)
-
 TILE_ROWS, TILE_COLUMNS = 20, 40  # px, as in the ground's densification
 # views so far apart share exp(-1/2) of what they show: about how far a face can be seen from
 SIMILAR_RAD = 0.7
 NOISE_CHI2 = 1.25  # below it is the worst tile of pure noise: 1 on average, a deviation of 0.05 for 800 px
 REPEAT = 0.05  # novelty of a view that was sent already: its noise differs
-NICENESS = 10  # of the ranking thread: the link has priority
 INPUTS = {"world_to_camera": [4, 4], "K": [3, 3], "exposure_time_s": []}
 SUN_INPUT = {"sun_dir": [3]}  # of a model whose radiance turns with the Sun
 
@@ -91,6 +84,7 @@ class Renderer:
         except ImportError as error:
             raise TriageMissing(f"triage needs onnxruntime: {install_command('onnx')}") from error
         content = verified_model(path)
+        self.sha256 = hashlib.sha256(content).digest()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = threads
         options.log_severity_level = 3
@@ -183,7 +177,7 @@ def rank_frames(model: Path, frames: Path, K: np.ndarray) -> tuple[list[Ranked],
         except (PacketError, OSError):
             unreadable += 1
             continue
-        ranked.append(_rank(renderer, frame, path, K))
+        ranked.append(rank_frame(renderer, frame, path, K))
     return sending_order(ranked, []), unreadable
 
 
@@ -244,7 +238,12 @@ def _view(position_body_m: np.ndarray, sun_dir_body: np.ndarray) -> tuple[float,
     return (*to_camera.tolist(), *sun_dir_body.tolist())
 
 
-def _rank(renderer: Renderer, frame: Frame, path: Path, K: np.ndarray) -> Ranked:
+def rank_frame(renderer: Renderer, frame: Frame, path: Path, K: np.ndarray) -> Ranked:
+    """Return how well the model predicts a frame.
+
+    Raises:
+        TriageError: the frame has another size or other channels, or the model fails while it renders.
+    """
     if frame.dn.shape[:2] != (renderer.height, renderer.width):
         raise TriageError(
             f"frame {frame.frame_id} is {frame.dn.shape[1]}x{frame.dn.shape[0]} px, the model renders "
@@ -272,90 +271,6 @@ def _rank(renderer: Renderer, frame: Frame, path: Path, K: np.ndarray) -> Ranked
         frame.pose.valid and not frame.pose.in_eclipse,
         view,
     )
-
-
-@dataclass(frozen=True)
-class ModelVerified:
-    """How the verification of a model file ended; `problem` is None for one that ranks frames from now on."""
-
-    path: Path
-    sha256: bytes
-    problem: str | None
-
-
-class TriageWorker:
-    """Verifies models and ranks frames in a thread of its own, while the link goes on."""
-
-    def __init__(self, K: np.ndarray, width: int, height: int):
-        self._K, self._size = K, (width, height)
-        self._renderer: Renderer | None = None
-        self._tasks: queue.SimpleQueue[tuple[Path, bool] | None] = queue.SimpleQueue()
-        self._results: queue.SimpleQueue[ModelVerified | tuple[Path, Ranked | None]] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="triage", daemon=True)
-
-    def verify(self, model: Path) -> None:
-        """Check a model file; if it is usable, later frames are ranked by it."""
-        self._put(model, True)
-
-    def rank(self, container: Path) -> None:
-        """Rank a stored frame by the newest model."""
-        self._put(container, False)
-
-    def results(self) -> list[ModelVerified | tuple[Path, Ranked | None]]:
-        """Return what was done since the last call, in order; None for a frame that cannot be ranked."""
-        done = []
-        while not self._results.empty():
-            done.append(self._results.get())
-        return done
-
-    def stop(self) -> None:
-        """End after the current task; the others are dropped."""
-        if self._thread.is_alive():
-            while not self._tasks.empty():
-                self._tasks.get()
-            self._tasks.put(None)
-            self._thread.join()
-
-    def _put(self, path: Path, is_model: bool) -> None:
-        if not self._thread.is_alive():
-            self._thread.start()
-        self._tasks.put((path, is_model))
-
-    def _run(self) -> None:
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)  # of this thread alone, on Linux
-        while (task := self._tasks.get()) is not None:
-            path, is_model = task
-            try:
-                result = self._verified(path) if is_model else (path, self._ranked(path))
-            except (
-                Exception
-            ) as error:  # the outermost loop of this thread: without it frames would wait forever
-                log.error("triage failed at %s: %r", path.name, error, exc_info=error)
-                result = ModelVerified(path, b"", f"triage failed: {error!r}") if is_model else (path, None)
-            self._results.put(result)
-
-    def _ranked(self, path: Path) -> Ranked | None:
-        if self._renderer is None:
-            return None
-        try:
-            return _rank(self._renderer, decode_frame(path.read_bytes()), path, self._K)
-        except (PacketError, OSError, TriageError) as error:
-            log.warning("%s cannot be ranked: %s", path.name, error)
-            return None
-
-    def _verified(self, path: Path) -> ModelVerified:
-        try:
-            sha256 = hashlib.sha256(path.read_bytes()).digest()
-            renderer = Renderer(path)
-            if (renderer.width, renderer.height) != self._size:
-                width, height = self._size
-                raise TriageError(
-                    f"the model renders {renderer.width}x{renderer.height}, the camera has {width}x{height}"
-                )
-        except (TriageError, OSError) as error:
-            return ModelVerified(path, b"", str(error))
-        self._renderer = renderer
-        return ModelVerified(path, sha256, None)
 
 
 def chi2_map(dn: np.ndarray, expected_dn: np.ndarray, sensor: dict[str, float]) -> np.ndarray:

@@ -25,7 +25,8 @@ import torch
 
 from flightsw.icd.frame import HEADER, Frame, PoseTag
 from flightsw.store import FrameStore
-from flightsw.triage import ModelVerified, Ranked, TriageWorker, sending_order, sent_view
+from flightsw.triage import Ranked, sending_order, sent_view
+from flightsw.triage_worker import ModelVerified, TriageWorker
 from ground.cameras import camera_of, exposed, sensor_of
 from ground.model_files import SURFACE_POINTS
 from ground.session import FrameRecord, Session, open_session

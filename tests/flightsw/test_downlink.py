@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from spacepackets.cfdp.pdu import FileDataPdu, MetadataPdu
@@ -36,7 +37,7 @@ from flightsw.icd.transfer import UPLINK, Receiver, Sender, Verdict, answer_key,
 from flightsw.icd.transfer.checksum import TYPES
 from flightsw.settings import Settings, save_settings
 from flightsw.store import FrameStore
-from flightsw.triage import verified_model
+from flightsw.triage_worker import ModelProcess
 from ground.uplink import make_key
 
 
@@ -238,11 +239,12 @@ class HeldTriage:
     def __init__(self, monkeypatch):
         self.go = threading.Event()
 
-        def verified(path: Path) -> bytes:
+        def begin(process: ModelProcess) -> dict[str, Any]:
             self.go.wait(30)
-            return verified_model(path)
+            return begin_at_once(process)
 
-        monkeypatch.setattr("flightsw.triage.verified_model", verified)
+        begin_at_once = ModelProcess.begin
+        monkeypatch.setattr(ModelProcess, "begin", begin)
 
 
 def ends(link: ListLink) -> dict[int, tuple[str, str]]:
