@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.benchmarks.figures import PAGES as PAGES_WITH_FIGURES
+from tests.benchmarks.figures import blocks, wrong
+
 ROOT = Path(__file__).parents[1]
 PAGES = [
     ROOT / "README.md",
@@ -53,3 +56,17 @@ def test_every_page_is_in_the_site():
     navigation = (ROOT / "mkdocs.yml").read_text()
     pages = [p.relative_to(ROOT / "docs") for p in PAGES if p.is_relative_to(ROOT / "docs")]
     assert [str(page) for page in pages if f"{page}" not in navigation] == []
+
+
+@pytest.mark.parametrize("page", PAGES_WITH_FIGURES, ids=lambda page: page.name)
+def test_every_figure_comes_from_rows(page):
+    found = {block: problems for block in blocks(page.read_text()) if (problems := wrong(block))}
+    assert found == {}
+
+
+def test_a_changed_digit_is_found():
+    page = PAGES_WITH_FIGURES[0].read_text()
+    changed = [
+        *blocks(page.replace("**44.8 dB**", "**44.9 dB**").replace("12 reach 35 dB", "12 reach 36 dB"))
+    ]
+    assert sum(bool(wrong(block)) for block in changed) == 2

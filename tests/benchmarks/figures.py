@@ -1,0 +1,187 @@
+"""The figures of README and docs/measured.md, and the rows that each comes from: `python -m tests.benchmarks.figures`.
+
+A paragraph or list item that holds figures ends with a comment, which a reader of the page does not see. It holds
+the queries that give them, divided by semicolons, and after `given` the numbers that are conditions, not results. The
+comment below a table has a line of queries for each of its rows.
+
+    On TDRS 44.2 dB. <!-- rows: mean(six400, psnr, target="TDRS-400") -->
+
+A query is an expression in Python of `mean`, `least` and `most`, each with the name of a file of rows, the key of a
+figure and what rows must hold. `psnr` and the like are short for keys, `o200` and the like for files. Rows are those
+`as taken` and of all steps unless the query says otherwise; seeds are averaged first, then targets.
+"""
+
+import json
+import re
+import statistics
+import sys
+from collections.abc import Iterator
+from functools import cache
+from typing import Any
+
+from tests.benchmarks.rows import FOLDER, ROOT
+
+PAGES = (ROOT / "README.md", ROOT / "docs" / "measured.md")
+COMMENT = re.compile(r"<!-- rows:(.*?)-->", re.DOTALL)
+BELOW_A_TABLE = re.compile(r"<!-- rows of the table, a line each:\n(.*?)\n-->", re.DOTALL)
+# what is no result: code, links' targets, comments, names of experiments, picture sizes and counts in words beside them
+NO_FIGURE = re.compile(r"`[^`]*`|\]\([^)]*\)|\[\d{3}\]|<!--.*?-->|\d+x\d+|https?://\S+", re.DOTALL)
+UNIT = r"(?:dB|%|s\b|Gaussians|times|degrees|pixels|px)"
+FIGURE = re.compile(  # decimals, thousands, whole numbers before a unit or a further number with one, those of a table
+    rf"(?<![\w.,])(\d[\d,]*\.\d+|\d{{1,3}}(?:,\d{{3}})+|\d+(?=(?:(?: to| and| or|,) \d+)* {UNIT})|(?<=\| )\d+(?= ))"
+    r"(?!\w|\.\d)"
+)
+KEYS = {
+    "psnr": "psnr_clean_db",
+    "foreground": "psnr_foreground_db",
+    "pooled": "psnr_clean_pooled_db",
+    "best": "psnr_best_db",
+    "chamfer": "chamfer",
+    "hausdorff": "hausdorff",
+    "surface": "completeness_surface",
+    "accuracy": "accuracy_surface",
+    "gaussians": "gaussians",
+    "seconds": "seconds",
+    "cpu": "cpu_seconds",
+    "CHI2": "chi2_held_out_both",
+}
+# the columns of README's table: seconds by the clock, without the number of Gaussians, seconds of the processor
+A, B, C = (
+    f"psnr foreground chamfer surface accuracy {last}"
+    for last in ("gaussians seconds", "cpu", "gaussians cpu")
+)
+FILES = {
+    "o200": "opponents-200x200",
+    "o400": "opponents-400x400",
+    "six400": "six-targets-400x400",
+    "o800": "paper-size-800x800",
+    "frozen": "frozen-targets-200x200",
+    "moving": "moving-sun-200x200",
+    "stability": "stability-200x200",
+    "robustness": "robustness-200x200",
+    "drafts": "drafts-400x400",
+    "foil": "foil-400x400",
+    "sector": "sector-200x200",
+    "sky": "sky-100x100",
+    "size": "size-200x200",
+    "mesh": "mesh-400x400",
+    "demo": "demo",
+    "live": "live",
+    "lego": "lego",
+    "ngp": "instant-ngp-200x200",
+    "bodies": "bodies",
+    "poses": "poses",
+    "photographs": "photographs",
+    "rasterizer": "rasterizer",
+}
+
+
+def by_target(file: str, key: str, method: str | None = "obbgs", **where: Any) -> list[float]:
+    """Return a figure of each target, the mean of its seeds; `where` holds what a row must say, None for anything."""
+    asked = {"method": method, "condition": "as taken", "steps_share": 1.0} | where
+    found: dict[str, list[float]] = {}
+    for row in _rows(file):
+        if all(value is None or row.get(name, value) == value for name, value in asked.items()):
+            value = row.get(key)
+            if value is not None:
+                found.setdefault(row.get("target", ""), []).append(float(value))
+    if not found:
+        raise LookupError(f"no row of results/{file}.jsonl has {key} where {asked}")
+    return [statistics.fmean(values) for values in found.values()]
+
+
+def mean(file: str, key: str, method: str | None = "obbgs", **where: Any) -> float:
+    """Return the mean over targets of the mean over seeds."""
+    return statistics.fmean(by_target(file, key, method, **where))
+
+
+def means(file: str, keys: str, method: str | None = "obbgs", **where: Any) -> list[float]:
+    """Return the means of several figures, named in one text by their short names."""
+    return [mean(file, KEYS[key], method, **where) for key in keys.split()]
+
+
+def least(file: str, key: str, method: str | None = "obbgs", **where: Any) -> float:
+    """Return the least of the targets' means over seeds."""
+    return min(by_target(file, key, method, **where))
+
+
+def most(file: str, key: str, method: str | None = "obbgs", **where: Any) -> float:
+    """Return the largest of the targets' means over seeds."""
+    return max(by_target(file, key, method, **where))
+
+
+def blocks(page: str) -> Iterator[str]:
+    """Yield the paragraphs, list items and lines of tables of a page, each with the comment of its queries."""
+    page = re.sub(r"```.*?```", "", page, flags=re.DOTALL)
+    parts = re.split(r"\n\s*\n", page)
+    for part, following in zip(parts, [*parts[1:], ""], strict=True):
+        if part.lstrip().startswith("|"):
+            _, _, *lines = part.splitlines()  # without the titles and the line below them
+            below = BELOW_A_TABLE.match(following)
+            queries = below.group(1).splitlines() if below else [""] * len(lines)
+            yield from (f"{line} <!-- rows: {query} -->" for line, query in zip(lines, queries, strict=True))
+        elif not BELOW_A_TABLE.match(part):
+            yield from re.split(r"(?m)^(?=- )", part)
+
+
+def wrong(block: str) -> list[str]:
+    """Return what is wrong with a block: figures that no query gives, and queries that give no figure of it."""
+    comment = COMMENT.search(block)
+    queries, _, given = (comment.group(1) if comment else "").partition("given")
+    conditions = FIGURE.findall(given) + re.findall(r"[\d.,]*\d", given)
+    figures = [text for text in FIGURE.findall(NO_FIGURE.sub("", block)) if text not in conditions]
+    names: dict[str, Any] = {
+        **{function.__name__: function for function in (by_target, mean, means, least, most)},
+        **KEYS,
+        **FILES,
+        **{"A": A, "B": B, "C": C},
+        "__builtins__": {},
+    }
+    values = {}
+    for query in filter(None, map(str.strip, queries.split(";"))):
+        value = eval(query, names)  # our own pages, nobody else's
+        values |= (
+            {query: value} if isinstance(value, float) else {f"{query}[{i}]": v for i, v in enumerate(value)}
+        )
+    found = [
+        f"{text} comes from no row" for text in figures if not any(_shows(text, v) for v in values.values())
+    ]
+    idle = [
+        f"no figure shows {query} = {value:.6g}"
+        for query, value in values.items()
+        if not any(_shows(text, value) for text in figures)
+    ]
+    return found + idle
+
+
+@cache
+def _rows(file: str) -> list[dict[str, Any]]:
+    from ground.compare.results import with_best
+
+    return [
+        with_best(json.loads(line)) for line in (FOLDER / f"{file}.jsonl").read_text().splitlines() if line
+    ]
+
+
+def _shows(text: str, value: float) -> bool:
+    digits = text.replace(",", "")
+    decimals = len(digits.partition(".")[2])
+    return abs(float(digits) - value) <= 0.5 * 10**-decimals * (1 + 1e-9)
+
+
+def main() -> None:
+    """Print what is wrong with the figures of the pages; exit code 1 if anything is."""
+    found = [
+        (page, block, problems)
+        for page in PAGES
+        for block in blocks(page.read_text())
+        if (problems := wrong(block))
+    ]
+    for page, block, problems in found:
+        print(f"{page.relative_to(ROOT)}: {' '.join(block.split())[:90]}")
+        print("".join(f"    {problem}\n" for problem in problems), end="")
+    sys.exit(1 if found else 0)
+
+
+if __name__ == "__main__":
+    main()
