@@ -21,7 +21,14 @@ from ground import attitude
 from ground.attitude import FoundAttitude, in_body_axes
 from ground.cameras import sensor_of
 from ground.live_status import LIVE_CHECKPOINT, LIVE_STATUS
-from ground.session import FrameRecord, Session, SessionError, open_session, read_records
+from ground.session import (
+    FrameRecord,
+    Session,
+    SessionError,
+    open_session,
+    read_frame_lines,
+    read_records,
+)
 from ground.training_frames import split, training_frame
 from obbgs_base.files import UNUSED, read_bounded
 from obbgs_core.errors import ReconstructionError
@@ -152,13 +159,13 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
 def session_facts(session: Session) -> dict[str, str | float]:
     """Return what says of a session that it is the same one: for config.yaml, and to compare with it."""
     # frames that came later stand behind those that were read
-    lines = (session.path / "frames.jsonl").read_bytes().splitlines(keepends=True)[: len(session.frames)]
+    lines = read_frame_lines(session.path).raw[: len(session.frames)]
     pictures = hashlib.sha256()
     for record in session.frames:
         pictures.update((session.path / record.file).read_bytes())
     return {
         "mission_sha256": session.mission_sha256,
-        "frames_jsonl_sha256": hashlib.sha256(b"".join(lines)).hexdigest(),
+        "frames_jsonl_sha256": hashlib.sha256(b"".join(line + b"\n" for line in lines)).hexdigest(),
         "pictures_sha256": pictures.hexdigest(),
         "created_utc": session.created_utc,
         "background": session.background,

@@ -13,12 +13,20 @@
 
 `SessionWriter` in session_writer.py adds frames; each step is whole or not done, so that a session opens again after
 a power cut at any moment. `open_session` reads one.
+
+What came over a link carries checksums: session.json and each line of the .jsonl files a CRC-32, pictures those of PNG.
+session.json and frames.jsonl stand twice, the second time with `.copy` behind their names, and what is damaged in one
+is taken from the other. A line that is damaged in both costs that frame alone, and is counted. Files without checksums
+are taken as they are: those of earlier versions, of imported pictures, and whatever is written by hand. Who edits
+session.json or a line of frames.jsonl by hand removes its entry `crc32`.
 """
 
 import dataclasses
-import json
+import functools
+import logging
 import math
 import re
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,15 +39,20 @@ from flightsw.icd.config import MAX_JSON_BYTES, ConfigError, build, keys_below, 
 from flightsw.icd.frame import Attitude
 from flightsw.icd.mission import CameraSection
 from ground.telemetry import FlightCounts
+from obbgs_base.checked import Lines, copy_of, names_checksum, read_lines_twice, read_twice
 from obbgs_base.errors import ObbgsError
 from obbgs_base.files import read_bounded
 from obbgs_base.navigation_errors import SharedParameters
+
+log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 1
 SPLITS = ("train", "val", "test")
 ENCODINGS = ("linear", "srgb")
 # No other file name is opened: a session may come from someone else.
 FRAME_FILE = re.compile(r"frames/\d{6,10}\.png", re.ASCII)
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+LINES_DAMAGED = "lines_damaged"  # the name of their count among the losses
 
 
 class SessionError(ObbgsError):
@@ -193,7 +206,13 @@ class Session:
         """
         path = self.path / record.file
         try:
-            dn = imagecodecs.png_decode(path.read_bytes())
+            content = path.read_bytes()
+            if not is_whole_png(content):
+                raise ValueError(
+                    "it is damaged; while the frame is still on board, "
+                    f"`ground uplink resend {record.id} {record.id}` brings it again"
+                )
+            dn = imagecodecs.png_decode(content)
         except FileNotFoundError as error:
             raise MissingFrames(f"frame {record.id}: {path} is not there", (record.id,)) from error
         except (OSError, ValueError, RuntimeError) as error:
@@ -208,6 +227,8 @@ class Session:
 
 def open_session(folder: str | Path) -> Session:
     """Return the session in a folder, without an unfinished last line of frames.jsonl.
+
+    Damage is told in a warning; lines of frames.jsonl that are damaged in both copies count among the losses.
 
     Raises:
         SessionError: there is no session, or one of another schema version.
@@ -235,9 +256,12 @@ def open_session(folder: str | Path) -> Session:
         )
     except (ConfigError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise SessionCorrupt(f"{folder / 'session.json'}: {error}") from error
-    frames = tuple(sorted(read_records(folder), key=lambda record: record.id))
+    lines = read_frame_lines(folder)
+    frames = tuple(sorted(records_of(folder, lines), key=lambda record: record.id))
     if not frames:
-        raise MissingFrames(f"{folder} holds no frames")
+        raise MissingFrames(f"{folder} holds no frames{damage_of(lines)}")
+    if lines.lost:
+        losses[LINES_DAMAGED] = losses.get(LINES_DAMAGED, 0) + lines.lost
     missing = tuple(record.id for record in frames if not (folder / record.file).is_file())
     if missing:
         named = ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
@@ -254,21 +278,25 @@ def open_session(folder: str | Path) -> Session:
 
 
 def read_header(folder: Path) -> dict[str, Any]:
-    """Return session.json, its schema version checked.
+    """Return session.json, its schema version checked; where it is damaged, what its copy holds.
 
     Raises:
         SessionError: there is no session.json, it cannot be read, or it has another schema version.
-        SessionCorrupt: it is not a JSON object.
+        SessionCorrupt: it is not a JSON object, or does not fit its checksum and has no good copy.
     """
     path = folder / "session.json"
     try:
-        header = parse_json(read_bounded(path, MAX_JSON_BYTES), "session")
+        header = _header(path)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise SessionError(f"{folder} is not a session: it has no session.json") from error
     except OSError as error:
         raise SessionError(f"{path} cannot be read: {error}") from error
     except ConfigError as error:
         raise SessionCorrupt(f"{path}: {error}") from error
+    except ValueError as error:
+        raise SessionCorrupt(
+            f"{path}: {error}, and there is no good copy; who edits it by hand removes its entry crc32"
+        ) from error
     if not isinstance(header, dict):
         raise SessionCorrupt(f"{path} should hold an object")
     if header.get("schema_version") != SCHEMA_VERSION:
@@ -277,6 +305,19 @@ def read_header(folder: Path) -> dict[str, Any]:
             f"this software reads {SCHEMA_VERSION}"
         )
     return header
+
+
+def _header(path: Path) -> Any:
+    """Return what session.json holds: the good one of the two; one that names no checksum as it is."""
+    has_copy = copy_of(path).exists()
+    content = b"" if has_copy and not path.exists() else read_bounded(path, MAX_JSON_BYTES)
+    if not names_checksum(content):
+        try:
+            return parse_json(content, "session")
+        except ConfigError:
+            if not has_copy:
+                raise
+    return read_twice(path, lambda problem: _tell(f"{path.parent}: {problem}"), mend=False)
 
 
 def flight_counts(header: dict[str, Any]) -> FlightCounts | None:
@@ -317,26 +358,67 @@ def _navigation(header: dict[str, Any]) -> Navigation:
     return build(Navigation, tree, "session.navigation", sigmas=sigmas)
 
 
-def read_records(folder: Path) -> list[FrameRecord]:
-    """Return the whole lines of frames.jsonl in their order; [] where there is no such file.
+def read_frame_lines(folder: Path) -> Lines:
+    """Return the whole lines of frames.jsonl in their order, none where there is no such file; damage is told.
 
     Raises:
-        SessionCorrupt: a line is damaged, or a frame occurs twice.
+        SessionError: the disk refuses it.
+    """
+    try:
+        lines = read_lines_twice(folder / "frames.jsonl", "id")
+    except OSError as error:
+        raise SessionError(f"{folder / 'frames.jsonl'} cannot be read: {error}") from error
+    if damage := damage_of(lines):
+        _tell(f"{folder / 'frames.jsonl'}{damage}")
+    return lines
+
+
+def damage_of(lines: Lines) -> str:
+    """Return what is wrong with frames.jsonl, to be read after its name; nothing of a whole one."""
+    words = []
+    if lines.problems:
+        words.append(f"has {len(lines.problems)} damaged lines ({lines.problems[0]})")
+    if lines.restored:
+        words.append(f"{lines.restored} frames stand in its copy only and are taken from there")
+    if lines.lost:
+        words.append(f"{lines.lost} frames are lost: `ground uplink resend` asks for what is still on board")
+    return ": " + "; ".join(words) if words else ""
+
+
+def read_records(folder: Path) -> list[FrameRecord]:
+    """Return the frames of frames.jsonl in the order of its lines; [] where there is no such file.
+
+    Raises:
+        SessionError, SessionCorrupt: as `read_frame_lines` and `records_of`.
+    """
+    return records_of(folder, read_frame_lines(folder))
+
+
+def records_of(folder: Path, lines: Lines) -> list[FrameRecord]:
+    """Return the frames of lines of a folder's frames.jsonl, in their order.
+
+    Raises:
+        SessionCorrupt: a line's values are wrong, a frame occurs twice, or a line without checksum is damaged.
     """
     path = folder / "frames.jsonl"
-    if not path.exists():
-        return []
-    *lines, _unfinished = path.read_bytes().split(b"\n")
+    if lines.problems and lines.unchecked == len(lines.raw) and not lines.restored:
+        raise SessionCorrupt(f"{path} {lines.problems[0]}")
     records: dict[int, FrameRecord] = {}
-    for number, line in enumerate(lines, start=1):
+    for number, tree in enumerate(lines.trees, start=1):
         try:
-            record = _record(json.loads(line))
+            record = _record(tree)
             if record.id in records:
                 raise ValueError(f"frame {record.id} is there twice")
         except (ValueError, TypeError, KeyError) as error:
             raise SessionCorrupt(f"{path} line {number}: {error}") from error
         records[record.id] = record
     return list(records.values())
+
+
+@functools.lru_cache(maxsize=1000)
+def _tell(problem: str) -> None:
+    """Log what is wrong, once: a session that is being written is read again and again."""
+    log.warning("%s", problem)
 
 
 def _record(tree: Any) -> FrameRecord:
@@ -375,6 +457,21 @@ def _record(tree: Any) -> FrameRecord:
     if not is_pose(values["world_to_camera"]):
         raise ValueError(f"world_to_camera must turn and move, got {values['world_to_camera'].tolist()}")
     return FrameRecord(**values)
+
+
+def is_whole_png(content: bytes) -> bool:
+    """Return whether a PNG has all its parts and every checksum fits; what the parts say is not looked at."""
+    at = len(PNG_SIGNATURE)
+    if not content.startswith(PNG_SIGNATURE):
+        return False
+    while True:
+        end = at + 12 + int.from_bytes(content[at : at + 4])
+        part = content[at + 4 : end - 4]
+        if end > len(content) or zlib.crc32(part) != int.from_bytes(content[end - 4 : end]):
+            return False
+        if part.startswith(b"IEND"):
+            return True
+        at = end
 
 
 def is_pose(matrix: np.ndarray) -> bool:

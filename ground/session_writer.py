@@ -2,8 +2,7 @@
 
 import dataclasses
 import hashlib
-import json
-import os
+import logging
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,15 +15,21 @@ from flightsw.icd.mission import Mission
 from flightsw.icd.quaternion import matrix_to_quat
 from flightsw.icd.tle import orbit_axes
 from ground.session import (
+    LINES_DAMAGED,
     SCHEMA_VERSION,
     SessionCorrupt,
     SessionError,
     flight_counts,
+    is_whole_png,
+    read_frame_lines,
     read_header,
-    read_records,
+    records_of,
 )
 from ground.telemetry import FlightCounts
-from obbgs_base.files import append_line, write_whole
+from obbgs_base.checked import append_twice, checked_text, copy_of, write_twice
+from obbgs_base.files import set_aside, write_whole
+
+log = logging.getLogger(__name__)
 
 
 class SessionWriter:
@@ -39,17 +44,16 @@ class SessionWriter:
         self.folder = Path(folder)
         self._mission = mission
         self._navigation = navigation_of(mission)
-        self._frames_file = self.folder / "frames.jsonl"
+        self._frames_file, self._header_file = self.folder / "frames.jsonl", self.folder / "session.json"
         self._losses_before: dict[str, int] = {}
         self._bytes_before = 0
         self.flight: FlightCounts | None = None  # as in session.json
         self._created_utc = datetime.now(UTC).isoformat(timespec="seconds")
         try:
             (self.folder / "frames").mkdir(parents=True, exist_ok=True)
-            if (self.folder / "session.json").exists():
+            if any(each.exists() for each in (self._header_file, copy_of(self._header_file))):
                 self._continue()
-            self._sha256_of = {record.id: record.sha256 for record in read_records(self.folder)}
-            self._cut_unfinished_line()
+            self._sha256_of = self._mended_lines()
             self.save({}, 0)
         except OSError as error:
             raise SessionError(f"cannot write the session {self.folder}: {error}") from error
@@ -66,6 +70,8 @@ class SessionWriter:
     def add(self, frame: Frame, container: bytes) -> bool:
         """Write a frame's picture and line, and return True; return False if the session already holds this very frame.
 
+        A picture of it that is damaged or gone is written again.
+
         Args:
             container: the frame as received; its SHA-256 tells whether two frames are the same.
 
@@ -81,17 +87,20 @@ class SessionWriter:
                     f"another frame {frame.frame_id} is in the session already; if the spacecraft has a new store, "
                     "start `ground listen` with another --session"
                 )
-            return False
+            if self._has_picture(frame.frame_id):
+                return False
+            log.warning("the picture of frame %d was damaged and is written again", frame.frame_id)
         camera = self._mission.camera
         shape = (camera.height, camera.width) + ((3,) if camera.channels == 3 else ())
         if frame.dn.shape != shape:
             raise SessionError(
                 f"frame {frame.frame_id} has shape {frame.dn.shape}, the mission's camera {shape}"
             )
-        name = f"frames/{frame.frame_id:06d}.png"
+        name = _picture_of(frame.frame_id)
         write_whole(self.folder / name, bytes(imagecodecs.png_encode(frame.dn, level=1)))
-        line = json.dumps(frame_line(frame, name, sha256), allow_nan=False).encode()
-        append_line(self._frames_file, line)
+        if known is not None:
+            return True
+        append_twice(self._frames_file, frame_line(frame, name, sha256))
         self._note_attitude(frame.pose.attitude)
         self._sha256_of[frame.frame_id] = sha256
         return True
@@ -99,7 +108,7 @@ class SessionWriter:
     def save(
         self, losses: Mapping[str, int], bytes_received: int, flight: FlightCounts | None = None
     ) -> None:
-        """Write session.json.
+        """Write session.json and its copy.
 
         `losses` and `bytes_received` are counts of this run and added to those of earlier runs; `flight` replaces the
         earlier value, unless it is None.
@@ -123,7 +132,7 @@ class SessionWriter:
             "bytes_received": self._bytes_before + bytes_received,
             "created_utc": self._created_utc,
         }
-        write_whole(self.folder / "session.json", json.dumps(header, indent=2).encode() + b"\n")
+        write_twice(self._header_file, header, form=checked_text)
 
     def _continue(self) -> None:
         header = read_header(self.folder)
@@ -144,12 +153,34 @@ class SessionWriter:
         """Keep the least that the mission file or any tag knows of the target's attitude."""
         self._navigation["attitude"] = max(self._navigation["attitude"], attitude, key=ATTITUDES.index)
 
-    def _cut_unfinished_line(self) -> None:
-        if self._frames_file.exists():
-            content = self._frames_file.read_bytes()
-            whole_bytes = content.rfind(b"\n") + 1
-            if whole_bytes < len(content):
-                os.truncate(self._frames_file, whole_bytes)
+    def _has_picture(self, frame_id: int) -> bool:
+        try:
+            return is_whole_png((self.folder / _picture_of(frame_id)).read_bytes())
+        except OSError:
+            return False
+
+    def _mended_lines(self) -> dict[int, str]:
+        """Return the digests of the frames, and make both copies of frames.jsonl whole; what is damaged is set aside.
+
+        A last line that was left unfinished goes.
+        """
+        lines = read_frame_lines(self.folder)
+        digests = {record.id: record.sha256 for record in records_of(self.folder, lines)}
+        if lines.lost:
+            self._losses_before[LINES_DAMAGED] = self._losses_before.get(LINES_DAMAGED, 0) + lines.lost
+        content = b"".join(line + b"\n" for line in lines.raw)
+        for each in (self._frames_file, copy_of(self._frames_file)):
+            before = each.read_bytes() if each.exists() else b""
+            if before == content:
+                continue
+            if not content.startswith(before) and not before.startswith(content):
+                log.warning("the damaged %s is kept as %s", each.name, set_aside(each).name)
+            write_whole(each, content)
+        return digests
+
+
+def _picture_of(frame_id: int) -> str:
+    return f"frames/{frame_id:06d}.png"
 
 
 def navigation_of(mission: Mission) -> dict[str, Any]:

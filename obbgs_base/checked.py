@@ -5,13 +5,15 @@ A checked line is a JSON object whose last key, `crc32`, holds the CRC-32 of the
 
 import contextlib
 import json
+import os
 import re
 import zlib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from obbgs_base.files import write_whole
+from obbgs_base.files import append_line, write_whole
 
 CHECKED = re.compile(rb'(\{.*),(?: |\n  )"crc32": "([0-9a-f]{8})"\n?\}', re.DOTALL)
 
@@ -37,6 +39,28 @@ def has_checksum(line: bytes) -> bool:
     return CHECKED.fullmatch(line) is not None
 
 
+def names_checksum(content: bytes) -> bool:
+    """Return whether there is the name of a checksum in it; what earlier versions or people wrote has none."""
+    return b'"crc32"' in content
+
+
+def parse_line(line: bytes) -> dict[str, Any]:
+    """Return the object of a line without its checksum, which must fit if it names one.
+
+    Raises:
+        ValueError: it is no JSON object, or the checksum does not fit.
+    """
+    if names_checksum(line):
+        return parse_checked_line(line)
+    try:
+        tree = json.loads(line)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    if not isinstance(tree, dict):
+        raise ValueError("expected an object")
+    return tree
+
+
 def parse_checked_line(line: bytes) -> dict[str, Any]:
     """Return the object of a line without its checksum.
 
@@ -49,6 +73,108 @@ def parse_checked_line(line: bytes) -> dict[str, Any]:
     if int(found[2], 16) != zlib.crc32(found[1]):
         raise ValueError(f"the checksum does not fit the line {line[:40]!r}")
     return json.loads(found[1] + b"}")
+
+
+@dataclass(frozen=True)
+class Lines:
+    """What the whole lines of a file say.
+
+    raw: the lines, without line feeds, in the order in which they were written; `trees` are their objects without
+        checksums.
+    problems: what is wrong with each line that is damaged and left out.
+    restored: how many of the lines only the file's copy still has.
+    lost: how many lines are damaged in both.
+    unchecked: how many of the lines have no checksum: earlier versions and other programs write none.
+    """
+
+    raw: tuple[bytes, ...] = ()
+    trees: tuple[dict[str, Any], ...] = ()
+    problems: tuple[str, ...] = ()
+    restored: int = 0
+    lost: int = 0
+    unchecked: int = 0
+
+
+def parse_lines(content: bytes) -> Lines:
+    """Return the whole lines of a file; a line feed ends each, and what stands behind the last one is unfinished.
+
+    A line that names no checksum is taken as it is: no single bit makes one of a line that had one, but by its name.
+    """
+    *lines, _unfinished = content.split(b"\n")
+    raw, trees, problems, unchecked = [], [], [], 0
+    for number, line in enumerate(lines, start=1):
+        try:
+            tree = parse_line(line)
+        except ValueError as error:
+            problems.append(f"line {number}: {error}")
+            continue
+        raw.append(line)
+        trees.append(tree)
+        unchecked += not names_checksum(line)
+    return Lines(tuple(raw), tuple(trees), tuple(problems), 0, len(problems), unchecked)
+
+
+def read_lines(path: Path) -> Lines:
+    """Return the whole lines of a file, none where it is not there.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    try:
+        return parse_lines(path.read_bytes())
+    except FileNotFoundError:
+        return Lines()
+
+
+def append_twice(path: Path, tree: Mapping[str, Any]) -> None:
+    """Append an object as a checked line to a file and then to its copy.
+
+    Raises:
+        OSError: the disk refuses; the file is as it was before.
+    """
+    line, before_bytes = checked_line(tree), path.stat().st_size if path.exists() else 0
+    append_line(path, line)
+    try:
+        append_line(copy_of(path), line)
+    except OSError:
+        os.truncate(path, before_bytes)
+        raise
+
+
+def read_lines_twice(path: Path, name: str) -> Lines:
+    """Return the whole lines that `append_twice` wrote, each at its place; nothing is written.
+
+    A line that is damaged or missing in one of the two files comes from the other. A file of which no line names a
+    checksum was written by hand, and its copy is not looked at.
+
+    Args:
+        name: of the entry that tells whether two lines say the same.
+
+    Raises:
+        OSError: neither of the files can be read, or one of them not.
+    """
+    content, copied = (each.read_bytes() if each.exists() else b"" for each in (path, copy_of(path)))
+    here = parse_lines(content)
+    if content.startswith(copied):  # as after each write, and after a power cut between the two
+        return here
+    if here.raw and here.unchecked == len(here.raw) and content.endswith(b"\n"):
+        return here  # written anew by hand
+    there = parse_lines(copied)
+    raw, trees = list(here.raw), list(here.trees)
+    place = {repr(tree.get(name)): at for at, tree in enumerate(trees)}
+    inserted = at = 0  # so many came from the copy; the next one belongs there
+    for line, tree in zip(there.raw, there.trees, strict=True):
+        known = place.get(repr(tree.get(name)))
+        if known is not None:
+            at = max(at, known + inserted + 1)
+            continue
+        raw.insert(at, line)
+        trees.insert(at, tree)
+        inserted, at = inserted + 1, at + 1
+    not_whole = len(there.problems) + (not copied.endswith(b"\n"))
+    lost = max(0, min(len(here.problems) - inserted, not_whole))
+    problems = here.problems + tuple(f"{copy_of(path).name} {problem}" for problem in there.problems)
+    return Lines(tuple(raw), tuple(trees), problems, inserted, lost, here.unchecked)
 
 
 def copy_of(path: Path) -> Path:
@@ -72,12 +198,15 @@ def write_twice(
     write(copy_of(path), content)
 
 
-def read_twice(path: Path, on_damage: Callable[[str], None]) -> dict[str, Any] | None:
+def read_twice(path: Path, on_damage: Callable[[str], None], mend: bool = True) -> dict[str, Any] | None:
     """Return the object that `write_twice` wrote, None where neither file is there.
 
     Where one of the two is damaged or gone, or older than the other since the power went between them, it is written
     again if the disk lets it, and `on_damage` is told of damage. A file of an earlier version, which has neither a
     checksum nor a copy, is taken as it is.
+
+    Args:
+        mend: whether to write; False for a reader of what another process writes.
 
     Raises:
         ValueError: neither of them is whole.
@@ -104,7 +233,7 @@ def read_twice(path: Path, on_damage: Callable[[str], None]) -> dict[str, Any] |
             raise problems[0]
         return earlier
     for each, content in zip(both, contents, strict=True):
-        if content != good:
+        if mend and content != good:
             with contextlib.suppress(OSError):  # on a disk that is full or read-only one is enough
                 write_whole(each, good)
     if problems:

@@ -260,7 +260,8 @@ def test_hostile_names_and_bad_containers_are_counted_and_never_leave_the_sessio
     assert ground.summary.frames_received == 1
     assert [record.id for record in open_session(tmp_path / "session").frames] == [2]
     session_files = {path.name for path in (tmp_path / "session").rglob("*") if path.is_file()}
-    assert session_files == {"session.json", "frames.jsonl", "000002.png", "listener.lock"}
+    twice = {f"{name}{end}" for name in ("session.json", "frames.jsonl") for end in ("", ".copy")}
+    assert session_files == {*twice, "000002.png", "listener.lock"}
     assert {path for path in tmp_path.rglob("*") if "session" not in path.parts} == before
 
 
