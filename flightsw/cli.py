@@ -23,6 +23,7 @@ from flightsw.icd.mission import BracketSection, Mission, load_mission
 from flightsw.run import RunResult, run_pass
 from flightsw.sequencer import plan
 from obbgs_base.command_line import new_app, run
+from obbgs_base.output import output_may_fail
 
 log = logging.getLogger(__name__)
 app = new_app("The flight software: takes frames, stores them, sends them down and obeys commands.")
@@ -368,6 +369,7 @@ def with_bracket(
     return dataclasses.replace(mission, bracket=section, orbit=orbit)
 
 
+@output_may_fail(log)
 def _run(
     mission: Mission,
     store_dir: Path,

@@ -22,12 +22,14 @@ from ground.cli_systems import dictionary_command, yamcs_command
 from ground.cli_uplink import uplink_command
 from ground.cli_view import view_command
 from obbgs_base.command_line import new_app, run
+from obbgs_base.output import output_may_fail
 
 app = new_app("The ground station: frames in, a 3D model out.")
 stderr = Console(stderr=True)
 
 
 @app.command("listen")
+@output_may_fail()
 def listen_command(
     link: Annotated[str, typer.Option(help="The link's URL, such as serial:///dev/ttyUSB0?baud=921600.")],
     session: SessionDir,

@@ -28,10 +28,12 @@ from ground.live_status import LiveStatus, line
 from ground.progress import Lines, Stop, say
 from ground.summary import frames_row, model_rows, table
 from obbgs_base.imports import quick_imports
+from obbgs_base.output import output_may_fail
 
 stderr = Console(stderr=True)
 
 
+@output_may_fail()
 def live_command(
     session: SessionDir,
     link: Annotated[
@@ -125,7 +127,7 @@ def _receive(
     key: Key | None,
 ) -> None:
     """Receive a pass here, with the training in a process of its own, and wait for its model."""
-    from ground.console import statuses_shown
+    from ground.console import failures_told, statuses_shown
     from ground.ingest import Status, listen
 
     stop = threading.Event()
@@ -146,7 +148,7 @@ def _receive(
                 exit_after,
                 idle_timeout,
                 should_stop=stop.is_set,
-                on_status=with_model,
+                on_status=failures_told(with_model),
                 on_event=on_event,
                 key=key,
             )

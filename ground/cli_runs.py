@@ -34,10 +34,12 @@ from ground.progress import Stop, say, shares_shown, steps_shown
 from ground.summary import frames_row, model_rows, table
 from obbgs_base.errors import Interrupted
 from obbgs_base.imports import quick_imports
+from obbgs_base.output import output_may_fail
 
 stderr = Console(stderr=True)
 
 
+@output_may_fail()
 def reconstruct_command(
     session: SessionDir,
     name: RunName = "run",

@@ -9,11 +9,13 @@ import typer
 
 from flightsw.icd.mission import load_mission
 from ground.cli_options import AsJson, UplinkCommand, listening_key
+from obbgs_base.output import output_may_fail
 
 if TYPE_CHECKING:
     from flightsw.icd.command import Command
 
 
+@output_may_fail()
 def uplink_command(
     command: Annotated[
         UplinkCommand | None, typer.Argument(help="The command; none with --script.", show_default=False)

@@ -9,10 +9,12 @@ import typer
 from rich.console import Console
 
 from obbgs_base.imports import quick_imports
+from obbgs_base.output import output_may_fail
 
 stderr = Console(stderr=True)
 
 
+@output_may_fail()
 def view_command(
     run: Annotated[Path, typer.Argument(help="A run's folder, or a session: its newest run.")],
     other: Annotated[Path | None, typer.Argument(help="A second one, shown beside it.")] = None,

@@ -2,7 +2,9 @@
 
 import contextlib
 import dataclasses
+import functools
 import json
+import logging
 import math
 import os
 import select
@@ -28,6 +30,7 @@ from ground.live_status import line as model_line
 from ground.telemetry import plain
 from ground.terminal_pictures import COLUMNS, LatestPicture
 
+log = logging.getLogger(__name__)
 PLAIN_S, JSON_S = 10.0, 1.0  # between lines where there is no screen
 RATE_WINDOW_S = 5.0
 SILENT_S = 3.0  # without a packet the link counts as silent; housekeeping comes every second
@@ -92,7 +95,23 @@ def statuses_shown(console: Console, as_json: bool, link: str, session: Path) ->
     # Refreshed by on_status, so that no thread of rich's can fail unseen.
     screen = Live(console=console, auto_refresh=False, transient=True)
     with keys_pressed() as keys, screen if live else contextlib.nullcontext():
-        yield on_status, on_event
+        yield failures_told(on_status), failures_told(on_event)
+
+
+def failures_told(show: Callable[[Any], None]) -> Callable[[Any], None]:
+    """Return the function with its failures logged, each once: no fault of what is shown may end a reception."""
+    told: set[str] = set()
+
+    @functools.wraps(show)
+    def shown_or_told(what: Any) -> None:
+        try:
+            show(what)
+        except Exception as error:  # whatever it is, what arrives matters more
+            if repr(error) not in told:
+                told.add(repr(error))
+                log.error("receiving goes on, but it cannot be shown: %r", error, exc_info=error)
+
+    return shown_or_told
 
 
 @contextlib.contextmanager

@@ -1,10 +1,12 @@
 """From the link to the session: receive, check, decode, write. Nothing that arrives can end the pass."""
 
+import contextlib
 import logging
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,7 @@ log = logging.getLogger(__name__)
 WAIT_S = 0.02  # longest wait for bytes before timers are checked again
 SAVE_S = 1.0  # between writes of session.json
 STATUS_S = 0.25  # between updates of the console
+LOG, MAX_LOG_BYTES = "listener.log", 1 << 20  # in the session; the one before is kept as listener.log.1
 # A frame (.obf) or thumbnail (.obt) by its number. Other names are refused, so that none can act as a path.
 FILE_NAME = re.compile(r"(\d{8})\.(obf|obt)", re.ASCII)
 # In intervals of the transfer timer, once the session holds all frames that were asked for:
@@ -128,7 +131,7 @@ def listen(
         LinkError: the port cannot be opened.
         SessionError: the folder cannot be used as this mission's session, or another process listens into it.
     """
-    with open_link(link_url, GROUND_SIDE) as link, listening(Path(session_dir)):
+    with open_link(link_url, GROUND_SIDE) as link, listening(Path(session_dir)), _logged(Path(session_dir)):
         writer = SessionWriter(session_dir, mission)
         ingest = _Ingest(link, writer, mission, on_event, forward, key)
         interval_s = timer_s(link.baud_rate)
@@ -162,6 +165,23 @@ def listen(
         on_progress(ingest.summary())
         on_status(ingest.status(now_s))
         return ingest.summary()
+
+
+@contextlib.contextmanager
+def _logged(session_dir: Path) -> Iterator[None]:
+    """Have warnings and errors kept in the session too, as far as its disk takes them."""
+    handler = RotatingFileHandler(session_dir / LOG, maxBytes=MAX_LOG_BYTES, backupCount=1, delay=True)
+    handler.setLevel(logging.WARNING)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    handler.handleError = lambda record: None
+    logger = logging.getLogger()
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        with contextlib.suppress(OSError):
+            handler.close()
 
 
 class _Ingest:

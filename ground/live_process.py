@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from ground.live_status import read_status
+from obbgs_base.command_line import in_words
 from obbgs_base.errors import Interrupted, ObbgsError
 
 LOG = "live.log"  # in the session: what the training says
@@ -44,9 +45,7 @@ class LiveProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._process is not None and self._process.poll() is None:
-            self._process.terminate()
-            self._process.wait()
+        self._end()
 
     def tend(self) -> None:
         """Start the training, or start it again if it was killed; an error of its own is shown, and it stays ended."""
@@ -54,13 +53,23 @@ class LiveProcess:
         if code is None or code == 0 or self._problem:
             return
         if code > 0 or self._starts == MOST_STARTS:
-            words = self._log.read_text().strip().splitlines()
-            self._problem = words[-1] if code > 0 and words else f"it was killed {self._starts} times"
-            self._say(f"the training has failed, receiving goes on: {self._problem}")
+            words = self._last_words() if code > 0 else ""
+            self._fail(words or f"it was killed {self._starts} times")
             return
         if self._process is not None:
             self._say(f"the training was ended by signal {-code} and is started again")
         self._starts += 1
+        try:
+            self._start()
+        except OSError as error:
+            self._fail(f"its process cannot be started: {in_words(error)}")
+
+    def _end(self) -> None:
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+            self._process.wait()
+
+    def _start(self) -> None:
         with open(self._log, "a") as log:  # its own group: Ctrl-C on the terminal is for the listener
             self._process = subprocess.Popen(
                 ["nice", "-n", str(NICENESS), *self._command],
@@ -69,6 +78,17 @@ class LiveProcess:
                 stderr=log,
                 start_new_session=True,
             )
+
+    def _fail(self, problem: str) -> None:
+        self._problem = problem
+        self._say(f"the training has failed, receiving goes on: {problem}")
+
+    def _last_words(self) -> str:
+        try:
+            lines = self._log.read_text(errors="replace").strip().splitlines()
+        except OSError as error:
+            return f"it ended, and its log cannot be read: {in_words(error)}"
+        return lines[-1] if lines else "it ended without a word"
 
     def status(self) -> dict[str, Any]:
         """Return how the training stands, as `read_status`; {} while it has said nothing."""
@@ -83,16 +103,15 @@ class LiveProcess:
             Interrupted: should_stop returned True; the training is saved.
         """
         self.tend()
-        while self._process is not None and self._process.poll() != 0:
+        while self._process is None or self._process.poll() != 0:
+            if self._problem:
+                raise TrainingFailed(f"no model was finished: {self._problem} (log: {self._log})")
             if should_stop():
-                self._process.terminate()
-                self._process.wait()
+                self._end()
                 raise Interrupted(
                     "interrupted; the training is saved, and the same command goes on from there"
                 )
             self.tend()
-            if self._problem:
-                raise TrainingFailed(f"no model was finished: {self._problem} (log: {self._log})")
             if facts := self.status():
                 on_status(facts)
             time.sleep(POLL_S)

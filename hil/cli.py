@@ -21,6 +21,7 @@ from hil.choices import NAVIGATION, CameraKind, FaultKind, LinkKind, NavigationK
 from hil.sky import SHIPPED, SHIPPED_FOIL, Materials
 from obbgs_base.command_line import new_app, refuse_beside, run
 from obbgs_base.locks import one_command_in
+from obbgs_base.output import output_may_fail
 
 app = new_app("The simulated world: sky, target, camera and link, so that a pass runs on a desk.")
 MissionFile = Annotated[Path, typer.Option("--mission", help="The mission file.")]
@@ -61,6 +62,7 @@ RealTime = Annotated[
 
 
 @app.command()
+@output_may_fail()
 def demo(
     out: Annotated[Path, typer.Option(help="Everything is written below this folder.")] = Path("demo"),
     mission: MissionFile = Path("mission.yaml"),
@@ -104,6 +106,7 @@ def demo(
 
 
 @app.command()
+@output_may_fail()
 def camera(
     listen: Annotated[
         str, typer.Option(help="hil:///path/to/socket, or hil://host:port; port 0 chooses a free one.")
@@ -160,6 +163,7 @@ def camera(
 
 
 @app.command()
+@output_may_fail()
 def link(
     can: Annotated[
         bool, typer.Option(help="Two slcan adapters on a CAN bus instead of a serial line.")
@@ -266,6 +270,7 @@ def scenario(
 
 
 @app.command()
+@output_may_fail()
 def dataset(
     context: typer.Context,
     out: Annotated[

@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 
 from obbgs_base.errors import Interrupted, ObbgsError
 from obbgs_base.extras import how_to_install, installed_package
+from obbgs_base.output import open_standard_streams, output_may_fail
 
 
 class _Group(TyperGroup):
@@ -61,10 +62,13 @@ def refuse_beside(context: typer.Context, option: str, others: Iterable[str]) ->
 def run(app: typer.Typer, tool: str) -> None:
     """Run a command line: one clear line for what went wrong, exit code 2 for usage and configuration, 1 for work.
 
+    An error's message that cannot be written does not change its exit code.
+
     Args:
         tool: its name, also that of the package's extra which installs what it needs.
     """
-    handler = logging.StreamHandler()
+    open_standard_streams()
+    handler = _ToStderr()
     handler.setFormatter(logging.Formatter("%(name)s: %(message)s"))
     handler.setLevel(logging.WARNING)
     logging.basicConfig(level=logging.INFO, handlers=[handler])
@@ -90,6 +94,15 @@ def in_words(error: OSError) -> str:
     return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
 
 
+class _ToStderr(logging.StreamHandler):
+    """Logs to what is stderr at the moment, as `output_may_fail` changes it."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.stream = sys.stderr
+        super().emit(record)
+
+
 def _end(tool: str, message: str, exit_code: int) -> None:
-    print(f"{tool}: {message}", file=sys.stderr)
+    with output_may_fail():
+        print(f"{tool}: {message}", file=sys.stderr)
     sys.exit(exit_code)

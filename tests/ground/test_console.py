@@ -18,7 +18,16 @@ from flightsw.icd.frame import HEADER, encode_frame
 from flightsw.icd.packet import APID_EVENTS, APID_FRAME_HEADERS, APID_HOUSEKEEPING, APID_REPORTS
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import Incoming
-from ground.console import PLAIN_S, ConsoleView, events_once, keys_pressed, link_state, shown, size
+from ground.console import (
+    PLAIN_S,
+    ConsoleView,
+    events_once,
+    failures_told,
+    keys_pressed,
+    link_state,
+    shown,
+    size,
+)
 from ground.ingest import ListenSummary, Status
 from ground.telemetry import TelemetryLog
 from ground.terminal_pictures import COLUMNS, LatestPicture, stretched
@@ -308,3 +317,21 @@ def test_keys_are_read_from_a_terminal_one_by_one_and_it_is_left_as_it_was(monke
     finally:
         os.close(master)
         os.close(slave)
+
+
+def test_whatever_fails_in_the_display_is_told_once_and_the_reception_does_not_see_it(caplog):
+    shown_before: list[Exception] = []
+
+    def show(error: Exception) -> None:
+        shown_before.append(error)
+        raise error
+
+    for error in (OSError(5, "Input/output error"), KeyError("mode"), OSError(5, "Input/output error")):
+        failures_told(show)(error)
+    told = failures_told(show)
+    for _ in range(3):
+        told(RecursionError("too deep"))
+    assert len(shown_before) == 6
+    assert [record.message for record in caplog.records].count(
+        "receiving goes on, but it cannot be shown: RecursionError('too deep')"
+    ) == 1

@@ -320,6 +320,18 @@ def test_a_training_that_fails_by_itself_is_not_started_again_and_its_message_is
     assert len(said) == 1 and "receiving goes on" in said[0]
 
 
+def test_a_training_whose_log_cannot_be_opened_does_not_end_the_reception(tmp_path):
+    """As where `sudo` has left the session's files to another user."""
+    (tmp_path / "live.log").mkdir()
+    said: list[str] = []
+    with LiveProcess(tmp_path, tmp_path / "runs" / "live", [], said.append) as training:
+        for _ in range(3):
+            training.tend()
+        with pytest.raises(TrainingFailed, match=r"cannot be started: .*live\.log: Is a directory"):
+            training.finish(lambda: False, lambda facts: None)
+    assert len(said) == 1 and "receiving goes on" in said[0]
+
+
 @pytest.mark.parametrize("option", [("--idle-timeout", "-3"), ("--exit-after", "0")])
 def test_an_ending_that_cannot_be_is_refused_before_anything_is_written(tmp_path, option):
     folder = tmp_path / "session"
