@@ -230,7 +230,9 @@ def mission_new(
     out: Annotated[
         Path, typer.Argument(help="The mission file to write; one that is there is not replaced.")
     ],
-    target_tle: Annotated[Path, typer.Option(help="A file with the target's two-line elements.")],
+    target_tle: Annotated[
+        Path, typer.Option(help="A file with the target's two-line elements, or an OMM of CCSDS.")
+    ],
     chaser_tle: Annotated[Path, typer.Option(help="The same of the spacecraft with the camera.")],
     target_size: Annotated[float, typer.Option(help="The target's largest dimension, m.")],
     picture: Annotated[str, typer.Option(help="Width and height of the picture, px.")] = "1024x1024",

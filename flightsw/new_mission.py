@@ -7,7 +7,9 @@ from pathlib import Path
 
 from flightsw.icd.config import ConfigError, build, in_file, parse_yaml
 from flightsw.icd.mission import Mission
-from obbgs_base.files import write_whole
+from flightsw.icd.ndm.orbit import two_lines
+from flightsw.icd.ndm.text import MAX_NDM_BYTES, is_message
+from obbgs_base.files import read_bounded, write_whole
 
 EXAMPLE = Path(__file__).with_name(
     "example_mission.yaml"
@@ -29,7 +31,7 @@ def write_mission(
     """Write the example with these figures, after reading it as every part does.
 
     Args:
-        target_tle, chaser_tle: files with two lines, or three with a name.
+        target_tle, chaser_tle: files with two lines, or three with a name, or with an OMM of CCSDS.
         target_size_m: largest dimension.
         picture: width and height, px, as 1024x1024; the line of sight meets its middle.
         channels: 1 or 3.
@@ -84,8 +86,12 @@ def write_mission(
 
 
 def _elements(path: Path) -> list[str]:
+    """Return the two lines of elements in a file: as they are, with or without a name before, or of an OMM."""
     try:
-        lines = [line.rstrip() for line in path.read_text().splitlines() if line.strip()]
+        content = read_bounded(path, MAX_NDM_BYTES)
+        with in_file(path):
+            text = "\n".join(two_lines(content)) if is_message(content) else content.decode()
+        lines = [line.rstrip() for line in text.splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
         raise ConfigError(str(path), f"cannot read the two-line elements: {reason}") from error

@@ -9,6 +9,7 @@ from flightsw.errors import NavigationError, OrbitError
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
+from flightsw.message_navigation import SCHEME, MessageNavigation
 from flightsw.navigation import NavigationStream, RelativePose, SatelliteStates
 from flightsw.orbit import in_eclipse, propagate, sun_direction_gcrs
 
@@ -23,8 +24,7 @@ class PoseTagger:
         self.outside_ephemeris = 0  # no pose: the orbit or the Sun cannot be computed for that time
         self.navigation_gaps = 0  # no pose: the stream has no state near enough
         self._mission = mission
-        source = mission.navigation
-        self.navigation = None if source.source == "sgp4" else NavigationStream(source)
+        self.navigation = open_navigation(mission)
 
     def close(self) -> None:
         if self.navigation is not None:
@@ -46,6 +46,20 @@ class PoseTagger:
             return unknown_pose()
         self.stale_elements += not tag.valid
         return tag
+
+
+def open_navigation(mission: Mission) -> NavigationStream | MessageNavigation | None:
+    """Return the mission's source of navigation states; None where poses come from the two-line elements.
+
+    Raises:
+        NavigationError: a file is not there, or not valid.
+    """
+    section = mission.navigation
+    if section.source == "sgp4":
+        return None
+    if section.source.startswith(SCHEME):
+        return MessageNavigation(section.source, mission.orbit.target_tle)
+    return NavigationStream(section)
 
 
 def unknown_pose() -> PoseTag:

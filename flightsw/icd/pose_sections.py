@@ -74,19 +74,23 @@ class PoseSection:
 
 @dataclass(frozen=True)
 class NavigationSection:
-    """Where the pose comes from: the two-line elements, or states as JSON lines (flightsw/navigation.py)."""
+    """Where the pose comes from: the two-line elements, states as JSON lines (flightsw/navigation.py), or messages.
 
-    source: str = "sgp4"  # or file:///path, tcp://host:port
-    max_gap_s: float = 2.0  # no pose is interpolated between states further apart
+    ndm:///folder holds CCSDS messages of both satellites (flightsw/message_navigation.py), which say themselves how
+    they are interpolated.
+    """
+
+    source: str = "sgp4"  # or file:///path, tcp://host:port, ndm:///folder
+    max_gap_s: float = 2.0  # no pose is interpolated between states further apart; not of messages
     wait_s: float = 2.0  # for a state that has not arrived yet
 
     def __post_init__(self):
         path = "mission.navigation"
         require(
             self.source == "sgp4"
-            or re.fullmatch(r"file:///.+|tcp://[^:/]+:\d{1,5}", self.source) is not None,
+            or re.fullmatch(r"(file|ndm):///.+|tcp://[^:/]+:\d{1,5}", self.source) is not None,
             f"{path}.source",
-            f"expected sgp4, file:///path or tcp://host:port, got {self.source!r}",
+            f"expected sgp4, file:///path, tcp://host:port or ndm:///folder, got {self.source!r}",
         )
         require(
             0 < self.max_gap_s <= 3600, f"{path}.max_gap_s", f"expected 0 to 3600 s, got {self.max_gap_s}"

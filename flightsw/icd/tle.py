@@ -6,10 +6,9 @@ import numpy as np
 from sgp4.api import SGP4_ERRORS, Satrec
 
 from flightsw.icd.config import ConfigError, require
+from flightsw.icd.reference_frames import julian_date
 
 # The fields of a two-line element set that SGP4 reads: line, first and last column (from 1), name, form.
-UNIX_EPOCH_JD = 2_440_587.5
-DAY_NS = 86_400_000_000_000
 DECIMAL = r" *-?\d*\.\d+ *"
 TLE_FIELDS = (
     (1, 19, 32, "epoch", r"\d\d[ \d]{2}\d\.\d+ *"),
@@ -72,8 +71,7 @@ def orbit_axes(tle: tuple[str, ...], utc_ns: int) -> tuple[float, np.ndarray]:
         ConfigError: SGP4 cannot propagate the elements so far.
     """
     satellite = Satrec.twoline2rv(*tle)
-    days, rest_ns = divmod(utc_ns, DAY_NS)
-    code, position_km, velocity_km_s = satellite.sgp4(UNIX_EPOCH_JD + days, rest_ns / DAY_NS)
+    code, position_km, velocity_km_s = satellite.sgp4(*julian_date(utc_ns))
     if code or not np.isfinite(position_km).all():
         reason = SGP4_ERRORS.get(code, f"error {code}")
         raise ConfigError("mission.orbit.target_tle", f"cannot be propagated: {reason}; load newer elements")

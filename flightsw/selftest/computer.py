@@ -14,7 +14,7 @@ from flightsw.commands import ReplayCounter
 from flightsw.icd.config import ConfigError
 from flightsw.icd.frame import Frame, PoseTag, encode_frame
 from flightsw.icd.mission import Mission
-from flightsw.icd.tle import DAY_NS, UNIX_EPOCH_JD
+from flightsw.icd.reference_frames import DAY_NS, UNIX_EPOCH_JD
 from flightsw.selftest.finding import Finding
 from obbgs_base.files import write_whole
 

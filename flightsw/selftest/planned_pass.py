@@ -7,10 +7,10 @@ import numpy as np
 
 from flightsw.errors import NavigationError, OrbitError
 from flightsw.icd.mission import Mission
-from flightsw.icd.pose_sections import NavigationSection
-from flightsw.navigation import NavigationStream
+from flightsw.message_navigation import MessageNavigation
 from flightsw.orbit import propagate, sun_position_gcrs
 from flightsw.planning import field_of_view
+from flightsw.pose import open_navigation
 from flightsw.selftest.finding import Finding
 
 NS = 1_000_000_000
@@ -67,7 +67,7 @@ def check_orbit(mission: Mission) -> list[Finding]:
         )
         findings.append(Finding.ok("orbit", found))
     if not by_elements:
-        findings += _navigation(mission.navigation)
+        findings += _navigation(mission)
     return findings
 
 
@@ -90,13 +90,24 @@ def check_view(mission: Mission) -> list[Finding]:
     return [Finding.warning("view", problem, advice) for problem in problems] or [Finding.ok("view", view)]
 
 
-def _navigation(section: NavigationSection) -> list[Finding]:
-    """Check that the navigation source can be opened and sends states."""
-    advice = "start the navigation filter, or correct navigation.source"
+def _navigation(mission: Mission) -> list[Finding]:
+    """Check that the navigation source can be opened and sends states; of messages, that they cover the pass."""
+    advice, section = "start the navigation filter, or correct navigation.source", mission.navigation
     try:
-        stream = NavigationStream(section)
-    except NavigationError as error:
+        stream = open_navigation(mission)
+        if isinstance(stream, MessageNavigation):
+            first_ns = mission.orbit.start_utc_ns
+            last_ns = first_ns + round((mission.bracket.count - 1) * mission.bracket.interval_s * NS)
+            for utc_ns in (first_ns, last_ns):
+                stream.at(utc_ns)
+            return [
+                Finding.ok(
+                    "navigation", f"{section.source} covers the pass, {_utc(first_ns)} to {_utc(last_ns)}"
+                )
+            ]
+    except (NavigationError, OrbitError) as error:
         return [Finding.failed("navigation", str(error), advice)]
+    assert stream is not None
     try:
         state = stream.first(section.wait_s)
     finally:
