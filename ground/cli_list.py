@@ -21,15 +21,16 @@ def list_command(
     folders: Annotated[
         list[Path] | None, typer.Argument(help="Where to look, three levels deep; default: here.")
     ] = None,
+    check: Annotated[bool, typer.Option("--check", help="Look for damage in every picture too.")] = False,
     json_: AsJson = False,
 ) -> None:
-    """Show the sessions in some folders, and their runs: frames, what is lost, method, quality, PSNR, poses, age.
+    """Show the sessions in some folders, and their runs: frames, what is lost or damaged, method, quality, PSNR, poses.
 
     Example: ground list passes demo --json
     """
     from ground.listing import find_sessions
 
-    sessions = find_sessions(folders or [Path()])
+    sessions = find_sessions(folders or [Path()], check)
     if json_:
         print(json.dumps([dataclasses.asdict(session) for session in sessions]))
         return
@@ -86,6 +87,8 @@ def _sessions_table(sessions: "list[SessionEntry]") -> Table:
         if s.problem:
             cells = [s.folder, "", "", "", "", s.problem]
         table.add_row(*map(Text, cells), style="bold")
+        for line in s.damage:
+            table.add_row(*map(Text, ("  damaged", "", "", "", "", line)))
         for run in s.runs:
             table.add_row(*map(Text, _run_cells(run)))
         table.add_section()

@@ -12,6 +12,7 @@ from typing import Any
 from ground.live_status import line, read_status
 from ground.runs import is_live, read_config, read_metrics, unfinished_folder
 from ground.session import SessionError, flight_counts, read_header, read_records
+from ground.session_check import damage
 from obbgs_core.train.presets import QUALITIES, preset
 
 DEEPEST = 3  # levels of folders below the given ones in which sessions are looked for
@@ -71,6 +72,7 @@ class SessionEntry:
 
     frames_lost: frames that will never come, by what became of them; without those that are 0.
     frames_missing: frames that have not come and are not known to be lost; at least, where frames_captured is None.
+    damage: what is damaged in its files; pictures are looked at on demand only.
     link: what was counted on the link, such as segments that came again: it costs time, and no frame.
     problem: why the session cannot be read; its other values are then 0, None or empty.
     """
@@ -87,10 +89,14 @@ class SessionEntry:
     size: str  # of the pictures, such as 256x256
     runs: list[RunEntry]
     problem: str
+    damage: list[str]
 
 
-def find_sessions(folders: Sequence[Path]) -> list[SessionEntry]:
+def find_sessions(folders: Sequence[Path], with_pictures: bool = False) -> list[SessionEntry]:
     """Return the sessions in some folders and below them, in the order of their paths.
+
+    Args:
+        with_pictures: whether to look for damage in the pictures too.
 
     Raises:
         SessionError: a folder is not there.
@@ -100,7 +106,7 @@ def find_sessions(folders: Sequence[Path]) -> list[SessionEntry]:
         if not folder.is_dir():
             raise SessionError(f"{folder} is not a folder")
         for session in sorted(_sessions_below(folder, DEEPEST)):
-            found.setdefault(session.resolve(), _session_entry(session))
+            found.setdefault(session.resolve(), _session_entry(session, with_pictures))
     return list(found.values())
 
 
@@ -119,7 +125,7 @@ def _sessions_below(folder: Path, levels: int) -> Iterator[Path]:
                 continue
 
 
-def _session_entry(folder: Path) -> SessionEntry:
+def _session_entry(folder: Path, with_pictures: bool) -> SessionEntry:
     try:
         header, records = read_header(folder), read_records(folder)
         flight = flight_counts(header)
@@ -147,9 +153,10 @@ def _session_entry(folder: Path) -> SessionEntry:
             f"{camera['width']}x{camera['height']}",
             _runs(folder),
             "",
+            damage(folder, with_pictures),
         )
     except (SessionError, KeyError, TypeError, ValueError, AttributeError) as error:
-        return SessionEntry(str(folder), "", None, 0, None, 0, {}, 0, {}, "", [], str(error))
+        return SessionEntry(str(folder), "", None, 0, None, 0, {}, 0, {}, "", [], str(error), [])
 
 
 def _runs(session: Path) -> list[RunEntry]:

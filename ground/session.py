@@ -39,7 +39,7 @@ from flightsw.icd.config import MAX_JSON_BYTES, ConfigError, build, keys_below, 
 from flightsw.icd.frame import Attitude
 from flightsw.icd.mission import CameraSection
 from ground.telemetry import FlightCounts
-from obbgs_base.checked import Lines, copy_of, names_checksum, read_lines_twice, read_twice
+from obbgs_base.checked import Lines, copy_of, names_checksum, read_lines, read_lines_twice, read_twice
 from obbgs_base.errors import ObbgsError
 from obbgs_base.files import read_bounded
 from obbgs_base.navigation_errors import SharedParameters
@@ -52,6 +52,7 @@ ENCODINGS = ("linear", "srgb")
 # No other file name is opened: a session may come from someone else.
 FRAME_FILE = re.compile(r"frames/\d{6,10}\.png", re.ASCII)
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+LOGS = ("telemetry.jsonl", "events.jsonl", "reports.jsonl", "commands.jsonl")
 LINES_DAMAGED = "lines_damaged"  # the name of their count among the losses
 
 
@@ -318,6 +319,51 @@ def _header(path: Path) -> Any:
             if not has_copy:
                 raise
     return read_twice(path, lambda problem: _tell(f"{path.parent}: {problem}"), mend=False)
+
+
+def header_damage(folder: Path) -> list[str]:
+    """Return what is wrong with session.json and its copy.
+
+    Raises:
+        SessionError: as `read_header`, but not where a good one of the two is used.
+    """
+    read_header(folder)
+    path, found = folder / "session.json", []
+    if copy_of(path).exists() and names_checksum(copy_of(path).read_bytes()):
+        read_twice(path, found.append, mend=False)
+    return found
+
+
+def read_log(path: Path) -> tuple[dict[str, Any], ...]:
+    """Return the objects in one of the files `LOGS`; damaged lines are left out, which is told."""
+    lines = read_lines(path)
+    if problem := log_damage(lines):
+        _tell(f"{path} {problem}")
+    return lines.trees
+
+
+def log_damage(lines: Lines) -> str:
+    """Return what is wrong with one of the files `LOGS`, to be read after its name; nothing of a whole one."""
+    words = f"has {len(lines.problems)} damaged lines ({lines.problems[0]})" if lines.problems else ""
+    if lines.unfinished:
+        words += (" and " if words else "") + "ends in an unfinished line"
+    return words
+
+
+def log_sizes(folder: Path) -> dict[str, int]:
+    """Return the sizes in bytes of the files `LOGS` that are there; they only grow."""
+    return {name: (folder / name).stat().st_size for name in LOGS if (folder / name).exists()}
+
+
+def shortened_logs(folder: Path, header: Mapping[str, Any]) -> list[str]:
+    """Return which of the files `LOGS` have less in them than session.json knows of."""
+    sizes, known = log_sizes(folder), header.get("log_bytes")
+    known = known if isinstance(known, dict) else {}
+    return [
+        f"{name} was cut: {sizes.get(name, 0):,} of {known[name]:,} bytes are there"
+        for name in LOGS
+        if type(known.get(name)) is int and sizes.get(name, 0) < known[name]
+    ]
 
 
 def flight_counts(header: dict[str, Any]) -> FlightCounts | None:

@@ -21,9 +21,11 @@ from ground.session import (
     SessionError,
     flight_counts,
     is_whole_png,
+    log_sizes,
     read_frame_lines,
     read_header,
     records_of,
+    shortened_logs,
 )
 from ground.telemetry import FlightCounts
 from obbgs_base.checked import append_twice, checked_text, copy_of, write_twice
@@ -130,6 +132,7 @@ class SessionWriter:
             "flight": dataclasses.asdict(self.flight) if self.flight else None,
             "frames_received": self.frame_count,
             "bytes_received": self._bytes_before + bytes_received,
+            "log_bytes": log_sizes(self.folder),
             "created_utc": self._created_utc,
         }
         write_twice(self._header_file, header, form=checked_text)
@@ -140,6 +143,8 @@ class SessionWriter:
             raise SessionError(
                 f"{self.folder} belongs to another mission file; choose another session folder"
             )
+        for problem in shortened_logs(self.folder, header):
+            log.warning("%s: %s", self.folder, problem)
         try:
             self._losses_before = {str(name): int(count) for name, count in header["losses"].items()}
             self._bytes_before = int(header["bytes_received"])

@@ -1,7 +1,6 @@
 """Receives telemetry, events and command reports, keeps them with the session and the newest ones in memory."""
 
 import dataclasses
-import json
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -19,6 +18,7 @@ from flightsw.icd.packet import (
     PacketError,
 )
 from flightsw.icd.telemetry import DICTIONARY
+from obbgs_base.checked import checked_line
 
 EVENTS_KEPT = 200  # in memory; the file has all
 EARLIER_COUNTS = ("run_utc_ns", "run_uptime_s")
@@ -146,14 +146,14 @@ class TelemetryLog:
             self.refused += 1
 
     def _write(self, name: str, line: dict[str, Any]) -> None:
-        """Append a line; after a line left unfinished by a power cut it starts a new one."""
+        """Append a line with its checksum; after a line left unfinished by a power cut it starts a new one."""
         try:
             with open(self._folder / name, "ab+") as file:
                 if file.tell():
                     file.seek(-1, 2)
                     if file.read(1) != b"\n":
                         file.write(b"\n")
-                file.write(json.dumps(plain(line), allow_nan=False).encode() + b"\n")
+                file.write(checked_line(plain(line)) + b"\n")
         except OSError:
             self.write_failures += 1
 

@@ -1,13 +1,14 @@
 """The spacecraft's housekeeping over time, as small figures with the limits of the telemetry dictionary in colour."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 
 from flightsw.icd.telemetry import DICTIONARY, Item
+from ground.session import read_log
 
 LIMIT_COLOURS = {"green": "#1f6feb", "yellow": "#d99a00", "red": "#c0392b"}
 SHOWN = (  # the items that say how a pass went; telemetry.jsonl holds all of them
@@ -38,7 +39,7 @@ def housekeeping_series(session: Path) -> list[Series]:
 
     Lines that are damaged or lack an item are left out: telemetry is shown as far as it can be read.
     """
-    lines = _housekeeping(session / "telemetry.jsonl")
+    lines = [line for line in read_log(session / "telemetry.jsonl") if _is_housekeeping(line)]
     if not lines:
         return []
     utc_ns = np.array([line["utc_ns"] for line in lines])
@@ -95,20 +96,9 @@ def broken_limits(series: list[Series]) -> list[tuple[str, str]]:
     return [(name, limit) for name, limit in worst.items() if limit != "green"]
 
 
-def _housekeeping(path: Path) -> list[dict]:
-    if not path.exists():
-        return []
-    kept = []
-    for line in path.read_bytes().split(b"\n"):
-        try:
-            values = json.loads(line)
-        except ValueError:
-            continue
-        if not isinstance(values, dict) or values.get("packet") != "housekeeping":
-            continue
-        if all(type(values.get(name)) in (int, float) for name in ("utc_ns", *SHOWN)):
-            kept.append(values)
-    return kept
+def _is_housekeeping(line: dict[str, Any]) -> bool:
+    is_packet = line.get("packet") == "housekeeping"
+    return is_packet and all(type(line.get(name)) in (int, float) for name in ("utc_ns", *SHOWN))
 
 
 def unit_of(item: Item) -> str:

@@ -10,7 +10,6 @@ history, whoever sent them. For how long a command may be sent is elapsed time, 
 import contextlib
 import fcntl
 import hashlib
-import json
 import logging
 import os
 import re
@@ -30,7 +29,7 @@ from flightsw.icd.model_file import MAX_MODEL_BYTES, ModelUnfit, check_for_triag
 from flightsw.icd.transfer import UPLINK, Sender
 from ground.session import SessionError
 from ground.telemetry import plain
-from obbgs_base.checked import copy_of, each_copy
+from obbgs_base.checked import checked_line, copy_of, each_copy, parse_line, read_twice, write_twice
 from obbgs_base.files import append_line, write_whole
 
 log = logging.getLogger(__name__)
@@ -200,7 +199,7 @@ def submit(session: Path, key_file: Path, command: Command, model: Path | None, 
                 "boot": _boot_id(),
                 "expires_ns": expires_ns,
             }
-            write_whole(folder / f"{counter:020d}.json", json.dumps(job).encode())
+            write_whole(folder / f"{counter:020d}.json", checked_line(job))
     except OSError as error:
         raise SessionError(f"cannot leave the command in {folder}: {error.strerror or error}") from error
     return counter
@@ -285,16 +284,23 @@ def _boot_id() -> str:
 
 
 def outcome(session: Path, counter: int) -> dict[str, Any] | None:
-    """Return a command's result (stage, text, reports); None while it has none."""
+    """Return a command's result (stage, text, reports); None while it has none.
+
+    Raises:
+        SessionError: it and its copy are damaged, or cannot be read.
+    """
     path = session / "uplink" / f"{counter:020d}.done.json"
-    return json.loads(path.read_bytes()) if path.exists() else None
+    try:
+        return read_twice(path, lambda problem: log.warning("%s", problem), mend=False)
+    except (OSError, ValueError) as error:
+        raise SessionError(f"the result of command {counter} cannot be read: {error}") from error
 
 
 def note_end(session: Path, done: dict[str, Any], utc_ns: int) -> None:
     """Add the end of a command, as `outcome` has it, to the session's history; a disk that refuses it is logged."""
     line = {"ended_utc_ns": utc_ns} | {name: done[name] for name in ("counter", "given", "stage", "text")}
     try:
-        append_line(session / HISTORY, json.dumps(line).encode())
+        append_line(session / HISTORY, checked_line(line))
     except OSError as error:
         log.error("the end of command %d is missing in %s: %s", done["counter"], session / HISTORY, error)
 
@@ -468,7 +474,7 @@ class Uplinker:
                 self._end(job, "failed", "no answer in time" if not job.reports else f"still {job.stage}")
 
     def _read(self, counter: int) -> Job:
-        tree = json.loads(_content(self._folder / f"{counter:020d}.json", MAX_JOB_BYTES))
+        tree = parse_line(_content(self._folder / f"{counter:020d}.json", MAX_JOB_BYTES))
         file = self._folder / f"{counter:020d}.bin"
         content = _content(file, 2 * MAX_MODEL_BYTES) if file.exists() else None
         packet = bytes.fromhex(tree["packet"])
@@ -502,7 +508,7 @@ class Uplinker:
         name = f"{job.counter:020d}"
         note_end(self._folder.parent, done, self._utc_ns())
         try:
-            write_whole(self._folder / f"{name}.done.json", json.dumps(done).encode())
+            write_twice(self._folder / f"{name}.done.json", done)
         except OSError as error:
             log.error("the end of command %d cannot be written: %s", job.counter, error)
         self._remove(job.counter)

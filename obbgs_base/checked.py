@@ -17,6 +17,8 @@ from obbgs_base.files import append_line, write_whole
 
 CHECKED = re.compile(rb'(\{.*),(?: |\n  )"crc32": "([0-9a-f]{8})"\n?\}', re.DOTALL)
 
+LIKE_CHECKSUM = re.compile(rb'"[^"]{5}": "[0-9a-f]{8}"\n?\}\s*\Z')
+
 
 def checked_line(tree: Mapping[str, Any]) -> bytes:
     """Return an object with at least one key as a line of JSON with its checksum, without a line feed.
@@ -40,8 +42,11 @@ def has_checksum(line: bytes) -> bool:
 
 
 def names_checksum(content: bytes) -> bool:
-    """Return whether there is the name of a checksum in it; what earlier versions or people wrote has none."""
-    return b'"crc32"' in content
+    """Return whether it names a checksum, or has a name there that one bit may have made of it.
+
+    What earlier versions or people wrote has none.
+    """
+    return b'"crc32"' in content or LIKE_CHECKSUM.search(content) is not None
 
 
 def parse_line(line: bytes) -> dict[str, Any]:
@@ -79,9 +84,10 @@ def parse_checked_line(line: bytes) -> dict[str, Any]:
 class Lines:
     """What the whole lines of a file say.
 
-    raw: the lines, without line feeds, in the order in which they were written; `trees` are their objects without
+    raw: the whole lines, without line feeds, in the order in which they were written; `trees` are their objects without
         checksums.
     problems: what is wrong with each line that is damaged and left out.
+    unfinished: whether something stands behind the last line feed.
     restored: how many of the lines only the file's copy still has.
     lost: how many lines are damaged in both.
     unchecked: how many of the lines have no checksum: earlier versions and other programs write none.
@@ -93,14 +99,15 @@ class Lines:
     restored: int = 0
     lost: int = 0
     unchecked: int = 0
+    unfinished: bool = False
 
 
 def parse_lines(content: bytes) -> Lines:
     """Return the whole lines of a file; a line feed ends each, and what stands behind the last one is unfinished.
 
-    A line that names no checksum is taken as it is: no single bit makes one of a line that had one, but by its name.
+    A line that names no checksum is taken as it is.
     """
-    *lines, _unfinished = content.split(b"\n")
+    *lines, unfinished = content.split(b"\n")
     raw, trees, problems, unchecked = [], [], [], 0
     for number, line in enumerate(lines, start=1):
         try:
@@ -111,7 +118,7 @@ def parse_lines(content: bytes) -> Lines:
         raw.append(line)
         trees.append(tree)
         unchecked += not names_checksum(line)
-    return Lines(tuple(raw), tuple(trees), tuple(problems), 0, len(problems), unchecked)
+    return Lines(tuple(raw), tuple(trees), tuple(problems), 0, len(problems), unchecked, bool(unfinished))
 
 
 def read_lines(path: Path) -> Lines:
@@ -174,7 +181,7 @@ def read_lines_twice(path: Path, name: str) -> Lines:
     not_whole = len(there.problems) + (not copied.endswith(b"\n"))
     lost = max(0, min(len(here.problems) - inserted, not_whole))
     problems = here.problems + tuple(f"{copy_of(path).name} {problem}" for problem in there.problems)
-    return Lines(tuple(raw), tuple(trees), problems, inserted, lost, here.unchecked)
+    return Lines(tuple(raw), tuple(trees), problems, inserted, lost, here.unchecked, here.unfinished)
 
 
 def copy_of(path: Path) -> Path:

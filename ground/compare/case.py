@@ -25,7 +25,7 @@ from obbgs_core.score.shown import shown_points
 from obbgs_core.sensor import Sensor
 
 # what session.json holds besides what decides a comparison: how the frames came, and when
-INCIDENTAL = ("created_utc", "losses", "flight", "frames_received", "bytes_received", "tles")
+INCIDENTAL = ("created_utc", "losses", "flight", "frames_received", "bytes_received", "log_bytes", "tles")
 
 
 @dataclass(frozen=True)

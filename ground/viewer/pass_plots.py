@@ -1,7 +1,6 @@
 """The pass beside the model: housekeeping as plots with limits, events and commands; live, or replayed at any speed."""
 
 import html
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -11,6 +10,7 @@ import numpy as np
 import viser
 from viser import uplot
 
+from ground.session import read_log
 from ground.telemetry_plots import (
     BYTES_PER_MB,
     LIMIT_COLOURS,
@@ -40,29 +40,17 @@ class Event:
 def pass_events(session: Path, start_utc_ns: int) -> list[Event]:
     """Return events and ends of commands in the order of time; lines that are damaged are left out."""
     found = []
-    for line in _lines(session / EVENTS):
+    for line in read_log(session / EVENTS):
         utc_ns, text = line.get("utc_ns", line.get("received_utc_ns")), line.get("text")
         if type(utc_ns) is int and isinstance(text, str):
             found.append(Event((utc_ns - start_utc_ns) / 1e9, str(line.get("severity", "info")), text))
-    for line in _lines(session / HISTORY):
+    for line in read_log(session / HISTORY):
         utc_ns, stage = line.get("ended_utc_ns"), line.get("stage")
         if type(utc_ns) is int:
             severity = "info" if stage == "completed" else "warning"
             text = f"command {line.get('given')} {stage}: {line.get('text')}"
             found.append(Event((utc_ns - start_utc_ns) / 1e9, severity, text))
     return sorted(found, key=lambda event: event.seconds)
-
-
-def _lines(path: Path) -> list[dict]:
-    found = []
-    for text in path.read_bytes().split(b"\n") if path.is_file() else []:
-        try:
-            line = json.loads(text)
-        except ValueError:
-            continue
-        if isinstance(line, dict):
-            found.append(line)
-    return found
 
 
 def up_to(series: Series, seconds: float) -> Series:

@@ -1,14 +1,15 @@
-"""Flipped bits, zeroed and cut files of a frame store: python -m tests.benchmarks.flips
+"""Flipped bits, zeroed and cut files of flight's store and the ground's session: python -m tests.benchmarks.flips
 
-Each trial damages one file of a store as a pass leaves it, and flies it: the downlink against a receiver in the same
-process on a clock of ours, or for some trials `flightsw downlink` as a process on a pseudo-terminal. What must hold:
-telemetry comes within 10 s and the downlink never starts again; every waiting frame whose container is intact arrives
-bit for bit, deleted and delivered ones do not; settings are as commanded, or safe; no number and no exposure is used
-again, and frames can be stored; and damage to what is read is told in an event.
+Each trial damages one file. Of a session, what must hold stands in ground_flips.py. A store is flown: the downlink
+against a receiver in the same process on a clock of ours, or for some trials `flightsw downlink` as a process on a
+pseudo-terminal. What must hold: telemetry comes within 10 s and the downlink never starts again; every waiting frame
+whose container is intact arrives bit for bit, deleted and delivered ones do not; settings are as commanded, or safe; no
+number and no exposure is used again, and frames can be stored; and damage to what is read is told in an event.
 """
 
 import argparse
 import hashlib
+import json
 import logging
 import os
 import random
@@ -20,7 +21,9 @@ import tempfile
 import time
 import tty
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +39,7 @@ from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import Receiver, timer_s
 from flightsw.settings import Settings, load_settings, save_settings
 from flightsw.store import FrameStore
+from tests.benchmarks import ground_flips
 from tests.benchmarks.rows import shown
 
 COMMANDED = Settings("oldest", exposure_times_ms=(100.0, 200.0, 400.0), max_error_dn=1, safe_mode=True)
@@ -45,6 +49,7 @@ NO_CONTENT = ("lock", "reserve")  # files whose content means nothing
 UP_WITHIN_S = 10.0
 LIMIT_S = 30.0  # of one flight
 BAUD_RATE = 3_000_000
+CHUNK = 250  # trials between two notes of progress
 KINDS = ("flipped bit", "zeroed file", "cut file")
 
 
@@ -227,58 +232,123 @@ def what_fails(
     return wrong if told else [*wrong, "nothing was told"]
 
 
-def measure(kind: str, trials: int, mission_file: Path, as_process: bool = False) -> tuple[dict, Counter]:
-    """Return the row of so many trials of a kind, seeded, over all files in turn, and what did not hold."""
+@dataclass(frozen=True)
+class Case:
+    """One way of damage to the files of one side; trials in one process, or each as a process of its own."""
+
+    side: str  # flight or ground
+    kind: str
+    trials: int
+    as_process: bool = False
+
+    @property
+    def condition(self) -> str:
+        return f"{self.kind}, {self.side}, {'as processes' if self.as_process else 'in one process'}"
+
+
+def measure(case: Case, first: int, trials: int, mission_file: Path) -> dict[str, Any]:
+    """Return the row of some trials of a case, seeded by their numbers, over all files in turn.
+
+    Its `failures` say what did not hold, and how often.
+    """
     failures: Counter[str] = Counter()
+    mission = load_mission(mission_file)
     with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as scratch:
-        made, copy = Path(scratch) / "made", Path(scratch) / "copy"
-        digests, source = make_store(made), random.Random(KINDS.index(kind))
-        files, failed = files_of(made), 0
-        started_s = time.monotonic()
-        for number in range(trials):
-            file = files[number % len(files)]
+        made = Path(scratch) / "made"
+        made.mkdir()
+        if case.side == "flight":
+            digests = make_store(made)
+            files = files_of(made)
+        else:
+            kept = ground_flips.make_pass(made, mission)
+            files = ground_flips.files_of(made)
+        started_s, failed = time.monotonic(), 0
+        for number in range(first, first + trials):
+            file, copy = files[number % len(files)], Path(scratch) / str(number)
             shutil.copytree(made, copy)
-            (copy / file).write_bytes(damaged((made / file).read_bytes(), kind, source))
-            wrong = what_fails(copy, file, mission_file, digests, as_process)
+            source = random.Random(f"{case.condition} {number}")
+            (copy / file).write_bytes(damaged((made / file).read_bytes(), case.kind, source))
+            if case.side == "flight":
+                wrong = what_fails(copy, file, mission_file, digests, case.as_process)
+            else:
+                wrong = ground_flips.what_fails(copy, file, mission, kept)
             failed += bool(wrong)
-            failures.update(f"{kind}, {file}: {problem}" for problem in wrong)
+            failures.update(f"{case.condition}, {file}, trial {number}: {problem}" for problem in wrong)
             shutil.rmtree(copy)
-    way = "as processes" if as_process else "in one process"
-    row = {
-        "condition": f"{kind}, {way}",
+    return {
+        "condition": case.condition,
+        "first": first,
         "trials": trials,
         "trials_failed": failed,
         "files": len(files),
         "seconds": round(time.monotonic() - started_s, 1),
+        "failures": failures,
     }
-    return row, failures
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Flipped bits, zeroed and cut files of a frame store.")
+    parser = argparse.ArgumentParser(description="Flipped bits, zeroed and cut files of flight and ground.")
     parser.add_argument("--json", action="store_true", help="one JSON object a row")
-    parser.add_argument("--flips", type=int, default=10_000, help="trials with a flipped bit")
     parser.add_argument(
-        "--files", type=int, default=1_000, help="trials with a zeroed or a cut file, half each"
+        "--flips", type=int, default=10_000, help="trials with a flipped bit, half on each side"
     )
-    parser.add_argument("--processes", type=int, default=30, help="trials with a flipped bit, as processes")
+    parser.add_argument(
+        "--files", type=int, default=1_000, help="trials with a zeroed or a cut file, a quarter each of both"
+    )
+    parser.add_argument(
+        "--processes", type=int, default=30, help="trials of flight's process with a flipped bit"
+    )
+    parser.add_argument(
+        "--progress", type=Path, help="file to note what is done, so that another start goes on"
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=float("inf"), help="begin no more trials after so many"
+    )
     arguments = parser.parse_args()
-    logging.getLogger("flightsw").propagate = False
-    logging.getLogger("flightsw").addHandler(logging.NullHandler())
-    cases = [(KINDS[0], arguments.flips, False), (KINDS[0], arguments.processes, True)]
-    cases += [(kind, arguments.files // 2, False) for kind in KINDS[1:]]
-    failed = 0
+    for name in ("flightsw", "ground"):
+        logging.getLogger(name).propagate = False
+        logging.getLogger(name).addHandler(logging.NullHandler())
+    sides = ("ground", "flight")
+    cases = [Case("flight", KINDS[0], arguments.processes, True)]
+    cases += [Case(side, kind, arguments.files // 4) for kind in KINDS[1:] for side in sides]
+    cases += [Case(side, KINDS[0], arguments.flips // 2) for side in sides]
+    done = _noted(arguments.progress)
+    end_s = time.monotonic() + 60 * arguments.minutes
     with tempfile.TemporaryDirectory() as folder:
         mission_file = Path(folder) / "mission.yaml"
         text = Path("mission.yaml").read_text()
         mission_file.write_text(text.replace("link:\n", "link:\n  priority: oldest\n"))
-        for kind, trials, as_process in cases:
-            row, failures = measure(kind, trials, mission_file, as_process)
-            failed += row["trials_failed"]
-            print(shown(row, "flips", arguments.json), flush=True)
-            for problem, count in failures.most_common(20):
-                print(f"{count} times: {problem}", file=sys.stderr)
-    return 1 if failed else 0
+        for first in range(0, max(case.trials for case in cases), CHUNK):  # all cases go on alike
+            for case in cases:
+                trials = min(CHUNK, case.trials - first)
+                if trials <= 0 or (case.condition, first) in done or time.monotonic() > end_s:
+                    continue
+                row = measure(case, first, trials, mission_file)
+                done[case.condition, first] = row
+                for problem, count in row["failures"].items():
+                    print(f"{count} times: {problem}", file=sys.stderr, flush=True)
+                if arguments.progress:
+                    with open(arguments.progress, "a") as file:
+                        file.write(json.dumps(row) + "\n")
+    rows = [_total([row for (name, _), row in done.items() if name == case.condition]) for case in cases]
+    for row in filter(None, rows):
+        print(shown(row, "flips", arguments.json), flush=True)
+    return 1 if any(row["trials_failed"] for row in filter(None, rows)) else 0
+
+
+def _noted(progress: Path | None) -> dict[tuple[str, int], dict[str, Any]]:
+    if progress is None or not progress.exists():
+        return {}
+    rows = [json.loads(line) for line in progress.read_text().splitlines()]
+    return {(row["condition"], row["first"]): row for row in rows}
+
+
+def _total(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return one row for all trials of a case; {} without any."""
+    if not rows:
+        return {}
+    summed = {name: sum(row[name] for row in rows) for name in ("trials", "trials_failed", "seconds")}
+    return {"condition": rows[0]["condition"], "files": rows[0]["files"]} | summed
 
 
 if __name__ == "__main__":
