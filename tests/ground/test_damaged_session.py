@@ -5,10 +5,16 @@ import random
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from flightsw.icd.frame import encode_frame
+from flightsw.icd.packet import APID_EVENTS
+from flightsw.icd.telemetry import DICTIONARY
+from ground import cli
 from ground.session import MissingFrames, SessionCorrupt, open_session, read_header
+from ground.session_check import damage
 from ground.session_writer import SessionWriter
+from ground.telemetry import TelemetryLog
 
 NUMBERS = (2, 0, 1, 3)
 
@@ -133,3 +139,37 @@ def test_a_session_of_which_every_line_is_damaged_says_so(session):
         (session / name).write_bytes(bytes(4000))
     with pytest.raises(MissingFrames, match="holds no frames"):
         open_session(session)
+
+
+def test_ground_list_says_what_is_damaged(session, tmp_path):
+    def listed(*options):
+        done = CliRunner().invoke(cli.app, ["list", str(tmp_path), "--json", *options])
+        (entry,) = json.loads(done.stdout)
+        return entry["damage"]
+
+    log = TelemetryLog(session)
+    for number in range(3):
+        log.add(APID_EVENTS, DICTIONARY.events["stopped"].pack(utc_ns=number))
+    assert listed("--check") == []
+    flip(session / "frames.jsonl", 2400)
+    flip(session / "session.json", 800)
+    flip(session / "events.jsonl", 400)
+    flip(session / "frames" / "000003.png", 900)
+    header, frames, events = listed()
+    assert "session.json or its copy was damaged" in header
+    assert "frames.jsonl: has 1 damaged lines" in frames and "1 frames stand in its copy only" in frames
+    assert events.startswith("events.jsonl has 1 damaged lines (line 1:")
+    assert listed("--check") == [header, frames, events, "frames/000003.png is damaged"]
+
+
+def test_a_log_that_lost_its_last_lines_is_told(session, small_mission, caplog):
+    log = TelemetryLog(session)
+    for number in range(3):
+        log.add(APID_EVENTS, DICTIONARY.events["stopped"].pack(utc_ns=number))
+    SessionWriter(session, small_mission)  # notes how long it is
+    lines = (session / "events.jsonl").read_bytes().splitlines(keepends=True)
+    (session / "events.jsonl").write_bytes(lines[0])
+    (told,) = damage(session)
+    assert told.startswith("events.jsonl was cut: ")
+    SessionWriter(session, small_mission)
+    assert told in caplog.text and damage(session) == []

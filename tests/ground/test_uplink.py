@@ -39,6 +39,7 @@ from ground.uplink import (
     submit,
     withdraw,
 )
+from obbgs_base.checked import checked_line, parse_checked_line
 
 INTERVAL_S = 0.5
 
@@ -450,7 +451,7 @@ def test_a_command_from_before_the_computer_started_is_not_sent(session, key_fil
     """Elapsed time begins anew at each start: how long such a command may still be sent is not known."""
     counter = submit(session, key_file, Command("ping", {}), None, 600)
     path = session / "uplink" / f"{counter:020d}.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"boot": "another"}))
+    path.write_bytes(checked_line(parse_checked_line(path.read_bytes()) | {"boot": "another"}))
     assert Uplinker(session, 1000, INTERVAL_S).next_command(0.0) is None
     end = outcome(session, counter)
     assert end is not None and end["stage"] == "failed"
