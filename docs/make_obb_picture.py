@@ -11,10 +11,10 @@ import imagecodecs
 import numpy as np
 import torch
 
-from ground.cameras import sensor_of
-from ground.pictures import tone
-from ground.session import open_session
-from ground.training_frames import split, training_frame
+from ground.session.cameras import sensor_of
+from ground.session.folder import open_session
+from ground.session.training_frames import split, training_frame
+from ground.show.pictures import tone
 from obbgs_core import obb
 from obbgs_core.losses import likelihood_loss
 from obbgs_core.render import render

@@ -7,12 +7,12 @@ import imagecodecs
 import numpy as np
 import torch
 
-from ground.estimated_poses import scored_records
-from ground.evaluate import clean_image, model_image
-from ground.pictures import ERROR_FULL_SCALE, bounding_box, heat, tone
-from ground.runs import open_run
-from ground.spread import evenly_spread
-from ground.truth import Truth
+from ground.run.estimated_poses import scored_records
+from ground.run.evaluate import clean_image, model_image
+from ground.run.runs import open_run
+from ground.session.spread import evenly_spread
+from ground.session.truth import Truth
+from ground.show.pictures import ERROR_FULL_SCALE, bounding_box, heat, tone
 
 OUT = Path(__file__).with_name("demo.png")
 SIZE_PX = 200

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from PIL import Image
 
-from ground.cameras import exposed, median_sun_direction
-from ground.estimated_poses import as_estimated, read_estimate
-from ground.runs import Run, open_run
-from ground.turntable import looking_at
+from ground.run.estimated_poses import as_estimated, read_estimate
+from ground.run.runs import Run, open_run
+from ground.session.cameras import exposed, median_sun_direction
+from ground.show.turntable import looking_at
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.render import render
 

@@ -15,8 +15,8 @@ import imagecodecs
 import numpy as np
 
 from flightsw.icd.quaternion import matrix_to_quat
-from ground.session import open_session
-from ground.truth import Truth
+from ground.session.folder import open_session
+from ground.session.truth import Truth
 
 OUT = Path(__file__).with_name("small_session")
 BINNED = 4  # pixels along a side

@@ -6,11 +6,11 @@ The names in `__all__` can be imported from `ground`; their modules are imported
 from obbgs_base.lazy import lazily
 
 _MODULES = {  # public name: the module that defines it
-    "frames_of": "training_frames",
-    "open_session": "session",
-    "predicted_image": "cameras",
-    "sensor_of": "cameras",
-    "split": "training_frames",
+    "frames_of": "session.training_frames",
+    "open_session": "session.folder",
+    "predicted_image": "session.cameras",
+    "sensor_of": "session.cameras",
+    "split": "session.training_frames",
 }
 __all__ = list(_MODULES)  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__ = lazily(__name__, _MODULES)

@@ -12,15 +12,15 @@ import typer
 from rich.console import Console
 
 from flightsw.icd.mission import load_mission
-from ground.cli_compare import compare_command
-from ground.cli_formats import export_command, import_command
-from ground.cli_list import compare_runs_command, list_command
-from ground.cli_live import live_command
-from ground.cli_options import AsJson, ListenKey, SessionDir, listening_key
-from ground.cli_runs import evaluate_command, mesh_command, reconstruct_command, report_command
-from ground.cli_systems import dictionary_command, yamcs_command
-from ground.cli_uplink import uplink_command
-from ground.cli_view import view_command
+from ground.commands.compare import compare_command
+from ground.commands.formats import export_command, import_command
+from ground.commands.list import compare_runs_command, list_command
+from ground.commands.live import live_command
+from ground.commands.options import AsJson, ListenKey, SessionDir, listening_key
+from ground.commands.runs import evaluate_command, mesh_command, reconstruct_command, report_command
+from ground.commands.systems import dictionary_command, yamcs_command
+from ground.commands.uplink import uplink_command
+from ground.commands.view import view_command
 from obbgs_base.command_line import new_app, run
 from obbgs_base.output import output_may_fail
 
@@ -58,9 +58,9 @@ def listen_command(
 
     Example: ground listen --link 'serial:///dev/ttyUSB0?baud=921600' --session pass-12
     """
-    from ground.console import statuses_shown
-    from ground.forward import Forwarder
-    from ground.ingest import listen
+    from ground.commands.console import statuses_shown
+    from ground.link.forward import Forwarder
+    from ground.link.ingest import listen
 
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -112,7 +112,7 @@ def key(
 
     Example: ground key mission.key
     """
-    from ground.uplink import make_key, move_counter
+    from ground.link.uplink import make_key, move_counter
 
     if counter is not None:
         moved = move_counter(file, counter)

@@ -11,15 +11,15 @@ from typing import Literal
 
 import numpy as np
 
-import ground.truth
+import ground.session.truth
 from flightsw.icd.config import ConfigError, build, in_file, parse_yaml
 from flightsw.icd.frame import Frame, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.sequencer import Shot, plan
 from ground.formats.nerf import export_nerf
-from ground.session import open_session
-from ground.session_writer import SessionWriter
-from ground.telemetry import FlightCounts
+from ground.session.folder import open_session
+from ground.session.telemetry import FlightCounts
+from ground.session.writer import SessionWriter
 from hil import truth
 from hil.choices import SensorKind
 from hil.sky import Materials, blender, motion, sensor
@@ -268,7 +268,7 @@ def _digest(config: DatasetConfig, scenario_sha256: str, mesh: Path) -> str:
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode() + mesh_sha256(mesh).encode())
     for source in (*blender.SOURCES, Path(__file__)):
         digest.update(source.read_bytes())
-    for module in (sensor, motion, stars, truth, ground.truth):
+    for module in (sensor, motion, stars, truth, ground.session.truth):
         digest.update(inspect.getsource(module).encode())
     return digest.hexdigest()
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from flightsw.icd.mission import load_mission
-from ground.summary import model_rows, table
+from ground.show.summary import model_rows, table
 from hil.processes import installed, tied
 from hil.progress import progress_bar
 from hil.simulated_pass import PassConfig, fly, is_fault_count

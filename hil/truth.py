@@ -10,8 +10,8 @@ import trimesh
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission
 from flightsw.pose import pose_tag
-from ground import truth
-from ground.session import Session, open_session
+from ground.session import truth
+from ground.session.folder import Session, open_session
 from hil.sky.render_farm import RenderFarm
 from hil.sky.sensor import through_lens
 
@@ -28,7 +28,7 @@ def write_truth(
     geometry: bool = False,
     simulation: dict[str, dict] | None = None,
 ) -> None:
-    """Write the truth of a session's frames beside them (`ground.truth`); an existing truth folder is replaced.
+    """Write the truth of a session's frames beside them (`ground.session.truth`); an existing truth folder is replaced.
 
     The cloud holds `points` surface points, even by area, that at least one of the session's brackets sees.
 

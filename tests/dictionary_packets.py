@@ -18,7 +18,7 @@ from flightsw.icd.packet import (
     pack_packet,
 )
 from flightsw.icd.telemetry import DICTIONARY, NUMBERS, Item, Layout
-from ground.xtce import FRAME_HEADER
+from ground.link.xtce.document import FRAME_HEADER
 
 SECTIONS = {
     "telemetry": (APID_HOUSEKEEPING, ""),
@@ -81,7 +81,7 @@ def some_value(rng: random.Random, item: Item) -> Any:
 
 
 def found(prefix: str, item: Item, value: Any) -> dict[str, Any]:
-    """Return the XTCE parameters of an item, by the names that ground/xtce.py promises."""
+    """Return the XTCE parameters of an item, by the names that ground/link/xtce/document.py promises."""
     name = f"{prefix}_{item.name}"
     if item.kind == "text":
         return {f"{name}_length": len(value.encode()), name: value}

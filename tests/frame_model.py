@@ -32,9 +32,9 @@ from flightsw.icd.mission import load_mission
 from flightsw.settings import Settings, save_settings
 from flightsw.store import FrameStore, lock_store
 from flightsw.transfer_numbers import TransferNumbers
-from ground.ingest import _Ingest
-from ground.session_writer import SessionWriter
-from ground.uplink import make_key, outcome, parse_command, submit
+from ground.link.ingest import _Ingest
+from ground.link.uplink import make_key, outcome, parse_command, submit
+from ground.session.writer import SessionWriter
 from obbgs_base.checked import copy_of
 
 SIDE_PX = 8

@@ -24,7 +24,7 @@ import numpy as np
 
 from flightsw.icd.frame import Frame, PoseTag, decode_frame, encode_frame
 from flightsw.store import FrameStore
-from ground.session import open_session
+from ground.session.folder import open_session
 from hil.links.faults import Faults
 from hil.links.virtual_can import VirtualCan
 from hil.links.virtual_link import VirtualLink

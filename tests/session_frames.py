@@ -5,7 +5,7 @@ from pathlib import Path
 import yaml
 
 from flightsw.icd.frame import Frame, PoseTag
-from ground.session import Session
+from ground.session.folder import Session
 
 
 def frames_of(session: Session) -> list[Frame]:

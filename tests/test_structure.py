@@ -15,7 +15,7 @@ LIBRARY = {f"obbgs_core.{room}" for room in ("model", "render", "poses", "train"
     "obbgs_core"
 }
 CONTRACT = {"obbgs_base", "flightsw.icd", "flightsw.icd.transfer"}
-SESSIONS = {"ground.session", "ground.session_writer", "ground.telemetry"}
+GROUND = {"ground.session", "ground.formats"}
 ARROWS = {  # room: the rooms that its modules may import besides their own; a module stands in the innermost one
     "obbgs_base": set(),
     "obbgs_core.model": {"obbgs_base"},
@@ -39,19 +39,20 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     "flightsw.cameras": {"obbgs_base", "flightsw.icd", "flightsw.errors", "flightsw.clock"},
     "flightsw": CONTRACT
     | {"flightsw.icd.ndm", "flightsw.ports", "flightsw.errors", "flightsw.clock", "flightsw.cameras"},
-    "ground.telemetry": {"obbgs_base", "flightsw.icd"},
-    "ground.session": {"obbgs_base", "flightsw.icd", "ground.telemetry"},
-    "ground.session_writer": {"obbgs_base", "flightsw.icd", "ground.session", "ground.telemetry"},
-    "ground.formats": {"obbgs_base", "flightsw.icd", "ground.session", "ground.session_writer"},
-    "ground.baselines": CORE | {"obbgs_core.poses", "obbgs_core.start", "obbgs_core.score", "ground.formats"},
-    "ground.compare": {"obbgs_base", "flightsw.icd", "ground", "ground.baselines", "ground.session"}
-    | LIBRARY,
-    "ground.viewer": {"obbgs_base", "flightsw.icd", "ground", "ground.session"}
-    | LIBRARY - {"obbgs_core.train"},
-    "ground": CONTRACT
-    | {"flightsw.ports", "ground.formats", "ground.compare", "ground.viewer", "obbgs_core.attitude"}
-    | SESSIONS
-    | LIBRARY,
+    "ground.session": {"obbgs_base", "flightsw.icd", "obbgs_core", "obbgs_core.model", "obbgs_core.render"},
+    "ground.link": CONTRACT | {"flightsw.ports", "ground.session"},
+    "ground.formats": {"obbgs_base", "flightsw.icd", "ground.session"},
+    "ground.run": {"obbgs_base", "flightsw.icd", *GROUND, "ground.link", "obbgs_core.attitude"} | LIBRARY,
+    "ground.show": {"obbgs_base", "flightsw.icd", "ground.session", "ground.link", "ground.run"}
+    | LIBRARY
+    | {"obbgs_core.attitude"},
+    "ground.baselines": CORE | {"obbgs_core.start", "obbgs_core.score", "obbgs_core.poses", "ground.formats"},
+    "ground.compare": {"obbgs_base", "flightsw.icd", "ground.session", "ground.run", "ground.show"}
+    | LIBRARY
+    | {"ground.baselines"},
+    "ground.commands": {"obbgs_base", "flightsw.icd", *GROUND, "ground.link", "ground.run", "ground.show"}
+    | {"ground.compare", "obbgs_core", "obbgs_core.train"},
+    "ground": {"obbgs_base", "flightsw.icd", "ground.link", "ground.commands"},
     "hil.watched": {"obbgs_base"},
     "hil.sky": {"obbgs_base", "flightsw.icd"},
     "hil.world": {"obbgs_base", "flightsw.icd", "flightsw", "flightsw.cameras"},
@@ -61,7 +62,14 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
         *("hil.sky", "hil.world", "hil.watched"),
     },
     "hil": {
-        *("obbgs_base", "flightsw.icd", "flightsw", "ground", "ground.formats", *SESSIONS),
+        *(
+            "obbgs_base",
+            "flightsw.icd",
+            "flightsw",
+            "ground.session",
+            "ground.formats",
+            "ground.show",
+        ),
         *("hil.sky", "hil.world", "hil.links", "hil.cameras"),
     },
 }

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from ground.yamcs import write_yamcs
+from ground.link.yamcs import write_yamcs
 
 START_S = 120.0  # of a Java server on a busy machine
 ANSWER_S = 60.0

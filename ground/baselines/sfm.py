@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from ground.baselines.reconstruction import Reconstruction, Work
-from ground.formats.photographs import silent_colmap
+from ground.formats.photographs.poses import silent_colmap
 from obbgs_base.errors import Interrupted
 from obbgs_base.files import write_whole
 from obbgs_core.frames import TrainingFrame, mean_exposure_s, usable

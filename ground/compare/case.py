@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from ground.baselines.reconstruction import Reconstruction
-from ground.cameras import exposed, sensor_of
 from ground.compare.errors import CompareError
-from ground.estimated_poses import Alignment
-from ground.scores import ScoredView, clean_scores, cloud_scores, display_scores, noisy_psnr_db
-from ground.session import FrameRecord, Session, open_session, read_header
-from ground.training_frames import split, training_frame
-from ground.truth import Truth
+from ground.run.estimated_poses import Alignment
+from ground.run.scores import ScoredView, clean_scores, cloud_scores, display_scores, noisy_psnr_db
+from ground.session.cameras import exposed, sensor_of
+from ground.session.folder import FrameRecord, Session, open_session, read_header
+from ground.session.training_frames import split, training_frame
+from ground.session.truth import Truth
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.poses.gauge import seen_after, size_of
 from obbgs_core.score.shown import shown_points

@@ -7,7 +7,7 @@ import plotly.graph_objects as go
 from plotly.colors import qualitative
 
 from ground.compare.results import VERDICTS, Results, pareto
-from ground.plots import ticks_1_2_5
+from ground.show.plots import ticks_1_2_5
 
 COLOURS = (*qualitative.D3, *qualitative.Set2)
 VERDICT_COLOURS = ("#2a9d8f", "#e9c46a", "#f4a261", "#c0392b", "#8795a5")  # of VERDICTS

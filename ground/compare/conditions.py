@@ -17,7 +17,7 @@ from flightsw.icd.config import MAX_YAML_BYTES, ConfigError, build, in_file, par
 from ground.compare.case import Case
 from ground.compare.errors import CompareError
 from ground.compare.sky_behind import behind
-from ground.settings import checked_settings
+from ground.run.settings import checked_settings
 from obbgs_base.files import read_bounded
 from obbgs_base.stars import star_irradiance
 from obbgs_core.frames import TrainingFrame

@@ -15,7 +15,7 @@ from ground.compare.charts import COLOURS, VERDICT_COLOURS
 from ground.compare.page import error_of, shown_view
 from ground.compare.results import VERDICTS, Results, pareto
 from ground.compare.rows import Rows
-from ground.pictures import heat, tone
+from ground.show.pictures import heat, tone
 from obbgs_base.files import keep_mode
 
 DPI = 110

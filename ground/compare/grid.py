@@ -11,7 +11,7 @@ from ground.compare.case import case_name, content_digest
 from ground.compare.conditions import Condition
 from ground.compare.errors import CompareError
 from ground.compare.methods import Method, method
-from ground.session import open_session
+from ground.session.folder import open_session
 
 FORMAT = 1  # of a cell's digest; raise it when what is scored changes its meaning
 BASE_MB = 600.0  # a process with PyTorch before any work

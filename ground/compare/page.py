@@ -21,8 +21,8 @@ from ground.compare.results import HOLDS_DB, MARGIN_DB, SHAKEN_DB, VERDICTS, Met
 from ground.compare.rows import Rows
 from ground.compare.views import SHOWN, WORST, KeptView, read_views
 from ground.compare.worker import VIEWS
-from ground.page import beside, label, legend, page, picture, plot, section
-from ground.pictures import ERROR_FULL_SCALE, heat, tone
+from ground.show.page import beside, label, legend, page, picture, plot, section
+from ground.show.pictures import ERROR_FULL_SCALE, heat, tone
 from obbgs_base.files import write_whole
 
 PAGE = "compare.html"

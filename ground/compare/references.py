@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from ground.cameras import exposed
 from ground.compare.case import Case
 from ground.compare.errors import CompareError
+from ground.session.cameras import exposed
 from obbgs_core.frames import TrainingFrame, mean_exposure_s
 
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ground.baselines.reconstruction import EstimatedPoses, Reconstruction, Work
 from ground.compare.follow import MARKS
-from ground.intervals import interval_scores, stated_error_scores
-from ground.model_files import SURFACE_POINTS
+from ground.run.intervals import interval_scores, stated_error_scores
+from ground.run.model_files import SURFACE_POINTS
 from obbgs_base.errors import Interrupted
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.io.ply import save_ply

@@ -16,8 +16,8 @@ from ground.compare.origin import commit, with_origin
 from ground.compare.rows import locked
 from ground.compare.trainings import MODEL
 from ground.compare.views import write_views
-from ground.scores import of_similarity
-from ground.session import SessionError
+from ground.run.scores import of_similarity
+from ground.session.folder import SessionError
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.process import prepare_process
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ground.formats.pictures import FormatError
+from ground.formats.pictures.files import FormatError
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from flightsw.icd.quaternion import quat_to_matrix
-from ground.formats.lens import Intrinsics
-from ground.formats.pictures import FormatError, within
-from ground.formats.view import View
+from ground.formats.pictures.files import FormatError, within
+from ground.formats.pictures.lens import Intrinsics
+from ground.formats.pictures.view import View
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from flightsw.icd.quaternion import matrix_to_quat
 from ground.formats.nerf import posed_frames, split_frames
 from ground.formats.nerfstudio import export_nerfstudio
-from ground.session import Session
+from ground.session.folder import Session
 from obbgs_base.files import write_whole
 
 PINHOLE = 1  # the number of COLMAP's camera model

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from ground.formats.axes import rigid_inverse
-from ground.formats.lens import Intrinsics
-from ground.formats.pictures import FormatError, pictures_in, read_header, within
-from ground.formats.view import View
+from ground.formats.pictures.files import FormatError, pictures_in, read_header, within
+from ground.formats.pictures.lens import Intrinsics
+from ground.formats.pictures.view import View
 
 COLUMNS = 17
 ROTATION_TOLERANCE = 1e-3

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ground.formats.lens import Intrinsics
-from ground.formats.pictures import FormatError, image_size, within
-from ground.formats.view import View
+from ground.formats.pictures.files import FormatError, image_size, within
+from ground.formats.pictures.lens import Intrinsics
+from ground.formats.pictures.view import View
 
 NUMBERS = 21  # of a picture: K, R and t
 ROTATION_TOLERANCE = 1e-3

@@ -17,10 +17,10 @@ import numpy as np
 from flightsw.icd.config import MAX_JSON_BYTES, ConfigError, build, keys_below, parse_json
 from flightsw.icd.mission import CameraSection
 from ground.formats.axes import opengl_to_world_to_camera, world_to_camera_to_opengl
-from ground.formats.lens import Intrinsics
-from ground.formats.pictures import KINDS, FormatError, image_size, within
-from ground.formats.views import Exported, View
-from ground.session import SPLITS, FrameRecord, Session
+from ground.formats.pictures.files import KINDS, FormatError, image_size, within
+from ground.formats.pictures.lens import Intrinsics
+from ground.formats.pictures.views import Exported, View
+from ground.session.folder import SPLITS, FrameRecord, Session
 from obbgs_base.files import read_bounded, write_whole
 
 log = logging.getLogger(__name__)

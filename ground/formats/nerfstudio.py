@@ -9,7 +9,6 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from ground.formats.lens import Intrinsics
 from ground.formats.nerf import (
     DISTORTION_KEYS,
     as_exported,
@@ -25,9 +24,10 @@ from ground.formats.nerf import (
     split_frames,
     write_readings,
 )
-from ground.formats.pictures import FormatError
-from ground.formats.views import Exported, View
-from ground.session import SPLITS, Session
+from ground.formats.pictures.files import FormatError
+from ground.formats.pictures.lens import Intrinsics
+from ground.formats.pictures.views import Exported, View
+from ground.session.folder import SPLITS, Session
 from obbgs_base.files import write_whole
 
 log = logging.getLogger(__name__)

@@ -10,9 +10,9 @@ import numpy as np
 
 from flightsw.icd.config import MAX_JSON_BYTES, ConfigError, parse_json
 from flightsw.icd.quaternion import quat_to_matrix
-from ground.formats.lens import Intrinsics
-from ground.formats.pictures import FormatError
-from ground.formats.view import View
+from ground.formats.pictures.files import FormatError
+from ground.formats.pictures.lens import Intrinsics
+from ground.formats.pictures.view import View
 from obbgs_base.files import read_bounded
 
 

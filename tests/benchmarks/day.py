@@ -154,15 +154,15 @@ def a_day(hours: float, folder: Path, show: Callable[[dict[str, Any]], None]) ->
         # imported here, since functions of the time are arguments' defaults
         import numpy as np
 
-        import ground.ingest
+        import ground.link.ingest
         from flightsw.commands import KeyRing
         from flightsw.downlink import run_downlink
         from flightsw.icd.command import Command
         from flightsw.icd.frame import Frame, PoseTag
         from flightsw.icd.mission import load_mission
         from flightsw.store import open_store
-        from ground.session import open_session
-        from ground.uplink import make_key, outcome, submit
+        from ground.link.uplink import make_key, outcome, submit
+        from ground.session.folder import open_session
 
         mission = load_mission("mission.yaml")
         camera = dataclasses.replace(mission.camera, width=SIZE_PX, height=SIZE_PX)
@@ -222,10 +222,10 @@ def a_day(hours: float, folder: Path, show: Callable[[dict[str, Any]], None]) ->
         flight = threading.Thread(
             target=lambda: run_downlink(sending, wire.flight, mission, should_stop=on_flight, keys=keys)
         )
-        with _port(ground.ingest, wire.ground):
+        with _port(ground.link.ingest, wire.ground):
             # flight has the first turn: the ground waits for its own within the first exchange
             flight.start()
-            summary = ground.ingest.listen(
+            summary = ground.link.ingest.listen(
                 "serial:///driven",
                 session,
                 mission,

@@ -65,8 +65,8 @@ from flightsw.icd.slcan import FD_SIZES, SlcanText, format_slcan
 from flightsw.icd.telemetry import DICTIONARY, NUMBERS, Item
 from flightsw.icd.transfer import Receiver, Sender, parse_pdu
 from flightsw.store import open_store
-from ground.telemetry import TelemetryLog
-from ground.uplink import Uplinker, parse_command
+from ground.link.uplink import Uplinker, parse_command
+from ground.session.telemetry import TelemetryLog
 
 if hook is not None:
     hook.__exit__(None, None, None)

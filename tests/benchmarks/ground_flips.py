@@ -22,12 +22,12 @@ from flightsw.icd.frame import Frame, PoseTag, encode_frame
 from flightsw.icd.mission import ConfigError, Mission
 from flightsw.icd.packet import APID_EVENTS, APID_HOUSEKEEPING, APID_REPORTS
 from flightsw.icd.telemetry import DICTIONARY, Item
-from ground.session import LOGS, SessionError, open_session, read_header, read_log
-from ground.session_check import damage
-from ground.session_writer import SessionWriter
-from ground.telemetry import TelemetryLog
-from ground.telemetry_plots import housekeeping_series
-from ground.uplink import Uplinker, make_key, outcome, submit
+from ground.link.uplink import Uplinker, make_key, outcome, submit
+from ground.session.check import damage
+from ground.session.folder import LOGS, SessionError, open_session, read_header, read_log
+from ground.session.telemetry import TelemetryLog
+from ground.session.writer import SessionWriter
+from ground.show.telemetry_plots import housekeeping_series
 from obbgs_base.files import write_whole
 
 FRAMES, SIZE_PX = 4, 24

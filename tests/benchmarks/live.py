@@ -28,12 +28,12 @@ import torch
 from flightsw.icd.frame import Frame
 from flightsw.icd.mission import load_mission
 from flightsw.store import FrameStore
-from ground.cameras import exposed, predicted_image, sensor_of
-from ground.estimated_poses import FILE as POSES
-from ground.estimated_poses import Alignment, read_estimate
-from ground.session import Session, open_session
-from ground.training_frames import split
-from ground.truth import Truth
+from ground.run.estimated_poses import FILE as POSES
+from ground.run.estimated_poses import Alignment, read_estimate
+from ground.session.cameras import exposed, predicted_image, sensor_of
+from ground.session.folder import Session, open_session
+from ground.session.training_frames import split
+from ground.session.truth import Truth
 from hil.links.virtual_serial import VirtualSerial
 from hil.processes import end, installed, tied, unwind_on_sigterm
 from obbgs_base.errors import ObbgsError

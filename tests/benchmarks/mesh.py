@@ -11,11 +11,11 @@ from pathlib import Path
 
 import torch
 
-from ground.cameras import sensor_of
 from ground.compare.case import load_case
-from ground.mesh_files import read_mesh_points, write_mesh
-from ground.scores import cloud_scores
-from ground.training_frames import split
+from ground.run.mesh_files import read_mesh_points, write_mesh
+from ground.run.scores import cloud_scores
+from ground.session.cameras import sensor_of
+from ground.session.training_frames import split
 from obbgs_core.frames import mean_exposure_s
 from obbgs_core.io.ply import load_ply
 from tests.benchmarks.rows import shown

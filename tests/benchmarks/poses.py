@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ground.cameras import exposed
-from ground.scores import ScoredView, clean_scores, cloud_scores
+from ground.run.scores import ScoredView, clean_scores, cloud_scores
+from ground.session.cameras import exposed
 from hil.world.scenario import load_scenario
 from obbgs_base.navigation_errors import (
     NominalMotion,

@@ -27,11 +27,11 @@ from torch import Tensor
 from flightsw.icd.frame import Frame, PoseTag
 from flightsw.icd.mission import CameraSection
 from flightsw.icd.quaternion import matrix_to_quat
-from ground.cameras import sensor_of
 from ground.compare.case import Case
-from ground.session import SCHEMA_VERSION
-from ground.session_writer import frame_line
-from ground.truth import TrueFrame, write_truth
+from ground.session.cameras import sensor_of
+from ground.session.folder import SCHEMA_VERSION
+from ground.session.truth import TrueFrame, write_truth
+from ground.session.writer import frame_line
 from hil.sky.sensor import PRESETS, RENDERED_PSF_SIGMA_PX, SensorModel, converted, read_out, through_lens
 from obbgs_base.stars import star_radiance
 from obbgs_core.frames import TrainingFrame

@@ -27,11 +27,11 @@ from flightsw.icd.frame import HEADER, Frame, PoseTag
 from flightsw.store import FrameStore
 from flightsw.triage import Ranked, sending_order, sent_view
 from flightsw.triage_worker import ModelVerified, TriageWorker
-from ground.cameras import camera_of, exposed, sensor_of
-from ground.model_files import SURFACE_POINTS
-from ground.session import FrameRecord, Session, open_session
-from ground.training_frames import split, training_frame
-from ground.truth import Truth
+from ground.run.model_files import SURFACE_POINTS
+from ground.session.cameras import camera_of, exposed, sensor_of
+from ground.session.folder import FrameRecord, Session, open_session
+from ground.session.training_frames import split, training_frame
+from ground.session.truth import Truth
 from hil.dataset import DatasetConfig, make_dataset
 from hil.sky import SHIPPED
 from obbgs_core.frames import TrainingFrame, cameras_of

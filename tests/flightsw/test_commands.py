@@ -18,7 +18,7 @@ from flightsw.icd.config import ConfigError
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.settings import load_settings
 from flightsw.store import FrameStore
-from ground.uplink import make_key
+from ground.link.uplink import make_key
 from obbgs_base.files import write_whole
 from tests.small_disk import fill_disk, small_disk
 

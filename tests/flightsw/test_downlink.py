@@ -38,7 +38,7 @@ from flightsw.icd.transfer.checksum import TYPES
 from flightsw.settings import Settings, save_settings
 from flightsw.store import FrameStore
 from flightsw.triage_worker import ModelProcess
-from ground.uplink import make_key
+from ground.link.uplink import make_key
 
 
 class ListLink:

@@ -36,7 +36,7 @@ from flightsw.triage import (
     tile_means,
     verified_model,
 )
-from ground.ingest import listen
+from ground.link.ingest import listen
 from hil.links.virtual_serial import VirtualSerial
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.sensor import Sensor

@@ -26,7 +26,7 @@ from flightsw.settings import Settings, save_settings
 from flightsw.store import FrameStore
 from flightsw.triage import Ranked, rank_frames
 from flightsw.triage_worker import ModelFailed, ModelVerified, Result, TriageWorker
-from ground.ingest import listen
+from ground.link.ingest import listen
 from hil.links.virtual_serial import VirtualSerial
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.sensor import Sensor

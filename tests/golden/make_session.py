@@ -12,7 +12,7 @@ from flightsw.icd.frame import decode_frame
 from flightsw.icd.mission import load_mission
 from flightsw.sequencer import capture
 from flightsw.store import FrameStore
-from ground.session_writer import SessionWriter
+from ground.session.writer import SessionWriter
 from hil.cameras.virtual import CameraServer
 from hil.sky import SHIPPED
 from hil.sky.render_farm import RenderFarm

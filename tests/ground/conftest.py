@@ -9,6 +9,6 @@ import pytest
 def few_surface_points() -> Iterator[None]:
     """The 100,000 points of a surface cost half of a short run, and hardly any test measures how good they are."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ground.model_files.SURFACE_POINTS", 2_000)
-        patch.setattr("ground.evaluate.SURFACE_POINTS", 2_000)  # on the mesh
+        patch.setattr("ground.run.model_files.SURFACE_POINTS", 2_000)
+        patch.setattr("ground.run.evaluate.SURFACE_POINTS", 2_000)  # on the mesh
         yield

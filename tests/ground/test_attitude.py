@@ -10,18 +10,19 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from flightsw.icd.quaternion import matrix_to_quat
-from ground import attitude, cli
-from ground.attitude import FoundAttitude, in_body_axes, refined_motion
-from ground.attitude_choice import chosen_by_training
-from ground.cameras import sensor_of
-from ground.evaluate import evaluate
-from ground.live import reconstruct_live
-from ground.reconstruct import reconstruct
-from ground.report_attitude import attitude_section
-from ground.runs import open_run
-from ground.session import Navigation, Session, SessionError, open_session
-from ground.training_frames import training_frame
-from ground.truth import Truth
+from ground import cli
+from ground.run import attitude
+from ground.run.attitude import FoundAttitude, in_body_axes, refined_motion
+from ground.run.attitude_choice import chosen_by_training
+from ground.run.evaluate import evaluate
+from ground.run.live.reconstruct import reconstruct_live
+from ground.run.reconstruct import reconstruct
+from ground.run.runs import open_run
+from ground.session.cameras import sensor_of
+from ground.session.folder import Navigation, Session, SessionError, open_session
+from ground.session.training_frames import training_frame
+from ground.session.truth import Truth
+from ground.show.report.attitude import attitude_section
 from obbgs_base.errors import Interrupted
 from obbgs_base.navigation_errors import SharedParameters, displaced
 from obbgs_core.attitude.estimate import AttitudeUndetermined

@@ -18,7 +18,7 @@ from flightsw.icd.frame import HEADER, encode_frame
 from flightsw.icd.packet import APID_EVENTS, APID_FRAME_HEADERS, APID_HOUSEKEEPING, APID_REPORTS
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import Incoming
-from ground.console import (
+from ground.commands.console import (
     PLAIN_S,
     ConsoleView,
     events_once,
@@ -28,9 +28,9 @@ from ground.console import (
     shown,
     size,
 )
-from ground.ingest import ListenSummary, Status
-from ground.telemetry import TelemetryLog
-from ground.terminal_pictures import COLUMNS, LatestPicture, stretched
+from ground.commands.terminal_pictures import COLUMNS, LatestPicture, stretched
+from ground.link.ingest import ListenSummary, Status
+from ground.session.telemetry import TelemetryLog
 
 LINK, HERE = "serial:///dev/ttyUSB0?baud=921600", Path("nowhere/pass-12")
 SAMPLES = {"text": "x", "bytes": b"\xab\xcd\xef\x01" * 8, "float64": 1.5}

@@ -11,10 +11,10 @@ from flightsw.icd.frame import encode_frame
 from flightsw.icd.packet import APID_EVENTS
 from flightsw.icd.telemetry import DICTIONARY
 from ground import cli
-from ground.session import MissingFrames, SessionCorrupt, open_session, read_header
-from ground.session_check import damage
-from ground.session_writer import SessionWriter
-from ground.telemetry import TelemetryLog
+from ground.session.check import damage
+from ground.session.folder import MissingFrames, SessionCorrupt, open_session, read_header
+from ground.session.telemetry import TelemetryLog
+from ground.session.writer import SessionWriter
 
 NUMBERS = (2, 0, 1, 3)
 

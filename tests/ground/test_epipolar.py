@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ground import cli
-from ground.formats import epipolar
 from ground.formats.middlebury import read_middlebury
-from ground.formats.views import FormatError, Intrinsics, PoseSigmas, View
-from ground.session import open_session
+from ground.formats.photographs import epipolar
+from ground.formats.pictures.views import FormatError, Intrinsics, PoseSigmas, View
+from ground.session.folder import open_session
 from tests import raycast
 
 SIZE_PX, FOCAL_PX = 200, 470.0

@@ -12,10 +12,10 @@ import torch
 from flightsw.icd.quaternion import quat_to_matrix
 from ground.baselines.reconstruction import EstimatedPoses, Reconstruction
 from ground.compare.case import load_case
-from ground.estimated_poses import FILE, Alignment, estimated_records, read_estimate, write_estimate
-from ground.session import SessionError, open_session
-from ground.truth import Truth
-from ground.viewer.source import Source
+from ground.run.estimated_poses import FILE, Alignment, estimated_records, read_estimate, write_estimate
+from ground.session.folder import SessionError, open_session
+from ground.session.truth import Truth
+from ground.show.viewer.source import Source
 from obbgs_base.navigation_errors import SharedParameters
 from obbgs_core.frames import cameras_of
 from obbgs_core.io.ply import save_ply

@@ -12,17 +12,17 @@ import torch
 import trimesh
 from scipy.spatial import KDTree
 
-from ground import evaluate as scoring
-from ground.card import chi2_explained, model_card
 from ground.compare.case import load_case
 from ground.compare.trainings import imaging
-from ground.evaluate import evaluate
-from ground.mesh_files import read_mesh_points
-from ground.reconstruct import reconstruct
-from ground.report import write_report
-from ground.scores import ScoredView, clean_scores
-from ground.session import SessionError
-from ground.truth import read_points
+from ground.run import evaluate as scoring
+from ground.run.card import chi2_explained, model_card
+from ground.run.evaluate import evaluate
+from ground.run.mesh_files import read_mesh_points
+from ground.run.reconstruct import reconstruct
+from ground.run.scores import ScoredView, clean_scores
+from ground.session.folder import SessionError
+from ground.session.truth import read_points
+from ground.show.report.document import write_report
 from obbgs_core.frames import cameras_of
 from obbgs_core.io.ply import load_ply
 from obbgs_core.score.metrics import foreground_psnr_db, psnr_db

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from ground import frames_of, open_session, sensor_of
-from ground.training_frames import usable
+from ground.session.training_frames import usable
 from obbgs_core import load_ply, preset
 from obbgs_core.train import train
 

@@ -17,15 +17,15 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 from scipy.spatial.transform import Rotation
 
 from ground.formats.axes import world_to_camera_to_opengl
-from ground.formats.brackets import brackets_of
-from ground.formats.exposures import estimated, light_s, read_table, with_exposures
-from ground.formats.lens import Intrinsics
-from ground.formats.photographs import read_photographs
-from ground.formats.pictures import FormatError, Light, decode, read_header
-from ground.formats.srgb import to_srgb
-from ground.formats.view import View
-from ground.formats.views import Values
-from ground.session import open_session
+from ground.formats.photographs.brackets import brackets_of
+from ground.formats.photographs.exposures import estimated, light_s, read_table, with_exposures
+from ground.formats.photographs.poses import read_photographs
+from ground.formats.pictures.files import FormatError, Light, decode, read_header
+from ground.formats.pictures.lens import Intrinsics
+from ground.formats.pictures.srgb import to_srgb
+from ground.formats.pictures.view import View
+from ground.formats.pictures.views import Values
+from ground.session.folder import open_session
 from tests import raycast
 from tests.commands import call
 

@@ -21,14 +21,14 @@ from flightsw.icd.framing import frame_packet
 from flightsw.icd.packet import APID_FRAME_HEADERS
 from flightsw.ports import SerialLink
 from flightsw.store import FrameStore
-from ground.evaluate import evaluate
-from ground.formats.views import Intrinsics, View, write_session
-from ground.ingest import listen
-from ground.reconstruct import reconstruct
-from ground.report import write_report
-from ground.session import SessionCorrupt, open_session
-from ground.session_writer import SessionWriter
-from ground.telemetry import FlightCounts, TelemetryLog
+from ground.formats.pictures.views import Intrinsics, View, write_session
+from ground.link.ingest import listen
+from ground.run.evaluate import evaluate
+from ground.run.reconstruct import reconstruct
+from ground.session.folder import SessionCorrupt, open_session
+from ground.session.telemetry import FlightCounts, TelemetryLog
+from ground.session.writer import SessionWriter
+from ground.show.report.document import write_report
 from hil.links.virtual_serial import VirtualSerial
 from tests.dictionary_packets import packets
 

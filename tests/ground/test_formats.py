@@ -21,9 +21,8 @@ from ground.formats.colmap import read_colmap
 from ground.formats.colmap_export import export_colmap
 from ground.formats.nerf import export_nerf, read_nerf, split_frames
 from ground.formats.nerfstudio import export_nerfstudio, read_nerfstudio
-from ground.formats.placement import placed
-from ground.formats.shirt import read_shirt
-from ground.formats.views import (
+from ground.formats.pictures.placement import placed
+from ground.formats.pictures.views import (
     FormatError,
     Intrinsics,
     PoseSigmas,
@@ -32,8 +31,9 @@ from ground.formats.views import (
     undistort,
     write_session,
 )
-from ground.session import SessionError, open_session
-from ground.session_writer import SessionWriter
+from ground.formats.shirt import read_shirt
+from ground.session.folder import SessionError, open_session
+from ground.session.writer import SessionWriter
 from tests.commands import call
 
 RNG = np.random.default_rng(3)

@@ -17,8 +17,8 @@ from flightsw.icd.config import ConfigError
 from flightsw.icd.framing import frame_packet
 from flightsw.icd.packet import APID_EVENTS, TELECOMMAND, pack_packet
 from flightsw.ports import LinkError
-from ground.forward import Forwarder, parse_target
-from ground.ingest import ListenSummary, Status, listen
+from ground.link.forward import Forwarder, parse_target
+from ground.link.ingest import ListenSummary, Status, listen
 from tests.dictionary_packets import packets
 from tests.yamcs import free_ports
 

@@ -13,16 +13,14 @@ from PIL import Image
 from skimage import color
 from skimage.metrics import peak_signal_noise_ratio
 
-from ground.cameras import cameras_of, predicted_image
-from ground.cli_options import PixelValues
-from ground.evaluate import evaluate
+from ground.commands.options import PixelValues
 from ground.formats.axes import world_to_camera_to_opengl
 from ground.formats.colmap import read_colmap
-from ground.formats.judgement import judge
 from ground.formats.nerf import export_nerf, read_nerf
 from ground.formats.nerfstudio import export_nerfstudio, read_nerfstudio
-from ground.formats.srgb import from_srgb, to_srgb
-from ground.formats.views import (
+from ground.formats.pictures.judgement import judge
+from ground.formats.pictures.srgb import from_srgb, to_srgb
+from ground.formats.pictures.views import (
     FormatError,
     Intrinsics,
     Values,
@@ -30,11 +28,13 @@ from ground.formats.views import (
     first_of_each_split,
     write_session,
 )
-from ground.reconstruct import reconstruct
-from ground.report import write_report
-from ground.runs import open_run
-from ground.session import SessionCorrupt, SessionError, open_session
-from ground.training_frames import split, training_frame
+from ground.run.evaluate import evaluate
+from ground.run.reconstruct import reconstruct
+from ground.run.runs import open_run
+from ground.session.cameras import cameras_of, predicted_image
+from ground.session.folder import SessionCorrupt, SessionError, open_session
+from ground.session.training_frames import split, training_frame
+from ground.show.report.document import write_report
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.render import render
 from tests.scenes import intrinsics, photographed, pose, target

@@ -8,7 +8,7 @@ import torch
 
 from ground.compare.case import load_case
 from ground.compare.errors import CompareError
-from ground.intervals import interval_scores, stated_error_scores
+from ground.run.intervals import interval_scores, stated_error_scores
 from obbgs_core.frames import cameras_of
 from obbgs_core.losses import fit_figures
 from obbgs_core.misfit import model_error

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from ground import cli
-from ground.reconstruct import reconstruct
+from ground.run.reconstruct import reconstruct
 from obbgs_core.train.presets import preset
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"

@@ -13,20 +13,20 @@ import torch
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-import ground.live
+import ground.run.live.reconstruct
 from flightsw.icd.mission import ConfigError
 from flightsw.icd.quaternion import matrix_to_quat
 from ground import cli
-from ground.estimated_poses import read_estimate
-from ground.listing import find_sessions
-from ground.live import MANY_EXPECTED, LiveReconstruction, PassEnd, reconstruct_live
-from ground.live_process import LiveProcess, TrainingFailed
-from ground.live_status import LiveStatus, line, read_status
-from ground.reconstruct import reconstruct
-from ground.runs import open_run, unfinished_run
-from ground.session import SessionError
-from ground.training_frames import is_held_out
-from ground.uplink import listening
+from ground.link.uplink import listening
+from ground.run.estimated_poses import read_estimate
+from ground.run.live.process import LiveProcess, TrainingFailed
+from ground.run.live.reconstruct import MANY_EXPECTED, LiveReconstruction, PassEnd, reconstruct_live
+from ground.run.live.status import LiveStatus, line, read_status
+from ground.run.reconstruct import reconstruct
+from ground.run.runs import open_run, unfinished_run
+from ground.session.folder import SessionError
+from ground.session.training_frames import is_held_out
+from ground.show.listing import find_sessions
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import TooFewFrames
 from obbgs_core.io.ply import load_ply

@@ -15,14 +15,14 @@ from flightsw.icd.frame import Frame, PoseTag, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.icd.quaternion import matrix_to_quat
 from flightsw.triage import Renderer, rank_frames
-from ground.cameras import sensor_of, sun_direction
-from ground.card import model_card
-from ground.evaluate import evaluate
-from ground.reconstruct import reconstruct
-from ground.report import write_report
-from ground.session import open_session
-from ground.session_writer import SessionWriter
-from ground.training_frames import training_frame
+from ground.run.card import model_card
+from ground.run.evaluate import evaluate
+from ground.run.reconstruct import reconstruct
+from ground.session.cameras import sensor_of, sun_direction
+from ground.session.folder import open_session
+from ground.session.training_frames import training_frame
+from ground.session.writer import SessionWriter
+from ground.show.report.document import write_report
 from obbgs_core.batches import Batches
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame, sun_span_deg

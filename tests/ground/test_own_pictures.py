@@ -19,16 +19,16 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from ground.formats.colmap import read_colmap
-from ground.formats.lens import Intrinsics, pinhole_of, undistort
 from ground.formats.llff import read_llff
-from ground.formats.masks import with_masks
 from ground.formats.middlebury import read_middlebury
 from ground.formats.nerf import read_nerf
 from ground.formats.nerfstudio import read_nerfstudio
-from ground.formats.pictures import KINDS, FormatError, decode, pictures_in, read_header, within
-from ground.formats.view import View
-from ground.formats.views import Values, write_session
-from ground.session import open_session
+from ground.formats.pictures.files import KINDS, FormatError, decode, pictures_in, read_header, within
+from ground.formats.pictures.lens import Intrinsics, pinhole_of, undistort
+from ground.formats.pictures.masks import with_masks
+from ground.formats.pictures.view import View
+from ground.formats.pictures.views import Values, write_session
+from ground.session.folder import open_session
 from tests.commands import call
 
 LENS = {"w": 16, "h": 16, "fl_x": 20.0, "fl_y": 20.0, "cx": 8.0, "cy": 8.0}

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from ground.telemetry_plots import LIMIT_COLOURS, housekeeping_series
-from ground.viewer.door import opened
-from ground.viewer.pass_plots import PassPlots, drawn_lines, pass_events, plotted, up_to
+from ground.show.telemetry_plots import LIMIT_COLOURS, housekeeping_series
+from ground.show.viewer.door import opened
+from ground.show.viewer.pass_plots import PassPlots, drawn_lines, pass_events, plotted, up_to
 from tests.browser import chromium
 from tests.browser import opened as page_of
 from tests.ground.test_telemetry_plots import packet, written

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from ground import cli
 from ground.baselines.sfm import similarity
-from ground.formats.photographs import read_photographs
-from ground.formats.views import FormatError, PoseSigmas, write_session
-from ground.session import open_session
+from ground.formats.photographs.poses import read_photographs
+from ground.formats.pictures.views import FormatError, PoseSigmas, write_session
+from ground.session.folder import open_session
 from obbgs_base.errors import Interrupted
 from tests import raycast
 

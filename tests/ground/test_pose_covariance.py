@@ -17,8 +17,8 @@ from flightsw.icd.mission import load_mission
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.navigation import RelativePose, SatelliteStates, interpolate, parse_state
 from flightsw.pose import navigation_tag
-from ground.session import open_session
-from ground.training_frames import motion_covariance, tag_covariance, training_frame
+from ground.session.folder import open_session
+from ground.session.training_frames import motion_covariance, tag_covariance, training_frame
 from obbgs_core.model.pose_covariance import flaw
 from obbgs_core.poses.corrections import PoseCorrections
 

@@ -20,13 +20,13 @@ from ground.compare.case import load_case
 from ground.compare.follow import image_of
 from ground.compare.methods import Task, method
 from ground.compare.references import black, mean_image
-from ground.evaluate import evaluate
-from ground.pictures import bounding_box
-from ground.reconstruct import reconstruct
-from ground.report import write_report
-from ground.session import MissingFrames, SessionError, open_session
-from ground.settings import changes_for
-from ground.training_frames import split
+from ground.run.evaluate import evaluate
+from ground.run.reconstruct import reconstruct
+from ground.run.settings import changes_for
+from ground.session.folder import MissingFrames, SessionError, open_session
+from ground.session.training_frames import split
+from ground.show.pictures import bounding_box
+from ground.show.report.document import write_report
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.io.ply import load_ply
@@ -54,7 +54,7 @@ def trained(tmp_path_factory) -> tuple[Path, dict]:
     """One real, short training of the default method, with its blind twin."""
     session = copy_session(tmp_path_factory.mktemp("trained"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ground.model_files.SURFACE_POINTS", 100_000)  # as everywhere but in these tests
+        patch.setattr("ground.run.model_files.SURFACE_POINTS", 100_000)  # as everywhere but in these tests
         reconstruct(session, "run", "obbgs", TRAINED, blind_reference=True)
     return session, evaluate(session, "run")
 
@@ -147,7 +147,7 @@ def test_a_killed_run_goes_on_to_the_same_model(tmp_path):
 import os, signal
 from pathlib import Path
 import obbgs_core.train.trainer as optimize
-from ground.reconstruct import reconstruct
+from ground.run.reconstruct import reconstruct
 optimize.CHECKPOINT_EVERY_S = 0.0
 def die(progress):
     if progress.info.step == 40:

@@ -18,14 +18,14 @@ from scipy.ndimage import center_of_mass
 from typer.testing import CliRunner
 
 from ground import cli, frames_of, predicted_image, sensor_of, split
-from ground.cameras import range_in_words
-from ground.estimated_poses import read_estimate, write_estimate
-from ground.evaluate import evaluate
-from ground.reconstruct import reconstruct
-from ground.report import write_report
-from ground.session import open_session
-from ground.viewer.source import Source
-from ground.viewer.viewer import _compared
+from ground.run.estimated_poses import read_estimate, write_estimate
+from ground.run.evaluate import evaluate
+from ground.run.reconstruct import reconstruct
+from ground.session.cameras import range_in_words
+from ground.session.folder import open_session
+from ground.show.report.document import write_report
+from ground.show.viewer.source import Source
+from ground.show.viewer.viewer import _compared
 from obbgs_core.score.metrics import psnr_db
 from tests.browser import as_url, chromium, opened
 from tests.ground.test_telemetry_plots import packet, written

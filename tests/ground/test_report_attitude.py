@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ground.report_attitude import axis_figure, rotation_rows
+from ground.show.report.attitude import axis_figure, rotation_rows
 from obbgs_core.attitude.motion import of_principal, principal
 from obbgs_core.attitude.target_motion import TargetMotion
 from tests import scenes

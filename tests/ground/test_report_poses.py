@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ground.cameras import sensor_of
-from ground.estimated_poses import write_estimate
-from ground.report_poses import pose_history, poses_section
-from ground.runs import Run
-from ground.session import Navigation, open_session
-from ground.training_frames import split
+from ground.run.estimated_poses import write_estimate
+from ground.run.runs import Run
+from ground.session.cameras import sensor_of
+from ground.session.folder import Navigation, open_session
+from ground.session.training_frames import split
+from ground.show.report.poses import pose_history, poses_section
 from obbgs_base.navigation_errors import SIZE, SharedParameters
 from obbgs_core.poses.estimate import PoseEstimate
 from tests import scenes

@@ -20,16 +20,17 @@ from typer.testing import CliRunner
 from flightsw.icd import model_file
 from flightsw.icd.mission import METHODS, VARIANTS, ConfigError, ReconstructSection, load_mission
 from flightsw.icd.telemetry import DICTIONARY
-from ground import cli, uplink
-from ground.card import model_card
-from ground.cli_options import ExportFormat, ImportFormat, Quality, UplinkCommand
-from ground.evaluate import evaluate
-from ground.progress import Stop, steps_shown
-from ground.reconstruct import reconstruct
-from ground.report import write_report
-from ground.session import SessionError
-from ground.settings import all_changes, changes_for, mission_changes, set_changes
-from ground.summary import model_rows
+from ground import cli
+from ground.commands.options import ExportFormat, ImportFormat, Quality, UplinkCommand
+from ground.commands.progress import Stop, steps_shown
+from ground.link import uplink
+from ground.run.card import model_card
+from ground.run.evaluate import evaluate
+from ground.run.reconstruct import reconstruct
+from ground.run.settings import all_changes, changes_for, mission_changes, set_changes
+from ground.session.folder import SessionError
+from ground.show.report.document import write_report
+from ground.show.summary import model_rows
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged
 from obbgs_core.io.ply import load_ply
@@ -72,7 +73,7 @@ def fail(*arguments, **named):
     ],
 )
 def test_what_cannot_be_made_of_a_model_is_named_and_the_rest_is_there(session, monkeypatch, part, missing):
-    monkeypatch.setattr(f"ground.model_files.{part}", fail)
+    monkeypatch.setattr(f"ground.run.model_files.{part}", fail)
     folder = reconstruct(session, "run", "obbgs", QUICK)
     metrics = evaluate(session, "run")
     assert metrics["missing_outputs"] == {missing: "RuntimeError: no such luck"}
@@ -119,8 +120,8 @@ def test_the_command_trains_and_ends_well_where_the_model_is_too_large_for_onnx(
 
 def test_the_limit_of_the_uplink_stops_no_model_of_the_ground_but_the_uplink(session, tmp_path, monkeypatch):
     assert uplink.MAX_MODEL_BYTES == model_file.MAX_MODEL_BYTES
-    monkeypatch.setattr("ground.model_files.MAX_MODEL_BYTES", 1000)
-    monkeypatch.setattr("ground.uplink.MAX_MODEL_BYTES", 1000)
+    monkeypatch.setattr("ground.run.model_files.MAX_MODEL_BYTES", 1000)
+    monkeypatch.setattr("ground.link.uplink.MAX_MODEL_BYTES", 1000)
     folder = reconstruct(session, "run", "obbgs", QUICK)
     metrics = evaluate(session, "run")
     assert metrics["onnx_bytes"] > 1000 and metrics["onnx_fits_uplink"] is False
@@ -138,7 +139,7 @@ def test_a_model_that_the_disk_does_not_take_is_kept_and_written_later(session, 
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("ground.model_files.save_ply", full)
+        patched.setattr("ground.run.model_files.save_ply", full)
         with pytest.raises(
             SessionError, match="No space left on device; the same command resumes from the training"
         ):
@@ -157,7 +158,7 @@ def test_a_blind_training_that_fails_does_not_cost_the_one_that_did_not(session,
             raise Diverged(7, math.inf)
         return train(frames, sensor, config, *more)
 
-    monkeypatch.setattr("ground.reconstruct.train", blindly_diverging)
+    monkeypatch.setattr("ground.run.reconstruct.train", blindly_diverging)
     reconstruct(session, "run", "obbgs", QUICK, blind_reference=True)
     metrics = evaluate(session, "run")
     assert "the loss became inf at step 7" in metrics["missing_outputs"]["blind.ply"]
@@ -244,8 +245,8 @@ def test_runs_go_to_another_folder_and_are_scored_there(session, tmp_path):
 TRAINS_UNTIL_TOLD = """
 import sys
 from pathlib import Path
-import ground.model_files
-from ground.reconstruct import reconstruct
+import ground.run.model_files
+from ground.run.reconstruct import reconstruct
 ground.model_files.SURFACE_POINTS = 1000
 def told(progress):
     if progress.info.step == 3:
@@ -285,7 +286,7 @@ def test_a_run_that_another_process_has_just_finished_is_not_replaced(session, m
     """The run appears between the first check of the folder and the lock: the check after locking refuses it."""
     reconstruct(session, "run", "obbgs", QUICK)
     model = (session / "runs" / "run" / "model.ply").read_bytes()
-    monkeypatch.setattr("ground.reconstruct.check_replaceable", lambda *arguments: None)
+    monkeypatch.setattr("ground.run.reconstruct.check_replaceable", lambda *arguments: None)
     with pytest.raises(SessionError, match="is a finished run"):
         reconstruct(session, "run", "obbgs", QUICK, seed=1)
     assert (session / "runs" / "run" / "model.ply").read_bytes() == model
@@ -305,8 +306,8 @@ def test_a_folder_that_cannot_be_written_to_is_named(finished, tmp_path, monkeyp
     def read_only(*arguments):
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr("ground.evaluate.write_whole", read_only)
-    monkeypatch.setattr("ground.report.write_whole", read_only)
+    monkeypatch.setattr("ground.run.evaluate.write_whole", read_only)
+    monkeypatch.setattr("ground.show.report.document.write_whole", read_only)
     for score in (evaluate, write_report):
         with pytest.raises(SessionError, match=r"cannot write to .*: Read-only file system; use --out DIR"):
             score(finished, "run")
@@ -399,10 +400,10 @@ def test_the_choices_of_the_commands_are_those_of_the_library_and_the_dictionary
 @pytest.mark.parametrize(
     ("command", "work"),
     [
-        (["evaluate", "--session", "s"], "ground.evaluate.evaluate"),
-        (["report", "--session", "s"], "ground.report.write_report"),
+        (["evaluate", "--session", "s"], "ground.run.evaluate.evaluate"),
+        (["report", "--session", "s"], "ground.show.report.document.write_report"),
         (["import", "--format", "nerf", "--from", "d", "--session", "s"], "ground.formats.nerf.read_nerf"),
-        (["export", "--session", "s", "--out", "d"], "ground.session.open_session"),
+        (["export", "--session", "s", "--out", "d"], "ground.session.folder.open_session"),
     ],
 )
 def test_an_interrupted_command_ends_with_one_line_and_exit_code_1(monkeypatch, capsys, command, work):
@@ -510,7 +511,7 @@ def test_an_interruption_after_the_training_says_that_the_run_is_there(session, 
     def interrupted(*arguments):
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("ground.evaluate.evaluate", interrupted)
+    monkeypatch.setattr("ground.run.evaluate.evaluate", interrupted)
     done = CliRunner().invoke(cli.app, ["reconstruct", "--session", str(session), "--steps", "3"])
     assert isinstance(done.exception, Interrupted)
     assert "the run is finished in" in str(done.exception) and "`ground evaluate`" in str(done.exception)
@@ -519,7 +520,7 @@ def test_an_interruption_after_the_training_says_that_the_run_is_there(session, 
 
 def test_a_training_without_a_terminal_says_every_so_often_how_far_it_is(monkeypatch):
     now_s, text = 0.0, io.StringIO()
-    monkeypatch.setattr("ground.progress.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("ground.commands.progress.time.monotonic", lambda: now_s)
     with steps_shown(Console(file=text)) as show:
         for step in range(1, 101):
             now_s += 0.5

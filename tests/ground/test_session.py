@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from flightsw.icd.frame import encode_frame
 from flightsw.icd.pose_sections import NavigationErrorsSection
-from ground.session import MissingFrames, SessionCorrupt, SessionError, open_session
-from ground.session_writer import SessionWriter
-from ground.training_frames import usable
+from ground.session.folder import MissingFrames, SessionCorrupt, SessionError, open_session
+from ground.session.training_frames import usable
+from ground.session.writer import SessionWriter
 
 GOLDEN_RECORD = open_session(Path(__file__).parents[1] / "golden" / "session").frames[0]
 

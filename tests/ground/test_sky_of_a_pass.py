@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from ground.evaluate import evaluate
-from ground.reconstruct import reconstruct
-from ground.report import write_report
+from ground.run.evaluate import evaluate
+from ground.run.reconstruct import reconstruct
+from ground.show.report.document import write_report
 from tests.scenes import QUICK
 from tests.small_sessions import small_session
 

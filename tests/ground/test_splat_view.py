@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 import torch
 
-from ground import turntable
-from ground.cameras import exposed
-from ground.evaluate import evaluate
-from ground.pictures import tone
-from ground.reconstruct import reconstruct
-from ground.report import write_report
-from ground.report_frames import frames_section, scored_section
-from ground.runs import open_run
-from ground.session import read_header
-from ground.splat_view import splat_view
+from ground.run.evaluate import evaluate
+from ground.run.reconstruct import reconstruct
+from ground.run.runs import open_run
+from ground.session.cameras import exposed
+from ground.session.folder import read_header
+from ground.show import turntable
+from ground.show.pictures import tone
+from ground.show.report.document import write_report
+from ground.show.report.frames import frames_section, scored_section
+from ground.show.splat_view import splat_view
 from obbgs_core.io.ply import save_ply
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
@@ -230,7 +230,7 @@ def test_the_turntable_is_an_animation_of_our_renders(session):
 
 
 def test_a_large_model_keeps_its_strongest_gaussians(session, monkeypatch):
-    monkeypatch.setattr("ground.splat_view.MOST_SPLATS", 100)
+    monkeypatch.setattr("ground.show.splat_view.MOST_SPLATS", 100)
     run = open_run(session, "run")
     facts = splat_view(run).partition('data-part="model">')[2].partition("</script>")[0]
     assert json.loads(facts)["count"] == 100 < len(run.gaussians)

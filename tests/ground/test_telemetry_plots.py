@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from flightsw.icd.telemetry import DICTIONARY
-from ground.telemetry_plots import (
+from ground.show.telemetry_plots import (
     LIMIT_COLOURS,
     SHOWN,
     broken_limits,

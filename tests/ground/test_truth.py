@@ -10,8 +10,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from ground.session import Navigation, SessionError, open_session
-from ground.truth import SCHEMA_VERSION, TrueFrame, Truth, write_truth
+from ground.session.folder import Navigation, SessionError, open_session
+from ground.session.truth import SCHEMA_VERSION, TrueFrame, Truth, write_truth
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
 CUBE = trimesh.creation.box(extents=(4, 2, 2))

@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ground.formats.turned_pictures import turned_back
+from ground.formats.photographs.turned_pictures import turned_back
 from tests import raycast
 
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 1500.0

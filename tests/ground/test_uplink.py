@@ -22,9 +22,8 @@ from flightsw.icd.model_file import SENSOR_METADATA
 from flightsw.icd.model_file import check_model as check_model_bytes
 from flightsw.store import FrameStore
 from ground import cli
-from ground.ingest import listen
-from ground.session import SessionError
-from ground.uplink import (
+from ground.link.ingest import listen
+from ground.link.uplink import (
     COUNTER_MARGIN,
     Uplinker,
     check_model,
@@ -39,6 +38,7 @@ from ground.uplink import (
     submit,
     withdraw,
 )
+from ground.session.folder import SessionError
 from obbgs_base.checked import checked_line, parse_checked_line
 
 INTERVAL_S = 0.5
@@ -470,7 +470,7 @@ def test_a_folder_that_cannot_be_read_is_told_once_and_the_listener_goes_on(
             raise PermissionError(13, "Permission denied", str(path))
         return real(path)
 
-    monkeypatch.setattr("ground.uplink.os.listdir", listdir)
+    monkeypatch.setattr("ground.link.uplink.os.listdir", listdir)
     submit(session, key_file, Command("ping", {}), None, 600)
     for step in range(1, 20):
         assert uplinker.next_command(step * INTERVAL_S) in (None, packet)
@@ -519,7 +519,7 @@ def test_a_result_that_cannot_be_written_is_not_sent_for_again(session, key_file
         raise PermissionError(13, "Permission denied")
 
     with monkeypatch.context() as patched:
-        patched.setattr("ground.uplink.write_whole", refuse)
+        patched.setattr("ground.link.uplink.write_whole", refuse)
         patched.setattr(Path, "unlink", refuse)
         uplinker.take_report(Report(0, counter, digest(packet), "completed", "alive"), 0.1)
     assert [uplinker.next_command(step) for step in range(1, 9)] == [None] * 8

@@ -22,14 +22,14 @@ from websockets.http11 import Request
 from websockets.sync.client import connect
 
 from ground import cli
-from ground.cameras import predicted_image
-from ground.live import reconstruct_live
-from ground.pictures import tone
-from ground.session import SessionError
-from ground.viewer import ruler, splats, viewer
-from ground.viewer.door import ViewError, opened, refused
-from ground.viewer.scene import UNCERTAINTY, Placed
-from ground.viewer.source import Shown, Source
+from ground.run.live.reconstruct import reconstruct_live
+from ground.session.cameras import predicted_image
+from ground.session.folder import SessionError
+from ground.show.pictures import tone
+from ground.show.viewer import ruler, splats, viewer
+from ground.show.viewer.door import ViewError, opened, refused
+from ground.show.viewer.scene import UNCERTAINTY, Placed
+from ground.show.viewer.source import Shown, Source
 from obbgs_base.errors import Interrupted
 from obbgs_core.io.mesh import save_mesh
 from obbgs_core.io.ply import load_ply, save_ply

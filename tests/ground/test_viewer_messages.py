@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from ground.viewer.door import POLICY_VIOLATION, opened
-from ground.viewer.messages import wrong
+from ground.show.viewer.door import POLICY_VIOLATION, opened
+from ground.show.viewer.messages import wrong
 
 CAMERA = {
     "type": "ViewerCameraMessage",

@@ -23,7 +23,7 @@ from flightsw.icd.frame import HEADER, read_header
 from flightsw.icd.packet import APID_HOUSEKEEPING, TELEMETRY, pack_packet
 from flightsw.icd.telemetry import DICTIONARY, parse_dictionary
 from ground.cli import app
-from ground.xtce import FRAME_HEADER, NAMESPACE, xtce_document
+from ground.link.xtce.document import FRAME_HEADER, NAMESPACE, xtce_document
 from tests.dictionary_packets import exactly, frame_header, packets
 
 PACKETS = 10_000

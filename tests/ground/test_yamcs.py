@@ -13,8 +13,8 @@ from flightsw.icd.command import Command, Report
 from flightsw.icd.config import ConfigError
 from flightsw.icd.packet import APID_HOUSEKEEPING, APID_REPORTS, TELEMETRY, pack_packet
 from flightsw.icd.telemetry import DICTIONARY, NUMBERS
-from ground.forward import Forwarder
-from ground.yamcs import write_yamcs
+from ground.link.forward import Forwarder
+from ground.link.yamcs import write_yamcs
 from tests.dictionary_packets import exactly, packets, some_value
 from tests.yamcs import Yamcs, running_yamcs, wait_for
 

@@ -28,9 +28,9 @@ from flightsw.icd.model_file import SENSOR_METADATA
 from flightsw.ports import open_link
 from flightsw.store import FrameStore
 from flightsw.triage import Renderer
-from ground.ingest import ListenSummary, listen
-from ground.session import open_session
-from ground.uplink import make_key, outcome, submit
+from ground.link.ingest import ListenSummary, listen
+from ground.link.uplink import make_key, outcome, submit
+from ground.session.folder import open_session
 from hil.cameras.virtual import CameraServer
 from hil.links.faults import Faults
 from hil.links.virtual_serial import VirtualSerial

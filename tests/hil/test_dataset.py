@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from flightsw.icd.mission import ConfigError
 from ground.formats.nerf import SPLIT_PATTERN
-from ground.session import open_session
+from ground.session.folder import open_session
 from hil import cli, dataset, truth
 from hil.dataset import DatasetConfig, DatasetError, load_dataset_config, make_dataset, target_meshes
 from hil.processes import installed

@@ -16,8 +16,8 @@ from flightsw.icd.packet import APID_FILES, TELEMETRY
 from flightsw.icd.transfer import Sender
 from flightsw.ports import SerialLink
 from flightsw.store import FrameStore
-from ground.ingest import ListenSummary, listen
-from ground.session import open_session
+from ground.link.ingest import ListenSummary, listen
+from ground.session.folder import open_session
 from hil.links.faults import Faults
 from hil.links.virtual_serial import VirtualSerial
 
@@ -163,7 +163,7 @@ with SerialLink(sys.argv[1]) as link:
 LISTEN = """
 import sys
 from flightsw.icd.mission import load_mission
-from ground.ingest import listen
+from ground.link.ingest import listen
 listen(sys.argv[1], sys.argv[2], load_mission(sys.argv[3]), exit_after=int(sys.argv[4]))
 """
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from flightsw.store import FrameStore
-from ground.live_status import read_status
-from ground.session import open_session
+from ground.run.live.status import read_status
+from ground.session.folder import open_session
 from hil.links.virtual_serial import VirtualSerial
 from tests.hil.test_commands_end_to_end import Tools, lines, wait_for
 from tests.session_frames import frames_of

@@ -12,8 +12,8 @@ from flightsw.icd.config import ConfigError, parse_json, parse_yaml
 from flightsw.icd.mission import load_mission
 from flightsw.icd.telemetry import parse_dictionary
 from ground.formats.nerf import load_transforms
-from ground.formats.views import FormatError
-from ground.session import SessionCorrupt, open_session
+from ground.formats.pictures.views import FormatError
+from ground.session.folder import SessionCorrupt, open_session
 from hil.dataset import DATASETS, load_dataset_config
 from hil.world.scenario import SCENARIOS, load_scenario
 

@@ -21,7 +21,7 @@ from ground.compare.grid import Budget, cells_of, parse_budgets, session_facts
 from ground.compare.methods import method
 from ground.compare.rows import Rows, locked
 from ground.compare.worker import _rounded_all, run_cell
-from ground.session import SessionError
+from ground.session.folder import SessionError
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.presets import preset, quality_changes
 from tests.benchmarks import targets

@@ -1,0 +1,252 @@
+"""Commands of `ground` that turn other formats into sessions and back: import and export."""
+
+import json
+import math
+import signal
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from ground.commands.options import (
+    AsJson,
+    Background,
+    BackgroundGiven,
+    ExportFormat,
+    ExposuresGiven,
+    ImportFormat,
+    MasksGiven,
+    PoseChoice,
+    PosesGiven,
+    PoseSigmaGiven,
+    SessionDir,
+    ValuesGiven,
+)
+
+if TYPE_CHECKING:
+    from ground.formats.photographs.poses import Registered
+    from ground.formats.pictures.files import Light
+    from ground.formats.pictures.views import Exported, PoseSigmas, View
+
+MOST_NAMED = 30  # pictures in one line; --json names all
+
+stderr = Console(stderr=True)
+
+
+def import_command(
+    folder: Annotated[Path, typer.Option("--from", help="The data set's folder.")],
+    session: Annotated[Path, typer.Option(help="The session folder to make.")],
+    format_: Annotated[ImportFormat, typer.Option("--format", help="The data set's format.")],
+    values: ValuesGiven = None,
+    background: BackgroundGiven = None,
+    exposures: ExposuresGiven = None,
+    masks: MasksGiven = None,
+    pose_sigma: PoseSigmaGiven = None,
+    poses: PosesGiven = PoseChoice.CHECK,
+    frames: Annotated[
+        int | None,
+        typer.Option(min=1, help="Import only the first so many pictures (of each split); default: all."),
+    ] = None,
+    json_: AsJson = False,
+) -> None:
+    """Make a session of pictures with known cameras, or of photographs.
+
+    Splits that the data set states are kept: `ground reconstruct` trains on train and holds out test, or val if there
+    is no test. Of images, a folder of photographs by one camera, structure from motion finds the cameras; it takes
+    minutes, and goes on where it was interrupted. Pictures are PNG, JPEG, TIFF, BMP, WebP, Radiance HDR, and with
+    obbgs[pictures] FITS, OpenEXR and DNG.
+
+    Example: ground import --format shirt --from shirtv1/roe1/lightbox --frames 363 --session roe1
+    """
+    from ground.formats.photographs.exposures import UNKNOWN, estimated, read_table, with_exposures
+    from ground.formats.pictures.masks import with_masks
+    from ground.formats.pictures.placement import placed
+    from ground.formats.pictures.views import EXACT, Values, first_of_each_split, write_session
+
+    given_sigmas = None if pose_sigma is None else _pose_sigmas(pose_sigma)
+    table = None if exposures in (None, UNKNOWN) else read_table(Path(exposures))
+    sigmas, exported, registration = EXACT, None, None
+    if format_ is ImportFormat.IMAGES:
+        found = _photographs(folder, session, frames, table)
+        views, sigmas, registration = found.views, found.sigmas, found.described()
+    else:
+        views, exported = _read(format_, folder)
+        views = first_of_each_split(views, frames)
+        if exposures != UNKNOWN:
+            views = with_exposures(views, table)
+    views, found_poses = with_masks(views, masks), {}
+    source = f"{format_.value}: {folder}"
+    given = None if values is None else Values(values.value)
+    if exposures == UNKNOWN:
+        views = estimated(views, given)
+    if format_ is not ImportFormat.IMAGES and poses is not PoseChoice.STATED:
+        views, found_poses = _checked_poses(views, given_sigmas or sigmas, poses is PoseChoice.MEND)
+        if poses is PoseChoice.MEND:
+            source += "".join(f", {len(pictures)} poses {kind}" for kind, pictures in found_poses.items())
+    views, origin_moved = placed(views)
+    with Progress(TextColumn("importing"), BarColumn(), TimeRemainingColumn(), console=stderr) as progress:
+        task = progress.add_task("import", total=len(views))
+        count = write_session(
+            views,
+            session,
+            source,
+            given,
+            None if background is None else background is Background.WHITE,
+            exported,
+            lambda: progress.advance(task),
+            given_sigmas or sigmas,
+            registration,
+            origin_moved,
+            transparent_on_white=format_ is ImportFormat.NERF,
+        )
+    if json_:
+        print(json.dumps({"frames": count, "session": str(session), **(registration or {}), **found_poses}))
+        return
+    print(f"{count} frames in {session}")
+    if registration and registration["left_out"]:
+        print(f"left out, because they could not be registered: {', '.join(registration['left_out'])}")
+    if registration and registration["turned"]:
+        print(f"turned by 180 degrees against the others: {', '.join(registration['turned'])}")
+
+
+def _read(format_: ImportFormat, folder: Path) -> "tuple[list[View], Exported | None]":
+    """Return the pictures of a data set whose cameras are known, and what our own export says of them."""
+    from ground.formats.colmap import read_colmap
+    from ground.formats.llff import read_llff
+    from ground.formats.middlebury import read_middlebury
+    from ground.formats.nerf import read_nerf
+    from ground.formats.nerfstudio import read_nerfstudio
+    from ground.formats.shirt import read_shirt
+
+    described = {ImportFormat.NERF: read_nerf, ImportFormat.NERFSTUDIO: read_nerfstudio}
+    if format_ in described:
+        return described[format_](folder)
+    plain = {
+        ImportFormat.COLMAP: read_colmap,
+        ImportFormat.SHIRT: read_shirt,
+        ImportFormat.LLFF: read_llff,
+        ImportFormat.MIDDLEBURY: read_middlebury,
+    }
+    return plain[format_](folder), None
+
+
+def _checked_poses(
+    views: "list[View]", sigmas: "PoseSigmas", mend: bool
+) -> "tuple[list[View], dict[str, list[str]]]":
+    """Return the views, mended if that is wanted, and the names of those that do not fit, by what is wrong.
+
+    What was found and what to do is said on stderr.
+    """
+    from ground.formats.photographs.epipolar import check_poses, mended
+
+    with Progress(TextColumn("checking poses"), BarColumn(), TimeRemainingColumn(), console=stderr) as bar:
+        task = bar.add_task("check", total=len(views))
+        check = check_poses(views, sigmas, lambda: bar.advance(task))
+    wrong = {"turned": check.turned, "contradicting": check.contradicting, "unchecked": check.unchecked}
+    names = {kind: [views[i].image.name for i in indices] for kind, indices in wrong.items() if indices}
+    said = {
+        "turned": "fit their pictures when turned by 180 degrees about the line of sight",
+        "contradicting": "contradict what their pictures share with their neighbours",
+        "unchecked": "could not be checked, as their pictures share too little with others",
+    }
+    done = {
+        "turned": ("they are turned", "--poses mend turns them"),
+        "contradicting": ("they are left out", "--poses mend leaves them out"),
+        "unchecked": ("they are taken as stated",) * 2,
+    }
+    for kind, pictures in names.items():
+        named = ", ".join(pictures[:MOST_NAMED]) + ", ..." * (len(pictures) > MOST_NAMED)
+        where = "" if len(pictures) == len(views) else f": {named}"
+        what = f"{len(pictures)} of {len(views)} cameras {said[kind]}{where}; {done[kind][not mend]}"
+        stderr.print(what, soft_wrap=True, highlight=False)
+    return mended(views, check) if mend else views, names
+
+
+def _pose_sigmas(text: str) -> "PoseSigmas":
+    from ground.formats.pictures.views import PoseSigmas
+
+    try:
+        degrees, metres = map(float, text.split(","))
+        return PoseSigmas(math.radians(degrees), metres)
+    except ValueError as error:
+        raise ValueError(
+            f"--pose-sigma: expected degrees and metres, both at least 0, such as 0.2,0.01, got {text!r}"
+        ) from error
+
+
+def _photographs(
+    folder: Path, session: Path, count: int | None, table: "dict[str, Light] | None"
+) -> "Registered":
+    """Return what structure from motion makes of a folder, with a bar; SIGINT and SIGTERM stop it at its next step."""
+    from ground.formats.photographs.poses import read_photographs
+    from ground.session.folder import SessionError
+
+    if (session / "session.json").exists():
+        raise SessionError(f"{session} holds a session already; choose a new folder")
+    stop = threading.Event()
+    before = {
+        number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        with Progress(
+            TextColumn("finding cameras"), BarColumn(), TimeRemainingColumn(), console=stderr
+        ) as progress:
+            task = progress.add_task("register", total=1.0)
+            return read_photographs(
+                folder,
+                session / "registration",
+                lambda share: progress.update(task, completed=share),
+                stop.is_set,
+                count,
+                table,
+            )
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def export_command(
+    session: SessionDir,
+    out: Annotated[Path, typer.Option(help="The folder to write.")],
+    format_: Annotated[
+        ExportFormat, typer.Option("--format", help="The format to write.")
+    ] = ExportFormat.NERF,
+    run: Annotated[
+        str | None,
+        typer.Option(
+            help="Write the poses of this run, refined as it refined them, and its split into train and test; frames "
+            "that it left out are not written."
+        ),
+    ] = None,
+    json_: AsJson = False,
+) -> None:
+    """Write a session's frames for other software, whole brackets split into train, val and test (6:2:3).
+
+    Pictures have 8 bits. Beside them lie the readings of 16 bits, which `ground import` takes with the sensor's figures
+    (a COLMAP folder is a nerfstudio folder too: import it as that).
+
+    Example: ground export --session pass-12 --run first --format nerfstudio --out pass-12-nerfstudio
+    """
+    from ground.formats.colmap_export import export_colmap
+    from ground.formats.nerf import export_nerf
+    from ground.formats.nerfstudio import export_nerfstudio
+    from ground.run.estimated_poses import refined_session
+    from ground.run.runs import open_run
+    from ground.session.folder import SessionError, open_session
+
+    exporters = {
+        ExportFormat.NERF: export_nerf,
+        ExportFormat.NERFSTUDIO: export_nerfstudio,
+        ExportFormat.COLMAP: export_colmap,
+    }
+    read = open_session(session) if run is None else refined_session(open_run(session, run))
+    read.check_body_axes()
+    if (out.exists() and not out.is_dir()) or (out / "session.json").exists():
+        kind = "a session" if out.is_dir() else "a file"
+        raise SessionError(f"{out} is {kind}: give a folder of its own with --out, new or empty")
+    counts = exporters[format_](read, out)
+    text = ", ".join(f"{count} {split}" for split, count in counts.items())
+    print(json.dumps(counts) if json_ else f"{text} in {out}")

@@ -1,0 +1,190 @@
+"""The commands of `ground` that make, score and show a model: reconstruct, evaluate, report, mesh."""
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from flightsw.icd.mission import ReconstructSection, load_mission
+from ground.commands.options import (
+    AsJson,
+    AttitudeChoice,
+    AttitudeGiven,
+    BlindReference,
+    Budget,
+    MeshFormatName,
+    MethodName,
+    Overwrite,
+    QualityName,
+    ReconstructMission,
+    RunName,
+    RunsDir,
+    Seed,
+    SessionDir,
+    SettingsGiven,
+    Steps,
+    Threads,
+    TimeLimit,
+)
+from ground.commands.progress import Stop, say, shares_shown, steps_shown
+from ground.show.summary import frames_row, model_rows, table
+from obbgs_base.errors import Interrupted
+from obbgs_base.imports import quick_imports
+from obbgs_base.output import output_may_fail
+
+stderr = Console(stderr=True)
+
+
+@output_may_fail()
+def reconstruct_command(
+    session: SessionDir,
+    name: RunName = "run",
+    out: RunsDir = None,
+    method: MethodName = None,
+    quality: QualityName = None,
+    budget: Budget = "auto",
+    steps: Steps = None,
+    settings: SettingsGiven = None,
+    mission: ReconstructMission = None,
+    time_limit: TimeLimit = math.inf,
+    seed: Seed = None,
+    blind_reference: BlindReference = False,
+    attitude: AttitudeGiven = AttitudeChoice.AUTO,
+    overwrite: Overwrite = False,
+    threads: Threads = None,
+    json_: AsJson = False,
+) -> None:
+    """Train a model on a session, export it, score it and write its report.
+
+    Ctrl-C and SIGTERM save the training and end with exit code 1; the same command resumes it, also after a kill. Only
+    one process at a time makes a run.
+
+    Example: ground reconstruct --session pass-12 --name first --time-limit 120 --set light.sun_shading=linear
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning threads slow each other down
+    stop, folder = Stop(), None
+    try:
+        with stop.on_signals(), steps_shown(stderr) as show:
+            with quick_imports():
+                from ground.run.evaluate import evaluate
+                from ground.run.reconstruct import Progress, reconstruct
+                from ground.run.settings import all_changes
+                from ground.show.report.document import write_report
+                from obbgs_core.process import prepare_process
+
+            section = load_mission(mission).reconstruct if mission else ReconstructSection()
+            chosen = method or section.method
+            changes = all_changes(section, chosen, quality, budget, steps, settings or [])
+            prepare_process(threads)
+            stop.raise_at_once()
+
+            def on_progress(progress: Progress) -> None:
+                stop.defer()
+                show(progress.label, progress.info)
+
+            say(stderr, f"reading the frames of {session}")
+            folder = reconstruct(
+                session,
+                name,
+                chosen,
+                changes,
+                section.seed if seed is None else seed,
+                time_limit,
+                blind_reference,
+                on_progress,
+                out,
+                overwrite,
+                lambda: stop.requested,
+                attitude.value,
+                shares_shown(stderr),
+            )
+            stop.raise_at_once()
+            say(stderr, "scoring the model and writing its report")
+            metrics = evaluate(session, name, out)
+            report = write_report(session, name, out)
+    except KeyboardInterrupt as error:
+        raise Interrupted(_interrupted(folder)) from error
+    _print_metrics(metrics, json_)
+    if not json_:
+        print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}\nreport: {report}")
+
+
+def evaluate_command(
+    session: SessionDir, name: RunName = "run", out: RunsDir = None, json_: AsJson = False
+) -> None:
+    """Score a finished run against its held-out frames, and against the truth if a simulator left one.
+
+    Example: ground evaluate --session demo/session --name demo --json
+    """
+    with quick_imports():
+        from ground.run.evaluate import evaluate
+
+    _print_metrics(evaluate(session, name, out), json_)
+
+
+def report_command(
+    session: SessionDir, name: RunName = "run", out: RunsDir = None, json_: AsJson = False
+) -> None:
+    """Write report.html into the folder of a finished run again.
+
+    Example: ground report --session demo/session --name demo
+    """
+    with quick_imports():
+        from ground.show.report.document import write_report
+
+    path = write_report(session, name, out)
+    print(json.dumps({"report": str(path)}) if json_ else path)
+
+
+def mesh_command(
+    session: SessionDir,
+    name: RunName = "run",
+    out: RunsDir = None,
+    format_: Annotated[
+        MeshFormatName, typer.Option("--format", help="The format to write.")
+    ] = MeshFormatName.GLB,
+    json_: AsJson = False,
+) -> None:
+    """Write a finished run's surface into its folder as a closed mesh: model.glb, or mesh.FORMAT.
+
+    Example: ground mesh --session demo/session --name demo --format obj
+    """
+    from ground.run.estimated_poses import estimated_records, read_estimate
+    from ground.run.evaluate import keep_metrics
+    from ground.run.mesh_files import write_mesh
+    from ground.run.model_files import model_sizes, white_radiance_of
+    from ground.run.runs import open_run
+
+    run = open_run(session, name, out)
+    training = estimated_records(run.training, read_estimate(run.folder))
+    stem = "model" if format_ is MeshFormatName.GLB else "mesh"  # model.ply holds the Gaussians
+    path = run.folder / f"{stem}.{format_.value}"
+    facts = write_mesh(run.gaussians, run.session, training, path, white_radiance_of(run.session, training))
+    if format_ is MeshFormatName.GLB:
+        # figures whose names end in _mesh are those of the mesh before
+        kept = {key: value for key, value in run.metrics.items() if not key.endswith("_mesh")}
+        missing = {n: why for n, why in kept.get("missing_outputs", {}).items() if n != path.name}
+        keep_metrics(run, kept | {"missing_outputs": missing} | facts | model_sizes(run.folder))
+    if json_:
+        print(json.dumps({"mesh": str(path)} | facts))
+    else:
+        unseen = f"{100 * facts['mesh_unseen_share']:.1f} % of the area seen by no view"
+        print(f"{facts['mesh_triangles']:,} triangles, {unseen}: {path}")
+
+
+def _interrupted(folder: Path | None) -> str:
+    """Return what an interruption left; `folder` is that of the run if it was finished."""
+    if folder is None:
+        return "interrupted; the same command resumes from the last checkpoint, if there is one"
+    return f"interrupted; the run is finished in {folder}: `ground evaluate` and `ground report` score it"
+
+
+def _print_metrics(metrics: dict, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(metrics))
+        return
+    Console().print(table("The model", [frames_row(metrics), *model_rows(metrics)]))

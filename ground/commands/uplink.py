@@ -1,0 +1,145 @@
+"""The command of `ground` that sends commands to the spacecraft, one or a script of them."""
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from flightsw.icd.mission import load_mission
+from ground.commands.options import AsJson, UplinkCommand, listening_key
+from obbgs_base.output import output_may_fail
+
+if TYPE_CHECKING:
+    from flightsw.icd.command import Command
+
+
+@output_may_fail()
+def uplink_command(
+    command: Annotated[
+        UplinkCommand | None, typer.Argument(help="The command; none with --script.", show_default=False)
+    ] = None,
+    arguments: Annotated[list[str] | None, typer.Argument(help="Its arguments, as above.")] = None,
+    session: Annotated[Path, typer.Option("--session", help="The session folder.")] = Path("session"),
+    key_file: Annotated[Path, typer.Option("--key", help="The file of the mission's key.")] = Path(
+        "mission.key"
+    ),
+    link: Annotated[
+        str | None, typer.Option(help="The link's URL, if no `ground listen` has it open.")
+    ] = None,
+    mission: Annotated[Path, typer.Option(help="The mission file; read with --link only.")] = Path(
+        "mission.yaml"
+    ),
+    timeout: Annotated[
+        float,
+        typer.Option(
+            min=0.1,
+            max=86_400.0,
+            help="Seconds to wait for each result, or for a model to be under way.",
+        ),
+    ] = 120.0,
+    script: Annotated[
+        Path | None,
+        typer.Option(
+            help="A file of commands, one a line, # before remarks: sent one after another, up to the first that is "
+            "not completed."
+        ),
+    ] = None,
+    json_: AsJson = False,
+) -> None:
+    """Send a command through the session's `ground listen`, or over --link, and wait for its result.
+
+    ping · bracket 0.05,0.1,0.2 (exposure times, ms) · near 2 (largest coding error, DN) · priority oldest, triage or
+    thumbnail-first · model FILE (a run's model.onnx) · safe (no more exposures) · resend FIRST LAST or all (frames that
+    are still on board, delivered once more) · fsck (check and repair the frame store while flight goes on). `arm
+    delete` and then delete FIRST LAST (numbers of frames), `arm resume` and then resume, `arm retire` and then retire
+    KEY (the number of another key), each at most 30 s later. What became of all commands of a session stands in its
+    commands.jsonl.
+
+    Example: ground uplink bracket 0.02,0.05,0.1 --session pass-12 --key mission.key
+    """
+    from ground.link import uplink as uplinking
+    from ground.session.folder import SessionError
+
+    if (command is None) == (script is None):
+        raise ValueError(
+            "expected one command, such as `ground uplink ping`, or a file of them after --script"
+        )
+    if command is not None:
+        made = [uplinking.parse_command(command.value, arguments or [])]
+    else:
+        made = uplinking.parse_script(_text_of(script))
+    for _, model in made:
+        if model is not None:
+            uplinking.check_model(model)
+    if link is None and not uplinking.is_listening(session):
+        raise SessionError(f"no `ground listen` receives into {session}: start one, or give --link URL")
+    for place, (each, model) in enumerate(made, start=1):
+        words = uplinking.in_words(each, model)
+        result = _sent(session, key_file, each, model, link, mission, timeout)
+        if json_:
+            print(json.dumps(result), flush=True)
+        else:
+            before = f"{words}: " if script is not None else ""
+            for report in result["reports"] or [result]:
+                print(f"{before}{report['stage']}: {report['text']}", flush=True)
+        if result["stage"] != "completed":
+            if not json_ and place < len(made):
+                print(f"the script ends here; not sent: {len(made) - place} more")
+            raise typer.Exit(1)
+
+
+def _text_of(script: Path | None) -> str:
+    from ground.session.folder import SessionError
+
+    assert script is not None
+    try:
+        return script.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = (isinstance(error, OSError) and error.strerror) or error
+        raise SessionError(f"the script {script} cannot be read: {reason}") from error
+
+
+def _sent(
+    session: Path,
+    key_file: Path,
+    command: "Command",
+    model: Path | None,
+    link: str | None,
+    mission: Path,
+    timeout_s: float,
+) -> dict[str, Any]:
+    """Leave a command for the listener, or send it over a link; wait for its end and return it."""
+    from ground.link import uplink as uplinking
+
+    counter = uplinking.submit(session, key_file, command, model, timeout_s)
+    end_s = time.monotonic() + timeout_s + 1.0  # the listener writes a result when the command expires
+
+    def ended() -> bool:
+        if uplinking.outcome(session, counter) is not None:
+            return True
+        if time.monotonic() <= end_s:
+            return False
+        is_tended = model is not None and uplinking.is_waiting(session, counter)
+        if is_tended and link is None:
+            is_tended = uplinking.is_listening(session)
+        return not is_tended
+
+    try:
+        if link is None:
+            while not ended():
+                time.sleep(0.05)
+        else:
+            from ground.link.ingest import listen
+
+            listen(link, session, load_mission(mission), should_stop=ended, key=listening_key(key_file))
+    finally:
+        uplinking.withdraw(session, counter)
+    result = uplinking.outcome(session, counter)
+    if result is None:
+        words = uplinking.in_words(command, model)
+        result = {"counter": counter, "command": command.name, "given": words, "stage": "failed"}
+        result |= {"text": "no process sent it", "reports": []}
+        uplinking.note_end(session, result, time.time_ns())
+    return result

@@ -1,0 +1,1 @@
+"""Photographs without poses or exposures: both are estimated from the pictures."""

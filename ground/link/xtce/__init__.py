@@ -1,0 +1,1 @@
+"""The dictionary of telemetry and commands as XTCE, for other ground systems."""

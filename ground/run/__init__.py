@@ -1,0 +1,1 @@
+"""Runs: from a session to a trained and scored model, and the files of it."""

@@ -1,0 +1,1 @@
+"""The model that grows while a pass goes on."""

@@ -1,0 +1,1 @@
+"""What people look at: reports, lists, pictures and the viewer's page."""

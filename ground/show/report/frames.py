@@ -1,0 +1,145 @@
+"""The report's pictures: the frames as they were received, and scored views beside the model's."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from ground.run.estimated_poses import as_estimated, read_estimate, scored_records
+from ground.run.evaluate import clean_image, model_image, noisy_image
+from ground.run.runs import Run
+from ground.session.cameras import exposed, predicted_image, range_in_words
+from ground.session.exposures import in_ms
+from ground.session.folder import FrameRecord
+from ground.session.spread import evenly_spread
+from ground.session.truth import Truth
+from ground.show.page import grid, label, picture, section
+from ground.show.pictures import ERROR_FULL_SCALE, bounding_box, heat, tone
+from obbgs_core.score.metrics import psnr_db
+
+LABEL_WIDTH = "minmax(44px, 60px)"
+PICTURE_WIDTH = "minmax(72px, 1fr)"
+COLUMNS = 6  # brackets shown for each exposure
+VIEWS_SHOWN = 3
+MARGIN_PX = 10
+# of full scale: pixels that differ more from the background are target when pictures are cropped
+ABOVE_EMPTY = 0.01
+NOISE_DEVIATIONS = 5.0  # no pixel of a frame rises by so many for noise alone
+
+
+def frames_section(run: Run) -> str:
+    nominal = run.session.nominal_exposures
+    posed = as_estimated(run.session, read_estimate(run.folder)).frames
+    by_place = {(r.bracket, r.bracket_index): r for r in posed}
+    picked = evenly_spread(sorted({r.bracket for r in run.session.frames}), COLUMNS)
+    cells = []
+    for place in sorted({r.bracket_index for r in run.session.frames}):
+        row = [by_place.get((bracket, place)) for bracket in picked]
+        times = {_exposure(run, record) for record in row if record is not None}
+        is_same = len(times) == 1
+        cells.append(label(*times) if is_same else label(f"exposure {place + 1}"))
+        for record in row:
+            if record is None:
+                cells.append(label("missing"))
+                continue
+            caption = f"frame {record.id}" + ("" if nominal else f", {range_in_words(record)}")
+            if not is_same:
+                caption += f", {_exposure(run, record)}"
+            if record.saturated:
+                caption += f"<br>{record.saturated:,} px saturated"
+            received = run.session.dn(record).astype(np.float32) / run.sensor.white_dn
+            image = _tone(run, received.reshape(*received.shape[:2], -1))
+            cells.append(picture(image, f"frame {record.id}", caption))
+    return section(
+        "Pictures" if nominal else "Frames by exposure",
+        f"{len(picked)} of the {len(run.session.frames):,} imported pictures, {brightness(run)}."
+        if nominal
+        else "Frames as received: each column is a bracket, each row one of its exposures; below each frame stand its "
+        "number, the range to the target and, where they differ in a row, the exposure time. "
+        f"Brightness is {brightness(run)}.",
+        grid(f"{LABEL_WIDTH} repeat({len(picked)}, {PICTURE_WIDTH})", cells),
+    )
+
+
+def scored_section(run: Run, truth: Truth | None) -> str:
+    estimate = read_estimate(run.folder)
+    range_of = {r.id: range_in_words(r) for r in as_estimated(run.session, estimate).frames}
+    nominal, brackets = run.session.nominal_exposures, sorted({r.bracket for r in run.scored})
+    shown = evenly_spread(brackets, VIEWS_SHOWN)
+    records = scored_records(run, truth, [r for r in run.scored if r.bracket in shown])
+    body = []
+    for bracket in shown:
+        of_view = sorted((r for r in records if r.bracket == bracket), key=lambda r: r.exposure_time_s)
+        named = f"Picture {of_view[0].id}" if nominal else f"Bracket {bracket}, {range_of[of_view[0].id]}"
+        body.append(f"<h3>{named}</h3>")
+        body.append(_compared(run, truth, of_view))
+    training = run.metrics["scored_frames"] == "training"
+    seen = "trained on: the session has too few brackets to hold one out" if training else "never trained on"
+    note = (
+        f"{len(shown)} of {len(brackets)} brackets, {seen}; cropped to the target, brightness as above. Error is the "
+        f"absolute difference: 0<span class='ramp'></span>{ERROR_FULL_SCALE:.0%} of full scale or more. PSNR is of the "
+        f"whole frame against the {'noiseless exposure' if truth else 'noisy frame'}{_mean(run, truth)}."
+    )
+    if estimate is not None:
+        note += (
+            " Poses were refined: each frame is seen from its true pose, moved as the model moved with its poses."
+            if truth
+            else " Poses were refined: each frame is seen from the pose that settles on its own picture."
+        )
+    if run.blind:
+        note += " Blind: the same training with every exposure time replaced by their mean."
+    title = "Training views (nothing was held out)" if training else "Held-out views"
+    return section(f"{title}: {'truth' if truth else 'frame'}, render, error", note, "".join(body))
+
+
+def _mean(run: Run, truth: Truth | None) -> str:
+    """Return in words the mean PSNR of all scored frames; nothing for a run that was not scored."""
+    mean_db = run.metrics.get("psnr_clean_db" if truth else "psnr_noisy_db")
+    return "" if mean_db is None else f"; its mean over all {len(run.scored):,} frames is {mean_db:.2f} dB"
+
+
+def _compared(run: Run, truth: Truth | None, of_view: list[FrameRecord]) -> str:
+    """Return the frames of a bracket, shortest exposure first, beside the renders of each model and their errors."""
+    reference = "truth" if truth else "frame"
+    names = [reference, "render", "error"] + (["blind render", "blind error"] if run.blind else [])
+    expected = [clean_image(run, truth, r) if truth else noisy_image(run, r) for r in of_view]
+    background = torch.tensor(run.session.background)
+    empty = exposed(background, run.sensor, of_view[-1].exposure_time_s)
+    signal = expected[-1] - empty  # of the longest exposure
+    if run.session.background:
+        signal = signal.abs()
+    noise = 0.0 if truth else NOISE_DEVIATIONS * run.sensor.read_noise_dn / run.sensor.white_dn
+    box = bounding_box(signal.mean(-1) > max(ABOVE_EMPTY, noise), MARGIN_PX)
+    cells = [label(""), *(label(name) for name in names)]
+
+    def renders(record: FrameRecord) -> Iterator[torch.Tensor]:
+        yield model_image(run, record)
+        if run.blind:
+            exposure_s = run.metrics["blind_reference_exposure_s"]
+            yield predicted_image(run.blind, run.session, record, run.sensor, exposure_s)
+
+    for record, image in zip(of_view, expected, strict=True):
+        cells.append(label(_exposure(run, record)))
+        cells.append(picture(_tone(run, image[box].numpy()), reference, f"frame {record.id}"))
+        for render in renders(record):
+            error = ((render - image).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
+            caption = f"{psnr_db(render, image):.1f} dB"
+            cells.append(picture(_tone(run, render[box].numpy()), "render", caption))
+            cells.append(picture(heat(error[box].numpy()), "error", "&nbsp;"))
+    return grid(f"{LABEL_WIDTH} repeat({len(names)}, {PICTURE_WIDTH})", cells)
+
+
+def _exposure(run: Run, record: FrameRecord) -> str:
+    """Return a frame's exposure time in words; nothing where it is made up."""
+    return "" if run.session.nominal_exposures else f"{in_ms(record.exposure_time_s)} ms"
+
+
+def brightness(run: Run) -> str:
+    """Return in words how pixel values become brightness on the page."""
+    if run.session.encoding == "srgb":
+        return "shown as they are"
+    return "the square root of the signal above black, full scale is white"
+
+
+def _tone(run: Run, image: np.ndarray) -> np.ndarray:
+    return tone(image, run.sensor, run.session.encoding)

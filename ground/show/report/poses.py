@@ -1,0 +1,267 @@
+"""The report's section on poses: what training found of their errors, how surely, and which frames still disagree."""
+
+import html
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import plotly.graph_objects as go
+import torch
+from plotly.subplots import make_subplots
+
+from ground.run.estimated_poses import doubts_left, read_estimate
+from ground.run.runs import Run
+from ground.session.spread import evenly_spread
+from ground.show.page import legend, plot, section, two_tables
+from obbgs_base.navigation_errors import LENGTHS
+from obbgs_core.frames import TrainingFrame, cameras_of
+from obbgs_core.losses import fit_figures
+from obbgs_core.model.motions import motion_vectors
+from obbgs_core.poses.corrections import PoseCorrections
+from obbgs_core.poses.estimate import PoseEstimate
+from obbgs_core.render import render
+
+MARGINS_PX = {"l": 60, "r": 20, "t": 20, "b": 45}
+AXES = {"x": "#1f6feb", "y": "#2a9d8f", "z": "#d1652a"}
+ELLIPSES = {"as the tags state": "rgba(91,107,123,0.4)", "left in doubt": "#1f6feb"}
+RESIDUALS = {"from the tagged pose": "#d1652a", "from the estimated pose": "#1f6feb"}
+ORBIT, BODY = ("radial", "transverse", "normal"), ("x", "y", "z")
+SHOWN = {  # the parameters that a pass shares: words, unit, axes
+    "position_m": ("relative position,", "m", ORBIT),
+    "velocity_m_s": ("relative velocity,", "m/s", ORBIT),
+    "attitude_rad": ("attitude of the target at the start, body", "deg", BODY),
+    "rate_rad_s": ("rate of the target, body", "deg/s", BODY),
+    "inertia_ratios": ("relative moment of inertia, body", "", BODY),
+    "boresight_rad": ("boresight, camera", "deg", BODY),
+    "clock_s": ("clock", "s", ()),
+    "focal": ("relative focal length", "", ()),
+}
+ELLIPSES_SHOWN = 60
+MISFIT_DEVIATIONS = 6.0  # of the median absolute deviation, scaled to that of a normal distribution
+
+
+@dataclass(frozen=True)
+class PoseHistory:
+    """The poses' corrections along the pass, a row for each bracket in the order of time.
+
+    A correction is the small motion in front of the tagged pose that gives the estimated one: a rotation vector (rad),
+    then a shift (m), along the camera's axes.
+    """
+
+    frame_ids: list[int]  # of the frame that stands for each bracket, its longest exposure
+    minutes: np.ndarray  # [P] since the first
+    correction: np.ndarray  # [P, 6]
+    prior: np.ndarray  # [P, 6, 6] covariance that the tags state, shared errors included
+    posterior: np.ndarray  # [P, 6, 6] that is left
+    chi2_tagged: np.ndarray  # [P] residual of the finished model from the tagged pose
+    chi2_estimated: np.ndarray  # [P] and from the estimated one
+
+    @property
+    def misfits(self) -> list[int]:
+        """The frames whose residual is far above that of most others, which speaks for an error of their poses."""
+        middle = float(np.nanmedian(self.chi2_estimated))
+        spread = 1.4826 * float(np.nanmedian(np.abs(self.chi2_estimated - middle)))
+        high = self.chi2_estimated > max(middle + MISFIT_DEVIATIONS * spread, 2 * middle)
+        return [number for number, is_high in zip(self.frame_ids, high, strict=True) if is_high]
+
+
+def pose_history(run: Run, estimate: PoseEstimate) -> PoseHistory:
+    """Return the corrections of a run's training frames.
+
+    Raises:
+        SessionError: a picture cannot be read.
+    """
+    records = {record.id: record for record in run.session.frames}
+    longest: dict[int, int] = {}  # the place of the frame that stands for each bracket
+    for place, (number, row) in enumerate(zip(estimate.frame_ids, estimate.brackets, strict=True)):
+        best = longest.setdefault(row, place)
+        if records[number].exposure_time_s > records[estimate.frame_ids[best]].exposure_time_s:
+            longest[row] = place
+    rows = sorted(longest, key=lambda row: records[estimate.frame_ids[longest[row]]].mid_exposure_utc_ns)
+    places = [longest[row] for row in rows]
+    ids = [estimate.frame_ids[place] for place in places]
+    frames = [run.without_sky_level(records[number]) for number in ids]
+    tagged, estimated = (torch.from_numpy(poses[places]) for poses in (estimate.tagged, estimate.estimated))
+    times_ns = np.array([records[number].mid_exposure_utc_ns for number in ids])
+    return PoseHistory(
+        ids,
+        (times_ns - times_ns[0]) / 60e9,
+        motion_vectors(estimated @ torch.linalg.inv(tagged)).numpy(),
+        PoseCorrections(frames).covariances.numpy(),
+        doubts_left(run.session, [records[number] for number in ids], estimate),
+        _residuals(run, frames, tagged),
+        _residuals(run, frames, estimated),
+    )
+
+
+@torch.no_grad()
+def _residuals(run: Run, frames: list[TrainingFrame], poses: torch.Tensor) -> np.ndarray:
+    """Return chi² on the target [P] of the finished model from given poses; NaN where it is not in the picture."""
+    found = []
+    for frame, pose in zip(frames, poses, strict=True):
+        rendered = render(run.gaussians, cameras_of([replace(frame, world_to_camera=pose.float())]))
+        exposure_s = torch.tensor([run.metrics.get("reference_exposure_s") or frame.exposure_time_s])
+        found.append(
+            fit_figures(rendered.radiance, rendered.alpha, exposure_s, frame.dn[None], run.sensor)[0]
+        )
+    return np.array(found)
+
+
+def poses_section(run: Run) -> str:
+    """Return the section; nothing for a run whose poses are as tagged."""
+    estimate = read_estimate(run.folder)
+    if estimate is None:
+        return ""
+    history = pose_history(run, estimate)
+    misfits = history.misfits
+    note = (
+        "What the training found the pose tags to err by. Corrections are along the camera's axes (z along the line of "
+        "sight), dotted lines are the standard deviations that the tags state. Ellipses lie across the line of sight: "
+        "pale what the tags allow, dark what is left in doubt, one standard deviation each. The residual is 1 where "
+        "only noise is left; it compares the finished model with the longest exposure of each bracket."
+    )
+    told = (
+        "No bracket's residual stands out from the others."
+        if not misfits
+        else (
+            f"The residual of {len(misfits)} of {len(history.frame_ids)} brackets stands out, those of the frames "
+            f"{', '.join(map(str, misfits))}: their poses may err by more than their tags say, or something "
+            "passed before the camera."
+        )
+    )
+    if left_out := run.metrics.get("misfit_frames"):
+        names = html.escape(", ".join(map(str, left_out)))
+        told += (
+            f" The frames {names} were left out of the training: they fitted no pose that their tags allow."
+        )
+    body = two_tables(shared_rows(estimate)) if estimate.shared_prior.vector().any() else ""
+    body += legend([(f"along {axis}", colour) for axis, colour in AXES.items()]) + plot(
+        correction_figure(history)
+    )
+    body += legend(ELLIPSES.items()) + plot(ellipse_figure(history))
+    body += legend(RESIDUALS.items()) + plot(residual_figure(history))
+    return section("Poses as estimated", note, f"{body}<p>{told}</p>")
+
+
+def shared_rows(estimate: PoseEstimate) -> list[tuple[str, str]]:
+    """Return a row for each parameter that the whole pass shares: its value with its deviation, and the prior's."""
+    rows, doubted = [], set(estimate.unobservable())
+    for name in LENGTHS:
+        words, unit, axes = SHOWN[name]
+        factor = math.degrees(1) if unit.startswith("deg") else 1.0
+        values, priors, left = (
+            factor * getattr(part, name)
+            for part in (estimate.shared, estimate.shared_prior, estimate.shared_posterior)
+        )
+        for i in np.flatnonzero(priors):
+            axis = f" {axes[i]}" if axes else ""
+            doubt = ": not determined by the frames" if {name, f"{name}[{i}]"} & doubted else ""
+            value = _unbroken(f"{values[i]:.4g} ± {left[i]:.2g}") + " "
+            value += _unbroken(f"(stated ± {priors[i]:.2g}) {unit}")
+            rows.append((f"{words}{axis}{doubt}", value))
+    return rows
+
+
+def _unbroken(text: str) -> str:
+    """Return text that stays in one line."""
+    return text.replace(" ", "\N{NO-BREAK SPACE}")
+
+
+def correction_figure(history: PoseHistory) -> go.Figure:
+    """Return the corrections against time, rotation above shift, with the deviations that the tags state."""
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
+    deviations = np.sqrt(np.maximum(np.diagonal(history.prior, axis1=1, axis2=2), 0))
+    for row, (first, factor, unit) in enumerate(((0, math.degrees(1), "deg"), (3, 1.0, "m")), start=1):
+        for i, (axis, colour) in enumerate(AXES.items()):
+            line = {"x": history.minutes, "legendgroup": axis, "row": row, "col": 1}
+            figure.add_scatter(
+                **line,
+                y=factor * history.correction[:, first + i],
+                name=axis,
+                line={"color": colour},
+                mode="lines+markers",
+                marker={"size": 4},
+                customdata=history.frame_ids,
+                hovertemplate=f"frame %{{customdata}}: %{{y:.4g}} {unit}<extra></extra>",
+            )
+            for sign in (-1, 1):
+                figure.add_scatter(
+                    **line,
+                    y=sign * factor * deviations[:, first + i],
+                    mode="lines",
+                    hoverinfo="skip",
+                    line={"color": colour, "dash": "dot", "width": 1},
+                )
+        figure.update_yaxes(title_text=f"{'rotation' if row == 1 else 'shift'}, {unit}", row=row, col=1)
+    figure.update_xaxes(title_text="minutes", row=2, col=1)
+    figure.update_layout(height=460, margin=MARGINS_PX, showlegend=False)
+    return figure
+
+
+def ellipse_figure(history: PoseHistory) -> go.Figure:
+    """Return the shifts across the line of sight, in the order of time, with their ellipses before and after."""
+    figure = go.Figure()
+    shifts = history.correction[:, 3:5]
+    shown = evenly_spread(range(len(shifts)), ELLIPSES_SHOWN)
+    for covariances, centres, name in (
+        (history.prior, np.zeros_like(shifts), "as the tags state"),
+        (history.posterior, shifts, "left in doubt"),
+    ):
+        outline = [_ellipse(covariances[i, 3:5, 3:5]) + centres[i] for i in shown]
+        gap = np.full((1, 2), np.nan)
+        points = np.concatenate([part for one in outline for part in (one, gap)])
+        figure.add_scatter(
+            x=points[:, 0],
+            y=points[:, 1],
+            mode="lines",
+            name=name,
+            line={"color": ELLIPSES[name]},
+            hoverinfo="skip",
+        )
+    figure.add_scatter(
+        x=shifts[:, 0],
+        y=shifts[:, 1],
+        mode="lines+markers",
+        name="correction",
+        line={"color": "#b9c4d0", "width": 1},
+        marker={
+            "color": history.minutes,
+            "colorscale": "Viridis",
+            "colorbar": {"title": {"text": "minutes"}},
+        },
+        customdata=history.frame_ids,
+        hovertemplate="frame %{customdata}: %{x:.3g}, %{y:.3g} m<extra></extra>",
+    )
+    figure.update_yaxes(title_text="shift along camera y, m", scaleanchor="x")
+    figure.update_xaxes(title_text="shift along camera x, m")
+    figure.update_layout(height=460, margin=MARGINS_PX, showlegend=False)
+    return figure
+
+
+def _ellipse(covariance: np.ndarray) -> np.ndarray:
+    """Return points [33, 2] at one standard deviation of a covariance [2, 2]."""
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0, 2 * np.pi, 33)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return circle * np.sqrt(np.maximum(values, 0)) @ vectors.T
+
+
+def residual_figure(history: PoseHistory) -> go.Figure:
+    """Return the residual of each bracket from its tagged and from its estimated pose."""
+    figure = go.Figure()
+    for values, (name, colour) in zip(
+        (history.chi2_tagged, history.chi2_estimated), RESIDUALS.items(), strict=True
+    ):
+        figure.add_scatter(
+            x=history.minutes,
+            y=values,
+            name=name,
+            mode="lines+markers",
+            line={"color": colour},
+            customdata=history.frame_ids,
+            hovertemplate="frame %{customdata}: %{y:.3g}<extra></extra>",
+        )
+    figure.update_yaxes(title_text="residual chi²", type="log")
+    figure.update_xaxes(title_text="minutes")
+    figure.update_layout(height=320, margin=MARGINS_PX, showlegend=False)
+    return figure

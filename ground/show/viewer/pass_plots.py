@@ -1,0 +1,186 @@
+"""The pass beside the model: housekeeping as plots with limits, events and commands; live, or replayed at any speed."""
+
+import html
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import viser
+from viser import uplot
+
+from ground.link.uplink import HISTORY
+from ground.session.folder import read_log
+from ground.show.telemetry_plots import (
+    BYTES_PER_MB,
+    LIMIT_COLOURS,
+    Series,
+    housekeeping_series,
+    near_limits,
+    unit_of,
+)
+
+TELEMETRY, EVENTS = "telemetry.jsonl", "events.jsonl"
+EVENTS_SHOWN = 30
+PLOT_PX, PANEL_PX = 120, 330
+SPEEDS = {"1x": 1.0, "10x": 10.0, "100x": 100.0, "1000x": 1000.0}
+SEVERITY_COLOURS = {"info": "inherit", "warning": LIMIT_COLOURS["yellow"], "error": LIMIT_COLOURS["red"]}
+
+
+@dataclass(frozen=True)
+class Event:
+    """What was told in the pass: seconds since its first housekeeping, by the spacecraft's clock where it has one."""
+
+    seconds: float
+    severity: str
+    text: str
+
+
+def pass_events(session: Path, start_utc_ns: int) -> list[Event]:
+    """Return events and ends of commands in the order of time; lines that are damaged are left out."""
+    found = []
+    for line in read_log(session / EVENTS):
+        utc_ns, text = line.get("utc_ns", line.get("received_utc_ns")), line.get("text")
+        if type(utc_ns) is int and isinstance(text, str):
+            found.append(Event((utc_ns - start_utc_ns) / 1e9, str(line.get("severity", "info")), text))
+    for line in read_log(session / HISTORY):
+        utc_ns, stage = line.get("ended_utc_ns"), line.get("stage")
+        if type(utc_ns) is int:
+            severity = "info" if stage == "completed" else "warning"
+            text = f"command {line.get('given')} {stage}: {line.get('text')}"
+            found.append(Event((utc_ns - start_utc_ns) / 1e9, severity, text))
+    return sorted(found, key=lambda event: event.seconds)
+
+
+def up_to(series: Series, seconds: float) -> Series:
+    """Return what was known of a series at a time."""
+    kept = series.seconds <= seconds
+    return Series(series.item, series.seconds[kept], series.values[kept], series.start_utc_ns)
+
+
+@dataclass(frozen=True)
+class Controls:
+    """The panel's controls, and a plot for each item of the housekeeping that is shown."""
+
+    replay: viser.GuiCheckboxHandle
+    speed: viser.GuiDropdownHandle
+    place: viser.GuiSliderHandle
+    told: viser.GuiHtmlHandle
+    plots: dict[str, viser.GuiUplotHandle]
+
+
+class PassPlots:
+    """A panel with the telemetry of a session; `on_time` is told the time of a replay, Unix ns, as it goes on."""
+
+    def __init__(
+        self, server: viser.ViserServer, session: Path, on_time: Callable[[int], None] = lambda utc_ns: None
+    ):
+        self._server, self._session, self._on_time = server, session, on_time
+        self._read: tuple[int, ...] = ()  # sizes of the files as they were read
+        self._series: list[Series] = []
+        self._events: list[Event] = []
+        self.controls: Controls | None = None  # None before the first housekeeping
+
+    def tick(self, elapsed_s: float) -> None:
+        """Read what has come, and let a replay go on by so many seconds of its viewers' time."""
+        files = [self._session / name for name in (TELEMETRY, EVENTS, HISTORY)]
+        sizes = tuple(path.stat().st_size if path.is_file() else 0 for path in files)
+        changed = sizes != self._read
+        if changed:
+            self._series, self._read = housekeeping_series(self._session), sizes
+            if self._series:
+                self._events = pass_events(self._session, self._series[0].start_utc_ns)
+        if not self._series:
+            return
+        if self.controls is None:
+            self.controls = self._built()
+        controls, end_s = self.controls, float(self._series[0].seconds[-1])
+        controls.place.max = max(end_s, 1.0)
+        if controls.replay.value:
+            seconds = min(
+                float(controls.place.value) + elapsed_s * SPEEDS.get(controls.speed.value, 1.0), end_s
+            )
+            controls.place.value = seconds
+            self._on_time(self._series[0].start_utc_ns + round(1e9 * seconds))
+            self._draw(controls, seconds)
+        elif changed:
+            self._draw(controls, np.inf)
+
+    def _built(self) -> Controls:
+        gui = self._server.gui
+        panel = gui.add_panel()
+        with panel.add_tab("Telemetry"):
+            replay = gui.add_checkbox("Replay the pass", initial_value=False)
+            speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="10x")
+            place = gui.add_slider("Seconds", min=0.0, max=1.0, step=0.1, initial_value=0.0)
+            controls = Controls(
+                replay, speed, place, gui.add_html(""), {s.item.name: self._plot(s) for s in self._series}
+            )
+        replay.on_update(lambda _: self._begin(controls))
+        panel.dock_left()
+        panel.set_width(PANEL_PX)
+        return controls
+
+    def _plot(self, series: Series) -> viser.GuiUplotHandle:
+        return self._server.gui.add_uplot(
+            data=plotted(series, series),
+            series=drawn_lines(series),
+            scales={"x": uplot.Scale(time=False)},
+            axes=(uplot.Axis(stroke="#9aa5b1"), uplot.Axis(stroke="#9aa5b1", size=64)),
+            title=f"{series.item.name.replace('_', ' ')}{unit_of(series.item)}",
+            legend=uplot.Legend(show=False),
+            height=PLOT_PX,
+        )
+
+    def _draw(self, controls: Controls, seconds: float) -> None:
+        """Draw plots and events as they were known at a time."""
+        known = [up_to(series, seconds) for series in self._series]
+        for whole, series in zip(self._series, known, strict=True):
+            plot, data = controls.plots[series.item.name], plotted(series, whole)
+            if len(data) != len(plot.series):  # a limit has come near, or is far away now
+                plot.series = drawn_lines(whole)
+            plot.data = data
+        controls.told.content = _told(known, [event for event in self._events if event.seconds <= seconds])
+
+    def _begin(self, controls: Controls) -> None:
+        """Start a replay from where the slider stands, at its end from the beginning; or show the pass as it is now."""
+        if not controls.replay.value:
+            self._draw(controls, np.inf)
+        elif controls.place.value >= controls.place.max:
+            controls.place.value = 0.0
+
+
+def drawn_lines(whole: Series) -> tuple[uplot.Series, ...]:
+    """Return how the columns of `plotted` are drawn."""
+    lines = [
+        uplot.Series(label="limit", stroke=colour, dash=(4, 4), width=1) for _, colour in near_limits(whole)
+    ]
+    return (uplot.Series(label="s"), uplot.Series(label="value", stroke="#6ea8fe", width=2), *lines)
+
+
+def plotted(known: Series, whole: Series) -> tuple[np.ndarray, ...]:
+    """Return a plot's columns: seconds, values (bytes in MB), then the limits that are near."""
+    factor = BYTES_PER_MB if known.item.unit == "B" else 1.0
+    limits = [np.full(len(known.seconds), bound / factor) for bound, _ in near_limits(whole)]
+    return (known.seconds, known.values / factor, *limits)
+
+
+def _told(known: list[Series], events: list[Event]) -> str:
+    """Return as HTML the limits that are broken now, red before yellow, and the newest events, the newest first."""
+    broken = [(s, s.limits[-1]) for s in known if len(s.values) and s.limits[-1] != "green"]
+    start_s = known[0].start_utc_ns / 1e9
+    lines = [
+        f'<b style="color: {LIMIT_COLOURS[limit]}">{s.item.name.replace("_", " ")} {_in_words(s)}</b>'
+        for s, limit in sorted(broken, key=lambda pair: pair[1] != "red")
+    ]
+    for event in events[: -EVENTS_SHOWN - 1 : -1]:
+        at = f"{datetime.fromtimestamp(start_s + event.seconds, UTC):%H:%M:%S}"
+        colour = SEVERITY_COLOURS.get(event.severity, "inherit")
+        lines.append(f'<span style="color: {colour}">{at} {html.escape(event.text)}</span>')
+    return f'<div style="padding: 4px 12px; font-size: 12px; line-height: 1.5">{"<br>".join(lines)}</div>'
+
+
+def _in_words(series: Series) -> str:
+    value = series.values[-1] / (BYTES_PER_MB if series.item.unit == "B" else 1.0)
+    return f"{value:,.6g}{unit_of(series.item).replace(',', '')}"

@@ -1,0 +1,413 @@
+"""The viewer's controls and what they do; it draws again whenever a run's model is renewed."""
+
+import logging
+import math
+import re
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+import imagecodecs
+import numpy as np
+import torch
+import viser
+
+from ground.session.cameras import predicted_image, range_in_words, sun_direction
+from ground.session.exposures import in_ms, offered_s
+from ground.session.folder import FrameRecord, Session, SessionError
+from ground.show.pictures import ERROR_FULL_SCALE, heat, tone
+from ground.show.turntable import VIEWS, circle, moving_png, pictures
+from ground.show.viewer.door import opened
+from ground.show.viewer.pass_plots import PassPlots
+from ground.show.viewer.ruler import Ruler
+from ground.show.viewer.scene import (
+    COLOURS,
+    ERROR,
+    RADIUS,
+    SENSOR,
+    UNCERTAINTY,
+    Placed,
+    states_scale,
+    states_time,
+)
+from ground.show.viewer.source import Source
+from ground.show.viewer.splats import CHI2_SHOWN, DEVIATION_SHOWN, legend, seen_exposure_s
+from ground.show.viewer.waiting import awaited
+from obbgs_core.errors import ReconstructionError
+
+log = logging.getLogger(__name__)
+POLL_S, TICK_S = 1.0, 0.25  # between looks for a renewed model, and between steps of a replay
+APART = 2.4  # radii between the centres of two models side by side
+FIELD_RAD = 0.4  # vertical field of view, about that of a telescope's picture of the model
+NEAREST, FARTHEST = (
+    1.4,
+    40.0,
+)  # radii from the model that the camera may come to: the wheel never flies into it
+# the exposure slider reaches from a quarter of the shortest exposure to so many times the longest
+REACH = 4.0
+DIGITS = 2  # that the exposure slider shows behind the first one of its shortest time
+PICTURE_PX = (1200, 800)
+TURNTABLE_PX = (480, 320)
+CHI2_WORDS = "chi²: mean squared residual over the variance of the noise; 1 is noise alone"
+DEVIATION_WORDS = "standard deviation of the radiance, as a share of full scale at the middle exposure"
+PARTS = ("splats", "cameras", "sun", "mesh")
+
+
+def view(
+    sources: list[Source],
+    host: str,
+    port: int,
+    on_ready: Callable[[int], None],
+    should_stop: Callable[[], bool],
+) -> None:
+    """Show one run, or two side by side, until told to stop; `on_ready` receives the port.
+
+    Until each has a model the page says what is waited for and shows the frames that have come.
+
+    Raises:
+        SessionError, ReconstructionError: a session or the first model of a run cannot be read. Later ones are logged,
+            and the model that was read last stays.
+        ViewError: the port cannot be bound.
+    """
+    server = opened(host, port)
+    try:
+        on_ready(server.get_port())
+        server.scene.set_up_direction("+z")
+        server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
+        if not awaited(server, sources, should_stop, POLL_S):
+            return
+        shown = [source.load() for source in sources]
+        first = Placed(server, "a", shown[0], np.zeros(3))
+        placed = [first]
+        for other in shown[1:]:
+            placed.append(Placed(server, "b", other, np.array([APART * RADIUS, 0.0, 0.0]), first.per_metre))
+        viewer = Viewer(server, placed)
+        plots = PassPlots(server, sources[0].session_path, viewer.show_time)
+        looked_s = time.monotonic() - POLL_S
+        while not should_stop():
+            plots.tick(TICK_S)
+            time.sleep(TICK_S)
+            if time.monotonic() < looked_s + POLL_S:
+                continue
+            looked_s = time.monotonic()
+            for i, source in enumerate(sources):
+                if source.renewed():
+                    try:
+                        viewer.renew(i, source)
+                    except (SessionError, ReconstructionError, OSError, ValueError) as error:
+                        log.warning("%s is not shown anew: %s", source.name, error)
+    finally:
+        server.stop()
+
+
+class Viewer:
+    """The page: all viewers of it share exposure, frame and colours, each has a camera of its own."""
+
+    def __init__(self, server: viser.ViserServer, placed: list[Placed]):
+        self.server, self.placed = server, placed
+        self.lock = threading.RLock()  # viser calls from threads of its own
+        self.frames = _in_time(placed[0])
+        self._controls()
+        self._start_camera()
+        server.on_client_connect(self._limit_zoom)
+        for client in server.get_clients().values():  # who waited for the model
+            self._reset(client)
+        self.draw_all()
+
+    @property
+    def record(self) -> FrameRecord:
+        """The frame that the timeline stands at."""
+        return self.frames[min(max(int(self.timeline.value), 0), len(self.frames) - 1)]
+
+    @property
+    def exposure_s(self) -> float:
+        low_ms, high_ms = self.exposure_limits_ms
+        value_ms = float(self.exposure.value)
+        return float(np.clip(value_ms if np.isfinite(value_ms) else low_ms, low_ms, high_ms)) / 1e3
+
+    @property
+    def colour(self) -> str:
+        return self.colouring.value if self.colouring.value in COLOURS else SENSOR
+
+    def _controls(self) -> None:
+        gui, session = self.server.gui, self.placed[0].shown.session
+        self.status = gui.add_markdown("")
+        exposures_s = sorted({record.exposure_time_s for record in session.frames})
+        seen_s = float(
+            np.clip(seen_exposure_s(self.placed[0].shown), exposures_s[0] / REACH, exposures_s[-1] * REACH)
+        )
+        middle_ms = 1e3 * seen_s
+        name = "Brightness, per mille" if session.nominal_exposures else "Exposure, ms"
+        self.exposure = gui.add_slider(name, min=middle_ms, max=middle_ms, step=1.0, initial_value=middle_ms)
+        self.exposure.on_update(lambda _: self.draw_splats())
+        self.brackets = gui.add_button_group("Brackets, ms", [""], visible=not session.nominal_exposures)
+        self.brackets.on_click(lambda _: self._expose(self.brackets.value))
+        self.colouring = gui.add_dropdown("Colours", COLOURS, initial_value=SENSOR)
+        self.colouring.on_update(lambda _: self._colour_anew())
+        self.legend = gui.add_html("", visible=False)
+        self.checks = {}
+        for part in PARTS:
+            self.checks[part] = gui.add_checkbox(part.capitalize(), initial_value=part in ("splats", "sun"))
+            self.checks[part].on_update(lambda _: self._show())
+        self._measuring_controls()
+        with gui.add_folder("Timeline of the pass"):
+            self.timeline = gui.add_slider("Frame", min=0, max=1, step=1, initial_value=0)
+            self.timeline.on_update(lambda _: self.draw_frame())
+            self.facts = gui.add_markdown("")
+            self.comparison = gui.add_image(
+                np.zeros((2, 6, 3), np.uint8), label="frame, model, error", format="png"
+            )
+            through = gui.add_button("Look through its camera")
+            through.on_click(lambda event: self._look_through(event.client))
+        reset = gui.add_button("Reset view")
+        reset.on_click(lambda event: self._reset(event.client))
+        picture = gui.add_button("Save picture")
+        picture.on_click(lambda event: self._save_picture(event.client))
+        turntable = gui.add_button("Save turntable")
+        turntable.on_click(lambda event: self._save_turntable(event.client))
+        self._fit_controls()
+
+    def _measuring_controls(self) -> None:
+        """Add the ruler and the box outside which nothing of the models is drawn."""
+        gui = self.server.gui
+        self.ruler = Ruler(self.server)
+        self.measuring = gui.add_checkbox("Ruler: click on two points", initial_value=False)
+        self.measuring.on_update(lambda _: self._measure())
+        self.length = gui.add_markdown("", visible=False)
+        self.crops = []
+        with gui.add_folder("Crop", expand_by_default=False):
+            reach_m = RADIUS / self.placed[0].per_metre
+            unit = "m" if states_scale(self.placed[0].shown.session) else "units"
+            for axis, middle in zip("xyz", self.placed[0].centre_m, strict=True):
+                ends = float(middle - 1.5 * reach_m), float(middle + 1.5 * reach_m)
+                crop = gui.add_multi_slider(f"{axis}, {unit}", *ends, step=reach_m / 100, initial_value=ends)
+                crop.on_update(lambda _: self._crop())
+                self.crops.append(crop)
+
+    def _colour_anew(self) -> None:
+        told = {ERROR: (CHI2_SHOWN, CHI2_WORDS), UNCERTAINTY: (DEVIATION_SHOWN, DEVIATION_WORDS)}.get(
+            self.colour
+        )
+        self.legend.visible = told is not None
+        if told is not None:
+            self.legend.content = legend(*told)
+        self.draw_splats()
+
+    def _measure(self) -> None:
+        """Take clicks for the ruler, or no longer."""
+        scene = self.server.scene
+        if self.measuring.value:
+            scene.on_click()(self._click)
+            self.length.content = "click on the first point"
+        else:
+            scene.remove_click_callback()
+            self.ruler.clear()
+        self.length.visible = bool(self.measuring.value)
+
+    def _click(self, event: viser.SceneClickEvent) -> None:
+        with self.lock:
+            origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+            if np.linalg.norm(direction) > 0:
+                self.length.content = self.ruler.click(self.placed, origin, direction)
+
+    def _crop(self) -> None:
+        ends = np.array([crop.value for crop in self.crops])
+        whole = np.array([(crop.min, crop.max) for crop in self.crops])
+        box_m = np.where(ends == whole, (-np.inf, np.inf), ends).T  # at a slider's end nothing is cut
+        for each in self.placed:
+            each.box_m = (box_m[0], box_m[1])
+        self.draw_splats()
+
+    def _fit_controls(self) -> None:
+        """Let the controls reach what there is to show; what was chosen stays where it still can be."""
+        exposures_s = [record.exposure_time_s for record in self.frames]
+        low_ms, high_ms = 1e3 * min(exposures_s) / REACH, 1e3 * max(exposures_s) * REACH
+        self.exposure_limits_ms = low_ms, high_ms
+        self.exposure.min, self.exposure.max, self.exposure.step = low_ms, high_ms, low_ms / 10
+        self.exposure.precision = max(0, DIGITS - math.floor(math.log10(low_ms)))
+        self.exposure.value = 1e3 * self.exposure_s  # within the limits
+        self.offered_s = offered_s(exposures_s)
+        self.brackets.options = tuple(self.offered_s)
+        self.timeline.max = max(1, len(self.frames) - 1)
+        self.checks["sun"].visible = any(sun_direction(record) is not None for record in self.frames)
+        self.checks["mesh"].visible = any(each.shown.mesh is not None for each in self.placed)
+
+    def draw_all(self) -> None:
+        """Draw everything anew, after a model was put in place."""
+        with self.lock:
+            for each in self.placed:
+                each.draw_mesh(self._is_checked("mesh"))
+                if len(self.placed) > 1:
+                    each.draw_name()
+            self.placed[0].draw_cameras(self.frames, self._choose, self._is_checked("cameras"))
+            self.draw_frame()
+            names = " | ".join(
+                f"{each.shown.name}, {len(each.shown.gaussians):,} Gaussians" for each in self.placed
+            )
+            self.status.content = f"**{names}**, read at {datetime.now(UTC):%H:%M:%SZ}"
+
+    def draw_splats(self) -> None:
+        """Draw the splats at the chosen exposure, from the direction of the chosen frame, under its Sun."""
+        with self.lock:
+            for each in self.placed:
+                record = self.record if each is self.placed[0] else _nearest(each, self.record)
+                each.draw(record, self.exposure_s, self.colour, self._is_checked("splats"))
+
+    def draw_frame(self) -> None:
+        """Draw what depends on the chosen frame: facts, pictures, the Sun and the splats' colours."""
+        with self.lock:
+            record, first = self.record, self.placed[0]
+            self.facts.content = _facts(first.shown.session, record)
+            self.comparison.image = _compared(first, record)
+            for each in self.placed:
+                each.draw_sun(record, self._is_checked("sun"))
+            self.draw_splats()
+
+    def show_time(self, utc_ns: int) -> None:
+        """Move the timeline to the frame that was taken last before a time of the pass."""
+        taken = [i for i, record in enumerate(self.frames) if record.mid_exposure_utc_ns <= utc_ns]
+        if taken and taken[-1] != self.timeline.value:
+            self.timeline.value = taken[-1]
+
+    def renew(self, index: int, source: Source) -> None:
+        """Read a run again and draw it in place of the one that was there, in the same scale."""
+        shown, old = source.load(), self.placed[index]
+        with self.lock:
+            self.placed[index] = Placed(self.server, "ab"[index], shown, old.offset, old.per_metre)
+            self.placed[index].box_m = old.box_m
+            self.ruler.clear()
+            old.clear()
+            if index == 0:
+                self.frames = _in_time(self.placed[0])
+            self._fit_controls()
+            self.draw_all()
+
+    def _is_checked(self, part: str) -> bool:
+        return bool(self.checks[part].value)
+
+    def _show(self) -> None:
+        with self.lock:
+            for each in self.placed:
+                for part in PARTS:
+                    each.show(part, self._is_checked(part))
+
+    def _expose(self, text: str) -> None:
+        if text in self.offered_s:
+            self.exposure.value = 1e3 * self.offered_s[text]
+
+    def _choose(self, record: FrameRecord) -> None:
+        self.timeline.value = self.frames.index(record)
+
+    def _start_camera(self) -> None:
+        camera = self.server.initial_camera
+        away = self.record.position_body_m / max(float(np.linalg.norm(self.record.position_body_m)), 1e-9)
+        middle = np.mean([each.offset for each in self.placed], axis=0)
+        self.start = middle + away * _fitting_distance(len(self.placed)), middle
+        camera.fov = FIELD_RAD
+        camera.position, camera.look_at = self.start
+        camera.near, camera.far = RADIUS / 10, 100 * RADIUS
+
+    def _limit_zoom(self, client: viser.ClientHandle) -> None:
+        client.camera.max_orbit_distance = FARTHEST * RADIUS
+        client.camera.min_orbit_distance = NEAREST * RADIUS
+
+    def _reset(self, client: viser.ClientHandle | None) -> None:
+        if client is not None:
+            client.camera.up_direction = (0.0, 0.0, 1.0)
+            client.camera.position, client.camera.look_at = self.start
+            client.camera.fov = FIELD_RAD
+            self._limit_zoom(client)
+
+    def _look_through(self, client: viser.ClientHandle | None) -> None:
+        """Put a viewer's camera where the chosen frame's was, as far away, with its direction of up and field."""
+        if client is None:
+            return
+        first = self.placed[0]
+        record, session = first.shown.compared(self.record), first.shown.session
+        pose, K = record.world_to_camera, session.K(record)
+        client.camera.max_orbit_distance = 1e6 * RADIUS
+        position = first.place(-pose[:3, :3].T @ pose[:3, 3])
+        distance = float(np.linalg.norm(position))
+        client.camera.far, client.camera.near = distance + 100 * RADIUS, max(0.01, distance - 50 * RADIUS)
+        client.camera.fov = float(2 * np.arctan(session.camera.height / 2 / K[1, 1]))
+        _, down, forward = pose[:3, :3]
+        client.camera.up_direction = -down
+        client.camera.position = position
+        client.camera.look_at = position + distance * forward
+
+    def file_name(self, what: str) -> str:
+        """Return the name of a picture to save: of which models, frame and exposure time it is."""
+        names = "-and-".join(each.shown.name for each in self.placed)
+        exposure = "" if self.placed[0].shown.session.nominal_exposures else f"-{in_ms(self.exposure_s)}ms"
+        text = f"{names}-frame{self.record.id:06d}{exposure}-{what}.png"
+        return re.sub(r"[^A-Za-z0-9._-]+", "-", text)
+
+    def _save_picture(self, client: viser.ClientHandle | None) -> None:
+        if client is not None:
+            width, height = PICTURE_PX
+            image = client.get_render(height, width, transport_format="png", timeout=60)
+            png = imagecodecs.png_encode(np.ascontiguousarray(on_black(image)))
+            client.send_file_download(self.file_name("view"), bytes(png), save_immediately=True)
+
+    def _save_turntable(self, client: viser.ClientHandle | None) -> None:
+        """Send the first model's turntable, drawn by our own renderer at the chosen exposure."""
+        if client is not None:
+            shown = self.placed[0].shown
+            cameras = circle(shown.gaussians, shown.session, VIEWS, *TURNTABLE_PX)
+            images = pictures(shown.gaussians, shown.session, shown.sensor, self.exposure_s, cameras)
+            client.send_file_download(self.file_name("turntable"), moving_png(images), save_immediately=True)
+
+
+def _in_time(placed: Placed) -> list[FrameRecord]:
+    return sorted(placed.shown.session.frames, key=lambda record: (record.mid_exposure_utc_ns, record.id))
+
+
+def _nearest(placed: Placed, record: FrameRecord) -> FrameRecord:
+    """Return the frame of another session that was taken from the direction nearest to a frame's."""
+    wanted = record.position_body_m / max(float(np.linalg.norm(record.position_body_m)), 1e-9)
+    frames = placed.shown.session.frames
+    return max(
+        frames,
+        key=lambda r: float(r.position_body_m @ wanted) / max(float(np.linalg.norm(r.position_body_m)), 1e-9),
+    )
+
+
+def _fitting_distance(models: int) -> float:
+    width = RADIUS * (1 + APART / 2 * (models - 1))
+    return 1.35 * width / np.tan(FIELD_RAD / 2)
+
+
+def _facts(session: Session, record: FrameRecord) -> str:
+    """Return what is known of a frame; of imported pictures only what their format states."""
+    facts = [f"frame {record.id} of bracket {record.bracket}"]
+    if not session.nominal_exposures:
+        facts.append(f"{1e3 * record.exposure_time_s:g} ms")
+    if states_time(session, record):
+        facts.append(f"{datetime.fromtimestamp(record.mid_exposure_utc_ns / 1e9, UTC):%H:%M:%S}")
+    if states_scale(session):
+        facts.append(range_in_words(record))
+    facts.append(f"{record.saturated:,} pixels saturated")
+    return ", ".join(facts)
+
+
+def _compared(placed: Placed, record: FrameRecord) -> np.ndarray:
+    """Return a frame, the model's picture and the error side by side, bytes [H, 3 W, 3]."""
+    shown = placed.shown
+    try:
+        dn = shown.session.dn(record).astype(np.float32)
+    except SessionError as error:
+        log.warning("%s", error)
+        return np.zeros((2, 6, 3), np.uint8)
+    frame = torch.from_numpy(dn.reshape(*dn.shape[:2], -1) / shown.sensor.white_dn)
+    seen_from = shown.compared(record)
+    image = predicted_image(shown.gaussians, shown.session, seen_from, shown.sensor, record.exposure_time_s)
+    error = ((image - frame).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
+    encoding = shown.session.encoding
+    toned = [tone(each.numpy(), shown.sensor, encoding) for each in (frame, image)]
+    return np.concatenate([*toned, heat(error.numpy())], axis=1)
+
+
+def on_black(image: np.ndarray) -> np.ndarray:
+    """Return a picture [H, W, 4] with transparency on black, bytes [H, W, 3]."""
+    return (image[..., :3].astype(np.float32) * (image[..., 3:] / 255)).round().astype(np.uint8)
