@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from obbgs_core import compiled
-from obbgs_core.misfit import OWN, model_error, relative_misfit, sampling_stride
+from obbgs_core.misfit import OWN, error_of, misfit_of, model_error, sampling_stride
 from obbgs_core.sensor import Sensor
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Wang et al. 2004
@@ -65,7 +65,7 @@ def likelihood_loss(
         ValueError: shapes disagree, or images are smaller than the 3x3 of an edge.
     """
     _check(radiance, exposure_time_s, dn)
-    native = compiled.module_for(radiance, exposure_time_s, dn)
+    native = None if sensor.jpeg else compiled.module_for(radiance, exposure_time_s, dn)
     if native is None:
         settings = (averaged_pixels, edge_weight, misfit)
         loss, residual = likelihood_loss_reference(radiance, exposure_time_s, dn, sensor, *settings)
@@ -86,16 +86,22 @@ def likelihood_loss_reference(
     misfit: float | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return what `likelihood_loss` does, in readable PyTorch."""
-    residual = sensor.deviance_residual(radiance, exposure_time_s, dn, averaged_pixels)
+    prediction = sensor.predicted(radiance, exposure_time_s, averaged_pixels)
+    residual = sensor.residual_of(prediction, dn, averaged_pixels)
     if misfit is None:
         loss = charbonnier(residual)
     else:
-        error = model_error(radiance, exposure_time_s, sensor, averaged_pixels, misfit)
-        prediction = sensor.predicted(radiance.detach(), exposure_time_s)
-        residual = residual / (1 + error.variance_dn2(prediction, sensor) / prediction.variance_dn2).sqrt()
-        loss = error.weight * cauchy(residual)
+        with torch.no_grad():
+            own = (
+                model_error(radiance, exposure_time_s, sensor, averaged_pixels, misfit)
+                if sensor.jpeg is None
+                else error_of(prediction, sensor, averaged_pixels, misfit)
+            )
+            excess = own.variance_dn2(prediction, sensor) / prediction.variance_dn2
+        residual = residual / (1 + excess).sqrt()
+        loss = own.weight * cauchy(residual)
     if edge_weight:
-        visible = sensor.expected_dn(radiance, exposure_time_s).clamp(max=sensor.white_dn)
+        visible = prediction.expected_dn.clamp(max=sensor.white_dn)
         loss = loss + edge_weight * sobel_edge_loss(sensor.stabilised(visible), sensor.stabilised(dn))
     return loss, residual.detach()
 
@@ -177,7 +183,7 @@ def fit_figures(
     mean of several pixels has none, since some of its pixels need not be saturated. PSNR is that of the prediction
     clamped at full scale. The other arguments are as for `likelihood_loss`.
     """
-    native = compiled.module_for(radiance, alpha, exposure_time_s, dn)
+    native = None if sensor.jpeg else compiled.module_for(radiance, alpha, exposure_time_s, dn)
     if native is not None:
         model, gains = _sensor_model(native, sensor, averaged_pixels), _gains(sensor, exposure_time_s)
         light, opaque, read = (image.detach().contiguous() for image in (radiance, alpha, dn))
@@ -185,13 +191,13 @@ def fit_figures(
         chi2, mse, misfit2 = native.fit(light, opaque, read, gains, model, ON_TARGET_ALPHA, threads)
         misfit = math.sqrt(misfit2)
     else:
-        prediction = sensor.predicted(radiance, exposure_time_s)
+        prediction = sensor.predicted(radiance, exposure_time_s, averaged_pixels)
         squares, expected = prediction.chi2_terms(dn, sensor.white_dn)
         seen = (alpha > ON_TARGET_ALPHA)[..., None] & ((averaged_pixels == 1) | (dn < sensor.white_dn))
         chi2 = (averaged_pixels * squares[seen].sum() / expected[seen].sum()).item()
         visible = prediction.expected_dn.clamp(max=sensor.white_dn)
         mse = ((visible - dn) / sensor.white_dn).square().mean().item()
-        misfit = relative_misfit(radiance, exposure_time_s, dn, sensor, averaged_pixels)
+        misfit = misfit_of(prediction, dn, sensor, averaged_pixels)
     return Fit(chi2, -10 * math.log10(max(mse, 1e-12)), misfit)
 
 

@@ -41,8 +41,14 @@ def model_error(
     other arguments are as for `likelihood_loss`, whose compiled sweep does the same (kernels/likelihood.cpp). Of large
     images, every so many pixels are taken.
     """
-    (radiance,) = sampled(radiance)
-    prediction = sensor.predicted(radiance, exposure_time_s)
+    (radiance,) = sampled(sensor, radiance)
+    return error_of(
+        sensor.predicted(radiance, exposure_time_s, averaged_pixels), sensor, averaged_pixels, misfit
+    )
+
+
+def error_of(prediction: Prediction, sensor: Sensor, averaged_pixels: int, misfit: float) -> ModelError:
+    """Return `model_error` of what is expected of some pictures, all of whose pixels are taken."""
     squares = _light_dn(prediction, sensor).square()
     variance = prediction.variance_dn2 / averaged_pixels
     seen = squares > 4 * variance
@@ -66,7 +72,13 @@ def relative_misfit(
     of the light; 0 where noise explains the difference. Values that are lit above twice the noise count, saturated ones
     do not. The arguments are as for `likelihood_loss`.
     """
-    prediction = sensor.predicted(radiance, exposure_time_s)
+    return misfit_of(
+        sensor.predicted(radiance, exposure_time_s, averaged_pixels), dn, sensor, averaged_pixels
+    )
+
+
+def misfit_of(prediction: Prediction, dn: Tensor, sensor: Sensor, averaged_pixels: int = 1) -> float:
+    """Return `relative_misfit` of what is expected of some pictures."""
     light_dn, variance = prediction.expected_dn - sensor.black_dn, prediction.variance_dn2 / averaged_pixels
     seen = (light_dn > 2 * variance.sqrt()) & (dn < sensor.white_dn)
     excess = torch.where(seen, (prediction.expected_dn - dn).square() - variance, 0.0).sum()
@@ -131,8 +143,10 @@ def mean_light2(prediction: Prediction, sensor: Sensor, averaged_pixels: int) ->
     return (squares * lit).sum(dim=(1, 2, 3), keepdim=True) / count
 
 
-def sampled(*images: Tensor) -> tuple[Tensor, ...]:
-    """Return about 50 rows of each image [B, H, W, ...], and columns as far apart."""
+def sampled(sensor: Sensor, *images: Tensor) -> tuple[Tensor, ...]:
+    """Return about 50 rows of each image [B, H, W, ...], and columns as far apart; all where blocks were coded."""
+    if sensor.jpeg is not None:
+        return images
     step = sampling_stride(images[0])
     return tuple(image[:, ::step, ::step] for image in images)
 

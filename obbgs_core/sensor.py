@@ -7,6 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from obbgs_core.jpeg import FULL_SCALE, JpegCoding
+
 HALF_DN = 0.5  # a reading of 0 means a signal below this, since signals are rounded
 # edge of the blocks by which noise is measured, and the share of them that is surely sky
 BLOCK_PX, SKY_BLOCKS = 8, 0.25
@@ -39,13 +41,17 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A linear sensor: dn = clip(black_dn + dn_per_radiance_s·exposure_time_s·radiance + noise, 0, white_dn)."""
+    """A linear sensor: dn = clip(black_dn + dn_per_radiance_s·exposure_time_s·radiance + noise, 0, white_dn).
+
+    jpeg: how the readings were stored, full scale as 255; None: as they are.
+    """
 
     black_dn: float
     white_dn: float
     dn_per_radiance_s: float
     electrons_per_dn: float
     read_noise_dn: float
+    jpeg: JpegCoding | None = None
 
     def __post_init__(self):
         if not (
@@ -66,10 +72,23 @@ class Sensor:
         signal_dn = (expected_dn.detach() - self.black_dn).clamp(min=0)
         return signal_dn / self.electrons_per_dn + self.read_noise_dn**2 + 1 / 12
 
-    def predicted(self, radiance: Tensor, exposure_time_s: float | Tensor) -> Prediction:
-        """Return the expected readings of a radiance and their noise."""
+    def predicted(
+        self, radiance: Tensor, exposure_time_s: float | Tensor, averaged_pixels: int = 1
+    ) -> Prediction:
+        """Return the expected readings of a radiance and their noise.
+
+        Of pictures [B, H, W, C] or [H, W, C] that were stored as JPEG they are what comes back of clipped readings; the
+        upper left pixel must then be that of one of the sensor's blocks. Of means of several pixels coding is left out.
+        """
         expected = self.expected_dn(radiance, exposure_time_s)
         variance = self.variance_dn2(expected)
+        if self.jpeg is not None and averaged_pixels == 1:
+            scale_dn = self.white_dn / FULL_SCALE
+            read, spread = clipped_moments(expected, variance.sqrt(), self.white_dn)
+            shape = read.shape if read.ndim == 4 else (1, *read.shape)
+            stored = self.jpeg.moments((read / scale_dn).view(shape), (spread / scale_dn**2).view(shape))
+            expected = (stored[0] * scale_dn).view(read.shape)
+            variance = ((stored[1] + 1 / 12) * scale_dn**2).view(read.shape)
         return Prediction(expected, variance, variance.sqrt())
 
     def normalised_residual(self, radiance: Tensor, exposure_time_s: float | Tensor, dn: Tensor) -> Tensor:
@@ -98,7 +117,12 @@ class Sensor:
 
         Source: Tobin, Estimation of relationships for limited dependent variables, 1958.
         """
-        prediction = self.predicted(radiance, exposure_time_s)
+        return self.residual_of(
+            self.predicted(radiance, exposure_time_s, averaged_pixels), dn, averaged_pixels
+        )
+
+    def residual_of(self, prediction: Prediction, dn: Tensor, averaged_pixels: int = 1) -> Tensor:
+        """Return the `deviance_residual` of what is expected."""
         expected, sigma = prediction.expected_dn, prediction.sigma_dn
         saturated = dn >= self.white_dn
         if averaged_pixels > 1:

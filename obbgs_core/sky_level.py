@@ -20,7 +20,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.sensor import Sensor, clipped_mean, clipped_moments
+from obbgs_core.jpeg import BLOCK_PX, FULL_SCALE
+from obbgs_core.sensor import Sensor, clipped_mean, clipped_moments, dark_reading
 
 log = logging.getLogger(__name__)
 BLOCKS = 28  # along the shorter side of the picture, about
@@ -40,6 +41,7 @@ FIRST_SWEEPS, SWEEPS = 30, 6  # of the first plane, and of the plane through sky
 # Of a reading's deviation: a level that departs by less from the stated black, in the mean of squares over frames and
 # pixels, is no reason to doubt it. Windows of 25 pixels tell sky from a face of 0.2 (`start.hull.FAINTEST_SIGMA`).
 NEGLIGIBLE = 0.03
+NEGLIGIBLE_CODED = 0.1  # the same of the noise before coding as JPEG, which rounds the mean of each block
 CERTAIN = 3.0  # and it has to be above the error of measurement by so many deviations
 
 
@@ -100,7 +102,8 @@ def levelled(frames: list[TrainingFrame], sensor: Sensor) -> tuple[list[Training
     if 2 * int(measured.sum()) < len(frames):
         return frames, sensor, told
     planes = planes - torch.tensor([sensor.black_dn, 0, 0])
-    departs = _departs(planes[measured], covariance[measured], NEGLIGIBLE * sigma_dn)
+    negligible_dn = NEGLIGIBLE * sigma_dn if sensor.jpeg is None else NEGLIGIBLE_CODED * _noise_dn(sensor)
+    departs = _departs(planes[measured], covariance[measured], negligible_dn)
     planes, covariance = _shared(planes, covariance, measured)
     if not departs:
         return frames, sensor, dataclasses.replace(told, sigma_dn=covariance.sqrt().float())
@@ -125,6 +128,8 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
     """Return planes [F, C, 3] and their variances, infinite where a frame shows no sky, and a reading's deviation."""
     height, width, channels = frames[0].dn.shape
     px = max(2, round(min(height, width) / BLOCKS))
+    if sensor.jpeg is not None:  # within its blocks readings are not independent
+        px = BLOCK_PX * max(1, round(px / BLOCK_PX))
     rows, columns = height // px, width // px
     if rows * columns < FEWEST_BLOCKS:
         nothing = torch.zeros(len(frames), channels, 3).double()
@@ -153,8 +158,12 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
         own, of_reading = plane, torch.empty(0)
         for _ in range(SWEEPS):
             own, of_reading = _fitted(own, basis, mean[:, channel], sky, sigma_dn, sensor)
+        of_mean = of_reading / (px * px)
+        if sensor.jpeg is not None:
+            of_mean = of_mean * (1 + _of_coding(sensor, px * px) * px * px / sigma_dn**2)
+            own, of_mean = _before_coding(own, of_mean, sigma_dn, sensor)
         planes.append(own)
-        variances.append(of_reading / (px * px))
+        variances.append(of_mean)
     errors = torch.where(usable[:, None, None], torch.stack(variances, dim=1), math.inf)
     return torch.stack(planes, dim=1), errors, sigma_dn
 
@@ -192,16 +201,50 @@ def _through_sky(
     sky = torch.ones_like(grey, dtype=torch.bool)
     expected, spread = _moments(plane, basis, sigma_dn, sensor)
     for _ in range(SWEEPS):
-        sky = _sky_blocks(grey, scatter, expected, spread, readings, size[1])
+        of_mean = spread / readings + _of_coding(sensor, readings)
+        sky = _sky_blocks(grey, scatter, expected, spread, of_mean, readings, size[1])
         plane, _ = _fitted(plane, basis, grey, sky, sigma_dn, sensor)
         _, spread = _moments(plane, basis, sigma_dn, sensor)
         ratio = (scatter * sky).sum(dim=1) / (spread * sky).sum(dim=1)
         if ratio.isfinite().any():
             sigma_dn *= math.sqrt(float(ratio.nanmedian()))
         expected, spread = _moments(plane, basis, sigma_dn, sensor)
-    below = (grey < expected - FAR_BELOW * (spread / readings).sqrt()).double().mean(dim=1)
+    of_mean = spread / readings + _of_coding(sensor, readings)
+    below = (grey < expected - FAR_BELOW * of_mean.sqrt()).double().mean(dim=1)
     count = sky.sum(dim=1)
     return _Fit(plane, sky, count * ((count >= FEWEST_BLOCKS) & (below <= MOST_BELOW)), sigma_dn)
+
+
+def _noise_dn(sensor: Sensor) -> float:
+    """Return the deviation of a reading without light as the sensor states it, before anything is clipped."""
+    return math.hypot(sensor.read_noise_dn, math.sqrt(1 / 12))
+
+
+def _of_coding(sensor: Sensor, readings: int) -> float:
+    """Return the variance, DN², of means of so many readings that JPEG adds to what their scatter says, at most.
+
+    It keeps slow noise while it smooths the fast, and rounds the mean of each block.
+    """
+    if sensor.jpeg is None:
+        return 0.0
+    step_dn = sensor.jpeg.luma[0] / BLOCK_PX * sensor.white_dn / FULL_SCALE
+    return dark_reading(sensor)[1] ** 2 / readings + step_dn**2 / 12
+
+
+def _before_coding(
+    planes: Tensor, variance: Tensor, sigma_dn: float, sensor: Sensor
+) -> tuple[Tensor, Tensor]:
+    """Return planes [F, 3] and their variances, fitted to pictures that were stored as JPEG, of what was stored.
+
+    Coding smooths readings that were clipped before: their mean stays, but they scatter by `sigma_dn`, less than the
+    sensor's noise, and near zero most of their mean is that of the clip.
+    """
+    level, narrow = planes[:, 0], torch.full_like(planes[:, 0], sigma_dn)
+    wide = torch.full_like(level, _noise_dn(sensor))
+    before = _levels(clipped_mean(level, narrow), float(wide[0]))
+    slope = torch.special.ndtr(level / narrow) / torch.special.ndtr(before / wide)
+    planes = torch.cat([before[:, None], planes[:, 1:] * slope[:, None]], dim=1)
+    return planes, variance * slope.square()[:, None]
 
 
 def _block_moments(dn: Tensor, px: int) -> tuple[Tensor, Tensor]:
@@ -246,10 +289,19 @@ def _moments(planes: Tensor, basis: Tensor, sigma_dn: float, sensor: Sensor) -> 
 
 
 def _sky_blocks(
-    mean: Tensor, variance: Tensor, expected: Tensor, spread: Tensor, readings: int, rows: int
+    mean: Tensor,
+    variance: Tensor,
+    expected: Tensor,
+    spread: Tensor,
+    of_mean: Tensor,
+    readings: int,
+    rows: int,
 ) -> Tensor:
-    """Return which blocks [F, B] read and scatter as empty sky, and have no neighbours that do not."""
-    lit = (mean - expected).abs() > FAR * (spread / readings).sqrt()
+    """Return which blocks [F, B] read and scatter as empty sky, and have no neighbours that do not.
+
+    of_mean: [F, B] the variance of the mean of a block.
+    """
+    lit = (mean - expected).abs() > FAR * of_mean.sqrt()
     lit |= variance > spread * (1 + TOO_VARIED * math.sqrt(2 / readings))
     grid = lit.double().view(len(lit), 1, rows, -1)
     near = F.max_pool2d(grid, 3, 1, 1).view(len(lit), -1) > 0

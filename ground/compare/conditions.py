@@ -5,6 +5,7 @@ number, so that every method and seed sees the same frames.
 """
 
 import dataclasses
+import io
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,19 +13,22 @@ from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from flightsw.icd.config import MAX_YAML_BYTES, ConfigError, build, in_file, parse_yaml, require
 from ground.compare.case import Case
 from ground.compare.errors import CompareError
 from ground.compare.sky_behind import behind
+from ground.formats.pictures.files import jpeg_coding
 from ground.run.settings import checked_settings
 from obbgs_base.files import read_bounded
 from obbgs_base.stars import star_irradiance
 from obbgs_core.frames import TrainingFrame
+from obbgs_core.jpeg import JpegCoding
 from obbgs_core.model.motions import rigid_motions
 from obbgs_core.sensor import Sensor
 
-NOISE, SHUTTER, DARK, POSE, LOSS, STRAY = range(6)  # streams of random numbers, one a purpose
+NOISE, SHUTTER, DARK, POSE, LOSS, STRAY, HOT = range(7)  # streams of random numbers, one a purpose
 MOST_ELECTRONS = 1e15  # NumPy's Poisson refuses about 9e18
 UNCERTAIN_SHIFT_M = 1e-6  # of a pose error that turns only: a covariance must not be singular
 
@@ -51,6 +55,8 @@ class Condition:
     - believed_noise, believed_gain: factors on the noise, and on the signal per light, that the method is told.
     - synthetic_bracket: the frames in turn are exposed for these multiples of their own exposure time, their readings
       taken for the light without noise, as where photographs of one exposure are to stand for a bracket.
+    - hot_pixels: share of the pixels, the same in all frames, that read up to full scale more than they should.
+    - jpeg: the frames are stored as JPEG of this quality (1 to 100, as libjpeg counts it) and 8 bits; 0: they are not.
     - frames: how many of the training frames are left, evenly spaced; 0: all.
     - lost_percent: so many of the frames are lost at random.
     - missing_exposure: the frames of this exposure time are lost, 1 is the shortest; 0: none.
@@ -71,6 +77,8 @@ class Condition:
     synthetic_bracket: tuple[float, ...] = ()
     believed_noise: float = 1.0
     believed_gain: float = 1.0
+    hot_pixels: float = 0.0
+    jpeg: int = 0
     frames: int = 0
     lost_percent: float = 0.0
     missing_exposure: int = 0
@@ -97,6 +105,10 @@ class Condition:
         require(
             0 <= self.earth <= 1, "earth", f"expected a share of the frames from 0 to 1, got {self.earth:g}"
         )
+        require(
+            0 <= self.hot_pixels < 1, "hot_pixels", f"expected a share of the pixels, got {self.hot_pixels:g}"
+        )
+        require(0 <= self.jpeg <= 100, "jpeg", f"expected a quality from 1 to 100, or 0, got {self.jpeg}")
         require(
             0 <= self.lost_percent < 100,
             "lost_percent",
@@ -195,6 +207,10 @@ def given(case: Case, condition: Condition) -> tuple[list[TrainingFrame], Sensor
             _unlit(f, case.sensor, condition) if first <= i / len(frames) < last else f
             for i, f in enumerate(frames)
         ]
+    if condition.hot_pixels:
+        frames = _with_hot_pixels(frames, case.sensor, condition.hot_pixels)
+    if condition.jpeg:
+        frames = [_stored_as_jpeg(f, case.sensor, condition.jpeg) for f in frames]
     if condition.pose_error_deg:
         frames = [_turned(f, math.radians(condition.pose_error_deg)) for f in frames]
     frames = _left(frames, condition)
@@ -203,6 +219,7 @@ def given(case: Case, condition: Condition) -> tuple[list[TrainingFrame], Sensor
         dn_per_radiance_s=case.sensor.dn_per_radiance_s * condition.believed_gain,
         electrons_per_dn=case.sensor.electrons_per_dn / condition.believed_noise**2,
         read_noise_dn=case.sensor.read_noise_dn * condition.believed_noise,
+        jpeg=_coding(frames[0], condition.jpeg) if condition.jpeg else None,
     )
     return frames, sensor
 
@@ -302,6 +319,35 @@ def _unlit(frame: TrainingFrame, sensor: Sensor, condition: Condition) -> Traini
     nothing, added_dn = np.zeros(tuple(frame.dn.shape)), _added_dn(frame, sensor, condition)
     dark = read_out(nothing, frame.exposure_time_s, sensor, condition, _random(DARK, frame), added_dn)
     return dataclasses.replace(frame, dn=torch.from_numpy(dark.astype(np.float32)))
+
+
+def _with_hot_pixels(frames: list[TrainingFrame], sensor: Sensor, share: float) -> list[TrainingFrame]:
+    """Return frames of one size in which the same pixels read more, by as much as each of them does in all frames."""
+    rng, (height, width) = np.random.default_rng(HOT), frames[0].dn.shape[:2]
+    more_dn = rng.uniform(0, sensor.white_dn, (height, width, 1)) * (rng.random((height, width, 1)) < share)
+    added_dn = torch.from_numpy(np.rint(more_dn).astype(np.float32))
+    return [dataclasses.replace(f, dn=(f.dn + added_dn).clamp(max=sensor.white_dn)) for f in frames]
+
+
+def _stored_as_jpeg(frame: TrainingFrame, sensor: Sensor, quality: int) -> TrainingFrame:
+    """Return a frame as it comes back from a JPEG file, whose 255 is the sensor's full scale."""
+    scale_dn = sensor.white_dn / 255
+    values = (frame.dn / scale_dn).round().to(torch.uint8).numpy()
+    stored, _ = _through_jpeg(values, quality)
+    return dataclasses.replace(frame, dn=torch.from_numpy(stored.astype(np.float32) * scale_dn))
+
+
+def _coding(frame: TrainingFrame, quality: int) -> JpegCoding | None:
+    """Return how frames are coded as JPEG of a quality."""
+    return _through_jpeg(np.zeros(tuple(frame.dn.shape), np.uint8), quality)[1]
+
+
+def _through_jpeg(values: np.ndarray, quality: int) -> tuple[np.ndarray, JpegCoding | None]:
+    """Return what comes back of values [H, W, C], uint8, and how they were coded."""
+    file = io.BytesIO()
+    Image.fromarray(values[..., 0] if values.shape[2] == 1 else values).save(file, "JPEG", quality=quality)
+    with Image.open(file) as stored:
+        return np.asarray(stored).reshape(values.shape), jpeg_coding(stored)
 
 
 def _turned(frame: TrainingFrame, sigma_rad: float) -> TrainingFrame:

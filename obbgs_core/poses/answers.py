@@ -45,7 +45,7 @@ class Question:
             images = (rendered.radiance, slopes, rendered.alpha, rendered.depth)
             readings = (batch.exposure_time_s, batch.dn, self.sensor, batch.averaged_pixels)
             told.append(pose_information(*images, cameras, *readings, cell_m=self.cell_m))
-            radiance, dn = sampled(rendered.radiance, batch.dn)
+            radiance, dn = sampled(self.sensor, rendered.radiance, batch.dn)
             for one in range(len(cameras)):
                 at = slice(one, one + 1)
                 seen = (radiance[at], batch.exposure_time_s[at], dn[at])

@@ -145,7 +145,7 @@ def unseen_factor(setup: TrainingSetup, state: TrainingState) -> float | None:
     for bracket in state.order.validation_brackets:
         batch = setup.batches.batch(bracket)
         rendered = render(state.model, batch.cameras)
-        radiance, alpha, dn = sampled(rendered.radiance, rendered.alpha, batch.dn)
+        radiance, alpha, dn = sampled(setup.sensor, rendered.radiance, rendered.alpha, batch.dn)
         compared.append(Compared(radiance, alpha > ON_TARGET_ALPHA, batch.exposure_time_s, dn))
     misfit = stated_misfit(compared, setup.sensor)
     if not state.misfit or math.isnan(misfit):

@@ -282,7 +282,7 @@ def _with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Senso
     pairs = zip(shown, empty_dn, strict=True)
     ratios, farther = zip(*(noise_excess(frame.dn, sensor, level) for frame, level in pairs), strict=True)
     excess = statistics.median(ratios)
-    too_much = excess < 1 / CLEAR_EXCESS and statistics.median(farther) < UNSMOOTHED
+    too_much = sensor.jpeg is None and excess < 1 / CLEAR_EXCESS and statistics.median(farther) < UNSMOOTHED
     if not (excess > CLEAR_EXCESS or too_much):
         return sensor, ""
     seen = dataclasses.replace(

@@ -198,7 +198,7 @@ class Trainer:
     def _measure(self, rendered: Rendered, batch: Batch) -> None:
         """Keep the running chi² on the target and misfit, and the PSNR of this step's frames, all of sampled pixels."""
         state, settings = self.state, self.setup.config.loss
-        radiance, alpha, dn = sampled(rendered.radiance, rendered.alpha, batch.dn)
+        radiance, alpha, dn = sampled(self.setup.sensor, rendered.radiance, rendered.alpha, batch.dn)
         fit = fit_figures(
             radiance, alpha, batch.exposure_time_s, dn, self.setup.sensor, batch.averaged_pixels
         )

@@ -1,6 +1,7 @@
 """Cells, budgets, conditions and rows of a comparison, without a training."""
 
 import dataclasses
+import io
 import json
 import math
 import shutil
@@ -11,6 +12,7 @@ import pytest
 import torch
 from hypothesis import given as generated
 from hypothesis import strategies as st
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from flightsw.icd.config import ConfigError
@@ -176,6 +178,27 @@ def test_shot_noise_has_the_variance_of_its_electrons():
     dn = read_out(np.full((200, 200), 1000.0), 1.0, sensor, Condition(), np.random.default_rng(1))
     expected = float(sensor.variance_dn2(torch.tensor(1064.0)))  # shot, read and rounding
     assert dn.var() == pytest.approx(expected, rel=0.04)  # 40,000 readings: deviation 0.7 %
+
+
+def test_hot_pixels_are_the_same_in_all_frames(case):
+    pairs = zip(frames_under(case), frames_under(case, hot_pixels=0.01), strict=True)
+    more = torch.stack([hot.dn - plain.dn for plain, hot in pairs])
+    changed = (more > 0).any(dim=3)
+    assert more.min() == 0 and changed[0].sum() > 5
+    unsaturated = torch.stack([f.dn for f in frames_under(case, hot_pixels=0.01)]) < case.sensor.white_dn
+    assert all(
+        len(set(m[u].tolist())) <= 1 for m, u in zip(more.flatten(1).T, unsaturated.flatten(1).T, strict=True)
+    )
+
+
+def test_frames_stored_as_jpeg_are_those_that_pillow_reads_and_their_tables_are_told(case):
+    frames, sensor = given(case, Condition(jpeg=70))
+    assert sensor.jpeg is not None and given(case, Condition())[1].jpeg is None
+    values = (case.training[0].dn * 255 / sensor.white_dn).round().numpy().astype(np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(values.squeeze()).save(file, "JPEG", quality=70)
+    read = torch.from_numpy(np.array(Image.open(file), np.float32)).reshape(values.shape)
+    torch.testing.assert_close(frames[0].dn, read * sensor.white_dn / 255)
 
 
 def test_a_pedestal_and_a_gradient_are_added_before_readings_are_clipped(case):

@@ -1,0 +1,121 @@
+"""What JPEG leaves of a picture: mean and variance of the values that come back, for values that are uncertain.
+
+An encoder turns red, green and blue into luma and two chromas, averages the chromas over blocks of pixels, transforms
+blocks of 8x8 by the discrete cosine transform, and rounds each coefficient to a multiple of its quantisation step. All
+but the rounding is linear. The coefficient of a reading with noise is normal, and mean and variance of its rounded
+value are known: a coefficient far below half its step comes back as zero whatever it was, which is what the likelihood
+has to know of it.
+
+Source: ITU-T T.81, 1992; T.871, 2011 (colours).
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+BLOCK_PX = 8
+# red, green and blue to luma and chromas, T.871
+TO_YCC = ((0.299, 0.587, 0.114), (-0.168736, -0.331264, 0.5), (0.5, -0.418688, -0.081312))
+TO_RGB = ((1.0, 0.0, 1.402), (1.0, -0.344136, -0.714136), (1.0, 1.772, 0.0))
+FULL_SCALE, MIDDLE = 255.0, 128.0  # the largest value; what is taken off luma before it is transformed
+# of a coefficient, in its steps: less would leave rounding without a slope; more, and its mean is what was rounded
+LEAST_SIGMA, WIDE = 0.05, 0.6
+THRESHOLDS = 2  # of rounding on each side of a coefficient that are looked at
+
+
+@dataclass(frozen=True)
+class JpegCoding:
+    """How a file's values were rounded.
+
+    luma, chroma: the 64 quantisation steps, row by row, from slow to fast; chroma may be empty where there is none.
+    averaged: rows and columns of pixels that share a chroma.
+    """
+
+    luma: tuple[int, ...]
+    chroma: tuple[int, ...] = ()
+    averaged: tuple[int, int] = (1, 1)
+
+    def __post_init__(self):
+        for name, steps in (("luma", self.luma), ("chroma", self.chroma)):
+            if len(steps) not in ((64,) if name == "luma" else (0, 64)) or min(steps, default=1) < 1:
+                raise ValueError(f"{name} must be 64 quantisation steps of 1 or more, got {steps}")
+
+    def moments(self, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and variance [B, H, W, C] of the values that come back, before they are clipped.
+
+        The upper left pixel of an image has to be that of a block, of 16 pixels where chromas are averaged.
+
+        Args:
+            mean, variance: [B, H, W, C] of the values that are coded, of which FULL_SCALE is the largest; C is 1 or 3.
+                The first may have a gradient.
+        """
+        height, width, channels = mean.shape[1:]
+        values, spread = mean.movedim(-1, 1), variance.movedim(-1, 1)
+        if channels == 3:
+            turn = torch.tensor(TO_YCC).to(mean)
+            values = torch.einsum("kc,bchw->bkhw", turn, values)
+            spread = torch.einsum("kc,bchw->bkhw", turn.square(), spread)
+        size = [BLOCK_PX * n for n in (self.averaged if channels == 3 else (1, 1))]
+        missing = (0, -width % size[1], 0, -height % size[0])
+        values, spread = (F.pad(image, missing, mode="replicate") for image in (values, spread))
+        luma = self._rounded(values[:, :1] - MIDDLE, spread[:, :1], self.luma)
+        back, error = luma[0] + MIDDLE, luma[1]
+        if channels == 3:
+            few = [F.avg_pool2d(image[:, 1:], self.averaged) for image in (values, spread)]
+            chroma = self._rounded(few[0], few[1] / math.prod(self.averaged), self.chroma or self.luma)
+            # linear between the middles of what was averaged, as libjpeg does
+            whole = [F.interpolate(i, values.shape[2:], mode="bilinear", align_corners=False) for i in chroma]
+            back, error = torch.cat([back, whole[0]], dim=1), torch.cat([error, whole[1]], dim=1)
+            turn = torch.tensor(TO_RGB).to(mean)
+            back = torch.einsum("ck,bkhw->bchw", turn, back)
+            error = torch.einsum("ck,bkhw->bchw", turn.square(), error)
+        back, error = (image[:, :, :height, :width].movedim(1, -1) for image in (back, error))
+        return back, error
+
+    @staticmethod
+    def _rounded(values: Tensor, variance: Tensor, steps: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+        """Return mean and variance of images [B, K, H, W] whose coefficients were rounded to multiples of steps."""
+        transform, rows, columns = (
+            _transform().to(values),
+            values.shape[2] // BLOCK_PX,
+            values.shape[3] // BLOCK_PX,
+        )
+        step = torch.tensor(steps, dtype=values.dtype, device=values.device)
+        shape = (*values.shape[:2], rows, BLOCK_PX, columns, BLOCK_PX)
+        coefficient = values.reshape(shape).transpose(3, 4).flatten(4) @ (transform.T / step)
+        # the noise of pixels is independent, and nearly the same all over a block
+        sigma = F.avg_pool2d(variance, BLOCK_PX).sqrt()[..., None] / step
+        mean, spread = _rounding(coefficient, sigma.clamp(min=LEAST_SIGMA))
+        back, error = (mean * step) @ transform, (spread * step.square()) @ transform.square()
+        parts = (*values.shape[:2], rows, columns, BLOCK_PX, BLOCK_PX)
+        back, error = (blocks.view(parts).transpose(3, 4).reshape(values.shape) for blocks in (back, error))
+        return back, error
+
+
+def _rounding(value: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and variance of round(x) for x normal with mean `value` and deviation `sigma`.
+
+    Far above WIDE rounding is a small error of variance 1/12.
+    """
+    nearest = value.detach().round()
+    offset = value - nearest
+    mean, square = torch.zeros_like(value), torch.zeros_like(value)
+    for k in range(THRESHOLDS):
+        above = torch.special.ndtr((offset - (k + 0.5)) / sigma)
+        below = torch.special.ndtr(-(offset + (k + 0.5)) / sigma)
+        mean = mean + above - below
+        square = square + (2 * k + 1) * (above + below).detach()
+    wide = sigma > WIDE
+    variance = torch.where(wide, sigma.square() + 1 / 12, square - mean.detach().square())
+    return torch.where(wide, value, nearest + mean), variance
+
+
+def _transform() -> Tensor:
+    """Return the orthonormal discrete cosine transform of a block [64, 64]: frequencies by places."""
+    n = torch.arange(BLOCK_PX, dtype=torch.float64)
+    along = torch.cos((2 * n + 1) * n[:, None] * math.pi / (2 * BLOCK_PX)) * math.sqrt(2 / BLOCK_PX)
+    along[0] /= math.sqrt(2)
+    return torch.kron(along, along)

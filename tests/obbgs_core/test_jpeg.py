@@ -1,0 +1,105 @@
+"""What JPEG leaves of readings is predicted as libjpeg does it, and known to the likelihood and to the level of sky."""
+
+import dataclasses
+import io
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.optimize import root_scalar
+
+from ground.formats.pictures.files import jpeg_coding
+from obbgs_core.frames import TrainingFrame
+from obbgs_core.jpeg import JpegCoding
+from obbgs_core.losses import likelihood_loss
+from obbgs_core.sensor import Sensor
+from obbgs_core.sky_level import levelled
+
+SENSOR = Sensor(0.0, 255.0, 1.0, 1e9, 6.0)  # black is 0: half of the noise on empty sky is clipped
+HEIGHT, WIDTH = 52, 72  # no multiple of a block
+
+
+def stored(values: np.ndarray, **how) -> tuple[np.ndarray, JpegCoding]:
+    """Return what comes back of values [H, W, C], and how they were coded."""
+    file = io.BytesIO()
+    Image.fromarray(values.squeeze()).save(file, "JPEG", **how)
+    image = Image.open(file)
+    coding = jpeg_coding(image)
+    assert coding is not None
+    return np.asarray(image, np.float64).reshape(values.shape), coding
+
+
+def readings(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return readings of given means, with the sensor's noise, clipped."""
+    noise = SENSOR.read_noise_dn * rng.standard_normal(mean.shape)
+    return np.rint(mean + noise).clip(0, 255).astype(np.uint8)
+
+
+def scene(channels: int) -> np.ndarray:
+    """Return a picture [H, W, C] of waves, an even part and sharp edges."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    image = np.stack([90 + 50 * np.sin(x / (4 + c)) * np.cos(y / (6 - c)) for c in range(channels)], axis=-1)
+    image[:20, :20], image[30:44, 10:30] = 100, 180
+    return image
+
+
+@pytest.mark.parametrize("how", [{"subsampling": 0}, {"subsampling": 1}, {"subsampling": 2}, {"grey": True}])
+@pytest.mark.parametrize("quality", [60, 85, 95])
+def test_mean_and_scatter_of_what_comes_back_are_those_of_libjpeg(quality, how):
+    rng, truth = np.random.default_rng(quality), scene(1 if how.pop("grey", False) else 3)
+    drawn = [stored(readings(truth, rng), quality=quality, **how) for _ in range(100)]
+    values, coding = np.stack([v for v, _ in drawn]), drawn[0][1]
+    variance = torch.full((1, *truth.shape), SENSOR.read_noise_dn**2 + 1 / 12).double()
+    mean, spread = coding.moments(torch.from_numpy(truth)[None], variance)
+    error = values.mean(axis=0) - mean[0].numpy()
+    by_chance = np.sqrt(values.var(axis=0).mean() / len(values))
+    changed = np.sqrt(np.square(values.mean(axis=0) - truth).mean())
+    # integer arithmetic and the rounding of what comes back leave a few tenths
+    assert np.sqrt(np.square(error).mean()) < by_chance + 0.3
+    assert changed > 1.2 * (by_chance + 0.3) or quality == 95 or truth.shape[2] == 1
+    # errors of neighbouring chromas are alike, which is left out
+    assert 0.8 < values.std(axis=0).mean() / spread.sqrt().mean().item() < 1.2
+
+
+@pytest.mark.parametrize("level_dn", [0.0, 3.0, 8.0, 60.0])
+def test_the_likeliest_light_is_the_true_one_though_coding_smooths_what_was_clipped(level_dn):
+    rng = np.random.default_rng(3)
+    values, coding = stored(readings(np.full((160, 160, 3), level_dn), rng), quality=85)
+    dn, time_s = torch.from_numpy(values).float()[None], torch.ones(1, 1, 1, 1)
+
+    def found_dn(sensor: Sensor) -> float:
+        def slope(light: float) -> float:  # as in a training, which does not follow the variance
+            radiance = torch.full(dn.shape, light, requires_grad=True)
+            loss, _ = likelihood_loss(radiance, time_s, dn, sensor, misfit=0.0)
+            return torch.autograd.grad(loss, radiance)[0].sum().item()
+
+        return root_scalar(slope, bracket=(-20, 90), xtol=0.01).root
+
+    told = dataclasses.replace(SENSOR, jpeg=coding)
+    # three deviations of a mean of so many readings, and a block's mean is rounded to steps of 5/8 DN
+    near_dn = 3 * SENSOR.read_noise_dn * 2 / 160 + 0.3
+    assert abs(found_dn(told) - level_dn) < near_dn
+    if level_dn < SENSOR.read_noise_dn:
+        assert found_dn(SENSOR) > level_dn + near_dn
+
+
+@pytest.mark.parametrize("quality", [85, 95])
+@pytest.mark.parametrize("level_dn", [0.0, 4.0])
+def test_the_level_of_sky_is_that_before_coding(level_dn, quality):
+    rng, frames, coding = np.random.default_rng(4), [], None
+    truth = np.full((96, 96, 3), level_dn)
+    truth[:30] += np.linspace(20, 150, 96)[None, :, None]
+    for number in range(6):
+        values, coding = stored(readings(truth, rng), quality=quality)
+        frames.append(
+            TrainingFrame(torch.from_numpy(values).float(), 1.0, torch.eye(4), torch.eye(3), number)
+        )
+    _, _, level = levelled(frames, dataclasses.replace(SENSOR, jpeg=coding))
+    assert level.fits == (level_dn == 0)
+    assert float((level.planes_dn[..., 0] - level_dn).abs().max()) < 0.1 * SENSOR.read_noise_dn
+
+
+def test_tables_that_are_none_are_refused():
+    with pytest.raises(ValueError, match="64 quantisation steps"):
+        JpegCoding((1,) * 63)
