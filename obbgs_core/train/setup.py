@@ -25,6 +25,7 @@ from obbgs_core.frames import (
     sun_span_deg,
     usable,
 )
+from obbgs_core.hot_pixels import without_hot_pixels
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.poses.evidence import validation_brackets
@@ -136,6 +137,7 @@ def prepare(
     """
     checked, reference_exposure_s = usable(frames, asked.exposure_aware, sensor.white_dn)
     checked, sensor, sky_level = levelled(checked, sensor)
+    checked, hot = without_hot_pixels(checked, sensor)
     sensor, noise = _with_noise_seen(checked, sensor)
     shown = [shows_light(light(f.dn, sensor, f.background, f.exposure_time_s), sensor) for f in checked]
     lit = _lit(checked, shown)
@@ -164,7 +166,7 @@ def prepare(
         unit_m=camera_extent_m(lit) if config.length_unit == "cameras" else radius_m,
         radiance_unit=_radiance_unit(config, sensor, lit),
         sun_span_deg=span_deg,
-        start=start + noise + _unusual_unit(lit, sensor),
+        start=start + hot + noise + _unusual_unit(lit, sensor),
         budget=budget,
         reference_exposure_s=reference_exposure_s,
         dark_frames=len(checked) - len(lit),
