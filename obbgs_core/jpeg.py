@@ -11,6 +11,7 @@ Source: ITU-T T.81, 1992; T.871, 2011 (colours).
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -42,6 +43,19 @@ class JpegCoding:
         for name, steps in (("luma", self.luma), ("chroma", self.chroma)):
             if len(steps) not in ((64,) if name == "luma" else (0, 64)) or min(steps, default=1) < 1:
                 raise ValueError(f"{name} must be 64 quantisation steps of 1 or more, got {steps}")
+
+    @staticmethod
+    def of(image: Any) -> "JpegCoding | None":
+        """Return how the values of a JPEG that Pillow has opened were rounded; None if it is neither grey nor YCbCr."""
+        layers, tables = image.layer, {k: tuple(table) for k, table in image.quantization.items()}
+        if len(layers) == 1:
+            return JpegCoding(tables[layers[0][3]])
+        if len(layers) != 3 or layers[1][1:3] != layers[2][1:3]:
+            return None
+        (_, wide, high, luma), (_, chroma_wide, chroma_high, chroma) = layers[:2]
+        if wide % chroma_wide or high % chroma_high:
+            return None
+        return JpegCoding(tables[luma], tables[chroma], (high // chroma_high, wide // chroma_wide))
 
     def moments(self, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and variance [B, H, W, C] of the values that come back, before they are clipped.

@@ -19,7 +19,6 @@ from flightsw.icd.config import MAX_YAML_BYTES, ConfigError, build, in_file, par
 from ground.compare.case import Case
 from ground.compare.errors import CompareError
 from ground.compare.sky_behind import behind
-from ground.formats.pictures.files import jpeg_coding
 from ground.run.settings import checked_settings
 from obbgs_base.files import read_bounded
 from obbgs_base.stars import star_irradiance
@@ -347,7 +346,7 @@ def _through_jpeg(values: np.ndarray, quality: int) -> tuple[np.ndarray, JpegCod
     file = io.BytesIO()
     Image.fromarray(values[..., 0] if values.shape[2] == 1 else values).save(file, "JPEG", quality=quality)
     with Image.open(file) as stored:
-        return np.asarray(stored).reshape(values.shape), jpeg_coding(stored)
+        return np.asarray(stored).reshape(values.shape), JpegCoding.of(stored)
 
 
 def _turned(frame: TrainingFrame, sigma_rad: float) -> TrainingFrame:

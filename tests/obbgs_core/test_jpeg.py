@@ -9,7 +9,6 @@ import torch
 from PIL import Image
 from scipy.optimize import root_scalar
 
-from ground.formats.pictures.files import jpeg_coding
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.jpeg import JpegCoding
 from obbgs_core.losses import likelihood_loss
@@ -25,7 +24,7 @@ def stored(values: np.ndarray, **how) -> tuple[np.ndarray, JpegCoding]:
     file = io.BytesIO()
     Image.fromarray(values.squeeze()).save(file, "JPEG", **how)
     image = Image.open(file)
-    coding = jpeg_coding(image)
+    coding = JpegCoding.of(image)
     assert coding is not None
     return np.asarray(image, np.float64).reshape(values.shape), coding
 

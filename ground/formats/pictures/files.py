@@ -20,7 +20,6 @@ import imagecodecs
 import numpy as np
 
 from ground.session.folder import SessionError
-from obbgs_core.jpeg import JpegCoding
 
 MOST_PX = 8192  # a side, that of a session's camera
 MOST_FILE_BYTES = 1 << 30
@@ -462,19 +461,6 @@ def _fits(path: Path) -> np.ndarray:
     elif data.dtype.kind == "i":
         data = np.maximum(data, 0).astype(np.uint16)
     return np.ascontiguousarray(data.astype(data.dtype.newbyteorder("=")))
-
-
-def jpeg_coding(image: Any) -> JpegCoding | None:
-    """Return how the values of a JPEG that Pillow has opened were rounded; None where it is neither grey nor YCbCr."""
-    layers, tables = image.layer, {k: tuple(table) for k, table in image.quantization.items()}
-    if len(layers) == 1:
-        return JpegCoding(tables[layers[0][3]])
-    (_, wide, high, luma), (_, *first, chroma), (_, *second, _) = (
-        layers if len(layers) == 3 else [(0,) * 4] * 3
-    )
-    if len(layers) != 3 or first != second or wide % first[0] or high % first[1]:
-        return None
-    return JpegCoding(tables[luma], tables[chroma], (high // first[1], wide // first[0]))
 
 
 _EXIF_NUMBERS = (
