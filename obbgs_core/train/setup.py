@@ -142,8 +142,7 @@ def prepare(
     shown = [shows_light(light(f.dn, sensor, f.background, f.exposure_time_s), sensor) for f in checked]
     lit = _lit(checked, shown)
     config = asked.for_frames(len(lit))
-    rng = torch.Generator().manual_seed(seed)
-    seen = silhouettes(lit, sensor, known)
+    rng, seen = torch.Generator().manual_seed(seed), silhouettes(lit, sensor, known)
     outlines, poses, why = settled(lit, seen, config.poses.refine != "never", refined)
     posed = lit if poses is None else poses.frames(lit)
     config, budget = _limited(config, [int(outline.certain.sum()) for outline in outlines.values()])
