@@ -110,7 +110,8 @@ def run_downlink(
     Raises:
         DownlinkError: an unforeseen error, six times in a row.
     """
-    downlink = _Downlink(store, link, mission, keys, capture_values, clock_s, boot, events or EventLog())
+    events = events or EventLog(clock_s=clock_s)
+    downlink = _Downlink(store, link, mission, keys, capture_values, clock_s, boot, events)
     logger = logging.getLogger("flightsw")
     logger.addHandler(downlink.events)
     for problem in keys.problems if keys is not None else ():
@@ -314,6 +315,7 @@ class _Downlink:
             self._link.write(self._stream.encode(*packet))
         data = self._link.exchange(WAIT_S if packet is None else 0.0)
         for apid, content in self._stream.decode(data):
+            self.events.heard()
             if apid == APID_FILES:
                 self._frames.transfers.receive(content, now_s)
             elif apid == APID_COMMANDS:

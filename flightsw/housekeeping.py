@@ -13,33 +13,61 @@ from typing import Any
 from flightsw.clock import utc_ns
 from flightsw.icd.telemetry import DICTIONARY
 
-MAX_EVENTS = 200  # waiting to be sent; the oldest are lost, and counted in the next one
+MAX_EVENTS = 200  # waiting to be sent, or to be sent again; the oldest are lost, and counted in the next one
+QUIET_S = (
+    10.0  # without a packet of the ground: events that were sent meanwhile may have gone into a cut link
+)
+ON_THE_WAY_S = 2.0  # before the silence, from when on events may be lost too
 
 
 class EventLog(logging.Handler):
     """Events to be sent. As a logging handler it makes an event of every warning and error of the flight software.
 
-    Any thread may write, one takes them out.
+    Any thread may write, one takes them out. Events are not acknowledged: those that were sent while the ground was
+    silent are sent again, the same bytes, once it is heard.
     """
 
-    def __init__(self, utc_ns: Callable[[], int] = utc_ns):
+    def __init__(self, utc_ns: Callable[[], int] = utc_ns, clock_s: Callable[[], float] = time.monotonic):
         super().__init__(logging.WARNING)
-        self._utc_ns = utc_ns
+        self._utc_ns, self._clock_s = utc_ns, clock_s
         self._packets: deque[bytes] = deque()
-        self._lost = 0
+        self._sent: deque[tuple[float, bytes]] = deque()  # and when, s, since the ground was heard
+        self._heard_s = float("-inf")
+        self._lost = self._not_kept = 0
         self._guard = threading.Lock()
 
     def add(self, name: str, **values: Any) -> None:
         """Queue an event of the dictionary."""
-        packet = DICTIONARY.events[name].pack(utc_ns=self._utc_ns(), **values)
+        packet = self._pack(name, **values)
         with self._guard:
             if len(self._packets) >= MAX_EVENTS:
                 self._packets.popleft()
                 self._lost += 1
             self._packets.append(packet)
 
+    def _pack(self, name: str, **values: Any) -> bytes:
+        return DICTIONARY.events[name].pack(utc_ns=self._utc_ns(), **values)
+
     def emit(self, record: logging.LogRecord) -> None:
         self.add("error" if record.levelno >= logging.ERROR else "warning", problem=record.getMessage())
+
+    def heard(self) -> None:
+        """Note that a packet of the ground has come; after a silence what was sent meanwhile is sent again."""
+        now_s = self._clock_s()
+        with self._guard:
+            if now_s - self._heard_s > QUIET_S:
+                again = [packet for _, packet in self._sent]
+                if self._not_kept:
+                    problem = f"{self._not_kept} events of the time without the ground are not sent again"
+                    again.insert(0, self._pack("warning", problem=problem))
+                self._packets.extendleft(reversed(again))
+                self._sent.clear()
+            self._heard_s, self._not_kept = now_s, 0
+            self._forget_received()
+
+    def _forget_received(self) -> None:
+        while self._sent and self._sent[0][0] < self._heard_s - ON_THE_WAY_S:
+            self._sent.popleft()
 
     def take(self) -> bytes | None:
         """Return the next event's packet data, None when there is none."""
@@ -48,6 +76,11 @@ class EventLog(logging.Handler):
                 return None
             lost, self._lost = self._lost, 0
             packet = self._packets.popleft()
+            self._sent.append((self._clock_s(), packet))
+            self._forget_received()
+            if len(self._sent) > MAX_EVENTS:
+                self._sent.popleft()
+                self._not_kept += 1
         if lost:
             self.add("warning", problem=f"{lost} events were lost: more than {MAX_EVENTS} waited")
         return packet

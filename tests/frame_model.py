@@ -224,7 +224,14 @@ class FrameModel(RuleBasedStateMachine):
         self.capturing = FrameStore(folder, QUOTA_BYTES, "drop-oldest")
         self.keys, self.down = KeyRing([self.key_file] if self.with_key else []), End()
         self.flight = _Downlink(
-            FrameStore(folder), self.down, self.mission, self.keys, dict, self.clock_s, 1, EventLog()
+            FrameStore(folder),
+            self.down,
+            self.mission,
+            self.keys,
+            dict,
+            self.clock_s,
+            1,
+            EventLog(clock_s=self.clock_s),
         )
 
     def _start_ground(self, session: Path) -> None:

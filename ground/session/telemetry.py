@@ -96,7 +96,8 @@ class FlightCounts:
 class TelemetryLog:
     """Writes telemetry.jsonl, events.jsonl and reports.jsonl in a session folder; no packet makes it raise.
 
-    `on_event` receives each event's line: event, severity, text and its values.
+    `on_event` receives each event's line: event, severity, text and its values. An event that comes again, because the
+    spacecraft did not know whether it had arrived, is taken once.
     """
 
     def __init__(
@@ -114,6 +115,9 @@ class TelemetryLog:
         self.frame_header: dict[str, Any] = {}
         self.headers_received = 0
         self.events: deque[dict[str, Any]] = deque(maxlen=EVENTS_KEPT)
+        self._known_events: deque[bytes] = deque(
+            maxlen=2 * EVENTS_KEPT
+        )  # as many as the spacecraft may repeat
         self._folder, self._on_event, self._on_report, self._utc_ns = folder, on_event, on_report, utc_ns
 
     def add(self, apid: int, data: bytes) -> None:
@@ -132,6 +136,9 @@ class TelemetryLog:
                 self._write("telemetry.jsonl", received | {"packet": "frame"} | self.frame_header)
             elif apid == APID_EVENTS:
                 layout, values = DICTIONARY.unpack("events", data)
+                if data in self._known_events:
+                    return
+                self._known_events.append(data)
                 event = {"event": layout.name, "severity": layout.severity, "text": layout.sentence(values)}
                 self.events.append(received | event | values)
                 self._write("events.jsonl", self.events[-1])

@@ -332,6 +332,68 @@ def test_waiting_events_are_bounded_and_the_lost_ones_told():
     assert texts[-1] == f"5 events were lost: more than {MAX_EVENTS} waited"
 
 
+def problems(events: EventLog) -> list[str]:
+    """Return what is sent now."""
+    sent = []
+    while (packet := events.take()) is not None:
+        sent.append(DICTIONARY.unpack("events", packet)[1]["problem"])
+    return sent
+
+
+def test_events_of_a_cut_link_are_sent_again_once_the_ground_is_heard():
+    now_s = 0.0
+    events = EventLog(clock_s=lambda: now_s)
+    events.add("warning", problem="at the start")
+    assert problems(events) == ["at the start"]
+    now_s = 50.0
+    events.heard()  # for the first time
+    assert problems(events) == ["at the start"]
+    now_s = 57.0
+    events.heard()  # not silent for long: it has what was sent
+    assert problems(events) == []
+    now_s = 60.0
+    events.add("warning", problem="long before the cut")
+    assert problems(events) == ["long before the cut"]
+    now_s = 64.0
+    events.heard()
+    for number in range(3):
+        now_s = 64.5 + 10 * number
+        events.add("warning", problem=f"{number}")
+        problems(events)
+    events.add("warning", problem="waits")
+    now_s = 100.0
+    events.heard()
+    assert problems(events) == ["0", "1", "2", "waits"]
+
+
+def test_no_more_events_are_kept_for_a_silent_ground_than_may_wait_and_the_others_are_counted():
+    now_s = 0.0
+    events = EventLog(clock_s=lambda: now_s)
+    for number in range(3 * MAX_EVENTS):
+        now_s = float(number)
+        events.add("warning", problem=f"{number}")
+        problems(events)
+    events.heard()
+    again = problems(events)
+    assert again[0] == f"{2 * MAX_EVENTS} events of the time without the ground are not sent again"
+    assert again[1:] == [f"{number}" for number in range(2 * MAX_EVENTS, 3 * MAX_EVENTS)]
+
+
+def test_the_downlink_sends_an_event_of_a_cut_again_byte_for_byte(store, small_mission, tmp_path):
+    link = ListLink()
+    key, keys = make_key(tmp_path / "k"), KeyRing([tmp_path / "k"])
+    ground = PacketStream(TELECOMMAND, 1100)
+
+    def talk(_progress) -> None:
+        if link.now_s > 20.0 and not link.incoming and not keys.counters[0].last:
+            link.incoming.append(ground.encode(APID_COMMANDS, seal(key, 1, Command("ping", {}).pack())))
+
+    fly(link, store, small_mission, 25.0, on_progress=talk, keys=keys)
+    keys.close()
+    sent = [data for apid, data in link.packets() if apid == APID_EVENTS]
+    assert DICTIONARY.unpack("events", sent[0])[0].name == "started" and sent.count(sent[0]) == 2
+
+
 def test_the_process_meter_agrees_with_the_kernel():
     meter = ProcessMeter()
     sum(range(300_000))

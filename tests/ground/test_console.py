@@ -31,6 +31,7 @@ from ground.commands.console import (
 from ground.commands.terminal_pictures import COLUMNS, LatestPicture, stretched
 from ground.link.ingest import ListenSummary, Status
 from ground.session.telemetry import TelemetryLog
+from obbgs_base.checked import parse_checked_line
 
 LINK, HERE = "serial:///dev/ttyUSB0?baud=921600", Path("nowhere/pass-12")
 SAMPLES = {"text": "x", "bytes": b"\xab\xcd\xef\x01" * 8, "float64": 1.5}
@@ -164,7 +165,7 @@ def test_a_model_and_the_lack_of_one_are_shown():
 
 
 def read(folder, name) -> list[dict]:
-    return [json.loads(line) for line in (folder / name).read_text().splitlines()]
+    return [parse_checked_line(line) for line in (folder / name).read_bytes().splitlines()]
 
 
 def test_telemetry_is_kept_with_the_session_as_it_came(tmp_path, make_frame):
@@ -186,6 +187,22 @@ def test_telemetry_is_kept_with_the_session_as_it_came(tmp_path, make_frame):
     assert events == [warning, model]
     assert read(tmp_path, "reports.jsonl")[0]["stage"] == "completed" and len(reports) == 1
     assert log.refused == 0
+
+
+def test_an_event_that_comes_again_is_taken_once(tmp_path):
+    heard: list[dict] = []
+    log, again = (
+        TelemetryLog(tmp_path, heard.append),
+        DICTIONARY.events["warning"].pack(utc_ns=5, problem="cold"),
+    )
+    later = DICTIONARY.events["warning"].pack(utc_ns=6, problem="cold")
+    for data in (again, again, later, again):
+        log.add(APID_EVENTS, data)
+    assert (
+        [event["utc_ns"] for event in heard]
+        == [5, 6]
+        == [e["utc_ns"] for e in read(tmp_path, "events.jsonl")]
+    )
 
 
 def test_what_the_dictionary_does_not_know_is_counted_and_written_nowhere(tmp_path):
