@@ -26,7 +26,7 @@ class Batch:
     dn: Tensor  # [B, H, W, C]
     exposure_time_s: Tensor  # [B, 1, 1, 1]
     averaged_pixels: int  # sensor pixels in one pixel of dn
-    share: float = 1.0  # of the pixels of the whole frames that these images show
+    shown: float = 1.0  # share of the pixels of the whole frames that these images show
     # [B, H, W] share of each pixel that a silhouette shows to be empty or solid, 0 where there is none
     sky: Tensor | None = None
     solid: Tensor | None = None

@@ -14,6 +14,7 @@ from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.model.cameras import Cameras, stacked_suns
 from obbgs_core.model.pose_covariance import flaw
 
+VIEW_MARGIN = 0.15  # of the image's width and height: what lies as far outside still counts as in view
 FEWEST_FRAMES = 3
 ROTATION_TOLERANCE = 1e-3  # of R Rᵀ from 1, single precision and printed numbers included
 K_TOLERANCE_PX = 1e-3
@@ -106,6 +107,25 @@ def cameras_of(frames: list[TrainingFrame]) -> Cameras:
     suns, psf_sigma_px = stacked_suns([f.sun_dir for f in frames]), frames[0].psf_sigma_px
     background = frames[0].background
     return Cameras(poses, K, width, height, sun_dir=suns, psf_sigma_px=psf_sigma_px, background=background)
+
+
+@torch.no_grad()
+def sampling_rates(means: Tensor, frames: list[TrainingFrame]) -> Tensor:
+    """Return how finely pictures sample points [N, 3] m: pixels for a metre [N] where each point is seen largest.
+
+    That is the largest focal length over depth of the frames that have it in view; 0 where none has.
+    """
+    rate = torch.zeros(len(means))
+    for frame in frames:
+        height, width = frame.dn.shape[:2]
+        x, y, z = (means @ frame.world_to_camera[:3, :3].T + frame.world_to_camera[:3, 3]).unbind(dim=1)
+        depth = z.clamp(min=1e-6)
+        u = frame.K[0, 0] * x / depth + frame.K[0, 2]
+        v = frame.K[1, 1] * y / depth + frame.K[1, 2]
+        in_view = (z > 1e-6) & ((u / width - 0.5).abs() <= 0.5 + VIEW_MARGIN)
+        in_view &= (v / height - 0.5).abs() <= 0.5 + VIEW_MARGIN
+        rate = torch.where(in_view, torch.maximum(rate, frame.K[0, 0] / depth), rate)
+    return rate
 
 
 def usable(

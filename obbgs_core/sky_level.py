@@ -13,6 +13,7 @@ Stein's estimator, 1975).
 import dataclasses
 import logging
 import math
+import statistics
 from dataclasses import dataclass
 
 import torch
@@ -21,9 +22,13 @@ from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.jpeg import BLOCK_PX, FULL_SCALE
-from obbgs_core.sensor import Sensor, clipped_mean, clipped_moments, dark_reading
+from obbgs_core.sensor import Sensor, clipped_mean, clipped_moments, dark_reading, noise_excess
 
 log = logging.getLogger(__name__)
+NOISE_FRAMES = 12  # about so many, spread evenly, by which the noise is measured
+# of the scatter of empty sky over that of the sensor model, or the reverse; frames that fit it have 0.93 to 0.97
+CLEAR_EXCESS = 1.3
+UNSMOOTHED = 1.1  # ratio of the scatter of pixels two apart to that of neighbours; noise has 1.02 to 1.05
 BLOCKS = 28  # along the shorter side of the picture, about
 FEWEST_BLOCKS = 12  # of sky, that a plane can be fitted to
 # The first plane has about this share of all blocks below it. Most pictures are mostly sky, and light of the target is
@@ -369,3 +374,32 @@ def _without(
         dn[frame.dn <= 0], dn[frame.dn >= sensor.white_dn] = 0.0, white_dn
         corrected.append(dataclasses.replace(frame, dn=dn))
     return corrected, dataclasses.replace(sensor, black_dn=black_dn, white_dn=white_dn)
+
+
+def with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Sensor, str]:
+    """Return the sensor with the read noise that empty sky shows, and in words what was changed, if anything.
+
+    With less than there is, noise would count as light: there would be no empty sky, and no hull. With more, faint
+    parts of the target would count as noise. Smoothed pictures scatter less too, but their nearest neighbours most.
+    """
+    shown = frames[:: max(1, len(frames) // NOISE_FRAMES)]
+    dark_dn, _ = dark_reading(sensor)
+    empty_dn = [
+        max(dark_dn, sensor.expected_dn(torch.tensor(frame.background), frame.exposure_time_s).item())
+        for frame in shown
+    ]
+    pairs = zip(shown, empty_dn, strict=True)
+    ratios, farther = zip(*(noise_excess(frame.dn, sensor, level) for frame, level in pairs), strict=True)
+    excess = statistics.median(ratios)
+    too_much = sensor.jpeg is None and excess < 1 / CLEAR_EXCESS and statistics.median(farther) < UNSMOOTHED
+    if not (excess > CLEAR_EXCESS or too_much):
+        return sensor, ""
+    seen = dataclasses.replace(
+        sensor, read_noise_dn=excess * sensor.variance_dn2(torch.tensor(sensor.black_dn)).sqrt().item()
+    )
+    changed = (
+        f"read noise taken as {seen.read_noise_dn:.2f} DN instead of the stated {sensor.read_noise_dn:.2f} DN: "
+        f"empty sky scatters {excess:.2g} times as much as that"
+    )
+    log.warning(changed)
+    return seen, f"; {changed}"

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from obbgs_core.model.motions import rigid_motions
 from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
+from obbgs_core.train.parts import Now, Part, Seen
+from obbgs_core.train.trainer import Trainer
 
 SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=4e7, electrons_per_dn=2.0, read_noise_dn=3.0)
 SIZE_PX, FOCAL_PX, RANGE_M = 64, 130.0, 8.0
@@ -105,7 +108,20 @@ def photographed(
 def move_poses_in(monkeypatch: pytest.MonkeyPatch, rounds: int) -> None:
     """Let the poses of a training move in so many rounds, as often early as late."""
     for name in ("EARLY_ROUNDS", "LATE_ROUNDS"):
-        monkeypatch.setattr(f"obbgs_core.train.pose_rounds.{name}", rounds)
+        monkeypatch.setattr(f"obbgs_core.train.poses.{name}", rounds)
+
+
+def now_of(trainer: Trainer) -> Now:
+    """Return a training as its parts see it between two steps, of which none has seen anything."""
+    moment = trainer.setup.config.moment(trainer.state.steps_done)
+    return trainer.state.now(trainer.setup, moment, cast(Seen, None))
+
+
+def decide(trainer: Trainer, part: Part) -> None:
+    """Let a part of a training decide, and apply the change that it asks for."""
+    change = part.decide(now_of(trainer))
+    if change is not None:
+        trainer.state.apply(trainer.setup, change)
 
 
 def tagged(frames: list[TrainingFrame], wrong: bool, sigma_rad: float = 0.005) -> list[TrainingFrame]:

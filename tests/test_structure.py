@@ -25,9 +25,12 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     },  # the flat modules: errors, sensor, losses, obb, frames, ...
     "obbgs_core.render": CORE,
     "obbgs_core.poses": CORE | {"obbgs_core.render"},
+    "obbgs_core.evidence": CORE | {"obbgs_core.render", "obbgs_core.poses"},
+    "obbgs_core.published": CORE,
     "obbgs_core.start": CORE | {"obbgs_core.poses"},
     "obbgs_core.attitude": CORE | {"obbgs_core.poses", "obbgs_core.start"},
-    "obbgs_core.train": CORE | {"obbgs_core.render", "obbgs_core.poses", "obbgs_core.start"},
+    "obbgs_core.train": CORE
+    | {f"obbgs_core.{room}" for room in ("render", "poses", "evidence", "published", "start")},
     "obbgs_core.io": CORE | {"obbgs_core.render"},
     "obbgs_core.score": CORE | {"obbgs_core.render", "obbgs_core.poses"},
     "flightsw.icd": {"obbgs_base"},

@@ -104,7 +104,7 @@ def reconstruct_gaussians(
         },
         # the images of other methods need more than a radiance and an exposure time
         stated_errors=functools.partial(_stated_errors, result, posed, sensor)
-        if config.exposure_aware and not config.compensation
+        if config.exposure_aware and not config.published.compensation
         else None,
         poses=_poses(result.gaussians, sensor, result.pose_estimate),
     )
@@ -167,7 +167,7 @@ def _may_end(trainer: Trainer) -> bool:
 
 def _snapshot(trainer: Trainer) -> Reconstruction:
     """Return the training as it stands, without points on its surface, which take long."""
-    gaussians, setup, poses = trainer.gaussians, trainer.setup, trainer.state.poses
+    gaussians, setup, poses = trainer.gaussians, trainer.setup, trainer.state.poses.corrections
     estimate = None if poses is None else poses.estimate(setup.frames)  # dark frames are not among those
     return Reconstruction(
         points=gaussians.means,

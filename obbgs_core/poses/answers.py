@@ -36,7 +36,7 @@ class Question:
     @torch.no_grad()
     def answer(self) -> "Answer":
         """Render the model and compare it with the frames' readings."""
-        told, shares = [], []
+        told, misfits = [], []
         for first in range(0, len(self.indices), RENDERED):
             batch = self.batches.batch(self.indices[first : first + RENDERED])
             poses = self.poses[first : first + RENDERED]
@@ -49,7 +49,7 @@ class Question:
             for one in range(len(cameras)):
                 at = slice(one, one + 1)
                 seen = (radiance[at], batch.exposure_time_s[at], dn[at])
-                shares.append(relative_misfit(*seen, self.sensor, batch.averaged_pixels))
+                misfits.append(relative_misfit(*seen, self.sensor, batch.averaged_pixels))
         information = PoseInformation(
             torch.cat([t.gradient for t in told]),
             torch.cat([t.curvature for t in told]),
@@ -57,20 +57,20 @@ class Question:
             self.cell_m,
         )
         dispersion = torch.cat([t.dispersion for t in told if t.dispersion is not None])
-        return Answer(self.indices, information, dispersion, torch.tensor(shares))
+        return Answer(self.indices, information, dispersion, torch.tensor(misfits))
 
 
 @dataclass(frozen=True)
 class Answer:
     """What frames say of their poses and of the surface.
 
-    dispersion: [B] their residuals as mean squares in deviations of the noise; shares: [B] as shares of their light.
+    dispersion: [B] their residuals as mean squares in deviations of the noise; misfit: [B] as shares of their light.
     """
 
     indices: list[int]
     information: PoseInformation
     dispersion: Tensor
-    shares: Tensor
+    misfit: Tensor
 
 
 class PoseRound:

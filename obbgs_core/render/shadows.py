@@ -6,7 +6,7 @@ Shadows with Depth Maps, 1987.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 import torch.nn.functional as F
@@ -27,6 +27,7 @@ BALL_MARGIN = 1.1
 # How far behind the first surface a Gaussian is still fully lit, and from where on it is in full shadow, in units of a
 # pixel's width plus the Gaussian's own sigma along the ray. The tolerance keeps surfaces from shading themselves.
 LIT_UNTIL, DARK_FROM = 2.0, 4.0
+SHADOW_INTERVAL = 120  # steps of a training between two computations of its shadow maps
 
 
 @dataclass(frozen=True)
@@ -126,3 +127,24 @@ def _spline_weights(place: Tensor) -> Tensor:
     """Return quadratic B-spline weights [N, 3] of the pixels before, at and after places [N] px."""
     off = place - place.floor() - 0.5
     return torch.stack([0.5 * (0.5 - off) ** 2, 0.75 - off**2, 0.5 * (0.5 + off) ** 2], dim=1)
+
+
+@dataclass
+class Shadows:
+    """The shadow maps of a model, by the Sun's direction; the model changes slowly, so they are kept for some steps."""
+
+    maps: dict[tuple[float, ...], ShadowMap] = field(default_factory=dict)
+
+    def sunlit(self, gaussians: Gaussians, cameras: Cameras, step: int) -> Tensor | None:
+        """Return the share of each camera's Sun that reaches each Gaussian [C, N]; None unless shading is Lambert's."""
+        if gaussians.shading != "lambert":
+            return None
+        if step % SHADOW_INTERVAL == 0:
+            self.maps = {}
+        used = []
+        for sun_dir in cameras.known_suns():
+            sun = tuple(sun_dir.tolist())
+            if sun not in self.maps:
+                self.maps[sun] = shadow_map(gaussians, sun_dir)
+            used.append(self.maps[sun])
+        return lit_shares(gaussians, used)

@@ -34,11 +34,9 @@ HULL_WIDTH = 0.7
 class StartSettings:
     """The first Gaussians."""
 
-    kind: Literal["random", "hull"] = "random"  # in a cube around the target, or on its hull
-    # seen: the radiance that the frames show where the points project; grey: half of full scale, plus up to 0.0011 of
-    # it at random (3DGS, on data sets without a point cloud)
-    colour: Literal["seen", "grey"] = "seen"
-    count: int = number(100_000, least=2)  # at most: the hull may have fewer points
+    # on the target's hull, or in a cube around it; the number is that of the note in docs/experiments (001)
+    kind: Literal["random", "hull"] = "hull"
+    count: int = number(3000, least=2)  # at most: the hull may have fewer points (046, 060)
 
     def __post_init__(self):
         check(self, "start")
@@ -73,12 +71,15 @@ def first_gaussians(
     settings: StartSettings,
     sh_degree: int,
     rng: torch.Generator,
+    grey: bool = False,
 ) -> tuple[Gaussians, float, str]:
     """Return the first Gaussians, the target's radius (m), and where the Gaussians came from.
 
     Args:
         outlines: silhouettes of some of the frames.
         sh_degree: of the spherical harmonics that the Gaussians have room for.
+        grey: their radiance is half of full scale, plus up to 0.0011 of it at random (3DGS, on data sets without a
+            point cloud), instead of what the frames show where the points project.
 
     Raises:
         ReconstructionError: every frame is black, or the origin is behind the cameras or far from the target.
@@ -98,7 +99,7 @@ def first_gaussians(
         if len(points) >= FEWEST_HULL_POINTS:
             chosen = spread(points, settings.count, rng)
             points = points[chosen] + (torch.rand(len(chosen), 3, generator=rng) - 0.5) * voxel_m
-            colours = _colours(points, frames, sensor, settings, rng)
+            colours = _colours(points, frames, sensor, grey, rng)
             width_m = HULL_WIDTH * _mean_spacing(points)
             model = _round_gaussians(points, colours, width_m, coefficients, HULL_OPACITY)
             return model, radius, f"visual hull, {len(chosen)} points"
@@ -113,7 +114,7 @@ def first_gaussians(
             )
         log.warning("the silhouettes agree on only %d points; starting at random", len(points))
     points = (2 * torch.rand(settings.count, 3, generator=rng) - 1) * radius
-    colours = _colours(points, frames, sensor, settings, rng)
+    colours = _colours(points, frames, sensor, grey, rng)
     spacing = _root_mean_square_spacing if settings.kind == "random" else _mean_spacing
     model = _round_gaussians(points, colours, spacing(points), coefficients, RANDOM_OPACITY)
     return model, radius, f"random, {settings.count} points"
@@ -150,11 +151,11 @@ def _colours(
     points: Tensor,
     frames: list[TrainingFrame],
     sensor: Sensor,
-    settings: StartSettings,
+    grey: bool,
     rng: torch.Generator,
 ) -> Tensor:
     """Return the coefficients of degree 0 [N, C] that Gaussians at points start with."""
-    if settings.colour == "grey":
+    if grey:
         noise = torch.rand(len(points), frames[0].dn.shape[2], generator=rng)
         full_scale = sensor.full_scale_radiance(mean_exposure_s(frames))
         return sh.from_radiance((0.5 + sh.C0 * noise / 255) * full_scale)

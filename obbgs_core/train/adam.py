@@ -1,14 +1,15 @@
-"""Adam over the Gaussians' parameters, and the learning rate of each parameter over the training."""
+"""Adam over the Gaussians' parameters, their learning rates over the training, and the mean of the last models."""
 
+import dataclasses
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from obbgs_core import compiled
 from obbgs_core.model.gaussians import LOBES, TENSORS, Gaussians
-from obbgs_core.settings import check, number
+from obbgs_core.train.config import RateSettings
+from obbgs_core.train.parts import Change
 
 FIRST_MEMORY, SECOND_MEMORY = 0.9, 0.999  # shares of the moments that a step keeps (Kingma and Ba 2015)
 OPACITY_RATE = 0.05  # of opacity logits a step (Kerbl et al. 2023)
@@ -17,27 +18,6 @@ WEIGHT_RATE = 0.03  # of the logarithms of their weights a step
 GLOSS_RATE = 0.01  # of the logarithms of roughness and peak radiance a step
 PSF_RATE = 0.002  # of the point spread a step, in pixels of the sensor
 AMBIENT_RATE = 0.001  # of the ambient light a step, in units of the Sun's
-
-
-@dataclass(frozen=True)
-class RateSettings:
-    """Learning rates a step, of the means in the method's unit of length and of `sh` in its unit of radiance."""
-
-    means: float = 1.6e-4  # at the first step
-    means_end: float = 1.6e-6  # at the last step, with exponential decay between them
-    quats: float = 0.001
-    log_scales: float = 0.005
-    sh: float = 0.0025
-    sh_rest: float = 1.0  # factor on the rate of the coefficients above degree 0
-    # all rates but that of the means decay exponentially to this share of themselves
-    final_share: float = 1.0
-    # Share of the second moments that a step keeps: the smaller it is, the sooner steps follow gradients that shrink.
-    # Where the Sun or the poses may move, the default is taken instead: a step that has forgotten the gradients of
-    # another Sun is too large for it, and refined poses lose accuracy.
-    second_memory: float = number(SECOND_MEMORY, most=0.9999)
-
-    def __post_init__(self):
-        check(self, "rates")
 
 
 def learning_rates(
@@ -133,3 +113,42 @@ class Adam:
             for name in (*TENSORS, "lobes") if "lobes" in moments else TENSORS:
                 rest = torch.zeros(added, *moments[name].shape[1:], dtype=moments[name].dtype)
                 moments[name] = torch.cat([moments[name][kept], rest])
+
+    def apply(self, change: Change) -> None:
+        """Follow a change of the model."""
+        if change.kept is not None:
+            self.follow(change.kept, change.added)
+        self.widen(change.model)
+        for name in change.begun_anew:
+            self.reset(name)
+
+
+class Average:
+    """The mean of a model over some steps, parameter by parameter: single steps scatter about what all frames want.
+
+    gaussians: without gradients; None: none is averaged yet.
+
+    Source: Polyak and Juditsky, Acceleration of Stochastic Approximation by Averaging, 1992.
+    """
+
+    def __init__(self):
+        self.gaussians: Gaussians | None = None
+        self.steps = 0
+
+    @torch.no_grad()
+    def observe(self, gaussians: Gaussians, is_averaged: bool = True) -> None:
+        """Take in the model after one more step; where it is too early for that, forget what was averaged."""
+        if not is_averaged or self.gaussians is None:
+            self.gaussians, self.steps = (gaussians.copied(), 1) if is_averaged else (None, 0)
+            return
+        self.steps += 1
+        before, now = self.gaussians.parameters(), gaussians.parameters()
+        means = {name: before[name].lerp(value.detach(), 1 / self.steps) for name, value in now.items()}
+        self.gaussians = dataclasses.replace(gaussians, **means)
+
+    def follow(self, change: Change) -> None:
+        """Keep the mean where a change only removes Gaussians; else it begins anew."""
+        if self.gaussians is None or change.kept is None or change.added:
+            self.gaussians, self.steps = None, 0
+        else:
+            self.gaussians = self.gaussians.select(change.kept)

@@ -1,127 +1,134 @@
-"""The methods as settings: what each published method, and ours, does differently from 3DGS."""
+"""The methods by name: `obbgs` is what the settings are at their defaults, published methods differ from it."""
 
 from dataclasses import fields, replace
 from typing import Any
 
+from obbgs_core.published.settings import PublishedSettings
 from obbgs_core.settings import changed
 from obbgs_core.start.initialisation import StartSettings
-from obbgs_core.train.adam import RateSettings
-from obbgs_core.train.appearance import LightSettings
-from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.growth import GrowthSettings
-from obbgs_core.train.objective import LossSettings
-from obbgs_core.train.parsimony import ParsimonySettings
-from obbgs_core.train.poses import PoseSettings
-from obbgs_core.train.sparsity import SparseSettings
+from obbgs_core.train.config import (
+    GrowthSettings,
+    LightSettings,
+    LossSettings,
+    MethodConfig,
+    ParsimonySettings,
+    PoseSettings,
+    RateSettings,
+    SparseSettings,
+)
 
-# Kerbl et al., 3D Gaussian Splatting, 2023: the defaults of every group are theirs
+# Kerbl et al., 3D Gaussian Splatting, 2023
 _3DGS = MethodConfig(
     name="3dgs",
-    length_unit="cameras",
-    radiance_unit="full_scale",
-    start=StartSettings(colour="grey"),
-    loss=LossSettings(clamped=False),
+    exposure_aware=False,
+    frames_per_step=1,
+    bracket_steps=False,
+    steps=30_000,
+    averaged_from=1.0,
+    chi2_end=0.0,
+    start=StartSettings(kind="random", count=100_000),
+    loss=LossSettings(
+        misfit=False,
+        edge_weight=0.0,
+        gloss_weight=0.0,
+        normal_weight=0.0,
+        flat_weight=0.0,
+        sky_weight=0.0,
+        solid_weight=0.0,
+    ),
     growth=GrowthSettings(
-        recorded_from=0.0,
+        max_gaussians=500_000,
+        gaussians_per_root_pixel=0,
+        begin=500 / 30_000,
         end=14_999 / 30_000,  # the last densification and reset come before step 15,000
+        interval=100,
+        grown_share=0.0,
+        obb_interval=0,
+        prune_opacity=0.005,
+    ),
+    rates=RateSettings(
+        means=1.6e-4,
+        means_end=1.6e-6,
+        quats=0.001,
+        log_scales=0.005,
+        sh=0.0025,
+        sh_rest=1 / 20,
+        final_share=1.0,
+        second_memory=0.999,
+    ),
+    parsimony=ParsimonySettings(prune_at=(), keep_above_opacity=1.0),
+    light=LightSettings(max_sh_degree=0, sun_span_deg=0.0, highlights=False),
+    poses=PoseSettings(refine="never"),
+    sparse=SparseSettings(dropout=0.0, sky_weight=0.0),
+    published=PublishedSettings(
+        length_unit="cameras",
+        radiance_unit="full_scale",
+        windows=False,
+        footprint="kerbl",
+        grey_start=True,
+        loss="l1_ssim",
+        clamped=False,
+        sh_degree=3,
+        sh_interval=1000,
+        recorded_from_start=True,
+        split="random",
+        pixel_weighted=False,
         prune_size=0.1,
         prune_size_from=3000 / 30_000,  # after the first reset of the opacities
+        opacity_reset_interval=3000,
     ),
-    rates=RateSettings(sh_rest=1 / 20),
-    light=LightSettings(sh_interval=1000),
 )
 PRESETS: dict[str, MethodConfig] = {
     c.name: c
     for c in (
         _3DGS,
-        changed(_3DGS, {"name": "pixel-gs", "growth.pixel_weighted": True, "growth.depth_scale": 0.37}),
+        changed(_3DGS, {"name": "pixel-gs", "published.pixel_weighted": True, "published.depth_scale": 0.37}),
         changed(
             _3DGS,
             {  # run_360.py and train.py of the authors' code
                 "name": "mvgs",
                 "steps": 39_000,
-                "coarse": ((1 / 8, 48, 3 / 39), (1 / 4, 24, 3 / 39), (1 / 2, 12, 3 / 39)),
                 "frames_per_step": 8,
-                "growth.multi_view": True,
+                "published.coarse": ((1 / 8, 48, 3 / 39), (1 / 4, 24, 3 / 39), (1 / 2, 12, 3 / 39)),
+                "published.multi_view": True,
             },
         ),
-        changed(_3DGS, {"name": "mip-splatting", "smoothing_px2": 0.2, "footprint": "mip-splatting"}),
+        changed(
+            _3DGS,
+            {
+                "name": "mip-splatting",
+                "published.smoothing_px2": 0.2,
+                "published.footprint": "mip-splatting",
+            },
+        ),
         changed(
             _3DGS,
             {
                 "name": "jiang2025",
                 "frames_per_step": 3,
                 "bracket_steps": True,
-                "outlier_filter": True,
                 "loss.edge_weight": 0.2,
-                "growth.pixel_weighted": True,
                 "growth.obb_interval": 50,
+                "published.pixel_weighted": True,
+                "published.outlier_filter": True,
             },
         ),
-        MethodConfig(
-            name="obbgs",
-            exposure_aware=True,
-            frames_per_step=3,
-            bracket_steps=True,
-            windows=True,
-            steps=1000,
-            footprint="camera",
-            averaged_from=0.88,
-            outlier_filter=False,  # few Gaussians stray from the hull; with it the demo lost 0.4 dB
-            chi2_end=1.0,
-            start=StartSettings(kind="hull", count=3000),
-            loss=LossSettings(
-                kind="likelihood",
-                ssim_weight=0.0,
-                edge_weight=0.05,
-                misfit=True,
-                gloss_weight=0.02,
-                normal_weight=0.02,
-                flat_weight=15.0,
-                sky_weight=1.0,
-                solid_weight=1.0,
-            ),
-            growth=GrowthSettings(
-                max_gaussians=10_000,
-                gaussians_per_root_pixel=12,  # detail lies along edges (experiment 084)
-                begin=0.08,
-                end=0.6,
-                interval=24,
-                share=0.08,
-                split="long_axis",
-                pixel_weighted=True,
-                obb_interval=12,
-                prune_opacity=0.02,
-                opacity_reset_interval=0,
-            ),
-            rates=RateSettings(
-                means=4e-3,
-                means_end=2e-5,
-                quats=0.01,
-                log_scales=0.02,
-                sh=0.04,
-                sh_rest=0.1,
-                final_share=0.4,
-                second_memory=0.99,
-            ),
-            parsimony=ParsimonySettings(prune_at=(0.3, 0.45, 0.6, 0.72, 0.85), keep_above_opacity=0.65),
-            light=LightSettings(sh_degree=0, max_sh_degree=2, sun_span_deg=5.0, highlights=True),
-            poses=PoseSettings(refine="auto"),
-            sparse=SparseSettings(dropout=0.3, sky_weight=3.0),
-        ),
+        MethodConfig(name="obbgs"),
     )
 }
 
 
 # What can be added to a method's name, `3dgs+exposure`, and the settings that it changes.
 VARIANTS: dict[str, dict[str, Any]] = {
-    "exposure": {
+    "exposure": {  # known exposure times, saturation as the sensor's
         "exposure_aware": True,
-        "loss.clamped": True,
-    },  # known exposure times, saturation as the sensor's
+        "published.clamped": True,
+    },
     "blind": {"exposure_aware": False},  # exposure times are not known
-    "affine": {"compensation": True, "loss.clamped": True},  # the colours of each frame are learnt
-    "hull": {f"start.{f.name}": getattr(PRESETS["obbgs"].start, f.name) for f in fields(StartSettings)},
+    # the colours of each frame are learnt
+    "affine": {"published.compensation": True, "published.clamped": True},
+    "hull": {f"start.{f.name}": getattr(StartSettings(), f.name) for f in fields(StartSettings)}
+    | {"published.grey_start": False},
     "random": {"start.kind": "random"},
 }
 

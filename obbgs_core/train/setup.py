@@ -1,15 +1,14 @@
-"""Prepares a training: checks and measures what it is given, and makes the state that it starts from."""
+"""Prepares a training: checks and measures what it is given, and places the first Gaussians."""
 
-import copy
 import dataclasses
 import functools
 import hashlib
 import logging
 import math
-import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,31 +27,20 @@ from obbgs_core.frames import (
 from obbgs_core.hot_pixels import without_hot_pixels
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
-from obbgs_core.poses.evidence import validation_brackets
-from obbgs_core.sensor import Sensor, dark_reading, noise_excess
-from obbgs_core.settings import flat
-from obbgs_core.sky_level import SkyLevel, levelled
+from obbgs_core.sensor import Sensor
+from obbgs_core.sky_level import SkyLevel, levelled, with_noise_seen
 from obbgs_core.start.alignment import settled
 from obbgs_core.start.hull import Silhouette, light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
-from obbgs_core.train.adam import FIRST_MEMORY, SECOND_MEMORY, Adam
-from obbgs_core.train.appearance import TURNING_SPAN_DEG
-from obbgs_core.train.compensation import Compensation
-from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.growth import Growth
-from obbgs_core.train.order import FrameOrder
-from obbgs_core.train.poses import HOLDS, PoseDecision
-from obbgs_core.train.smoothing import sampling_deviation_m
-from obbgs_core.train.state import Identity, TrainingState
+from obbgs_core.train.config import MethodConfig, few_share
 
 log = logging.getLogger(__name__)
-NOISE_FRAMES = 12  # about so many, spread evenly, by which the noise is measured
 # full scale at the mean exposure may be a radiance between this and its inverse without harm
 USUAL_FULL_SCALE = 10.0
-# of the scatter of empty sky over that of the sensor model, or the reverse; frames that fit it have 0.93 to 0.97
-CLEAR_EXCESS = 1.3
-UNSMOOTHED = 1.1  # ratio of the scatter of pixels two apart to that of neighbours; noise has 1.02 to 1.05
 MOST_HIDDEN = 0.01  # share of the first Gaussians that may be nearer to the cameras than what is drawn
+# Albedos under Lambert's law turn with the Sun where no two Suns are further apart: over part of the sphere harmonics
+# describe what light from other parts and coarse shadows do, all round it they do not (experiment 075).
+TURNING_SPAN_DEG = 90.0
 AS_MANY_PICTURES = 35  # long exposures: the lit pixels of fewer count as those of so many (experiment 084)
 
 
@@ -91,18 +79,26 @@ class TrainingSetup:
 
         Under Suns between those of its frames it can err by far more than under these.
         """
-        loss = self.config.loss
-        learnt = loss.misfit and loss.kind == "likelihood" and not self.config.compensation
-        return learnt and self.sun_moves
+        return self.config.learns_misfit and not self.config.published.compensation and self.sun_moves
 
     @property
     def albedos_turn(self) -> bool:
         """Whether albedos under Lambert's law turn with the Sun, which is where it does not go all round."""
         return self.sun_span_deg <= TURNING_SPAN_DEG
 
+    @property
+    def exposures_s(self) -> list[float]:
+        """The exposure times that the frames are taken to have."""
+        return [frame.exposure_time_s for frame in self.frames]
+
+    @property
+    def dropout(self) -> float:
+        """The share of the Gaussians that steps leave out."""
+        return few_share(len(self.frames)) * self.config.sparse.dropout
+
     @functools.cached_property
-    def identity(self) -> Identity:
-        """What decides the result of a training: the method's settings, the seed, the sensor and the frames."""
+    def digest(self) -> str:
+        """A digest of the seed, the sensor and the frames."""
         digest = hashlib.sha256(repr((self.seed, self.sensor)).encode())
         if background := self.frames[0].background:
             digest.update(f"background {background}".encode())
@@ -115,7 +111,16 @@ class TrainingSetup:
                 attitude = None if f.inertial_to_body is None else f.inertial_to_body.tolist()
                 digest.update(repr((f.time_s, attitude, f.navigation.tree())).encode())
             digest.update(repr((f.exposure_time_s, f.bracket, known, f.psf_sigma_px)).encode())
-        return Identity(digest.hexdigest(), flat(self.asked), flat(MethodConfig(self.asked.name)))
+        return digest.hexdigest()
+
+
+class Start(NamedTuple):
+    """What a training starts from."""
+
+    gaussians: Gaussians
+    poses: PoseCorrections | None  # aligned by silhouettes, or refined by a training before; None: as tagged
+    why: str  # they are, in words
+    rng: torch.Generator
 
 
 def prepare(
@@ -125,8 +130,8 @@ def prepare(
     seed: int,
     known: Mapping[int, Silhouette] = MappingProxyType({}),
     refined: PoseCorrections | None = None,
-) -> tuple[TrainingSetup, TrainingState]:
-    """Return the setup of a training and its state before the first step.
+) -> tuple[TrainingSetup, Start]:
+    """Return the setup of a training and what it starts from.
 
     Args:
         known: silhouettes of a setup of the first of these frames, which are not made again.
@@ -138,34 +143,37 @@ def prepare(
     checked, reference_exposure_s = usable(frames, asked.exposure_aware, sensor.white_dn)
     checked, sensor, sky_level = levelled(checked, sensor)
     checked, hot = without_hot_pixels(checked, sensor)
-    sensor, noise = _with_noise_seen(checked, sensor)
+    sensor, noise = with_noise_seen(checked, sensor)
     shown = [shows_light(light(f.dn, sensor, f.background, f.exposure_time_s), sensor) for f in checked]
     lit = _lit(checked, shown)
     config = asked.for_frames(len(lit))
+    published = config.published
     rng, seen = torch.Generator().manual_seed(seed), silhouettes(lit, sensor, known)
     outlines, poses, why = settled(lit, seen, config.poses.refine != "never", refined)
     posed = lit if poses is None else poses.frames(lit)
-    config, budget = _limited(config, [int(outline.certain.sum()) for outline in outlines.values()])
-    given = (posed, list(outlines.values()), sensor, config.start, config.light.sh_degree, rng)
-    gaussians, radius_m, start = first_gaussians(*given)
+    noise += _unusual_unit(lit, sensor)
+    certain = {i: outline.certain for i, outline in outlines.items()}
+    config, budget = _limited(config, [int(mask.sum()) for mask in certain.values()])
+    given = (posed, list(outlines.values()), sensor, config.start, published.sh_degree, rng)
+    gaussians, radius_m, start = first_gaussians(*given, published.grey_start)
     _check_nearness(gaussians.means.detach(), posed)
-    gaussians = dataclasses.replace(gaussians, footprint=config.footprint)
+    gaussians = dataclasses.replace(gaussians, footprint=published.footprint)
     span_deg = sun_span_deg(lit)
     sky, solid = _masks(outlines, config, span_deg, lit[0].background)
-    certain = {i: outline.certain for i, outline in outlines.items()}
-    shown_part = windows(posed, gaussians.means.detach(), certain) if config.windows else None
+    parts = windows(posed, gaussians.means.detach(), certain) if published.windows else None
+    white = sensor.full_scale_radiance(mean_exposure_s(lit))
     setup = TrainingSetup(
         frames=lit,
         sensor=sensor,
         asked=asked,
         config=config,
         seed=seed,
-        batches=Batches(lit, sensor.white_dn, sky, shown_part, solid),
+        batches=Batches(lit, sensor.white_dn, sky, parts, solid),
         radius_m=radius_m,
-        unit_m=camera_extent_m(lit) if config.length_unit == "cameras" else radius_m,
-        radiance_unit=_radiance_unit(config, sensor, lit),
+        unit_m=camera_extent_m(lit) if published.length_unit == "cameras" else radius_m,
+        radiance_unit=white if published.radiance_unit == "full_scale" else 1.0,
         sun_span_deg=span_deg,
-        start=start + hot + noise + _unusual_unit(lit, sensor),
+        start=start + hot + noise,
         budget=budget,
         reference_exposure_s=reference_exposure_s,
         dark_frames=len(checked) - len(lit),
@@ -175,38 +183,7 @@ def prepare(
         start_means=gaussians.means.detach(),
         sky_level=sky_level,
     )
-    brackets = validation_brackets(lit)
-    decision = PoseDecision.REFINED if poses is not None else _decided_at_once(config, lit, brackets)
-    is_open = decision is PoseDecision.OPEN
-    if poses is None and config.poses.refine == "always":
-        poses = PoseCorrections(lit)
-    kept_back = brackets if is_open or (setup.keeps_unseen and poses is None) else []
-    state = TrainingState(
-        rng=rng,
-        gaussians=gaussians,
-        adam=_adam(setup, gaussians, exact_tags=poses is None and not is_open),
-        growth=Growth.of(len(gaussians)),
-        order=FrameOrder.of(lit, config.bracket_steps, kept_back),
-        poses=poses,
-        poses_aligned=bool(why),
-        pose_decision=decision,
-        pose_evidence=why,
-        holds=HOLDS if poses is not None else 0,
-        placed_by=copy.deepcopy(refined),
-        appearance_reason="as configured" if config.light.sh_degree else "",
-        compensation=Compensation(len(lit), lit[0].dn.shape[2]) if config.compensation else None,
-        smoothing_m=_first_smoothing_m(config, gaussians, lit),
-    )
-    return setup, state
-
-
-def _first_smoothing_m(
-    config: MethodConfig, gaussians: Gaussians, frames: list[TrainingFrame]
-) -> Tensor | None:
-    """Return the deviations [N] of the 3D filter of the first Gaussians; None where the method has none."""
-    if not config.smoothing_px2:
-        return None
-    return sampling_deviation_m(gaussians.means, frames, config.smoothing_px2)
+    return setup, Start(gaussians, poses, why, rng)
 
 
 def _lit(frames: list[TrainingFrame], shown: list[bool]) -> list[TrainingFrame]:
@@ -255,48 +232,6 @@ def _check_nearness(points: Tensor, frames: list[TrainingFrame]) -> None:
         )
 
 
-def _radiance_unit(config: MethodConfig, sensor: Sensor, frames: list[TrainingFrame]) -> float:
-    """Return the method's unit of radiance."""
-    return (
-        sensor.full_scale_radiance(mean_exposure_s(frames)) if config.radiance_unit == "full_scale" else 1.0
-    )
-
-
-def _adam(setup: TrainingSetup, gaussians: Gaussians, exact_tags: bool) -> Adam:
-    """Return the optimizer; with the method's own memory only where neither the Sun nor the poses can move."""
-    still = exact_tags and not setup.sun_moves
-    return Adam(gaussians, (FIRST_MEMORY, setup.config.rates.second_memory if still else SECOND_MEMORY))
-
-
-def _with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Sensor, str]:
-    """Return the sensor with the read noise that empty sky shows, and in words what was changed, if anything.
-
-    With less than there is, noise would count as light: there would be no empty sky, and no hull. With more, faint
-    parts of the target would count as noise. Smoothed pictures scatter less too, but their nearest neighbours most.
-    """
-    shown = frames[:: max(1, len(frames) // NOISE_FRAMES)]
-    dark_dn, _ = dark_reading(sensor)
-    empty_dn = [
-        max(dark_dn, sensor.expected_dn(torch.tensor(frame.background), frame.exposure_time_s).item())
-        for frame in shown
-    ]
-    pairs = zip(shown, empty_dn, strict=True)
-    ratios, farther = zip(*(noise_excess(frame.dn, sensor, level) for frame, level in pairs), strict=True)
-    excess = statistics.median(ratios)
-    too_much = sensor.jpeg is None and excess < 1 / CLEAR_EXCESS and statistics.median(farther) < UNSMOOTHED
-    if not (excess > CLEAR_EXCESS or too_much):
-        return sensor, ""
-    seen = dataclasses.replace(
-        sensor, read_noise_dn=excess * sensor.variance_dn2(torch.tensor(sensor.black_dn)).sqrt().item()
-    )
-    changed = (
-        f"read noise taken as {seen.read_noise_dn:.2f} DN instead of the stated {sensor.read_noise_dn:.2f} DN: "
-        f"empty sky scatters {excess:.2g} times as much as that"
-    )
-    log.warning(changed)
-    return seen, f"; {changed}"
-
-
 def _unusual_unit(frames: list[TrainingFrame], sensor: Sensor) -> str:
     """Return a warning, also logged, if radiance is measured in a unit in which full scale is far from 1."""
     white = sensor.full_scale_radiance(mean_exposure_s(frames))
@@ -330,14 +265,3 @@ def _limited(config: MethodConfig, lit_pixels: list[int]) -> tuple[MethodConfig,
     growth = dataclasses.replace(config.growth, max_gaussians=most)
     start = dataclasses.replace(config.start, count=min(config.start.count, most))
     return dataclasses.replace(config, growth=growth, start=start), budget
-
-
-def _decided_at_once(
-    config: MethodConfig, frames: list[TrainingFrame], brackets: list[list[int]]
-) -> PoseDecision:
-    """Return whether the poses are refined where no training is needed to know; else that this is open."""
-    if config.poses.refine != "auto":
-        return {"never": PoseDecision.NEVER, "always": PoseDecision.REFINED}[config.poses.refine]
-    if not PoseCorrections(frames).covariances.any():
-        return PoseDecision.EXACT_TAGS
-    return PoseDecision.OPEN if brackets else PoseDecision.TOO_FEW_BRACKETS

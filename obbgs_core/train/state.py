@@ -1,5 +1,6 @@
 """The state of a training: everything that the next step depends on, and the checkpoint that it is saved in."""
 
+import dataclasses
 import io
 import json
 import logging
@@ -13,27 +14,32 @@ import torch
 from torch import Tensor
 
 from obbgs_base.files import set_aside, write_whole
+from obbgs_core.errors import Diverged
+from obbgs_core.evidence.poses import validation_brackets
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.pose_covariance import Whitening
 from obbgs_core.obb import Obb
 from obbgs_core.poses.answers import SAVED as ROUND_SAVED
-from obbgs_core.poses.answers import PoseRound
 from obbgs_core.poses.corrections import PoseCorrections
-from obbgs_core.render.shadows import ShadowMap
-from obbgs_core.train.adam import Adam
-from obbgs_core.train.appearance import Shadows
-from obbgs_core.train.averaging import Average
-from obbgs_core.train.compensation import Compensation
-from obbgs_core.train.growth import Growth
-from obbgs_core.train.neighbours import Neighbours
+from obbgs_core.published.compensation import Compensation
+from obbgs_core.published.smoothing import sampling_deviation_m, smoothed
+from obbgs_core.render.shadows import ShadowMap, Shadows
+from obbgs_core.settings import flat
+from obbgs_core.train.adam import FIRST_MEMORY, SECOND_MEMORY, Adam, Average
+from obbgs_core.train.config import MethodConfig, Moment
+from obbgs_core.train.fit import Fit
+from obbgs_core.train.growth import Growth, OpacityResets, finite
+from obbgs_core.train.objective import Neighbours
 from obbgs_core.train.order import FrameOrder
-from obbgs_core.train.poses import PoseDecision
+from obbgs_core.train.parts import Change, Now, Part, Seen
+from obbgs_core.train.poses import PoseDecision, Poses
 from obbgs_core.train.result import StepInfo
-from obbgs_core.train.smoothing import log_lowering, smoothed
+from obbgs_core.train.selection import Harmonics, Highlights, Pruning
+from obbgs_core.train.setup import Start, TrainingSetup
 
 log = logging.getLogger(__name__)
-FORMAT = 16  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 17  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,11 @@ class Identity:
     inputs: str
     settings: dict[str, Any]
     defaults: dict[str, Any]
+
+    @staticmethod
+    def of(setup: TrainingSetup) -> "Identity":
+        """Return that of the training of a setup."""
+        return Identity(setup.digest, flat(setup.asked), flat(MethodConfig(setup.asked.name)))
 
     def text(self) -> str:
         """Return inputs and settings as JSON."""
@@ -72,46 +83,130 @@ class Identity:
 
 @dataclass
 class TrainingState:
-    """Everything that the next step depends on besides what the training is given, and what its result reports."""
+    """Everything that the next step depends on besides what the training is given, and what its result reports.
+
+    The trainer keeps the model, its optimizer, the random numbers and the schedule; the other fields are the parts,
+    each of which changes itself.
+    """
 
     rng: torch.Generator
     gaussians: Gaussians
     adam: Adam
-    growth: Growth
     order: FrameOrder
-    poses: PoseCorrections | None  # None: as tagged
-    poses_aligned: bool  # before the first step, or by rounds before the schedule was set back
-    pose_decision: PoseDecision
-    pose_evidence: (
-        str  # what the decision rests on, in words for the report; nothing where the decision says it all
-    )
-    holds: int  # how often the schedule will still be set back for the poses
-    appearance_reason: str  # why the radiance depends on what it does
-    highlights_reason: str = ""  # why it has highlights or not; empty: not tested
-    highlights_frames: int = 0  # how many there were when they were tested
-    has_joined: bool = False  # frames have, since the first Gaussians were placed
-    # refined poses that the setup was made with, as they were then; None: it was made with the tags
-    placed_by: PoseCorrections | None = None
-    round: PoseRound | None = None  # of the poses, under way
-    pose_rounds: float = 0.0  # in which the pose of a frame has moved, mean of the frames
-    average: Average | None = None  # of the models of the last steps; None: not averaged yet
-    smoothing_m: Tensor | None = None  # [N] deviations of the 3D filter; None: the method has none
+    growth: Growth
+    poses: Poses
+    harmonics: Harmonics
+    highlights: Highlights = field(default_factory=Highlights)
+    fit: Fit = field(default_factory=Fit)
+    average: Average = field(default_factory=Average)  # of the models of the last steps
+    deviation_m: Tensor | None = None  # [N] of the 3D filter; None: the method has none
     compensation: Compensation | None = None  # None: the colours of all frames are the model's
-    misfits: list[int] = field(
-        default_factory=list
-    )  # frames that are left out: they fit no pose that their tags allow
-    boxes: list[Obb] = field(default_factory=list)  # behind the worst tiles since the last growth inside them
     shadows: Shadows = field(default_factory=Shadows)
     neighbours: Neighbours = field(default_factory=Neighbours)
-    chi2: float = math.nan  # running mean
-    misfit: float | None = None  # running mean of the model's own error; None: not learnt, or not yet
-    # how many times as large it is on frames that are not trained on; None: not measured
-    unseen_factor: float | None = None
-    psnr_db: float = math.nan  # of the last step's frames
+    has_joined: bool = False  # frames have, since the first Gaussians were placed
     steps_done: int = 0
     seconds: float = 0.0
     removed_not_finite: int = 0
     history: list[StepInfo] = field(default_factory=list)
+
+    @staticmethod
+    def first(setup: TrainingSetup, start: Start, refined: PoseCorrections | None = None) -> "TrainingState":
+        """Return the state before the first step.
+
+        Args:
+            refined: poses that the start was made with.
+        """
+        config, brackets = setup.config, validation_brackets(setup.frames)
+        poses = Poses.first(setup, start, bool(brackets), refined)
+        is_open, as_tagged = poses.decision is PoseDecision.OPEN, poses.corrections is None
+        kept_back = brackets if is_open or (setup.keeps_unseen and as_tagged) else []
+        # the method's own memory only where neither the Sun nor the poses can move
+        still = as_tagged and not is_open and not setup.sun_moves
+        memory = config.rates.second_memory if still else SECOND_MEMORY
+        channels = setup.frames[0].dn.shape[2]
+        state = TrainingState(
+            rng=start.rng,
+            gaussians=start.gaussians,
+            adam=Adam(start.gaussians, (FIRST_MEMORY, memory)),
+            order=FrameOrder(setup.exposures_s, config.bracket_steps, kept_back),
+            growth=Growth.of(len(start.gaussians)),
+            poses=poses,
+            harmonics=Harmonics("as configured" if config.published.sh_degree else ""),
+            compensation=Compensation(len(setup.frames), channels) if config.published.compensation else None,
+        )
+        if config.published.smoothing_px2:
+            state.deviation_m = sampling_deviation_m(
+                start.gaussians.means, setup.frames, config.published.smoothing_px2
+            )
+        return state
+
+    @property
+    def parts(self) -> list[Part]:
+        """The parts that decide on the model, in the order in which they do."""
+        number = [self.growth, OpacityResets()]
+        return [self.poses, self.fit, *number, self.highlights, Pruning(), self.harmonics]
+
+    def now(self, setup: TrainingSetup, moment: Moment, seen: Seen) -> Now:
+        """Return what parts see of the training in a step."""
+        poses = self.poses
+        is_resettling = self.has_joined and poses.corrections is not None
+        return Now(
+            setup=setup,
+            moment=moment,
+            taken=len(self.history),
+            gaussians=self.gaussians,
+            deviation_m=self.deviation_m,
+            corrections=poses.corrections,
+            is_resettling=is_resettling,
+            waits_for_poses=is_resettling and poses.set_backs > 0,
+            keeps_unseen=self.keeps_unseen(setup),
+            misfit=self.fit.misfit,
+            order=self.order,
+            shadows=self.shadows,
+            rng=self.rng,
+            seen=seen,
+        )
+
+    def keeps_unseen(self, setup: TrainingSetup) -> bool:
+        """Return whether there are brackets that are kept back to tell the model's own error."""
+        return setup.keeps_unseen and not self.poses.decision.is_open and bool(self.order.validation_brackets)
+
+    def apply(self, setup: TrainingSetup, change: Change) -> None:
+        """Change the model, and all that follows its Gaussians."""
+        self.gaussians = change.model.trainable()
+        self.adam.apply(change)
+        self.growth.follow(change)
+        self.average.follow(change)
+        if change.reason:
+            log.info("step %d: %s", self.steps_done + 1, change.reason)
+        if change.goes_on and not change.added and self.deviation_m is not None:
+            self.deviation_m = self.deviation_m[change.kept]
+        elif change.kept is not None:
+            self.find_filter(setup)
+
+    def find_filter(self, setup: TrainingSetup) -> None:
+        """Find the widths of the 3D filter, where the method has one, because Gaussians have moved or are others."""
+        if setup.config.published.smoothing_px2:
+            poses = self.poses.corrections
+            frames = setup.frames if poses is None else poses.frames(setup.frames)
+            variance_px2 = setup.config.published.smoothing_px2
+            self.deviation_m = sampling_deviation_m(self.gaussians.means, frames, variance_px2)
+
+    def drop_not_finite(self, setup: TrainingSetup) -> None:
+        """Remove the Gaussians of which a parameter became NaN or infinite, and count them.
+
+        Raises:
+            Diverged: no Gaussian is finite.
+        """
+        kept = finite(self.gaussians)
+        count = len(kept) - int(kept.sum())
+        if count == len(kept):
+            problem = f"none of {count} Gaussians has finite parameters any more,"
+            raise Diverged(self.steps_done, math.nan, problem)
+        if count:
+            self.apply(setup, Change.only(self.gaussians, kept, "", goes_on=True))
+            self.removed_not_finite += count
+            log.warning("step %d: %d Gaussians were not finite and are removed", self.steps_done, count)
 
     @property
     def model(self) -> Gaussians:
@@ -121,21 +216,15 @@ class TrainingState:
     @property
     def averaged_model(self) -> Gaussians:
         """The mean of the models of the last steps where they are averaged, else the model, without gradients."""
-        return self._filtered(self.gaussians if self.average is None else self.average.gaussians).detach()
+        return self._filtered(self.average.gaussians or self.gaussians).detach()
 
     def _filtered(self, gaussians: Gaussians) -> Gaussians:
-        return gaussians if self.smoothing_m is None else smoothed(gaussians, self.smoothing_m)
+        return gaussians if self.deviation_m is None else smoothed(gaussians, self.deviation_m)
 
-    @property
-    def pose_report(self) -> str:
-        """Whether the poses are refined, and why, in words."""
-        decision = self.pose_decision.report
-        return f"{decision} ({self.pose_evidence})" if self.pose_evidence else decision
-
-    @property
-    def log_lowering(self) -> Tensor | None:
-        """The logarithm [N] of the factor by which the 3D filter lowers opacities."""
-        return None if self.smoothing_m is None else log_lowering(self.gaussians, self.smoothing_m)
+    def begun_again(self, fresh: "TrainingState") -> "TrainingState":
+        """Return a state before the first step that goes on with what this one counted."""
+        counted = {name: getattr(self, name) for name in ("history", "seconds", "removed_not_finite")}
+        return dataclasses.replace(fresh, **counted)
 
     def __getstate__(self) -> dict:
         return vars(self) | {"rng": self.rng.get_state()}
@@ -189,21 +278,7 @@ class TrainingState:
 
 # the classes that a checkpoint may hold: nothing else in a file is ever built
 SAVED = [
-    TrainingState,
-    Gaussians,
-    Adam,
-    Average,
-    Growth,
-    Compensation,
-    FrameOrder,
-    PoseCorrections,
-    PoseDecision,
-    Whitening,
-    Obb,
-    Shadows,
-    ShadowMap,
-    Neighbours,
-    Cameras,
-    StepInfo,
-    *ROUND_SAVED,
+    *(TrainingState, Gaussians, Adam, Average, Growth, Compensation, FrameOrder, Harmonics, Highlights),
+    *(Fit, Poses, PoseDecision, PoseCorrections, Whitening, Obb, Shadows, ShadowMap, Neighbours, Cameras),
+    *(StepInfo, *ROUND_SAVED),
 ]

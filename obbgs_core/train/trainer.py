@@ -13,35 +13,27 @@ from obbgs_base.errors import Interrupted
 from obbgs_core.batches import Batch
 from obbgs_core.compiled import torch_on_one_thread
 from obbgs_core.errors import Diverged
+from obbgs_core.evidence.radiance import described
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.losses import fit_figures
-from obbgs_core.misfit import sampled
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.poses.estimate import PoseEstimate
+from obbgs_core.published.growth import outliers
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
-from obbgs_core.train import decisions, pose_rounds
 from obbgs_core.train.adam import learning_rates
-from obbgs_core.train.appearance import described, freeze_later_degrees
-from obbgs_core.train.averaging import Average
-from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.growth import outliers
+from obbgs_core.train.config import SET_BACK_AT, SET_BACK_TO, MethodConfig, Moment
 from obbgs_core.train.joining import begun_again, check_joinable, join, release, withhold
-from obbgs_core.train.objective import image_loss, priors
-from obbgs_core.train.poses import HELD_AT, HELD_FROM
+from obbgs_core.train.objective import DROPPED_UNTIL, dropped, image_loss, priors
+from obbgs_core.train.parts import Seen
 from obbgs_core.train.result import Exposing, StepInfo, TrainResult
 from obbgs_core.train.setup import TrainingSetup, prepare
-from obbgs_core.train.sparsity import DROPPED_UNTIL, dropped
-from obbgs_core.train.state import TrainingState
+from obbgs_core.train.state import Identity, TrainingState
 
 log = logging.getLogger(__name__)
-MEMORY = 0.98  # share of the running figures that a step keeps; the rest is the step's own
 CHECKPOINT_EVERY_S = 20.0
 LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
 FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
-# share of the steps that the schedule is set back to when frames join
-HOLD = 0.25
 PACE_STEPS = 50  # the time left is estimated from the pace of so many steps
 
 
@@ -112,7 +104,8 @@ class Trainer:
     def __init__(self, frames: list[TrainingFrame], sensor: Sensor, config: MethodConfig, seed: int = 0):
         began = time.monotonic()
         self._given, self._stated = frames, sensor
-        self.setup, self.state = prepare(frames, sensor, config, seed)
+        self.setup, start = prepare(frames, sensor, config, seed)
+        self.state = TrainingState.first(self.setup, start)
         self.state.seconds = time.monotonic() - began
 
     @torch_on_one_thread()
@@ -125,51 +118,52 @@ class Trainer:
         began = time.monotonic()
         setup, state, config = self.setup, self.state, self.setup.config
         moment = config.moment(state.steps_done)
-        share = moment.share
         drawn = state.order.draw(min(moment.frames, len(setup.frames)), state.rng)
         batch = setup.batches.batch(drawn, moment.image_scale)
-        if state.poses is not None:
-            batch = dataclasses.replace(batch, cameras=state.poses.cameras(drawn, batch.cameras))
-        cameras = batch.cameras
-        sunlit = state.shadows.sunlit(state.gaussians, cameras, state.steps_done)
-        seen = rendered = self._compensated(render(self._drawn(share), cameras, sunlit=sunlit), batch)
-        loss, residual = image_loss(
-            rendered, batch, setup.sensor, config.loss, state.misfit, config.compensation
-        )
+        if state.poses.corrections is not None:
+            cameras = state.poses.corrections.cameras(drawn, batch.cameras)
+            batch = dataclasses.replace(batch, cameras=cameras)
+        sunlit = state.shadows.sunlit(state.gaussians, batch.cameras, state.steps_done)
+        model, drops = state.model, setup.dropout > 0 and moment.share < DROPPED_UNTIL
+        drawn_model = dropped(model, setup.dropout, state.rng) if drops else model
+        rendered = self._compensated(render(drawn_model, batch.cameras, sunlit=sunlit), batch)
+        loss, residual = image_loss(rendered, batch, setup.sensor, config, state.fit.misfit)
         if not torch.isfinite(loss):
             raise Diverged(state.steps_done, loss.item())
         smooth = config.loss.normal_weight > 0 and state.gaussians.shading == "lambert"
         nearest = state.neighbours.of(state.gaussians, state.steps_done) if smooth else None
         prior = priors(state.gaussians, rendered, batch, setup.radius_m, config.loss, nearest)
         (loss + prior).backward()
-        if decisions.is_recorded(setup, share):
-            decisions.observe(setup, state, rendered, batch, residual, share)
-        if self._drops(share):  # figures are of the whole model, as it was before the step
+        seen = Seen(batch, rendered, residual)
+        state.growth.observe(setup, state.gaussians, seen, moment)
+        if drops:  # figures are of the whole model, as it was before the step
             with torch.no_grad():
-                seen = self._compensated(render(state.model, cameras, sunlit=sunlit), batch)
-        self._descend(share)
-        decisions.decide_poses(setup, state, share)
-        decisions.measure_unseen(setup, state, share)
-        pose_rounds.advance(setup, state, share)
-        decisions.change_number(setup, state, batch, residual, moment)
-        decisions.select_model(setup, state)
-        averaged = share >= config.averaged_from
-        state.average = Average.of(state.gaussians, state.average) if averaged else None
-        self._measure(seen, batch)
+                rendered = self._compensated(render(state.model, batch.cameras, sunlit=sunlit), batch)
+        self._descend(moment)
+        self._decide(moment, seen)
+        state.average.observe(state.gaussians, moment.share >= config.averaged_from)
+        state.fit.observe(setup, rendered, seen)
         state.steps_done += 1
         state.seconds += time.monotonic() - began
         info = self._recorded(loss.item())
-        pose_rounds.hold(setup, state)
+        state.steps_done = state.poses.set_back(setup, state.steps_done)
         return info
 
-    def _drops(self, share: float) -> bool:
-        """Return whether Gaussians are left out of a step."""
-        return self.setup.config.dropout > 0 and share < DROPPED_UNTIL
-
-    def _drawn(self, share: float) -> Gaussians:
-        """Return the Gaussians that a step renders."""
-        model, rate = self.state.model, self.setup.config.dropout
-        return dropped(model, rate, self.state.rng) if self._drops(share) else model
+    def _decide(self, moment: Moment, seen: Seen) -> None:
+        """Take the decisions that are due, one part after the other."""
+        setup, state, config = self.setup, self.state, self.setup.config
+        now = state.now(setup, moment, seen)
+        for part in state.parts:
+            if part.due(now):
+                state.drop_not_finite(setup)
+                change = part.decide(state.now(setup, moment, seen))
+                if change is not None:
+                    state.apply(setup, change)
+                now = state.now(setup, moment, seen)
+        # Gaussians end under the filter that they were trained with
+        left = config.steps - moment.done - 1 >= config.growth.interval
+        if moment.share >= config.growth.end and moment.step % config.growth.interval == 0 and left:
+            state.find_filter(setup)
 
     def _compensated(self, rendered: Rendered, batch: Batch) -> Rendered:
         """Return what was rendered in the colours of its frames, where the method learns those."""
@@ -180,33 +174,19 @@ class Trainer:
         radiance = compensation.applied(rendered.radiance, batch.indices, full_scale)
         return dataclasses.replace(rendered, radiance=radiance)
 
-    def _descend(self, share: float) -> None:
-        """Move the Gaussians, the poses and the colours of the frames down their gradients."""
-        state, config = self.state, self.setup.config
-        freeze_later_degrees(state.gaussians, state.steps_done + 1, config.light)
-        coefficients = state.gaussians.sh.shape[1]
-        lobe = state.gaussians.lobes.shape[1]
-        rates = learning_rates(
-            config.rates, share, self.setup.unit_m, coefficients, self.setup.radiance_unit, lobe
-        )
+    def _descend(self, moment: Moment) -> None:
+        """Move the Gaussians and the colours of the frames down their gradients."""
+        state, setup = self.state, self.setup
+        interval, gradient = setup.config.published.sh_interval, state.gaussians.sh.grad
+        if interval and gradient is not None:  # higher degrees are not trained yet (3DGS)
+            gradient[:, ((moment.done + 1) // interval + 1) ** 2 :] = 0
+        of_sh = (state.gaussians.sh.shape[1], setup.radiance_unit, state.gaussians.lobes.shape[1])
+        rates = learning_rates(setup.config.rates, moment.share, setup.unit_m, *of_sh)
         state.adam.step(state.gaussians, rates)
         state.gaussians.ambient.detach().clamp_(min=0)
         state.gaussians.psf_sigma_px.detach().clamp_(min=LEAST_PSF_SIGMA_PX)
         if state.compensation is not None:
-            state.compensation.step(share)
-
-    def _measure(self, rendered: Rendered, batch: Batch) -> None:
-        """Keep the running chi² on the target and misfit, and the PSNR of this step's frames, all of sampled pixels."""
-        state, settings = self.state, self.setup.config.loss
-        radiance, alpha, dn = sampled(self.setup.sensor, rendered.radiance, rendered.alpha, batch.dn)
-        fit = fit_figures(
-            radiance, alpha, batch.exposure_time_s, dn, self.setup.sensor, batch.averaged_pixels
-        )
-        state.psnr_db = fit.psnr_db
-        if not math.isnan(fit.chi2):
-            state.chi2 = fit.chi2 if math.isnan(state.chi2) else _running(state.chi2, fit.chi2)
-        if settings.misfit and settings.kind == "likelihood" and not math.isnan(fit.misfit):
-            state.misfit = _running(fit.misfit if state.misfit is None else state.misfit, fit.misfit)
+            state.compensation.step(moment.share)
 
     def _recorded(self, loss: float) -> StepInfo:
         """Return how the training stands, and keep it in the history."""
@@ -215,8 +195,8 @@ class Trainer:
             step=state.steps_done,
             steps=self.setup.config.steps,
             loss=loss,
-            psnr_db=state.psnr_db,
-            chi2=state.chi2,
+            psnr_db=state.fit.psnr_db,
+            chi2=state.fit.chi2,
             gaussians=len(state.gaussians),
             seconds=state.seconds,
             seconds_left=_seconds_left(state, self.setup.config),
@@ -231,10 +211,10 @@ class Trainer:
             untrained = ", before the first step: the model is its untrained start"
             return f"time limit of {time_limit_s:g} s" + (untrained if state.steps_done == 0 else "")
         all_drawn = not state.order.validation_brackets  # what is kept back is to be trained on first
-        if config.chi2_end and state.chi2 <= config.chi2_end and self.is_past_growth and all_drawn:
-            return f"residual chi² reached the noise ({state.chi2:.3f})"
+        if config.chi2_end and state.fit.chi2 <= config.chi2_end and self.is_past_growth and all_drawn:
+            return f"residual chi² reached the noise ({state.fit.chi2:.3f})"
         if state.steps_done >= config.steps:
-            return f"all {config.steps} steps done (residual chi² {state.chi2:.2f})"
+            return f"all {config.steps} steps done (residual chi² {state.fit.chi2:.2f})"
         return ""
 
     @torch_on_one_thread()
@@ -250,8 +230,8 @@ class Trainer:
         check_joinable(self.setup.config)
         began = time.monotonic()
         every = self._given + frames
-        joined, fresh = self._prepared(every, self.state.poses)
-        join(self.setup, self.state, joined, fresh, HOLD)
+        joined, fresh = self._prepared(every, self.state.poses.corrections)
+        join(self.setup, self.state, joined, fresh)
         self.setup, self._given = joined, every
         self.state.seconds += time.monotonic() - began
 
@@ -269,9 +249,9 @@ class Trainer:
         for good (docs/experiments/078).
         """
         began = time.monotonic()
-        release(self.setup, self.state, HOLD)
+        release(self.setup, self.state)
         if self.state.has_joined:
-            self.setup, fresh = self._prepared(self._given, self.state.poses)
+            self.setup, fresh = self._prepared(self._given, self.state.poses.corrections)
             self.state = begun_again(self.state, fresh)
             log.info("%d frames: the schedule begins again", len(self.setup.frames))
         self.state.seconds += time.monotonic() - began
@@ -281,15 +261,15 @@ class Trainer:
     ) -> tuple[TrainingSetup, TrainingState]:
         """Return setup and first state of a training of frames that begin with those of this one, with their poses."""
         given = (self._stated, self.setup.asked, self.setup.seed, self.setup.silhouettes)
-        return prepare(frames, *given, poses)
+        setup, start = prepare(frames, *given, poses)
+        return setup, TrainingState.first(setup, start, poses)
 
     @property
     def pose_estimate(self) -> PoseEstimate | None:
         """What was found of the poses so far, by the last pictures that were asked; None where they are as tagged."""
-        if self.state.poses is None:
-            return None
-        return self.state.poses.estimate(self.setup.frames).of_frames(
-            pose_rounds.fitting(self.setup, self.state)
+        poses = self.state.poses.corrections
+        return (
+            None if poses is None else poses.estimate(self.setup.frames).of_frames(self.state.order.fitting)
         )
 
     @property
@@ -322,12 +302,12 @@ class Trainer:
             Diverged: no Gaussian is finite.
         """
         setup, state = self.setup, self.state
-        decisions.drop_not_finite(state)
-        factor = state.unseen_factor
-        if decisions.is_keeping_unseen(setup, state):  # ended before they were trained on
-            factor = decisions.unseen_factor(setup, state)
+        state.drop_not_finite(setup)
+        fit, factor = state.fit, state.fit.unseen_factor
+        if state.keeps_unseen(setup):  # ended before they were trained on
+            factor = fit.unseen(state.model, setup, state.order.validation_brackets)
         gaussians, removed = self.gaussians, 0
-        if setup.config.outlier_filter:
+        if setup.config.published.outlier_filter:
             stray = outliers(gaussians)
             removed = int(stray.sum())
             gaussians = gaussians.select(torch.nonzero(~stray)[:, 0])
@@ -338,17 +318,17 @@ class Trainer:
             stop_reason=stop_reason,
             start=setup.start,
             budget=setup.budget,
-            appearance=described(state.gaussians, state.appearance_reason, state.highlights_reason),
+            appearance=described(state.gaussians, state.harmonics.reason, state.highlights.reason),
             growth=f"until step {min(state.steps_done, round(setup.config.steps_until(setup.config.growth.end)))}",
-            poses=state.pose_report,
-            pose_estimate=pose_rounds.estimate(setup, state),
+            poses=state.poses.report,
+            pose_estimate=state.poses.estimate(setup, state.model, state.order),
             exposing=self.exposing,
-            misfit=None if state.misfit is None else state.misfit * (1.0 if factor is None else factor),
+            misfit=None if fit.misfit is None else fit.misfit * (1.0 if factor is None else factor),
             unseen_factor=factor,
             sky_level=setup.sky_level,
             sun_span_deg=setup.sun_span_deg,
             dark_frames=setup.dark_frames,
-            misfit_frames=[setup.frames[i].id for i in state.misfits],
+            misfit_frames=[setup.frames[i].id for i in state.order.left_out],
             removed_outliers=removed,
             removed_not_finite=state.removed_not_finite,
             seconds=state.seconds,
@@ -356,22 +336,17 @@ class Trainer:
 
     def save(self, path: Path) -> None:
         """Write everything that the next step depends on, whole or not at all."""
-        self.state.save(path, self.setup.identity)
+        self.state.save(path, Identity.of(self.setup))
 
     def resume(self, path: Path) -> bool:
         """Go on from a checkpoint of this very training; return False when there is none."""
-        state = TrainingState.load(path, self.setup.identity)
+        state = TrainingState.load(path, Identity.of(self.setup))
         if state is None:
             return False
         self.state = state
-        if state.placed_by is not None:
-            self.setup, _ = self._prepared(self._given, state.placed_by)
+        if state.poses.placed_by is not None:
+            self.setup, _ = self._prepared(self._given, state.poses.placed_by)
         return True
-
-
-def _running(mean: float, value: float) -> float:
-    """Return a running mean after one more value."""
-    return MEMORY * mean + (1 - MEMORY) * value
 
 
 def _seconds_left(state: TrainingState, config: MethodConfig) -> float:
@@ -385,10 +360,10 @@ def _seconds_left(state: TrainingState, config: MethodConfig) -> float:
             for (start, scale, frames), until in zip(stages, ends, strict=True)
         )
 
-    held = state.holds * work(*(round(config.steps_until(share)) for share in (HELD_FROM, HELD_AT)))
+    again = state.poses.set_backs * work(*(round(config.steps_until(s)) for s in (SET_BACK_TO, SET_BACK_AT)))
     before = state.history[-PACE_STEPS] if len(state.history) >= PACE_STEPS else None
     if before is not None and before.step >= state.steps_done:  # the schedule was set back since
         before = None
     since, spent = (before.step, state.seconds - before.seconds) if before else (0, state.seconds)
-    left = work(state.steps_done, config.steps) + held
+    left = work(state.steps_done, config.steps) + again
     return spent / max(work(since, state.steps_done), 1e-9) * left

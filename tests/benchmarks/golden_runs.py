@@ -25,7 +25,7 @@ from tests.scenes import SENSOR, photographed, tagged, target
 
 SMALL = {"steps": 120, "start.count": 400, "growth.max_gaussians": 900}
 # the published schedules in a hundredth of their steps
-PUBLISHED = SMALL | {"growth.interval": 6, "growth.opacity_reset_interval": 40, "growth.begin": 0.1}
+PUBLISHED = SMALL | {"growth.interval": 6, "published.opacity_reset_interval": 40, "growth.begin": 0.1}
 MANY_EXPECTED = {"sparse.dropout": 0.0, "sparse.sky_weight": 0.0}
 
 
@@ -47,7 +47,7 @@ def published(method: str, **changes) -> Trainer:
 
 
 def multi_view() -> Trainer:
-    return published("mvgs", **{"coarse": ((1 / 4, 6, 0.1), (1 / 2, 4, 0.1)), "frames_per_step": 3})
+    return published("mvgs", **{"published.coarse": ((1 / 4, 6, 0.1), (1 / 2, 4, 0.1)), "frames_per_step": 3})
 
 
 def before_grey() -> Trainer:

@@ -22,7 +22,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 from obbgs_core.start.initialisation import StartSettings
-from obbgs_core.train import decisions, setup, trainer
+from obbgs_core.train import fit, growth, setup, trainer
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
@@ -37,8 +37,8 @@ SENSOR = Sensor(black_dn=64, white_dn=4095, dn_per_radiance_s=2e7, electrons_per
 PARTS = {
     "loss_forward": [(trainer, "image_loss")],
     "adam": [(Adam, "step")],
-    "growth": [(decisions, "observe"), (decisions, "change_number"), (decisions, "select_model")],
-    "figures": [(Trainer, "_measure")],
+    "growth": [(growth.Growth, "observe"), (Trainer, "_decide")],
+    "figures": [(fit.Fit, "observe")],
 }
 COLUMNS = (
     "rasterizer_forward",
@@ -127,7 +127,7 @@ def frames(distance: float) -> list[TrainingFrame]:
 
 
 def first_gaussians(
-    _frames, _outlines, _sensor, _settings: StartSettings, sh_degree: int, _rng
+    _frames, _outlines, _sensor, _settings: StartSettings, sh_degree: int, _rng, _grey: bool = False
 ) -> tuple[Gaussians, float, str]:
     """Return the frames' own Gaussians, with as many colour coefficients as the method has, and their radius, m."""
     truth = scene(GAUSSIANS)

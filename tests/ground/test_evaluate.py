@@ -30,7 +30,7 @@ from obbgs_core.train.result import Exposing
 from tests.commands import call
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
-QUICK = {"steps": 30, "start.count": 500, "growth.max_gaussians": 600, "light.sh_degree": 0}
+QUICK = {"steps": 30, "start.count": 500, "growth.max_gaussians": 600, "published.sh_degree": 0}
 
 
 def run_of(folder: Path, wanted=lambda frame: True) -> Path:

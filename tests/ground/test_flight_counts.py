@@ -33,7 +33,7 @@ from hil.links.virtual_serial import VirtualSerial
 from tests.dictionary_packets import packets
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
-QUICK = {"steps": 10, "start.count": 300, "growth.max_gaussians": 300, "light.sh_degree": 0}
+QUICK = {"steps": 10, "start.count": 300, "growth.max_gaussians": 300, "published.sh_degree": 0}
 NS = 1_000_000_000
 START_NS = 1_784_631_150 * NS
 

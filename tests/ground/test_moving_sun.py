@@ -25,6 +25,7 @@ from ground.session.writer import SessionWriter
 from ground.show.report.document import write_report
 from obbgs_core.batches import Batches
 from obbgs_core.errors import ReconstructionError
+from obbgs_core.evidence.gains import next_degree_gain
 from obbgs_core.frames import TrainingFrame, sun_span_deg
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.io.ply import display_sh, load_ply, save_ply
@@ -35,10 +36,9 @@ from obbgs_core.render import lit_from, render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.appearance import TURNING_SPAN_DEG
-from obbgs_core.train.neighbours import Neighbours, normals_apart
-from obbgs_core.train.parsimony import next_degree_gain
+from obbgs_core.train.objective import Neighbours, normals_apart
 from obbgs_core.train.presets import preset
+from obbgs_core.train.setup import TURNING_SPAN_DEG
 from obbgs_core.train.trainer import Trainer, train
 from tests import ply_by_trimesh
 from tests.session_frames import forget_session_facts
@@ -276,8 +276,8 @@ def test_light_that_follows_the_sun_asks_for_its_harmonics_and_constant_light_do
     plain = dataclasses.replace(lit, sh=lit.sh[:, :1])
     for truth, spread_deg, justified in ((lit, 60, True), (plain, 60, False), (plain, 8, False)):
         batches = Batches(shown(truth, spread_deg), SENSOR.white_dn)
-        gain, penalty = next_degree_gain(plain, batches, SENSOR, torch.Generator().manual_seed(0))
-        assert (gain > penalty) == justified, (gain, penalty)
+        evidence = next_degree_gain(plain, batches, SENSOR, torch.Generator().manual_seed(0))
+        assert bool(evidence.justifies) == justified, evidence
 
 
 def test_under_the_sun_neighbours_are_as_smooth_as_asked_for(moving):

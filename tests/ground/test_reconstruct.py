@@ -36,7 +36,7 @@ from tests.session_frames import forget_session_facts
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
 TRAINED = {"steps": 700, "start.count": 2500, "growth.max_gaussians": 3000}
-QUICK = {"steps": 60, "start.count": 1500, "growth.max_gaussians": 2000, "light.sh_degree": 0}
+QUICK = {"steps": 60, "start.count": 1500, "growth.max_gaussians": 2000, "published.sh_degree": 0}
 
 
 def copy_session(to: Path) -> Path:

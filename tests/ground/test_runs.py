@@ -39,7 +39,7 @@ from obbgs_core.train.presets import PRESETS, QUALITIES
 from obbgs_core.train.result import StepInfo
 
 GOLDEN = Path(__file__).parents[1] / "golden"
-QUICK = {"steps": 8, "start.count": 600, "growth.max_gaussians": 800, "light.sh_degree": 0}
+QUICK = {"steps": 8, "start.count": 600, "growth.max_gaussians": 800, "published.sh_degree": 0}
 FILES = {"model.ply", "model.spz", "splats.glb", "model.glb", "surface.ply", "model.onnx"}
 
 
@@ -442,9 +442,12 @@ def test_the_methods_of_a_mission_file_are_those_of_the_ground():
         (["rates.means=fast"], r"rates\.means: expected a number, got 'fast'"),
         (["start.kind=nowhere"], r"start\.kind: expected one of random, hull, got 'nowhere'"),
         (["start=hull"], "start: expected a mapping of keys, got 'hull'"),
-        (["light.sh_degree=9"], r"light\.sh_degree must be from 0 to 3, got 9"),
-        (["light.sh_degree=1", "light.sh_degree=2"], r"--set light\.sh_degree: is given twice"),
-        (["light.sh_degree=1", "light={sh_degree: 2}"], r"--set light\.sh_degree: is given twice"),
+        (["published.sh_degree=9"], r"published\.sh_degree must be from 0 to 3, got 9"),
+        (["published.sh_degree=1", "published.sh_degree=2"], r"--set published\.sh_degree: is given twice"),
+        (
+            ["published.sh_degree=1", "published={sh_degree: 2}"],
+            r"--set published\.sh_degree: is given twice",
+        ),
         (["parsimony.prune_at=[0.5"], r"--set parsimony\.prune_at: is not valid YAML"),
         (["steps=5"], "--set steps: is given by --steps too"),
     ],
@@ -455,10 +458,12 @@ def test_a_setting_that_is_not_there_or_of_the_wrong_kind_is_named(assignments, 
 
 
 def test_settings_have_the_types_that_the_method_wants():
-    assert set_changes(["rates.means=2e-3", "parsimony.prune_at=[0.5, 1]", "coarse=[[0.5, 12, 0.1]]"]) == {
+    assert set_changes(
+        ["rates.means=2e-3", "parsimony.prune_at=[0.5, 1]", "published.coarse=[[0.5, 12, 0.1]]"]
+    ) == {
         "rates.means": 0.002,
         "parsimony.prune_at": (0.5, 1.0),
-        "coarse": ((0.5, 12.0, 0.1),),
+        "published.coarse": ((0.5, 12.0, 0.1),),
     }
 
 

@@ -30,7 +30,7 @@ from tests.scenes import random_gaussians
 from tests.session_frames import forget_session_facts
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
-QUICK = {"steps": 30, "start.count": 500, "growth.max_gaussians": 600, "light.sh_degree": 0}
+QUICK = {"steps": 30, "start.count": 500, "growth.max_gaussians": 600, "published.sh_degree": 0}
 CANVAS = '[data-part="canvas"]'
 
 

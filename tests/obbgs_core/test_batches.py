@@ -1,6 +1,7 @@
 """The frames of each step: their averaged images, and the order in which they are drawn."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -9,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from obbgs_core.batches import Batches
-from obbgs_core.frames import averaged
-from obbgs_core.poses.evidence import validation_brackets
+from obbgs_core.evidence.poses import validation_brackets
+from obbgs_core.frames import TrainingFrame, averaged
 from obbgs_core.train.order import FrameOrder
 from tests.scenes import SENSOR, photographed, target
 
@@ -71,12 +72,16 @@ def test_smaller_pictures_have_the_size_of_their_cameras_and_their_sky(size_px, 
     assert (batch.sky[0] == 1).all() and (batch.sky[1] == 0).all()  # of frame 2 no silhouette is known
 
 
+def order_of(frames: list[TrainingFrame], kept_back: Sequence[list[int]] = ()) -> FrameOrder:
+    return FrameOrder([f.exposure_time_s for f in frames], True, list(kept_back))
+
+
 def test_validation_brackets_are_withheld_whole():
     exact = photographed(target(), 72)
     frames = [dataclasses.replace(f, bracket=i // 3) for i, f in enumerate(exact)]
     brackets = validation_brackets(frames)
     assert brackets == [[9, 10, 11], [30, 31, 32], [51, 52, 53]]
-    order, rng = FrameOrder.of(frames, True, brackets), torch.Generator().manual_seed(0)
+    order, rng = order_of(frames, brackets), torch.Generator().manual_seed(0)
     drawn = [i for _ in range(42) for i in order.draw(3, rng)]
     assert (
         sorted(drawn[:63]) == sorted(drawn[63:]) == sorted(set(range(72)) - {i for b in brackets for i in b})
@@ -86,10 +91,10 @@ def test_validation_brackets_are_withheld_whole():
 
 def test_frames_that_join_late_are_drawn_more_often_until_they_have_caught_up():
     frames = photographed(target(5), 24, size_px=8)
-    order, rng = FrameOrder.of(frames[:12], True, []), torch.Generator().manual_seed(0)
+    order, rng = order_of(frames[:12]), torch.Generator().manual_seed(0)
     order.draw(12 * 8, rng)
     assert set(order.visits.values()) == {8}
-    order = FrameOrder.of(frames, True, [], earlier=order)
+    order.extend([f.exposure_time_s for f in frames])
     drawn = order.draw(48, rng)  # a round: each of the old once, each of the new three times
     assert sorted(drawn) == sorted([*range(12), *[i for i in range(12, 24) for _ in range(3)]])
     for _ in range(20):
@@ -101,17 +106,13 @@ def test_frames_that_join_late_are_drawn_more_often_until_they_have_caught_up():
 
 def test_frames_that_were_there_from_the_start_are_drawn_once_a_round():
     frames = photographed(target(5), 12, size_px=8)
-    order, rng = FrameOrder.of(frames, True, []), torch.Generator().manual_seed(0)
+    order, rng = order_of(frames), torch.Generator().manual_seed(0)
     for _ in range(5):
         assert sorted(order.draw(12, rng)) == list(range(12))
 
 
 def exposed(times_s: list[float]) -> FrameOrder:
-    return FrameOrder.of(
-        [dataclasses.replace(photographed(target(5), 1, size_px=8)[0], exposure_time_s=t) for t in times_s],
-        True,
-        [],
-    )
+    return FrameOrder(times_s, True, [])
 
 
 AUTOMATIC = [0.02] * 85 + [0.016] * 13 + [1 / 60] * 13 + [0.025] * 7 + [0.0125]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from obbgs_core.published.compensation import Compensation, mapped, nearest
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.compensation import Compensation, mapped, nearest
 from obbgs_core.train.result import Exposing
 
 SENSOR = Sensor(black_dn=10, white_dn=255, dn_per_radiance_s=2.45e6, electrons_per_dn=1e9, read_noise_dn=2)

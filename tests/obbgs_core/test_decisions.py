@@ -6,28 +6,28 @@ import pytest
 import torch
 
 from obbgs_core.batches import Batches
-from obbgs_core.frames import TrainingFrame, cameras_of
-from obbgs_core.misfit import Compared, stated_misfit
-from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.model.sh import from_radiance
-from obbgs_core.poses.evidence import CorrectionEvidence
-from obbgs_core.render import render
-from obbgs_core.train import decisions
-from obbgs_core.train.parsimony import (
+from obbgs_core.evidence import gains
+from obbgs_core.evidence.gains import (
     SHOWN_RADII,
     SHOWN_RADII_LAMBERT,
     VIEWS,
-    ParsimonySettings,
     justified,
     likelihood_gains,
     next_degree_gain,
     shown_frames,
 )
-from obbgs_core.train.poses import HELD_FROM, PoseDecision
+from obbgs_core.evidence.poses import CorrectionEvidence
+from obbgs_core.frames import TrainingFrame, cameras_of, sampling_rates
+from obbgs_core.misfit import Compared, stated_misfit
+from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.sh import from_radiance
+from obbgs_core.render import render
+from obbgs_core.train import poses
+from obbgs_core.train.fit import UNSEEN_UNTIL
+from obbgs_core.train.poses import SET_BACK_TO, PoseDecision
 from obbgs_core.train.presets import preset
-from obbgs_core.train.smoothing import sampling_rates
 from obbgs_core.train.trainer import Trainer, train
-from tests.scenes import QUICK, SENSOR, move_poses_in, photographed, tagged, target
+from tests.scenes import QUICK, SENSOR, decide, move_poses_in, photographed, tagged, target
 
 
 def test_the_likelihood_gain_of_a_gaussian_matches_removing_it():
@@ -35,7 +35,7 @@ def test_the_likelihood_gain_of_a_gaussian_matches_removing_it():
     frames = photographed(model, count=12)
     batches = Batches(frames, SENSOR.white_dn)
     rng = torch.Generator().manual_seed(1)
-    estimates = torch.stack([likelihood_gains(model, batches, SENSOR, rng)[0] for _ in range(60)])
+    estimates = torch.stack([likelihood_gains(model, batches, SENSOR, rng)[0].gain for _ in range(60)])
     exact = torch.zeros(len(model))
     for j in range(len(model)):
         fewer = model.select(torch.arange(len(model)) != j)
@@ -63,7 +63,7 @@ def test_the_pixels_that_show_a_gaussian_are_its_weights_in_the_reference_render
             alone = dataclasses.replace(model.detach(), sh=sh)
             weights = render(alone, cameras, backend="reference").radiance / 1e4
             most[j] = torch.maximum(most[j], weights.sum())
-    _, shown_px, _ = likelihood_gains(model, batches, SENSOR, torch.Generator().manual_seed(0))
+    _, shown_px = likelihood_gains(model, batches, SENSOR, torch.Generator().manual_seed(0))
     torch.testing.assert_close(shown_px, most, rtol=1e-3, atol=1e-3)
 
 
@@ -85,12 +85,13 @@ def test_opaque_gaussians_are_pruned_where_no_picture_shows_them_and_dark_ones_a
     both = Gaussians.concatenate([dark, dust])
     both.opacity_logits[:] = 3.0
     rng = torch.Generator().manual_seed(0)
-    settings = ParsimonySettings(keep_above_opacity=0.65)
-    kept = justified(both, Batches(frames, SENSOR.white_dn), SENSOR, settings, 1.0, rng)
+    kept = justified(both, Batches(frames, SENSOR.white_dn), SENSOR, 1.0, 0.65, rng)
     assert kept.tolist() == [True] * 8 + [False] * 8
 
 
-def test_opaque_gaussians_are_pruned_by_what_they_show_of_the_target_and_sooner_under_a_moving_sun():
+def test_opaque_gaussians_are_pruned_by_what_they_show_of_the_target_and_sooner_under_a_moving_sun(
+    monkeypatch,
+):
     """The same picture of a larger target: what was more than a strip of it is less."""
     model = dataclasses.replace(target(8, seed=2).detach(), footprint="camera")
     model.opacity_logits[:] = 3.0
@@ -98,14 +99,14 @@ def test_opaque_gaussians_are_pruned_by_what_they_show_of_the_target_and_sooner_
     frames = [dataclasses.replace(f, sun_dir=sun) for f in photographed(model, count=12)]
     batches = Batches(frames, SENSOR.white_dn)
     # no likelihood is enough
-    settings = ParsimonySettings(keep_above_opacity=0.65, bic_factor=1e12)
-    _, shown_px, _ = likelihood_gains(model, batches, SENSOR, torch.Generator().manual_seed(0))
+    monkeypatch.setattr(gains, "bic_penalty", lambda *_: 1e12)
+    _, shown_px = likelihood_gains(model, batches, SENSOR, torch.Generator().manual_seed(0))
     per_m = sampling_rates(model.means.median(dim=0).values[None], frames).item()
     for shading, radii in (("view", SHOWN_RADII), ("lambert", SHOWN_RADII_LAMBERT)):
         gaussians = dataclasses.replace(model, shading=shading)
         for least_px, shown in ((0.8 * shown_px.min().item(), True), (1.2 * shown_px.max().item(), False)):
             rng = torch.Generator().manual_seed(0)
-            kept = justified(gaussians, batches, SENSOR, settings, least_px / radii / per_m, rng)
+            kept = justified(gaussians, batches, SENSOR, least_px / radii / per_m, 0.65, rng)
             assert kept.tolist() == [shown] * len(model)
 
 
@@ -114,12 +115,10 @@ def test_colour_that_turns_with_the_view_justifies_harmonics_and_plain_colour_do
     turning = Gaussians(
         **{**plain.tensors(), "sh": torch.cat([plain.sh, torch.full((10, 3, 1), 0.3)], dim=1)}
     )
-    gains = []
-    for seen in (plain, turning):
+    for seen, justifies in ((plain, False), (turning, True)):
         batches = Batches(photographed(seen, 24), SENSOR.white_dn)
-        gains.append(next_degree_gain(plain, batches, SENSOR, torch.Generator().manual_seed(0)))
-    assert gains[0][0] < gains[0][1]
-    assert gains[1][0] > gains[1][1]
+        evidence = next_degree_gain(plain, batches, SENSOR, torch.Generator().manual_seed(0))
+        assert bool(evidence.justifies) == justifies
 
 
 # with these a training of `tagged` frames tells right poses from wrong ones
@@ -128,25 +127,30 @@ TELLING = {
     "start.count": 1500,
     "growth.max_gaussians": 2000,
     "poses.refine": "auto",
-    "poses.refine_from": 0.4,
 }
 
 
+@pytest.fixture
+def tested_late(monkeypatch):
+    monkeypatch.setattr(poses, "REFINED_FROM", 0.4)
+
+
+@pytest.mark.usefixtures("tested_late")
 @pytest.mark.parametrize("wrong", [True, False])
 def test_wrong_poses_are_refined_and_exact_ones_are_left_alone(wrong):
     frames = tagged(photographed(target(80, seed=5), 42), wrong, sigma_rad=0.01)
     trainer = Trainer(frames, SENSOR, preset("obbgs", TELLING))
-    while trainer.state.pose_decision is PoseDecision.OPEN:
+    while trainer.state.poses.decision is PoseDecision.OPEN:
         assert trainer.state.order.validation_brackets == [[i] for i in range(3, 42, 7)]
         trainer.step()
     assert trainer.state.order.validation_brackets == [] and trainer.state.history[-1].step == 161
     assert trainer.state.steps_done == (
-        400 * HELD_FROM if wrong else 161
+        400 * SET_BACK_TO if wrong else 161
     )  # a refinement sets the schedule back
-    assert trainer.state.pose_decision is (PoseDecision.REFINED if wrong else PoseDecision.TAGS_HOLD)
-    assert trainer.state.pose_report.startswith("refined (step 161" if wrong else "as tagged (step 161")
-    assert (trainer.state.poses is not None) == wrong
-    assert trainer.result("").poses == trainer.state.pose_report
+    assert trainer.state.poses.decision is (PoseDecision.REFINED if wrong else PoseDecision.TAGS_HOLD)
+    assert trainer.state.poses.report.startswith("refined (step 161" if wrong else "as tagged (step 161")
+    assert (trainer.state.poses.corrections is not None) == wrong
+    assert trainer.result("").poses == trainer.state.poses.report
     # who was drawn how often is not forgotten: frames that join late are drawn more often
     order = trainer.state.order
     assert sum(order.visits.values()) == order.turn > 0
@@ -169,45 +173,49 @@ def own_error(model: Gaussians, frames: list[TrainingFrame], indices: list[int])
     return stated_misfit(compared, SENSOR)
 
 
+@pytest.mark.usefixtures("tested_late")
 @pytest.mark.parametrize("tags", ["exact", "uncertain, and no evidence against them"])
 def test_where_the_sun_moves_brackets_not_yet_seen_tell_the_models_own_error(tags, monkeypatch):
     no_evidence = CorrectionEvidence(torch.tensor([-1.0, -2.0, -3.0]))
-    monkeypatch.setattr(decisions, "correction_evidence", lambda *_: no_evidence)
+    monkeypatch.setattr(poses, "correction_evidence", lambda *_: no_evidence)
     frames, unseen = under_a_moving_sun()
     frames = frames if tags == "exact" else tagged(frames, wrong=False)
     trainer = Trainer(frames, SENSOR, preset("obbgs", TELLING))
     trainer.withhold()  # as where frames may join, of which none came
-    while trainer.state.steps_done <= TELLING["steps"] * decisions.UNSEEN_UNTIL:
-        model, misfit = trainer.state.model.copied(), trainer.state.misfit
-        trainer.state.chi2 = 0.5  # of noise alone: the training goes on until all frames are trained on
+    while trainer.state.steps_done <= TELLING["steps"] * UNSEEN_UNTIL:
+        model, misfit = trainer.state.model.copied(), trainer.state.fit.misfit
+        trainer.state.fit.chi2 = 0.5  # of noise alone: the training goes on until all frames are trained on
         assert trainer.stop_reason() == ""
         assert trainer.state.order.validation_brackets == [[i] for i in unseen]
-        assert trainer.state.unseen_factor is None
+        assert trainer.state.fit.unseen_factor is None
         trainer.step()
         assert not set(unseen) & set(trainer.state.order.visits)
     assert trainer.state.order.validation_brackets == [] and misfit is not None
     # of the model of one step before, and here of whole pictures
-    assert trainer.state.unseen_factor == pytest.approx(own_error(model, frames, unseen) / misfit, rel=0.25)
+    assert trainer.state.fit.unseen_factor == pytest.approx(
+        own_error(model, frames, unseen) / misfit, rel=0.25
+    )
     while not (reason := trainer.stop_reason()):
         trainer.step()
     assert set(unseen) <= set(trainer.state.order.visits)
     result = trainer.result(reason)
-    assert result.misfit == trainer.state.misfit * trainer.state.unseen_factor
-    assert result.unseen_factor == trainer.state.unseen_factor
+    assert result.misfit == trainer.state.fit.misfit * trainer.state.fit.unseen_factor
+    assert result.unseen_factor == trainer.state.fit.unseen_factor
 
 
+@pytest.mark.usefixtures("tested_late")
 def test_a_training_that_ends_before_states_the_error_on_the_brackets_that_it_has_not_seen():
     frames, unseen = under_a_moving_sun()
     trainer = Trainer(frames, SENSOR, preset("obbgs", TELLING))
     for _ in range(150):
         trainer.step()
     result = trainer.result("time limit of 1 s")
-    assert trainer.state.unseen_factor is None and result.unseen_factor is not None
+    assert trainer.state.fit.unseen_factor is None and result.unseen_factor is not None
     assert result.misfit == pytest.approx(own_error(result.gaussians, frames, unseen), rel=0.25)
 
 
 @pytest.mark.parametrize(
-    "changes", [{"loss.kind": "l1_ssim"}, {"loss.misfit": False}, {"compensation": True}]
+    "changes", [{"published.loss": "l1_ssim"}, {"loss.misfit": False}, {"published.compensation": True}]
 )
 def test_where_no_own_error_is_learnt_no_bracket_is_kept_back_for_it(changes):
     frames, _ = under_a_moving_sun()
@@ -223,9 +231,10 @@ def test_brackets_that_do_not_tell_an_error_leave_that_of_the_others(caplog):
     for i in unseen:  # nothing but full scale is read
         trainer.setup.batches.frames[i].dn.fill_(SENSOR.white_dn)
     trainer.setup.batches._images.clear()
-    assert decisions.unseen_factor(trainer.setup, trainer.state) is None
+    decide(trainer, trainer.state.fit)
+    assert trainer.state.fit.unseen_factor is None and trainer.state.order.validation_brackets == []
     assert "do not tell the model's own error" in caplog.text
-    assert trainer.state.misfit == Trainer.result(trainer, "").misfit
+    assert trainer.state.fit.misfit == Trainer.result(trainer, "").misfit
 
 
 def test_with_exact_poses_or_few_frames_no_bracket_is_kept_for_validation():
@@ -234,9 +243,9 @@ def test_with_exact_poses_or_few_frames_no_bracket_is_kept_for_validation():
     for frames, why in ((exact, "the tags are exact"), (tagged(exact, True)[:23], "too few brackets")):
         trainer = Trainer(frames, SENSOR, config)
         assert (
-            why in trainer.state.pose_report
+            why in trainer.state.poses.report
             and not trainer.state.order.validation_brackets
-            and trainer.state.poses is None
+            and trainer.state.poses.corrections is None
         )
     assert "before this was decided" in Trainer(tagged(exact, True), SENSOR, config).result("").poses
 
@@ -244,8 +253,9 @@ def test_with_exact_poses_or_few_frames_no_bracket_is_kept_for_validation():
 @pytest.mark.parametrize("killed_at", [12, 19, 35])
 def test_a_training_killed_about_its_decisions_resumes_to_the_same_model(tmp_path, monkeypatch, killed_at):
     move_poses_in(monkeypatch, 8)  # else poses move in each of so few steps
+    monkeypatch.setattr(poses, "REFINED_FROM", 0.35)
     frames = tagged(photographed(target(), 28), True)
-    changes = {"poses.refine": "auto", "poses.refine_from": 0.35, "growth.interval": 5}
+    changes = {"poses.refine": "auto", "growth.interval": 5}
     config = preset("obbgs", QUICK | changes | {"parsimony.prune_at": (0.5,)})
     whole = train(frames, SENSOR, config, seed=3)
     first = Trainer(frames, SENSOR, config, seed=3)

@@ -14,11 +14,13 @@ from scipy.spatial.transform import Rotation
 from obbgs_core import obb
 from obbgs_core.model import sh
 from obbgs_core.model.rotations import multiply, quats_to_matrices
+from obbgs_core.published.growth import grow, outliers
 from obbgs_core.score.metrics import cloud_distances
 from obbgs_core.sensor import Sensor
 from obbgs_core.start import hull, initialisation
 from obbgs_core.train.adam import Adam
-from obbgs_core.train.growth import grow, keep, outliers, split_long_axis
+from obbgs_core.train.growth import split_long_axis
+from obbgs_core.train.parts import Change
 from tests.scenes import random_gaussians
 
 
@@ -176,14 +178,19 @@ def test_growth_clones_the_small_splits_the_large_and_carries_the_moments():
     adam.first["means"][:] = torch.arange(10.0)[:, None]
     chosen = torch.zeros(10, dtype=torch.bool)
     chosen[[2, 3]] = True
-    grown, unsplit = grow(gaussians, adam, chosen, split_over_m=0.5, rng=torch.Generator().manual_seed(0))
+    grown, unsplit = grow(gaussians, chosen, split_over_m=0.5, rng=torch.Generator().manual_seed(0))
+    change = Change(grown, unsplit)
+    adam.apply(change)
     assert unsplit.tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
     assert len(grown) == 12  # one clone added, one split into two
     torch.testing.assert_close(grown.means[9], gaussians.means[2])
     torch.testing.assert_close(grown.scales[10:], gaussians.scales[[3, 3]] / 1.6)
     assert adam.first["means"][:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9, 0, 0, 0]
-    kept = keep(grown, adam, torch.arange(12) != 5)
-    assert len(kept) == 11 and adam.second["sh"].shape[0] == 11 and kept.means.requires_grad
+    fewer = change.then_only(torch.arange(12) != 5)
+    assert fewer.kept is not None and fewer.kept.tolist() == [0, 1, 2, 4, 5, 7, 8, 9] and fewer.added == 3
+    assert torch.equal(fewer.model.means, torch.cat([grown.means[:5], grown.means[6:]]))
+    adam.apply(Change.only(grown, torch.arange(12) != 5, ""))
+    assert adam.second["sh"].shape[0] == 11
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -194,7 +201,7 @@ def test_two_along_the_longest_axis_have_the_mean_and_the_covariance_of_the_one(
     with torch.no_grad():
         gaussians.log_scales += torch.from_numpy(rng.normal(size=(6, 3))).float()
     growing = torch.tensor([False, True, False, True, True, False])
-    grown, kept = split_long_axis(gaussians, Adam(gaussians), growing)
+    grown, kept = split_long_axis(gaussians, growing)
     assert kept.tolist() == [0, 2, 5] and len(grown) == 9
     with torch.no_grad():
         torch.testing.assert_close(grown.means[:3], gaussians.means[kept])

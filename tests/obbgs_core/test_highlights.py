@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from obbgs_core.evidence.highlights import first_lobes
 from obbgs_core.frames import cameras_of
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.io.ply import display_sh, load_ply, save_ply
@@ -20,9 +21,8 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import lit_from, native_kernels, render
 from obbgs_core.render.highlights import highlights_along, lobe, shortest_axes
 from obbgs_core.render.lighting import radiance_along
-from obbgs_core.train import decisions
+from obbgs_core.train import selection
 from obbgs_core.train.adam import Adam
-from obbgs_core.train.glints import first_lobes
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
@@ -33,7 +33,7 @@ from tests.obbgs_core.test_render import (
     random_gaussians,
     under_the_sun,
 )
-from tests.scenes import SENSOR, ball, photographed, target
+from tests.scenes import SENSOR, ball, decide, photographed, target
 from tests.scenes import random_gaussians as any_gaussians
 
 needs_native = pytest.mark.skipif(not native_kernels(), reason="the compiled rasterizer is not installed")
@@ -258,7 +258,7 @@ def _trained(frames, changes=None) -> Trainer:
 
 @pytest.fixture
 def tested_early(monkeypatch):
-    monkeypatch.setattr(decisions, "FEWEST_STEPS", 10)
+    monkeypatch.setattr(selection, "FEWEST_STEPS", 10)
 
 
 @pytest.mark.usefixtures("tested_early")
@@ -297,9 +297,9 @@ def test_the_true_shapes_get_highlights_where_the_frames_show_them(shiny_frames,
     frames = shiny_frames if shiny else photographed(target(30), 90, size_px=32, focal_px=65.0)
     trainer = _trainer(frames)
     before, random = trainer.state.gaussians, trainer.state.rng.get_state()
-    decisions.add_highlights(trainer.setup, trainer.state)
+    decide(trainer, trainer.state.highlights)
     after = trainer.state.gaussians
-    assert after.has_highlights == shiny and trainer.state.highlights_reason
+    assert after.has_highlights == shiny and trainer.state.highlights.reason
     assert torch.equal(
         trainer.state.rng.get_state(), random
     )  # a matt target is trained as if there were no test
@@ -323,7 +323,7 @@ def test_under_a_told_sun_that_stands_still_an_axis_is_the_normal_of_a_mirror(mo
     other = torch.tensor([0.0, 0.6, 0.8]) if moves else STATIC_SUN
     frames = [dataclasses.replace(f, sun_dir=other if i == 50 else STATIC_SUN) for i, f in enumerate(frames)]
     trainer = _trainer(frames)
-    decisions.add_highlights(trainer.setup, trainer.state)
+    decide(trainer, trainer.state.highlights)
     after = trainer.state.gaussians
     assert after.has_highlights
     assert (
@@ -353,9 +353,9 @@ def test_under_a_moving_sun_lobes_that_other_brackets_do_not_confirm_lie_along_t
     frames = photographed(truth, 90, size_px=32, focal_px=65.0, suns=suns)
     trainer = _trainer(frames, {"light.sun_shading": "linear"})
     trainer.state.gaussians = dataclasses.replace(trainer.state.gaussians, shading="sun").trainable()
-    decisions.add_highlights(trainer.setup, trainer.state)
+    decide(trainer, trainer.state.highlights)
     after = trainer.state.gaussians
-    assert after.lobes.shape == (30, 1) and "along the normals" in trainer.state.highlights_reason
+    assert after.lobes.shape == (30, 1) and "along the normals" in trainer.state.highlights.reason
     weights = after.lobes.detach().exp().mean()
     for _ in range(10):
         trainer.step()
@@ -380,7 +380,7 @@ def test_a_lobe_along_the_normal_is_one_whose_axis_is_the_shortest_on_either_sid
 
 def test_short_trainings_do_not_test_for_highlights(shiny_frames):
     trainer = _trained(shiny_frames)
-    assert not trainer.gaussians.has_highlights and not trainer.state.highlights_reason
+    assert not trainer.gaussians.has_highlights and not trainer.state.highlights.reason
 
 
 @pytest.mark.usefixtures("tested_early")
@@ -400,10 +400,10 @@ def test_highlights_that_few_frames_do_not_show_are_found_when_more_have_joined(
     trainer = _trainer(shiny_frames[:6])
     for _ in range(40):
         trainer.step()
-    assert not trainer.gaussians.has_highlights and trainer.state.highlights_frames == 6
+    assert not trainer.gaussians.has_highlights and trainer.state.highlights.frames == 6
     trainer.join(shiny_frames[6:8])
     trainer.step()
-    assert trainer.state.highlights_frames == 6  # too few more to ask again
+    assert trainer.state.highlights.frames == 6  # too few more to ask again
     trainer.join(shiny_frames[8:])
     trainer.step()
-    assert trainer.state.highlights_frames == 90 and trainer.gaussians.has_highlights
+    assert trainer.state.highlights.frames == 90 and trainer.gaussians.has_highlights

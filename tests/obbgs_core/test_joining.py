@@ -12,10 +12,10 @@ from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.model.gaussians import TENSORS, Gaussians
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
-from obbgs_core.train.joining import NEW_SPACINGS, SETTLED_ROUNDS
-from obbgs_core.train.poses import HOLDS, PoseDecision
+from obbgs_core.train.joining import JOINED_AT, NEW_SPACINGS, SETTLED_ROUNDS
+from obbgs_core.train.poses import SET_BACKS, PoseDecision
 from obbgs_core.train.presets import preset
-from obbgs_core.train.trainer import HOLD, Trainer
+from obbgs_core.train.trainer import Trainer
 from tests.scenes import EXPOSURES_S, QUICK, SENSOR, SIZE_PX, photographed, tagged, target
 
 STEPS = 120
@@ -54,7 +54,7 @@ def test_a_training_that_frames_joined_ends_as_good_as_one_that_had_them_from_th
     """Measured: 27.4 dB with frames that joined, 28.5 dB with all from the start, 19.1 dB with the first four alone."""
     unseen = photographed(target(), 8, seed=9)
     joined = trained(frames, [12, 24, 36], 20)
-    assert joined.state.steps_done <= round(HOLD * STEPS) + 20
+    assert joined.state.steps_done <= round(JOINED_AT * STEPS) + 20
     scores = {}
     whole, few = Trainer(frames, SENSOR, CONFIG, seed=3), Trainer(frames[:4], SENSOR, CONFIG, seed=3)
     for name, trainer in (("joined", joined), ("whole", whole), ("few", few)):
@@ -76,7 +76,7 @@ def test_joining_keeps_what_was_learnt_and_sets_the_schedule_back(frames):
     for name in TENSORS:
         assert torch.equal(getattr(before, name)[old], getattr(after, name)[new]), name
     assert torch.equal(trainer.state.adam.second["means"][new], moments[old])
-    assert trainer.state.steps_done == round(HOLD * STEPS) and len(trainer.state.history) == 70
+    assert trainer.state.steps_done == round(JOINED_AT * STEPS) and len(trainer.state.history) == 70
     assert len(trainer.setup.frames) == 36
     early = trained(frames, [18], 10)
     early.join(frames[18:])
@@ -205,16 +205,16 @@ def test_brackets_that_decide_on_the_poses_have_never_been_trained_on(frames):
     trainer = Trainer(doubted[:6], SENSOR, config)
     trainer.withhold()
     for first in range(6, 42, 6):
-        assert trainer.state.pose_decision is (
+        assert trainer.state.poses.decision is (
             PoseDecision.TOO_FEW_BRACKETS if first < 24 else PoseDecision.OPEN
         )
-        assert trainer.state.poses is None
+        assert trainer.state.poses.corrections is None
         drawn = {index for group in trainer.state.order.groups for index in group}
         assert drawn == {i for i in range(first) if i % 7 != 3}
         trainer.join(doubted[first : first + 6])
-    while trainer.state.pose_decision is PoseDecision.OPEN:
+    while trainer.state.poses.decision is PoseDecision.OPEN:
         trainer.step()
-    assert "that a validation bracket's pose errs" in trainer.state.pose_report
+    assert "that a validation bracket's pose errs" in trainer.state.poses.report
     assert sorted(index for group in trainer.state.order.groups for index in group) == list(range(42))
 
 
@@ -223,11 +223,14 @@ def test_corrections_of_brackets_are_kept_when_others_join(frames):
     trainer = Trainer(doubted[:18], SENSOR, preset("obbgs", QUICK | {"poses.refine": "always"}))
     for _ in range(24):  # every frame has spoken at least once
         trainer.step()
-    assert trainer.state.poses is not None
-    before = trainer.state.poses.value.clone()
+    assert trainer.state.poses.corrections is not None
+    before = trainer.state.poses.corrections.value.clone()
     trainer.join(doubted[18:])
-    assert before.any() and torch.equal(trainer.state.poses.value[:18], before)
-    assert trainer.state.poses.value.shape == (36, 6) and not trainer.state.poses.value[18:].any()
+    assert before.any() and torch.equal(trainer.state.poses.corrections.value[:18], before)
+    assert (
+        trainer.state.poses.corrections.value.shape == (36, 6)
+        and not trainer.state.poses.corrections.value[18:].any()
+    )
     trainer.step()
 
 
@@ -236,16 +239,16 @@ def test_refined_poses_are_what_the_training_begins_again_with(frames):
     trainer = Trainer(doubted[:30], SENSOR, preset("obbgs", QUICK | {"poses.refine": "always"}))
     for _ in range(24):
         trainer.step()
-    rounds = trainer.state.pose_rounds
+    rounds = trainer.state.poses.moved
     assert rounds > 1
     trainer.join(doubted[30:])
-    assert trainer.state.pose_rounds == pytest.approx(rounds * 30 / 36)
-    before = trainer.state.poses.value.clone()
-    for many, holds in ((SETTLED_ROUNDS, 0), (SETTLED_ROUNDS - 1, HOLDS)):
-        trainer.state.pose_rounds, trainer.state.has_joined = many, True
+    assert trainer.state.poses.moved == pytest.approx(rounds * 30 / 36)
+    before = trainer.state.poses.corrections.value.clone()
+    for many, holds in ((SETTLED_ROUNDS, 0), (SETTLED_ROUNDS - 1, SET_BACKS)):
+        trainer.state.poses.moved, trainer.state.has_joined = many, True
         trainer.end_joining()
-        assert torch.equal(trainer.state.poses.value, before) and before.any()
-        assert trainer.state.steps_done == 0 and trainer.state.holds == holds
+        assert torch.equal(trainer.state.poses.corrections.value, before) and before.any()
+        assert trainer.state.steps_done == 0 and trainer.state.poses.set_backs == holds
     trainer.step()
 
 
@@ -256,7 +259,7 @@ def test_too_few_brackets_to_decide_are_trained_on_when_no_more_come(frames):
     assert trainer.state.order.validation_brackets == [[3], [10], [17]]
     trainer.end_joining()
     assert sorted(index for group in trainer.state.order.groups for index in group) == list(range(18))
-    assert trainer.state.pose_decision is PoseDecision.TOO_FEW_BRACKETS
+    assert trainer.state.poses.decision is PoseDecision.TOO_FEW_BRACKETS
 
 
 def test_a_sun_that_moves_only_later_is_tested_then(frames):

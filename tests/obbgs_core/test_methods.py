@@ -7,9 +7,9 @@ import torch
 from obbgs_core import obb
 from obbgs_core.frames import cameras_of
 from obbgs_core.model.cameras import Cameras
+from obbgs_core.published.multi_view import corner_rays, crossing_boxes, inside, threshold_factor
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
-from obbgs_core.train.multi_view import corner_rays, crossing_boxes, inside, threshold_factor
 from obbgs_core.train.presets import PRESETS, preset
 from obbgs_core.train.trainer import Trainer
 from tests.scenes import SENSOR, intrinsics, photographed, pose, target
@@ -95,7 +95,7 @@ def test_mvgs_goes_through_its_authors_four_trainings():
 )
 def test_coarse_stages_that_no_training_can_have_are_refused(coarse):
     with pytest.raises(ValueError, match="coarse must be triples of an image scale"):
-        preset("mvgs", {"coarse": coarse})
+        preset("mvgs", {"published.coarse": coarse})
 
 
 def cameras(*positions: tuple[float, float, float]) -> Cameras:

@@ -8,13 +8,12 @@ import torch
 from scipy import stats
 
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.train import pose_rounds
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.growth import Growth
-from obbgs_core.train.pose_rounds import MISFIT_DEVIATIONS, MISFIT_FACTOR, MISFIT_FROM, standing_out
+from obbgs_core.train.poses import FAR_DEVIATIONS, FAR_FACTOR, LEFT_OUT_FROM, standing_out
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
-from tests.scenes import QUICK, SENSOR, move_poses_in, photographed, tagged, target
+from tests.scenes import QUICK, SENSOR, decide, move_poses_in, now_of, photographed, tagged, target
 
 CONFIG = preset("obbgs", QUICK | {"poses.refine": "always"})
 
@@ -31,9 +30,10 @@ def trained(frames: list[TrainingFrame], monkeypatch: pytest.MonkeyPatch) -> Tra
     state = trainer.state
     state.gaussians = target(60, seed=5).trainable()
     state.adam, state.growth = Adam(state.gaussians), Growth.of(len(state.gaussians))
-    for share in (0.3, 0.5, MISFIT_FROM):
+    for share in (0.3, 0.5, LEFT_OUT_FROM):
         state.steps_done = round(share * CONFIG.steps)
-        pose_rounds.advance(trainer.setup, state, share)
+        assert state.poses.due(now_of(trainer))
+        decide(trainer, state.poses)
     return trainer
 
 
@@ -72,12 +72,12 @@ def test_residuals_stand_out_by_scipys_median_absolute_deviation():
     shares[40] = np.nanmedian(shares)  # thin structures: many deviations of the noise, but little light
     logs = np.log(residuals)
     spread = stats.median_abs_deviation(logs, scale="normal", nan_policy="omit")
-    limit = np.nanmedian(logs) + MISFIT_DEVIATIONS * spread
+    limit = np.nanmedian(logs) + FAR_DEVIATIONS * spread
     assert (logs > limit)[[5, 40]].all()
     found = standing_out(torch.from_numpy(residuals), torch.from_numpy(shares))
     assert found[5] and not found[7] and not found[40]
     np.testing.assert_array_equal(
-        found.numpy(), (logs > limit) & (shares > MISFIT_FACTOR * np.nanmedian(shares))
+        found.numpy(), (logs > limit) & (shares > FAR_FACTOR * np.nanmedian(shares))
     )
     far, shares = torch.tensor([1.0, 1.0, 1.0, 9.0, 9.0]), torch.tensor([0.0, 0.1, 0.1, 0.55, 0.65])
     assert standing_out(far, shares).tolist() == [False, False, False, False, True]

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.highlights import shortest_axes
-from obbgs_core.train.neighbours import Neighbours, normals_apart
+from obbgs_core.train.objective import Neighbours, normals_apart
 from tests.scenes import random_gaussians
 
 

@@ -12,6 +12,7 @@ from skimage import transform
 
 from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displaced_motion
 from obbgs_core.errors import ReconstructionError
+from obbgs_core.evidence.gains import justified
 from obbgs_core.frames import Navigation, TrainingFrame, cameras_of, usable
 from obbgs_core.losses import likelihood_loss
 from obbgs_core.model.gaussians import Gaussians
@@ -28,9 +29,7 @@ from obbgs_core.score.poses import moved, pose_errors, settled_poses
 from obbgs_core.start.alignment import _aligned, settled
 from obbgs_core.start.initialisation import silhouettes
 from obbgs_core.start.silhouette_coherence import _open_directions, coherence, most_coherent, seen_from
-from obbgs_core.train import decisions
-from obbgs_core.train.parsimony import justified
-from obbgs_core.train.poses import HELD_AT, HELD_FROM, HOLDS
+from obbgs_core.train.poses import SET_BACK_AT, SET_BACK_TO, SET_BACKS
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests import scenes
@@ -549,7 +548,7 @@ def test_a_training_finds_what_the_pass_shares(erring):
     assert after.pixels < 0.3 * before.pixels
     estimate, allowed = result.pose_estimate, SIGMAS.vector() > 0
     prior, posterior = estimate.shared_prior.vector()[allowed], estimate.shared_posterior.vector()[allowed]
-    assert trainer.state.poses is not None and trainer.state.poses.together is not None
+    assert trainer.state.poses.corrections is not None and trainer.state.poses.together is not None
     assert (posterior <= prior * (1 + 1e-6)).all() and posterior[9:].max() < 0.5 * prior[9:].max()
     # what leads from the tags back to the true poses is -ERRORS but for products of errors, a hundredth of a deviation
     off = (estimate.shared.vector() + ERRORS.vector())[allowed] / posterior
@@ -585,21 +584,19 @@ def test_pruning_sees_the_target_from_the_refined_poses(erring):
     true, wrong = erring
     settings = preset("obbgs", QUICK | {"poses.refine": "auto"})
     trainer, exact = (Trainer(frames, SENSOR, settings) for frames in (wrong, true))
-    trainer.state.poses._move_shared(wrong, -torch.from_numpy(ERRORS.vector()))
-    trainer.state.poses.value.zero_()
+    trainer.state.poses.corrections._move_shared(wrong, -torch.from_numpy(ERRORS.vector()))
+    trainer.state.poses.corrections.value.zero_()
     for one in (trainer, exact):
         one.state.gaussians = MODEL.trainable()
-    poses = torch.stack(
-        [f.world_to_camera for f in decisions.batches_at(trainer.setup, trainer.state).frames]
-    )
+    poses = torch.stack([f.world_to_camera for f in scenes.now_of(trainer).batches.frames])
     assert errors(poses, true).pixels < 0.3
     kept = [
         justified(
             one.state.model,
-            decisions.batches_at(one.setup, one.state),
+            scenes.now_of(one).batches,
             SENSOR,
-            dataclasses.replace(settings.parsimony, keep_above_opacity=1.0),
             one.setup.radius_m,
+            1.0,
             torch.Generator().manual_seed(0),
         )
         for one in (trainer, exact)
@@ -610,12 +607,12 @@ def test_pruning_sees_the_target_from_the_refined_poses(erring):
 
 def test_the_schedule_is_set_back_for_aligned_poses_as_often_as_it_says(erring):
     trainer = Trainer(erring[1], SENSOR, preset("obbgs", QUICK | {"poses.refine": "auto"}))
-    assert trainer.state.poses_aligned
+    assert trainer.state.poses.aligned
     seen = []
     while not trainer.stop_reason():
         info = trainer.step()
         assert 0 <= info.seconds_left < 1e4
         seen.append(info.step)
-    held_at, held_from = (round(share * 40) for share in (HELD_AT, HELD_FROM))
+    held_at, held_from = (round(share * 40) for share in (SET_BACK_AT, SET_BACK_TO))
     again = list(range(held_from + 1, held_at + 1))
-    assert seen == [*range(1, held_at + 1), *(HOLDS * again), *range(held_at + 1, 41)]
+    assert seen == [*range(1, held_at + 1), *(SET_BACKS * again), *range(held_at + 1, 41)]

@@ -36,15 +36,15 @@ def test_models_do_not_depend_on_how_long_pictures_take_to_say_what_they_know_of
 
     monkeypatch.setattr(Question, "answer", held_back)
     first = Trainer(doubted, SENSOR, CONFIG, seed=3)
-    while first.state.round is None:
+    while first.state.poses.round is None:
         first.step()
     first.step()  # without the answer
-    assert not answered and first.state.pose_rounds == 0
+    assert not answered and first.state.poses.moved == 0
     may_answer.set()
     first.save(tmp_path / "checkpoint")  # which waits for it
     assert answered == [(len(doubted), 1)]
     resumed = Trainer(doubted, SENSOR, CONFIG, seed=3)
-    assert resumed.resume(tmp_path / "checkpoint") and resumed.state.round is not None
+    assert resumed.resume(tmp_path / "checkpoint") and resumed.state.poses.round is not None
     for trainer in (first, resumed):
         while not trainer.stop_reason():
             trainer.step()

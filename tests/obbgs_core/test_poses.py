@@ -14,13 +14,13 @@ from torch import Tensor
 
 from obbgs_core.batches import Batches
 from obbgs_core.errors import ReconstructionError
+from obbgs_core.evidence.poses import CorrectionEvidence, correction_evidence
 from obbgs_core.frames import TrainingFrame, usable
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.motions import motion_vectors, rigid_motions
 from obbgs_core.model.pose_covariance import flaw, whitening
 from obbgs_core.poses.corrections import PoseCorrections, _null_space
-from obbgs_core.poses.evidence import CorrectionEvidence, correction_evidence
 from obbgs_core.poses.registration import pose_information
 from obbgs_core.render import render
 from obbgs_core.render.slopes import render_with_slopes
@@ -207,14 +207,14 @@ def evidence_of(tags: list[TrainingFrame]) -> CorrectionEvidence:
 def test_one_bracket_of_many_that_errs_for_certain_is_enough_and_a_doubtful_one_is_not(frames):
     """Of a set of photographs a few cameras may err where the others are exact."""
     tags = tagged(frames, torch.full((6,), 5e-3**2).double().diag())
-    assert not evidence_of(tags).says_so
+    assert not evidence_of(tags).justifies
     motion = torch.tensor([[0.03, -0.03, 0.03, 0, 0, 0]])
     tags[7] = dataclasses.replace(tags[7], world_to_camera=rigid_motions(motion)[0] @ tags[7].world_to_camera)
     found = evidence_of(tags)
     assert found.factors.argmax() == 7 and found.mean < found.error
-    assert found.says_so and "in one of them" in str(found)
+    assert found.justifies and "in one of them" in str(found)
     doubtful = CorrectionEvidence(found.factors.clamp(max=10))
-    assert not doubtful.says_so and "in one of them" not in str(doubtful)
+    assert not doubtful.justifies and "in one of them" not in str(doubtful)
 
 
 def test_a_bracket_is_corrected_by_the_mean_of_its_frames_covariances(frames):
@@ -334,7 +334,6 @@ def test_a_killed_training_with_correlated_tags_resumes_to_the_same_model(frames
         "steps": 12,
         "start.count": 200,
         "growth.max_gaussians": 300,
-        "poses.refine_from": 0.2,
     }
     config = preset("obbgs", changes | {"poses.refine": "always"})
     whole = train(doubted, SENSOR, config, seed=3)
@@ -457,7 +456,7 @@ def test_pose_refinement_takes_tilt_out_of_the_poses():
     while not trainer.stop_reason():
         trainer.step()
     trainer.result("")
-    assert trainer.state.poses is not None
+    assert trainer.state.poses.corrections is not None
     before, after = [], []
     for i, (t, w) in enumerate(zip(true, wrong, strict=True)):
         corrected = trainer.state.poses.corrected([i])[0]

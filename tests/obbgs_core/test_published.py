@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,8 +15,7 @@ from obbgs_core.model.sh import from_radiance, radiance
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.adam import Adam, learning_rates
-from obbgs_core.train.decisions import drop_not_finite, is_growing, is_recorded
-from obbgs_core.train.growth import Growth, densify
+from obbgs_core.train.growth import Growth, OpacityResets
 from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests import scenes
@@ -90,7 +88,7 @@ def test_rates_of_colours_are_for_pictures_from_0_to_1(frames):
 
 
 def test_the_degree_rises_by_one_after_every_interval(frames):
-    trainer = Trainer(frames, SENSOR, quick("3dgs", {"light.sh_interval": 4, "growth.end": 0.0}))
+    trainer = Trainer(frames, SENSOR, quick("3dgs", {"published.sh_interval": 4, "growth.end": 0.0}))
     for step in range(1, 14):
         trainer.step()
         moved = trainer.state.gaussians.sh.detach().abs().amax(dim=(0, 2)) > 0
@@ -114,19 +112,16 @@ def test_higher_degrees_move_at_a_twentieth_of_the_rate_as_two_groups_of_torchs_
     )
 
 
-def test_what_is_large_in_space_or_in_a_picture_is_pruned_after_the_first_reset_of_the_opacities():
-    settings, unit_m = preset("3dgs").growth, 5.0
+def test_what_is_large_is_pruned_after_the_first_reset_of_the_opacities(frames):
+    trainer = Trainer(frames, SENSOR, preset("3dgs", {"start.count": 6}))
     model = ball(6)
-    model.log_scales[1] = math.log(0.11 * unit_m)  # limit: 0.1 of the extent
+    model.log_scales[1] = math.log(0.11 * trainer.setup.unit_m)  # limit: 0.1 of the extent
     model.opacity_logits[2] = -6.0  # opacity 0.0025, limit 0.005
-    settings = replace(settings, prune_radius_px=20.0)
-    for share, left in ((0.05, 5), (0.2, 3)):
-        growth = Growth.of(6)
-        growth.radius_px[3] = 21.0
-        growth.radius_px[4] = 20.0
-        now = model.trainable()
-        kept = densify(now, Adam(now), growth, unit_m, settings, share, torch.Generator().manual_seed(0))
-        assert len(kept) == left
+    trainer.state.gaussians = model.trainable()
+    for share, left in ((0.05, 5), (0.2, 4)):
+        trainer.state.steps_done = round(share * 30_000) - 1
+        now = scenes.now_of(trainer)
+        assert Growth.of(6).due(now) and len(Growth.of(6).decide(now).model) == left
 
 
 def test_the_records_of_growth_follow_the_gaussians_that_are_kept(frames):
@@ -137,32 +132,33 @@ def test_the_records_of_growth_follow_the_gaussians_that_are_kept(frames):
     )
     for _ in range(2):
         trainer.step()
-    longest_px = trainer.state.growth.radius_px.clone()
+    before = trainer.state.growth.gradient.clone()
     with torch.no_grad():
         trainer.state.gaussians.log_scales[:5] = math.nan
-    drop_not_finite(trainer.state)
-    assert trainer.state.removed_not_finite == 5 and torch.equal(
-        trainer.state.growth.radius_px, longest_px[5:]
-    )
+    trainer.state.drop_not_finite(trainer.setup)
+    assert trainer.state.removed_not_finite == 5
+    assert torch.equal(trainer.state.growth.gradient, before[5:])
     for _ in range(8):  # past growth in the boxes and everywhere
         trainer.step()
-    assert len(trainer.state.growth.radius_px) == len(trainer.state.gaussians)
+    assert len(trainer.state.growth.gradient) == len(trainer.state.gaussians)
 
 
-def test_densifications_and_resets_come_when_the_authors_have_them():
+def test_densifications_and_resets_come_when_the_authors_have_them(frames):
     """if iteration < 15000: every 100 after 500; and every 3000 a reset; sizes count after the first reset."""
     config = preset("3dgs")
-    setup = SimpleNamespace(config=config)
     now = range(1, config.steps + 1)
     growing = [
-        i for i in now if i % config.growth.interval == 0 and is_growing(setup, (i - 1) / config.steps)
+        i for i in now if i % config.growth.interval == 0 and Growth.is_growing(config, config.moment(i - 1))
     ]
     assert growing == [i for i in range(0, 15_000, 100) if i > 500]
-    recorded = [i for i in now if is_recorded(setup, (i - 1) / config.steps)]
+    recorded = [i for i in now if Growth.is_recorded(config, config.moment(i - 1))]
     assert recorded == list(range(1, 15_000))
-    resets = [i for i in recorded if i % config.growth.opacity_reset_interval == 0]
+    trainer, resets = Trainer(frames, SENSOR, preset("3dgs", {"start.count": 6})), []
+    for i in range(500, 30_000, 500):
+        trainer.state.steps_done = i - 1
+        resets += [i] if OpacityResets().due(scenes.now_of(trainer)) else []
     assert resets == [3000, 6000, 9000, 12_000]
-    assert next(i for i in growing if (i - 1) / config.steps >= config.growth.prune_size_from) == 3100
+    assert next(i for i in growing if (i - 1) / config.steps >= config.published.prune_size_from) == 3100
 
 
 def test_a_view_counts_where_the_gaussian_reaches_the_picture_and_gradients_are_per_half_width_and_height():
@@ -177,7 +173,7 @@ def test_a_view_counts_where_the_gaussian_reaches_the_picture_and_gradients_are_
     means2d = rendered.means2d.detach()[0]
     (rendered.radiance[..., 0] * torch.linspace(0, 1, 60)).sum().backward()
     growth = Growth.of(4)
-    growth.observe(rendered, (30.0, 20.0), pixel_weighted=False)
+    growth.add(rendered, (30.0, 20.0), pixel_weighted=False)
     assert growth.weight.tolist() == [1, 1, 0, 1] and means2d[2, 0] - 3 * 60 * 0.1 / RANGE_M > 60
     gradient = rendered.screen.means2d[0][0]
     assert growth.gradient[0] == pytest.approx(math.hypot(30 * gradient[0], 20 * gradient[1]), rel=1e-5)
@@ -185,7 +181,7 @@ def test_a_view_counts_where_the_gaussian_reaches_the_picture_and_gradients_are_
 
 def test_a_reset_of_the_opacities_forgets_their_moments(frames):
     trainer = Trainer(
-        frames, SENSOR, quick("3dgs", {"growth.opacity_reset_interval": 5, "growth.begin": 0.0})
+        frames, SENSOR, quick("3dgs", {"published.opacity_reset_interval": 5, "growth.begin": 0.0})
     )
     for _ in range(4):
         trainer.step()
@@ -218,7 +214,7 @@ def test_pixel_gs_counts_gradients_near_the_camera_less(frames):
         Trainer(
             frames,
             SENSOR,
-            quick("pixel-gs", {"growth.begin": 0.0, "growth.end": 1.0, "growth.depth_scale": scale}),
+            quick("pixel-gs", {"growth.begin": 0.0, "growth.end": 1.0, "published.depth_scale": scale}),
         )
         for scale in (0.0, 1.0)
     )

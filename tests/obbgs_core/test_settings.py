@@ -15,9 +15,9 @@ from obbgs_core.train.presets import PRESETS, preset, quality_changes
         ("rates.means", math.nan, "0 or more, got nan"),
         ("growth.interval", 0, "at least 1, got 0"),
         ("parsimony.prune_at", (0.5, 1.5), "from 0 to 1, got 1.5"),
-        ("coarse", ((0.5, 12),), "triples of an image scale"),
-        ("coarse", ((0.5, 12, 0.6), (0.5, 12, 0.5)), "less than 1 in all"),
-        ("light.sh_degree", 4, "from 0 to 3, got 4"),
+        ("published.coarse", ((0.5, 12),), "triples of an image scale"),
+        ("published.coarse", ((0.5, 12, 0.6), (0.5, 12, 0.5)), "less than 1 in all"),
+        ("published.sh_degree", 4, "from 0 to 3, got 4"),
     ],
 )
 def test_settings_that_no_training_can_have_are_refused(name, value, message):
@@ -57,7 +57,7 @@ def test_presets_are_data_and_mistakes_are_named():
 
 def test_variants_are_added_to_a_methods_name_in_any_order():
     known = preset("3dgs+exposure")
-    assert known.exposure_aware and known.loss.clamped and not preset("3dgs").loss.clamped
+    assert known.exposure_aware and known.published.clamped and not preset("3dgs").published.clamped
     both = preset("3dgs+hull+exposure", {"steps": 7})
     assert both == preset("3dgs+exposure+hull", {"steps": 7}) and both.name == "3dgs+exposure+hull"
     assert both.start == preset("obbgs").start and both.growth == preset("3dgs").growth
@@ -79,9 +79,12 @@ def test_variants_are_added_to_a_methods_name_in_any_order():
 def test_a_group_is_changed_setting_by_setting_and_keeps_the_others():
     config = preset("obbgs", {"growth.interval": 33, "light.sun_shading": "linear"})
     assert (config.growth.interval, config.light.sun_shading) == (33, "linear")
-    assert config.growth.share == preset("obbgs").growth.share and preset("obbgs").growth.interval == 24
+    assert (
+        config.growth.grown_share == preset("obbgs").growth.grown_share
+        and preset("obbgs").growth.interval == 24
+    )
     for wrong in ("growth", "growth.magic", "steps.magic"):
         with pytest.raises(ValueError, match=f"no setting {wrong}; expected one of .*growth.begin"):
             preset("obbgs", {wrong: 1})
-    with pytest.raises(ValueError, match=r"loss\.kind must be l1_ssim or likelihood, got 'l2'"):
-        preset("obbgs", {"loss.kind": "l2"})
+    with pytest.raises(ValueError, match=r"published\.loss must be l1_ssim or likelihood, got 'l2'"):
+        preset("obbgs", {"published.loss": "l2"})

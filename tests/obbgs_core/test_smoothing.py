@@ -9,12 +9,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import TrainingFrame, sampling_rates
 from obbgs_core.model.gaussians import Gaussians
-from obbgs_core.train.adam import Adam
-from obbgs_core.train.growth import reset_opacities
+from obbgs_core.published.growth import reset_opacities
+from obbgs_core.published.smoothing import log_lowering, sampling_deviation_m, smoothed
 from obbgs_core.train.presets import preset
-from obbgs_core.train.smoothing import log_lowering, sampling_deviation_m, sampling_rates, smoothed
 from obbgs_core.train.trainer import Trainer
 from tests.scenes import SENSOR, intrinsics, photographed, pose, random_gaussians, target
 
@@ -103,7 +102,7 @@ def test_opacities_are_reset_as_they_are_rendered():
     model.opacity_logits[::7] = -6.0
     model, widths_m = model.trainable(), torch.full((50,), 0.03)
     seen = smoothed(model, widths_m).opacities.detach()
-    reset_opacities(model, Adam(model), log_lowering(model, widths_m).detach())
+    model = reset_opacities(model, log_lowering(model, widths_m).detach())
     torch.testing.assert_close(
         smoothed(model, widths_m).opacities, seen.clamp(max=0.01), rtol=1e-4, atol=1e-7
     )
@@ -117,13 +116,13 @@ def test_the_finished_model_holds_the_filter_and_the_filter_follows_the_gaussian
         "start.count": 200,
         "growth.begin": 0.1,
         "growth.interval": 6,
-        "growth.opacity_reset_interval": 9,
+        "published.opacity_reset_interval": 9,
     }
     trainer = Trainer(frames, SENSOR, preset("mip-splatting", changes))
     known = []
     while not trainer.stop_reason():
         trainer.step()
-        known.append(trainer.state.smoothing_m)
+        known.append(trainer.state.deviation_m)
         assert len(known[-1]) == len(trainer.state.gaussians)
     changed_at = [i + 2 for i in range(39) if known[i] is not known[i + 1]]
     assert changed_at == [
@@ -147,16 +146,16 @@ def test_gaussians_that_are_not_finite_leave_with_their_filter():
     frames = photographed(target(), 12, size_px=32, focal_px=65.0)
     trainer = Trainer(frames, SENSOR, preset("mip-splatting", {"steps": 40, "start.count": 200}))
     trainer.step()
-    widths_m = trainer.state.smoothing_m
+    widths_m = trainer.state.deviation_m
     assert widths_m is not None
     with torch.no_grad():
         trainer.state.gaussians.means[7] = torch.nan
     assert len(trainer.result("").gaussians) == 199
-    assert trainer.state.smoothing_m is not None
-    assert torch.equal(trainer.state.smoothing_m, torch.cat([widths_m[:7], widths_m[8:]]))
+    assert trainer.state.deviation_m is not None
+    assert torch.equal(trainer.state.deviation_m, torch.cat([widths_m[:7], widths_m[8:]]))
 
 
 @pytest.mark.parametrize("value", [-0.1, float("nan")])
 def test_a_filter_without_a_width_is_refused(value):
     with pytest.raises(ValueError, match="smoothing_px2 must be 0 or more"):
-        preset("mip-splatting", {"smoothing_px2": value})
+        preset("mip-splatting", {"published.smoothing_px2": value})

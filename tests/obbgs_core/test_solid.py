@@ -16,7 +16,8 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
 from obbgs_core.start.hull import Silhouette
-from obbgs_core.train.objective import LossSettings, priors
+from obbgs_core.train.config import LossSettings
+from obbgs_core.train.objective import priors
 from obbgs_core.train.trainer import Trainer
 from tests.scenes import QUICK, SENSOR, photographed, target
 
@@ -56,13 +57,18 @@ def test_shares_of_solid_pixels_are_averaged_with_the_picture():
     assert not batch.solid[0, 8:].any() and not batch.solid[1].any()  # of frame 2 no silhouette is known
 
 
+def solid_prior(weight: float) -> LossSettings:
+    """Return the settings with this prior alone."""
+    return LossSettings(gloss_weight=0, normal_weight=0, flat_weight=0, sky_weight=0, solid_weight=weight)
+
+
 def test_the_prior_makes_what_shows_light_more_opaque_and_nothing_else():
     model, frames = target(40).trainable(), photographed(target(40), 1)
     left = torch.zeros(64, 64, dtype=torch.bool)
     left[:, :32] = True
     batch = Batches(frames, SENSOR.white_dn, solid={0: left}).batch([0])
     rendered = render(model, cameras_of(frames))
-    value = priors(model, rendered, batch, 1.0, LossSettings(solid_weight=2.0))
+    value = priors(model, rendered, batch, 1.0, solid_prior(2.0))
     expected = 2.0 * (1 - rendered.alpha.detach()[0, :, :32]).sum() / 64**2
     torch.testing.assert_close(value.detach(), expected)
     value.backward()
@@ -70,7 +76,7 @@ def test_the_prior_makes_what_shows_light_more_opaque_and_nothing_else():
     assert gradient is not None and (gradient <= 1e-9).all()
     right = rendered.means2d[0][:, 0] - rendered.radii[0] > 32  # drawn on the other half alone
     assert right.any() and not gradient[right].any()
-    assert priors(model, rendered, batch, 1.0, LossSettings()) == 0
+    assert priors(model, rendered, batch, 1.0, solid_prior(0.0)) == 0
 
 
 def test_dust_that_shines_like_a_dark_face_becomes_opaque():

@@ -7,7 +7,9 @@ from obbgs_core import preset
 from obbgs_core.frames import cameras_of
 from obbgs_core.render import render
 from obbgs_core.train import train
-from obbgs_core.train.sparsity import FEW, MANY, dropped, few_share
+from obbgs_core.train.config import FEW, MANY, few_share
+from obbgs_core.train.objective import dropped
+from obbgs_core.train.trainer import Trainer
 from tests.scenes import QUICK, SENSOR, photographed, target
 
 
@@ -22,13 +24,12 @@ def test_many_frames_change_no_setting_and_few_change_them_once():
     config = preset("obbgs")
     assert config.for_frames(MANY) == config
     few = config.for_frames(FEW)
-    assert few.dropout == config.sparse.dropout > 0
+    trainers = [Trainer(photographed(target(), n), SENSOR, preset("obbgs", QUICK)) for n in (FEW, MANY)]
+    assert [one.setup.dropout for one in trainers] == [config.sparse.dropout, 0] and config.sparse.dropout > 0
     assert few.loss.sky_weight == config.sparse.sky_weight > config.loss.sky_weight
     assert few.light.max_sh_degree == 1 < config.light.max_sh_degree
     assert few.for_frames(FEW) == few
     assert preset("3dgs").for_frames(3) == preset("3dgs")
-    asked = preset("obbgs", {"dropout": 0.7}).for_frames(FEW)
-    assert asked.dropout == 0.7
 
 
 def test_what_is_left_is_more_opaque_by_as_much_as_is_missing():
@@ -65,5 +66,5 @@ def test_a_training_of_few_frames_repeats_bit_for_bit():
     frames = photographed(target(60), 6)
     config = preset("obbgs", QUICK)
     first, second = (train(frames, SENSOR, config, seed=1) for _ in range(2))
-    assert first.config.dropout > 0
+    assert first.config.sparse.dropout > 0 and len(frames) < MANY
     torch.testing.assert_close(first.gaussians.means, second.gaussians.means, rtol=0, atol=0)

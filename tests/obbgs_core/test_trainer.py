@@ -19,7 +19,7 @@ from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.growth import finite
 from obbgs_core.train.presets import preset
-from obbgs_core.train.state import SAVED
+from obbgs_core.train.state import SAVED, Identity
 from obbgs_core.train.trainer import Trainer, train
 from tests.scenes import QUICK, SENSOR, SIZE_PX, move_poses_in, photographed, target
 
@@ -105,7 +105,7 @@ def test_the_mean_begins_anew_when_poses_move(frames, monkeypatch):
     assert trainer.state.adam.betas == (0.9, 0.999)
     while not trainer.stop_reason():
         trainer.step()
-    assert trainer.state.average is not None and trainer.state.average.steps == 6
+    assert trainer.state.average.gaussians is not None and trainer.state.average.steps == 6
 
 
 def test_the_mean_begins_anew_when_frames_join(frames):
@@ -159,22 +159,23 @@ def test_a_checkpoint_outlives_settings_that_are_added_later(frames, tmp_path, c
     with torch.serialization.safe_globals(SAVED):
         saved = torch.load(tmp_path / "c", weights_only=True)
     older = json.loads(saved["identity"])
-    del older["settings"]["growth.obb_interval"]  # 30 in obbgs, 0 by default
+    del older["settings"]["growth.obb_interval"]
     torch.save(saved | {"identity": json.dumps(older)}, tmp_path / "older")
-    without = Trainer(frames, SENSOR, preset("obbgs", QUICK | {"growth.obb_interval": 0}))
-    assert without.resume(tmp_path / "older") and without.state.steps_done == 1
-    assert not Trainer(frames, SENSOR, config).resume(tmp_path / "older")
+    by_default = Trainer(frames, SENSOR, config)
+    assert by_default.resume(tmp_path / "older") and by_default.state.steps_done == 1
+    without = preset("obbgs", QUICK | {"growth.obb_interval": 0})
+    assert not Trainer(frames, SENSOR, without).resume(tmp_path / "older")
     assert "another training, which differs in growth.obb_interval: it is not used" in caplog.text
 
 
 def test_a_default_that_changed_since_a_checkpoint_is_noticed(frames):
     """The file holds every setting as it was, so that it does not matter where today's value comes from."""
-    saved = Trainer(frames, SENSOR, preset("obbgs", QUICK)).setup.identity
-    raised = saved.defaults | {"growth.prune_size": 0.3}
-    now = dataclasses.replace(saved, settings=saved.settings | {"growth.prune_size": 0.3}, defaults=raised)
-    assert now.difference(saved.text()) == "in growth.prune_size" and not saved.difference(saved.text())
-    gone = {name: value for name, value in saved.settings.items() if name != "growth.prune_size"}
-    assert dataclasses.replace(saved, settings=gone).difference(saved.text()) == "in growth.prune_size"
+    saved = Identity.of(Trainer(frames, SENSOR, preset("obbgs", QUICK)).setup)
+    raised = saved.defaults | {"published.prune_size": 0.3}
+    now = dataclasses.replace(saved, settings=saved.settings | {"published.prune_size": 0.3}, defaults=raised)
+    assert now.difference(saved.text()) == "in published.prune_size" and not saved.difference(saved.text())
+    gone = {name: value for name, value in saved.settings.items() if name != "published.prune_size"}
+    assert dataclasses.replace(saved, settings=gone).difference(saved.text()) == "in published.prune_size"
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])

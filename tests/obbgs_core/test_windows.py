@@ -35,7 +35,7 @@ def test_a_window_shows_what_the_whole_picture_shows_there(scale):
     whole = Batches(frames, SENSOR.white_dn).batch(indices, scale)
     height, width = part.dn.shape[1:3]
     assert (part.cameras.height, part.cameras.width) == (height, width)
-    assert part.share == pytest.approx(height * width / (whole.dn.shape[1] * whole.dn.shape[2]), rel=0.05)
+    assert part.shown == pytest.approx(height * width / (whole.dn.shape[1] * whole.dn.shape[2]), rel=0.05)
     ours, theirs = (render(SMALL, batch.cameras).radiance for batch in (part, whole))
     moved = ((whole.cameras.K - part.cameras.K)[:, :2, 2]).round().long().tolist()
     for k, (x, y) in enumerate(moved):
@@ -91,9 +91,9 @@ def test_what_is_learnt_in_windows_is_as_good_on_whole_pictures():
     true = render(SMALL, cameras).radiance
     scores_db = []
     for wanted in (False, True):
-        config = preset("obbgs", {"steps": 120, "windows": wanted})
+        config = preset("obbgs", {"steps": 120, "published.windows": wanted})
         setup = Trainer(frames, SENSOR, config).setup
-        assert (setup.batches.batch([0], 1.0).share < 0.6) == wanted
+        assert (setup.batches.batch([0], 1.0).shown < 0.6) == wanted
         learnt = train(frames, SENSOR, config, seed=0).gaussians
         scores_db.append(psnr_db(render(learnt, cameras).radiance / true.max(), true / true.max()))
     assert scores_db[0] > 30

@@ -28,9 +28,9 @@ from obbgs_core.frames import FEWEST_FRAMES
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.joining import check_joinable
+from obbgs_core.train.joining import JOINED_AT, check_joinable
 from obbgs_core.train.presets import preset
-from obbgs_core.train.trainer import HOLD, Trainer
+from obbgs_core.train.trainer import Trainer
 
 log = logging.getLogger(__name__)
 STEPS = 1000  # of the schedule, which begins again when the last frames have joined
@@ -286,7 +286,7 @@ class LiveReconstruction:
             compared = functools.partial(self._compared, *offered)
             self._offer = self._comparing.submit(compared)
             return
-        arrivals, is_past_start = self.arrivals, trainer.share >= HOLD
+        arrivals, is_past_start = self.arrivals, trainer.share >= JOINED_AT
         if self._uplink is not None and is_past_start and arrivals.session is not None:
             self._uplink.follow(self.shown, arrivals.session, arrivals.training, self._part)
 
@@ -319,7 +319,7 @@ class LiveReconstruction:
             held_out_db=_known(shown.held_out_db),
             model_step=shown.step,
             gaussians=None if shown.gaussians is None else len(shown.gaussians),
-            chi2=_known(trainer.state.chi2) if trainer else None,
+            chi2=_known(trainer.state.fit.chi2) if trainer else None,
             train_seconds=round(trainer.state.seconds, 3) if trainer else 0.0,
             updated_utc_ns=time.time_ns(),
             uplink=self._uplink.state if self._uplink else "",

@@ -57,14 +57,15 @@ def test_a_training_ends_early_only_after_half_of_its_steps_and_not_against_its_
 
 
 def test_a_training_that_estimates_its_poses_hands_them_on_and_its_curve_is_measured_after_alignment(
-    case, tmp_path
+    case, tmp_path, monkeypatch
 ):
+    monkeypatch.setattr("obbgs_core.train.poses.REFINED_FROM", 0.1)
     doubt = torch.diag(torch.tensor([0.01, 0.01, 0.01, 0.02, 0.02, 0.02]) ** 2)
     frames = [dataclasses.replace(frame, pose_covariance=doubt) for frame in case.training]
     dark = dataclasses.replace(frames[0], dn=torch.full_like(frames[0].dn, case.sensor.black_dn))
     frames[0] = dark
     # twice the steps: by the models of fewer a frame may stay where it is
-    changes = {"steps": 2 * STEPS, "start.count": 150, "poses.refine": "always", "poses.refine_from": 0.1}
+    changes = {"steps": 2 * STEPS, "start.count": 150, "poses.refine": "always"}
     followed = Follower(case, tmp_path, tmp_path / "stop")
     config = preset("obbgs", changes | {"chi2_end": 1e-9})
     result = reconstruct_gaussians(frames, case.sensor, config, 0, Work(None, followed.on_step))

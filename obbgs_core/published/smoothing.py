@@ -7,10 +7,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import TrainingFrame, sampling_rates
 from obbgs_core.model.gaussians import Gaussians
 
-MARGIN = 0.15  # of the image's width and height: a Gaussian as far outside still counts as in view
 FULL_LOG_OPACITY = -1e-6  # opacities stay below 1, where the logit is infinite
 
 
@@ -29,25 +28,6 @@ def sampling_deviation_m(means: Tensor, frames: list[TrainingFrame], variance_px
     if seen.any():
         rate = torch.where(seen, rate, rate[seen].min())
     return math.sqrt(variance_px2) / rate
-
-
-@torch.no_grad()
-def sampling_rates(means: Tensor, frames: list[TrainingFrame]) -> Tensor:
-    """Return how finely pictures sample points [N, 3] m: pixels for a metre [N] where each point is seen largest.
-
-    That is the largest focal length over depth of the frames that have it in view; 0 where none has.
-    """
-    rate = torch.zeros(len(means))
-    for frame in frames:
-        height, width = frame.dn.shape[:2]
-        x, y, z = (means @ frame.world_to_camera[:3, :3].T + frame.world_to_camera[:3, 3]).unbind(dim=1)
-        depth = z.clamp(min=1e-6)
-        u = frame.K[0, 0] * x / depth + frame.K[0, 2]
-        v = frame.K[1, 1] * y / depth + frame.K[1, 2]
-        in_view = (z > 1e-6) & ((u / width - 0.5).abs() <= 0.5 + MARGIN)
-        in_view &= (v / height - 0.5).abs() <= 0.5 + MARGIN
-        rate = torch.where(in_view, torch.maximum(rate, frame.K[0, 0] / depth), rate)
-    return rate
 
 
 def smoothed(gaussians: Gaussians, deviation_m: Tensor) -> Gaussians:

@@ -14,6 +14,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from obbgs_core.batches import Batches
+from obbgs_core.evidence import Evidence
+from obbgs_core.evidence.gains import shown_frames
 from obbgs_core.frames import TrainingFrame, bracket_numbers, cameras_of
 from obbgs_core.misfit import mean_light2
 from obbgs_core.model.cameras import stacked_suns
@@ -21,15 +23,9 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import from_radiance, radiance
 from obbgs_core.render import render, weighted_gradient
 from obbgs_core.render.highlights import brightest_axes, lobe
+from obbgs_core.render.shadows import Shadows
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.appearance import Shadows
-from obbgs_core.train.parsimony import shown_frames
 
-# share of the steps at which highlights are tested; later they gain less (experiment 069)
-HIGHLIGHTS_FROM = 0.1
-# before that a model has not settled, and parallax that it does not have yet looks like highlights
-FEWEST_STEPS = 100
-MORE_FRAMES = 1.5  # times as many as at the last test: then they are tested again
 VIEWS = 120  # training frames that are rendered, spread evenly: few of them show the glint of one Gaussian
 # Gaussians that decide, spread evenly: first so many, and more where those gain on average
 SAMPLES = (192, 768)
@@ -49,14 +45,21 @@ AT_ONCE = 16  # Gaussians whose axes are searched together: the cache holds thei
 class Lobes:
     """What highlights a training starts with, and what they gain.
 
-    gaussians: with a lobe each; None where no gain on frames that the lobes are not fitted to is sure.
-    gain: nats over all frames.
-    sureness: the mean of the gains' signed square roots over its standard error.
+    gaussians: with a lobe each; None where the evidence does not justify them.
+    evidence: the mean of the gains' signed square roots, on frames that the lobes are not fitted to.
+    nats: the gain over all frames.
     """
 
     gaussians: Gaussians | None
-    gain: float
-    sureness: float
+    evidence: Evidence
+    nats: float
+
+    def __str__(self) -> str:
+        errors = self.evidence.gain / self.evidence.error * SURE
+        return (
+            f"highlights would gain {self.nats:,.0f} nats on frames that they are not fitted to, with {errors:.1f} "
+            "standard errors"
+        )
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,7 @@ def lobed(
     axes = _sphere(AXES)
     moves = model.shading != "view"
     alphas, first = SHARP_ALPHAS if moves else ALPHAS, _first_half(batches, moves)
-    sureness, best, gain = 0.0, 0, 0.0
+    evidence, best, nats = Evidence(torch.zeros(())), 0, 0.0
     for count in SAMPLES:
         sample = torch.arange(0, len(model), max(1, len(model) // count))
         # [alphas * strengths, sample]
@@ -125,14 +128,14 @@ def lobed(
         roots = gains.sign() * gains.abs().sqrt()
         means, errors = roots.mean(dim=1), roots.std(dim=1, correction=0) / math.sqrt(len(sample))
         best = int((means - SURE * errors).argmax())
-        sureness = (means[best] / errors[best].clamp(min=1e-12)).item()
-        gain = gains[best].sum().item() * len(model) / len(sample) * len(batches.frames) / seen.slope.shape[1]
-        if sureness <= 0:
+        evidence = Evidence(means[best], error=SURE * max(errors[best].item(), 1e-12))
+        nats = gains[best].sum().item() * len(model) / len(sample) * len(batches.frames) / seen.slope.shape[1]
+        if evidence.gain <= 0:
             break
-    if not sureness > SURE:
-        return Lobes(None, gain, sureness)
+    if not evidence.justifies:
+        return Lobes(None, evidence, nats)
     alpha, strength = alphas[best // len(STRENGTHS)], STRENGTHS[best % len(STRENGTHS)] * unit
-    return Lobes(_with_lobes(model, seen, axes, alpha, strength), gain, sureness)
+    return Lobes(_with_lobes(model, seen, axes, alpha, strength), evidence, nats)
 
 
 def along_normals(gaussians: Gaussians) -> Gaussians:

@@ -12,30 +12,17 @@ import torch
 from torch import Tensor
 
 from obbgs_core.batches import Batch, Batches
+from obbgs_core.evidence import Evidence
+from obbgs_core.frames import sampling_rates
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render, weighted_gradient
 from obbgs_core.sensor import Sensor
-from obbgs_core.settings import check, fraction
-from obbgs_core.train.smoothing import sampling_rates
 
 VIEWS = 36  # training frames that are rendered at most, spread evenly; gains are scaled to all frames
 # An opaque Gaussian that no picture shows on as much as a strip, one pixel wide and so many of the target's radii long,
 # hides nothing that its neighbours do not hide too. Detail lies along edges: the limit grows with the target's width in
 # the picture. Under Lambert's law smaller ones bring no decibels (experiment 073).
 SHOWN_RADII, SHOWN_RADII_LAMBERT = 1 / 450, 1 / 150
-
-
-@dataclass(frozen=True)
-class ParsimonySettings:
-    """When Gaussians whose likelihood gain is below their BIC penalty are pruned."""
-
-    prune_at: tuple[float, ...] = fraction(())  # shares of the steps; none: never
-    bic_factor: float = 1.0  # on the penalty: larger values give smaller models
-    # Gaussians above it are kept where a picture shows them: dark surface explains no light and is surface nevertheless
-    keep_above_opacity: float = fraction(1.0)
-
-    def __post_init__(self):
-        check(self, "parsimony")
 
 
 def bic_penalty(gaussians: Gaussians, values: int) -> float:
@@ -54,27 +41,28 @@ def justified(
     gaussians: Gaussians,
     batches: Batches,
     sensor: Sensor,
-    settings: ParsimonySettings,
     radius_m: float,
+    keep_above_opacity: float,
     rng: torch.Generator,
 ) -> Tensor:
     """Return which Gaussians [N] gain more likelihood than their BIC penalty, or are opaque and shown by a picture.
 
-    radius_m: of the target.
+    Args:
+        radius_m: of the target.
+        keep_above_opacity: how opaque the latter are: dark surface explains no light and is surface nevertheless.
     """
-    gains, shown_px, values = likelihood_gains(gaussians, batches, sensor, rng)
-    kept = gains >= settings.bic_factor * bic_penalty(gaussians, values)
-    surface = gaussians.opacities.detach() > settings.keep_above_opacity
+    evidence, shown_px = likelihood_gains(gaussians, batches, sensor, rng)
+    surface = gaussians.opacities.detach() > keep_above_opacity
     least_radii = SHOWN_RADII_LAMBERT if gaussians.shading == "lambert" else SHOWN_RADII
     middle = gaussians.means.detach().median(dim=0).values
     least_px = least_radii * radius_m * sampling_rates(middle[None], batches.frames)
-    return kept | (surface & (shown_px > least_px))
+    return evidence.justifies | (surface & (shown_px > least_px))
 
 
 def likelihood_gains(
     gaussians: Gaussians, batches: Batches, sensor: Sensor, rng: torch.Generator
-) -> tuple[Tensor, Tensor, int]:
-    """Return each Gaussian's likelihood gain and the pixels that show it, and the number of values above noise.
+) -> tuple[Evidence, Tensor]:
+    """Return each Gaussian's likelihood gain with its BIC penalty, and the pixels that show it.
 
     The gain [N], in nats over all frames, is what the log-likelihood would lose without the Gaussian. Without Gaussian
     j the prediction changes by exactly -o_j d(prediction)/d(o_j), because compositing is linear in each opacity; at the
@@ -95,13 +83,13 @@ def likelihood_gains(
         change = slope / (1 - model.opacities.detach()).clamp(min=1e-6)
         gains += 0.5 * change**2
         values, times = values + view.values, view.times
-    return gains * times, shown_px, round(values * times)
+    return Evidence(gains * times, bic_penalty(gaussians, round(values * times))), shown_px
 
 
 def next_degree_gain(
     gaussians: Gaussians, batches: Batches, sensor: Sensor, rng: torch.Generator
-) -> tuple[float, float]:
-    """Return the likelihood gain of the next spherical-harmonic degree and its BIC penalty, both in nats.
+) -> Evidence:
+    """Return the likelihood gain of the next spherical-harmonic degree with its BIC penalty, in nats.
 
     A score test (Rao 1948): with slope g and curvature F of the log-likelihood at zero, a coefficient gains g²/(2F).
     F is the diagonal of the Fisher information: coefficients that explain the same light are counted twice. Where the
@@ -126,7 +114,8 @@ def next_degree_gain(
         new_slope = new_slope - by_constant * slope[:, :1]
         new_curvature = new_curvature - by_constant * shared[:, old:]
     gain = times * (new_slope**2 / (2 * new_curvature.clamp(min=1e-6))).sum().item()
-    return gain, 0.5 * new_slope.numel() * math.log(max(2, values * times))
+    penalty = 0.5 * new_slope.numel() * math.log(max(2, values * times))
+    return Evidence(torch.tensor(gain, dtype=torch.float64), penalty)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from obbgs_core.batches import Batch
+from obbgs_core.evidence import Evidence
 from obbgs_core.frames import TrainingFrame, bracket_numbers
 from obbgs_core.losses import likelihood_loss
 from obbgs_core.model.gaussians import Gaussians
@@ -45,25 +46,25 @@ class CorrectionEvidence:
     factors: Tensor
 
     @property
-    def mean(self) -> float:
-        """Over the brackets."""
-        return self.factors.mean().item()
+    def mean(self) -> Evidence:
+        """Over the brackets, with the standard error of the mean."""
+        return Evidence(self.factors.mean(), error=self.factors.std().item() / math.sqrt(len(self.factors)))
 
     @property
-    def error(self) -> float:
-        """The standard error of the mean."""
-        return self.factors.std().item() / math.sqrt(len(self.factors))
+    def largest(self) -> Evidence:
+        """That of the bracket whose pose errs most certainly."""
+        return Evidence(self.factors.max(), CERTAIN_NATS)
 
     @property
-    def says_so(self) -> bool:
-        """Whether poses err: the brackets say so on the whole, or one is certain of it."""
-        return self.mean > self.error or bool(self.factors.max() > CERTAIN_NATS)
+    def justifies(self) -> bool:
+        """Whether poses are corrected: the brackets say so on the whole, or one is certain of it."""
+        return bool(self.mean.justifies | self.largest.justifies)
 
     def __str__(self) -> str:
-        certain = f", of {self.factors.max():.0f} in one of them" if self.factors.max() > CERTAIN_NATS else ""
+        certain = f", of {self.largest.gain:.0f} in one of them" if self.largest.justifies else ""
         return (
-            f"that a validation bracket's pose errs has a log Bayes factor of {self.mean:.1f} ± {self.error:.1f}"
-            f"{certain}"
+            f"that a validation bracket's pose errs has a log Bayes factor of {self.mean.gain:.1f} ± "
+            f"{self.mean.error:.1f}{certain}"
         )
 
 
