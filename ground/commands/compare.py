@@ -46,7 +46,7 @@ def compare_command(
     weights: Annotated[Path | None, typer.Option(help="The file of weights that mvsnet needs.")] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(help="A dask scheduler, such as tcp://10.0.0.1:8786; default: processes of its own."),
+        typer.Option(help="A dask scheduler, such as tls://10.0.0.1:8786; default: processes of its own."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes of its own, of one thread each; default: one a core.")

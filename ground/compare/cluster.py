@@ -8,9 +8,11 @@ from collections.abc import Iterator
 import dask.config
 import psutil
 from distributed import Client, LocalCluster
+from distributed.security import Security
 
 from ground.compare.errors import CompareError
 
+log = logging.getLogger(__name__)
 USED_MEMORY = 0.9  # of what is available: the rest is for everybody else
 CONFIG = {
     "distributed.scheduler.worker-ttl": "1 hour",  # a busy worker of low priority may be silent for minutes
@@ -28,8 +30,11 @@ CONFIG = {
 def connected(scheduler: str | None, workers: int | None, needs_mb: list[float]) -> Iterator[Client]:
     """Give a client of the scheduler at a URL, or of a cluster of this machine's own for the time of the block.
 
+    Whoever reaches a scheduler has its workers run code. The own cluster therefore takes only connections with the
+    credentials that it makes for itself, and a scheduler without TLS is warned of.
+
     Args:
-        scheduler: such as tcp://10.0.0.1:8786; its workers must see the sessions and the comparison's folder under the
+        scheduler: such as tls://10.0.0.1:8786; its workers must see the sessions and the comparison's folder under the
             same paths.
         workers: processes of the own cluster, of one thread each; None: one a core. Fewer are started where the
             memory does not hold so many of the largest cell.
@@ -43,6 +48,11 @@ def connected(scheduler: str | None, workers: int | None, needs_mb: list[float])
     )  # its warnings are about nothing that a user can change
     with dask.config.set(CONFIG):
         if scheduler is not None:
+            if not scheduler.startswith("tls://"):
+                log.warning(
+                    "whoever reaches the scheduler %s has its workers run code as their user: it should stand at tls://",
+                    scheduler,
+                )
             try:
                 client = Client(scheduler, timeout="30s", set_as_default=False)
             except (OSError, ValueError, TypeError) as error:
@@ -56,6 +66,7 @@ def connected(scheduler: str | None, workers: int | None, needs_mb: list[float])
                 n_workers=min(count, max(1, len(needs_mb))),
                 threads_per_worker=1,
                 memory_limit=int(limit_mb * 1e6),
+                security=Security.temporary(),
                 dashboard_address=None,  # pyright: ignore[reportArgumentType]
                 silence_logs=50,
                 preload="ground.compare.local_worker",

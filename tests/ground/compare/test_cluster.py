@@ -9,11 +9,14 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import dask.config
 import pytest
+from distributed import Client
+from distributed.security import Security
 from typer.testing import CliRunner
 
 from ground import cli
-from ground.compare.cluster import share_memory
+from ground.compare.cluster import connected, share_memory
 from ground.compare.errors import CompareError
 from tests.commands import call
 from tests.small_sessions import small_session
@@ -169,6 +172,7 @@ def test_a_scheduler_that_dies_is_one_sentence_and_the_same_command_goes_on(sess
     _, told = running.communicate()
     assert running.returncode == 1 and "Traceback" not in told, told
     assert "the same command goes on" in told
+    assert f"the scheduler {address} has its workers run code" in told and "should stand at tls://" in told
 
 
 @pytest.mark.parametrize(
@@ -194,3 +198,15 @@ def test_the_command_refuses_to_compare_no_method(sessions, tmp_path):
         "ground", "compare", "--sessions", str(sessions[0]), "--methods", " ,", "--out", str(tmp_path / "out")
     )
     assert done.returncode == 1 and "no method is named" in done.stderr and not (tmp_path / "out").exists()
+
+
+def test_a_comparison_s_own_cluster_takes_only_its_own_credentials():
+    """A scheduler has its workers run whatever a client sends."""
+    with connected(None, 1, [10.0]) as client:
+        address = client.scheduler_info()["address"]
+        assert address.startswith("tls://") and client.submit(max, 3, 7).result() == 7
+        plain = {"address": address.replace("tls://", "tcp://")}
+        with dask.config.set({"distributed.comm.timeouts.connect": "2s"}):
+            for stranger in (plain, {"address": address, "security": Security.temporary()}):
+                with pytest.raises(OSError):
+                    Client(**stranger, timeout="2s", set_as_default=False)
