@@ -55,7 +55,9 @@ Interval = Annotated[
 CameraUrl = Annotated[
     str,
     typer.Option(
-        "--camera", help="gige://ID (or its IP address); simulated: hil:///path/to/socket or hil://host:port."
+        "--camera",
+        help="gige://ID (or its IP address), or the scheme of an installed driver (none comes for V4L2); simulated: "
+        "hil:///path/to/socket or hil://host:port.",
     ),
 ]
 LinkUrl = Annotated[

@@ -1,7 +1,16 @@
-"""Cameras behind one protocol; `open_camera` picks the driver by URL."""
+"""Cameras behind one protocol; `open_camera` picks the driver by URL.
+
+Drivers of others are found by entry points of the group `obbgs.cameras`: the name is the URL's scheme, the value is
+called with the URL and the mission's section `camera` and returns a `Camera`. skeleton.py is one to begin with,
+contract.py tests it.
+"""
+
+from importlib.metadata import entry_points
 
 from flightsw.cameras.camera import Camera
 from flightsw.icd.mission import CameraSection
+
+GROUP = "obbgs.cameras"
 
 
 def open_camera(url: str, section: CameraSection) -> Camera:
@@ -9,16 +18,26 @@ def open_camera(url: str, section: CameraSection) -> Camera:
 
     Raises:
         CaptureError: the camera does not answer, or cannot be what the mission expects.
-        ValueError: no driver for this URL.
+        ValueError: no driver for this URL, or one that cannot be loaded.
     """
-    if url.startswith("hil://"):
+    scheme = url.partition("://")[0]
+    if scheme == "hil":
         from flightsw.cameras.networked import NetworkedCamera
 
         return NetworkedCamera(url)
-    if url.startswith("gige://"):
+    if scheme == "gige":
         from flightsw.cameras.gige import GigeCamera
 
         return GigeCamera(url, section)
+    installed = entry_points(group=GROUP)
+    for found in installed.select(name=scheme):
+        try:
+            driver = found.load()
+        except Exception as error:  # of whatever the driver imports
+            raise ValueError(f"the camera driver {found.value} cannot be loaded: {error}") from error
+        return driver(url, section)
+    others = "".join(f", {name}://" for name in sorted(installed.names))
     raise ValueError(
-        f"no camera driver for {url!r}; expected hil:///path/to/socket, hil://host:port or gige://<device id or IP>"
+        f"no camera driver for {url!r}; expected hil:///path/to/socket, hil://host:port, gige://<device id or IP>"
+        f"{others}; a package with an entry point of the group {GROUP} adds one"
     )

@@ -71,6 +71,10 @@ WITH_ERROR = {
     "arv_camera_is_feature_available": (I32, P, S),
     "arv_camera_set_integer": (None, P, S, ctypes.c_int64),
     "arv_camera_get_integer": (ctypes.c_int64, P, S),
+    "arv_camera_set_string": (None, P, S, S),
+    "arv_camera_get_string": (S, P, S),
+    "arv_camera_set_boolean": (None, P, S, I32),
+    "arv_camera_get_boolean": (I32, P, S),
 }
 PLAIN = {
     "arv_buffer_new_allocate": (P, ctypes.c_size_t),

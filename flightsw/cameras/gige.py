@@ -28,6 +28,8 @@ BUFFERS = 3
 ANSWER_S = 3.0  # from the end of an exposure to its last packet
 LATE_S = 0.5  # an exposure that is asked for so long after its time is not taken
 CLOCK_S = 1.0  # a camera whose time stamps differ from our clock by less keeps UTC (PTP, IEEE 1588)
+# What changes readings in other proportion than the exposure time (Standard Features Naming Convention of GenICam):
+AUTOMATIC, GAMMA = (b"ExposureAuto", b"GainAuto", b"BalanceWhiteAuto"), b"GammaEnable"
 START_TIME = b"ExposureStartUtcNs"  # feature of a camera whose clock can be set to the start of an exposure
 
 
@@ -35,11 +37,12 @@ class GigeCamera:
     """One camera, triggered by software; opened again after it was lost.
 
     The region and the pixel format are set to the mission's camera: Mono8, Mono12 or Mono16 by its bit depth,
-    unless the URL names a format. A Bayer mosaic goes as it is into a frame of one channel, interpolated into one of
-    three.
+    unless the URL names a format. Automatic exposure, gain and white balance and gamma are switched off. A Bayer
+    mosaic goes as it is into a frame of one channel, interpolated into one of three.
 
     Raises:
-        CameraLost: the camera does not answer, or cannot be what the mission expects.
+        CameraLost: the camera does not answer, or cannot be what the mission expects, or leaves something
+            automatic on.
         ValueError: the URL names an unknown pixel format.
     """
 
@@ -119,6 +122,7 @@ class GigeCamera:
                 raise CaptureError("it does not answer")
             call("arv_camera_set_pixel_format_from_string", self._camera, self._format.encode())
             call("arv_camera_set_region", self._camera, 0, 0, section.width, section.height)
+            self._switch_off_automatics()
             call("arv_camera_set_trigger", self._camera, b"Software")
             self.has_own_clock = bool(call("arv_camera_is_feature_available", self._camera, START_TIME))
             self._stream = call("arv_camera_create_stream", self._camera, None, None)
@@ -129,6 +133,37 @@ class GigeCamera:
         except CaptureError as error:
             self._release()()
             raise CameraLost(f"no camera at {self._url}: {error}") from error
+
+    def _switch_off_automatics(self) -> None:
+        """Switch off whatever keeps readings from following the exposure time, and read back whether it is off.
+
+        Raises:
+            CaptureError: the camera leaves it on.
+        """
+        call, camera = self._aravis.call, self._camera
+
+        def state(name: bytes) -> str:
+            if name == GAMMA:
+                return "On" if call("arv_camera_get_boolean", camera, name) else "Off"
+            return call("arv_camera_get_string", camera, name).decode()
+
+        for name in (*AUTOMATIC, GAMMA):
+            if not call("arv_camera_is_feature_available", camera, name) or (before := state(name)) == "Off":
+                continue
+            refusal = ""
+            try:
+                if name == GAMMA:
+                    call("arv_camera_set_boolean", camera, name, 0)
+                else:
+                    call("arv_camera_set_string", camera, name, b"Off")
+            except AravisError as error:
+                refusal = f" ({error})"
+            if (after := state(name)) != "Off":
+                raise CaptureError(
+                    f"{name.decode()} stays {after}{refusal}: readings would not follow the exposure time; switch it "
+                    "off with the vendor's program and keep that in the user set that the camera starts with"
+                )
+            log.warning("%s: %s was %s and is switched off", self._url, name.decode(), before)
 
     def _release(self) -> Callable[[], None]:
         """Forget the camera, and return what gives it back to Aravis."""

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +18,12 @@ import pytest
 from flightsw.cameras import open_camera
 from flightsw.cameras.aravis import aravis
 from flightsw.cameras.gige import GigeCamera, demosaic
-from flightsw.errors import CaptureError
+from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.frame import decode_frame
 from flightsw.icd.mission import CameraSection, Mission, load_mission
 from flightsw.sequencer import capture
 from flightsw.store import FrameStore
-from hil.cameras.gige import GigeCameraServer
+from hil.cameras.gige import DESCRIPTION, GigeCameraServer
 from hil.sky.sensor import demosaic as simulator_demosaic
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")
@@ -163,6 +163,80 @@ def test_a_camera_that_comes_back_is_opened_again():
     with fake_camera():
         assert camera.expose(0.01, time.time_ns()).dn.shape == (SIZE_PX, SIZE_PX)
         camera.close()
+
+
+AUTOMATIC_FEATURES = "".join(
+    f'''<Enumeration Name="{name}" NameSpace="Standard">
+    <EnumEntry Name="Off" NameSpace="Standard"><Value>0</Value></EnumEntry>
+    <EnumEntry Name="Once" NameSpace="Standard"><Value>1</Value></EnumEntry>
+    <EnumEntry Name="Continuous" NameSpace="Standard"><Value>2</Value></EnumEntry>
+    <pValue>{name}Register</pValue></Enumeration>
+    <IntReg Name="{name}Register" NameSpace="Custom"><Address>{address:#x}</Address><Length>4</Length>
+    <AccessMode>RW</AccessMode><pPort>Device</pPort><Sign>Unsigned</Sign><Endianess>BigEndian</Endianess></IntReg>'''
+    for name, address in (("ExposureAuto", 0xB000), ("GainAuto", 0xB004), ("BalanceWhiteAuto", 0xB008))
+)
+AUTOMATIC_FEATURES += """<Boolean Name="GammaEnable" NameSpace="Standard"><pValue>GammaRegister</pValue>
+    <OnValue>1</OnValue><OffValue>0</OffValue></Boolean>
+    <IntReg Name="GammaRegister" NameSpace="Custom"><Address>0xb00c</Address><Length>4</Length>
+    <AccessMode>RW</AccessMode><pPort>Device</pPort><Sign>Unsigned</Sign><Endianess>BigEndian</Endianess></IntReg>"""
+
+
+@contextlib.contextmanager
+def automatic_camera(folder: Path, description: str) -> Iterator[Callable[[], list[int]]]:
+    """Run Aravis' fake camera with all that is automatic switched on; give what reads its registers."""
+    library = aravis()
+    (folder / "camera.xml").write_text(description)
+    names = (b"127.0.0.1", b"OBGF", str(folder / "camera.xml").encode())
+    device = library.call("arv_gv_fake_camera_new_full", *names)
+    memory = library.call("arv_gv_fake_camera_get_fake_camera", device)
+    value = ctypes.create_string_buffer(4)
+    for address, number in ((0xB000, 2), (0xB004, 1), (0xB008, 2), (0xB00C, 1)):
+        value.raw = number.to_bytes(4, "big")
+        library.call("arv_fake_camera_write_memory", memory, address, 4, value)
+
+    def registers() -> list[int]:
+        numbers = []
+        for address in (0xB000, 0xB004, 0xB008, 0xB00C):
+            library.call("arv_fake_camera_read_memory", memory, address, 4, value)
+            numbers.append(int.from_bytes(value.raw, "big"))
+        return numbers
+
+    try:
+        yield registers
+    finally:
+        library.unref(device)
+
+
+def described(features: str) -> str:
+    return DESCRIPTION.read_text().replace("<Port ", f"{features}<Port ")
+
+
+def test_what_is_automatic_is_switched_off_and_said(tmp_path, caplog):
+    """Cameras are often delivered so, or another program left them so."""
+    with automatic_camera(tmp_path, described(AUTOMATIC_FEATURES)) as registers:
+        assert registers() == [2, 1, 2, 1]
+        camera = open_camera("gige://127.0.0.1?pixel_format=Mono8", section(8))
+        assert registers() == [0, 0, 0, 0]
+        camera.close()
+        told = [record.getMessage().partition(": ")[2] for record in caplog.records]
+        before = ("ExposureAuto was Continuous", "GainAuto was Once", "BalanceWhiteAuto was Continuous")
+        assert told == [f"{words} and is switched off" for words in (*before, "GammaEnable was On")]
+        caplog.clear()
+        camera.open()
+        camera.close()
+        assert not caplog.records
+
+
+@pytest.mark.parametrize("name", ["ExposureAuto", "GainAuto", "BalanceWhiteAuto", "GammaEnable"])
+def test_a_camera_that_leaves_something_automatic_on_is_refused_with_what_to_do(tmp_path, name):
+    register = "GammaRegister" if name == "GammaEnable" else f"{name}Register"
+    locked = AUTOMATIC_FEATURES.replace(f"<pValue>{register}</pValue>", "<pValue>Locked</pValue>")
+    locked += '<IntSwissKnife Name="Locked" NameSpace="Custom"><Formula>1</Formula></IntSwissKnife>'
+    with (
+        automatic_camera(tmp_path, described(locked)),
+        pytest.raises(CameraLost, match=rf"{name} stays \w+.*: readings would not follow .*; switch it off"),
+    ):
+        open_camera("gige://127.0.0.1?pixel_format=Mono8", section(8))
 
 
 def test_impossible_requests_are_refused_with_the_reason():
