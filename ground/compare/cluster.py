@@ -67,7 +67,7 @@ def connected(scheduler: str | None, workers: int | None, needs_mb: list[float])
                 threads_per_worker=1,
                 memory_limit=int(limit_mb * 1e6),
                 security=Security.temporary(),
-                dashboard_address=None,  # pyright: ignore[reportArgumentType]
+                dashboard_address="127.0.0.1:0",
                 silence_logs=50,
                 preload="ground.compare.local_worker",
             ) as cluster,
