@@ -198,6 +198,14 @@ class Session:
         """Return the pinhole matrix [3, 3] of a frame, float32, px."""
         return np.array(self.camera.K if record.K is None else record.K, dtype=np.float32)
 
+    def is_whole(self, record: FrameRecord) -> bool:
+        """Return whether every checksum in a frame's picture fits.
+
+        Raises:
+            MissingFrames, SessionCorrupt: its file is not there, or cannot be read.
+        """
+        return is_whole_png(self._content(record))
+
     def dn(self, record: FrameRecord) -> np.ndarray:
         """Return a frame's digital numbers, uint16 [H, W] or [H, W, 3].
 
@@ -205,18 +213,15 @@ class Session:
             MissingFrames: its file is not there.
             SessionCorrupt: its file is not a 16-bit picture of the camera's size.
         """
-        path = self.path / record.file
+        path, content = self.path / record.file, self._content(record)
         try:
-            content = path.read_bytes()
             if not is_whole_png(content):
                 raise ValueError(
                     "it is damaged; while the frame is still on board, "
                     f"`ground uplink resend {record.id} {record.id}` brings it again"
                 )
             dn = imagecodecs.png_decode(content)
-        except FileNotFoundError as error:
-            raise MissingFrames(f"frame {record.id}: {path} is not there", (record.id,)) from error
-        except (OSError, ValueError, RuntimeError) as error:
+        except (ValueError, RuntimeError) as error:
             raise SessionCorrupt(f"frame {record.id}: {path} cannot be read: {error}") from error
         expected = (self.camera.height, self.camera.width) + ((3,) if self.camera.channels == 3 else ())
         if dn.shape != expected or dn.dtype != np.uint16:
@@ -224,6 +229,15 @@ class Session:
                 f"frame {record.id}: expected uint16 {expected}, {path} has {dn.dtype} {dn.shape}"
             )
         return dn
+
+    def _content(self, record: FrameRecord) -> bytes:
+        path = self.path / record.file
+        try:
+            return path.read_bytes()
+        except FileNotFoundError as error:
+            raise MissingFrames(f"frame {record.id}: {path} is not there", (record.id,)) from error
+        except OSError as error:
+            raise SessionCorrupt(f"frame {record.id}: {path} cannot be read: {error}") from error
 
 
 def open_session(folder: str | Path) -> Session:

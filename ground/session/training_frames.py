@@ -21,10 +21,10 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
     Where the frames state their splits, those of `test` are held out, or those of `val` where there is no test frame;
     otherwise the frames of `val` are in neither list. Where nothing but `train` is stated, and where no split is, every
     eighth bracket is held out as a whole (`is_held_out`); where that is none, the last one; a single bracket is all for
-    training. Frames that are not `usable` are in neither list.
+    training. Frames that are not `usable` are in neither list, nor are those whose picture is damaged.
 
     Raises:
-        SessionError: no frame is left, or none that is for training.
+        SessionError: no frame is left, or none that is for training; or a picture cannot be read.
     """
     frames = usable(session.frames)
     if not frames:
@@ -38,6 +38,15 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
             "%d frames are left out: in eclipse, or without a valid pose or the Sun's direction",
             len(session.frames) - len(frames),
         )
+    damaged = [r.id for r in frames if not session.is_whole(r)]
+    if damaged:
+        log.warning(
+            "the pictures of %d frames are damaged and left out: %s; `ground uplink resend` asks for what is still on "
+            "board",
+            len(damaged),
+            ", ".join(map(str, damaged)),
+        )
+        frames = [r for r in frames if r.id not in damaged]
     stated = {name: [r for r in frames if r.split == name] for name in SPLITS}
     if any(stated.values()) and not stated["train"]:
         raise SessionError(

@@ -14,6 +14,7 @@ from ground import cli
 from ground.session.check import damage
 from ground.session.folder import MissingFrames, SessionCorrupt, open_session, read_header
 from ground.session.telemetry import TelemetryLog
+from ground.session.training_frames import split
 from ground.session.writer import SessionWriter
 
 NUMBERS = (2, 0, 1, 3)
@@ -173,3 +174,12 @@ def test_a_log_that_lost_its_last_lines_is_told(session, small_mission, caplog):
     assert told.startswith("events.jsonl was cut: ")
     SessionWriter(session, small_mission)
     assert told in caplog.text and damage(session) == []
+
+
+def test_a_damaged_picture_costs_its_frame_alone_when_a_model_is_made(session, caplog):
+    training, held_out = split(open_session(session))
+    assert {record.id for record in training + held_out} == {0, 1, 2, 3}
+    flip(session / "frames" / "000002.png", 1000)
+    training, held_out = split(open_session(session))
+    assert {record.id for record in training + held_out} == {0, 1, 3}
+    assert "the pictures of 1 frames are damaged and left out: 2;" in caplog.text
