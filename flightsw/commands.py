@@ -17,6 +17,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from flightsw.clock import utc_ns
 from flightsw.errors import FlightError, StoreError
@@ -28,15 +29,18 @@ from flightsw.icd.mission import Mission
 from flightsw.icd.packet import PacketError
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.settings import Settings, load_settings, save_settings
-from flightsw.store import FrameStore, keep_reserve, write_with_reserve
-from obbgs_base.checked import copy_of, each_copy
-from obbgs_base.files import write_whole
+from flightsw.store import RESERVE, FrameStore, keep_reserve, write_with_reserve
+from obbgs_base.checked import copy_of, each_copy, read_twice, write_twice
+from obbgs_base.files import set_aside, write_whole
 
 log = logging.getLogger(__name__)
 REMEMBERED = 64  # commands whose reports are sent again when the ground asks again
 RESERVE_BYTES = 8 * 1024  # given up for the counter on a full disk: commands are what empties it
 ANSWER_S = 0.2  # between answers to packets without effect: a flood of them must not fill the downlink
 DELETE_S = 0.05  # for deleting frames in one turn of the downlink's loop
+DELETIONS = (
+    "deletions.json"  # in the store's folder: what is being deleted, so that a restart goes on with it
+)
 
 
 class ReplayCounter:
@@ -194,6 +198,36 @@ class Upload:
         return self.size_bytes + TAG_BYTES
 
 
+@dataclass(frozen=True)
+class Deletion:
+    """The frames that a command deletes: those of its range that were stored when it came."""
+
+    command: Received
+    first: int
+    last: int
+    count: int = 0
+
+    def of(self, frame_ids: Iterable[int]) -> list[int]:
+        """Return the frames of these that it is about."""
+        return [frame_id for frame_id in frame_ids if self.first <= frame_id <= self.last]
+
+    def tree(self) -> dict[str, Any]:
+        """Return it as `from_tree` takes it."""
+        command = vars(self.command) | {"digest": self.command.digest.hex()}
+        return vars(self) | {"command": command}
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> "Deletion":
+        """Return what `tree` gave.
+
+        Raises:
+            ValueError, TypeError, KeyError: it is not that.
+        """
+        command = tree["command"]
+        received = Received(command["spi"], command["counter"], bytes.fromhex(command["digest"]))
+        return cls(received, int(tree["first"]), int(tree["last"]), int(tree["count"]))
+
+
 class Commander:
     """Takes sealed commands, gives reports.
 
@@ -222,9 +256,9 @@ class Commander:
         self._remembered: OrderedDict[Received, list[Report]] = OrderedDict()
         self._armed: tuple[str, float] | None = None  # command, until when
         self._verifying: dict[Path, Received] = {}  # the command of each model that has come
-        self._deleting: deque[tuple[Received, deque[int], int]] = (
-            deque()
-        )  # with the frames, and how many they were
+        self._deletions: deque[Deletion] = deque()
+        self._frames_to_delete: deque[int] | None = None  # of the first of them, once it is begun
+        self._are_deletions_read = False  # those of the run before
         self._last_used = next(iter(self._keys.counters), None)
         self._check_of_store: tuple[Received, RunningCheck] | None = None  # the command that asked for it
         self._next_answer_s = float("-inf")
@@ -276,9 +310,13 @@ class Commander:
     def poll(self) -> None:
         """Go on with what commands have begun, for `DELETE_S` at most."""
         self._poll_check()
+        self._read_deletions()
         end_s = self._clock_s() + DELETE_S
-        while self._deleting:
-            received, frames, count = self._deleting[0]
+        while self._deletions:
+            deletion = self._deletions[0]
+            if self._frames_to_delete is None:
+                self._frames_to_delete = deque(deletion.of(f.frame_id for f in self._store.frames))
+            frames, count = self._frames_to_delete, deletion.count
             try:
                 while frames:
                     if self._store.path(frames[0]).exists():  # it may have been deleted for another's room
@@ -287,10 +325,15 @@ class Commander:
                     if self._clock_s() > end_s:
                         return
             except FlightError as error:
-                self._note(received, "failed", f"{count - len(frames)} of {count} frames deleted: {error}")
+                self._note(
+                    deletion.command, "failed", f"{count - len(frames)} of {count} frames deleted: {error}"
+                )
             else:
-                self._note(received, "completed", f"{count} frames deleted")
-            self._deleting.popleft()
+                self._note(deletion.command, "completed", f"{count} frames deleted")
+            self._deletions.popleft()
+            self._frames_to_delete = None
+            with contextlib.suppress(StoreError):  # after a restart it is found to be done
+                self._keep_deletions()
 
     def receive_model(self, name: str, data: bytes) -> Path | None:
         """Return where the announced model now lies, to be verified; None, and the command failed, if it is another.
@@ -412,9 +455,18 @@ class Commander:
                 self._armed = (values["command"], self._clock_s() + DICTIONARY.arm_s)
                 return f"{values['command']} is armed for {DICTIONARY.arm_s} s"
             case "delete":
-                first, last = values["first_frame"], values["last_frame"]
-                frames = deque(f.frame_id for f in self._store.frames if first <= f.frame_id <= last)
-                self._deleting.append((received, frames, len(frames)))
+                self._read_deletions()  # before they are written
+                deletion = Deletion(received, values["first_frame"], values["last_frame"])
+                frames = deletion.of(f.frame_id for f in self._store.frames)
+                if not frames:
+                    return "0 frames deleted"
+                # none that is taken later: its number would be in the range too
+                self._deletions.append(dataclasses.replace(deletion, last=max(frames), count=len(frames)))
+                try:
+                    self._keep_deletions()
+                except StoreError:
+                    self._deletions.pop()
+                    raise
                 return None
             case "retire":
                 retired = self._keys.of(values["key"])
@@ -433,6 +485,44 @@ class Commander:
                 self._change(safe_mode=command.name == "safe")
                 return "no exposures until resumed" if self.settings.safe_mode else "exposures go on"
         raise AssertionError(command.name)  # the dictionary has no other
+
+    def _read_deletions(self) -> None:
+        """Go on with what a run before has begun to delete, once the store is open."""
+        if self._are_deletions_read or not self._store.is_open:
+            return
+        self._are_deletions_read = True
+        path = self._store.folder / DELETIONS
+        try:
+            tree = read_twice(path, log.warning)
+            begun = [Deletion.from_tree(each) for each in tree["deletions"]] if tree is not None else []
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            log.error("a deletion of the run before may be left half done, command it again: %s", error)
+            if not isinstance(error, OSError):
+                for each in filter(Path.exists, (path, copy_of(path))):
+                    with contextlib.suppress(OSError):  # it is said again after the next start
+                        set_aside(each)
+            return
+        self._deletions.extendleft(reversed(begun))
+        for deletion in begun:
+            log.warning("the deletion of command %d goes on after a restart", deletion.command.counter)
+
+    def _keep_deletions(self) -> None:
+        """Note on the disk what is to be deleted.
+
+        Raises:
+            StoreError: the disk refuses.
+        """
+        path = self._store.folder / DELETIONS
+        try:
+            if self._deletions:
+                tree = {"deletions": [deletion.tree() for deletion in self._deletions]}
+                reserve = self._store.folder / RESERVE
+                write_twice(path, tree, lambda file, data: write_with_reserve(file, data, reserve))
+            else:
+                for each in (path, copy_of(path)):
+                    each.unlink(missing_ok=True)
+        except OSError as error:
+            raise StoreError(f"cannot note what is to be deleted: {error}") from error
 
     def _change(self, **changes: object) -> None:
         settings: Settings = dataclasses.replace(self.settings, **changes)  # type: ignore[arg-type]

@@ -20,7 +20,13 @@ from flightsw.transfer_numbers import FILE, numbers_line, parse_numbers, random_
 from obbgs_base.checked import checked_line, copy_of, parse_checked_line, read_twice
 from obbgs_base.files import sync_folder, write_whole
 
-TWICE = ("boots.json", "pass.json", "settings.json", "store.json")  # files with a checksum and a copy
+TWICE = (
+    "boots.json",
+    "deletions.json",
+    "pass.json",
+    "settings.json",
+    "store.json",
+)  # files with a checksum and a copy
 
 
 @dataclass

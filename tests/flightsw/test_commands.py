@@ -418,6 +418,59 @@ def test_frames_are_deleted_some_a_turn_and_the_command_ends_when_all_are(spacec
     assert ends[1:] == [(3, "alive"), (2, "10 frames deleted")]
 
 
+def half_deleted(spacecraft, make_frame) -> bytes:
+    """Begin to delete the frames 0 to 9 of six, take one more, and lose the power; return the command's packet."""
+    for _ in range(3):
+        spacecraft.store.put(make_frame(spacecraft.store.next_frame_id))
+    spacecraft.send("arm", command="delete")
+    packet = spacecraft.seal("delete", first_frame=0, last_frame=9)
+    spacecraft.commander.receive(packet)
+    spacecraft.store.put(make_frame(spacecraft.store.next_frame_id))
+    spacecraft.tick_s = DELETE_S
+    spacecraft.commander.poll()
+    spacecraft.tick_s = 0.0
+    assert 1 < len(spacecraft.store.frames) < 6
+    spacecraft.store = FrameStore(spacecraft.store.folder)
+    spacecraft.restart()
+    return packet
+
+
+def test_a_deletion_goes_on_after_a_restart_and_its_command_hears_of_it(spacecraft, make_frame, caplog):
+    packet = half_deleted(spacecraft, make_frame)
+    spacecraft.commander.poll()
+    ((stage, text),) = spacecraft.reports()
+    assert (stage, text) == ("completed", "6 frames deleted")
+    assert [frame.frame_id for frame in spacecraft.store.frames] == [6]  # taken after the command
+    assert "the deletion of command 2 goes on after a restart" in caplog.text
+    assert not list(spacecraft.store.folder.glob("deletions*"))
+    spacecraft.commander.receive(packet)  # the ground had no answer
+    assert spacecraft.reports() == [("completed", "6 frames deleted")]
+
+
+def test_a_new_deletion_does_not_replace_the_one_of_before_the_restart(spacecraft, make_frame):
+    half_deleted(spacecraft, make_frame)
+    spacecraft.commander.receive(spacecraft.seal("arm", command="delete"))
+    spacecraft.commander.receive(spacecraft.seal("delete", first_frame=6, last_frame=6))
+    spacecraft.restart()
+    spacecraft.commander.poll()
+    assert [end[1] for end in spacecraft.reports()] == ["6 frames deleted", "1 frames deleted"]
+    assert not spacecraft.store.frames
+
+
+def test_a_note_of_a_deletion_that_is_damaged_twice_is_told_and_nothing_is_deleted_by_it(
+    spacecraft, make_frame, caplog
+):
+    half_deleted(spacecraft, make_frame)
+    for path in spacecraft.store.folder.glob("deletions*"):
+        path.write_bytes(path.read_bytes().replace(b'"last": 5', b'"last": 7'))
+    before = spacecraft.store.frames
+    for _ in range(2):
+        spacecraft.restart()
+        spacecraft.commander.poll()
+    assert spacecraft.store.frames == before and spacecraft.reports() == []
+    assert caplog.text.count("may be left half done, command it again") == 1
+
+
 @pytest.mark.parametrize("suffix", ["", ".copy"])
 def test_no_flipped_bit_of_a_counter_file_takes_a_command_away_or_lets_one_in_again(tmp_path, suffix):
     key_file = tmp_path / "k"
