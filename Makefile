@@ -1,11 +1,12 @@
 # `make demo` runs the whole loop and ends in a report; `make test` checks everything. Both set up from nothing, as all below do.
 # `make test-portable` repeats the numerical tests as processors with fewer instructions would run them: tests/other_processors.py.
 # `make sanitize` runs the kernels under the address, undefined-behaviour and thread sanitizers: tests/sanitize.py.
-# `make coverage` says which lines the tests reach; `make docs` builds the documentation into build/docs.
+# `make coverage` says which lines the tests reach, `make coverage-flight` fails where the tests of flight reach too few of its branches;
+# `make docs` builds the documentation into build/docs.
 OUT ?= demo
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo test test-portable sanitize coverage docs setup clean
+.PHONY: demo test test-portable sanitize coverage coverage-flight docs setup clean
 
 demo: setup
 	.venv/bin/hil demo --out "$(OUT)" $(ARGS)
@@ -25,6 +26,9 @@ sanitize: setup
 
 coverage: setup
 	.venv/bin/pytest -n 3 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:build/coverage $(ARGS)
+
+coverage-flight: setup
+	.venv/bin/pytest -q -n 3 --dist loadfile --cov=flightsw --cov-branch --cov-report=term:skip-covered --cov-fail-under=95 tests/flightsw $(ARGS)
 
 docs: .venv-docs/.ready
 	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --strict --site-dir build/docs

@@ -7,10 +7,13 @@ import shutil
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
+from flightsw.cli import app
 from flightsw.errors import StoreError
 from flightsw.fsck import fsck
 from flightsw.icd.frame import decode_frame, encode_frame
+from flightsw.settings import Settings, save_settings
 from flightsw.store import FrameStore
 
 COUNT = 5
@@ -186,3 +189,57 @@ def test_any_bytes_of_damage_end_in_a_store_that_opens(folder, tmp_path, data):
 def test_what_is_no_store_is_refused(tmp_path):
     with pytest.raises(StoreError, match="no frame store"):
         fsck(tmp_path)
+
+
+def test_of_what_stands_twice_the_good_copy_replaces_the_damaged_one(folder):
+    save_settings(folder, Settings("oldest", safe_mode=True))
+    path, copy = folder / "settings.json", folder / "settings.json.copy"
+    whole = path.read_bytes()
+    for damaged in (path, copy):
+        damaged.write_bytes(whole.replace(b"true", b"trve"))
+        (problem,) = fsck(folder, repair=False).problems
+        assert problem.startswith(f"{damaged.name}: ") and damaged.read_bytes() != whole
+        assert fsck(folder).problems == [problem]
+        assert path.read_bytes() == copy.read_bytes() == whole
+    for damaged in (path, copy):
+        damaged.write_bytes(b"{}")
+    (problem,) = fsck(folder).problems
+    assert "so is its copy" in problem and not path.exists() and not copy.exists()
+    kept = {found.read_bytes() for found in (folder / "quarantine").iterdir()}
+    assert kept == {b"{}"}
+
+
+def test_a_container_that_came_back_after_its_frame_was_deleted_goes_again(folder):
+    store = FrameStore(folder)
+    path = store.path(3)
+    container = path.read_bytes()
+    store.drop(3)
+    path.write_bytes(container)
+    assert fsck(folder, repair=False).problems == ["frame 3: was deleted, but its container was still there"]
+    assert path.exists()
+    fsck(folder)
+    assert not path.exists() and 3 not in [frame.frame_id for frame in FrameStore(folder).frames]
+
+
+def test_a_line_of_a_deleted_frame_that_its_second_copy_lacks_is_added(folder):
+    FrameStore(folder).drop(3)
+    (folder / "deleted.jsonl").write_bytes(b"")
+    assert any("deleted.jsonl does not have" in problem for problem in fsck(folder).problems)
+    (folder / "index.jsonl").unlink()  # of the two copies one is enough now
+    assert 3 not in [frame.frame_id for frame in FrameStore(folder).frames]
+    assert FrameStore(folder).next_frame_id == COUNT
+
+
+def test_the_command_says_what_it_found_and_ends_with_1_where_something_is_wrong(folder):
+    sound = CliRunner().invoke(app, ["fsck", "--store", str(folder), "--json"])
+    assert sound.exit_code == 0 and json.loads(sound.stdout)["problems"] == []
+    container = bytearray((folder / "frames" / "00000002.obf").read_bytes())
+    container[400] ^= 1
+    (folder / "frames" / "00000002.obf").write_bytes(container)
+    looked = CliRunner().invoke(app, ["fsck", "--store", str(folder), "--check"])
+    assert looked.exit_code == 1 and "00000002.obf" in looked.stdout
+    repaired = CliRunner().invoke(app, ["fsck", "--store", str(folder)])
+    kept = [path.read_bytes() for path in (folder / "quarantine").iterdir()]
+    assert repaired.exit_code == 1 and bytes(container) in kept
+    again = CliRunner().invoke(app, ["fsck", "--store", str(folder), "--check"])
+    assert again.exit_code == 0

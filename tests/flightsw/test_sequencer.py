@@ -167,3 +167,48 @@ def test_region_of_interest_keeps_the_target_with_its_margin_and_drops_the_sky()
     margin = MISSION.link.roi_margin_px
     assert mask[20 - margin : 40 + margin, 25 - margin : 50 + margin].all()
     assert not mask[:5].any() and not mask[-5:].any()
+
+
+def test_a_restart_goes_on_with_the_exposure_times_that_the_last_bracket_showed(tmp_path):
+    """A target far brighter than the mission file expects: the second bracket is darker, also after a restart."""
+
+    class Bright(Sky):
+        def expose(self, exposure_time_s: float, start_utc_ns: int) -> Exposure:
+            exposure = super().expose(exposure_time_s, start_utc_ns)
+            dn = np.clip(64 + (exposure.dn.astype(float) - 64) * 50, 0, 4095).round().astype(np.uint16)
+            return dataclasses.replace(exposure, dn=dn)
+
+    bracket = dataclasses.replace(MISSION.bracket, auto=True, count=2)
+    mission = dataclasses.replace(MISSION, bracket=bracket)
+
+    def times_s(store):
+        return [decode_frame(store.read(stored.frame_id)).exposure_time_s for stored in store.frames]
+
+    through = FrameStore(tmp_path / "through")
+    capture(mission, Bright(), through)
+    first = dataclasses.replace(mission, bracket=dataclasses.replace(bracket, count=1))
+    capture(first, Bright(), FrameStore(tmp_path / "again"))
+    again = FrameStore(tmp_path / "again")
+    capture(mission, Bright(), again)
+    assert times_s(again) == times_s(through)
+    assert min(times_s(through)[3:]) < min(times_s(through)[:3])
+    again.path(2).write_bytes(b"damaged")  # a frame that cannot be read is not asked what it showed
+    again.path(5).write_bytes(b"damaged")
+    later = dataclasses.replace(mission, bracket=dataclasses.replace(bracket, count=3))
+    assert capture(later, Bright(), again).stored == 3
+
+
+def test_a_camera_of_another_size_gives_no_frame_and_says_both_sizes(tmp_path, caplog):
+    class Smaller(Sky):
+        def expose(self, exposure_time_s: float, start_utc_ns: int) -> Exposure:
+            exposure = super().expose(exposure_time_s, start_utc_ns)
+            return dataclasses.replace(exposure, dn=exposure.dn[:-1])
+
+    store = FrameStore(tmp_path)
+    counts = capture(MISSION, Smaller(), store)
+    camera = MISSION.camera
+    assert counts.failed == 48 and not store.frames
+    assert (
+        f"({camera.height}, {camera.width}) pixels, this one ({camera.height - 1}, {camera.width})"
+        in caplog.text
+    )

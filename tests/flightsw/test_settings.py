@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 
+from flightsw.errors import StoreError
 from flightsw.settings import Settings, load_settings, save_settings
 
 COMMANDED = Settings("triage", exposure_times_ms=(100.0, 200.0, 400.0), max_error_dn=2, safe_mode=True)
@@ -47,3 +48,19 @@ def test_settings_of_an_earlier_version_are_taken(tmp_path, small_mission):
     text = '{"priority": "triage", "exposure_times_ms": null, "safe_mode": true, "near": 2}'
     (tmp_path / "settings.json").write_text(text)
     assert load_settings(tmp_path, small_mission) == Settings("triage", max_error_dn=2, safe_mode=True)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"priority": "newest"}, {"max_error_dn": 256}, {"max_error_dn": True}, {"safe_mode": 1}]
+)
+def test_settings_that_no_command_can_give_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        dataclasses.replace(COMMANDED, **wrong)
+
+
+def test_settings_that_the_disk_refuses_are_an_error_and_those_before_stay(tmp_path, small_mission):
+    save_settings(tmp_path, COMMANDED)
+    (tmp_path / "settings.json.part").mkdir()  # the disk takes no file of this name
+    with pytest.raises(StoreError, match="cannot keep the settings"):
+        save_settings(tmp_path, dataclasses.replace(COMMANDED, safe_mode=False))
+    assert load_settings(tmp_path, small_mission) == COMMANDED

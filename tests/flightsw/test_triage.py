@@ -101,6 +101,11 @@ def test_command_prints_the_ranking(model, tmp_path):
     arguments = ["triage", "--model", str(model), "--frames", str(tmp_path), "--json"]
     result = CliRunner().invoke(app, [*arguments, "--mission", str(GOLDEN / "mission.yaml")])
     assert result.exit_code == 0 and json.loads(result.stdout)["ranked"][0]["frame_id"] == 3
+    (tmp_path / "frames" / "00000004.obf").write_bytes(b"damaged")
+    result = CliRunner().invoke(app, [*arguments[:-1], "--mission", str(GOLDEN / "mission.yaml")])
+    title, row = result.stdout.splitlines()[:2]
+    assert title.startswith("rank  frame") and row.split()[:2] == ["1", "3"]
+    assert "1 containers could not be read" in result.stderr
 
 
 def test_a_saturated_pixel_counts_only_when_the_model_is_darker():

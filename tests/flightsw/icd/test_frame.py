@@ -301,3 +301,26 @@ def test_a_thumbnail_is_the_frame_averaged_over_squares(make_frame, size_px, cha
 
 def test_a_small_frame_has_no_thumbnail(make_frame):
     assert encode_thumbnail(make_frame(3)) is None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "problem"),
+    [
+        ({"position_body_m": [1.0, 2.0]}, r"position_body_m must be \(3,\) finite numbers"),
+        ({"covariance": np.full((6, 6), np.nan)}, r"covariance must be \(6, 6\) finite numbers"),
+        ({"source": "guess"}, "source must be one of .*, got 'guess'"),
+        ({"attitude": "guess"}, "attitude must be one of .*, got 'guess'"),
+        ({"correlation_time_s": -1.0}, "correlation_time_s must be at least 0, got -1.0"),
+        ({"correlation_time_s": float("inf")}, "correlation_time_s must be at least 0, got inf"),
+    ],
+)
+def test_a_tag_cannot_hold_what_no_tag_says(make_frame, wrong, problem):
+    with pytest.raises(ValueError, match=problem):
+        dataclasses.replace(make_frame(1).pose, **wrong)
+
+
+def test_what_cannot_be_coded_is_refused_before_it_is_coded(make_frame):
+    with pytest.raises(ValueError, match="max_error_dn must be 0 to 255, got 256"):
+        encode_frame(make_frame(1), max_error_dn=256)
+    with pytest.raises(ValueError, match=r"roi_mask has shape \(2, 2\), the frame"):
+        encode_frame(make_frame(1), roi_mask=np.ones((2, 2), bool))

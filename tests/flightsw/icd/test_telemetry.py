@@ -188,9 +188,39 @@ arm_s: 30
         ("id: 1", "id: 1, severity: dire", "telemetry.a.severity: expected one of info, warning, error"),
         ("uint8}}}}", "uint8}}}, b: {id: 1}}", "telemetry.b.id: expected a number of 0 to 255 of its own"),
         ("version: 1", "version: [", "is not valid YAML"),
+        ("{a: {id: 1, items: {x: {type: uint8}}}}", "{a: 7}", "telemetry.a: expected a mapping with an id"),
+        ("{type: uint8}", "7", "telemetry.a.x: expected a mapping with a type"),
+        ("items: {x:", "items: {X:", "telemetry.a.X: expected a name of lower-case letters"),
+        ("{a: {id", "{1a: {id", "telemetry.1a: expected a name of lower-case letters"),
+        (
+            "type: uint8",
+            "type: uint8, states: {256: a}",
+            "x.states: expected numbers that a whole-number type holds",
+        ),
+        (
+            "type: uint8",
+            "type: float64, states: {1: a}",
+            "x.states: expected numbers that a whole-number type holds",
+        ),
     ],
 )
 def test_a_mistake_in_the_dictionary_is_named_by_its_path(old, new, problem):
     assert parse_dictionary(GOOD.encode()).telemetry["a"].pack(x=3) == b"\1\1\3"
     with pytest.raises(ConfigError, match=problem):
         parse_dictionary(GOOD.replace(old, new).encode())
+
+
+@pytest.mark.parametrize(
+    ("item", "data", "problem"),
+    [
+        (Item("x", "text[4]"), b"\x05abcde", "x: at most 4 are allowed, 5 came"),
+        (Item("x", "text[4]"), b"\x02\xff\xff", "x is not UTF-8"),
+        (Item("x", "text[4]"), b"\x02a\x07", "x has characters that cannot be printed"),
+        (Item("x", "float64[4]", range=(0.0, 1.0)), b"\0", "x: expected at least one number"),
+        (Item("x", "uint8", range=(0, 9)), b"\x0a", "x"),
+        (Item("x", "uint8", states=((1, "on"),)), b"\x02", "x: 2 is none of"),
+    ],
+)
+def test_a_value_that_the_dictionary_does_not_allow_is_refused(item, data, problem):
+    with pytest.raises(PacketError, match=problem):
+        item.unpack(data, 0)
