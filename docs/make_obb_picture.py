@@ -17,8 +17,8 @@ from ground.session.training_frames import split, training_frame
 from ground.show.pictures import tone
 from obbgs_core import obb
 from obbgs_core.losses import likelihood_loss
+from obbgs_core.methods.presets import preset
 from obbgs_core.render import render
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 
 ZOOM, STEPS = 4, 250

@@ -19,10 +19,10 @@ from ground.compare import references
 from ground.compare.case import Case
 from ground.compare.trainings import reconstruct_gaussians
 from obbgs_core.frames import TrainingFrame
+from obbgs_core.methods.config import MethodConfig
+from obbgs_core.methods.presets import budget_changes, preset
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import changed, flat
-from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.presets import budget_changes, preset
 
 
 @dataclass(frozen=True)

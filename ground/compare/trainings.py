@@ -15,6 +15,7 @@ from ground.run.model_files import SURFACE_POINTS
 from obbgs_base.errors import Interrupted
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.io.ply import save_ply
+from obbgs_core.methods.config import MethodConfig
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import with_estimate
@@ -23,7 +24,6 @@ from obbgs_core.render import render
 from obbgs_core.score.poses import settled_poses
 from obbgs_core.score.surface import surface_positions
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.result import Exposing, TrainResult
 from obbgs_core.train.trainer import CHECKPOINT_EVERY_S, Trainer
 

@@ -16,9 +16,9 @@ from obbgs_base.errors import Interrupted
 from obbgs_core.attitude.target_motion import TargetMotion
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.losses import likelihood_loss
+from obbgs_core.methods.presets import preset
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import train
 
 log = logging.getLogger(__name__)

@@ -26,8 +26,8 @@ from ground.session.cameras import sensor_of
 from ground.session.folder import FrameRecord, Session, open_session
 from ground.session.training_frames import frames_of, split
 from obbgs_core.errors import ReconstructionError
-from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.presets import preset
+from obbgs_core.methods.config import MethodConfig
+from obbgs_core.methods.presets import preset
 from obbgs_core.train.result import StepInfo, TrainResult
 from obbgs_core.train.trainer import train
 

@@ -14,9 +14,9 @@ from ground.run.model_files import exposure_times_s
 from ground.run.runs import session_facts
 from ground.session.cameras import median_sun_direction
 from ground.session.folder import FrameRecord, Session
+from obbgs_core.methods.config import MethodConfig
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import native_kernels
-from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.result import TrainResult
 
 LOG_EVERY = 10  # steps

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 from flightsw.icd.config import names_like
 from flightsw.icd.mission import ConfigError, ReconstructSection, build, parse_yaml
+from obbgs_core.methods.config import MethodConfig
+from obbgs_core.methods.presets import budget_changes, preset, quality_changes
 from obbgs_core.settings import known_names
-from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.presets import budget_changes, preset, quality_changes
 
 
 def all_changes(

@@ -13,7 +13,7 @@ from ground.run.live.status import line, read_status
 from ground.run.runs import is_live, read_config, read_metrics, unfinished_folder
 from ground.session.check import damage
 from ground.session.folder import SessionError, flight_counts, read_header, read_records
-from obbgs_core.train.presets import QUALITIES, preset
+from obbgs_core.methods.presets import QUALITIES, preset
 
 DEEPEST = 3  # levels of folders below the given ones in which sessions are looked for
 FIGURES = (  # of metrics.json, in the order of a comparison

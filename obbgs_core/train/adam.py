@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from obbgs_core import compiled
+from obbgs_core.methods.config import RateSettings
 from obbgs_core.model.gaussians import LOBES, TENSORS, Gaussians
-from obbgs_core.train.config import RateSettings
 from obbgs_core.train.parts import Change
 
 FIRST_MEMORY, SECOND_MEMORY = 0.9, 0.999  # shares of the moments that a step keeps (Kingma and Ba 2015)

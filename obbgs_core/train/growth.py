@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from obbgs_core import obb
+from obbgs_core.methods.config import GrowthSettings, MethodConfig, Moment
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.published.growth import (
@@ -21,7 +22,6 @@ from obbgs_core.published.growth import (
 from obbgs_core.published.multi_view import crossing_boxes, inside, threshold_factor
 from obbgs_core.published.smoothing import log_lowering
 from obbgs_core.render import Rendered
-from obbgs_core.train.config import GrowthSettings, MethodConfig, Moment
 from obbgs_core.train.parts import Change, Now, Seen
 from obbgs_core.train.setup import TrainingSetup
 

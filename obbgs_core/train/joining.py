@@ -11,12 +11,12 @@ from torch import Tensor
 from obbgs_core.evidence.gains import padded_to
 from obbgs_core.evidence.highlights import first_lobes
 from obbgs_core.evidence.poses import every_seventh_bracket
+from obbgs_core.methods.config import SET_BACK_TO, SET_BACKS, MethodConfig
 from obbgs_core.model.cameras import stacked_suns
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.lighting import constant_towards
 from obbgs_core.start import hull
 from obbgs_core.train.adam import Adam
-from obbgs_core.train.config import SET_BACK_TO, SET_BACKS, MethodConfig
 from obbgs_core.train.parts import Change
 from obbgs_core.train.poses import PoseDecision, Poses
 from obbgs_core.train.selection import SUN_FROM

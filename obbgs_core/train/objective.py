@@ -9,11 +9,11 @@ from torch import Tensor
 
 from obbgs_core.batches import Batch
 from obbgs_core.losses import likelihood_loss, published_loss
+from obbgs_core.methods.config import LossSettings, MethodConfig
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import Rendered
 from obbgs_core.render.highlights import shortest_axes
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.config import LossSettings, MethodConfig
 
 NEIGHBOURS = 8  # of a Gaussian, whose normals are compared with its own
 NEIGHBOUR_INTERVAL = 20  # steps between two searches for them

@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from obbgs_core.batches import Batch, Batches
+from obbgs_core.methods.config import MethodConfig, Moment
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.published.smoothing import smoothed
 from obbgs_core.render import Rendered
 from obbgs_core.render.shadows import Shadows
-from obbgs_core.train.config import MethodConfig, Moment
 from obbgs_core.train.order import FrameOrder
 from obbgs_core.train.setup import TrainingSetup
 

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from obbgs_core.evidence.poses import correction_evidence
+from obbgs_core.methods.config import SET_BACK_AT, SET_BACK_TO, SET_BACKS, Moment
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.answers import PoseRound, Question
 from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.train.adam import learning_rates
-from obbgs_core.train.config import SET_BACK_AT, SET_BACK_TO, SET_BACKS, Moment
 from obbgs_core.train.order import FrameOrder
 from obbgs_core.train.parts import Change, Now
 from obbgs_core.train.setup import Start, TrainingSetup

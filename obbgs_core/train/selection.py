@@ -8,7 +8,7 @@ from typing import Literal
 from obbgs_core.evidence.gains import justified
 from obbgs_core.evidence.highlights import along_normals, lobed
 from obbgs_core.evidence.radiance import described, raised_degree
-from obbgs_core.train.config import SET_BACK_AT
+from obbgs_core.methods.config import SET_BACK_AT
 from obbgs_core.train.parts import Change, Now
 
 log = logging.getLogger(__name__)

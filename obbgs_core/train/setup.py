@@ -25,6 +25,7 @@ from obbgs_core.frames import (
     usable,
 )
 from obbgs_core.hot_pixels import without_hot_pixels
+from obbgs_core.methods.config import MethodConfig, few_share
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.sensor import Sensor
@@ -32,7 +33,6 @@ from obbgs_core.sky_level import SkyLevel, levelled, with_noise_seen
 from obbgs_core.start.alignment import settled
 from obbgs_core.start.hull import Silhouette, light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
-from obbgs_core.train.config import MethodConfig, few_share
 
 log = logging.getLogger(__name__)
 # full scale at the mean exposure may be a radiance between this and its inverse without harm

@@ -16,6 +16,7 @@ from torch import Tensor
 from obbgs_base.files import set_aside, write_whole
 from obbgs_core.errors import Diverged
 from obbgs_core.evidence.poses import validation_brackets
+from obbgs_core.methods.config import MethodConfig, Moment
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.pose_covariance import Whitening
@@ -27,7 +28,6 @@ from obbgs_core.published.smoothing import sampling_deviation_m, smoothed
 from obbgs_core.render.shadows import ShadowMap, Shadows
 from obbgs_core.settings import flat
 from obbgs_core.train.adam import FIRST_MEMORY, SECOND_MEMORY, Adam, Average
-from obbgs_core.train.config import MethodConfig, Moment
 from obbgs_core.train.fit import Fit
 from obbgs_core.train.growth import Growth, OpacityResets, finite
 from obbgs_core.train.objective import Neighbours

@@ -15,6 +15,7 @@ from obbgs_core.compiled import torch_on_one_thread
 from obbgs_core.errors import Diverged
 from obbgs_core.evidence.radiance import described
 from obbgs_core.frames import TrainingFrame
+from obbgs_core.methods.config import SET_BACK_AT, SET_BACK_TO, MethodConfig, Moment
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.poses.estimate import PoseEstimate
@@ -22,7 +23,6 @@ from obbgs_core.published.growth import outliers
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.adam import learning_rates
-from obbgs_core.train.config import SET_BACK_AT, SET_BACK_TO, MethodConfig, Moment
 from obbgs_core.train.joining import begun_again, check_joinable, join, release, withhold
 from obbgs_core.train.objective import DROPPED_UNTIL, dropped, image_loss, priors
 from obbgs_core.train.parts import Seen

@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.train.presets import preset
+from obbgs_core.methods.presets import preset
 from obbgs_core.train.result import TrainResult
 from obbgs_core.train.trainer import Trainer
 from tests.ground import test_moving_sun as sunlit

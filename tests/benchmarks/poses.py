@@ -29,6 +29,8 @@ from obbgs_base.navigation_errors import (
     jacobian,
 )
 from obbgs_core.frames import Navigation, TrainingFrame, cameras_of
+from obbgs_core.methods.config import MethodConfig
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
 from obbgs_core.poses.corrections import with_estimate
 from obbgs_core.poses.estimate import PoseEstimate
@@ -36,8 +38,6 @@ from obbgs_core.poses.gauge import best_motion, seen_after, size_of
 from obbgs_core.render import render
 from obbgs_core.score.poses import pose_errors, settled_poses
 from obbgs_core.train import train
-from obbgs_core.train.config import MethodConfig
-from obbgs_core.train.presets import preset
 from obbgs_core.train.result import TrainResult
 from tests.benchmarks.passes import SENSOR, Pass, photographed
 from tests.benchmarks.rows import shown

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hil.sky.sensor import converted
 from obbgs_core.frames import TrainingFrame
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
@@ -24,7 +25,6 @@ from obbgs_core.sensor import Sensor
 from obbgs_core.start.initialisation import StartSettings
 from obbgs_core.train import fit, growth, setup, trainer
 from obbgs_core.train.adam import Adam
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests.benchmarks.rasterizer import camera, scene
 from tests.benchmarks.rows import shown

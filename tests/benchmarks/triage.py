@@ -36,12 +36,12 @@ from hil.dataset import DatasetConfig, make_dataset
 from hil.sky import SHIPPED
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.io.onnx import export_onnx
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
 from obbgs_core.score.metrics import cloud_distances, psnr_db
 from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import train
 from tests.benchmarks.rows import shown
 

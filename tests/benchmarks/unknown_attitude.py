@@ -18,8 +18,8 @@ from obbgs_base.navigation_errors import NominalMotion
 from obbgs_core.attitude.estimate import AttitudeUndetermined, estimate_motion
 from obbgs_core.attitude.target_motion import TargetMotion
 from obbgs_core.frames import Navigation, TrainingFrame
+from obbgs_core.methods.config import MethodConfig
 from obbgs_core.train import train
-from obbgs_core.train.config import MethodConfig
 from tests.benchmarks import passes, poses
 
 BRACKETS, DURATION_S = 100, 1950.0  # 15 brackets a turn of 293 s

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from ground import cli
 from ground.run.reconstruct import reconstruct
-from obbgs_core.train.presets import preset
+from obbgs_core.methods.presets import preset
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"
 TINY = {"steps": 8, "start.count": 300, "growth.max_gaussians": 300}

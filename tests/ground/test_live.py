@@ -30,8 +30,8 @@ from ground.show.listing import find_sessions
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import TooFewFrames
 from obbgs_core.io.ply import load_ply
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.gaussians import TENSORS
-from obbgs_core.train.presets import preset
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "session"  # 48 frames in 16 brackets
 CHANGES = {"steps": 200, "start.count": 1000, "growth.max_gaussians": 1200}

@@ -30,6 +30,7 @@ from obbgs_core.frames import TrainingFrame, sun_span_deg
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.io.ply import display_sh, load_ply, save_ply
 from obbgs_core.io.spz import load_spz, save_spz
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import lit_from, render
@@ -37,7 +38,6 @@ from obbgs_core.score.metrics import psnr_db
 from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.objective import Neighbours, normals_apart
-from obbgs_core.train.presets import preset
 from obbgs_core.train.setup import TURNING_SPAN_DEG
 from obbgs_core.train.trainer import Trainer, train
 from tests import ply_by_trimesh

@@ -30,7 +30,7 @@ from ground.show.report.document import write_report
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.io.ply import load_ply
-from obbgs_core.train.presets import PRESETS
+from obbgs_core.methods.presets import PRESETS
 from tests import ply_by_trimesh
 from tests.session_frames import forget_session_facts
 

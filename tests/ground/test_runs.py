@@ -34,8 +34,8 @@ from ground.show.summary import model_rows
 from obbgs_base.errors import Interrupted
 from obbgs_core.errors import Diverged
 from obbgs_core.io.ply import load_ply
-from obbgs_core.train import presets
-from obbgs_core.train.presets import PRESETS, QUALITIES
+from obbgs_core.methods import presets
+from obbgs_core.methods.presets import PRESETS, QUALITIES
 from obbgs_core.train.result import StepInfo
 
 GOLDEN = Path(__file__).parents[1] / "golden"

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.io.onnx import export_onnx
+from obbgs_core.methods.presets import preset
 from obbgs_core.model import sh
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.render import native_kernels, render
 from obbgs_core.sensor import Sensor
 from obbgs_core.start import hull
 from obbgs_core.start.initialisation import silhouettes
-from obbgs_core.train.presets import preset
 from obbgs_core.train.result import StepInfo
 from obbgs_core.train.trainer import Trainer
 from tests.scenes import QUICK, SENSOR, intrinsics, photographed, pose, random_gaussians, target

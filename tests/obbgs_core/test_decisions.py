@@ -18,6 +18,7 @@ from obbgs_core.evidence.gains import (
 )
 from obbgs_core.evidence.poses import CorrectionEvidence
 from obbgs_core.frames import TrainingFrame, cameras_of, sampling_rates
+from obbgs_core.methods.presets import preset
 from obbgs_core.misfit import Compared, stated_misfit
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import from_radiance
@@ -25,7 +26,6 @@ from obbgs_core.render import render
 from obbgs_core.train import poses
 from obbgs_core.train.fit import UNSEEN_UNTIL
 from obbgs_core.train.poses import SET_BACK_TO, PoseDecision
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
 from tests.scenes import QUICK, SENSOR, decide, move_poses_in, photographed, tagged, target
 

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from obbgs_core.errors import ReconstructionError
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.footprint import PIXEL_PX2, footprint_px2
 from obbgs_core.model.gaussians import DEFAULT_PSF_SIGMA_PX, Footprint, Gaussians
 from obbgs_core.render import native_kernels, project, render
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests import scenes
 from tests.obbgs_core.test_render import looking_at_origin, random_gaussians

@@ -16,6 +16,7 @@ from obbgs_core.frames import cameras_of
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.io.ply import display_sh, load_ply, save_ply
 from obbgs_core.io.spz import load_spz, save_spz
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import lit_from, native_kernels, render
@@ -24,7 +25,6 @@ from obbgs_core.render.lighting import radiance_along
 from obbgs_core.train import selection
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.growth import Growth
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests import ply_by_trimesh
 from tests.obbgs_core.test_render import (

@@ -9,12 +9,12 @@ import torch.nn.functional as F
 from scipy.spatial import KDTree
 
 from obbgs_core.frames import TrainingFrame, cameras_of
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.gaussians import TENSORS, Gaussians
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.train.joining import JOINED_AT, NEW_SPACINGS, SETTLED_ROUNDS
 from obbgs_core.train.poses import SET_BACKS, PoseDecision
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests.scenes import EXPOSURES_S, QUICK, SENSOR, SIZE_PX, photographed, tagged, target
 

@@ -6,11 +6,11 @@ import torch
 
 from obbgs_core import obb
 from obbgs_core.frames import cameras_of
+from obbgs_core.methods.presets import PRESETS, preset
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.published.multi_view import corner_rays, crossing_boxes, inside, threshold_factor
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
-from obbgs_core.train.presets import PRESETS, preset
 from obbgs_core.train.trainer import Trainer
 from tests.scenes import SENSOR, intrinsics, photographed, pose, target
 

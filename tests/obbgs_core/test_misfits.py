@@ -8,10 +8,10 @@ import torch
 from scipy import stats
 
 from obbgs_core.frames import TrainingFrame
+from obbgs_core.methods.presets import preset
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.growth import Growth
 from obbgs_core.train.poses import FAR_DEVIATIONS, FAR_FACTOR, LEFT_OUT_FROM, standing_out
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests.scenes import QUICK, SENSOR, decide, move_poses_in, now_of, photographed, tagged, target
 

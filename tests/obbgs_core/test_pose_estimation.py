@@ -15,6 +15,7 @@ from obbgs_core.errors import ReconstructionError
 from obbgs_core.evidence.gains import justified
 from obbgs_core.frames import Navigation, TrainingFrame, cameras_of, usable
 from obbgs_core.losses import likelihood_loss
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
 from obbgs_core.model.sh import from_radiance
@@ -30,7 +31,6 @@ from obbgs_core.start.alignment import _aligned, settled
 from obbgs_core.start.initialisation import silhouettes
 from obbgs_core.start.silhouette_coherence import _open_directions, coherence, most_coherent, seen_from
 from obbgs_core.train.poses import SET_BACK_AT, SET_BACK_TO, SET_BACKS
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests import scenes
 from tests.scenes import QUICK, SENSOR, target

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from obbgs_core.frames import TrainingFrame
+from obbgs_core.methods.presets import preset
 from obbgs_core.poses.answers import Answer, Question
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
 from tests.scenes import QUICK, SENSOR, move_poses_in, photographed, tagged, target
 

@@ -16,6 +16,7 @@ from obbgs_core.batches import Batches
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.evidence.poses import CorrectionEvidence, correction_evidence
 from obbgs_core.frames import TrainingFrame, usable
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.motions import motion_vectors, rigid_motions
@@ -26,7 +27,6 @@ from obbgs_core.render import render
 from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.start.alignment import MOST_DILATION_PX, _error_px, settled
 from obbgs_core.start.initialisation import silhouettes
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer, train
 from tests import scenes
 from tests.scenes import QUICK, RANGE_M, SENSOR, intrinsics, target

@@ -9,6 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from obbgs_core.frames import TrainingFrame, camera_extent_m
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import from_radiance, radiance
@@ -16,7 +17,6 @@ from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.adam import Adam, learning_rates
 from obbgs_core.train.growth import Growth, OpacityResets
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests import scenes
 

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
+from obbgs_core.methods.presets import PRESETS, preset, quality_changes
 from obbgs_core.settings import changed
-from obbgs_core.train.presets import PRESETS, preset, quality_changes
 
 
 @pytest.mark.parametrize(

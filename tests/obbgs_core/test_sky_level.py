@@ -13,12 +13,12 @@ from scipy.stats import norm
 
 from hil.sky.sensor import converted
 from obbgs_core.frames import TrainingFrame, cameras_of
+from obbgs_core.methods.presets import preset
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.sensor import Sensor
 from obbgs_core.sky_level import field, levelled
 from obbgs_core.train import train
-from obbgs_core.train.presets import preset
 from tests.scenes import QUICK, SENSOR, ball, photographed, target
 
 SIZE_PX = 96

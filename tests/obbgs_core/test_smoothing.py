@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obbgs_core.frames import TrainingFrame, sampling_rates
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.published.growth import reset_opacities
 from obbgs_core.published.smoothing import log_lowering, sampling_deviation_m, smoothed
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests.scenes import SENSOR, intrinsics, photographed, pose, random_gaussians, target
 

@@ -12,11 +12,11 @@ from scipy import ndimage
 from obbgs_core import preset
 from obbgs_core.batches import Batches
 from obbgs_core.frames import cameras_of
+from obbgs_core.methods.config import LossSettings
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import from_radiance
 from obbgs_core.render import render
 from obbgs_core.start.hull import Silhouette
-from obbgs_core.train.config import LossSettings
 from obbgs_core.train.objective import priors
 from obbgs_core.train.trainer import Trainer
 from tests.scenes import QUICK, SENSOR, photographed, target

@@ -5,9 +5,9 @@ import torch
 
 from obbgs_core import preset
 from obbgs_core.frames import cameras_of
+from obbgs_core.methods.config import FEW, MANY, few_share
 from obbgs_core.render import render
 from obbgs_core.train import train
-from obbgs_core.train.config import FEW, MANY, few_share
 from obbgs_core.train.objective import dropped
 from obbgs_core.train.trainer import Trainer
 from tests.scenes import QUICK, SENSOR, photographed, target

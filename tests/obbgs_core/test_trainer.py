@@ -14,11 +14,11 @@ from obbgs_base.errors import Interrupted
 from obbgs_core import compiled
 from obbgs_core.errors import Diverged, ReconstructionError, TooFewFrames
 from obbgs_core.frames import TrainingFrame
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.gaussians import TENSORS
 from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.growth import finite
-from obbgs_core.train.presets import preset
 from obbgs_core.train.state import SAVED, Identity
 from obbgs_core.train.trainer import Trainer, train
 from tests.scenes import QUICK, SENSOR, SIZE_PX, move_poses_in, photographed, target

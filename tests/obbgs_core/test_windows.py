@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from obbgs_core.batches import GRID_PX, Batches, common, windows
 from obbgs_core.frames import cameras_of
+from obbgs_core.methods.presets import preset
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.start.initialisation import silhouettes
 from obbgs_core.train import train
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 from tests.scenes import SENSOR, photographed, target
 

@@ -25,11 +25,11 @@ from obbgs_base.errors import Interrupted
 from obbgs_core.compiled import Background
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.frames import FEWEST_FRAMES
+from obbgs_core.methods.config import MethodConfig
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.estimate import PoseEstimate
-from obbgs_core.train.config import MethodConfig
 from obbgs_core.train.joining import JOINED_AT, check_joinable
-from obbgs_core.train.presets import preset
 from obbgs_core.train.trainer import Trainer
 
 log = logging.getLogger(__name__)

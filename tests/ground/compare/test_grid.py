@@ -24,8 +24,8 @@ from ground.compare.methods import method
 from ground.compare.rows import Rows, locked
 from ground.compare.worker import _rounded_all, run_cell
 from ground.session.folder import SessionError
+from obbgs_core.methods.presets import preset, quality_changes
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.presets import preset, quality_changes
 from tests.benchmarks import targets
 from tests.small_sessions import small_session
 

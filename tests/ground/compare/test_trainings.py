@@ -15,7 +15,7 @@ from ground.compare.energy import EnergyMeter
 from ground.compare.follow import MARKS, Follower, image_of
 from ground.compare.trainings import reconstruct_gaussians
 from obbgs_base.errors import Interrupted
-from obbgs_core.train.presets import preset
+from obbgs_core.methods.presets import preset
 from tests.small_sessions import small_session
 
 STEPS = 24

@@ -3,10 +3,7 @@
 from dataclasses import fields, replace
 from typing import Any
 
-from obbgs_core.published.settings import PublishedSettings
-from obbgs_core.settings import changed
-from obbgs_core.start.initialisation import StartSettings
-from obbgs_core.train.config import (
+from obbgs_core.methods.config import (
     GrowthSettings,
     LightSettings,
     LossSettings,
@@ -16,6 +13,9 @@ from obbgs_core.train.config import (
     RateSettings,
     SparseSettings,
 )
+from obbgs_core.published.settings import PublishedSettings
+from obbgs_core.settings import changed
+from obbgs_core.start.initialisation import StartSettings
 
 # Kerbl et al., 3D Gaussian Splatting, 2023
 _3DGS = MethodConfig(

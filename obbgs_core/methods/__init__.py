@@ -1,0 +1,1 @@
+"""The methods as settings: what they are, and which values make which method. Nothing here trains."""
