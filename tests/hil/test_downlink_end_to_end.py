@@ -261,7 +261,7 @@ def test_hostile_names_and_bad_containers_are_counted_and_never_leave_the_sessio
     assert [record.id for record in open_session(tmp_path / "session").frames] == [2]
     session_files = {path.name for path in (tmp_path / "session").rglob("*") if path.is_file()}
     twice = {f"{name}{end}" for name in ("session.json", "frames.jsonl") for end in ("", ".copy")}
-    assert session_files == {*twice, "000002.png", "listener.lock"}
+    assert session_files == {*twice, "000002.png", "listener.lock", "listener.log"}
     assert {path for path in tmp_path.rglob("*") if "session" not in path.parts} == before
 
 
