@@ -347,7 +347,8 @@ def _total(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return one row for all trials of a case; {} without any."""
     if not rows:
         return {}
-    summed = {name: sum(row[name] for row in rows) for name in ("trials", "trials_failed", "seconds")}
+    summed = {name: sum(row[name] for row in rows) for name in ("trials", "trials_failed")}
+    summed["seconds"] = round(sum(row["seconds"] for row in rows), 1)
     return {"condition": rows[0]["condition"], "files": rows[0]["files"]} | summed
 
 

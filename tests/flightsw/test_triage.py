@@ -30,6 +30,7 @@ from flightsw.triage import (
     Ranked,
     Renderer,
     chi2_map,
+    rank_frame,
     rank_frames,
     sending_order,
     sent_view,
@@ -330,3 +331,11 @@ def test_over_the_link_an_informative_view_comes_before_repeats_of_what_the_grou
             ground.join(30)
     received = [json.loads(text)["id"] for text in (session / "frames.jsonl").read_text().splitlines()]
     assert received == [4, 2, 1, 3]
+
+
+def test_a_frame_of_other_channels_than_the_model_renders_is_refused(model):
+    renderer = Renderer(model)
+    frame = frame_of(renderer, 3, 0.0, seed=0)
+    colour = replace(frame, dn=np.repeat(frame.dn.reshape(*frame.dn.shape[:2], 1), 3, axis=2))
+    with pytest.raises(TriageError, match="frame 3 has 3 channels, the model renders 1"):
+        rank_frame(renderer, colour, Path("3.obf"), np.eye(3))

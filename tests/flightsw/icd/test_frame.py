@@ -324,3 +324,15 @@ def test_what_cannot_be_coded_is_refused_before_it_is_coded(make_frame):
         encode_frame(make_frame(1), max_error_dn=256)
     with pytest.raises(ValueError, match=r"roi_mask has shape \(2, 2\), the frame"):
         encode_frame(make_frame(1), roi_mask=np.ones((2, 2), bool))
+
+
+def test_a_header_that_is_cut_or_has_more_behind_it_is_refused(make_frame):
+    header = encode_frame(make_frame(1))[: HEADER.size]
+    assert read_header(header)["frame_id"] == 1
+    for data, problem in (
+        (header[:9], "a frame header has at least"),
+        (header[:-1], f"has {HEADER.size} bytes, got {HEADER.size - 1}"),
+        (header + b"\0", "expected one header of"),
+    ):
+        with pytest.raises(PacketError, match=problem):
+            read_header(data)
