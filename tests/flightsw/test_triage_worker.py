@@ -197,6 +197,8 @@ def test_a_model_that_needs_too_much_memory_or_time_is_told_and_the_one_in_use_g
     worker.verify(that_grows(tmp_path / "grows.onnx"))
     worker.verify(that_turns(tmp_path / "turns.onnx", AT_ONCE))
     frame = container(3)
+    worker.rank(container(2))
+    worker.forget_frames()  # both models still wait
     worker.rank(frame)
     grown, turned, ranked = results(worker, 3)
     assert isinstance(grown, ModelVerified) and grown.is_unfit and "while it renders" in str(grown.problem)
@@ -257,18 +259,43 @@ def test_the_process_of_a_hanging_model_is_gone_once_the_worker_has_stopped(tmp_
     assert process.exit_code == -signal.SIGKILL and not worker.processes and worker.results() == []
 
 
-def test_a_hanging_model_whose_flight_software_was_killed_ends_by_its_processor_time(tmp_path, small_mission):
-    """Nobody is left to kill it then."""
+def asked(model: Path, small_mission, *containers: Path, without: str = "") -> subprocess.CompletedProcess:
+    """Run a model's process with these lines and no more, as where flight is gone, on a computer without a module."""
     task = {
-        "model": str(that_turns(tmp_path / "turns.onnx", AT_ONCE)),
+        "model": str(model),
         "width": SIZE_PX,
         "height": SIZE_PX,
         "K": small_mission.camera.K,
         "limits": {"time_s": 1.0, "memory_bytes": 1 << 30},
     }
-    child = [sys.executable, "-m", "flightsw.model_process"]
-    done = subprocess.run(child, input=json.dumps(task) + "\n", capture_output=True, text=True, timeout=60)
+    lines = "".join(json.dumps(each) + "\n" for each in (task, *map(str, containers)))
+    hide = f"import sys; sys.modules[{without!r}] = None; " if without else ""
+    child = [sys.executable, "-c", f"{hide}from flightsw.model_process import main; main()"]
+    return subprocess.run(child, input=lines, capture_output=True, text=True, timeout=PATIENT_S)
+
+
+def test_a_hanging_model_whose_flight_software_was_killed_ends_by_its_processor_time(tmp_path, small_mission):
+    """Nobody is left to kill it then."""
+    done = asked(that_turns(tmp_path / "turns.onnx", AT_ONCE), small_mission)
     assert done.returncode == -signal.SIGXCPU and done.stdout == "{}\n"
+
+
+def test_the_process_of_a_model_answers_each_line_and_ends_with_its_input(
+    model, tmp_path, container, small_mission
+):
+    (expected,), _ = rank_frames(model, container(3).parent, np.array(small_mission.camera.K))
+    done = asked(model, small_mission, container(3), tmp_path / "00000009.obf")
+    begun, verified, ranked, gone = map(json.loads, done.stdout.splitlines())
+    assert (done.returncode, done.stderr, begun) == (0, "", {})
+    assert verified == {"sha256": hashlib.sha256(model.read_bytes()).hexdigest()}
+    assert Ranked(**ranked | {"path": container(3), "view": tuple(ranked["view"])}) == expected
+    assert "No such file" in gone["problem"]
+
+
+def test_without_onnxruntime_no_model_is_to_blame(model, small_mission):
+    done = asked(model, small_mission, without="onnxruntime")
+    answer = json.loads(done.stdout.splitlines()[1])
+    assert "triage needs onnxruntime" in answer["problem"] and not answer["is_unfit"]
 
 
 def test_without_a_process_the_model_is_not_verified_and_not_to_blame(model, new_worker, monkeypatch):
