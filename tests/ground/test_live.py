@@ -60,8 +60,8 @@ class Writer:
 def fast(monkeypatch) -> None:
     """What is due at intervals is due at every step, but for the shown model."""
     for name in ("LOOK_S", "STATUS_S", "WAIT_S", "JOIN_PAUSE"):
-        monkeypatch.setattr(ground.live, name, 0.0)
-    monkeypatch.setattr(ground.live, "JOIN_STEPS", 20)
+        monkeypatch.setattr(ground.run.live.reconstruct, name, 0.0)
+    monkeypatch.setattr(ground.run.live.reconstruct, "JOIN_STEPS", 20)
 
 
 def begun(
