@@ -151,9 +151,9 @@ def test_outlines_on_white_are_those_on_black():
 def test_a_background_belongs_to_the_identity_of_a_training():
     frames = photographed(target(), 6, size_px=32, focal_px=65.0)
     config = preset("3dgs", QUICK)
-    black = Trainer(frames, SENSOR, config).setup.identity
+    black = Trainer(frames, SENSOR, config).setup.digest
     grey = [dataclasses.replace(f, background=1e-3) for f in frames]
-    assert Trainer(grey, SENSOR, config).setup.identity != black
+    assert Trainer(grey, SENSOR, config).setup.digest != black
 
 
 @pytest.mark.parametrize("wrong", [-1.0, float("nan"), float("inf")])

@@ -60,8 +60,8 @@ def test_evidence_justifies_what_gains_more_than_its_penalty_and_its_error():
 
 
 def test_rewording_what_a_training_reports_changes_no_training():
-    frames = tagged(photographed(target(), 36), True)
-    config = preset("obbgs", QUICK | {"poses.refine": "auto", "steps": 60})
+    frames = tagged(photographed(target(), 26, size_px=32, focal_px=65.0), False)
+    config = preset("obbgs", QUICK | {"poses.refine": "auto"})
     plain, reworded = (Trainer(frames, SENSOR, config, seed=3) for _ in range(2))
     for trainer in (plain, reworded):
         while not trainer.stop_reason():

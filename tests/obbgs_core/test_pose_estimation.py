@@ -548,12 +548,16 @@ def test_a_training_finds_what_the_pass_shares(erring):
     assert after.pixels < 0.3 * before.pixels
     estimate, allowed = result.pose_estimate, SIGMAS.vector() > 0
     prior, posterior = estimate.shared_prior.vector()[allowed], estimate.shared_posterior.vector()[allowed]
-    assert trainer.state.poses.corrections is not None and trainer.state.poses.together is not None
+    assert (
+        trainer.state.poses.corrections is not None and trainer.state.poses.corrections.together is not None
+    )
     assert (posterior <= prior * (1 + 1e-6)).all() and posterior[9:].max() < 0.5 * prior[9:].max()
     # what leads from the tags back to the true poses is -ERRORS but for products of errors, a hundredth of a deviation
     off = (estimate.shared.vector() + ERRORS.vector())[allowed] / posterior
     assert (np.abs(off) < 3).mean() > 0.75, off
-    trainer.state.poses.together = None  # the deviations of the likelihood of the finished model alone
+    trainer.state.poses.corrections.together = (
+        None  # the deviations of the likelihood of the finished model alone
+    )
     assert (
         posterior > trainer.result("").pose_estimate.shared_posterior.vector()[allowed] * (1 - 1e-6)
     ).all()
