@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from obbgs_core.background import Backdrop
 from obbgs_core.frames import TrainingFrame, averaged, cameras_of
 from obbgs_core.model.cameras import Cameras
 
@@ -30,6 +31,7 @@ class Batch:
     # [B, H, W] share of each pixel that a silhouette shows to be empty or solid, 0 where there is none
     sky: Tensor | None = None
     solid: Tensor | None = None
+    doubt: Tensor | None = None  # [B, H, W, C] deviation of the cameras' backdrop
 
 
 class Batches:
@@ -51,9 +53,15 @@ class Batches:
     ):
         self.frames, self.white_dn = frames, white_dn
         self._masks = (sky or {}, solid or {})
+        self._backdrops: dict[int, Backdrop] = {}
+        self._behind: dict[tuple[int, str], list[Tensor]] = {}
         self._windows = windows
         self._images: dict[int, list[Tensor]] = {}
         self._shares: dict[int, tuple[list[Tensor] | None, ...]] = {}
+
+    def cameras(self, indices: list[int]) -> Cameras:
+        """Return the cameras of whole frames, with nothing behind the target."""
+        return cameras_of([self.frames[i] for i in indices])
 
     def posed(self, frames: list[TrainingFrame]) -> "Batches":
         """Return the same images with the poses of other frames, such as refined ones."""
@@ -61,11 +69,39 @@ class Batches:
         other.frames = frames
         return other
 
+    @property
+    def has_backdrops(self) -> bool:
+        """Whether something stands behind the target in some frames."""
+        return bool(self._backdrops)
+
+    def stand(self, backdrops: dict[int, Backdrop], sky: dict[int, Tensor]) -> None:
+        """Put something behind the target in some frames, by their index, and say where they show nothing else.
+
+        Args:
+            sky: [H, W] bool, without the target; it is only used where silhouettes' sky is.
+        """
+        self._backdrops = backdrops
+        if self._masks[0]:
+            self._masks = (self._masks[0] | sky, self._masks[1])
+        self._images, self._shares, self._behind = {}, {}, {}  # copies keep those that they have
+
     def batch(self, indices: list[int], scale: float = 1.0) -> Batch:
         """Return given frames, averaged to `scale` (1 / whole number) of their size, or windows of one size of them."""
         factor = round(1 / scale)
         if factor not in self._images:
-            images = [averaged(f.dn, factor, self.white_dn) for f in self.frames]
+            readings = [
+                self._backdrops[i].dn if i in self._backdrops else f.dn for i, f in enumerate(self.frames)
+            ]
+            images = [averaged(dn, factor, self.white_dn) for dn in readings]
+            if self._backdrops:
+                nothing = torch.zeros_like(images[0])
+                for name in ("radiance", "sigma"):
+                    self._behind[factor, name] = [
+                        averaged(getattr(self._backdrops[i], name), factor, torch.inf)
+                        if i in self._backdrops
+                        else nothing
+                        for i in range(len(self.frames))
+                    ]
             self._shares[factor] = tuple(self._shares_at(m, images[0].shape[:2], factor) for m in self._masks)
             self._images[factor] = images  # last: another thread may ask meanwhile
         cameras, share, shown = self._shown(indices, factor)
@@ -74,15 +110,21 @@ class Batches:
             return torch.stack([images[i][part] for i, part in zip(indices, shown, strict=True)])
 
         sky, solid = (None if shares is None else stacked(shares) for shares in self._shares[factor])
+        cameras = cameras.scaled(1 / factor) if factor > 1 else cameras
+        doubt = None
+        if any(i in self._backdrops for i in indices):
+            cameras = dataclasses.replace(cameras, backdrop=stacked(self._behind[factor, "radiance"]))
+            doubt = stacked(self._behind[factor, "sigma"])
         return Batch(
             indices,
-            cameras.scaled(1 / factor) if factor > 1 else cameras,
+            cameras,
             stacked(self._images[factor]),
             torch.tensor([self.frames[i].exposure_time_s for i in indices]).view(-1, 1, 1, 1),
             factor * factor,
             share,
             sky,
             solid,
+            doubt,
         )
 
     def _shown(self, indices: list[int], factor: int) -> tuple[Cameras, float, list[tuple[slice, slice]]]:

@@ -89,8 +89,8 @@ class SkyLevel:
 def levelled(frames: list[TrainingFrame], sensor: Sensor) -> tuple[list[TrainingFrame], Sensor, SkyLevel]:
     """Measure the level of empty sky in frames of one size, and take its departure from the stated black off them.
 
-    In front of another background than black, and where fewer than half of the frames show sky, nothing is measured and
-    the stated level holds.
+    Frames that have the Earth in view take the mean of the others. In front of another background than black, and where
+    fewer than half of those others show sky, nothing is measured and the stated level holds.
 
     Returns:
         The frames and the sensor with which their readings say of the light what those given say of light and
@@ -102,9 +102,13 @@ def levelled(frames: list[TrainingFrame], sensor: Sensor) -> tuple[list[Training
     told = SkyLevel(ids, nothing, torch.full_like(nothing, math.inf))
     if frames[0].background:
         return frames, sensor, told
-    planes, covariance, sigma_dn = _measured(frames, sensor)
+    black = [i for i, f in enumerate(frames) if f.earth_m is None]
+    if not black:
+        return frames, sensor, told
+    planes, covariance = nothing.double(), torch.full_like(nothing, math.inf).double()
+    planes[black], covariance[black], sigma_dn = _measured([frames[i] for i in black], sensor)
     measured = covariance.isfinite().all(dim=2).all(dim=1)
-    if 2 * int(measured.sum()) < len(frames):
+    if 2 * int(measured.sum()) < len(black):
         return frames, sensor, told
     planes = planes - torch.tensor([sensor.black_dn, 0, 0])
     negligible_dn = NEGLIGIBLE * sigma_dn if sensor.jpeg is None else NEGLIGIBLE_CODED * _noise_dn(sensor)
@@ -382,7 +386,8 @@ def with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Sensor
     With less than there is, noise would count as light: there would be no empty sky, and no hull. With more, faint
     parts of the target would count as noise. Smoothed pictures scatter less too, but their nearest neighbours most.
     """
-    shown = frames[:: max(1, len(frames) // NOISE_FRAMES)]
+    shown = [frame for frame in frames if frame.earth_m is None] or frames
+    shown = shown[:: max(1, len(shown) // NOISE_FRAMES)]
     dark_dn, _ = dark_reading(sensor)
     empty_dn = [
         max(dark_dn, sensor.expected_dn(torch.tensor(frame.background), frame.exposure_time_s).item())

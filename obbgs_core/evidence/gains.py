@@ -150,7 +150,7 @@ def _views(model: Gaussians, batches: Batches, sensor: Sensor, rng: torch.Genera
         dn_per_radiance = sensor.dn_per_radiance_s * batch.exposure_time_s
         weight = torch.where(batch.dn < sensor.white_dn, dn_per_radiance / sigma_dn, 0.0)
         signs = torch.randint(0, 2, radiance.shape, generator=rng) * 2.0 - 1
-        empty_dn = sensor.expected_dn(torch.tensor(batch.cameras.background), batch.exposure_time_s)
+        empty_dn = sensor.expected_dn(batch.cameras.behind, batch.exposure_time_s)
         values = int(((prediction.expected_dn - empty_dn).abs() > sigma_dn).sum()) * batch.averaged_pixels
         yield _View(batch, radiance, added, weight, signs, values, len(batches.frames) / len(chosen))
 

@@ -19,6 +19,7 @@ class Cameras:
     model's own estimate is used. Only models whose footprint is the camera's need it.
     scale: pixels of these images for one of the sensor, along a side; below 1 where pixels were averaged.
     background: radiance, the same in all channels, of what is seen where no Gaussian is; space is black.
+    backdrop: [C, H, W, channels] (no gradient), what is added to that in each picture; None: nothing.
     """
 
     world_to_camera: Tensor
@@ -30,6 +31,7 @@ class Cameras:
     psf_sigma_px: float | None = None
     scale: float = 1.0
     background: float = 0.0
+    backdrop: Tensor | None = None
 
     def __post_init__(self):
         count = self.world_to_camera.shape[0]
@@ -47,6 +49,9 @@ class Cameras:
             )
         if not 0 <= self.background < math.inf:
             raise ValueError(f"background must be a radiance of at least 0, got {self.background}")
+        pictures = (count, self.height, self.width)
+        if self.backdrop is not None and tuple(self.backdrop.shape[:3]) != pictures:
+            raise ValueError(f"backdrop must be {[*pictures, 'C']}, got {list(self.backdrop.shape)}")
 
     def __len__(self) -> int:
         return self.world_to_camera.shape[0]
@@ -56,6 +61,11 @@ class Cameras:
         """Camera centres [C, 3], m, body frame."""
         R, t = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3:]
         return -(R.transpose(1, 2) @ t)[..., 0]
+
+    @property
+    def behind(self) -> Tensor:
+        """Radiance of what is seen where no Gaussian is: a number [], or [C, H, W, channels]."""
+        return self.background + (torch.zeros(()) if self.backdrop is None else self.backdrop)
 
     def known_suns(self) -> Tensor:
         """Return sun_dir.
@@ -72,14 +82,19 @@ class Cameras:
     def one(self, index: int) -> "Cameras":
         """Return one of the cameras, still of shape [1, ...]."""
         sun_dir = None if self.sun_dir is None else self.sun_dir[index : index + 1]
+        backdrop = None if self.backdrop is None else self.backdrop[index : index + 1]
         pose, K = self.world_to_camera[index : index + 1], self.K[index : index + 1]
-        return dataclasses.replace(self, world_to_camera=pose, K=K, sun_dir=sun_dir)
+        return dataclasses.replace(self, world_to_camera=pose, K=K, sun_dir=sun_dir, backdrop=backdrop)
 
     def scaled(self, factor: float) -> "Cameras":
-        """Return the cameras of images resized by `factor` (0.5: half as wide and high, rounded up)."""
+        """Return the cameras of images resized by `factor` (0.5: half as wide and high, rounded up).
+
+        They have no backdrop.
+        """
         K = self.K * torch.tensor([[factor], [factor], [1.0]], dtype=self.K.dtype, device=self.K.device)
         width, height = -int(-self.width * factor // 1), -int(-self.height * factor // 1)
-        return dataclasses.replace(self, K=K, width=width, height=height, scale=self.scale * factor)
+        scale = self.scale * factor
+        return dataclasses.replace(self, K=K, width=width, height=height, scale=scale, backdrop=None)
 
 
 def stacked_suns(directions: Sequence[Tensor | None]) -> Tensor | None:

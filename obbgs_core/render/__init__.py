@@ -55,6 +55,6 @@ def render(
     elif suns is not None and sunlit is None:
         sunlit = sunlit_shares(gaussians, suns, backend)
     rendered = rasterize(gaussians, cameras, backend, suns, sunlit, added)
-    if cameras.background:
-        rendered.radiance = rendered.radiance + (1 - rendered.alpha)[..., None] * cameras.background
+    if cameras.background or cameras.backdrop is not None:
+        rendered.radiance = rendered.radiance + (1 - rendered.alpha)[..., None] * cameras.behind
     return rendered

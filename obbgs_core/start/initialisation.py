@@ -18,6 +18,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import check, number
 from obbgs_core.start import hull
+from obbgs_core.start.earth import earth_silhouette
 
 log = logging.getLogger(__name__)
 FEWEST_HULL_POINTS = 200  # with fewer the start is random
@@ -48,16 +49,24 @@ def silhouettes(
     """Return silhouettes of the longest exposures by the frame's index, as tagged.
 
     Shadowed faces are brightest there. Where these frames are few those of the next longest exposure join them: a view
-    that misses a shadowed face does less harm than no view. Those that are `known` are not made again.
+    that misses a shadowed face does less harm than no view. Those that are `known` are not made again. Frames with the
+    Earth in view have no silhouette, or, where there are few others, one of what differs from an even Earth.
     """
+    black = {i: f for i, f in enumerate(frames) if f.earth_m is None}
+    earth: dict[int, TrainingFrame] = {}
+    if len(black) < FEWEST_VIEWS:
+        earth = {i: f for i, f in enumerate(frames) if f.earth_m is not None}
     chosen: dict[int, TrainingFrame] = {}
     for exposure_s in sorted({f.exposure_time_s for f in frames}, reverse=True):
         if len(chosen) < FEWEST_VIEWS:
-            chosen |= {i: f for i, f in enumerate(frames) if f.exposure_time_s == exposure_s}
+            chosen |= {i: f for i, f in black.items() if f.exposure_time_s == exposure_s}
     outlines = {}
-    for i, f in chosen.items():
+    for i, f in (chosen | earth).items():
         if i in known:
             outlines[i] = known[i]
+            continue
+        if i in earth:
+            outlines[i] = earth_silhouette(f, sensor)
             continue
         light = hull.light(f.dn, sensor, f.background, f.exposure_time_s)
         outlines[i] = hull.silhouette(light, sensor, f.world_to_camera, f.K)
@@ -193,6 +202,7 @@ def _round_gaussians(
 def _seen_radiance(points: Tensor, frames: list[TrainingFrame], sensor: Sensor) -> Tensor:
     """Return the mean radiance [N, C] that some of the frames show where the points project, occlusion ignored."""
     total, seen = torch.zeros(len(points), frames[0].dn.shape[2]), torch.zeros(len(points), 1)
+    frames = [frame for frame in frames if frame.earth_m is None] or frames
     for frame in frames[:: max(1, len(frames) // VIEWS_FOR_COLOUR)]:
         p = points @ frame.world_to_camera[:3, :3].T + frame.world_to_camera[:3, 3]
         z = p[:, 2].clamp(min=1e-6)

@@ -110,6 +110,8 @@ class TrainingSetup:
             if f.navigation is not None:
                 attitude = None if f.inertial_to_body is None else f.inertial_to_body.tolist()
                 digest.update(repr((f.time_s, attitude, f.navigation.tree())).encode())
+            if f.earth_m is not None:
+                digest.update(repr(f.earth_m.tolist()).encode())
             digest.update(repr((f.exposure_time_s, f.bracket, known, f.psf_sigma_px)).encode())
         return digest.hexdigest()
 
@@ -159,7 +161,7 @@ def prepare(
     _check_nearness(gaussians.means.detach(), posed)
     gaussians = dataclasses.replace(gaussians, footprint=published.footprint)
     span_deg = sun_span_deg(lit)
-    sky, solid = _masks(outlines, config, span_deg, lit[0].background)
+    sky, solid = _masks(outlines, config, span_deg, lit)
     parts = windows(posed, gaussians.means.detach(), certain) if published.windows else None
     white = sensor.full_scale_radiance(mean_exposure_s(lit))
     setup = TrainingSetup(
@@ -202,15 +204,17 @@ def _lit(frames: list[TrainingFrame], shown: list[bool]) -> list[TrainingFrame]:
 
 
 def _masks(
-    outlines: dict[int, Silhouette], config: MethodConfig, span_deg: float, background: float
+    outlines: dict[int, Silhouette], config: MethodConfig, span_deg: float, frames: list[TrainingFrame]
 ) -> tuple[dict[int, Tensor], dict[int, Tensor]]:
     """Return where silhouettes show empty sky, and what is solid, by the frame's index; empty where not asked for.
 
     What is dark under one Sun is lit under another, which tells it from dust: where the Sun moves nothing is solid. Nor
-    is it in front of another background than black, which shows through dust.
+    is it in front of another background than black, which shows through dust. Frames with the Earth in view say
+    neither: what stands behind the target in them follows from the model.
     """
+    outlines = {i: outline for i, outline in outlines.items() if frames[i].earth_m is None}
     sky = {i: outline.sky for i, outline in outlines.items()} if config.loss.sky_weight else {}
-    used = config.loss.solid_weight and not config.light.moves(span_deg) and not background
+    used = config.loss.solid_weight and not config.light.moves(span_deg) and not frames[0].background
     return sky, {i: outline.solid for i, outline in outlines.items()} if used else {}
 
 

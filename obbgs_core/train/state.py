@@ -100,6 +100,8 @@ class TrainingState:
     fit: Fit = field(default_factory=Fit)
     average: Average = field(default_factory=Average)  # of the models of the last steps
     deviation_m: Tensor | None = None  # [N] of the 3D filter; None: the method has none
+    # [H, W] which pixels may show the target, of the frames that have the Earth in view, by index
+    near_target: dict[int, Tensor] = field(default_factory=dict)
     compensation: Compensation | None = None  # None: the colours of all frames are the model's
     shadows: Shadows = field(default_factory=Shadows)
     neighbours: Neighbours = field(default_factory=Neighbours)

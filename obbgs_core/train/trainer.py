@@ -118,6 +118,7 @@ class Trainer:
         began = time.monotonic()
         setup, state, config = self.setup, self.state, self.setup.config
         moment = config.moment(state.steps_done)
+        renew(setup, state)
         drawn = state.order.draw(min(moment.frames, len(setup.frames)), state.rng)
         batch = setup.batches.batch(drawn, moment.image_scale)
         if state.poses.corrections is not None:
@@ -127,6 +128,7 @@ class Trainer:
         model, drops = state.model, setup.dropout > 0 and moment.share < DROPPED_UNTIL
         drawn_model = dropped(model, setup.dropout, state.rng) if drops else model
         rendered = self._compensated(render(drawn_model, batch.cameras, sunlit=sunlit), batch)
+        batch = doubted(batch, rendered, setup.sensor)
         loss, residual = image_loss(rendered, batch, setup.sensor, config, state.fit.misfit)
         if not torch.isfinite(loss):
             raise Diverged(state.steps_done, loss.item())
