@@ -21,7 +21,9 @@ def renew(setup: TrainingSetup, state: TrainingState) -> None:
     indices = [i for i, f in enumerate(setup.frames) if f.earth_m is not None]
     if not indices or setup.config.published.loss != "likelihood":
         return
-    due = state.steps_done % EVERY_STEPS == 0 and state.poses.round is None  # a round asks about one and the same
+    due = (
+        state.steps_done % EVERY_STEPS == 0 and state.poses.round is None
+    )  # a round asks about one and the same
     if due or set(state.near_target) != set(indices):
         poses = state.poses.corrections
         batches = setup.batches if poses is None else setup.batches.posed(poses.frames(setup.frames))

@@ -293,5 +293,11 @@ def standing_out(dispersion: Tensor, misfit: Tensor) -> Tensor:
 
 def _question(setup: TrainingSetup, model: Gaussians, poses: PoseCorrections, indices: list[int]) -> Question:
     """Return what frames are asked about a model and their poses as they stand; training may go on meanwhile."""
-    given = (setup.batches.posed(setup.frames), indices, poses.corrected(indices), setup.sensor, cell_m(setup))
+    given = (
+        setup.batches.posed(setup.frames),
+        indices,
+        poses.corrected(indices),
+        setup.sensor,
+        cell_m(setup),
+    )
     return Question(model.copied(), *given)

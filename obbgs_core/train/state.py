@@ -39,7 +39,7 @@ from obbgs_core.train.selection import Harmonics, Highlights, Pruning
 from obbgs_core.train.setup import Start, TrainingSetup
 
 log = logging.getLogger(__name__)
-FORMAT = 17  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 18  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)

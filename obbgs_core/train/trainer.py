@@ -23,6 +23,7 @@ from obbgs_core.published.growth import outliers
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.adam import learning_rates
+from obbgs_core.train.backdrops import doubted, renew
 from obbgs_core.train.joining import begun_again, check_joinable, join, release, withhold
 from obbgs_core.train.objective import DROPPED_UNTIL, dropped, image_loss, priors
 from obbgs_core.train.parts import Seen
