@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from obbgs_core.train.presets import preset
 
 from obbgs_base.earth import RADIUS_M
 from obbgs_core.background import backdrop, earth_pixels, filled, weighed
 from obbgs_core.frames import TrainingFrame
+from obbgs_core.methods.presets import preset
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.render import render
 from obbgs_core.start.earth import earth_silhouette
