@@ -247,7 +247,7 @@ import sys
 from pathlib import Path
 import ground.run.model_files
 from ground.run.reconstruct import reconstruct
-ground.model_files.SURFACE_POINTS = 1000
+ground.run.model_files.SURFACE_POINTS = 1000
 def told(progress):
     if progress.info.step == 3:
         print("training", flush=True)
