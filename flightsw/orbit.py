@@ -13,9 +13,8 @@ from jplephem.spk import SPK
 from sgp4.api import SGP4_ERRORS, Satrec
 
 from flightsw.errors import OrbitError
-from flightsw.icd.reference_frames import TT_MINUS_UTC_S, julian_date, teme_to_gcrs
+from flightsw.icd.reference_frames import EARTH_RADIUS_M, TT_MINUS_UTC_S, julian_date, teme_to_gcrs
 
-EARTH_RADIUS_M = 6_378_137.0  # WGS 84
 SUN_RADIUS_M = 6.957e8  # IAU 2015 nominal
 # Sun, Earth and their barycentres, cut out of JPL's DE421 without a change of the coefficients (file size 2 of 17 MB):
 # python -m jplephem excerpt --targets 3,10,399 2000/1/1 2053/10/9 de421.bsp de421_sun_2000_2053.bsp

@@ -45,8 +45,16 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     | {"flightsw.icd.ndm", "flightsw.ports", "flightsw.errors", "flightsw.clock", "flightsw.cameras"},
     "ground.session": {"obbgs_base", "flightsw.icd", "obbgs_core", "obbgs_core.model", "obbgs_core.render"},
     "ground.link": CONTRACT | {"flightsw.ports", "ground.session"},
-    "ground.formats": {"obbgs_base", "flightsw.icd", "ground.session"},
-    "ground.run": {"obbgs_base", "flightsw.icd", *GROUND, "ground.link", "obbgs_core.attitude"} | LIBRARY,
+    "ground.formats": {"obbgs_base", "flightsw.icd", "flightsw.icd.ndm", "ground.session"},
+    "ground.run": {
+        "obbgs_base",
+        "flightsw.icd",
+        "flightsw.icd.ndm",
+        *GROUND,
+        "ground.link",
+        "obbgs_core.attitude",
+    }
+    | LIBRARY,
     "ground.show": {"obbgs_base", "flightsw.icd", "ground.session", "ground.link", "ground.run"}
     | LIBRARY - {"obbgs_core.train"}
     | {"obbgs_core.attitude"},

@@ -6,6 +6,7 @@ UNIX_EPOCH_JD = 2_440_587.5
 DAY_NS = 86_400_000_000_000
 TT_MINUS_UTC_S = 69.184  # 37 leap seconds + 32.184 s; true since 2017-01-01
 ARCSEC_RAD = np.pi / 648_000
+EARTH_RADIUS_M = 6_378_137.0  # WGS 84
 # where the pole and the origin of right ascension of J2000 lie in GCRS (IERS Conventions 2010, 5.21 and 5.33), arcsec
 POLE_X, POLE_Y, RIGHT_ASCENSION = -0.016617, -0.0068192, -0.0146
 
@@ -84,3 +85,20 @@ def _rotation(axis: int, angle_rad: float) -> np.ndarray:
     matrix[i, i] = matrix[j, j] = c
     matrix[i, j], matrix[j, i] = s, -s
     return matrix
+
+
+def low_precision_sun(utc_ns: int) -> np.ndarray:
+    """Return the unit vector [3] from the Earth to the Sun, GCRS, within 0.01 degrees from 1950 to 2050.
+
+    Source: Astronomical Almanac, low-precision formulas, with the longitude counted from the equinox of J2000. Flight
+    has the Sun from DE421 (flightsw/orbit.py).
+    """
+    jd, fr = julian_date(utc_ns)
+    days = (jd - 2_451_545.0) + fr
+    anomaly = np.radians(357.528 + 0.9856003 * days)
+    longitude = np.radians(280.460 + 0.9856474 * days - 3.8246e-5 * days)
+    longitude += np.radians(1.915 * np.sin(anomaly) + 0.020 * np.sin(2 * anomaly))
+    obliquity = np.radians(23.4393)
+    return np.array(
+        [np.cos(longitude), np.cos(obliquity) * np.sin(longitude), np.sin(obliquity) * np.sin(longitude)]
+    )

@@ -73,16 +73,17 @@ def import_command(
         found = _photographs(folder, session, frames, table)
         views, sigmas, registration = found.views, found.sigmas, found.described()
     else:
-        views, exported = _read(format_, folder)
+        views, exported = _read(format_, folder, table)
         views = first_of_each_split(views, frames)
-        if exposures != UNKNOWN:
+        if exposures != UNKNOWN and format_ is not ImportFormat.NDM:
             views = with_exposures(views, table)
     views, found_poses = with_masks(views, masks), {}
     source = f"{format_.value}: {folder}"
     given = None if values is None else Values(values.value)
     if exposures == UNKNOWN:
         views = estimated(views, given)
-    if format_ is not ImportFormat.IMAGES and poses is not PoseChoice.STATED:
+    in_body_axes = all(view.attitude_known for view in views)
+    if format_ is not ImportFormat.IMAGES and poses is not PoseChoice.STATED and in_body_axes:
         views, found_poses = _checked_poses(views, given_sigmas or sigmas, poses is PoseChoice.MEND)
         if poses is PoseChoice.MEND:
             source += "".join(f", {len(pictures)} poses {kind}" for kind, pictures in found_poses.items())
@@ -112,11 +113,14 @@ def import_command(
         print(f"turned by 180 degrees against the others: {', '.join(registration['turned'])}")
 
 
-def _read(format_: ImportFormat, folder: Path) -> "tuple[list[View], Exported | None]":
+def _read(
+    format_: ImportFormat, folder: Path, table: "dict[str, Light] | None"
+) -> "tuple[list[View], Exported | None]":
     """Return the pictures of a data set whose cameras are known, and what our own export says of them."""
     from ground.formats.colmap import read_colmap
     from ground.formats.llff import read_llff
     from ground.formats.middlebury import read_middlebury
+    from ground.formats.ndm import read_ndm
     from ground.formats.nerf import read_nerf
     from ground.formats.nerfstudio import read_nerfstudio
     from ground.formats.shirt import read_shirt
@@ -124,6 +128,8 @@ def _read(format_: ImportFormat, folder: Path) -> "tuple[list[View], Exported | 
     described = {ImportFormat.NERF: read_nerf, ImportFormat.NERFSTUDIO: read_nerfstudio}
     if format_ in described:
         return described[format_](folder)
+    if format_ is ImportFormat.NDM:
+        return read_ndm(folder, table), None
     plain = {
         ImportFormat.COLMAP: read_colmap,
         ImportFormat.SHIRT: read_shirt,
@@ -226,7 +232,8 @@ def export_command(
     """Write a session's frames for other software, whole brackets split into train, val and test (6:2:3).
 
     Pictures have 8 bits. Beside them lie the readings of 16 bits, which `ground import` takes with the sensor's figures
-    (a COLMAP folder is a nerfstudio folder too: import it as that).
+    (a COLMAP folder is a nerfstudio folder too: import it as that). The format ndm writes no pictures, but CCSDS
+    messages: the target's attitude and rate, the camera's attitude and its path about the target with covariance.
 
     Example: ground export --session pass-12 --run first --format nerfstudio --out pass-12-nerfstudio
     """
@@ -234,6 +241,7 @@ def export_command(
     from ground.formats.nerf import export_nerf
     from ground.formats.nerfstudio import export_nerfstudio
     from ground.run.estimated_poses import refined_session
+    from ground.run.navigation_messages import export_ndm
     from ground.run.runs import open_run
     from ground.session.folder import SessionError, open_session
 
@@ -242,11 +250,15 @@ def export_command(
         ExportFormat.NERFSTUDIO: export_nerfstudio,
         ExportFormat.COLMAP: export_colmap,
     }
-    read = open_session(session) if run is None else refined_session(open_run(session, run))
-    read.check_body_axes()
     if (out.exists() and not out.is_dir()) or (out / "session.json").exists():
         kind = "a session" if out.is_dir() else "a file"
         raise SessionError(f"{out} is {kind}: give a folder of its own with --out, new or empty")
-    counts = exporters[format_](read, out)
+    opened = None if run is None else open_run(session, run)
+    if format_ is ExportFormat.NDM:
+        counts = export_ndm(open_session(session) if opened is None else opened.session, out, opened)
+    else:
+        read = open_session(session) if opened is None else refined_session(opened)
+        read.check_body_axes()
+        counts = exporters[format_](read, out)
     text = ", ".join(f"{count} {split}" for split, count in counts.items())
     print(json.dumps(counts) if json_ else f"{text} in {out}")

@@ -65,6 +65,7 @@ class ImportFormat(StrEnum):
     SHIRT = "shirt"
     LLFF = "llff"
     MIDDLEBURY = "middlebury"
+    NDM = "ndm"
     IMAGES = "images"
 
 
@@ -97,6 +98,7 @@ class ExportFormat(StrEnum):
     NERF = "nerf"
     NERFSTUDIO = "nerfstudio"
     COLMAP = "colmap"
+    NDM = "ndm"
 
 
 class MeshFormatName(StrEnum):
@@ -149,8 +151,8 @@ ExposuresGiven = Annotated[
         "--exposures",
         metavar="FILE.csv|unknown",
         help="Exposures that the pictures do not state: a table with the columns name and exposure_time_s, iso, "
-        "f_number or gain; unknown: estimated, one a picture, from features that neighbours share. Default: what the "
-        "data set or the pictures' headers state (EXIF, FITS).",
+        "f_number, gain or mid_exposure_utc; unknown: estimated, one a picture, from features that neighbours share. "
+        "Default: what the data set or the pictures' headers state (EXIF, FITS).",
     ),
 ]
 MasksGiven = Annotated[

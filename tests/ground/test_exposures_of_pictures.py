@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import shlex
+from datetime import UTC, datetime
 from pathlib import Path
 
 import imagecodecs
@@ -16,6 +17,9 @@ from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 from scipy.spatial.transform import Rotation
 
+from flightsw.icd.ndm.formation import Formation
+from flightsw.icd.ndm.write import Object, write_aem, write_oem
+from flightsw.icd.quaternion import matrix_to_quat
 from ground.formats.axes import world_to_camera_to_opengl
 from ground.formats.photographs.brackets import brackets_of
 from ground.formats.photographs.exposures import estimated, light_s, read_table, with_exposures
@@ -337,7 +341,33 @@ def data(bracketed, scene) -> Path:
     (folder / "fits/transforms.json").write_text(json.dumps({**lens, "frames": frames}))
     (folder / "fits/exposures.csv").write_text("\n".join(table) + "\n")
     np.save(folder / "llff/poses_bounds.npy", np.array(poses, dtype=float))
+    write_pass(folder / "pass", sorted(bracketed.iterdir()))
     return folder
+
+
+def write_pass(folder: Path, pictures: list[Path]) -> None:
+    """Write pictures, their times, and messages of a camera on its way about a target that rests."""
+    (folder / "images").mkdir(parents=True)
+    start_ns, rows, times, quats, places = 1_784_631_150_000_000_000, ["name,mid_exposure_utc"], [], [], []
+    for number, path in enumerate(pictures):
+        (folder / "images" / path.name).write_bytes(path.read_bytes())
+        times.append(start_ns + (number // 3) * 20_000_000_000 + (number % 3) * 500_000_000)
+        taken = datetime.fromtimestamp(times[-1] / 1e9, UTC)
+        rows.append(f"{path.name},{taken:%Y-%m-%dT%H:%M:%S.%f}")
+        pose = POSES[number // 3]
+        quats.append(matrix_to_quat(pose[:3, :3]))
+        places.append(-pose[:3, :3].T @ pose[:3, 3])
+    rest, chaser, target = np.tile([1.0, 0, 0, 0], (len(times), 1)), Object("CHASER"), Object("TARGET")
+    way = (times, np.stack(places), np.zeros((len(times), 3)), None, start_ns, ("LINEAR", 1))
+    files = {
+        "chaser.oem": write_oem(chaser, "TARGET", *way),
+        "chaser.aem": write_aem(chaser, "CAMERA", times, np.stack(quats), None, start_ns),
+        "target.aem": write_aem(target, "SC_BODY_1", times, rest, None, start_ns),
+        "camera.yaml": b"fx_px: 375.0\n",
+        "table.csv": "\n".join(rows).encode() + b"\n",
+    }
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
 
 
 def write_fits(path: Path, image: np.ndarray) -> None:
@@ -349,16 +379,16 @@ def write_fits(path: Path, image: np.ndarray) -> None:
 def test_every_command_of_the_page_does_what_the_page_says(data, monkeypatch):
     page = (Path(__file__).parents[2] / "docs/own-pictures.md").read_text()
     commands = [shlex.split(block) for block in re.findall(r"```sh\n(.*?)```", page, re.S)]
-    assert len(commands) == 5
+    assert len(commands) == 7
     monkeypatch.chdir(data)
     for tool, *arguments in commands:
         quick = ["--steps", "20", "--no-blind-reference"] if arguments[0] == "reconstruct" else []
         done = call(tool, *arguments, *quick)
         assert done.returncode == 0, done.stderr
-    expected = {"photographed": 30, "with-colmap": 30, "with-fits": 30, "with-masks": 10}
+    expected = {"photographed": 30, "with-colmap": 30, "with-fits": 30, "with-masks": 10, "with-orbits": 30}
     sessions = {name: open_session(data / name) for name in expected}
     assert {name: len(session.frames) for name, session in sessions.items()} == expected
-    for name in ("photographed", "with-colmap", "with-fits"):
+    for name in ("photographed", "with-colmap", "with-fits", "with-orbits"):
         assert sorted({r.exposure_time_s for r in sessions[name].frames}) == pytest.approx(BRACKET_S), name
         assert sessions[name].encoding == "linear"
     assert sessions["with-fits"].camera.bit_depth == 12 and sessions["with-fits"].frames[5].saturated > 0
@@ -368,7 +398,9 @@ def test_every_command_of_the_page_does_what_the_page_says(data, monkeypatch):
     one, other = (sessions["with-fits"].dn(sessions["with-fits"].frames[i]).astype(float) for i in (0, 1))
     known = (other < 4095) & (one > 50)
     np.testing.assert_allclose(other[known] / one[known], 2, rtol=0.05)
-    for name in ("with-colmap", "with-fits", "with-masks"):  # the poses are those of the scene
+    found = Formation.of({path.name: path.read_bytes() for path in (data / "found").glob("*em")})
+    assert found.chaser.centre == "TARGET" and found.target_attitude is not None
+    for name in ("with-colmap", "with-fits", "with-masks", "with-orbits"):  # the poses are those of the scene
         session = sessions[name]
         for record in session.frames[:: len(session.frames) // 10]:
             number = record.id * 10 // len(session.frames)

@@ -43,7 +43,7 @@ def write_oem(
         *("META_STOP", ""),
     ]
     for at_ns, position, velocity in zip(utc_ns, positions_m, velocities_m_s, strict=True):
-        numbers = " ".join(f"{x / 1e3:.10f}" for x in (*position, *velocity))
+        numbers = " ".join(f"{x / 1e3:.13f}" for x in (*position, *velocity))
         lines.append(f"{epoch_text(tai_ns(at_ns))} {numbers}")
     if covariances is not None:
         lines += ["", "COVARIANCE_START"]

@@ -15,13 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
+from flightsw.icd.config import in_file
+from flightsw.icd.ndm.text import Value
+from flightsw.icd.ndm.times import parse_epoch, utc_ns
 from ground.formats.photographs.epipolar import matched_points
 from ground.formats.pictures.files import FormatError, Light, read_header
 from ground.formats.pictures.view import View, colours_of, grey_light, has_display_values, read_image
 from ground.formats.pictures.views import Values
 
 log = logging.getLogger(__name__)
-COLUMNS = ("name", "exposure_time_s", "iso", "f_number", "gain")
+COLUMNS = ("name", "exposure_time_s", "iso", "f_number", "gain", "mid_exposure_utc")
 LARGEST_TABLE = 1 << 24  # bytes
 PATCH_PX = 2  # around a feature, on every side, whose mean is compared
 DARKEST, BRIGHTEST = 0.02, 0.95  # of full scale: values that are compared
@@ -36,7 +39,8 @@ UNKNOWN = "unknown"
 def read_table(path: Path) -> dict[str, Light]:
     """Return what a CSV file says of each picture, by its file name without folders.
 
-    The first line names the columns: name, and exposure_time_s, iso, f_number or gain, of which some may be left out.
+    The first line names the columns: name, and exposure_time_s, iso, f_number, gain or mid_exposure_utc (ISO 8601), of
+    which some may be left out.
 
     Raises:
         FormatError: it cannot be read, has another column, names a picture twice, or a value is no positive number.
@@ -67,9 +71,11 @@ def read_table(path: Path) -> dict[str, Light]:
         picture = Path(values.pop("name").replace("\\", "/")).name
         if picture in table:
             raise FormatError(f"{path}, line {number}: {picture} is listed twice")
+        taken = values.pop("mid_exposure_utc", None)
         entries = {name: _positive(text, f"{path}, line {number}: {name}") for name, text in values.items()}
         known = {"time_s" if name == "exposure_time_s" else name: value for name, value in entries.items()}
-        table[picture] = dataclasses.replace(Light(), **known)
+        middle = None if taken is None else _utc_ns(taken, f"{path}, line {number}: mid_exposure_utc")
+        table[picture] = dataclasses.replace(Light(), **known, middle_utc_ns=middle)
     return table
 
 
@@ -93,6 +99,8 @@ def with_exposures(views: Sequence[View], table: dict[str, Light] | None = None)
                 f"the table of exposures lacks {len(missing)} pictures: {', '.join(missing[:5])}"
             )
         lights = [table[view.image.name] for view in views]
+        if all(light == Light(middle_utc_ns=light.middle_utc_ns) for light in lights):
+            lights = [headers[view.image].light for view in views]  # the table tells times only
     elif all(view.exposure_stated for view in views):
         return list(views)
     else:
@@ -103,7 +111,7 @@ def with_exposures(views: Sequence[View], table: dict[str, Light] | None = None)
                 "--exposures FILE.csv with the columns name,exposure_time_s,gain (times of light)"
             )
         lights = [dataclasses.replace(light, gain=None) for light in lights]
-    timed = _with_times(views, [headers[view.image].light for view in views])
+    timed = _with_times(views, [headers[view.image].light for view in views], table or {})
     unknown = [view.image.name for view, light in zip(views, lights, strict=True) if not _says(light, table)]
     if len(unknown) == len(views) and table is None:
         log.warning(
@@ -241,9 +249,16 @@ def _says(light: Light, table: dict[str, Light] | None) -> bool:
     return light.time_s is not None or (table is not None and (light.gain or light.iso) is not None)
 
 
-def _with_times(views: Sequence[View], lights: Sequence[Light]) -> list[View]:
-    """Return the views with the times at which they were taken, where all pictures say that."""
+def _utc_ns(text: str, where: str) -> int:
+    with in_file(where):
+        return utc_ns(parse_epoch(Value(text, "UTC"), "UTC"))
+
+
+def _with_times(views: Sequence[View], lights: Sequence[Light], table: dict[str, Light]) -> list[View]:
+    """Return the views with the times at which they were taken, where the table or all pictures say that."""
     times = [light.taken_utc_ns for light in lights]
+    if all(view.image.name in table and table[view.image.name].middle_utc_ns is not None for view in views):
+        times = [table[view.image.name].middle_utc_ns for view in views]
     if any(time is None for time in times) or any(view.mid_exposure_utc_ns is not None for view in views):
         return list(views)
     return [

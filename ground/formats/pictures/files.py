@@ -48,13 +48,8 @@ KINDS = {
 }
 HDR_SIZE = re.compile(rb"\n-Y (\d{1,6}) \+X (\d{1,6})\n")
 EXIF_IFD, EXIF_TIME_S, EXIF_F_NUMBER, EXIF_ISO, EXIF_ISO_SPEED = 0x8769, 0x829A, 0x829D, 0x8827, 0x8833
-EXIF_SHUTTER, EXIF_APERTURE, EXIF_TAKEN, EXIF_SUBSECONDS, ORIENTATION = (
-    0x9201,
-    0x9202,
-    0x9003,
-    0x9291,
-    0x0112,
-)
+EXIF_SHUTTER, EXIF_APERTURE, ORIENTATION = 0x9201, 0x9202, 0x0112
+EXIF_TAKEN, EXIF_SUBSECONDS, EXIF_ZONE = 0x9003, 0x9291, 0x9011
 MOST_CHANNELS, MOST_BITS = 4, 64
 MOST_VALUES = 1 << 30  # of all channels
 TIFF_COLOURS = (0, 1, 2)  # white is zero, black is zero, RGB
@@ -74,7 +69,10 @@ class Light:
     iso: float | None = None
     f_number: float | None = None
     gain: float | None = None  # of the sensor, in whatever unit the camera has
-    taken_utc_ns: int | None = None  # the camera's own clock, taken for UTC
+    taken_utc_ns: int | None = (
+        None  # the beginning, by the camera's own clock, taken for UTC where it states no zone
+    )
+    middle_utc_ns: int | None = None  # of the exposure
 
 
 @dataclass(frozen=True)
@@ -258,13 +256,15 @@ def _light(exif: Any) -> Light:
         time_s=_number(exif.get(EXIF_TIME_S)) or (None if shutter is None else 1 / shutter),
         iso=_number(exif.get(EXIF_ISO)) or _number(exif.get(EXIF_ISO_SPEED)),
         f_number=_number(exif.get(EXIF_F_NUMBER)) or (None if aperture is None else math.sqrt(aperture)),
-        taken_utc_ns=_taken_ns(exif.get(EXIF_TAKEN), exif.get(EXIF_SUBSECONDS)),
+        taken_utc_ns=_taken_ns(exif.get(EXIF_TAKEN), exif.get(EXIF_SUBSECONDS), exif.get(EXIF_ZONE)),
     )
 
 
-def _taken_ns(text: Any, subseconds: Any) -> int | None:
+def _taken_ns(text: Any, subseconds: Any, zone: Any) -> int | None:
+    """Return the time of EXIF entries; without a time zone that of UTC."""
+    zone = str(zone or "").strip("\0 ") or "+00:00"
     try:
-        taken = datetime.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+        taken = datetime.strptime(str(text).strip("\0 ") + zone, "%Y:%m:%d %H:%M:%S%z")
         digits = str(subseconds or "").strip("\0 ")
         return int(taken.timestamp()) * 10**9 + (int(digits[:9].ljust(9, "0")) if digits.isdecimal() else 0)
     except ValueError:
@@ -348,10 +348,12 @@ def _header_of_fits(path: Path) -> Header:
         def said(*names: str) -> Any:
             return next((h[name] for name in names for h in (header, common) if name in h), None)
 
+        utc = str(said("TIMESYS") or "UTC").strip().upper() == "UTC"
         light = Light(
             time_s=_number(said(*FITS_TIME_S)),
             gain=_number(said("GAIN")),
-            taken_utc_ns=_fits_time_ns(said("DATE-OBS")),
+            taken_utc_ns=_fits_time_ns(said("DATE-OBS", "DATE-BEG")) if utc else None,
+            middle_utc_ns=_fits_time_ns(said("DATE-AVG")) if utc else None,
         )
         return Header(shape[0], shape[1], light)
 
@@ -471,6 +473,7 @@ _EXIF_NUMBERS = (
     EXIF_APERTURE,
     EXIF_TAKEN,
     EXIF_SUBSECONDS,
+    EXIF_ZONE,
 )
 _HEADERS: dict[str, Callable[[Path], Header]] = {
     **dict.fromkeys(("png", "jpeg", "bmp", "webp"), _header_of_pillow),

@@ -28,6 +28,8 @@ class View:
     sun_dir_body: np.ndarray = field(default_factory=lambda: np.zeros(3))  # unit; zero where unknown
     in_eclipse: bool = False
     covariance: np.ndarray | None = None  # [6, 6] of the pose, as in a session's frames; None: not stated
+    attitude_known: bool = True  # of the target; otherwise poses are in GCRS axes about it
+    quat_inertial_to_body: np.ndarray | None = None  # [4] attitude of the target that the pose assumes, GCRS
     split: str | None = None  # train, val or test; stated for all views or for none
     readings: Path | None = None  # of our own export: the digital numbers of the session that it was made of
 

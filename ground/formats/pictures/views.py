@@ -142,6 +142,8 @@ def write_session(
         on_view()
     write_whole(folder / "frames.jsonl", ("\n".join(lines) + "\n").encode())
     header = _header(target, source, len(views), registration, origin_moved)
+    if not all(view.attitude_known for view in views):
+        header["navigation"] = {"attitude": "unknown"}
     write_whole(folder / "session.json", json.dumps(header, indent=2).encode() + b"\n")
     return len(views)
 
@@ -357,6 +359,8 @@ def _frame(view: View, number: int, dn: np.ndarray, camera: CameraSection, sigma
         in_eclipse=view.in_eclipse,
         valid=True,
         source="none",
+        attitude="known" if view.attitude_known else "unknown",
+        quat_inertial_to_body=view.quat_inertial_to_body,
     )
     time_ns = view.mid_exposure_utc_ns
     return Frame(

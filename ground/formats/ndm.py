@@ -1,0 +1,165 @@
+"""Pictures with times beside navigation data messages of CCSDS (NDM): orbits and attitudes give the cameras' poses.
+
+    camera.yaml      the lens, and how the camera is mounted on the chaser (`Camera`)
+    images/          the pictures, or they lie beside the files
+    target.oem, chaser.oem, target.aem, chaser.aem    as flight reads them (flightsw/icd/ndm)
+
+Without target.aem the target's attitude is unknown, and `ground reconstruct` finds it.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from flightsw.icd.config import MAX_YAML_BYTES, build, in_file, parse_yaml, require
+from flightsw.icd.ndm.formation import Formation, Geometry, role_of
+from flightsw.icd.ndm.orbit import NoState
+from flightsw.icd.ndm.text import MAX_NDM_BYTES
+from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
+from flightsw.icd.reference_frames import EARTH_RADIUS_M, low_precision_sun
+from ground.formats.photographs.brackets import brackets_of
+from ground.formats.photographs.exposures import with_exposures
+from ground.formats.pictures.files import FormatError, Light, pictures_in, read_header
+from ground.formats.pictures.lens import Intrinsics
+from ground.formats.pictures.view import View
+from ground.formats.pictures.views import unposed
+from obbgs_base.files import read_bounded
+
+CAMERA = "camera.yaml"
+
+
+@dataclass(frozen=True)
+class Camera:
+    """The lens, and where the camera is on the chaser.
+
+    fy_px: null: as fx_px. cx_px, cy_px: where the line of sight meets the pictures; null: their middle.
+    distortion: k1, k2, p1, p2, k3 as of OpenCV.
+    quat_chaser_to_camera, camera_position_m: as in a mission file.
+    times: what the pictures' own times are of; those of a table, and DATE-AVG of FITS, are of the middle.
+    """
+
+    fx_px: float
+    fy_px: float | None = None
+    cx_px: float | None = None
+    cy_px: float | None = None
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    quat_chaser_to_camera: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+    camera_position_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+    times: Literal["start", "middle"] = "start"
+
+    def __post_init__(self):
+        for name, count in (("distortion", 5), ("quat_chaser_to_camera", 4), ("camera_position_m", 3)):
+            got = len(getattr(self, name))
+            require(got == count, f"camera.{name}", f"expected {count} numbers, got {got}")
+        length = math.hypot(*self.quat_chaser_to_camera)
+        require(
+            abs(length - 1) < 1e-6,
+            "camera.quat_chaser_to_camera",
+            f"expected a unit quaternion, got length {length:.6f}",
+        )
+        for name in ("fx_px", "fy_px"):
+            value = getattr(self, name)
+            require(value is None or value > 0, f"camera.{name}", f"must be positive, got {value}")
+
+    def lens(self, width: int, height: int) -> Intrinsics:
+        return Intrinsics(
+            width,
+            height,
+            self.fx_px,
+            self.fx_px if self.fy_px is None else self.fy_px,
+            width / 2 if self.cx_px is None else self.cx_px,
+            height / 2 if self.cy_px is None else self.cy_px,
+            self.distortion,
+        )
+
+
+def read_ndm(folder: Path, table: dict[str, Light] | None = None) -> list[View]:
+    """Return the pictures of a folder with the poses that its messages give at their times, in the order of time.
+
+    Args:
+        table: what is known of the pictures' exposures and times beside what they say themselves.
+
+    Raises:
+        FormatError: a file is missing, a picture states no time, or a message does not cover one.
+        ConfigError: camera.yaml or a message is not valid.
+    """
+    try:
+        content = read_bounded(folder / CAMERA, MAX_YAML_BYTES)
+        paths = [path for path in sorted(folder.iterdir()) if role_of(path.name)]
+        files = {path.name: read_bounded(path, MAX_NDM_BYTES) for path in paths}
+    except OSError as error:
+        raise FormatError(
+            f"{error.filename}: {error.strerror}; expected {CAMERA}, target.oem, chaser.oem and chaser.aem there"
+        ) from error
+    with in_file(folder / CAMERA):
+        camera = build(Camera, parse_yaml(content, "camera"), "camera")
+    with in_file(folder):
+        formation = Formation.of(files)
+    if formation.chaser_attitude is None:
+        raise FormatError(f"{folder}: chaser.aem is missing, which says where the camera looks")
+    pictures = folder / "images" if (folder / "images").is_dir() else folder
+    views = with_exposures([unposed(pictures / name) for name in pictures_in(pictures)], table)
+    posed = [_posed(view, camera, formation, table or {}) for view in views]
+    return [view for group in brackets_of(posed) for view in group] if posed else []
+
+
+def _posed(view: View, camera: Camera, formation: Formation, table: dict[str, Light]) -> View:
+    utc_ns = _middle_ns(view.image, camera, table.get(view.image.name))
+    try:
+        found = formation.at(utc_ns)
+    except NoState as error:
+        raise FormatError(f"{view.image}: {error}") from error
+    assert found.quat_gcrs_to_chaser is not None
+    to_chaser, known = quat_to_matrix(found.quat_gcrs_to_chaser), found.quat_gcrs_to_body is not None
+    to_body = quat_to_matrix(found.quat_gcrs_to_body) if found.quat_gcrs_to_body is not None else np.eye(3)
+    position_m = to_body @ (found.chaser_from_target_m + to_chaser.T @ np.array(camera.camera_position_m))
+    pose = np.eye(4)
+    pose[:3, :3] = quat_to_matrix(np.array(camera.quat_chaser_to_camera)) @ to_chaser @ to_body.T
+    pose[:3, 3] = -pose[:3, :3] @ position_m
+    covariance = None
+    if found.covariance is not None:
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = to_body @ found.covariance[:3, :3] @ to_body.T
+    sun = low_precision_sun(utc_ns)
+    return dataclasses.replace(
+        view,
+        world_to_camera=pose,
+        intrinsics=camera.lens(view.intrinsics.width, view.intrinsics.height),
+        mid_exposure_utc_ns=utc_ns,
+        sun_dir_body=to_body @ sun,
+        in_eclipse=_in_eclipse(found, sun),
+        covariance=covariance,
+        attitude_known=known,
+        quat_inertial_to_body=matrix_to_quat(to_body),
+    )
+
+
+def _middle_ns(image: Path, camera: Camera, row: Light | None) -> int:
+    """Return the middle of a picture's exposure."""
+    if row is not None and row.middle_utc_ns is not None:
+        return row.middle_utc_ns
+    light = read_header(image).light
+    if light.middle_utc_ns is not None:
+        return light.middle_utc_ns
+    if light.taken_utc_ns is None:
+        raise FormatError(
+            f"{image}: states no time (EXIF DateTimeOriginal, FITS DATE-OBS); give --exposures FILE.csv with the "
+            "columns name,mid_exposure_utc"
+        )
+    if camera.times == "middle":
+        return light.taken_utc_ns
+    seconds = (row.time_s if row is not None else None) or light.time_s or 0.0
+    return light.taken_utc_ns + round(seconds * 5e8)
+
+
+def _in_eclipse(found: Geometry, sun: np.ndarray) -> bool:
+    """Return whether the Earth hides the middle of the Sun from the target; False where its place is not known."""
+    if found.target is None:
+        return False
+    along = found.target.position_m @ sun
+    across_m = np.linalg.norm(found.target.position_m - along * sun)
+    return bool(along < 0 and across_m < EARTH_RADIUS_M)
