@@ -85,6 +85,7 @@ class Sensor:
         if self.jpeg is not None and averaged_pixels == 1:
             scale_dn = self.white_dn / FULL_SCALE
             read, spread = clipped_moments(expected, variance.sqrt(), self.white_dn)
+            spread = spread.detach()  # it is 0 where all is saturated, and its root has no slope there
             shape = read.shape if read.ndim == 4 else (1, *read.shape)
             stored = self.jpeg.moments((read / scale_dn).view(shape), (spread / scale_dn**2).view(shape))
             expected = (stored[0] * scale_dn).view(read.shape)

@@ -99,6 +99,14 @@ def test_the_level_of_sky_is_that_before_coding(level_dn, quality):
     assert float((level.planes_dn[..., 0] - level_dn).abs().max()) < 0.1 * SENSOR.read_noise_dn
 
 
+def test_a_saturated_picture_has_a_gradient_that_is_finite():
+    values, coding = stored(np.full((32, 32, 3), 255, np.uint8), quality=85)
+    light = torch.full((1, 32, 32, 3), 2000.0, requires_grad=True)
+    dn, sensor = torch.from_numpy(values).float()[None], dataclasses.replace(SENSOR, jpeg=coding)
+    loss, _ = likelihood_loss(light, torch.ones(1, 1, 1, 1), dn, sensor, edge_weight=0.05, misfit=0.1)
+    assert torch.autograd.grad(loss, light)[0].isfinite().all()
+
+
 def test_tables_that_are_none_are_refused():
     with pytest.raises(ValueError, match="64 quantisation steps"):
         JpegCoding((1,) * 63)
