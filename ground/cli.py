@@ -14,6 +14,7 @@ from rich.console import Console
 from flightsw.icd.mission import load_mission
 from ground.commands.compare import compare_command
 from ground.commands.formats import export_command, import_command
+from ground.commands.inspect import inspect_command, measure_command
 from ground.commands.list import compare_runs_command, list_command
 from ground.commands.live import live_command
 from ground.commands.options import AsJson, ListenKey, SessionDir, listening_key
@@ -135,6 +136,8 @@ app.command("reconstruct")(reconstruct_command)
 app.command("evaluate")(evaluate_command)
 app.command("report")(report_command)
 app.command("mesh")(mesh_command)
+app.command("inspect")(inspect_command)
+app.command("measure")(measure_command)
 app.command("view")(view_command)
 app.command("compare")(compare_command)
 app.command("list")(list_command)

@@ -33,6 +33,7 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     "obbgs_core.train": CORE
     | {f"obbgs_core.{room}" for room in ("render", "poses", "evidence", "published", "start", "methods")},
     "obbgs_core.io": CORE | {"obbgs_core.render"},
+    "obbgs_core.inspect": CORE,
     "obbgs_core.score": CORE | {"obbgs_core.render", "obbgs_core.poses"},
     "flightsw.icd": {"obbgs_base"},
     "flightsw.icd.transfer": {"obbgs_base", "flightsw.icd"},
@@ -55,7 +56,14 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
         "obbgs_core.attitude",
     }
     | LIBRARY,
-    "ground.show": {"obbgs_base", "flightsw.icd", "ground.session", "ground.link", "ground.run"}
+    "ground.show": {
+        "obbgs_base",
+        "flightsw.icd",
+        "ground.session",
+        "ground.link",
+        "ground.run",
+        "obbgs_core.inspect",
+    }
     | LIBRARY - {"obbgs_core.train"}
     | {"obbgs_core.attitude"},
     "ground.baselines": CORE | {"obbgs_core.start", "obbgs_core.score", "obbgs_core.poses", "ground.formats"},

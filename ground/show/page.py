@@ -70,13 +70,13 @@ pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px;
 """
 
 
-def page(title: str, subtitle: str, sections: Iterable[str]) -> str:
-    """Return the whole page; title and subtitle are plain text, sections HTML."""
+def page(title: str, subtitle: str, sections: Iterable[str], plots: bool = True) -> str:
+    """Return the whole page; title and subtitle are plain text, sections HTML; `plots`: some of them hold figures."""
     title = html.escape(title)
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style>'
-        f"<script>{get_plotlyjs()}</script></head><body><main><h1>{title}</h1>"
+        f"{f'<script>{get_plotlyjs()}</script>' if plots else ''}</head><body><main><h1>{title}</h1>"
         f'<p class="note">{html.escape(subtitle)}</p>{"".join(sections)}</main></body></html>'
     )
 

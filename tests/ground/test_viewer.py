@@ -26,6 +26,7 @@ from ground.run.live.reconstruct import reconstruct_live
 from ground.session.cameras import predicted_image
 from ground.session.folder import SessionError
 from ground.show.pictures import tone
+from ground.show.sizes import size_deviation
 from ground.show.viewer import ruler, splats, viewer
 from ground.show.viewer.door import ViewError, opened, refused
 from ground.show.viewer.scene import UNCERTAINTY, Placed
@@ -485,9 +486,9 @@ def test_the_stated_error_of_sizes_is_that_of_the_ranges(session):
         )
         navigation = dataclasses.replace(shown.session.navigation, correlation_time_s=correlation_time_s)
         tagged = dataclasses.replace(shown.tagged, frames=records, navigation=navigation)
-        return ruler.size_deviation(dataclasses.replace(shown, tagged=tagged))
+        return size_deviation(tagged, shown.estimate)
 
-    assert ruler.size_deviation(shown) == 0  # these poses are exact
+    assert size_deviation(shown.tagged, shown.estimate) == 0  # these poses are exact
     assert stated(0.0) == pytest.approx(0.01 / 24**0.5, rel=0.02)  # 0.08 m at 8 m, in 24 brackets
     assert stated(1e12) == pytest.approx(0.01, rel=0.02)
 

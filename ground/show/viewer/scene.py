@@ -21,7 +21,6 @@ RADIUS = 10.0  # of the first model in the scene: large enough for the half-prec
 CAMERAS_AT = 2.0  # radii: true directions, but nearer, or the model could not be seen beside them
 MOST_CAMERAS = 60
 THUMBNAIL_PX = 64
-YEAR_2000_NS = 946_684_800 * 10**9
 SENSOR, ERROR, UNCERTAINTY = "as the sensor sees it", "misfit (chi²)", "uncertainty of radiance"
 COLOURS = (SENSOR, ERROR, UNCERTAINTY)
 
@@ -163,16 +162,6 @@ class Placed:
         """Show or hide a part: splats, mesh, cameras, sun, name."""
         for handle in self.handles.get(part, ()):
             handle.visible = visible
-
-
-def states_time(session: Session, record: FrameRecord) -> bool:
-    """Return whether a frame's time is its own: pictures are imported in many formats that state none."""
-    return session.frames_imported is None or record.mid_exposure_utc_ns > YEAR_2000_NS
-
-
-def states_scale(session: Session) -> bool:
-    """Return whether the poses are in metres: those of a link are, and those that were exported from one."""
-    return session.frames_imported is None or all(states_time(session, record) for record in session.frames)
 
 
 def one_per_bracket(records: list[FrameRecord]) -> list[FrameRecord]:

@@ -17,6 +17,7 @@ from ground.session.cameras import predicted_image, range_in_words, sun_directio
 from ground.session.exposures import in_ms, offered_s
 from ground.session.folder import FrameRecord, Session, SessionError
 from ground.show.pictures import ERROR_FULL_SCALE, heat, tone
+from ground.show.sizes import states_scale, states_time
 from ground.show.turntable import VIEWS, circle, moving_png, pictures
 from ground.show.viewer.door import opened
 from ground.show.viewer.pass_plots import PassPlots
@@ -28,8 +29,6 @@ from ground.show.viewer.scene import (
     SENSOR,
     UNCERTAINTY,
     Placed,
-    states_scale,
-    states_time,
 )
 from ground.show.viewer.source import Source
 from ground.show.viewer.splats import CHI2_SHOWN, DEVIATION_SHOWN, legend, seen_exposure_s

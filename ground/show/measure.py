@@ -1,0 +1,89 @@
+"""Lengths and areas of a run's body, with their stated errors."""
+
+import numpy as np
+
+from ground.show.inspection import Model
+from ground.show.page import section
+from obbgs_core.inspect.faces import (
+    area_half_width,
+    flat_faces,
+    largest_dimension,
+    length_half_width,
+    nearest_on,
+)
+
+NAMED_FACES = 8
+
+
+def places_of(text: str) -> np.ndarray:
+    """Return two places [2, 3] m that a text such as 0,0,1:0,0,-1 names.
+
+    Raises:
+        ValueError: it names no two places.
+    """
+    try:
+        places = np.array([[float(x) for x in place.split(",")] for place in text.split(":")])
+    except ValueError:
+        places = np.zeros(0)
+    if places.shape != (2, 3) or not np.isfinite(places).all():
+        raise ValueError(f"expected two places as X,Y,Z:X,Y,Z in metres, got {text!r}")
+    return places
+
+
+def measured(model: Model, between: list[np.ndarray] | None = None) -> dict:
+    """Return sizes of a run's body as values for JSON, each with half the width of its 90 % interval.
+
+    Args:
+        between: pairs of places [2, 3] m, body axes; the points of the surface that are nearest to them count.
+    """
+    pixel_m, deviation = model.surface.pixel_m, model.size_deviation
+
+    def length(value: float) -> dict:
+        return {"value": value, "half_width_90": length_half_width(value, pixel_m, deviation)}
+
+    largest, ends = largest_dimension(model.surface.points)
+    faces = [
+        {
+            "name": f"face {number}",
+            "middle": face.middle.tolist(),
+            "normal": face.axes[2].tolist(),
+            "length": length(float(face.extent[0])),
+            "width": length(float(face.extent[1])),
+            "area": {"value": face.area_m2, "half_width_90": area_half_width(face, pixel_m, deviation)},
+        }
+        for number, face in enumerate(flat_faces(model.surface), 1)
+    ]
+    distances = []
+    for places in between or []:
+        points = nearest_on(model.surface, places)
+        distances.append(length(float(np.linalg.norm(points[1] - points[0]))) | {"points": points.tolist()})
+    return {
+        "run": model.name,
+        "unit": "m" if model.in_metres else "units of the imported poses",
+        "size_sigma_percent": 100 * deviation,
+        "pixel": pixel_m,
+        "largest_dimension": length(largest) | {"points": ends.tolist()},
+        "faces": faces,
+        "distances": distances,
+    }
+
+
+def sizes_section(values: dict) -> str:
+    """Return the section of a report with the sizes of the body."""
+    unit = values["unit"]
+    squared = "m²" if unit == "m" else "units²"
+    rows = [("largest dimension", _told(values["largest_dimension"], unit))]
+    for face in values["faces"][:NAMED_FACES]:
+        size = f"{_told(face['length'], unit)} x {_told(face['width'], unit)}, {_told(face['area'], squared)}"
+        rows.append((face["name"], size))
+    note = (
+        "The largest dimension of what the frames show, and the flat faces of the model's surface: length and width of "
+        "the smallest rectangle about each, and the area that it covers. Intervals hold the true value with a "
+        f"probability of 90 %; the model's size has a standard deviation of {values['size_sigma_percent']:.2g} %."
+    )
+    body = "".join(f"<tr><td>{name}</td><td>{text}</td></tr>" for name, text in rows)
+    return section("Sizes", note, f'<div class="scroll"><table>{body}</table></div>')
+
+
+def _told(value: dict, unit: str) -> str:
+    return f"{value['value']:.3g} ± {value['half_width_90']:.2g} {unit}"
