@@ -25,6 +25,7 @@ SAME_NORMAL = (
 )
 SYMMETRIC = 1.15  # times the best misfit: another rotation that fits so well cannot be told from it
 APART_RAD = np.radians(15.0)
+LEAST_SIGMA_PX = 0.1  # of a surface, also of one that is compared with itself
 CORRELATED_PX = (
     4.0  # over which a surface's errors are alike: a square of this width counts as one observation
 )
@@ -148,7 +149,9 @@ def refine(
     for step in range(FINE_STEPS):
         rows, residual, away = _rows(design, tree, surface, place, pivot)
         close = np.abs((residual - thicker_m * rows[:, 7])[away < 2 * cut_m])
-        sigma_m = max(1.4826 * float(np.median(close)), 1e-9) if len(close) else cut_m
+        sigma_m = (
+            max(1.4826 * float(np.median(close)), LEAST_SIGMA_PX * surface.pixel_m) if len(close) else cut_m
+        )
         limit = KNEE * max(sigma_m, cut_m * 0.7**step)
         weight = np.clip(1 - (np.minimum(away, np.inf) / limit) ** 2, 0, None) ** 2
         normal = rows[:, free].T @ (weight[:, None] * rows[:, free])
@@ -178,7 +181,9 @@ def covariance_of(rows: np.ndarray, residual: np.ndarray, near: np.ndarray, surf
     if near.sum() < rows.shape[1]:
         return np.full((rows.shape[1],) * 2, np.inf)
     share = np.minimum(1.0, surface.area / (CORRELATED_PX * surface.pixel_m) ** 2)[near]
-    variance = float((share * residual[near] ** 2).sum() / share.sum())
+    variance = (
+        float((share * residual[near] ** 2).sum() / share.sum()) + (LEAST_SIGMA_PX * surface.pixel_m) ** 2
+    )
     information = rows[near].T @ (share[:, None] * rows[near])
     return variance * np.linalg.pinv(information, rcond=1e-12, hermitian=True)
 

@@ -11,6 +11,10 @@ from obbgs_core.inspect.cad import Samples, groups_within
 
 JOINED_PX = 1.5  # samples of one part nearer to each other are of one piece
 FLAT = 0.25  # of a plate's width at most is its thickness
+EVEN, FACING = (
+    0.7,
+    0.9,
+)  # of a plate's samples face along its normal, by that cosine at least: a ring's do not
 NARROWEST_PX = 5.0  # width of a plate whose turn is looked at
 ATTACHED = 0.8  # of a piece's samples within a plate's box: it moves with it
 BESIDE_PX = 2.0
@@ -98,6 +102,8 @@ def _plate(design: Samples, own: np.ndarray, pixel_m: float) -> Plate | None:
     low, high = along.min(axis=0), along.max(axis=0)
     extent = high - low
     if extent[1] < NARROWEST_PX * pixel_m or extent[2] > FLAT * extent[1]:
+        return None
+    if (np.abs(design.normals[own] @ axes[2]) > FACING).mean() < EVEN:
         return None
     return Plate(int(design.part[own[0]]), own, own, (low + high) / 2 @ axes, axes, extent)
 
