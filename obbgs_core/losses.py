@@ -65,6 +65,7 @@ def likelihood_loss(
         ValueError: shapes disagree, or images are smaller than the 3x3 of an edge.
     """
     _check(radiance, exposure_time_s, dn)
+    radiance, sensor = sensor.linear(radiance, exposure_time_s)
     native = None if sensor.jpeg else compiled.module_for(radiance, exposure_time_s, dn)
     if native is None:
         settings = (averaged_pixels, edge_weight, misfit)
@@ -132,6 +133,7 @@ def published_loss(
         ValueError: shapes disagree, or images are smaller than the 3x3 of an edge.
     """
     _check(radiance, exposure_time_s, dn)
+    radiance, sensor = sensor.linear(radiance, exposure_time_s)
     native = compiled.module_for(radiance, exposure_time_s, dn)
     if native is None:
         return published_loss_reference(
@@ -183,6 +185,7 @@ def fit_figures(
     mean of several pixels has none, since some of its pixels need not be saturated. PSNR is that of the prediction
     clamped at full scale. The other arguments are as for `likelihood_loss`.
     """
+    radiance, sensor = sensor.linear(radiance, exposure_time_s)
     native = None if sensor.jpeg else compiled.module_for(radiance, alpha, exposure_time_s, dn)
     if native is not None:
         model, gains = _sensor_model(native, sensor, averaged_pixels), _gains(sensor, exposure_time_s)

@@ -1,5 +1,6 @@
 """The sensor model: from scene-linear radiance and exposure time to digital numbers (DN), and their noise."""
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ from torch import Tensor
 from obbgs_core.jpeg import FULL_SCALE, JpegCoding
 
 HALF_DN = 0.5  # a reading of 0 means a signal below this, since signals are rounded
+STRAIGHT = 1e-3  # share of full scale below which a response is a straight line
 # edge of the blocks by which noise is measured, and the share of them that is surely sky
 BLOCK_PX, SKY_BLOCKS = 8, 0.25
 SKY_SCATTERS = 1.0  # a block whose mean is farther above an empty one, in deviations of a reading, is no sky
@@ -44,6 +46,7 @@ class Sensor:
     """A linear sensor: dn = clip(black_dn + dn_per_radiance_s·exposure_time_s·radiance + noise, 0, white_dn).
 
     jpeg: how the readings were stored, full scale as 255; None: as they are.
+    response: what is above black is the share of full scale that light would read to this power; 1: a linear sensor.
     """
 
     black_dn: float
@@ -52,6 +55,7 @@ class Sensor:
     electrons_per_dn: float
     read_noise_dn: float
     jpeg: JpegCoding | None = None
+    response: float = 1.0
 
     def __post_init__(self):
         if not (
@@ -61,7 +65,20 @@ class Sensor:
 
     def expected_dn(self, radiance: Tensor, exposure_time_s: float | Tensor) -> Tensor:
         """Return the noiseless reading, not clipped at full scale, so that a saturated prediction keeps a gradient."""
-        return self.black_dn + self.dn_per_radiance_s * exposure_time_s * radiance
+        linear, sensor = self.linear(radiance, exposure_time_s)
+        return sensor.black_dn + sensor.dn_per_radiance_s * exposure_time_s * linear
+
+    def linear(self, radiance: Tensor, exposure_time_s: float | Tensor) -> tuple[Tensor, "Sensor"]:
+        """Return the radiance that a linear sensor would read like this one reads a given one, and that sensor.
+
+        Near black, where powers have no slope or an infinite one, the response is a straight line.
+        """
+        if self.response == 1:
+            return radiance, self
+        white = (self.white_dn - self.black_dn) / (self.dn_per_radiance_s * exposure_time_s)
+        share = radiance / white
+        bent = share.clamp(min=STRAIGHT) ** (self.response - 1) * share
+        return bent * white, dataclasses.replace(self, response=1.0)
 
     def full_scale_radiance(self, exposure_time_s: float) -> float:
         """Return the radiance whose noiseless reading is full scale."""

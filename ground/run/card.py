@@ -139,6 +139,8 @@ def _quality(metrics: dict) -> list[str]:
     lines = []
     if isinstance(level := metrics.get("sky_level"), str):
         lines.append(f"- Sky: {level}.")
+    if isinstance(response := metrics.get("response"), str):
+        lines.append(f"- Camera: {response}.")
     if isinstance(chi2 := metrics.get("chi2"), int | float) and math.isfinite(chi2):
         lines.append(f"- Residual chi² {chi2:.2f}: {chi2_explained(chi2)}")
     if isinstance(misfit := metrics.get("misfit"), float):

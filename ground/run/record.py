@@ -56,6 +56,10 @@ def training_metrics(
         "dark_frames": result.dark_frames,
         "sky_level": None if result.sky_level.fits else str(result.sky_level),  # null: the stated black level
         "sky_level_dn": None if result.sky_level.fits else result.sky_level.by_frame(),
+        "response": None
+        if result.response.exponent == 1
+        else str(result.response),  # null: linear, as stated
+        "response_exponent": result.response.exponent,
         "misfit_frames": result.misfit_frames,
         "chi2": None if math.isnan(chi2) else chi2,
         "misfit": result.misfit,  # null: not learnt

@@ -10,6 +10,7 @@ from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.published.compensation import mapped, nearest
 from obbgs_core.sensor import Sensor
 from obbgs_core.sky_level import SkyLevel
+from obbgs_core.train.response import Response
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ class TrainResult:
     misfit: float | None
     # how many times as large that is as on the frames that it was trained on; None: not measured
     unseen_factor: float | None
+    response: Response  # of the camera, as far as it is learnt
     sky_level: SkyLevel  # of the frames that were given
     sun_span_deg: float  # largest angle between two frames' Suns, body frame
     dark_frames: int  # left out: nothing in them rises above the noise

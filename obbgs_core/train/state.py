@@ -34,6 +34,7 @@ from obbgs_core.train.objective import Neighbours
 from obbgs_core.train.order import FrameOrder
 from obbgs_core.train.parts import Change, Now, Part, Seen
 from obbgs_core.train.poses import PoseDecision, Poses
+from obbgs_core.train.response import Response
 from obbgs_core.train.result import StepInfo
 from obbgs_core.train.selection import Harmonics, Highlights, Pruning
 from obbgs_core.train.setup import Start, TrainingSetup
@@ -98,6 +99,7 @@ class TrainingState:
     harmonics: Harmonics
     highlights: Highlights = field(default_factory=Highlights)
     fit: Fit = field(default_factory=Fit)
+    response: Response = field(default_factory=Response)
     average: Average = field(default_factory=Average)  # of the models of the last steps
     deviation_m: Tensor | None = None  # [N] of the 3D filter; None: the method has none
     # [H, W] which pixels may show the target, of the frames that have the Earth in view, by index
@@ -281,6 +283,18 @@ class TrainingState:
 # the classes that a checkpoint may hold: nothing else in a file is ever built
 SAVED = [
     *(TrainingState, Gaussians, Adam, Average, Growth, Compensation, FrameOrder, Harmonics, Highlights),
-    *(Fit, Poses, PoseDecision, PoseCorrections, Whitening, Obb, Shadows, ShadowMap, Neighbours, Cameras),
+    *(
+        Fit,
+        Response,
+        Poses,
+        PoseDecision,
+        PoseCorrections,
+        Whitening,
+        Obb,
+        Shadows,
+        ShadowMap,
+        Neighbours,
+        Cameras,
+    ),
     *(StepInfo, *ROUND_SAVED),
 ]

@@ -27,6 +27,7 @@ from obbgs_core.train.backdrops import doubted, renew
 from obbgs_core.train.joining import begun_again, check_joinable, join, release, withhold
 from obbgs_core.train.objective import DROPPED_UNTIL, dropped, image_loss, priors
 from obbgs_core.train.parts import Seen
+from obbgs_core.train.response import DECIDED_AT
 from obbgs_core.train.result import Exposing, StepInfo, TrainResult
 from obbgs_core.train.setup import TrainingSetup, prepare
 from obbgs_core.train.state import Identity, TrainingState
@@ -147,6 +148,7 @@ class Trainer:
         state.average.observe(state.gaussians, moment.share >= config.averaged_from)
         state.fit.observe(setup, rendered, seen)
         state.steps_done += 1
+        self._learn_response()
         state.seconds += time.monotonic() - began
         info = self._recorded(loss.item())
         state.steps_done = state.poses.set_back(setup, state.steps_done)
@@ -190,6 +192,24 @@ class Trainer:
         state.gaussians.psf_sigma_px.detach().clamp_(min=LEAST_PSF_SIGMA_PX)
         if state.compensation is not None:
             state.compensation.step(moment.share)
+
+    def _learn_response(self) -> None:
+        """Take another exponent of the camera's response when that is due and the frames tell it."""
+        state, setup, config = self.state, self.setup, self.setup.config
+        due = state.steps_done in {round(config.steps_until(share)) for share in DECIDED_AT}
+        if not due or state.fit.misfit is None or setup.sun_moves:
+            return
+        corrections = state.poses.corrections
+        batches = (
+            setup.batches if corrections is None else setup.batches.posed(corrections.frames(setup.frames))
+        )
+        if state.response.decide(state.model, batches, setup.sensor, state.fit.misfit):
+            self._use_response()
+
+    def _use_response(self) -> None:
+        """Let the setup's sensor have the response that is known."""
+        sensor = dataclasses.replace(self.setup.sensor, response=self.state.response.exponent)
+        self.setup = dataclasses.replace(self.setup, sensor=sensor)
 
     def _recorded(self, loss: float) -> StepInfo:
         """Return how the training stands, and keep it in the history."""
@@ -236,6 +256,7 @@ class Trainer:
         joined, fresh = self._prepared(every, self.state.poses.corrections)
         join(self.setup, self.state, joined, fresh)
         self.setup, self._given = joined, every
+        self._use_response()
         self.state.seconds += time.monotonic() - began
 
     def withhold(self) -> None:
@@ -329,6 +350,7 @@ class Trainer:
             misfit=None if fit.misfit is None else fit.misfit * (1.0 if factor is None else factor),
             unseen_factor=factor,
             sky_level=setup.sky_level,
+            response=state.response,
             sun_span_deg=setup.sun_span_deg,
             dark_frames=setup.dark_frames,
             misfit_frames=[setup.frames[i].id for i in state.order.left_out],
@@ -349,6 +371,7 @@ class Trainer:
         self.state = state
         if state.poses.placed_by is not None:
             self.setup, _ = self._prepared(self._given, state.poses.placed_by)
+        self._use_response()
         return True
 
 
