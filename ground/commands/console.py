@@ -128,11 +128,12 @@ def keys_pressed() -> Iterator[Callable[[], str]]:
         ready, _, _ = select.select([descriptor], [], [], 0)
         return os.read(descriptor, 100).decode(errors="ignore") if ready else ""
 
-    tty.setcbreak(descriptor)  # single keys; Ctrl-C still ends the command
+    # single keys; Ctrl-C still ends the command. At once: a terminal that nobody reads never sends what it holds
+    tty.setcbreak(descriptor, termios.TCSANOW)
     try:
         yield typed
     finally:
-        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+        termios.tcsetattr(descriptor, termios.TCSANOW, before)
 
 
 class ConsoleView:
