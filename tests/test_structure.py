@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PARTS = ("obbgs_base", "obbgs_core", "flightsw", "ground", "hil")
+PARTS = ("obbgs_base", "obbgs_core", "flightsw", "ground", "compare", "hil")
 LONGEST_FILE, LONGEST_FUNCTION = 800, 80  # lines
 CORE = {"obbgs_base", "obbgs_core.model", "obbgs_core"}  # what every room of the library may use
 LIBRARY = {
@@ -66,13 +66,16 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     }
     | LIBRARY - {"obbgs_core.train"}
     | {"obbgs_core.attitude"},
-    "ground.baselines": CORE | {"obbgs_core.start", "obbgs_core.score", "obbgs_core.poses", "ground.formats"},
-    "ground.compare": {"obbgs_base", "flightsw.icd", "ground.session", "ground.run", "ground.show"}
-    | LIBRARY
-    | {"ground.baselines"},
     "ground.commands": {"obbgs_base", "flightsw.icd", *GROUND, "ground.link", "ground.run", "ground.show"}
-    | {"ground.compare", "obbgs_core", "obbgs_core.train"},
+    | {"obbgs_core", "obbgs_core.train"},
     "ground": {"obbgs_base", "flightsw.icd", "ground.link", "ground.commands"},
+    "compare.opponents": CORE
+    | {"obbgs_core.start", "obbgs_core.score", "obbgs_core.poses", "ground.formats"},
+    "compare": {"obbgs_base", "flightsw.icd", "ground.session", "ground.run", "compare.opponents"} | LIBRARY,
+    "compare.grid": CORE
+    | {"obbgs_core.render", "ground.session", "ground.run", "compare", "compare.opponents"},
+    "compare.charts": {"obbgs_base", "ground.show", "compare", "compare.grid"},
+    "compare.command": {"obbgs_base", "ground.commands", "compare", "compare.grid", "compare.charts"},
     "hil.watched": {"obbgs_base"},
     "hil.sky": {"obbgs_base", "flightsw.icd"},
     "hil.world": {"obbgs_base", "flightsw.icd", "flightsw", "flightsw.cameras"},

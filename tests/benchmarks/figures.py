@@ -156,7 +156,7 @@ def wrong(block: str) -> list[str]:
 
 @cache
 def _rows(file: str) -> list[dict[str, Any]]:
-    from ground.compare.results import with_best
+    from compare.charts.results import with_best
 
     return [
         with_best(json.loads(line)) for line in (FOLDER / f"{file}.jsonl").read_text().splitlines() if line

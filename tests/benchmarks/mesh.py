@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from ground.compare.case import load_case
+from compare.case import load_case
 from ground.run.mesh_files import read_mesh_points, write_mesh
 from ground.run.scores import cloud_scores
 from ground.session.cameras import sensor_of

@@ -10,7 +10,7 @@ import statistics
 from collections.abc import Iterable
 from pathlib import Path
 
-from ground.compare.origin import this_command, with_origin
+from compare.grid.origin import this_command, with_origin
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "results"
@@ -94,7 +94,7 @@ def shown(row: dict, bench: str, as_json: bool) -> str:
 def page(files: Iterable[Path]) -> str:
     """Return the page of some files of rows as Markdown."""
     # not above, since it loads every method, which the benchmarks of links do not need
-    from ground.compare.results import with_best
+    from compare.charts.results import with_best
 
     parts = [
         "# Results\n",

@@ -24,10 +24,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from compare.case import Case
 from flightsw.icd.frame import Frame, PoseTag
 from flightsw.icd.mission import CameraSection
 from flightsw.icd.quaternion import matrix_to_quat
-from ground.compare.case import Case
 from ground.session.cameras import sensor_of
 from ground.session.folder import SCHEMA_VERSION
 from ground.session.truth import TrueFrame, write_truth

@@ -17,9 +17,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ground.baselines.mvsnet import network_input
-from ground.baselines.mvsnet_network import STRIDE, MvsNet
-from ground.baselines.stereo_views import View, depth_range_m, neighbours, prepare
+from compare.opponents.mvsnet import network_input
+from compare.opponents.mvsnet_network import STRIDE, MvsNet
+from compare.opponents.stereo_views import View, depth_range_m, neighbours, prepare
 from obbgs_base.files import write_whole
 from tests import raycast
 

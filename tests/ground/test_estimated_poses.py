@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from compare.case import load_case
+from compare.opponents.reconstruction import EstimatedPoses, Reconstruction
 from flightsw.icd.quaternion import quat_to_matrix
-from ground.baselines.reconstruction import EstimatedPoses, Reconstruction
-from ground.compare.case import load_case
 from ground.run.estimated_poses import FILE, Alignment, estimated_records, read_estimate, write_estimate
 from ground.session.folder import SessionError, open_session
 from ground.session.truth import Truth

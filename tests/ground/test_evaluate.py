@@ -12,8 +12,8 @@ import torch
 import trimesh
 from scipy.spatial import KDTree
 
-from ground.compare.case import load_case
-from ground.compare.trainings import imaging
+from compare.case import load_case
+from compare.trainings import imaging
 from ground.run import evaluate as scoring
 from ground.run.card import chi2_explained, model_card
 from ground.run.evaluate import evaluate

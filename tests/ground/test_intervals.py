@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from ground.compare.case import load_case
-from ground.compare.errors import CompareError
+from compare.case import load_case
+from compare.errors import CompareError
 from ground.run.intervals import interval_scores, stated_error_scores
 from obbgs_core.frames import cameras_of
 from obbgs_core.losses import fit_figures

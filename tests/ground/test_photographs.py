@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from compare.opponents.sfm import similarity
 from ground import cli
-from ground.baselines.sfm import similarity
 from ground.formats.photographs.poses import read_photographs
 from ground.formats.pictures.views import FormatError, PoseSigmas, write_session
 from ground.session.folder import open_session

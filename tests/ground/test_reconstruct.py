@@ -14,12 +14,12 @@ import torch
 import yaml
 from typer.testing import CliRunner
 
+from compare.case import load_case
+from compare.follow import image_of
+from compare.methods import Task, method
+from compare.opponents.reconstruction import Work
+from compare.references import black, mean_image
 from ground import cli
-from ground.baselines.reconstruction import Work
-from ground.compare.case import load_case
-from ground.compare.follow import image_of
-from ground.compare.methods import Task, method
-from ground.compare.references import black, mean_image
 from ground.run.evaluate import evaluate
 from ground.run.reconstruct import reconstruct
 from ground.run.settings import changes_for

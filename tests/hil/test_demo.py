@@ -13,10 +13,10 @@ import pytest
 import yaml
 from rich.console import Console
 
+from compare.case import load_case
+from compare.references import black
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import load_mission
-from ground.compare.case import load_case
-from ground.compare.references import black
 from hil import cli
 from hil.cameras.gige import GVCP_PORT, LOOPBACK
 from hil.demo import simulate_pass

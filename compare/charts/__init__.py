@@ -1,0 +1,1 @@
+"""The page and the charts of a comparison, and what its rows say together."""

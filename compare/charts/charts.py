@@ -1,0 +1,214 @@
+"""The interactive figures of a comparison's page."""
+
+from collections.abc import Callable
+from typing import Any
+
+import plotly.graph_objects as go
+from plotly.colors import qualitative
+
+from compare.charts.results import VERDICTS, Results, pareto
+from ground.show.plots import ticks_1_2_5
+
+COLOURS = (*qualitative.D3, *qualitative.Set2)
+VERDICT_COLOURS = ("#2a9d8f", "#e9c46a", "#f4a261", "#c0392b", "#8795a5")  # of VERDICTS
+REFERENCE_COLOUR, FRONT_COLOUR = "#5b6b7b", "#1c2733"
+LABELS_APART = 0.06  # of the values drawn: names of lines that are nearer would cover one another
+EXACT_DB = 119.0  # the score of a picture that is compared with itself, which would squeeze all others
+
+
+def colour_of(results: Results) -> Callable[[str], str]:
+    """Return the function from a method's label to its colour, the same in every figure."""
+    colours = {label: COLOURS[i % len(COLOURS)] for i, label in enumerate(results.trained)}
+    return lambda label: colours.get(label, REFERENCE_COLOUR)
+
+
+def speed_figures(results: Results, target: str) -> list[go.Figure]:
+    """Return score and Chamfer distance of one target against seconds, each where any method has it.
+
+    Curves, final scores and their Pareto front; the score's figure also has the methods without training as lines.
+    """
+    score = results.score_of(target)
+    figures = []
+    for key, title, sign in ((score.key, score.title, 1.0), ("chamfer", "Chamfer distance", -1.0)):
+        figure = _speed(results, target, key, sign)
+        if figure.data:
+            figure.update_layout(title={"text": title, "font": {"size": 14}})
+            figures.append(figure)
+            if key == score.key:
+                _draw_references(figure, results, target, key)
+            else:
+                figure.update_yaxes(type="log")
+    return figures
+
+
+def _speed(results: Results, target: str, key: str, sign: float) -> go.Figure:
+    """Return curves, ends and Pareto front of one metric; `sign` is -1 where less is better."""
+    figure, colour = go.Figure(), colour_of(results)
+    ends: list[tuple[float, float]] = []
+    for label in results.trained:
+        for row in results.of(label, target, results.base):
+            curve = [point for point in row.get("curve", []) if key in point]
+            if curve:
+                figure.add_scatter(
+                    x=[point["seconds"] for point in curve],
+                    y=[point[key] for point in curve],
+                    mode="lines",
+                    line={"color": colour(label), "width": 2},
+                    hovertemplate=f"{label}<br>%{{x:.1f}} s: %{{y:.4g}}<extra></extra>",
+                )
+            if row.get(key) is None or not row.get("seconds"):
+                continue
+            ends.append((row["seconds"], sign * row[key]))
+            figure.add_scatter(
+                x=[row["seconds"]],
+                y=[row[key]],
+                mode="markers",
+                name=label,
+                marker={"color": colour(label), "size": 10, "symbol": "diamond"},
+                hovertemplate=f"{label}, seed {row['seed']}<br>%{{x:.1f}} s: %{{y:.4g}}<extra></extra>",
+            )
+    if front := pareto(ends):
+        figure.add_scatter(
+            x=[cost for cost, _ in front],
+            y=[sign * value for _, value in front],
+            mode="lines",
+            name="Pareto front",
+            line={"color": FRONT_COLOUR, "dash": "dot", "shape": "hv", "width": 1.5},
+            hoverinfo="skip",
+        )
+    _draw_log_axis(figure, "seconds of training")
+    return _sized(figure, 380)
+
+
+def _draw_references(figure: go.Figure, results: Results, target: str, key: str) -> None:
+    """Draw a line for each method without training, and one name for those that lie too close to be told apart."""
+    shown = [label for label in results.labels if label not in results.trained]
+    values = {
+        label: value
+        for label in shown
+        if results.method_of[label] != "ceiling"
+        and (value := results.mean(label, target, results.base, key)) is not None
+        and value < EXACT_DB
+    }
+    drawn = [*_drawn(figure, "y"), *values.values()]
+    apart = LABELS_APART * (max(drawn) - min(drawn))
+    groups: list[list[str]] = []
+    for label in sorted(values, key=lambda label: values[label]):
+        if groups and values[label] - values[groups[-1][0]] < apart:
+            groups[-1].append(label)
+        else:
+            groups.append([label])
+        figure.add_hline(y=values[label], line={"dash": "dash", "color": REFERENCE_COLOUR, "width": 1})
+    for group in groups:
+        figure.add_annotation(
+            **{"x": 0, "xref": "paper", "xanchor": "left", "y": values[group[-1]], "yanchor": "bottom"},
+            text=", ".join(group),
+            showarrow=False,
+            font={"size": 11, "color": REFERENCE_COLOUR},
+            bgcolor="rgba(255,255,255,0.8)",
+        )
+
+
+def size_figures(results: Results) -> list[go.Figure]:
+    """Return score against the number of Gaussians and against bytes, a marker for each method and target."""
+    colour, figures = colour_of(results), []
+    for key, title, unit in (("gaussians", "Gaussians", 1.0), ("bytes", "kB that one would keep", 1e-3)):
+        figure = go.Figure()
+        for label in results.trained:
+            points = [
+                (size * unit, value, target)
+                for target in results.targets
+                if (size := results.mean(label, target, results.base, key))
+                and (value := results.mean(label, target, results.base, results.score.key)) is not None
+            ]
+            if points:
+                figure.add_scatter(
+                    x=[size for size, _, _ in points],
+                    y=[value for _, value, _ in points],
+                    text=[target for _, _, target in points],
+                    mode="markers",
+                    name=label,
+                    marker={"color": colour(label), "size": 10},
+                    hovertemplate=f"{label}, %{{text}}<br>%{{x:,.0f}}: %{{y:.2f}} dB<extra></extra>",
+                )
+        if figure.data:
+            _draw_log_axis(figure, title)
+            figure.update_yaxes(title_text=results.score.title)
+            figures.append(_sized(figure, 360))
+    return figures
+
+
+def failure_figure(results: Results) -> go.Figure:
+    """Return the map of conditions and methods, coloured by verdict, with the mean score in each cell."""
+    labels, conditions = results.trained, results.conditions[::-1]
+    found = [[results.verdict(label, condition) for label in labels] for condition in conditions]
+    scores = [
+        [results.over_targets(label, condition, results.score.key)[0] for label in labels]
+        for condition in conditions
+    ]
+    levels = len(VERDICTS)
+    scale = [[(i + side) / levels, colour] for i, colour in enumerate(VERDICT_COLOURS) for side in (0, 1)]
+    figure = go.Figure(
+        go.Heatmap(
+            z=[[VERDICTS.index(verdict) if verdict else None for verdict, _ in row] for row in found],
+            x=labels,
+            y=conditions,
+            text=[
+                ["" if not v else v if s is None else f"{s:.1f}" for (v, _), s in zip(row, of, strict=True)]
+                for row, of in zip(found, scores, strict=True)
+            ],
+            customdata=[[f"{verdict}<br>{words}" for verdict, words in row] for row in found],
+            texttemplate="%{text}",
+            hovertemplate="%{x}, %{y}<br>%{customdata}<extra></extra>",
+            zmin=-0.5,
+            zmax=levels - 0.5,
+            colorscale=scale,
+            xgap=2,
+            ygap=2,
+            showscale=False,
+        )
+    )
+    figure.update_xaxes(side="top")
+    return _sized(figure, 110 + 30 * len(conditions))
+
+
+def gain_figure(results: Results, label: str, base: str) -> go.Figure:
+    """Return the relative gains of a method over a base method, a tile for each metric and target."""
+    gains = results.gains(label, base)
+    values = [of_targets for _, of_targets in gains]
+    largest = max((abs(value) for row in values for value in row if value is not None), default=1.0)
+    figure = go.Figure(
+        go.Heatmap(
+            z=values,
+            x=results.targets,
+            y=[metric.title for metric, _ in gains],
+            text=[["" if value is None else f"{value:+.1f} %" for value in row] for row in values],
+            texttemplate="%{text}",
+            hovertemplate="%{y}, %{x}: %{z:+.1f} %<extra></extra>",
+            colorscale="Viridis",
+            zmin=min(0.0, min((v for row in values for v in row if v is not None), default=0.0)),
+            zmax=largest,
+            xgap=2,
+            ygap=2,
+            showscale=False,
+        )
+    )
+    figure.update_yaxes(autorange="reversed")
+    return _sized(figure, 110 + 32 * len(gains))
+
+
+def _draw_log_axis(figure: go.Figure, title: str) -> None:
+    """Make the x axis logarithmic, with whole numbers at its ticks."""
+    ticks = ticks_1_2_5(_drawn(figure, "x"))
+    figure.update_xaxes(type="log", title_text=title, tickvals=ticks, ticktext=[f"{t:,g}" for t in ticks])
+
+
+def _drawn(figure: go.Figure, axis: str) -> list[float]:
+    """Return the values of all marks along an axis."""
+    traces: Any = figure.data
+    return [value for trace in traces for value in trace[axis]]
+
+
+def _sized(figure: go.Figure, height_px: int) -> go.Figure:
+    figure.update_layout(height=height_px, margin={"l": 60, "r": 20, "t": 50, "b": 50}, showlegend=False)
+    return figure

@@ -1,0 +1,312 @@
+"""The page of a comparison: one HTML file that opens without a network, made of all rows in the folder."""
+
+import html
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from compare.charts.charts import (
+    VERDICT_COLOURS,
+    colour_of,
+    failure_figure,
+    gain_figure,
+    size_figures,
+    speed_figures,
+)
+from compare.charts.results import HOLDS_DB, MARGIN_DB, SHAKEN_DB, VERDICTS, Metric, Results
+from compare.grid.rows import Rows
+from compare.grid.worker import VIEWS
+from compare.methods import reference_names
+from compare.views import SHOWN, WORST, KeptView, read_views
+from ground.show.page import beside, label, legend, page, picture, plot, section
+from ground.show.pictures import ERROR_FULL_SCALE, heat, tone
+from obbgs_base.files import write_whole
+
+PAGE = "compare.html"
+WORST_SHOWN = 6
+CELL_PX = 90  # of a method in a map of conditions, at least
+
+
+def write_page(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyType({})) -> Path:
+    """Write compare.html into a comparison's folder and return its path.
+
+    Args:
+        asked: as for `Results`.
+
+    Raises:
+        CompareError: the rows are damaged.
+        OSError: the folder cannot be written.
+    """
+    results = Results(Rows(out).rows.values(), asked)
+    replaced = ""
+    if results.replaced:
+        replaced = (
+            f" {results.replaced} more rows are left out: they bear the same names, and their condition, session or "
+            "settings have changed since, or are not those asked for."
+        )
+    targets = f"{len(results.targets)} target{'s' if len(results.targets) != 1 else ''}"
+    content = page(
+        "Comparison of methods",
+        f"{len(results.rows)} rows: {len(results.labels)} methods, {targets}, "
+        f"{len(results.conditions)} conditions.{replaced}",
+        [
+            _tables(results),
+            _speed(results),
+            _failures(results, out),
+            _size(results),
+            _gains(results),
+            _side_by_side(results, out),
+            _origin(results),
+        ],
+    )
+    path = out / PAGE
+    write_whole(path, content.encode())
+    return path
+
+
+def _tables(results: Results) -> str:
+    """Return the table of means over the targets, and one of each target."""
+    body = _table(results, None) if len(results.targets) > 1 else ""
+    for target in results.targets:
+        body += f"<h3>{html.escape(target)}</h3>{_table(results, target)}"
+    return section(f"Scores, {html.escape(results.base)}", _explained(results), body)
+
+
+def _explained(results: Results) -> str:
+    """Return what the columns and rows that are there mean."""
+    methods = set(results.method_of.values())
+    notes = []
+    if results.truth:
+        notes.append(
+            "Clean figures compare with noiseless exposures of held-out views, full scale as 1; foreground counts only "
+            "the pixels that the target covers; pooled is of the mean squared error over all views together, which "
+            "single nearly exact views do not lift. Best on the way is the highest clean PSNR of a curve: what a "
+            "method would reach if the truth told it when to stop. Distances are in units where the target's largest "
+            "dimension is 2: Chamfer, Hausdorff and centres complete are of the Gaussians' centres or the points of a "
+            "cloud; surface complete and accuracy of 100,000 points on the surface that the training views see. "
+            "Complete: within 0.01 of a point."
+        )
+    if not all(results.score_of(target).key == "psnr_clean_db" for target in results.targets):
+        which = (
+            "Of some of these sessions no truth is known"
+            if results.truth
+            else "No truth is known of these sessions"
+        )
+        notes.append(
+            f"{which}: their methods are compared with held-out frames as received, whose own noise bounds the PSNR."
+        )
+    notes.append("Bold: the best of those that reconstruct something.")
+    if "ceiling" in methods:
+        notes.append(
+            "The ceiling is a perfect model that ignores exposure: true radiance at the geometric mean of the exposure "
+            "times; at that exposure it is exact (120 dB), so that only its pooled figure tells."
+        )
+    if "noise" in methods:
+        notes.append("Noise is the noisy frame itself, which of course equals itself (120 dB).")
+    if any(len(results.of(label, t, results.base)) > 1 for label in results.labels for t in results.targets):
+        notes.append("± is the deviation over seeds.")
+    return " ".join(notes)
+
+
+def _table(results: Results, target: str | None) -> str:
+    """Return the table of one target, or of the means over all."""
+    shown = results.known(target)
+
+    def value(label: str, metric: Metric) -> tuple[float | None, str]:
+        if target is None:
+            mean, count = results.over_targets(label, results.base, metric.key)
+            more = (
+                ""
+                if count in (0, len(results.targets))
+                else f" <small>({count} of {len(results.targets)})</small>"
+            )
+        else:
+            mean = results.mean(label, target, results.base, metric.key)
+            spread = results.spread(label, target, results.base, metric.key)
+            more = "" if spread is None else f" ± {metric.form.format(_scaled(metric, spread))}"
+        return mean, "" if mean is None else metric.form.format(_scaled(metric, mean)) + more
+
+    lines = []
+    best = {m.key: _best(results, m, lambda label, m=m: value(label, m)[0]) for m in shown}
+    for name in results.labels:
+        cells = [f"<td>{html.escape(name)}</td>"]
+        reason = None if target is None else results.error(name, target, results.base)
+        for metric in shown:
+            mean, text = value(name, metric)
+            text = f"<b>{text}</b>" if mean is not None and mean == best[metric.key] else text
+            cells.append(f'<td class="n">{text}</td>')
+        if reason is not None:
+            words = f"No result: {html.escape(reason.rstrip('.'))}."
+            cells = [cells[0], f'<td class="words" colspan="{max(1, len(shown))}"><div>{words}</div></td>']
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    head = "".join(f"<th>{html.escape(m.title)}</th>" for m in shown)
+    title = "<h3>Mean of the targets</h3>" if target is None else ""
+    rows = f"<tr><th>method</th>{head}</tr>{''.join(lines)}"
+    return f'{title}<div class="scroll"><table class="scores">{rows}</table></div>'
+
+
+def _scaled(metric: Metric, value: float) -> float:
+    return value / 1e3 if metric.key == "bytes" else value
+
+
+def _best(results: Results, metric: Metric, value: Callable[[str], float | None]) -> float | None:
+    """Return the best value of a column among the methods that reconstruct something."""
+    known = [found for name in results.trained if (found := value(name)) is not None]
+    if not known or metric.more_is_better is None:
+        return None
+    return max(known) if metric.more_is_better else min(known)
+
+
+def _methods_legend(results: Results) -> str:
+    scored = {row["method"] for row in results.rows if row.get(results.score.key) is not None}
+    colour = colour_of(results)
+    return legend((name, colour(name)) for name in results.trained if results.method_of[name] in scored)
+
+
+def _speed(results: Results) -> str:
+    note = (
+        "Curves are measured on the way, on up to 16 of the held-out views; measuring is not counted as time. "
+        "Diamonds are final scores over all held-out views, and the dotted line their Pareto front: no other "
+        "method is both faster and better than those on it."
+    )
+    body = ""
+    for target in results.targets:
+        figures = speed_figures(results, target)
+        drawn = beside(map(plot, figures)) if figures else "<p>No method has a score on this target.</p>"
+        body += f"<h3>{html.escape(target)}</h3>{drawn}"
+    if not results.trained:
+        return section("Speed against accuracy", note, "No method was trained.")
+    return section("Speed against accuracy", note, _methods_legend(results) + body)
+
+
+def _failures(results: Results, out: Path) -> str:
+    """Return the map of conditions and methods, and the worst views of all."""
+    note = (
+        f"Numbers are mean scores over targets and seeds; the colour is that of the worst target. Holds: at most "
+        f"{HOLDS_DB:g} dB below {html.escape(results.base)}; shaken: at most {SHAKEN_DB:g} dB; suffers: more; fails: "
+        f"less than {MARGIN_DB:g} dB above the best image without training (black, mean, untrained); refused: ended in "
+        "an error that says why. Point at a cell for its figures."
+    )
+    worst: dict[tuple[str, str], tuple[str, KeptView]] = {}  # of each method and target
+    for row in results.rows:
+        view = read_views(out / VIEWS / f"{row['digest']}.npz").get(WORST)
+        if view is None or row["method"] in reference_names():
+            continue
+        key = (row["method"], row["target"])
+        if key not in worst or view.psnr_db < worst[key][1].psnr_db:
+            worst[key] = (f"{row['method']}, {row['target']}, {row['condition']}", view)
+    shown = sorted(worst.values(), key=lambda entry: entry[1].psnr_db)[:WORST_SHOWN]
+    cells = [f'<div class="label head">{words}</div>' for words in ("", "expected", "render", "error")]
+    for words, view in shown:
+        cells += [label(f"{html.escape(words)}, frame {view.frame}"), *_compared(view)]
+    title = "<h3>Worst views, one of each method and target</h3>"
+    pictures = f'{title}<div class="grid compared">{"".join(cells)}</div>' if shown else ""
+    drawn = ""
+    if results.trained:
+        width_px = CELL_PX * (1 + len(results.trained))
+        drawn = legend(zip(VERDICTS, VERDICT_COLOURS, strict=True))
+        drawn += f'<div class="scroll"><div style="min-width: {width_px}px">{plot(failure_figure(results))}</div></div>'
+    return section("Where methods fail", note, drawn + pictures)
+
+
+def _size(results: Results) -> str:
+    note = "A marker for each method and target: left up is what one wants, no more model than a scene needs."
+    figures = size_figures(results)
+    return (
+        section("Size against accuracy", note, _methods_legend(results) + beside(map(plot, figures)))
+        if figures
+        else ""
+    )
+
+
+def _gains(results: Results) -> str:
+    base = results.gain_base
+    others = [name for name in results.trained if name != base]
+    if base is None or not others:
+        return ""
+    note = (
+        f"By how many per cent a method is better than {html.escape(base)}, tile by tile; for distances and LPIPS a "
+        "smaller value is the better one, so that a positive gain is always an improvement."
+    )
+    figures = [(name, gain_figure(results, name, base)) for name in others if results.gains(name, base)]
+    body = "".join(f"<h3>{html.escape(name)}</h3>{plot(figure)}" for name, figure in figures)
+    return section(f"Relative gains over {html.escape(base)}", note, body) if body else ""
+
+
+def _side_by_side(results: Results, out: Path) -> str:
+    """Return for each target the view that all methods share: truth, renders, errors."""
+    note = (
+        "The held-out view in which the target is brightest, the same for all methods; brightness is the square root "
+        "of the signal above black. Error is the absolute difference: 0<span class='ramp'></span>"
+        f"{ERROR_FULL_SCALE:.0%} of full scale or more."
+    )
+    body = []
+    for target in results.targets:
+        kept = [
+            (name, view)
+            for name in results.labels
+            if (view := shown_view(results, out, name, target)) is not None
+        ]
+        if not kept:
+            continue
+        body.append(f"<h3>{html.escape(target)}, frame {kept[0][1].frame}</h3>")
+        truth = tone(kept[0][1].expected, kept[0][1].sensor)
+        cells = [picture(truth, "expected", "expected")]
+        for name, view in kept:
+            _, render, error = _compared(view)
+            cells.append(f'<div>{render}{error}<div class="label">{html.escape(name)}</div></div>')
+        body.append(f'<div class="grid views">{"".join(cells)}</div>')
+    return section("Side by side", note, "".join(body)) if body else ""
+
+
+def shown_view(results: Results, out: Path, name: str, target: str) -> KeptView | None:
+    """Return the view of a target that all methods share, of a method's first seed; None where none was kept."""
+    rows = results.of(name, target, results.base)
+    views = [read_views(out / VIEWS / f"{row['digest']}.npz").get(SHOWN) for row in rows]
+    return next((view for view in views if view is not None), None)
+
+
+def error_of(view: KeptView) -> np.ndarray:
+    """Return the error of a view's image [H, W, 1], 1 at `ERROR_FULL_SCALE` of full scale and above."""
+    error = np.abs(view.image - view.expected).mean(axis=2, keepdims=True)
+    return np.clip(error / ERROR_FULL_SCALE, 0, 1)
+
+
+def _compared(view: KeptView) -> list[str]:
+    return [
+        picture(tone(view.expected, view.sensor), "expected", f"{view.exposure_time_s * 1e3:g} ms"),
+        picture(tone(view.image, view.sensor), "render", f"{view.psnr_db:.1f} dB"),
+        picture(heat(error_of(view)), "error", "&nbsp;"),
+    ]
+
+
+def _origin(results: Results) -> str:
+    """Return where the rows come from."""
+    lines = []
+    for key, title in (
+        ("commit", "commit"),
+        ("machine", "machine"),
+        ("threads", "threads"),
+        ("command", "command"),
+    ):
+        values = list(dict.fromkeys(str(row[key]) for row in results.rows if key in row))
+        lines += [f"<tr><td>{title}</td><td>{html.escape(value)}</td></tr>" for value in values]
+    loads = [row["load"] for row in results.rows if "load" in row]
+    if loads:
+        lines.append(f"<tr><td>load</td><td>{min(loads):g} to {max(loads):g}</td></tr>")
+    changes = {row["condition"]: row["changes"] for row in results.rows if "changes" in row}
+    lines += [
+        f"<tr><td>{html.escape(name)}</td><td>{html.escape(json.dumps(change))}</td></tr>"
+        for name, change in changes.items()
+    ]
+    early = sum(bool(row.get("converged")) for row in results.rows)
+    note = (
+        f"Every row is a line of rows.jsonl with its own commit, machine, load and date. {early} trainings ended early "
+        "because their curve had moved by less than 0.05 dB over its last fifth (`converged`)."
+    )
+    return section(
+        "Where the rows come from", note, f'<div class="scroll"><table>{"".join(lines)}</table></div>'
+    )

@@ -1,0 +1,133 @@
+"""The processes that a comparison runs on: a cluster of its own on this machine, or one that a scheduler leads."""
+
+import contextlib
+import logging
+import os
+from collections.abc import Iterator
+
+import dask.config
+import psutil
+from distributed import Client, LocalCluster
+from distributed.security import Security
+
+from compare.errors import CompareError
+
+log = logging.getLogger(__name__)
+USED_MEMORY = 0.9  # of what is available: the rest is for everybody else
+CONFIG = {
+    "distributed.scheduler.worker-ttl": "1 hour",  # a busy worker of low priority may be silent for minutes
+    "distributed.worker.memory.target": False,  # results are single rows: nothing of dask's own to spill
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": 0.95,
+    "distributed.admin.tick.limit": "1 hour",  # no warnings about a loop that waits for a computation
+    "distributed.comm.timeouts.connect": "60s",
+    "distributed.comm.timeouts.tcp": "600s",
+}
+
+
+@contextlib.contextmanager
+def connected(scheduler: str | None, workers: int | None, needs_mb: list[float]) -> Iterator[Client]:
+    """Give a client of the scheduler at a URL, or of a cluster of this machine's own for the time of the block.
+
+    Whoever reaches a scheduler has its workers run code. The own cluster therefore takes only connections with the
+    credentials that it makes for itself, and a scheduler without TLS is warned of.
+
+    Args:
+        scheduler: such as tls://10.0.0.1:8786; its workers must see the sessions and the comparison's folder under the
+            same paths.
+        workers: processes of the own cluster, of one thread each; None: one a core. Fewer are started where the
+            memory does not hold so many of the largest cell.
+        needs_mb: what each cell is estimated to need.
+
+    Raises:
+        CompareError: the scheduler does not answer, or the memory does not hold the largest cell.
+    """
+    logging.getLogger("distributed").setLevel(
+        logging.CRITICAL
+    )  # its warnings are about nothing that a user can change
+    with dask.config.set(CONFIG):
+        if scheduler is not None:
+            if not scheduler.startswith("tls://"):
+                log.warning(
+                    "whoever reaches the scheduler %s has its workers run code as their user: it should stand at tls://",
+                    scheduler,
+                )
+            try:
+                client = Client(scheduler, timeout="30s", set_as_default=False)
+            except (OSError, ValueError, TypeError) as error:
+                raise CompareError(f"no dask scheduler answers at {scheduler}: {error}") from error
+            with client:
+                yield client
+            return
+        count, limit_mb = share_memory(workers or os.cpu_count() or 1, needs_mb, available_mb())
+        with (
+            LocalCluster(
+                n_workers=min(count, max(1, len(needs_mb))),
+                threads_per_worker=1,
+                memory_limit=int(limit_mb * 1e6),
+                security=Security.temporary(),
+                dashboard_address="127.0.0.1:0",
+                silence_logs=50,
+                preload="compare.grid.local_worker",
+            ) as cluster,
+            Client(cluster, set_as_default=False) as client,
+        ):
+            yield client
+
+
+def available_mb() -> float:
+    """Return the memory that a comparison may use on this machine."""
+    return USED_MEMORY * psutil.virtual_memory().available / 1e6
+
+
+def share_memory(workers: int, needs_mb: list[float], available: float) -> tuple[int, float]:
+    """Return how many workers there is memory for, and how much each of them has (MB).
+
+    Raises:
+        CompareError: the memory does not hold the largest need.
+    """
+    largest = max(needs_mb, default=0.0)
+    if largest > available:
+        raise CompareError(
+            f"a cell needs about {largest / 1e3:.1f} GB of memory, {available / 1e3:.1f} GB are available: give a "
+            "smaller budget of Gaussians, such as --budgets 1@100000, or run on another machine with --scheduler"
+        )
+    count = max(1, min(workers, int(available // max(largest, 1.0))))
+    return count, available / count
+
+
+def fitting_hosts(client: Client, need_mb: float) -> list[str] | None:
+    """Return the hosts whose workers have the memory that a cell needs; None where all have, or do not say.
+
+    Raises:
+        CompareError: no worker has it, or the scheduler is lost.
+    """
+    found = _workers(client)
+    limits_mb = {address: info.get("memory_limit") or float("inf") for address, info in found.items()}
+    fitting = [address for address, limit in limits_mb.items() if limit >= need_mb * 1e6]
+    if found and not fitting:
+        raise CompareError(
+            f"a cell needs about {need_mb / 1e3:.1f} GB of memory, the largest worker has "
+            f"{max(limits_mb.values()) / 1e9:.1f} GB: start one with more (dask worker --memory-limit), or give a "
+            "smaller budget of Gaussians"
+        )
+    if len(fitting) == len(found):
+        return None
+    return sorted({address.rpartition("//")[2].rpartition(":")[0] for address in fitting})
+
+
+def threads_of(client: Client) -> int:
+    """Return how many cells the workers take at once.
+
+    Raises:
+        CompareError: the scheduler is lost.
+    """
+    return sum(info["nthreads"] for info in _workers(client).values())
+
+
+def _workers(client: Client) -> dict[str, dict]:
+    try:
+        return client.scheduler_info(n_workers=-1)["workers"]
+    except (KeyError, OSError) as error:  # of a lost one nothing is known
+        raise CompareError("the scheduler was lost; the same command goes on from what is saved") from error

@@ -1,0 +1,260 @@
+"""Means, verdicts, gains and Pareto fronts that are worked out from rows, and the page made of them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from compare.case import load_case
+from compare.charts.figures import write_figures
+from compare.charts.page import write_page
+from compare.charts.results import Results, pareto
+from compare.grid.rows import Rows
+from compare.references import black, noise
+from compare.views import SHOWN, WORST, read_views, write_views
+from tests.browser import as_url, chromium, opened
+from tests.commands import call
+from tests.small_sessions import small_session
+
+
+def row(method: str, condition: str = "as taken", target: str = "A", seed: int = 0, **figures) -> dict:
+    made = {
+        "method": method,
+        "target": target,
+        "seed": seed,
+        "condition": condition,
+        "size": 40,
+        "steps_share": 1.0,
+    }
+    made |= {
+        "digest": f"{method}-{condition}-{target}-{seed}",
+        "commit": "abc1234",
+        "command": "ground compare",
+    }
+    changes = {} if condition == "as taken" else {"changes": {"noise": 2.0}}
+    return made | changes | figures
+
+
+ROWS = [
+    row("obbgs", psnr_clean_db=40.0, chamfer=0.02, seconds=60.0, gaussians=7000, bytes=420_000),
+    row("obbgs", seed=1, psnr_clean_db=41.0, chamfer=0.03, seconds=62.0, gaussians=7200, bytes=430_000),
+    row("3dgs", psnr_clean_db=30.0, chamfer=0.1, seconds=2000.0, gaussians=30_000, bytes=7_000_000),
+    row("black", psnr_clean_db=26.0),
+    row("untrained", psnr_clean_db=27.0, chamfer=0.025),
+    row("obbgs", "noise x2", psnr_clean_db=38.0, chamfer=0.03, seconds=60.0),
+    row("3dgs", "noise x2", psnr_clean_db=27.9),
+    row("jiang2025", error="Diverged: the loss became nan"),
+]
+
+
+def test_means_are_over_seeds_and_references_stand_first():
+    results = Results(ROWS)
+    assert results.mean("obbgs", "A", "as taken", "psnr_clean_db") == pytest.approx(40.5)
+    assert results.spread("obbgs", "A", "as taken", "psnr_clean_db") == pytest.approx(0.5**0.5)
+    assert results.labels[:2] == ["black", "untrained"]
+    assert results.trained == ["obbgs", "3dgs", "jiang2025"] and results.base == "as taken"
+
+
+@pytest.mark.parametrize(
+    ("label", "condition", "verdict"),
+    [
+        ("obbgs", "as taken", "holds"),
+        ("obbgs", "noise x2", "shaken"),  # 2.5 dB less
+        ("3dgs", "as taken", "holds"),
+        ("3dgs", "noise x2", "fails"),  # 0.9 dB above the untrained start, as it was taken
+        ("jiang2025", "as taken", "refused"),
+        ("jiang2025", "noise x2", ""),
+    ],
+)
+def test_verdicts(label, condition, verdict):
+    assert Results(ROWS).verdict(label, condition)[0] == verdict
+
+
+def test_the_worst_target_decides_a_verdict():
+    rows = [row("obbgs", target=t, psnr_clean_db=v) for t, v in (("A", 40.0), ("B", 20.0))]
+    rows += [row("black", target=t, psnr_clean_db=25.0) for t in "AB"]
+    assert Results(rows).verdict("obbgs", "as taken")[0] == "fails"
+
+
+def test_gains_are_positive_where_a_method_is_better():
+    results = Results(ROWS)
+    assert results.gain_base == "3dgs"
+    assert results.gain("obbgs", "3dgs", "A", "psnr_clean_db") == pytest.approx(35.0)  # 40.5 of 30
+    assert results.gain("obbgs", "3dgs", "A", "chamfer") == pytest.approx(75.0)  # 0.025 of 0.1
+    assert results.gain("obbgs", "3dgs", "A", "lpips") is None
+
+
+def test_a_method_that_comes_to_fit_the_noise_is_shown_with_the_best_point_of_its_curve():
+    curve = [
+        {"share": share, "psnr_clean_db": value} for share, value in ((0.1, 31.0), (0.5, 33.0), (1.0, 30.0))
+    ]
+    results = Results(
+        [row("3dgs", psnr_clean_db=30.0, curve=curve), row("black", psnr_clean_db=26.0, curve=[])]
+    )
+    assert results.mean("3dgs", "A", "as taken", "psnr_best_db") == 33.0
+    assert results.mean("black", "A", "as taken", "psnr_best_db") is None
+
+
+def test_rows_of_other_contents_under_the_same_name_are_not_taken_for_seeds():
+    rows = [row("3dgs", psnr_clean_db=v) | {"digest": d} for v, d in ((30.0, "old"), (20.0, "new"))]
+    last = Results(rows)
+    assert last.mean("3dgs", "A", "as taken", "psnr_clean_db") == 20.0 and last.replaced == 1
+    assert last.spread("3dgs", "A", "as taken", "psnr_clean_db") is None
+    asked = {"old": ("A", "as taken")}
+    assert Results(rows, asked).mean("3dgs", "A", "as taken", "psnr_clean_db") == 30.0
+    assert Results(ROWS).replaced == 0
+
+
+def test_rows_stand_under_the_names_that_their_session_and_condition_have_today():
+    rows = [row("3dgs", psnr_clean_db=v) | {"digest": d} for v, d in ((30.0, "moved"), (20.0, "new"))]
+    asked = {"moved": ("A-old", "as taken"), "new": ("A", "as taken")}
+    results = Results(rows, asked)
+    assert results.replaced == 0 and results.targets == ["A-old", "A"]
+    assert results.mean("3dgs", "A-old", "as taken", "psnr_clean_db") == 30.0
+    assert results.mean("3dgs", "A", "as taken", "psnr_clean_db") == 20.0
+    renamed = Results(rows, {"moved": ("A", "b"), "new": ("A", "a")})
+    assert renamed.conditions == ["b", "a"] and renamed.replaced == 0
+
+
+def test_trainings_of_several_budgets_are_told_apart():
+    rows = [
+        row("3dgs", psnr_clean_db=30.0),
+        row("3dgs", psnr_clean_db=20.0) | {"steps_share": 0.1, "digest": "x"},
+    ]
+    assert Results(rows).labels == ["3dgs (1 of the steps)", "3dgs (0.1 of the steps)"]
+
+
+@given(st.lists(st.tuples(st.floats(0, 100), st.floats(-100, 100)), max_size=30))
+def test_nothing_beats_a_point_of_the_pareto_front(points):
+    front = pareto(points)
+    for cost, score in points:
+        assert any(c <= cost and s >= score for c, s in front)
+    for cost, score in front:
+        assert not any(c <= cost and s >= score and (c, s) != (cost, score) for c, s in points)
+
+
+@pytest.fixture(scope="module")
+def comparison(tmp_path_factory) -> Path:
+    """A folder with the rows above, and views of some of them."""
+    out = tmp_path_factory.mktemp("comparison")
+    case = load_case(small_session(tmp_path_factory.mktemp("session") / "A"))
+    rows = Rows(out)
+    for made in ROWS:
+        if made["method"] in ("obbgs", "3dgs"):
+            made = made | {
+                "curve": [{"share": s, "seconds": 60 * s, "psnr_clean_db": 40 * s} for s in (0.5, 1.0)]
+            }
+            write_views(case, noise(case, case.training), out / "views" / f"{made['digest']}.npz")
+        rows.add(made)
+    write_views(case, black(case, case.training), out / "views" / "black-as taken-A-0.npz")
+    return out
+
+
+def test_the_kept_views_are_the_brightest_and_the_worst(comparison, tmp_path):
+    case = load_case(small_session(tmp_path / "A"))
+    images = [clean.clone() for clean in case.clean]
+    images[0] += 0.1
+    write_views(case, images, tmp_path / "views.npz")
+    views = read_views(tmp_path / "views.npz")
+    brightest = int(torch.tensor([clean.sum() for clean in case.clean]).argmax())
+    assert views[SHOWN].frame == case.held_out[brightest].id
+    assert views[WORST].frame == case.held_out[0].id and views[WORST].psnr_db == pytest.approx(20, abs=1e-3)
+    half_precision = 5e-4
+    np.testing.assert_allclose(views[WORST].image, images[0].numpy(), atol=half_precision)
+    assert read_views(tmp_path / "none.npz") == {}
+
+
+def test_the_page_shows_every_part(comparison):
+    page = write_page(comparison).read_text()
+    body = page[page.index("<body>") :]
+    titles = (
+        "Speed against accuracy",
+        "Where methods fail",
+        "Size against accuracy",
+        "Worst views",
+        "Side by side",
+    )
+    for words in (*titles, "Relative gains over 3dgs", "40.50", "No result: the loss became nan.", "abc1234"):
+        assert words in body
+    assert 'src="http' not in page and "<link" not in page
+
+
+@pytest.fixture(scope="module")
+def without_truth(tmp_path_factory) -> Path:
+    """The same comparison of photographs: noisy PSNR only, and a condition that these sessions cannot fulfil."""
+    out = tmp_path_factory.mktemp("photographs")
+    rows = Rows(out)
+    for made in ROWS:
+        figures = {key: value for key, value in made.items() if key not in ("psnr_clean_db", "chamfer")}
+        if "psnr_clean_db" in made:
+            figures["psnr_noisy_db"] = made["psnr_clean_db"] - 3
+            curve = [{"share": s, "seconds": 60 * s, "psnr_noisy_db": 37 * s} for s in (0.5, 1.0)]
+            figures |= {"curve": curve} if "seconds" in made else {}
+        else:
+            figures["error"] = "CompareError: A has no truth, which a condition needs that exposes anew"
+        rows.add(figures)
+    return out
+
+
+def test_without_truth_scores_charts_and_gains_are_of_noisy_frames(without_truth):
+    results = Results(Rows(without_truth).rows.values())
+    assert [metric.key for metric in results.known("A")] == ["psnr_noisy_db", "gaussians", "bytes", "seconds"]
+    ((metric, values),) = results.gains("obbgs", "3dgs")
+    assert metric.key == "psnr_noisy_db" and values == pytest.approx([100 * (37.5 / 27 - 1)])
+    assert results.verdict("3dgs", "noise x2")[0] == "fails" and results.gains("jiang2025", "3dgs") == []
+
+
+def test_a_target_without_truth_beside_one_with_it_is_scored_by_its_noisy_frames():
+    rows = [
+        row("obbgs", psnr_clean_db=40.0, psnr_noisy_db=30.0),
+        row("obbgs", target="B", psnr_noisy_db=20.0),
+    ]
+    results = Results(rows + [row("black", target=t, psnr_noisy_db=19.5) for t in "AB"])
+    assert [results.score_of(t).key for t in "AB"] == ["psnr_clean_db", "psnr_noisy_db"]
+    assert results.verdict("obbgs", "as taken") == (
+        "fails",
+        "B: 20.00 dB, +0.50 dB against the best image without training",
+    )
+
+
+@pytest.mark.parametrize("folder", ["comparison", "without_truth"])
+def test_the_page_is_one_column_on_a_phone_and_shows_no_empty_chart(folder, request):
+    """In the browser: no error, nothing wider than the screen, a mark in every chart, names beside their colours."""
+    path = write_page(request.getfixturevalue(folder))
+    with chromium() as browser, opened(browser, as_url(path), 390, 800) as page:
+        page.wait_for_selector(".legend")
+        assert page.evaluate("document.documentElement.scrollWidth") == 390
+        charts = page.evaluate("""[...document.querySelectorAll('.js-plotly-plot')].map(chart => ({
+            marks: chart.querySelectorAll('.scatterlayer .trace, .heatmaplayer image').length,
+            left: chart.getBoundingClientRect().left, width: chart.getBoundingClientRect().width}))""")
+        assert len(charts) >= 4 and all(chart["marks"] for chart in charts)
+        assert len({round(chart["left"]) for chart in charts}) == 1
+        legend = page.locator(".legend").first.inner_text()
+        assert "obbgs" in legend and "3dgs" in legend
+        body = page.locator("body").inner_text()
+        assert "Relative gains over 3dgs" in body and "CompareError" not in body and "Diverged" not in body
+        assert ("No truth is known" in body) == ("SSIM" not in body and "Chamfer" not in body)
+
+
+def test_figures_are_written_as_png(comparison):
+    paths = write_figures(comparison)
+    assert {path.name for path in paths} == {
+        "failures.png", "size.png", "speed-A.png", "views-A.png", "gain-obbgs.png"
+    }  # fmt: skip
+    assert all(path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" for path in paths)
+
+
+def test_figures_of_photographs_are_written_without_a_true_surface(without_truth):
+    rows = Rows(without_truth)
+    rows.add(row("obbgs", target="B", psnr_clean_db=40.0, chamfer=0.02, seconds=60.0))
+    names = {path.name for path in write_figures(without_truth)}
+    assert {"speed-A.png", "speed-B.png", "gain-obbgs.png"} <= names and "gain-jiang2025.png" not in names
+
+
+def test_the_command_says_what_is_wrong_with_its_arguments(tmp_path):
+    arguments = ["compare", "--sessions", str(tmp_path / "no"), "--out", str(tmp_path)]
+    done = call("ground", *arguments)
+    assert done.returncode == 1 and "is not a session" in done.stderr and "Traceback" not in done.stderr
