@@ -3,7 +3,6 @@
 import numpy as np
 
 from ground.show.inspection import Model
-from ground.show.page import section
 from obbgs_core.inspect.faces import (
     area_half_width,
     flat_faces,
@@ -11,8 +10,6 @@ from obbgs_core.inspect.faces import (
     length_half_width,
     nearest_on,
 )
-
-NAMED_FACES = 8
 
 
 def places_of(text: str) -> np.ndarray:
@@ -66,24 +63,3 @@ def measured(model: Model, between: list[np.ndarray] | None = None) -> dict:
         "faces": faces,
         "distances": distances,
     }
-
-
-def sizes_section(values: dict) -> str:
-    """Return the section of a report with the sizes of the body."""
-    unit = values["unit"]
-    squared = "m²" if unit == "m" else "units²"
-    rows = [("largest dimension", _told(values["largest_dimension"], unit))]
-    for face in values["faces"][:NAMED_FACES]:
-        size = f"{_told(face['length'], unit)} x {_told(face['width'], unit)}, {_told(face['area'], squared)}"
-        rows.append((face["name"], size))
-    note = (
-        "The largest dimension of what the frames show, and the flat faces of the model's surface: length and width of "
-        "the smallest rectangle about each, and the area that it covers. Intervals hold the true value with a "
-        f"probability of 90 %; the model's size has a standard deviation of {values['size_sigma_percent']:.2g} %."
-    )
-    body = "".join(f"<tr><td>{name}</td><td>{text}</td></tr>" for name, text in rows)
-    return section("Sizes", note, f'<div class="scroll"><table>{body}</table></div>')
-
-
-def _told(value: dict, unit: str) -> str:
-    return f"{value['value']:.3g} ± {value['half_width_90']:.2g} {unit}"

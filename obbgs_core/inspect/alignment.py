@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from obbgs_core.inspect.cad import CadError, CadMesh, Samples, sampled
+from obbgs_core.inspect.cad import CadError, CadMesh, Samples, principal_axes, sampled
 
 STARTS = 160  # rotations drawn evenly, besides those that bring principal or file axes together
 FIRST_POINTS, COARSE_POINTS, FEW_POINTS, FINE_POINTS = (
@@ -273,9 +273,7 @@ def _similar(x: np.ndarray, y: np.ndarray, scale: float) -> tuple:
 def _starts(design: Samples, surface: Surface, rng: np.random.Generator) -> list[tuple]:
     """Return places to start from: axes upon axes in all 24 ways, principal axes upon each other, and random ones."""
     cube = Rotation.create_group("O").as_matrix()
-    axes = [
-        np.linalg.svd(p - p.mean(axis=0), full_matrices=False)[2] for p in (design.points, surface.points)
-    ]
+    axes = [principal_axes(points) for points in (design.points, surface.points)]
     for frame in axes:
         frame[2] *= np.sign(np.linalg.det(frame)) or 1.0
     rotations = [

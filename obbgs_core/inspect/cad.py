@@ -154,6 +154,11 @@ def _linked(first: np.ndarray, second: np.ndarray, count: int) -> np.ndarray:
     return connected_components(links, directed=False)[1]
 
 
+def principal_axes(points: np.ndarray) -> np.ndarray:
+    """Return the axes [3, 3] (rows) along which points [N, 3] spread most, second most and least."""
+    return np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+
+
 def groups_within(points: np.ndarray, reach: float) -> np.ndarray:
     """Return the number [N] of the group of each point [N, 3]: points within reach of each other are of one group."""
     if len(points) == 0:

@@ -7,7 +7,7 @@ from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.distance import cdist
 
 from obbgs_core.inspect.alignment import Surface
-from obbgs_core.inspect.cad import CadMesh, Samples, groups_within, sampled
+from obbgs_core.inspect.cad import CadMesh, Samples, groups_within, principal_axes, sampled
 from obbgs_core.inspect.plates import Z_90
 
 EDGE_PX = 0.6  # standard deviation of where an edge of a model lies, at each end of a length
@@ -80,7 +80,7 @@ def _best_plane(
 def _face(members: np.ndarray, points: np.ndarray, normals: np.ndarray, area: np.ndarray) -> Face:
     """Return a face with its smallest rectangle: one of its sides lies along the hull (Freeman and Shapira 1975)."""
     middle = points.mean(axis=0)
-    axes = np.linalg.svd(points - middle, full_matrices=False)[2]
+    axes = principal_axes(points)
     normal = axes[2] * (np.sign(axes[2] @ normals.mean(axis=0)) or 1.0)
     flat = (points - middle) @ axes[:2].T
     hull = flat[ConvexHull(flat).vertices]

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from obbgs_core.inspect.alignment import CORRELATED_PX, FINE_POINTS, Similarity, Surface, aligned, refine
-from obbgs_core.inspect.cad import CadMesh, Samples, groups_within, sampled
+from obbgs_core.inspect.cad import CadMesh, Samples, groups_within, principal_axes, sampled
 from obbgs_core.inspect.plates import Z_90, Turn, is_turned, plates_of, turn_of
 from obbgs_core.inspect.shown import Views, views_showing
 
@@ -241,7 +241,7 @@ def _region(
     pixel_m = surface.pixel_m
     if area.sum() < LEAST_AREA_PX * pixel_m**2 or len(points) < 4:
         return None
-    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    axes = principal_axes(points)
     size = float(np.ptp(points @ axes.T, axis=0).max())
     half = Z_90 * np.sqrt(2) * EDGE_PX * pixel_m
     deepest = float(np.quantile(depth, 0.95))

@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from obbgs_core.inspect.alignment import Surface, refine
-from obbgs_core.inspect.cad import Samples, groups_within
+from obbgs_core.inspect.cad import Samples, groups_within, principal_axes
 
 JOINED_PX = 1.5  # samples of one part nearer to each other are of one piece
 FLAT = 0.25  # of a plate's width at most is its thickness
@@ -96,7 +96,7 @@ def _plate(design: Samples, own: np.ndarray, pixel_m: float) -> Plate | None:
     points = design.points[own]
     if len(points) < 20:
         return None
-    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    axes = principal_axes(points)
     axes[2] = np.cross(axes[0], axes[1])
     along = points @ axes.T
     low, high = along.min(axis=0), along.max(axis=0)
