@@ -22,6 +22,7 @@ EXTRAS = {
         "tifffile",
     },
     "pictures": {"astropy", "rawpy", "OpenEXR"},  # and those of ground
+    "spice": {"spiceypy"},  # and those of ground
     "compare": {"dask", "distributed", "matplotlib", "psutil", "pycolmap"},  # and those of ground
     "view": {"viser"},  # and those of ground
 }
@@ -49,13 +50,13 @@ def how_to_install(error: ModuleNotFoundError, extra: str) -> str | None:
     """Return how to get a missing module that belongs to an extra of this package; None for any other module.
 
     Args:
-        extra: the one to name, ground or hil; modules that only comparisons, the viewer or some kinds of pictures
-            need are in extras of theirs.
+        extra: the one to name, ground or hil; modules that only comparisons, the viewer, kernels or some kinds of
+            pictures need are in extras of theirs.
     """
     module = (error.name or "").partition(".")[0]
     if not any(module in modules for modules in EXTRAS.values()):
         return None
-    extra = next((name for name in ("compare", "view", "pictures") if module in EXTRAS[name]), extra)
+    extra = next((name for name in ("compare", "view", "pictures", "spice") if module in EXTRAS[name]), extra)
     return (
         f"this command needs {module}, which is not installed: {install_command(extra)}, "
         f"or in a clone of the project: pip install '.[{extra}]'"

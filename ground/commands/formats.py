@@ -69,13 +69,14 @@ def import_command(
     given_sigmas = None if pose_sigma is None else _pose_sigmas(pose_sigma)
     table = None if exposures in (None, UNKNOWN) else read_table(Path(exposures))
     sigmas, exported, registration = EXACT, None, None
+    timed = (ImportFormat.NDM, ImportFormat.SPICE)  # their readers need the table for the poses
     if format_ is ImportFormat.IMAGES:
         found = _photographs(folder, session, frames, table)
         views, sigmas, registration = found.views, found.sigmas, found.described()
     else:
         views, exported = _read(format_, folder, table)
         views = first_of_each_split(views, frames)
-        if exposures != UNKNOWN and format_ is not ImportFormat.NDM:
+        if exposures != UNKNOWN and format_ not in timed:
             views = with_exposures(views, table)
     views, found_poses = with_masks(views, masks), {}
     source = f"{format_.value}: {folder}"
@@ -124,12 +125,15 @@ def _read(
     from ground.formats.nerf import read_nerf
     from ground.formats.nerfstudio import read_nerfstudio
     from ground.formats.shirt import read_shirt
+    from ground.formats.spice import read_spice
 
     described = {ImportFormat.NERF: read_nerf, ImportFormat.NERFSTUDIO: read_nerfstudio}
     if format_ in described:
         return described[format_](folder)
     if format_ is ImportFormat.NDM:
         return read_ndm(folder, table), None
+    if format_ is ImportFormat.SPICE:
+        return read_spice(folder, table), None
     plain = {
         ImportFormat.COLMAP: read_colmap,
         ImportFormat.SHIRT: read_shirt,

@@ -66,6 +66,7 @@ class ImportFormat(StrEnum):
     LLFF = "llff"
     MIDDLEBURY = "middlebury"
     NDM = "ndm"
+    SPICE = "spice"
     IMAGES = "images"
 
 

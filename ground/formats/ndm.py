@@ -22,8 +22,8 @@ from flightsw.icd.ndm.text import MAX_NDM_BYTES
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.icd.reference_frames import EARTH_RADIUS_M, low_precision_sun
 from ground.formats.photographs.brackets import brackets_of
-from ground.formats.photographs.exposures import with_exposures
-from ground.formats.pictures.files import FormatError, Light, pictures_in, read_header
+from ground.formats.photographs.exposures import middle_utc_ns, with_exposures
+from ground.formats.pictures.files import FormatError, Light, pictures_in
 from ground.formats.pictures.lens import Intrinsics
 from ground.formats.pictures.view import View
 from ground.formats.pictures.views import unposed
@@ -108,7 +108,7 @@ def read_ndm(folder: Path, table: dict[str, Light] | None = None) -> list[View]:
 
 
 def _posed(view: View, camera: Camera, formation: Formation, table: dict[str, Light]) -> View:
-    utc_ns = _middle_ns(view.image, camera, table.get(view.image.name))
+    utc_ns = middle_utc_ns(view.image, camera.times, table.get(view.image.name))
     try:
         found = formation.at(utc_ns)
     except NoState as error:
@@ -136,24 +136,6 @@ def _posed(view: View, camera: Camera, formation: Formation, table: dict[str, Li
         attitude_known=known,
         quat_inertial_to_body=matrix_to_quat(to_body),
     )
-
-
-def _middle_ns(image: Path, camera: Camera, row: Light | None) -> int:
-    """Return the middle of a picture's exposure."""
-    if row is not None and row.middle_utc_ns is not None:
-        return row.middle_utc_ns
-    light = read_header(image).light
-    if light.middle_utc_ns is not None:
-        return light.middle_utc_ns
-    if light.taken_utc_ns is None:
-        raise FormatError(
-            f"{image}: states no time (EXIF DateTimeOriginal, FITS DATE-OBS); give --exposures FILE.csv with the "
-            "columns name,mid_exposure_utc"
-        )
-    if camera.times == "middle":
-        return light.taken_utc_ns
-    seconds = (row.time_s if row is not None else None) or light.time_s or 0.0
-    return light.taken_utc_ns + round(seconds * 5e8)
 
 
 def _in_eclipse(found: Geometry, sun: np.ndarray) -> bool:

@@ -12,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -132,6 +133,31 @@ def with_exposures(views: Sequence[View], table: dict[str, Light] | None = None)
         dataclasses.replace(view, exposure_time_s=time_s, exposure_stated=True)
         for view, time_s in zip(timed, seconds, strict=True)
     ]
+
+
+def middle_utc_ns(image: Path, stated: Literal["start", "middle"], row: Light | None) -> int:
+    """Return the middle of a picture's exposure, by its row of a table or by the picture.
+
+    Args:
+        stated: what the picture's own time is of, unless it says that itself.
+
+    Raises:
+        FormatError: neither states a time.
+    """
+    if row is not None and row.middle_utc_ns is not None:
+        return row.middle_utc_ns
+    light = read_header(image).light
+    if light.middle_utc_ns is not None:
+        return light.middle_utc_ns
+    if light.taken_utc_ns is None:
+        raise FormatError(
+            f"{image}: states no time (EXIF DateTimeOriginal, FITS DATE-OBS); give --exposures FILE.csv with the "
+            "columns name,mid_exposure_utc"
+        )
+    if stated == "middle":
+        return light.taken_utc_ns
+    seconds = (row.time_s if row is not None else None) or light.time_s or 0.0
+    return light.taken_utc_ns + round(seconds * 5e8)
 
 
 def light_s(lights: Sequence[Light]) -> list[float]:
