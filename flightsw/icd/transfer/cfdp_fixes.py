@@ -5,6 +5,7 @@ needed any more or no longer enough.
 """
 
 import hashlib
+import io
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -31,10 +32,12 @@ from spacepackets.cfdp.pdu.nak import get_max_seg_reqs_for_max_packet_size_and_p
 from spacepackets.cfdp.tlv import FilestoreResponseStatusCode
 from spacepackets.countdown import Countdown
 
-from flightsw.icd.transfer.checksum import file_checksum
+from flightsw.icd.mission import Checksum
+from flightsw.icd.transfer.checksum import RunningChecksum
 from flightsw.icd.transfer.receipt import Verdict, attach, receipt, store_of
 
 MAX_GAPS = 16_384  # of one file: 50 MB with 30 % of its segments lost have some 10,000
+DIGEST_BYTES = 2 << 20  # read for checksum and digest in one call
 
 
 def delivered(finished: FinishedParams) -> bool:
@@ -66,33 +69,68 @@ class ClockCountdown(Countdown):
 
 
 class OneFile(VirtualFilestore):
-    """A file store that is one file in memory: names from the link reach no disk."""
+    """A file store that is one file in memory: names from the link reach no disk.
 
-    def __init__(self, content: bytes, max_bytes: int):
-        self.content = bytearray(content)
+    What is read in order goes into the file's checksum and its SHA-256 on the way, so that no call takes long at its
+    end. Those bytes do not change any more: another segment with the same place is ignored there.
+    """
+
+    def __init__(self, content: bytes, max_bytes: int, checksum: Checksum):
+        self.size_bytes = len(content)
         self._max_bytes = max_bytes
+        self._file = io.BytesIO(content)  # which takes and gives its content without a copy
+        self._digested_bytes = 0
+        self._checksum, self._sha256 = RunningChecksum(checksum), hashlib.sha256()
+
+    @property
+    def content(self) -> bytes:
+        return self._file.getvalue()
+
+    @property
+    def sha256(self) -> bytes | None:
+        """The digest of the whole file, None before all of it was read."""
+        return self._sha256.digest() if self._digested_bytes == self.size_bytes else None
+
+    def digest(self, end: int) -> bool:
+        """Read the next `DIGEST_BYTES` before this byte; tell whether nothing before it is left to be read."""
+        left_bytes = end - self._digested_bytes
+        if left_bytes > 0:
+            self.read_data(Path(), self._digested_bytes, min(left_bytes, DIGEST_BYTES))
+        return left_bytes <= DIGEST_BYTES
+
+    def forget(self) -> None:
+        """Give the memory of the content back."""
+        self._file, self.size_bytes = io.BytesIO(), 0
 
     def read_data(self, file: Path, offset: int | None, read_len: int) -> bytes:
         start = offset or 0
-        return bytes(self.content[start : start + read_len])
+        self._file.seek(start)
+        data = self._file.read(read_len)
+        if start == self._digested_bytes:
+            self._digested_bytes += len(data)
+            self._checksum.add(data)
+            self._sha256.update(data)
+        return data
 
     def write_data(self, file: Path, data: bytes, offset: int | None) -> None:
         start = offset or 0
         end = start + len(data)
         if end > self._max_bytes:
             raise PermissionError(f"{end} bytes are more than the {self._max_bytes} allowed")
-        if end > len(self.content):
-            self.content.extend(bytes(end - len(self.content)))
-        self.content[start:end] = data
+        known_bytes = max(self._digested_bytes - start, 0)
+        if known_bytes < len(data):
+            self._file.seek(start + known_bytes)
+            self._file.write(data[known_bytes:])
+            self.size_bytes = max(self.size_bytes, end)
 
     def calculate_checksum(
         self, checksum_type: Any, file_path: Path, size_to_verify: int, segment_len: int = 4096
     ) -> bytes:
-        whole = size_to_verify == len(self.content)
-        return file_checksum(checksum_type, self.content if whole else self.content[:size_to_verify])
+        """Return the checksum of what was read in order, which is all of the file where a transfer ends well."""
+        return self._checksum.value()
 
     def file_size(self, file: Path) -> int:
-        return len(self.content)
+        return self.size_bytes
 
     def file_exists(self, path: Path) -> bool:
         return True
@@ -136,13 +174,12 @@ class Indications(CfdpUserBase):
         self.finished = params.finished_params
         if self._accept is None or not delivered(self.finished):
             return
-        content = bytes(self.file.content)
-        verdict = self._accept(self.dest_name or "", content)
+        verdict = self._accept(self.dest_name or "", self.file.content)
         if not isinstance(verdict, Verdict):
             verdict = Verdict.STORED if verdict else Verdict.UNSTORED
-        if self.store and verdict is not Verdict.UNSTORED:
+        sha256 = self.file.sha256
+        if self.store and sha256 is not None and verdict is not Verdict.UNSTORED:
             transaction = params.transaction_id.seq_num.value
-            sha256 = hashlib.sha256(content).digest()
             made = receipt(verdict, self.store, transaction, sha256, self._key)
             attach(self.finished, verdict, made)
         if not verdict:
@@ -251,6 +288,15 @@ class FixedDestHandler(DestHandler):
     def _handle_file_data_without_previous_metadata(self, fd_pdu: FileDataPdu) -> None:
         self._handle_fd_pdu(fd_pdu)
 
+    def _handle_fd_pdu(self, file_data_pdu: FileDataPdu) -> None:
+        super()._handle_fd_pdu(file_data_pdu)
+        self._digest()
+
+    def _digest(self) -> bool:
+        """Take some of what has no gap before it into checksum and digest; tell whether that was all of it."""
+        gaps = self._params.acked_params.lost_seg_tracker.lost_segments
+        return self.user.file.digest(gaps[0][0] if gaps else self._params.fp.progress)
+
     def _handle_metadata_packet(self, metadata_pdu: MetadataPdu) -> None:
         self.user.store = store_of(metadata_pdu)
         super()._handle_metadata_packet(metadata_pdu)
@@ -264,7 +310,8 @@ class FixedDestHandler(DestHandler):
         assert remote is not None
         timer, missing = acked.procedure_timer, bool(acked.lost_seg_tracker.lost_segments)
         if not missing and not acked.metadata_missing:
-            super()._deferred_lost_segment_handling()  # all is there
+            if self._digest():  # else it goes on in the next call
+                super()._deferred_lost_segment_handling()  # all is there
             return
         if timer is None:
             acked.procedure_timer = ClockCountdown(self.clock, remote.nak_timer_interval_seconds)
@@ -300,10 +347,15 @@ class FixedDestHandler(DestHandler):
 
     def _handle_transfer_completion(self) -> None:
         # with nothing missing the original reports success without looking at the checksum
-        params = self._params
+        params, file = self._params, self.user.file
         if params.completion_disposition == CompletionDisposition.COMPLETED:
-            whole = len(self.user.file.content) == params.fp.file_size
-            if not whole or file_checksum(params.checksum_type, self.user.file.content) != params.fp.crc32:
+            whole = file.size_bytes == params.fp.file_size
+            if whole and not file.digest(file.size_bytes):
+                return  # it goes on in the next call
+            if (
+                not whole
+                or file.calculate_checksum(params.checksum_type, Path(), file.size_bytes) != params.fp.crc32
+            ):
                 params.finished_params.delivery_code = DeliveryCode.DATA_INCOMPLETE
                 params.finished_params.condition_code = ConditionCode.FILE_CHECKSUM_FAILURE
         super()._handle_transfer_completion()

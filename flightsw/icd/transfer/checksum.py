@@ -15,23 +15,31 @@ TYPES: dict[Checksum, ChecksumType] = {
 }
 
 
-def file_checksum(kind: ChecksumType, content: bytes | bytearray) -> bytes:
-    """Return the four bytes of a file's checksum.
+class RunningChecksum:
+    """The checksum of a file whose parts come one after the other.
 
     The modular one (CCSDS 727.0-B, 4.2.2) is the sum of the file's big-endian 32-bit words, the last one filled up with
     zeros: words that changed places keep it, so it is for other systems that know no CRC.
-
-    Raises:
-        ValueError: another kind.
     """
-    match kind:
-        case ChecksumType.CRC_32:
-            number = zlib.crc32(content)
-        case ChecksumType.CRC_32C:
-            number = crc32.iscsi(bytes(content))
-        case ChecksumType.MODULAR:
-            words = np.frombuffer(bytes(content) + bytes(-len(content) % 4), ">u4")
-            number = int(words.sum(dtype=np.uint64)) % (1 << 32)
-        case _:
-            raise ValueError(f"expected CRC-32, CRC-32C or the modular checksum, got {kind!r}")
-    return number.to_bytes(4, "big")
+
+    def __init__(self, kind: Checksum):
+        self._kind, self._number = kind, 0
+        self._unfinished = b""  # up to three bytes of the modular checksum's next word
+
+    def add(self, part: bytes) -> None:
+        """Take the next part of the file."""
+        match self._kind:
+            case "crc-32":
+                self._number = zlib.crc32(part, self._number)
+            case "crc-32c":
+                self._number = crc32.iscsi(part, self._number)
+            case "modular":
+                words = self._unfinished + part
+                whole_bytes = len(words) // 4 * 4
+                self._unfinished = words[whole_bytes:]
+                self._number += int(np.frombuffer(words[:whole_bytes], ">u4").sum(dtype=np.uint64))
+
+    def value(self) -> bytes:
+        """Return the four bytes of the checksum of all parts so far."""
+        last_word = int.from_bytes(self._unfinished.ljust(4, b"\0"), "big")
+        return ((self._number + last_word) % (1 << 32)).to_bytes(4, "big")

@@ -215,7 +215,7 @@ class Receiver:
         source, destination = self._route
         nak_bytes = min(self._max_pdu_bytes, MAX_NAK_BYTES)
         config, remotes = configuration(destination, source, nak_bytes, self._interval_s, self._checksum)
-        user = Indications(OneFile(b"", self._max_file_bytes), self._accept, self._key)
+        user = Indications(OneFile(b"", self._max_file_bytes, self._checksum), self._accept, self._key)
         handler = FixedDestHandler(config, user, remotes, NoCheckTimer())
         handler.clock = self._clock
         receiving = _Receiving(handler, user, self._clock.now_s)
@@ -228,7 +228,7 @@ class Receiver:
     def _make_room(self, receiving: _Receiving, size_bytes: int) -> None:
         """Give up the files that were silent for longest where one of this size would not fit beside them."""
         sizes = {
-            number: len(other.user.file.content)
+            number: other.user.file.size_bytes
             for number, other in self._receiving.items()
             if other is not receiving
         }
@@ -243,7 +243,7 @@ class Receiver:
             self.pdus_refused += 1
         self._drain(receiving)
         if receiving.finished_pdu is not None:
-            receiving.user.file.content.clear()  # stored or given up; only the answers are still needed
+            receiving.user.file.forget()  # stored or given up; only the answers are still needed
             receiving.handler.naks = iter(())
         if receiving.handler.idle:
             self._receiving.pop(transaction, None)

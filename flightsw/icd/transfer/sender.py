@@ -1,6 +1,5 @@
 """The sending end of a file transfer."""
 
-import hashlib
 from collections import OrderedDict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -73,7 +72,7 @@ class _File:
     name: str
     store: bytes
     transaction: int
-    sha256: bytes
+    sha256: bytes | None  # None while not all of it was sent once
 
     def verdict(self, finished: FinishedPdu, keys: Sequence[bytes]) -> Verdict | None:
         """Return what a Finished PDU says about this very file; None if it does not prove to be about it.
@@ -90,12 +89,16 @@ class _File:
             return Verdict.UNSTORED
         if not self.store or (not given and not keys):
             return verdict
-        return verdict if fits(given, verdict, self.store, self.transaction, self.sha256, keys) else None
+        if self.sha256 is None or not fits(given, verdict, self.store, self.transaction, self.sha256, keys):
+            return None
+        return verdict
 
 
 @dataclass
 class _Sending:
-    file: _File
+    name: str
+    store: bytes
+    transaction: int
     size_bytes: int
     handler: FixedSourceHandler
     user: Indications
@@ -111,8 +114,8 @@ class _Sending:
     verdict: Verdict | None = None
 
     @property
-    def name(self) -> str:
-        return self.file.name
+    def file(self) -> _File:
+        return _File(self.name, self.store, self.transaction, self.user.file.sha256)
 
 
 class Sender:
@@ -177,7 +180,7 @@ class Sender:
             self._checksum,
             self._segments.length_bytes,
         )
-        user = Indications(OneFile(content, len(content)))
+        user = Indications(OneFile(content, len(content), self._checksum))
         handler = FixedSourceHandler(config, user, remotes, NoCheckTimer(), _OneNumber(transaction))
         handler.clock = self._clock
         path = Path(name)
@@ -188,9 +191,8 @@ class Sender:
         faults = config.default_fault_handlers
         assert isinstance(faults, Faults)
         rounds = NakRounds(len(content))
-        file = _File(name, self._store, transaction, hashlib.sha256(content).digest())
         self._sending[transaction] = _Sending(
-            file, len(content), handler, user, faults, now_s, rounds, urgent
+            name, self._store, transaction, len(content), handler, user, faults, now_s, rounds, urgent
         )
         if urgent:
             for number in [n for n, sending in self._sending.items() if not sending.urgent]:

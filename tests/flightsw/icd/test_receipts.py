@@ -19,6 +19,7 @@ from flightsw.icd.frame import HEADER
 from flightsw.icd.mission import CameraSection
 from flightsw.icd.transfer import Outcome, Receiver, Sender, Verdict, answer_key, parse_pdu
 from flightsw.icd.transfer.cfdp_fixes import Gaps
+from flightsw.icd.transfer.checksum import RunningChecksum
 from flightsw.icd.transfer.receipt import attach, receipt
 
 MAX_PDU_BYTES = 200
@@ -188,6 +189,55 @@ def test_a_file_with_more_gaps_than_allowed_arrives(monkeypatch):
         if up is not None:
             tx.receive(up, now_s)
     assert outcomes[0].delivered and ground.stored == [content]
+
+
+@pytest.mark.parametrize("checksum", ["crc-32", "crc-32c", "modular"])
+def test_no_call_checks_more_than_a_part_of_a_file(monkeypatch, checksum):
+    """Where the file's first bytes come last, all the others are still to be checked then."""
+    part_bytes, added = 1000, []
+    monkeypatch.setattr("flightsw.icd.transfer.cfdp_fixes.DIGEST_BYTES", part_bytes)
+    add = RunningChecksum.add
+    monkeypatch.setattr(RunningChecksum, "add", lambda self, part: (added.append(len(part)), add(self, part)))
+    content, stored, most = random.Random(1).randbytes(20_001), [], 0
+    tx = Sender(MAX_PDU_BYTES, INTERVAL_S, store=STORE, keys=[KEY], checksum=checksum)
+    rx = Receiver(
+        MAX_PDU_BYTES,
+        INTERVAL_S,
+        lambda name, data: stored.append(data) or True,
+        checksum=checksum,
+        key=KEY,
+    )
+    tx.put("00000000.obf", content, 1, 0.0)
+    for turn in range(3000):
+        now_s, before = turn * 0.01, len(added)
+        down = tx.next_pdu(now_s)
+        most, before = max(most, sum(added[before:])), len(added)
+        is_first = (
+            down is not None and isinstance(parse_pdu(down), FileDataPdu) and parse_pdu(down).offset == 0
+        )
+        if down is not None and not (is_first and now_s < 2.0):
+            rx.receive(down, now_s)
+            most, before = max(most, sum(added[before:])), len(added)
+        if (up := rx.next_pdu(now_s)) is not None:
+            tx.receive(up, now_s)
+        most = max(most, sum(added[before:]))
+    (outcome,) = tx.outcomes()
+    assert outcome.delivered and stored == [content]
+    assert sum(added) == 2 * len(content) and most <= 2 * part_bytes
+
+
+def test_a_segment_with_other_bytes_does_not_change_what_was_checked():
+    content, ground, tx = random.Random(1).randbytes(1000), Ground(KEY), sender(STORE, KEY)
+    forged = FileDataPdu(configuration(7), FileDataParams(b"forged" * 10, 0))
+    receive = ground.receiver.receive
+
+    def received_twice(data: bytes, now_s: float) -> None:
+        receive(data, now_s)
+        if isinstance(parse_pdu(data), FileDataPdu):
+            receive(bytes(forged.pack()), now_s)
+
+    ground.receiver.receive = received_twice
+    assert send(tx, ground, content).delivered and ground.stored == [content]
 
 
 def test_naks_are_made_one_by_one_and_ask_for_everything():
