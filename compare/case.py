@@ -14,12 +14,20 @@ from torch import Tensor
 from compare.errors import CompareError
 from compare.opponents.reconstruction import Reconstruction
 from ground.run.estimated_poses import Alignment
-from ground.run.scores import ScoredView, clean_scores, cloud_scores, display_scores, noisy_psnr_db
+from ground.run.scores import (
+    ScoredView,
+    clean_scores,
+    cloud_scores,
+    display_scores,
+    mu_law_psnr_db,
+    noisy_psnr_db,
+)
 from ground.session.cameras import exposed, sensor_of
 from ground.session.folder import FrameRecord, Session, open_session, read_header
 from ground.session.training_frames import split, training_frame
 from ground.session.truth import Truth
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import TrainingFrame, cameras_of
+from obbgs_core.model.cameras import Cameras
 from obbgs_core.poses.gauge import seen_after, size_of
 from obbgs_core.score.shown import shown_points
 from obbgs_core.sensor import Sensor
@@ -121,6 +129,22 @@ class Case:
         exposures_s = [frame.exposure_time_s for frame in self.held_out]
         true = zip(images, self.clean, self.coverage, exposures_s, strict=True)
         return figures | clean_scores([ScoredView(*view) for view in true])
+
+    def radiance_scores(self, image: Callable[[Cameras, float], Tensor]) -> dict[str, float]:
+        """Return psnr_mu_db of the radiance that a method's images tell; {} where none is known.
+
+        Images are asked for at the exposure time at which the brightest true pixel of all views reaches full scale, so
+        that none is clipped.
+        """
+        brightest = max((light.max().item() for light in self.radiance), default=0.0)
+        if not brightest:
+            return {}
+        black = self.sensor.black_dn / self.sensor.white_dn
+        exposure_s = self.sensor.full_scale_radiance(1.0) / brightest
+        with torch.no_grad():
+            images = [image(cameras_of([frame]), exposure_s) for frame in self.held_out]
+        shown = [(picture - black) / (1 - black) for picture in images]
+        return {"psnr_mu_db": mu_law_psnr_db(shown, [light / brightest for light in self.radiance])}
 
     def cloud_scores(self, points_m: Tensor, surface_m: Tensor) -> dict[str, float]:
         """Return the scores of a method's points [N, 3] and surface points [M, 3]; {} where no surface is known."""

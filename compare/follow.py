@@ -17,7 +17,7 @@ from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.score.metrics import psnr_db
 
 MARKS = (0.02, *(i / 20 for i in range(1, 20)))  # shares of the work at which the curve is measured
-FEW_MARKS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)  # of methods whose images take long
+FEW_MARKS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)  # of methods whose images take long, and of all surfaces
 CURVE_VIEWS = 16  # held-out frames, evenly spaced; final scores use all
 SETTLED_DB, SETTLED_OVER = (
     0.05,
@@ -38,7 +38,7 @@ class Follower:
     """
 
     def __init__(self, case: Case, folder: Path, stop: Path, marks: tuple[float, ...] = MARKS):
-        self.points: list[dict[str, float]] = []  # share, seconds, PSNR, Chamfer distance
+        self.points: list[dict[str, float]] = []  # share, seconds, PSNR, Chamfer distance, and F of surfaces
         self._folder, self._stop, self._marks = folder, stop, marks
         self._psnr = "psnr_clean_db" if case.radiance else "psnr_noisy_db"
         count = len(case.held_out)
@@ -54,7 +54,7 @@ class Follower:
         if kept is not None:
             self.points, self._joules_before = kept["points"], kept["joules"]
 
-    def on_step(self, share: float, seconds: float, snapshot: Callable[[], Reconstruction]) -> None:
+    def on_step(self, share: float, seconds: float, snapshot: Callable[[bool], Reconstruction]) -> None:
         """Note that a share of the work is done, and measure the reconstruction as it stands where that is due.
 
         `cpu_seconds` is the processor time of the work until now, over all its interrupted parts, without measuring.
@@ -67,7 +67,8 @@ class Follower:
         self._share = share
         measured = self.points[-1]["share"] if self.points else 0.0
         if share < 1 and any(measured < mark <= share for mark in self._marks):
-            self._add(share, seconds, snapshot())
+            with_surface = any(measured < mark <= share for mark in FEW_MARKS)
+            self._add(share, seconds, snapshot(with_surface))
         now_s = time.monotonic()
         if now_s - self._told_s > TELL_EVERY_S:
             self._told_s = now_s
@@ -119,7 +120,8 @@ class Follower:
         self._joules_before *= kept
 
     def _add(self, share: float, seconds: float, reconstruction: Reconstruction) -> None:
-        point = {"share": round(share, 5), "seconds": round(seconds, 2)} | self._measured(reconstruction)
+        spent = {"seconds": round(seconds, 2), "cpu_seconds": round(self.cpu_seconds, 2)}
+        point = {"share": round(share, 5)} | spent | self._measured(reconstruction)
         self.points = [earlier for earlier in self.points if earlier["share"] < point["share"]] + [point]
         self._keep()
 
@@ -135,8 +137,11 @@ class Follower:
             values = [psnr_db(image_of(reconstruction, frame), expected) for frame, expected in pairs]
             figures[self._psnr] = round(sum(values) / len(values), 4)
         if case.cloud_m is not None and len(reconstruction.points):
-            scores = case.cloud_scores(reconstruction.points, torch.zeros(0, 3))
+            scores = case.cloud_scores(reconstruction.points, reconstruction.surface)
             figures["chamfer"] = round(scores["chamfer"], 5)
+            figures |= {
+                key: round(scores[key], 2) for key in ("f_01_surface", "f_02_surface") if key in scores
+            }
         return figures
 
     def _keep(self) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from compare import references
 from compare.case import Case
 from compare.opponents.mvsnet import reconstruct_mvsnet
-from compare.opponents.nerf import AS_PUBLISHED, FOR_A_CPU, Size, reconstruct_nerf
+from compare.opponents.nerf import AS_PUBLISHED, FOR_A_CPU, Knowing, Size, reconstruct_nerf
 from compare.opponents.plane_sweep import reconstruct_mvs
 from compare.opponents.reconstruction import Reconstruction, Work
 from compare.opponents.sfm import Pictures, reconstruct_sfm
@@ -95,8 +95,9 @@ def method(name: str, weights: Path | None = None) -> Method:
         return _BASELINES[name]
     if name == UNTRAINED:
         return dataclasses.replace(_training(preset("obbgs"), name, 0.0), stepped=False)
+    plain = name.removesuffix(EARLY)
     try:
-        return _training(preset(name), name)
+        return _training(preset(plain), name, validated=name != plain)
     except ValueError as error:
         others = ", ".join([*reference_names(), *_BASELINES, MVSNET])
         raise ValueError(f"{error}; or {others}, which are no trainings of Gaussians") from error
@@ -113,23 +114,26 @@ _REFERENCES: dict[str, Callable[[Case, list[TrainingFrame]], list[Tensor]]] = {
     "ceiling": references.ceiling,
     "noise": references.noise,
 }
+EARLY = "+early"  # after a training's name: its model is the one that shows brackets best which are kept back
 MVSNET, UNTRAINED = "mvsnet", "untrained"  # the Gaussians that `obbgs` starts from
 NGP_MB = 1500.0  # 1,100 were seen beside PyTorch and the frames
 
 
 def _radiance_field(name: str, size: Size, working_mb: float = 0.0) -> list[Method]:
-    """Return a radiance field as published, blind to exposure, and with exposure known."""
+    """Return a radiance field as published, blind to exposure, with exposure known, and knowing clips and masks too."""
 
-    def variant(exposure_aware: bool) -> Method:
+    def variant(*names: str) -> Method:
+        knowing = Knowing("clips" in names, "mask" in names)
         return Method(
-            name + ("+exposure" if exposure_aware else ""),
-            lambda task: _nerf(task, size, exposure_aware),
+            "+".join((name, *names)),
+            lambda task: _nerf(task, size, "exposure" in names, knowing),
             seeded=True,
             stepped=True,
             working_mb=working_mb,
         )
 
-    return [variant(False), variant(True)]
+    more = ("mask",), ("clips",), ("mask", "clips")
+    return [variant(), variant("exposure"), *(variant("exposure", *names) for names in more)]
 
 
 _BASELINES: dict[str, Method] = {
@@ -151,10 +155,12 @@ def _reference(task: Task, images: Callable[[Case, list[TrainingFrame]], list[Te
     return Outcome(Reconstruction(empty, empty, None, 0, 0.0), images(task.case, task.frames))
 
 
-def _nerf(task: Task, size: Size, exposure_aware: bool) -> Outcome:
+def _nerf(task: Task, size: Size, exposure_aware: bool, knowing: Knowing) -> Outcome:
     settings = (task.seed, task.work, task.steps_share, exposure_aware, size)
     on_gpu = torch.cuda.is_available()
-    made = reconstruct_nerf(task.frames, task.sensor, *settings, device="cuda" if on_gpu else "cpu")
+    made = reconstruct_nerf(
+        task.frames, task.sensor, *settings, device="cuda" if on_gpu else "cpu", knowing=knowing
+    )
     figures = made.figures | {"device": torch.cuda.get_device_name()} if on_gpu else made.figures
     return Outcome(dataclasses.replace(made, figures=figures))
 
@@ -171,7 +177,9 @@ def _motion(task: Task, pictures: Pictures) -> Outcome:
     return Outcome(reconstruct_sfm(task.frames, task.sensor, task.work, pictures))
 
 
-def _training(config: MethodConfig, name: str, time_limit_s: float = float("inf")) -> Method:
+def _training(
+    config: MethodConfig, name: str, time_limit_s: float = float("inf"), validated: bool = False
+) -> Method:
     def run(task: Task) -> Outcome:
         changes = dict(task.settings)
         changes["steps"] = max(1, round(changes.get("steps", config.steps) * task.steps_share))
@@ -180,14 +188,15 @@ def _training(config: MethodConfig, name: str, time_limit_s: float = float("inf"
         used = changed(config, changes)
         return Outcome(
             reconstruct_gaussians(
-                task.frames, task.sensor, used, task.seed, task.work, task.settled, time_limit_s
+                task.frames, task.sensor, used, task.seed, task.work, task.settled, time_limit_s, validated
             )
         )
 
     return Method(
         name,
         run,
-        {"settings": differing(config), "time_limit_s": time_limit_s},
+        {"settings": differing(config), "time_limit_s": time_limit_s}
+        | ({"validated": True} if validated else {}),
         seeded=True,
         stepped=True,
         sized=True,

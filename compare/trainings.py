@@ -4,27 +4,27 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from compare.follow import MARKS
 from compare.opponents.reconstruction import EstimatedPoses, Reconstruction, Work
+from compare.validation import BEST, Best, imaging, withheld
 from ground.run.intervals import interval_scores, stated_error_scores
 from ground.run.model_files import SURFACE_POINTS
 from obbgs_base.errors import Interrupted
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.io.ply import save_ply
 from obbgs_core.methods.config import MethodConfig
-from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import with_estimate
 from obbgs_core.poses.estimate import PoseEstimate
-from obbgs_core.render import render
 from obbgs_core.score.poses import settled_poses
 from obbgs_core.score.surface import surface_positions
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.result import Exposing, TrainResult
+from obbgs_core.train.result import TrainResult
 from obbgs_core.train.trainer import CHECKPOINT_EVERY_S, Trainer
 
 CHECKPOINT, MODEL = "training.checkpoint", "model.ply"
@@ -39,6 +39,7 @@ def reconstruct_gaussians(
     work: Work,
     settled: Callable[[], bool] = lambda: False,
     time_limit_s: float = float("inf"),
+    validated: bool = False,
 ) -> Reconstruction:
     """Return the Gaussians that a method trains; its figures say how the training went.
 
@@ -48,17 +49,21 @@ def reconstruct_gaussians(
     Args:
         settled: asked after growth and resets are over and half of the steps are done; when it is true the training
             ends as converged. A method with a rule of its own for its end (`chi2_end`) is not asked.
+        validated: every tenth bracket is not trained on; the model is the one on the way that shows those best, and the
+            training ends where none has been better for a fifth of the steps. What that takes counts.
 
     Raises:
         ReconstructionError: the frames allow no model, or the training diverged.
         Interrupted: work.should_stop returned true; the training is saved.
         OSError: it cannot be saved.
     """
+    frames, kept_back = withheld(frames) if validated else (frames, [])
     trainer = Trainer(frames, sensor, config, seed)
     checkpoint = None if work.folder is None else work.folder / CHECKPOINT
     if checkpoint is not None:
         trainer.resume(checkpoint)
     resumed_at = trainer.state.steps_done
+    best = Best(kept_back, None if work.folder is None else work.folder / BEST)
 
     def save() -> None:
         if checkpoint is not None:
@@ -70,18 +75,24 @@ def reconstruct_gaussians(
             reason = f"converged at step {trainer.state.steps_done} of {config.steps}"
             break
         info = trainer.step()
-        work.on_step(info.step / info.steps, info.seconds, lambda: _snapshot(trainer))
+        work.on_step(info.step / info.steps, info.seconds, lambda surface: _snapshot(trainer, surface))
         if work.should_stop():
             save()
             raise Interrupted(f"interrupted at step {info.step} of {info.steps}")
         marked = any((info.step - 1) / info.steps < mark <= info.step / info.steps for mark in MARKS)
+        if marked and kept_back:
+            best.look(trainer)
+            if best.is_past(trainer):
+                reason = f"validation brackets were shown best after step {best.step} of {config.steps}"
+                converged = True
+                break
         if marked or time.monotonic() - saved_s > CHECKPOINT_EVERY_S:
             save()
             saved_s = time.monotonic()
     else:
         converged = False
     save()
-    result = trainer.result(reason)
+    result = best.of(trainer, trainer.result(reason)) if kept_back else trainer.result(reason)
     if work.folder is not None:
         save_ply(result.gaussians, work.folder / MODEL, sun_dir=frames[0].sun_dir)
     posed = _estimated(frames, result.pose_estimate)
@@ -91,23 +102,29 @@ def reconstruct_gaussians(
         image=imaging(result.gaussians, sensor, result.exposing),
         size_bytes=sum(4 * tensor.numel() for tensor in result.gaussians.parameters().values()),
         seconds=result.seconds,
-        figures={
-            "gaussians": len(result.gaussians),
-            "steps": trainer.state.steps_done,
-            "converged": converged,
-            **({"resumed_at": resumed_at} if resumed_at else {}),
-            "start": result.start,
-            "stop": result.stop_reason,
-            "appearance": result.appearance,
-            "growth": result.growth,
-            "poses": result.poses,
-        },
+        figures=_figures(trainer, result, resumed_at, converged)
+        | ({"best_step": best.step} if kept_back else {}),
         # the images of other methods need more than a radiance and an exposure time
         stated_errors=functools.partial(_stated_errors, result, posed, sensor)
         if config.exposure_aware and not config.published.compensation
         else None,
         poses=_poses(result.gaussians, sensor, result.pose_estimate),
     )
+
+
+def _figures(trainer: Trainer, result: TrainResult, resumed_at: int, converged: bool) -> dict[str, Any]:
+    """Return the columns of a row that say how a training went."""
+    return {
+        "gaussians": len(result.gaussians),
+        "steps": trainer.state.steps_done,
+        "converged": converged,
+        **({"resumed_at": resumed_at} if resumed_at else {}),
+        "start": result.start,
+        "stop": result.stop_reason,
+        "appearance": result.appearance,
+        "growth": result.growth,
+        "poses": result.poses,
+    }
 
 
 def _stated_errors(
@@ -142,22 +159,6 @@ def _poses(gaussians: Gaussians, sensor: Sensor, estimate: PoseEstimate | None) 
     return EstimatedPoses(estimate, settled)
 
 
-def imaging(gaussians: Gaussians, sensor: Sensor, exposing: Exposing) -> Callable[[Cameras, float], Tensor]:
-    """Return the function from a camera and an exposure time (s) to a model's image [H, W, C] in 0..1.
-
-    Args:
-        exposing: what the pictures are made with: the exposure that a blind method takes every other for, and the gains
-            that a method has learnt.
-    """
-
-    @torch.no_grad()
-    def image(camera: Cameras, exposure_time_s: float) -> Tensor:
-        radiance = render(gaussians, camera).radiance[0]
-        return exposing.image(radiance, sensor, exposure_time_s)
-
-    return image
-
-
 def _may_end(trainer: Trainer) -> bool:
     """Return whether growth and resets are over and half of the steps are done, of a method without an own end."""
     config = trainer.setup.config
@@ -165,13 +166,16 @@ def _may_end(trainer: Trainer) -> bool:
     return half_done and trainer.is_past_growth and not config.chi2_end
 
 
-def _snapshot(trainer: Trainer) -> Reconstruction:
-    """Return the training as it stands, without points on its surface, which take long."""
+def _snapshot(trainer: Trainer, with_surface: bool) -> Reconstruction:
+    """Return the training as it stands."""
     gaussians, setup, poses = trainer.gaussians, trainer.setup, trainer.state.poses.corrections
     estimate = None if poses is None else poses.estimate(setup.frames)  # dark frames are not among those
+    frames = setup.frames if poses is None else poses.frames(setup.frames)
     return Reconstruction(
         points=gaussians.means,
-        surface=torch.zeros(0, 3),
+        surface=surface_positions(gaussians, cameras_of(frames), SURFACE_POINTS)
+        if with_surface
+        else torch.zeros(0, 3),
         image=imaging(gaussians, setup.sensor, trainer.exposing),
         size_bytes=0,
         seconds=trainer.state.seconds,

@@ -15,6 +15,9 @@ HOLDS_DB, SHAKEN_DB = 1.0, 3.0
 MARGIN_DB = 1.0  # above the best image without training: less is a failure; seeds scatter by about 0.3 dB
 
 
+LEVELS_DB, LEVEL_F = (35, 38, 40), 60.0  # of clean PSNR, and of F within 0.02, %: how soon they are reached
+
+
 @dataclass(frozen=True)
 class Metric:
     """A column: the row's key, its title with unit, how it is written, and which way is better (None: neither)."""
@@ -30,12 +33,19 @@ METRICS = (
     Metric("psnr_clean_pooled_db", "pooled, dB", "{:.2f}", True),
     Metric("psnr_foreground_db", "foreground, dB", "{:.2f}", True),
     Metric("psnr_best_db", "best on the way, dB", "{:.2f}", True),
+    Metric("psnr_mu_db", "mu-law, dB", "{:.2f}", True),
     Metric("psnr_noisy_db", "noisy, dB", "{:.2f}", True),
     Metric("psnr_srgb_db", "sRGB, dB", "{:.2f}", True),
     Metric("ssim_clean", "SSIM", "{:.4f}", True),
     Metric("lpips", "LPIPS", "{:.4f}", False),
-    Metric("chamfer", "Chamfer", "{:.4f}", False),
-    Metric("hausdorff", "Hausdorff", "{:.3f}", False),
+    *(
+        Metric(f"{key}_{radius}_surface", f"{title} .{radius}, %", "{:.1f}", True)
+        for radius in ("01", "02")
+        for key, title in (("precision", "precision"), ("recall", "recall"), ("f", "F"))
+    ),
+    Metric("chamfer_surface", "Chamfer of the surface", "{:.4f}", False),
+    Metric("chamfer", "Chamfer of centres", "{:.4f}", False),
+    Metric("hausdorff", "Hausdorff of centres", "{:.3f}", False),
     Metric("completeness_centres", "centres complete, %", "{:.1f}", True),
     Metric("completeness_surface", "surface complete, %", "{:.1f}", True),
     Metric("completeness_shown_surface", "complete of what is shown, %", "{:.1f}", True),
@@ -44,8 +54,10 @@ METRICS = (
     Metric("chi2_held_out_both", "chi² over noise and own error", "{:.2f}", None),
     Metric("gaussians", "Gaussians", "{:,.0f}", None),
     Metric("bytes", "kB", "{:,.0f}", None),
-    Metric("cpu_seconds", "processor time, s", "{:,.0f}", None),
-    Metric("seconds", "seconds", "{:,.0f}", None),
+    *(Metric(f"seconds_to_{level}_db", f"s to {level} dB", "{:,.1f}", False) for level in LEVELS_DB),
+    Metric("seconds_to_f60", "s to F .02 of 60 %", "{:,.1f}", False),
+    Metric("cpu_seconds", "processor time, s", "{:,.1f}", None),
+    Metric("seconds", "seconds", "{:,.1f}", None),
     Metric("energy_j", "energy, J", "{:,.0f}", None),
 )
 # of the paper's figure: relative gains of these, the first three of pictures, the others of geometry; where no truth is
@@ -58,13 +70,37 @@ CLEAN, NOISY = METRICS[0], next(metric for metric in METRICS if metric.key == "p
 
 
 def with_best(row: dict[str, Any]) -> dict[str, Any]:
-    """Return a row with the highest clean PSNR of its curve, in dB, as `psnr_best_db` where it has a curve.
+    """Return a row with what its curve tells, where it has one.
 
-    It is what the method would have reached if the truth had told it when to stop: methods that come to fit the noise
-    end below it.
+    psnr_best_db: the highest clean PSNR, which the method would have reached if the truth had told it when to stop:
+    those that come to fit the noise end below it. seconds_to_35_db and the like, seconds_to_f60: the processor time
+    after which it first had a clean PSNR, or F within 0.02 of 60 %, without that of measuring; missing where never.
     """
-    values = [point["psnr_clean_db"] for point in row.get("curve") or () if "psnr_clean_db" in point]
-    return row | {"psnr_best_db": max(values)} if values else row
+    curve = row.get("curve") or []
+    values = [point["psnr_clean_db"] for point in curve if "psnr_clean_db" in point]
+    asked = {f"seconds_to_{level}_db": ("psnr_clean_db", level) for level in LEVELS_DB}
+    asked["seconds_to_f60"] = "f_02_surface", LEVEL_F
+    found = {name: seconds_to(curve, *what) for name, what in asked.items()}
+    best = {"psnr_best_db": max(values)} if values else {}
+    return row | best | {name: seconds for name, seconds in found.items() if seconds is not None}
+
+
+def seconds_to(curve: Iterable[Mapping[str, float]], key: str, level: float) -> float | None:
+    """Return the processor time after which a curve first reaches a level, between its points on a straight line.
+
+    None where it never does, or where only the clock was read on the way.
+    """
+    before: tuple[float, float] | None = None
+    for point in curve:
+        if key not in point or "cpu_seconds" not in point:
+            continue
+        now = point["cpu_seconds"], point[key]
+        if now[1] >= level:
+            if before is None:
+                return now[0]
+            return before[0] + (now[0] - before[0]) * (level - before[1]) / (now[1] - before[1])
+        before = now
+    return None
 
 
 class Results:

@@ -28,7 +28,14 @@ ROW_NAMES = {  # of the scores whose names in a row differ
     "lpips_clean": "lpips",
     "completeness": "completeness_centres",
 }
-ROW_LEAVES_OUT = ("accuracy", "chamfer_surface", "hausdorff_surface", "completeness_shown")
+ROW_LEAVES_OUT = ("accuracy", "hausdorff_surface", "completeness_shown")
+OF_NO_SURFACE = (
+    "completeness_surface",
+    "recall_01_surface",
+    "recall_02_surface",
+    "f_01_surface",
+    "f_02_surface",
+)
 
 
 def run_cell(cell: Cell, out: Path, stop: Path, command: str) -> dict[str, Any]:
@@ -117,8 +124,10 @@ def scores(case: Case, outcome: Outcome, views: Path) -> dict[str, Any]:
     if images is not None:
         write_views(case, images, views)
         figures |= case.image_scores(images)
+    if result.image is not None:
+        figures |= case.radiance_scores(result.image)
     if case.cloud_m is not None and len(result.points):
-        figures["completeness_surface"] = 0.0  # where it shows no surface
+        figures |= dict.fromkeys(OF_NO_SURFACE, 0.0)
     figures |= case.cloud_scores(result.points, result.surface)
     if result.seconds:
         figures |= {"bytes": result.size_bytes, "seconds": result.seconds}

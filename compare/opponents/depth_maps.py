@@ -75,7 +75,7 @@ def reconstruct_by_depth_maps(
         work.on_step(
             len(maps) / (len(views.views) + 1),
             spent,
-            lambda so_far=so_far, spent=spent: _fused(views, so_far, fusion, spent, figures),
+            lambda _, so_far=so_far, spent=spent: _fused(views, so_far, fusion, spent, figures),
         )
         if work.should_stop():
             where = "nothing is kept" if work.folder is None else f"they are kept in {work.folder}"

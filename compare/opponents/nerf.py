@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from compare.opponents.nerf_field import EncodingSize, Field
 from compare.opponents.nerf_pictures import Nerf
@@ -23,7 +24,7 @@ from obbgs_base.errors import Interrupted
 from obbgs_base.files import set_aside, write_whole
 from obbgs_core.errors import Diverged, ReconstructionError
 from obbgs_core.frames import TrainingFrame, cameras_of, mean_exposure_s, usable
-from obbgs_core.sensor import Sensor
+from obbgs_core.sensor import Sensor, clipped_moments
 from obbgs_core.start.hull import radius_m
 from obbgs_core.start.initialisation import silhouettes
 
@@ -38,8 +39,10 @@ RATE_DROPS, RATE_DROP = (
     0.33,
 )  # shares of the steps at which the rate falls by the factor
 UPDATE_EVERY, UPDATE_EVERYWHERE_UNTIL = 16, 256  # steps; of the occupancy grid, as published
+SKY_WEIGHT = 0.1  # of the mean opacity of rays through empty sky
 CHECKPOINT_EVERY_S = 60.0
 SURFACE_POINTS = 100_000
+VIEWS_ON_THE_WAY = 40  # by which the surface is found where the training goes on
 FEWEST_PIXELS_ACROSS = 16.0  # of the target; less would leave the encoding no finer level
 
 
@@ -62,6 +65,21 @@ FOR_A_CPU = Size(8000, 2**15, 4096, EncodingSize(levels=8, features=4, table_row
 AS_PUBLISHED = Size(20_000, 2**18, 32_768, EncodingSize(levels=16, features=2, table_rows=2**19))
 
 
+@dataclass(frozen=True)
+class Knowing:
+    """What a radiance field knows besides the pictures, which the published ones do not.
+
+    clips: that readings are clipped at zero and at full scale: it predicts their mean, which is above the light in dark
+        pixels. mask: where silhouettes show empty sky, which has no matter in front of it.
+    """
+
+    clips: bool = False
+    mask: bool = False
+
+
+PUBLISHED = Knowing()
+
+
 def reconstruct_nerf(
     frames: list[TrainingFrame],
     sensor: Sensor,
@@ -71,6 +89,7 @@ def reconstruct_nerf(
     exposure_aware: bool = False,
     size: Size = FOR_A_CPU,
     device: str = "cpu",
+    knowing: Knowing = PUBLISHED,
 ) -> Reconstruction:
     """Train a radiance field on frames, and return its images and the surface that it shows the training views.
 
@@ -83,6 +102,7 @@ def reconstruct_nerf(
             geometric mean of their times. True: it holds radiance, each frame's exposure time and the sensor's gain
             turn it into readings, and a reading at full scale only says "at least this much".
         device: where it is trained and drawn, as PyTorch names it; frames, images and points are on the CPU.
+        knowing: what it knows of the sensor and the silhouettes besides; nothing, as published.
 
     Raises:
         ValueError: steps_share is not positive and finite.
@@ -94,14 +114,14 @@ def reconstruct_nerf(
     if not 0 < steps_share < math.inf:
         raise ValueError(f"steps_share must be a positive number, got {steps_share}")
     steps = max(1, round(steps_share * size.steps))
-    training = Training(frames, sensor, seed, steps, exposure_aware, size, torch.device(device))
+    training = Training(frames, sensor, seed, steps, exposure_aware, size, torch.device(device), knowing)
     checkpoint = None if work.folder is None else work.folder / "nerf.ckpt"
     if checkpoint is not None and training.resume(checkpoint):
         log.info("resumed at step %d of %d", training.steps_done, training.steps)
     saved = time.monotonic()
     while training.steps_done < training.steps:
         training.step()
-        work.on_step(training.steps_done / training.steps, training.seconds, training.reconstruction)
+        work.on_step(training.steps_done / training.steps, training.seconds, training.snapshot)
         if work.should_stop():
             kept = checkpoint is not None and training.save(checkpoint)
             where = f"saved in {checkpoint}: the same call goes on from there" if kept else "not saved"
@@ -130,11 +150,13 @@ class Training:
         exposure_aware: bool,
         size: Size,
         device: torch.device,
+        knowing: Knowing = PUBLISHED,
     ):
         began = time.monotonic()
         usable(frames, exposure_aware)
         self.steps, self.exposure_aware, self.sensor, self.size = steps, exposure_aware, sensor, size
-        radius = radius_m(list(silhouettes(frames, sensor).values()))
+        self.knowing, outlines = knowing, silhouettes(frames, sensor)
+        radius = radius_m(list(outlines.values()))
         if radius == 0:
             raise ReconstructionError(
                 f"all {len(frames)} frames are black (eclipse, or exposures too short): nothing rises above the noise"
@@ -149,6 +171,9 @@ class Training:
         dn = torch.stack([f.dn for f in frames])
         self.signals = ((dn - sensor.black_dn) / (sensor.white_dn - sensor.black_dn)).to(device)
         self.saturated = (dn >= sensor.white_dn).to(device)
+        self.sky = torch.zeros(dn.shape[:3], dtype=torch.bool, device=device)
+        for i, outline in outlines.items() if knowing.mask else ():
+            self.sky[i] = outline.sky.to(device) > 0
         self.generator = torch.Generator(device).manual_seed(seed)
         channels, finest_cells = dn.shape[3], round(pixels_across)
         field = Field(channels, not exposure_aware, size.encoding, finest_cells, self.generator)
@@ -163,7 +188,9 @@ class Training:
             fused=True,
         )
         self.steps_done, self.rays = 0, FIRST_RAYS
-        self.fingerprint = _fingerprint(frames, (sensor, seed, steps, exposure_aware, size, device.type))
+        self.fingerprint = _fingerprint(
+            frames, (sensor, seed, steps, exposure_aware, size, device.type, knowing)
+        )
         self.seconds = time.monotonic() - began
 
     def step(self) -> None:
@@ -184,12 +211,20 @@ class Training:
         camera, row, column = drawn // (height * width), drawn // width % height, drawn % width
         rays = rays_of(self.rays_from, camera, row, column, self.model.radius_m)
         samples = self.model.visible(rays, torch.rand(self.rays, **random))
-        colours, _ = self.model.composited(rays, samples)
+        colours, depths = self.model.composited(rays, samples)
         true, saturated = self.signals[camera, row, column], self.saturated[camera, row, column]
         if self.exposure_aware:
             colours = colours * self.exposures[camera, None]
-        residual = torch.where(saturated & self.exposure_aware, (colours - true).clamp(max=0), colours - true)
+        if self.knowing.clips:
+            residual = self._clipped_means(colours) - true
+        else:
+            residual = torch.where(
+                saturated & self.exposure_aware, (colours - true).clamp(max=0), colours - true
+            )
         loss = residual.square().mean()
+        if self.knowing.mask:
+            alpha = 1 - torch.exp(-torch.zeros_like(colours[:, 0]).index_add(0, samples.ray, depths))
+            loss = loss + SKY_WEIGHT * (alpha * self.sky[camera, row, column]).mean()
         if not torch.isfinite(loss):
             raise Diverged(self.steps_done, loss.item())
         for group in self.adam.param_groups:
@@ -203,11 +238,32 @@ class Training:
         self.steps_done += 1
         self.seconds += time.monotonic() - began
 
-    def reconstruction(self) -> Reconstruction:
-        """Return what the field shows as it stands; further steps do not change it."""
+    def _clipped_means(self, signals: Tensor) -> Tensor:
+        """Return what pixels of these signals read in the mean, clipped at zero and at full scale, as signals."""
+        sensor = self.sensor
+        range_dn = sensor.white_dn - sensor.black_dn
+        expected_dn = sensor.black_dn + range_dn * signals
+        sigma_dn = sensor.variance_dn2(expected_dn).sqrt()
+        mean_dn, _ = clipped_moments(expected_dn, sigma_dn, sensor.white_dn)
+        return (mean_dn - sensor.black_dn) / range_dn
+
+    def snapshot(self, with_surface: bool) -> Reconstruction:
+        """Return what the field shows on the way, its surface from some of the views."""
+        return self.reconstruction(VIEWS_ON_THE_WAY if with_surface else 0)
+
+    def reconstruction(self, surface_views: int | None = None) -> Reconstruction:
+        """Return what the field shows as it stands; further steps do not change it.
+
+        Args:
+            surface_views: by how many views its surface is found at most; None: by all.
+        """
         model = self.model.snapshot()
         parameters = list(model.field.parameters())
-        points = model.surface(self.cameras, SURFACE_POINTS)
+        points = (
+            model.surface(self.cameras, SURFACE_POINTS, surface_views)
+            if surface_views != 0
+            else torch.zeros(0, 3)
+        )
         return Reconstruction(
             points=points,
             surface=points,

@@ -29,7 +29,6 @@ MIDDLE = 0.5  # of a step, where images are sampled; trainings draw the place at
 SURFACE_TRANSMITTANCE = 0.5  # a ray ends where this share of its light is left
 # of full scale; where a ray ends in less light nothing tells matter from the black sky
 FAINTEST_SURFACE = 3e-3
-SURFACE_VIEWS = 40  # at most, spread evenly, whose depths are fused
 
 
 @dataclass(frozen=True)
@@ -116,11 +115,16 @@ class Nerf:
         depth = torch.cat(pieces).cpu().reshape(camera.height, camera.width)
         return depth, slopes(depth)
 
-    def surface(self, cameras: Cameras, count: int, seed: int = 0) -> Tensor:
-        """Return points [count, 3] m, evenly spread over the surface that the cameras see; [0, 3] if they see none."""
-        views = torch.linspace(0, len(cameras) - 1, min(SURFACE_VIEWS, len(cameras))).round().long().unique()
+    def surface(self, cameras: Cameras, count: int, most_views: int | None = None) -> Tensor:
+        """Return points [count, 3] m, evenly spread over the surface that the cameras see; [0, 3] if they see none.
+
+        Args:
+            most_views: whose depths are fused, spread evenly; None: of all cameras.
+        """
+        kept = len(cameras) if most_views is None else min(most_views, len(cameras))
+        views = torch.linspace(0, len(cameras) - 1, kept).round().long().unique()
         chosen = Cameras(cameras.world_to_camera[views], cameras.K[views], cameras.width, cameras.height)
-        points, _ = fused_points(lambda c: self.depth_map(chosen.one(c)), chosen, count, seed)
+        points, _ = fused_points(lambda c: self.depth_map(chosen.one(c)), chosen, count)
         return points
 
 

@@ -66,12 +66,13 @@ class Work:
     folder: where checkpoints and other intermediate files go; a killed reconstruction goes on from them when it is
         called again. None: nothing is kept.
     on_step: called with the share of the work that is done, the seconds spent so far, and a function that returns the
-        reconstruction as it stands; its own time does not count as the method's.
+        reconstruction as it stands, with points on its surface where it is called with true: those take long. Its own
+        time does not count as the method's.
     should_stop: asked after each step; when it returns true, the work is saved and ends in `Interrupted`.
     """
 
     folder: Path | None = None
-    on_step: Callable[[float, float, Callable[[], Reconstruction]], None] = lambda share, seconds, snapshot: (
-        None
+    on_step: Callable[[float, float, Callable[[bool], Reconstruction]], None] = (
+        lambda share, seconds, snapshot: None
     )
     should_stop: Callable[[], bool] = lambda: False

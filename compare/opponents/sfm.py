@@ -142,7 +142,7 @@ class _Clock:
     def report(self, share: float) -> None:
         seconds = self.seconds()
         self.work.on_step(
-            share, seconds, lambda: Reconstruction.nothing(seconds, "the mapping has not ended")
+            share, seconds, lambda _: Reconstruction.nothing(seconds, "the mapping has not ended")
         )
         self.started += self.seconds() - seconds  # the report's own time does not count
 

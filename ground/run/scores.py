@@ -15,8 +15,10 @@ from obbgs_core.score.lpips import SMALLEST_PX, WeightsMissing, lpips
 from obbgs_core.score.metrics import (
     cloud_distances,
     foreground_psnr_db,
+    mu_law,
     psnr_db,
     ssim,
+    surface_scores,
 )
 from obbgs_core.sensor import Sensor
 
@@ -93,6 +95,15 @@ def clean_scores(views: Sequence[ScoredView]) -> dict[str, float]:
     return figures
 
 
+def mu_law_psnr_db(images: Sequence[Tensor], radiance: Sequence[Tensor]) -> float:
+    """Return the mean PSNR of radiance after the mu-law, as publications on HDR count it.
+
+    Args:
+        images, radiance: [H, W, C] of a model and of the truth, in units of the brightest true pixel of all views.
+    """
+    return _mean([psnr_db(mu_law(a), mu_law(b)) for a, b in zip(images, radiance, strict=True)])
+
+
 def cloud_scores(
     clouds_m: Mapping[str, np.ndarray],
     true_cloud_m: np.ndarray,
@@ -109,14 +120,17 @@ def cloud_scores(
         shown: [K], which of those the training frames show; None: unknown.
 
     Returns:
-        chamfer, hausdorff, accuracy and completeness as `cloud_distances` has them, but for empty clouds;
-        surface_shown: percentage of the true surface that the frames show.
+        chamfer, hausdorff, accuracy and completeness as `cloud_distances` has them, but for empty clouds; of surfaces
+        also precision, recall and f, and their chamfer, as `surface_scores` has them; surface_shown: percentage of the
+        true surface that the frames show.
     """
     true_cloud = true_cloud_m * units_per_m
     figures: dict[str, float] = {}
     for name, cloud_m in clouds_m.items():
         if len(cloud_m):
             distances = cloud_distances(cloud_m * units_per_m, true_cloud, shown)
+            if name:  # points on a surface, not centres
+                distances |= surface_scores(cloud_m * units_per_m, true_cloud)
             figures |= {f"{key}{name}": value for key, value in distances.items()}
     if shown is not None:
         figures["surface_shown"] = 100 * float(shown.mean())

@@ -130,6 +130,23 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "hull": {f"start.{f.name}": getattr(StartSettings(), f.name) for f in fields(StartSettings)}
     | {"published.grey_start": False},
     "random": {"start.kind": "random"},
+    # where silhouettes show empty sky no Gaussian may be, and only the part around the target is compared
+    "mask": {"loss.sky_weight": LossSettings().sky_weight, "published.windows": True},
+    "l1": {"published.ssim_weight": 0.0},
+    # the rates of obbgs and its schedule, stretched from three frames a step to one, without resets of opacities
+    "fast": {f"rates.{f.name}": getattr(RateSettings(), f.name) for f in fields(RateSettings)}
+    | {
+        "steps": 3 * MethodConfig(name="").steps,
+        "averaged_from": MethodConfig(name="").averaged_from,
+        "growth.begin": GrowthSettings().begin,
+        "growth.end": GrowthSettings().end,
+        "growth.interval": 3 * GrowthSettings().interval,
+        "published.length_unit": "target",
+        "published.radiance_unit": "one",
+        "published.sh_interval": 300,
+        "published.prune_size": PublishedSettings().prune_size,
+        "published.opacity_reset_interval": 0,
+    },
 }
 
 

@@ -25,6 +25,7 @@ class PublishedSettings:
     # first radiance: grey, half of full scale and a little at random (3DGS without a point cloud), or as frames show it
     grey_start: bool = False
     loss: Literal["l1_ssim", "likelihood"] = "likelihood"
+    ssim_weight: float = fraction(0.2)  # of l1_ssim: the share of SSIM in it (3DGS)
     # of l1_ssim: the prediction is clamped at full scale as the sensor clips, so that a saturated pixel does not pull
     clamped: bool = True
     sh_degree: int = number(0, most=3)  # of the spherical harmonics at the start

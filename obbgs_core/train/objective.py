@@ -43,7 +43,7 @@ def image_loss(
         drawn = None if published.compensation else rendered.alpha
         known = (batch.averaged_pixels, edge_weight, misfit, drawn)
         return likelihood_loss(*images, *known, factor=batch.shown)
-    loss, residual = published_loss(*images, edge_weight=edge_weight, clamped=published.clamped)
+    loss, residual = published_loss(*images, published.ssim_weight, edge_weight, published.clamped)
     return loss * (batch.shown * len(batch.cameras)), residual  # a sum over the step's frames, as published
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
-from compare.opponents import nerf, nerf_pictures, nerf_rays
+from compare.opponents import nerf, nerf_rays
 from compare.opponents.nerf import AS_PUBLISHED, FOR_A_CPU
 from compare.opponents.nerf_field import (
     EncodingSize,
@@ -36,6 +36,7 @@ from obbgs_base.errors import Interrupted
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.frames import cameras_of
 from obbgs_core.score.metrics import psnr_db
+from obbgs_core.start.initialisation import silhouettes
 from tests import scenes
 
 SMALL = dataclasses.replace(FOR_A_CPU, samples_per_step=2**12, most_rays=512)
@@ -162,7 +163,6 @@ def test_the_learning_rate_rises_then_falls_near_the_end():
 @pytest.fixture
 def small(monkeypatch, use_threads):
     monkeypatch.setattr(nerf, "SURFACE_POINTS", 500)
-    monkeypatch.setattr(nerf_pictures, "SURFACE_VIEWS", 8)
     monkeypatch.setattr(nerf_rays, "GRID_CELLS", 24)
     use_threads(1)
 
@@ -246,6 +246,39 @@ def test_a_checkpoint_of_another_training_or_half_a_file_is_not_used(small, tmp_
     # below a file there is no room for a folder
     assert not first.save(tmp_path / "a.ckpt.unused-1" / "c.ckpt")
     assert "cannot be written" in caplog.text
+
+
+def test_a_field_that_knows_clips_predicts_the_mean_of_clipped_readings(small):
+    sensor = dataclasses.replace(scenes.SENSOR, black_dn=0.0, read_noise_dn=0.1 * scenes.SENSOR.white_dn)
+    frames = scenes.photographed(scenes.target(), 6, size_px=32, focal_px=60.0)
+    training = nerf.Training(
+        frames, sensor, 0, 10, True, SMALL, torch.device("cpu"), nerf.Knowing(clips=True)
+    )
+    signals = torch.tensor([0.0, 0.03, 0.5, 1.0, 3.0])
+    expected = sensor.white_dn * signals
+    noise = torch.randn(100_000, 1, generator=torch.Generator().manual_seed(0))
+    read = (expected + sensor.variance_dn2(expected).sqrt() * noise).clamp(0, sensor.white_dn)
+    torch.testing.assert_close(
+        training._clipped_means(signals), read.mean(0) / sensor.white_dn, atol=2e-3, rtol=0
+    )
+
+
+def test_a_field_that_knows_the_mask_has_no_matter_in_front_of_empty_sky(small):
+    frames = scenes.photographed(scenes.target(), 20, size_px=32, focal_px=60.0)
+    opaque = []
+    for knowing in (nerf.PUBLISHED, nerf.Knowing(mask=True)):
+        training = nerf.Training(frames, scenes.SENSOR, 0, 80, True, SMALL, torch.device("cpu"), knowing)
+        for _ in range(80):
+            training.step()
+        sky = next(iter(silhouettes(frames, scenes.SENSOR).items()))
+        depth = []
+        for rays, middle in training.model._pieces(cameras_of([frames[sky[0]]])):
+            samples = training.model.visible(rays, middle)
+            _, depths = training.model.composited(rays, samples)
+            depth.append(torch.zeros(len(middle)).index_add(0, samples.ray, depths.detach()))
+        alpha = 1 - torch.exp(-torch.cat(depth)).reshape(32, 32)
+        opaque.append(alpha[sky[1].sky].mean().item())
+    assert opaque[1] < 0.75 * opaque[0]
 
 
 def test_frames_that_allow_no_field_are_refused(small):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from compare.case import load_case
 from compare.charts.figures import write_figures
 from compare.charts.page import write_page
-from compare.charts.results import Results, pareto
+from compare.charts.results import Results, pareto, with_best
 from compare.grid.rows import Rows
 from compare.references import black, noise
 from compare.views import SHOWN, WORST, read_views, write_views
@@ -96,6 +96,21 @@ def test_a_method_that_comes_to_fit_the_noise_is_shown_with_the_best_point_of_it
     )
     assert results.mean("3dgs", "A", "as taken", "psnr_best_db") == 33.0
     assert results.mean("black", "A", "as taken", "psnr_best_db") is None
+
+
+def test_the_time_to_a_quality_is_read_off_the_curve_between_its_points():
+    curve = [
+        {"share": 0.1, "cpu_seconds": 2.0, "psnr_clean_db": 36.0, "f_02_surface": 50.0},
+        {"share": 0.5, "cpu_seconds": 6.0, "psnr_clean_db": 40.0},
+        {"share": 1.0, "cpu_seconds": 12.0, "psnr_clean_db": 39.0, "f_02_surface": 55.0},
+    ]
+    found = with_best(row("3dgs", curve=curve))
+    assert (found["seconds_to_35_db"], found["seconds_to_38_db"], found["seconds_to_40_db"]) == (
+        2.0,
+        4.0,
+        6.0,
+    )
+    assert "seconds_to_f60" not in found
 
 
 def test_rows_of_other_contents_under_the_same_name_are_not_taken_for_seeds():

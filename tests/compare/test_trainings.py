@@ -11,11 +11,14 @@ import torch
 from compare import trainings
 from compare.case import Case, load_case
 from compare.energy import EnergyMeter
-from compare.follow import MARKS, Follower, image_of
+from compare.follow import FEW_MARKS, MARKS, Follower, image_of
 from compare.opponents.reconstruction import Reconstruction, Work
 from compare.trainings import reconstruct_gaussians
+from compare.validation import withheld
+from ground.session.cameras import exposed
 from obbgs_base.errors import Interrupted
 from obbgs_core.methods.presets import preset
+from obbgs_core.score.metrics import psnr_db
 from tests.small_sessions import small_session
 
 STEPS = 24
@@ -93,6 +96,40 @@ def test_a_training_states_its_errors_where_it_knows_the_exposure(case):
     assert trained(case, preset("3dgs", {"steps": 3, "start.count": 150}), Work()).stated_errors is None
 
 
+def test_a_validated_training_ends_with_the_model_that_shows_best_what_was_kept_back(case, tmp_path):
+    spoilt = dataclasses.replace(
+        PUBLISHED, rates=dataclasses.replace(PUBLISHED.rates, means=1e-5, sh=0.02, final_share=1e4)
+    )  # rates that rise make it worse in the end
+    _, kept_back = withheld(case.training)
+    assert 0 < len(kept_back) < len(case.training) / 5
+
+    def shown(made: Reconstruction) -> float:
+        pairs = [(image_of(made, f), f.dn / case.sensor.white_dn) for f in kept_back]
+        return sum(psnr_db(*pair) for pair in pairs) / len(pairs)
+
+    best, last = trained(case, spoilt, Work(), validated=True), trained(case, spoilt, Work())
+    assert 0 < best.figures["best_step"] < STEPS and shown(best) > shown(last) + 0.5
+    asked = iter(range(1000))
+    with pytest.raises(Interrupted):
+        trained(case, spoilt, Work(tmp_path, should_stop=lambda: next(asked) == 9), validated=True)
+    resumed = trained(case, spoilt, Work(tmp_path), validated=True)
+    assert (
+        torch.equal(resumed.points, best.points) and resumed.figures["best_step"] == best.figures["best_step"]
+    )
+
+
+def test_images_of_the_true_radiance_are_exact_also_where_readings_would_be_clipped(case):
+    of_camera = {tuple(f.world_to_camera.flatten().tolist()): i for i, f in enumerate(case.held_out)}
+
+    def image(camera, exposure_s: float) -> torch.Tensor:
+        light = case.radiance[of_camera[tuple(camera.world_to_camera[0].flatten().tolist())]]
+        return exposed(light, case.sensor, exposure_s)
+
+    assert case.radiance_scores(image)["psnr_mu_db"] > 100
+    brighter = case.radiance_scores(lambda camera, s: (0.01 + image(camera, s)).clamp(max=1))["psnr_mu_db"]
+    assert brighter < 20  # 0.01 of the brightest is nearly half of the scale
+
+
 def test_a_time_limit_of_nothing_is_the_untrained_start(case):
     start = trained(case, OURS, Work(), time_limit_s=0.0)
     assert start.figures["steps"] == 0 and not start.figures["converged"]
@@ -104,14 +141,16 @@ def test_the_curve_is_measured_on_the_way_and_goes_on_after_an_interruption(case
     curve = followed.finish(result)
     due = {math.ceil(mark * STEPS - 1e-9) for mark in MARKS}  # the first step that reaches each mark
     assert [round(point["share"] * STEPS) for point in curve] == [*sorted(due - {STEPS}), STEPS]
-    assert all({"seconds", "psnr_clean_db", "chamfer"} <= set(point) for point in curve)
+    assert all({"seconds", "cpu_seconds", "psnr_clean_db", "chamfer"} <= set(point) for point in curve)
+    of_surface = [round(point["share"] * STEPS) for point in curve[:-1] if "f_02_surface" in point]
+    assert of_surface == sorted({math.ceil(mark * STEPS - 1e-9) for mark in FEW_MARKS})
     assert curve[-1]["share"] == 1
     assert curve[-1]["psnr_clean_db"] == pytest.approx(
         case.image_scores([image_of(result, f) for f in case.held_out])["psnr_clean_db"],
         abs=1e-3,
     )
     again = Follower(case, tmp_path, tmp_path / "stop")
-    again.on_step(0.5, result.seconds / 2, lambda: result)  # resumed from a checkpoint in the middle
+    again.on_step(0.5, result.seconds / 2, lambda _: result)  # resumed from a checkpoint in the middle
     assert followed.cpu_seconds / 2 < again.cpu_seconds < followed.cpu_seconds + 1
     assert max(point["share"] for point in again.points) <= 0.5 and len(again.points) >= 9
 
@@ -125,10 +164,10 @@ def test_costs_are_of_the_parts_that_the_work_went_on_from(case, tmp_path):
         return Follower(case, tmp_path, tmp_path / "stop")
 
     anew = follower()
-    anew.on_step(0.01, 0.0, lambda: result)  # its checkpoint could not be used
+    anew.on_step(0.01, 0.0, lambda _: result)  # its checkpoint could not be used
     assert anew.cpu_seconds < 5
     resumed = follower()
-    resumed.on_step(0.5, 45.0, lambda: result)
+    resumed.on_step(0.5, 45.0, lambda _: result)
     assert resumed.cpu_seconds == pytest.approx(40, abs=5)
     complete = follower()
     complete.finish(dataclasses.replace(result, seconds=90.0))

@@ -13,7 +13,7 @@ import trimesh
 from scipy.spatial import KDTree
 
 from compare.case import load_case
-from compare.trainings import imaging
+from compare.validation import imaging
 from ground.run import evaluate as scoring
 from ground.run.card import chi2_explained, model_card
 from ground.run.evaluate import evaluate

@@ -15,7 +15,7 @@ from obbgs_core import obb
 from obbgs_core.model import sh
 from obbgs_core.model.rotations import multiply, quats_to_matrices
 from obbgs_core.published.growth import grow, outliers
-from obbgs_core.score.metrics import cloud_distances
+from obbgs_core.score.metrics import cloud_distances, even, surface_scores
 from obbgs_core.sensor import Sensor
 from obbgs_core.start import hull, initialisation
 from obbgs_core.train.adam import Adam
@@ -247,6 +247,39 @@ def test_cloud_distances_match_brute_force(seed):
     assert ours["chamfer"] == pytest.approx((table.min(1).mean() + table.min(0).mean()) / 2)
     assert ours["hausdorff"] == pytest.approx((table.min(1).max() + table.min(0).max()) / 2)
     assert ours["completeness"] == pytest.approx(100 * (table.min(0) < 0.01).mean())
+
+
+def test_f_is_of_the_share_within_a_radius_both_ways_however_dense_the_points_are():
+    side = np.arange(0.0025, 1, 0.005)  # one point in the middle of each cell
+    truth = np.stack([*np.meshgrid(side, side), np.zeros((len(side), len(side)))], axis=-1).reshape(-1, 3)
+    half = truth[truth[:, 0] < 0.5] + [0, 0, 0.015]
+    crowded = np.concatenate([half, *[half[half[:, 1] < 0.2] + 1e-4 * i for i in range(5)]])
+    for points in (half, crowded):
+        found = surface_scores(points, truth)
+        assert found["precision_01"] == found["recall_01"] == found["f_01"] == 0
+        assert found["precision_02"] == 100
+        assert found["recall_02"] == pytest.approx(
+            50, abs=2
+        )  # a strip of 0.013 beside the half is near it too
+        assert found["f_02"] == pytest.approx(200 * found["recall_02"] / (100 + found["recall_02"]))
+
+
+@given(st.integers(0, 1000))
+def test_scores_of_surfaces_match_brute_force(seed):
+    rng = np.random.default_rng(seed)
+    a, b = (even(0.1 * rng.random((count, 3))) for count in (40, 60))
+    table, found = cdist(a, b), surface_scores(a, b)
+    assert found["chamfer"] == pytest.approx((table.min(1).mean() + table.min(0).mean()) / 2)
+    assert found["precision_02"] == pytest.approx(100 * (table.min(1) < 0.02).mean())
+    assert found["recall_02"] == pytest.approx(100 * (table.min(0) < 0.02).mean())
+
+
+@given(st.integers(0, 1000))
+def test_even_points_are_some_of_all_with_one_in_each_cell_that_had_any(seed):
+    points = np.random.default_rng(seed).normal(0, 0.01, (200, 3))
+    kept, cells = even(points), {tuple(cell) for cell in np.floor(points / 0.005)}
+    assert {tuple(cell) for cell in np.floor(kept / 0.005)} == cells and len(kept) == len(cells)
+    assert {tuple(point) for point in kept} <= {tuple(point) for point in points}
 
 
 def test_an_empty_cloud_is_refused():
