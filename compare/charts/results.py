@@ -15,7 +15,7 @@ HOLDS_DB, SHAKEN_DB = 1.0, 3.0
 MARGIN_DB = 1.0  # above the best image without training: less is a failure; seeds scatter by about 0.3 dB
 
 
-LEVELS_DB, LEVEL_F = (35, 38, 40), 60.0  # of clean PSNR, and of F within 0.02, %: how soon they are reached
+LEVELS_DB, LEVEL_F = (35, 38, 40), 60  # of clean PSNR, and of F within 0.02, %: how soon they are reached
 
 
 @dataclass(frozen=True)
