@@ -2,7 +2,8 @@
 
 The model is one for all exposure times. If the readings of long exposures are too bright for it and those of short
 ones too dark, by a ratio that is a power of the exposure time, then readings are that power of light. Frames are
-compared with the ones beside them, so that what changes slowly along a pass, such as the light, is no evidence.
+compared with the ones beside them, so that what changes slowly along a pass, such as the light, is no evidence, and in
+the radiance that both can read, so that a model which is too dark where it is bright is none either.
 
 Source: Mitsunaga and Nayar, Radiometric self calibration, 1999, who fit a polynomial to exposures of one view.
 """
@@ -27,10 +28,8 @@ FEWEST_READINGS = 30
 MOST = 120  # pairs of neighbouring frames that are rendered
 FEWEST = 24  # pairs of frames that are compared
 LEFT_OUT = 10  # parts of the pass, each left out once (jackknife)
-LEAST, CERTAIN = (
-    0.02,
-    3.0,
-)  # an exponent is used that is by so much other than 1, and by so many of its errors
+# an exponent is used that is by so much other than 1, and by so many of its errors
+LEAST, CERTAIN = 0.02, 3.0
 LIT_SIGMA, BELOW_FULL_SCALE = 4.0, 0.9  # readings that count: between so much noise and so much of full scale
 RANGE = (0.3, 3.0)  # of exponents
 
@@ -43,16 +42,15 @@ class Response:
     error: float = math.nan  # its standard error; nan: not measured
 
     @torch.no_grad()
-    def decide(self, model: Gaussians, batches: Batches, sensor: Sensor, misfit: float) -> bool:
+    def decide(self, model: Gaussians, batches: Batches, sensor: Sensor) -> bool:
         """Take the exponent that the frames tell beside the model as it stands; return whether it is another one."""
         last = len(batches.frames) - 2
         starts = np.linspace(0, last, min(last + 1, MOST)).round().astype(int).tolist()
         told = {
-            i: _told(model, batches.batch([i]), sensor, misfit)
-            for i in sorted({*starts, *(i + 1 for i in starts)})
+            i: _told(model, batches.batch([i]), sensor) for i in sorted({*starts, *(i + 1 for i in starts)})
         }
-        found = [(told[i], told[i + 1]) for i in starts]
-        pairs = np.array([np.subtract(b, a) for a, b in found if a and b]).reshape(-1, 2)
+        found = [_compared(told[i], told[i + 1]) for i in starts]
+        pairs = np.array([pair for pair in found if pair]).reshape(-1, 2)
         pairs = pairs[np.abs(pairs[:, 0]) > LEAST_STEP]
         if len(pairs) < FEWEST:
             return False
@@ -72,22 +70,50 @@ class Response:
         return f"readings follow light to the power of {self.exponent:.3f} ± {self.error:.3f}"
 
 
-def _told(model: Gaussians, batch: Batch, sensor: Sensor, misfit: float) -> tuple[float, float] | None:
-    """Return ln of a frame's exposure time, and of the light that it reads over that which is expected.
+@dataclass(frozen=True)
+class _Told:
+    """What the readings of a frame say beside the model: [K] values of pixels that are neither dark nor full."""
 
-    None where too few readings tell.
-    """
+    exposure_time_s: float
+    radiance: torch.Tensor
+    light: torch.Tensor  # that is expected, DN above black
+    read: torch.Tensor  # DN above black
+
+    def log_ratio(self, least: float, most: float) -> float | None:
+        """Return ln of the light that is read over that which is expected, where the radiance lies between bounds.
+
+        None where too few readings tell.
+        """
+        counts = (self.radiance >= least) & (self.radiance <= most)
+        if counts.sum() < FEWEST_READINGS:
+            return None
+        # a ratio of sums: any weight of pixels by their noise would be another one for each exposure time
+        ratio = float(self.read[counts].sum() / self.light[counts].sum())
+        return math.log(ratio) if ratio > 0 else None
+
+
+def _told(model: Gaussians, batch: Batch, sensor: Sensor) -> _Told:
     radiance, dn = sampled(sensor, render(model, batch.cameras).radiance, batch.dn)
     prediction = sensor.predicted(radiance, batch.exposure_time_s)
     light, variance = prediction.expected_dn - sensor.black_dn, prediction.variance_dn2
     counts = light > LIT_SIGMA * variance.sqrt()
     counts &= light < BELOW_FULL_SCALE * (sensor.white_dn - sensor.black_dn)
-    if counts.sum() < FEWEST_READINGS:
+    return _Told(batch.exposure_time_s.item(), radiance[counts], light[counts], dn[counts] - sensor.black_dn)
+
+
+def _compared(one: _Told, other: _Told) -> tuple[float, float] | None:
+    """Return by how much ln of the exposure time, and of read over expected light, differ between two frames.
+
+    None where too few readings of either lie in the radiance that both can read.
+    """
+    if not one.radiance.numel() or not other.radiance.numel():
         return None
-    light, read = light[counts], dn[counts] - sensor.black_dn
-    weight = 1 / (variance[counts] + (misfit * light).square())
-    ratio = float((weight * light * read).sum() / (weight * light.square()).sum())
-    return (math.log(batch.exposure_time_s.item()), math.log(ratio)) if ratio > 0 else None
+    least = max(float(one.radiance.min()), float(other.radiance.min()))
+    most = min(float(one.radiance.max()), float(other.radiance.max()))
+    before, after = one.log_ratio(least, most), other.log_ratio(least, most)
+    if before is None or after is None:
+        return None
+    return math.log(other.exposure_time_s / one.exposure_time_s), after - before
 
 
 def _slope(pairs: np.ndarray) -> float:

@@ -203,7 +203,7 @@ class Trainer:
         batches = (
             setup.batches if corrections is None else setup.batches.posed(corrections.frames(setup.frames))
         )
-        if state.response.decide(state.model, batches, setup.sensor, state.fit.misfit):
+        if state.response.decide(state.model, batches, setup.sensor):
             self._use_response()
 
     def _use_response(self) -> None:

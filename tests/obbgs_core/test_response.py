@@ -8,6 +8,7 @@ import torch
 
 from obbgs_core.batches import Batches
 from obbgs_core.losses import likelihood_loss
+from obbgs_core.model.sh import from_radiance, radiance
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.response import LEAST, Response
 from tests.scenes import SENSOR, photographed, target
@@ -26,19 +27,30 @@ def test_the_exponent_is_found_and_a_linear_camera_stays_linear(exponent):
     model = target()
     frames = [dataclasses.replace(f, dn=bent(f.dn, exponent)) for f in photographed(model, count=36)]
     batches, response = Batches(frames, SENSOR.white_dn), Response()
-    changed = response.decide(model, batches, SENSOR, 0.05)
+    changed = response.decide(model, batches, SENSOR)
     assert changed == (exponent != 1)
     for _ in range(2):  # as often as in a training
-        response.decide(model, batches, dataclasses.replace(SENSOR, response=response.exponent), 0.05)
+        response.decide(model, batches, dataclasses.replace(SENSOR, response=response.exponent))
     assert response.exponent == pytest.approx(exponent, abs=LEAST)  # what is taken for linear may be as wrong
     assert response.error < 0.02
+
+
+@pytest.mark.parametrize(("contrast", "size"), [(1, 1.3), (0.7, 1.3), (1.4, 1), (0.4, 1)])
+def test_a_model_that_is_wrong_is_no_evidence_against_a_linear_camera(contrast, size):
+    """A training in its first steps has one: too soft, dark faces too bright or bright ones too dark."""
+    frames = photographed(target(), count=54)
+    model = target()
+    value = radiance(model.sh, torch.tensor([[0.0, 0.0, 1.0]]).expand(len(model.sh), 3))[:, None]
+    model.sh = from_radiance(0.35 + contrast * (value - 0.35))
+    model.log_scales = model.log_scales + np.log(size)
+    assert not Response().decide(model, Batches(frames, SENSOR.white_dn), SENSOR)
 
 
 def test_frames_of_one_exposure_time_tell_nothing():
     model = target()
     frames = photographed(model, count=36, exposures_s=(1e-4,))
     response = Response()
-    assert not response.decide(model, Batches(frames, SENSOR.white_dn), SENSOR, 0.05)
+    assert not response.decide(model, Batches(frames, SENSOR.white_dn), SENSOR)
     assert response.exponent == 1 and np.isnan(response.error)
 
 
