@@ -6,7 +6,7 @@ import numpy as np
 from sgp4.api import SGP4_ERRORS, Satrec
 
 from flightsw.icd.config import ConfigError, require
-from flightsw.icd.reference_frames import julian_date
+from flightsw.icd.reference_frames import julian_date, teme_to_gcrs
 
 # The fields of a two-line element set that SGP4 reads: line, first and last column (from 1), name, form.
 DECIMAL = r" *-?\d*\.\d+ *"
@@ -61,6 +61,16 @@ def check_tle(lines: tuple[str, ...], path: str) -> None:
         )
 
 
+def position_gcrs_m(tle: tuple[str, ...], utc_ns: int) -> np.ndarray:
+    """Return where a satellite is at a UTC time by SGP4: [3] m from the Earth's centre, GCRS.
+
+    Raises:
+        ConfigError: SGP4 cannot propagate the elements so far.
+    """
+    position_km, _ = _state(Satrec.twoline2rv(*tle), utc_ns)
+    return teme_to_gcrs(utc_ns) @ position_km * 1e3
+
+
 def orbit_axes(tle: tuple[str, ...], utc_ns: int) -> tuple[float, np.ndarray]:
     """Return the mean motion (rad/s) and the rotation [3, 3] from inertial to radial, transverse and normal axes.
 
@@ -71,11 +81,17 @@ def orbit_axes(tle: tuple[str, ...], utc_ns: int) -> tuple[float, np.ndarray]:
         ConfigError: SGP4 cannot propagate the elements so far.
     """
     satellite = Satrec.twoline2rv(*tle)
+    position_km, velocity_km_s = _state(satellite, utc_ns)
+    radial = position_km / np.linalg.norm(position_km)
+    normal = np.cross(position_km, velocity_km_s)
+    normal /= np.linalg.norm(normal)
+    return satellite.no_kozai / 60, np.stack([radial, np.cross(normal, radial), normal])
+
+
+def _state(satellite: Satrec, utc_ns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return position (km) and velocity (km/s) in SGP4's axes."""
     code, position_km, velocity_km_s = satellite.sgp4(*julian_date(utc_ns))
     if code or not np.isfinite(position_km).all():
         reason = SGP4_ERRORS.get(code, f"error {code}")
         raise ConfigError("mission.orbit.target_tle", f"cannot be propagated: {reason}; load newer elements")
-    radial = np.array(position_km) / np.linalg.norm(position_km)
-    normal = np.cross(position_km, velocity_km_s)
-    normal /= np.linalg.norm(normal)
-    return satellite.no_kozai / 60, np.stack([radial, np.cross(normal, radial), normal])
+    return np.array(position_km), np.array(velocity_km_s)

@@ -135,6 +135,7 @@ def _posed(view: View, camera: Camera, formation: Formation, table: dict[str, Li
         covariance=covariance,
         attitude_known=known,
         quat_inertial_to_body=matrix_to_quat(to_body),
+        target_position_m=None if found.target is None else found.target.position_m,
     )
 
 

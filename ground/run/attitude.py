@@ -107,9 +107,14 @@ def _in_inertial_axes(session: Session, records: list[FrameRecord]) -> list[Trai
     resting = dataclasses.replace(stated, rate_rad_s=(0.0, 0.0, 0.0), sigmas=orbit)
     at_rest = dataclasses.replace(session, navigation=resting)
     return [
-        training_frame(
-            at_rest,
-            dataclasses.replace(_turned(r, _assumed(session, r).T), quat_inertial_to_body=None),
+        dataclasses.replace(
+            training_frame(
+                at_rest,
+                dataclasses.replace(
+                    _turned(r, _assumed(session, r).T), quat_inertial_to_body=np.array([1.0, 0, 0, 0])
+                ),
+            ),
+            inertial_to_body=None,
         )
         for r in records
     ]

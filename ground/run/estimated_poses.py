@@ -24,6 +24,7 @@ from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.poses.gauge import best_motion, size_of
 from obbgs_core.score.poses import PoseErrors, pose_errors, settled_poses
 from obbgs_core.sensor import Sensor
+from obbgs_core.train.backdrops import without_earth
 
 FILE = "poses_estimated.json"
 
@@ -165,7 +166,8 @@ def settled_records(
     """
     if estimate is None or not records:
         return records
-    poses = settled_poses(gaussians, with_estimate(list(frames), estimate), sensor)
+    placed = [without_earth(gaussians, frame, sensor) for frame in with_estimate(list(frames), estimate)]
+    poses = settled_poses(gaussians, placed, sensor)
     return [_placed(record, pose.double().numpy()) for record, pose in zip(records, poses, strict=True)]
 
 

@@ -94,7 +94,7 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     }
     states_errors = run.metrics["scored_frames"] == "held_out" and not run.metrics.get("reference_exposure_s")
     if states_errors:
-        frames = map(run.without_sky_level, shown)
+        frames = map(run.on_black_sky, shown)
         figures |= stated_error_scores(run.gaussians, run.sensor, frames, run.metrics.get("misfit"))
     if run.session.frames_imported is not None and run.session.camera.channels == 3:
         pairs = ((model_image(run, record), noisy_image(run, record)) for record in shown)
@@ -143,7 +143,7 @@ def _geometry(run: Run, truth: Truth) -> tuple[dict[str, np.ndarray], np.ndarray
         clouds["_mesh"] = read_mesh_points(run.folder / "model.glb", SURFACE_POINTS)
     if run.session.background:
         return clouds, None
-    training = [run.without_sky_level(truth.posed(record)) for record in run.training]
+    training = [run.on_black_sky(truth.posed(record)) for record in run.training]
     return clouds, shown_points(truth.cloud_m, training, run.sensor)
 
 
@@ -162,7 +162,7 @@ def _interval_figures(
     """Return how often the intervals hold that the model states of the held-out frames."""
     radiance = [] if truth is None else [torch.from_numpy(truth.radiance(record)[0]) for record in shown]
     training = estimated_records(run.training, estimate)
-    known, scored = ([run.without_sky_level(r) for r in records] for records in (training, shown))
+    known, scored = ([run.on_black_sky(r) for r in records] for records in (training, shown))
     return interval_scores(run.gaussians, known, run.sensor, scored, radiance)
 
 
@@ -209,5 +209,5 @@ def _exposure_s(run: Run, record: FrameRecord) -> float:
 
 
 def noisy_image(run: Run, record: FrameRecord) -> torch.Tensor:
-    """Return a frame as received [H, W, C], without what empty sky reads above black, as a fraction of full scale."""
-    return run.without_sky_level(record).dn / run.sensor.white_dn
+    """Return a frame as received [H, W, C] as a fraction of full scale, without the Earth and what empty sky reads."""
+    return run.on_black_sky(record).dn / run.sensor.white_dn

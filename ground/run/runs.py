@@ -37,6 +37,7 @@ from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
 from obbgs_core.sky_level import field, levelled
+from obbgs_core.train.backdrops import without_earth
 
 LOG = "log"
 LOCK = "lock"  # in the folder of an unfinished run; holds the name of the process that works on it
@@ -87,6 +88,10 @@ class Run:
             self.sensor.white_dn
         )  # still says no more than "at least this much"
         return dataclasses.replace(frame, dn=dn)
+
+    def on_black_sky(self, record: FrameRecord) -> TrainingFrame:
+        """Return a frame as if the sky was as black as stated, and the Earth not in view, as the model shows it."""
+        return without_earth(self.gaussians, self.without_sky_level(record), self.sensor)
 
     @functools.cached_property
     def _sky_planes_dn(self) -> dict[int, Tensor]:

@@ -97,6 +97,8 @@ class FrameRecord:
     split: str | None = None
     K: np.ndarray | None = None  # [3, 3] px, where it is not the session's camera's
     quat_inertial_to_body: np.ndarray | None = None  # [4] attitude of the target that the pose assumes, GCRS
+    # [3] of the target from the Earth's centre, GCRS, m; None: its two-line elements say it, if there are any
+    target_position_m: np.ndarray | None = None
 
 
 ARRAY_SHAPES = {
@@ -107,6 +109,7 @@ ARRAY_SHAPES = {
     "sun_dir_body": (3,),
     "K": (3, 3),
     "quat_inertial_to_body": (4,),
+    "target_position_m": (3,),
 }
 
 

@@ -8,6 +8,7 @@ import torch
 
 from flightsw.icd.quaternion import quat_to_matrix
 from ground.session.cameras import sun_direction
+from ground.session.earth import earth_m
 from ground.session.folder import SPLITS, FrameRecord, Session, SessionError
 from obbgs_core.frames import Navigation, TrainingFrame
 
@@ -98,6 +99,7 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
         MissingFrames, SessionCorrupt: its picture cannot be read.
     """
     dn, assumed = session.dn(record).astype(np.float32), record.quat_inertial_to_body
+    earth = earth_m(session, record, dn)
     return TrainingFrame(
         dn=torch.from_numpy(dn.reshape(*dn.shape[:2], session.camera.channels)),
         exposure_time_s=record.exposure_time_s,
@@ -114,6 +116,7 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
         navigation=navigation_of(session),
         time_s=(record.mid_exposure_utc_ns - session.navigation.epoch_utc_ns) / 1e9,
         inertial_to_body=None if assumed is None else torch.from_numpy(quat_to_matrix(assumed)),
+        earth_m=None if earth is None else torch.from_numpy(earth).float(),
     )
 
 

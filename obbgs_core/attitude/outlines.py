@@ -40,8 +40,12 @@ def outline(frame: TrainingFrame, sensor: Sensor, binned: int) -> Silhouette:
 
 
 def whole_outlines(frames: list[TrainingFrame], sensor: Sensor) -> dict[int, Silhouette]:
-    """Return the outline in all pixels of each bracket's longest exposure that shows light, by the frame's index."""
-    whole = {i: outline(frames[i], sensor, 1) for i in longest_exposures(frames)}
+    """Return the outline in all pixels of each bracket's longest exposure that shows light, by the frame's index.
+
+    Frames that have the Earth in view have none.
+    """
+    black = [i for i in longest_exposures(frames) if frames[i].earth_m is None]
+    whole = {i: outline(frames[i], sensor, 1) for i in black}
     return {i: s for i, s in whole.items() if int(s.certain.sum()) >= FEWEST_LIT_PX}
 
 

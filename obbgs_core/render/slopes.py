@@ -18,7 +18,8 @@ def render_with_slopes(gaussians: Gaussians, cameras: Cameras) -> tuple[Rendered
     """Return what `render` does, and the derivatives of the radiance [C, H, W, channels, 2] along x and y, per px.
 
     A derivative is the difference of the radiance half a pixel to both sides, rendered there. Between the pixels of the
-    picture itself, which are two apart, edges and structures as thin as a pixel are smoothed away.
+    picture itself, which are two apart, edges and structures as thin as a pixel are smoothed away. A backdrop stays
+    where it is: the derivatives are of Gaussians that move in front of it.
     """
     suns = None if gaussians.shading == "view" else cameras.known_suns()
     sunlit = sunlit_shares(gaussians, cameras.known_suns()) if gaussians.shading == "lambert" else None
@@ -28,6 +29,10 @@ def render_with_slopes(gaussians: Gaussians, cameras: Cameras) -> tuple[Rendered
     for axis, name in enumerate(("width", "height")):
         K = cameras.K.clone()
         K[:, axis, 2] += 0.5
-        shifted = dataclasses.replace(cameras, K=K, **{name: getattr(cameras, name) + 1})
-        slopes.append(render(matt, shifted, sunlit=sunlit, added=shine).radiance.diff(dim=2 - axis))
+        shifted = dataclasses.replace(cameras, K=K, backdrop=None, **{name: getattr(cameras, name) + 1})
+        seen = render(matt, shifted, sunlit=sunlit, added=shine)
+        slope = seen.radiance.diff(dim=2 - axis)
+        if cameras.backdrop is not None:
+            slope = slope - seen.alpha.diff(dim=2 - axis)[..., None] * cameras.backdrop
+        slopes.append(slope)
     return render(matt, cameras, sunlit=sunlit, added=shine), torch.stack(slopes, dim=-1)

@@ -6,6 +6,8 @@ import torch
 
 from obbgs_core.background import backdrop, grown, weighed
 from obbgs_core.batches import Batch
+from obbgs_core.frames import TrainingFrame, cameras_of
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.setup import TrainingSetup
@@ -49,3 +51,15 @@ def doubted(batch: Batch, rendered: Rendered, sensor: Sensor) -> Batch:
     behind_dn = gain * (1 - rendered.alpha)[..., None] * batch.doubt
     dn = weighed(batch.dn, prediction.expected_dn, prediction.sigma_dn, behind_dn, sensor.white_dn)
     return dataclasses.replace(batch, dn=dn)
+
+
+@torch.no_grad()
+def without_earth(model: Gaussians, frame: TrainingFrame, sensor: Sensor) -> TrainingFrame:
+    """Return a frame as if the sky was black where it has the Earth in view, beside the target and behind it."""
+    if frame.earth_m is None:
+        return frame
+    alpha = render(model, cameras_of([frame])).alpha[0]
+    found = backdrop(frame, sensor, grown(alpha > NEAR_ALPHA, REACH_PX))
+    behind_dn = sensor.dn_per_radiance_s * frame.exposure_time_s * (1 - alpha)[..., None] * found.radiance
+    dn = torch.where(found.dn < sensor.white_dn, (found.dn - behind_dn).clamp(min=0), found.dn)
+    return dataclasses.replace(frame, dn=dn, earth_m=None)

@@ -13,6 +13,7 @@ from obbgs_core.frames import TrainingFrame
 from obbgs_core.methods.presets import preset
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.render import render
+from obbgs_core.render.slopes import render_with_slopes
 from obbgs_core.start.earth import earth_silhouette
 from obbgs_core.train.trainer import Trainer, train
 from tests import scenes
@@ -100,6 +101,20 @@ def test_a_backdrop_is_composited_behind_the_model():
     torch.testing.assert_close(seen.radiance, same.radiance)
     with pytest.raises(ValueError, match="backdrop must be"):
         dataclasses.replace(cameras, backdrop=behind[:, 1:])
+
+
+def test_derivatives_are_those_of_a_target_that_moves_in_front_of_a_backdrop_at_rest():
+    frame, size = scenes.photographed(spacecraft(), 1)[0], scenes.SIZE_PX
+    behind = torch.rand(1, size, size, 1, generator=torch.Generator().manual_seed(3))
+    cameras = Cameras(frame.world_to_camera[None], frame.K[None], size, size, backdrop=behind)
+    _, slopes = render_with_slopes(spacecraft(), cameras)
+    for axis in (0, 1):
+        sides = []
+        for shift in (-0.5, 0.5):
+            K = cameras.K.clone()
+            K[:, axis, 2] += shift
+            sides.append(render(spacecraft(), dataclasses.replace(cameras, K=K)).radiance)
+        torch.testing.assert_close(slopes[..., axis], sides[0] - sides[1], atol=1e-4, rtol=1e-3)
 
 
 def test_doubt_acts_as_noise_of_its_own():

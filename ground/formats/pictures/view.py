@@ -30,6 +30,7 @@ class View:
     covariance: np.ndarray | None = None  # [6, 6] of the pose, as in a session's frames; None: not stated
     attitude_known: bool = True  # of the target; otherwise poses are in GCRS axes about it
     quat_inertial_to_body: np.ndarray | None = None  # [4] attitude of the target that the pose assumes, GCRS
+    target_position_m: np.ndarray | None = None  # [3] of the target from the Earth's centre, GCRS
     split: str | None = None  # train, val or test; stated for all views or for none
     readings: Path | None = None  # of our own export: the digital numbers of the session that it was made of
 

@@ -136,6 +136,8 @@ def write_session(
         line = frame_line(_frame(view, number, dn, camera, sigmas), name, sha256)
         if view.split is not None:
             line["split"] = view.split
+        if view.target_position_m is not None:
+            line["target_position_m"] = view.target_position_m.tolist()
         if (K := pinhole_of(view.intrinsics).K) != camera.K:
             line["K"] = K
         lines.append(json.dumps(line, allow_nan=False))

@@ -1,5 +1,6 @@
 """The model that a live reconstruction shows: the best so far by the held-out frames that have come."""
 
+import dataclasses
 import logging
 import math
 import shutil
@@ -14,10 +15,12 @@ from ground.run.runs import is_live
 from ground.session.cameras import cameras_of, median_sun_direction, predicted_image, sensor_of
 from ground.session.folder import FrameRecord
 from ground.session.training_frames import training_frame
+from obbgs_core.frames import TrainingFrame
 from obbgs_core.io.ply import save_ply
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.score.metrics import psnr_db
+from obbgs_core.train.backdrops import without_earth
 
 log = logging.getLogger(__name__)
 SCORED = 16  # held-out frames at most, spread evenly over those that have come
@@ -39,7 +42,7 @@ class ShownModel:
         self.estimate: PoseEstimate | None = None
         self._folder, self._arrivals = folder, arrivals
         self._scored_frames = 0  # held-out frames that had come when held_out_db was found
-        self._images: dict[int, torch.Tensor] = {}  # held-out frames [H, W, C] as fractions of full scale
+        self._frames: dict[int, TrainingFrame] = {}  # held-out frames as tagged
 
     def offer(self, gaussians: Gaussians, step: int, estimate: PoseEstimate | None = None) -> bool:
         """Show a model, unless the shown one is better by the same held-out frames; return whether it was shown.
@@ -74,19 +77,23 @@ class ShownModel:
     def _score_db(
         self, gaussians: Gaussians, estimate: PoseEstimate | None, held_out: list[FrameRecord]
     ) -> float:
+        """Return the mean PSNR against held-out frames, those without the Earth in view where there are such."""
         session = self._arrivals.session
         if session is None or not held_out:
             return math.nan
         sensor, values = sensor_of(session.camera), []
+        for record in held_out:
+            if record.id not in self._frames:
+                self._frames[record.id] = training_frame(session, record)
+        held_out = [r for r in held_out if self._frames[r.id].earth_m is None] or held_out
         scored = held_out[:: math.ceil(len(held_out) / (SCORED if estimate is None else SETTLED))]
-        frames = (training_frame(session, record) for record in scored)
+        frames = (self._frames[record.id] for record in scored)
         scored = settled_records(gaussians, scored, frames, sensor, estimate)
         for record in scored:
-            if record.id not in self._images:
-                dn = torch.from_numpy(session.dn(record).astype("float32"))
-                self._images[record.id] = dn.reshape(*dn.shape[:2], -1) / sensor.white_dn
+            pose = torch.from_numpy(record.world_to_camera).float()
+            frame = dataclasses.replace(self._frames[record.id], world_to_camera=pose)
             predicted = predicted_image(gaussians, session, record, sensor, record.exposure_time_s)
-            values.append(psnr_db(predicted, self._images[record.id]))
+            values.append(psnr_db(predicted, without_earth(gaussians, frame, sensor).dn / sensor.white_dn))
         return math.fsum(values) / len(values)
 
     def _write(self, gaussians: Gaussians, estimate: PoseEstimate | None) -> None:

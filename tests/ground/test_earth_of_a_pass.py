@@ -1,0 +1,119 @@
+"""A real pass with the Earth behind the target: where it is, by skyfield, and that a training knows it."""
+
+import dataclasses
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+import skyfield.api
+import torch
+from skyfield.api import EarthSatellite
+
+from flightsw.icd.frame import Frame, encode_frame
+from flightsw.icd.mission import Mission
+from flightsw.icd.quaternion import quat_to_matrix
+from flightsw.icd.tle import position_gcrs_m
+from flightsw.pose import pose_tag
+from ground.run.evaluate import evaluate
+from ground.run.reconstruct import reconstruct
+from ground.session.folder import open_session
+from ground.session.training_frames import frames_of, training_frame
+from ground.session.writer import SessionWriter
+from obbgs_base.earth import camera_rays, earth_radiance
+from obbgs_core.background import earth_pixels
+from obbgs_core.model.cameras import Cameras
+from obbgs_core.render import render
+from tests import scenes
+
+SHOWS_IT_S, BESIDE_IT_S = 200, 800  # after the mission's start the Earth is behind the target, and is not
+EXPOSURES_S = (2e-5, 5e-5)
+TIMES = skyfield.api.load.timescale(builtin=True)
+
+
+@pytest.fixture
+def mission(small_mission) -> Mission:
+    """Return the demo's mission with 48 pixels that look at the target."""
+    camera = dataclasses.replace(small_mission.camera, cx_px=24.0, cy_px=24.0, fx_px=1800.0, fy_px=1800.0)
+    return dataclasses.replace(small_mission, camera=camera)
+
+
+def flown(mission, folder, times_s, earth: bool = True, target=None):
+    """Write a session of frames at times after the start: a target, if any, in front of a black sky or the Earth."""
+    writer, camera = SessionWriter(folder, mission), mission.camera
+    for number, at_s in enumerate(times_s):
+        utc_ns, exposure_s = mission.orbit.start_utc_ns + round(at_s * 1e9), EXPOSURES_S[number % 2]
+        pose = pose_tag(mission, utc_ns)
+        light, through = np.zeros((camera.height, camera.width)), 1.0
+        if target is not None:
+            K = torch.tensor(camera.K, dtype=torch.float32)
+            w2c = torch.from_numpy(pose.world_to_camera).float()
+            seen = render(target, Cameras(w2c[None], K[None], camera.width, camera.height))
+            light, through = seen.radiance[0, ..., 0].numpy(), 1 - seen.alpha[0].numpy()
+        if earth:
+            light = light + through * light_of_earth(mission, utc_ns, pose)
+        noise = np.random.default_rng(number).standard_normal(light.shape)
+        dn = camera.black_dn + camera.dn_per_radiance_s * exposure_s * light + camera.read_noise_dn * noise
+        dn = np.rint(dn).clip(0, camera.white_dn).astype(np.uint16)
+        frame = Frame(number, number // 2, number % 2, 2, exposure_s, utc_ns, pose, dn, 12, camera.black_dn, 0)
+        writer.add(frame, encode_frame(frame))
+    writer.save({}, 0)
+    return open_session(folder)
+
+
+def light_of_earth(mission, utc_ns, pose) -> np.ndarray:
+    """Return the Earth's light [H, W]."""
+    rays = camera_rays(np.array(mission.camera.K), mission.camera.width, mission.camera.height)
+    sun = pose.world_to_camera[:3, :3] @ pose.sun_dir_body
+    return earth_radiance(rays, -by_skyfield(mission, utc_ns, pose), sun, 1e-3).mean(axis=2)
+
+
+def by_skyfield(mission, utc_ns, pose) -> np.ndarray:
+    """Return where the Earth's centre is: [3] m from the camera, in its axes."""
+    time = TIMES.from_datetime(datetime.fromtimestamp(utc_ns / 1e9, UTC))
+    target_m = EarthSatellite(*mission.orbit.target_tle, ts=TIMES).at(time).xyz.m
+    in_body_m = -(quat_to_matrix(pose.quat_inertial_to_body) @ target_m) - pose.position_body_m
+    return pose.world_to_camera[:3, :3] @ in_body_m
+
+
+def test_the_earths_centre_is_where_skyfield_has_it(mission, tmp_path):
+    session = flown(mission, tmp_path / "session", [SHOWS_IT_S, SHOWS_IT_S + 27])
+    for record in session.frames:
+        frame = training_frame(session, record)
+        assert frame.earth_m is not None and earth_pixels(frame).all()
+        true_m = by_skyfield(mission, record.mid_exposure_utc_ns, record)
+        np.testing.assert_allclose(frame.earth_m.numpy(), true_m, atol=30.0)  # of 6,900 km: 0.2 seconds of arc
+
+
+def test_no_earth_is_in_frames_that_look_away_from_it_or_do_not_show_it(mission, tmp_path):
+    assert frames_of(flown(mission, tmp_path / "beside", [BESIDE_IT_S]))[0].earth_m is None
+    # a simulator's black sky, and a night side as dark
+    assert frames_of(flown(mission, tmp_path / "black", [SHOWS_IT_S], earth=False))[0].earth_m is None
+    seen = flown(mission, tmp_path / "seen", [SHOWS_IT_S])
+    nobody_knows = dataclasses.replace(seen.frames[0], quat_inertial_to_body=None)
+    assert training_frame(seen, nobody_knows).earth_m is None
+
+
+def test_a_frame_may_state_the_targets_place_itself(mission, tmp_path):
+    session = flown(mission, tmp_path / "session", [SHOWS_IT_S])
+    record, without = session.frames[0], dataclasses.replace(session, tles={})
+    assert training_frame(without, record).earth_m is None
+    place_m = position_gcrs_m(mission.orbit.target_tle, record.mid_exposure_utc_ns)
+    stated = dataclasses.replace(record, target_position_m=place_m)
+    assert torch.equal(training_frame(without, stated).earth_m, training_frame(session, record).earth_m)
+
+
+def test_a_pass_with_the_earth_makes_a_model_like_that_of_a_black_sky(mission, tmp_path):
+    """Scored on what is left of the held-out frames without the Earth, which those in front of it have for the most."""
+    small = scenes.target()
+    target = dataclasses.replace(
+        small, means=1.5 * small.means, log_scales=small.log_scales + np.log(1.5), opacity_logits=small.opacity_logits + 4
+    )
+    psnr_db = {}
+    for name, earth in (("black", False), ("earth", True)):
+        times_s = [44.0 * (n // 2) + n % 2 for n in range(48)]
+        session = flown(mission, tmp_path / name, times_s, earth, target)
+        count = sum(frame.earth_m is not None for frame in frames_of(session))
+        assert (8 < count < 40) if earth else count == 0, count
+        reconstruct(session.path, "run", "obbgs", scenes.QUICK | {"steps": 60})
+        psnr_db[name] = evaluate(session.path, "run")["psnr_noisy_db"]
+    assert psnr_db["earth"] > psnr_db["black"] - 3, psnr_db
