@@ -54,7 +54,9 @@ def flown(mission, folder, times_s, earth: bool = True, target=None):
         noise = np.random.default_rng(number).standard_normal(light.shape)
         dn = camera.black_dn + camera.dn_per_radiance_s * exposure_s * light + camera.read_noise_dn * noise
         dn = np.rint(dn).clip(0, camera.white_dn).astype(np.uint16)
-        frame = Frame(number, number // 2, number % 2, 2, exposure_s, utc_ns, pose, dn, 12, camera.black_dn, 0)
+        frame = Frame(
+            number, number // 2, number % 2, 2, exposure_s, utc_ns, pose, dn, 12, camera.black_dn, 0
+        )
         writer.add(frame, encode_frame(frame))
     writer.save({}, 0)
     return open_session(folder)
@@ -81,7 +83,9 @@ def test_the_earths_centre_is_where_skyfield_has_it(mission, tmp_path):
         frame = training_frame(session, record)
         assert frame.earth_m is not None and earth_pixels(frame).all()
         true_m = by_skyfield(mission, record.mid_exposure_utc_ns, record)
-        np.testing.assert_allclose(frame.earth_m.numpy(), true_m, atol=30.0)  # of 6,900 km: 0.2 seconds of arc
+        np.testing.assert_allclose(
+            frame.earth_m.numpy(), true_m, atol=30.0
+        )  # of 6,900 km: 0.2 seconds of arc
 
 
 def test_no_earth_is_in_frames_that_look_away_from_it_or_do_not_show_it(mission, tmp_path):
@@ -106,7 +110,10 @@ def test_a_pass_with_the_earth_makes_a_model_like_that_of_a_black_sky(mission, t
     """Scored on what is left of the held-out frames without the Earth, which those in front of it have for the most."""
     small = scenes.target()
     target = dataclasses.replace(
-        small, means=1.5 * small.means, log_scales=small.log_scales + np.log(1.5), opacity_logits=small.opacity_logits + 4
+        small,
+        means=1.5 * small.means,
+        log_scales=small.log_scales + np.log(1.5),
+        opacity_logits=small.opacity_logits + 4,
     )
     psnr_db = {}
     for name, earth in (("black", False), ("earth", True)):
