@@ -275,7 +275,11 @@ def pictures(request, **background):
 
 
 def render(request):
-    """Write one view: radiance, premultiplied by coverage, in float16 (float32 if requested), and coverage (alpha)."""
+    """Write one view: radiance, premultiplied by coverage, in float16 (float32 if requested), and coverage (alpha).
+
+    The light paths are those of the seed that is requested, default 0.
+    """
+    bpy.context.scene.cycles.seed = request.get("seed", 0)
     (combined,) = pictures(request, Combined=(0, 0, 0, 0))
     alpha = np.clip(combined[..., 3], 0, 1)
     radiance = np.clip(np.nan_to_num(combined[..., :3]), 0, LARGEST_FLOAT16)

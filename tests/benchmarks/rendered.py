@@ -113,17 +113,25 @@ def render(
 
 
 def ask_for_view(
-    worker: Worker, pose: np.ndarray, sun: np.ndarray, K: np.ndarray, size: int, channels: int, out: Path
+    worker: Worker,
+    pose: np.ndarray,
+    sun: np.ndarray,
+    K: np.ndarray,
+    size: int,
+    channels: int,
+    out: Path,
+    seed: int = 0,
 ) -> None:
     """Let a view in sunlight be written, see `render` in `hil/sky/blender_worker.py`.
 
     Args:
         pose: [4, 4] body to camera, m; sun: [3] towards the Sun, unit, body frame; K: [3, 3] px.
         size: pixels along a side.
+        seed: of the light paths.
     """
     camera = {"world_to_camera": pose.tolist(), "K": K.tolist(), "width": size, "height": size}
     light = {"sun_dir_body": sun.tolist(), "in_eclipse": False}
-    worker.ask(op="render", **camera, channels=channels, **light, out=str(out))
+    worker.ask(op="render", **camera, channels=channels, **light, out=str(out), seed=seed)
 
 
 def shown_points(worker: Worker, poses: np.ndarray, kept: Path) -> np.ndarray:
