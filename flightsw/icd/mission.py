@@ -245,8 +245,8 @@ class LinkSection:
 
 
 # the ground's training methods, and what can be added to their names
-METHODS = ("obbgs", "jiang2025", "3dgs", "pixel-gs", "mip-splatting", "mvgs")
-VARIANTS = ("exposure", "blind", "affine", "hull", "random")
+METHODS = ("obbgs", "jiang2025", "3dgs", "3dgs-mcmc", "pixel-gs", "mip-splatting", "mvgs")
+VARIANTS = ("exposure", "blind", "affine", "hull", "random", "mask", "l1", "fast")
 
 
 @dataclass(frozen=True)

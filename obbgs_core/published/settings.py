@@ -47,6 +47,8 @@ class PublishedSettings:
     pixel_weighted: bool = True  # gradients are averaged over pixels (Pixel-GS) instead of views (3DGS)
     # above 0: gradients of Gaussians nearer to the camera than this count less (Pixel-GS)
     depth_scale: float = 0.0
+    # densified: cloned and split where gradients are large; sampled: 3DGS-MCMC
+    growth: Literal["densified", "sampled"] = "densified"
     # also clone what lies where the worst tiles of a step's views cross, and halve the threshold where two of the
     # step's cameras are far apart (MVGS)
     multi_view: bool = False

@@ -12,6 +12,7 @@ from obbgs_core import obb
 from obbgs_core.methods.config import GrowthSettings, MethodConfig, Moment
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.published import mcmc
 from obbgs_core.published.growth import (
     GRADIENT_THRESHOLD,
     SPLIT_SIZE,
@@ -139,6 +140,8 @@ class Growth:
         return dataclasses.replace(_grown(now, growing), goes_on=True)
 
     def _everywhere(self, now: Now) -> Change:
+        if now.config.published.growth == "sampled":
+            return Change(*mcmc.relocated(now.gaussians.detach(), now.config.growth.max_gaussians, now.rng))
         gaussians, settings, published = now.gaussians, now.config.growth, now.config.published
         crossed, threshold = None, GRADIENT_THRESHOLD
         if published.multi_view:

@@ -19,6 +19,7 @@ from obbgs_core.methods.config import SET_BACK_AT, SET_BACK_TO, MethodConfig, Mo
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.poses.estimate import PoseEstimate
+from obbgs_core.published import mcmc
 from obbgs_core.published.growth import outliers
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
@@ -137,6 +138,8 @@ class Trainer:
         smooth = config.loss.normal_weight > 0 and state.gaussians.shading == "lambert"
         nearest = state.neighbours.of(state.gaussians, state.steps_done) if smooth else None
         prior = priors(state.gaussians, rendered, batch, setup.radius_m, config.loss, nearest)
+        if config.published.growth == "sampled":
+            prior = prior + mcmc.sparsity(state.gaussians)
         (loss + prior).backward()
         seen = Seen(batch, rendered, residual)
         state.growth.observe(setup, state.gaussians, seen, moment)
@@ -188,6 +191,8 @@ class Trainer:
         of_sh = (state.gaussians.sh.shape[1], setup.radiance_unit, state.gaussians.lobes.shape[1])
         rates = learning_rates(setup.config.rates, moment.share, setup.unit_m, *of_sh)
         state.adam.step(state.gaussians, rates)
+        if setup.config.published.growth == "sampled":
+            mcmc.shake(state.gaussians, rates["means"], state.rng)
         state.gaussians.ambient.detach().clamp_(min=0)
         state.gaussians.psf_sigma_px.detach().clamp_(min=LEAST_PSF_SIGMA_PX)
         if state.compensation is not None:

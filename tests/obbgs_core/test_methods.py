@@ -17,7 +17,8 @@ from tests.scenes import SENSOR, intrinsics, photographed, pose, target
 STEPS = 40
 QUICK = {"steps": STEPS, "start.count": 250, "growth.max_gaussians": 400}
 SOON = {"growth.begin": 0.1, "growth.interval": 8, "rates.sh": 0.02}  # published methods grow after 500 steps
-VARIED = ("3dgs+exposure", "obbgs+blind", "3dgs+affine", "3dgs+hull", "obbgs+random")  # each variant once
+# each variant once
+VARIED = ("3dgs+exposure", "obbgs+blind", "3dgs+affine", "obbgs+random", "3dgs+exposure+hull+mask+l1+fast")
 
 
 @pytest.fixture(scope="module")

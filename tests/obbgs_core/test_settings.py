@@ -43,7 +43,7 @@ def test_quality_scales_steps_and_what_goes_with_them_and_unknown_ones_are_refus
 
 
 def test_presets_are_data_and_mistakes_are_named():
-    assert set(PRESETS) == {"3dgs", "pixel-gs", "mip-splatting", "mvgs", "jiang2025", "obbgs"}
+    assert set(PRESETS) == {"3dgs", "3dgs-mcmc", "pixel-gs", "mip-splatting", "mvgs", "jiang2025", "obbgs"}
     assert preset("jiang2025").loss.edge_weight == 0.2 and not preset("jiang2025").exposure_aware
     with pytest.raises(ValueError, match="no method 'nerf'; expected one of 3dgs, "):
         preset("nerf")
