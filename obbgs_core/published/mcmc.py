@@ -60,7 +60,7 @@ def shared(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def shake(gaussians: Gaussians, rate_m: float, rng: torch.Generator) -> None:
+def shake(gaussians: Gaussians, rate_m: float | Tensor, rng: torch.Generator) -> None:
     """Move the means at random, within each Gaussian's shape, the more the fainter it is.
 
     Args:
