@@ -96,7 +96,7 @@ class FrameModel(RuleBasedStateMachine):
         self.numbers: list[int] = []
         self.commands: dict[tuple[Path, int], str] = {}
         self.sessions: list[Path] = []
-        self.frames_made = 0
+        self.frames_made = self.last_counter = 0
         self.flight = self.keys = None
         self._watch()
         self.new_session()
@@ -176,8 +176,10 @@ class FrameModel(RuleBasedStateMachine):
         self._start_ground(self.sessions[-1])
 
     def flip_and_restart(self) -> None:
-        """One bit of what transfers depend on flips on the disk while flight is off."""
-        path = self.flight_folder / self.random.choice(["transaction", "store.json", "store.json.copy"])
+        """One bit of what transfers and commands depend on flips on the disk while flight is off."""
+        files = [self.flight_folder / name for name in ("transaction", "store.json", "store.json.copy")]
+        received = self.key_file.with_name(self.key_file.name + ".received")
+        path = self.random.choice([*files, received, copy_of(received)])
         if path.exists():
             with lock_store(self.flight_folder):
                 content = bytearray(path.read_bytes())
@@ -223,6 +225,10 @@ class FrameModel(RuleBasedStateMachine):
         self.flight_folder = folder
         self.capturing = FrameStore(folder, QUOTA_BYTES, "drop-oldest")
         self.keys, self.down = KeyRing([self.key_file] if self.with_key else []), End()
+        if self.with_key:
+            (own,) = self.keys.counters  # also where a file of its counter was damaged
+            assert own.last >= self.last_counter, "the counter of commands has fallen"
+            self.last_counter = own.last
         self.flight = _Downlink(
             FrameStore(folder),
             self.down,
@@ -273,6 +279,13 @@ class FrameModel(RuleBasedStateMachine):
         assert {n for n, reason in dropped.items() if reason == "delivered"} <= arrived
         assert set(captured) == on_board | arrived | lost | deleted, "not accounted for"
         assert not lost & (arrived | on_board), "counted as lost, and there"
+
+    @invariant()
+    def counters_never_fall(self) -> None:
+        if getattr(self, "with_key", False):
+            (own,) = self.keys.counters
+            assert own.last >= self.last_counter, "the counter of commands has fallen"
+            self.last_counter = own.last
 
     @invariant()
     def numbers_never_come_twice(self) -> None:
