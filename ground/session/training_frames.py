@@ -39,15 +39,7 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
             "%d frames are left out: in eclipse, or without a valid pose or the Sun's direction",
             len(session.frames) - len(frames),
         )
-    damaged = [r.id for r in frames if not session.is_whole(r)]
-    if damaged:
-        log.warning(
-            "the pictures of %d frames are damaged and left out: %s; `ground uplink resend` asks for what is still on "
-            "board",
-            len(damaged),
-            ", ".join(map(str, damaged)),
-        )
-        frames = [r for r in frames if r.id not in damaged]
+    frames = whole(session, frames)
     stated = {name: [r for r in frames if r.split == name] for name in SPLITS}
     if any(stated.values()) and not stated["train"]:
         raise SessionError(
@@ -60,6 +52,23 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
     if not chosen and len(brackets) > 1:
         chosen = {brackets[-1]}
     return [r for r in frames if r.bracket not in chosen], [r for r in frames if r.bracket in chosen]
+
+
+def whole(session: Session, records: Sequence[FrameRecord]) -> list[FrameRecord]:
+    """Return the frames whose pictures are not damaged; a warning names the others.
+
+    Raises:
+        SessionError: a picture cannot be read.
+    """
+    damaged = {record.id for record in records if not session.is_whole(record)}
+    if damaged:
+        log.warning(
+            "the pictures of %d frames are damaged and left out: %s; `ground uplink resend` asks for what is still on "
+            "board",
+            len(damaged),
+            ", ".join(map(str, sorted(damaged))),
+        )
+    return [record for record in records if record.id not in damaged]
 
 
 def usable(records: Sequence[FrameRecord]) -> list[FrameRecord]:

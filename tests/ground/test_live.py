@@ -177,6 +177,32 @@ def test_it_waits_and_says_what_is_missing_and_frames_in_eclipse_are_none(tmp_pa
     assert statuses[-1].frames_received == 21 and statuses[-1].frames_trained == 12
 
 
+def test_a_damaged_picture_costs_its_frame_alone_and_is_told(tmp_path, caplog):
+    """Two frames for training and a held-out one come with a flipped bit."""
+    writer, end, statuses = Writer(tmp_path / "s"), PassEnd(tmp_path / "s", 0.0, False), []
+    records = [json.loads(text) for text in writer.lines[:24]]
+    writer.add(24)
+    for record in (records[1], records[13], records[21]):
+        path = writer.folder / record["file"]
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content)
+    live = begun(writer.folder, statuses, {"steps": 20})
+    while live.turn(end):
+        pass
+    live.finish(lambda: False)
+    live.close()
+    assert statuses[-1].frames_received == 24 and statuses[-1].frames_trained == 19
+    assert statuses[-1].frames_unusable == 3 and statuses[-1].frames_held_out == 2
+    (told,) = (message for message in caplog.messages if "damaged" in message)
+    assert (
+        "3 frames" in told
+        and "left out: {}, {}, {};".format(*(records[at]["id"] for at in (1, 13, 21))) in told
+    )
+    run = open_run(writer.folder, "live")
+    assert len(run.training) == 19 and [record.id for record in run.scored] == [r["id"] for r in records[22:]]
+
+
 def test_a_pass_that_ends_with_too_few_frames_says_so(tmp_path):
     writer = Writer(tmp_path / "s")
     with pytest.raises(SessionError, match="no frame came into"):

@@ -11,7 +11,7 @@ from ground.session.folder import (
     open_session,
     read_records,
 )
-from ground.session.training_frames import is_held_out, split, training_frame, usable
+from ground.session.training_frames import is_held_out, split, training_frame, usable, whole
 from obbgs_core.frames import TrainingFrame
 
 log = logging.getLogger(__name__)
@@ -23,6 +23,7 @@ class Arrivals:
     session: None while there is none, or none with a frame.
     frames: those for training, in the order of arrival, `training` their records; `held_out` are the others that are
         usable. Whether a frame is held out depends on its bracket's number alone, so that it never changes.
+    damaged: the numbers of those that have come with a damaged picture, or were held out when theirs was damaged.
     """
 
     def __init__(self, folder: Path):
@@ -32,6 +33,8 @@ class Arrivals:
         self.training: list[FrameRecord] = []
         self.held_out: list[FrameRecord] = []
         self.eclipsed = self.untagged = 0  # untagged: without a valid pose or the Sun's direction
+        self.damaged: set[int] = set()
+        self._known: set[int] = set()  # whose pictures were looked at when they came
         self._bytes_seen = 0  # of frames.jsonl
 
     @property
@@ -64,6 +67,14 @@ class Arrivals:
         self._take(self.session)
         return True
 
+    def whole(self, records: list[FrameRecord]) -> list[FrameRecord]:
+        """Return the frames whose pictures are not damaged now; the others are told, and left out from now on."""
+        assert self.session is not None
+        good = whole(self.session, [record for record in records if record.id not in self.damaged])
+        self.damaged |= {record.id for record in records} - {record.id for record in good}
+        self.held_out = [record for record in self.held_out if record.id not in self.damaged]
+        return good
+
     def _take(self, session: Session) -> None:
         if session.frames[0].split is not None:  # an imported session, which is whole from the start
             training, self.held_out = split(session)
@@ -71,6 +82,9 @@ class Arrivals:
             # in the order of the lines, and no more of them than the session that was read a moment before has
             known = {record.id for record in session.frames}
             records = [record for record in read_records(self.folder) if record.id in known]
+            self.whole([record for record in records if record.id not in self._known])
+            self._known |= known
+            records = [record for record in records if record.id not in self.damaged]
             chosen = usable(records)
             self.eclipsed = sum(r.in_eclipse for r in records)
             self.untagged = len(records) - self.eclipsed - len(chosen)

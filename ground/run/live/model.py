@@ -82,9 +82,12 @@ class ShownModel:
         if session is None or not held_out:
             return math.nan
         sensor, values = sensor_of(session.camera), []
-        for record in held_out:
-            if record.id not in self._frames:
-                self._frames[record.id] = training_frame(session, record)
+        new = [record for record in held_out if record.id not in self._frames]
+        for record in self._arrivals.whole(new):
+            self._frames[record.id] = training_frame(session, record)
+        held_out = [record for record in held_out if record.id in self._frames]
+        if not held_out:
+            return math.nan
         held_out = [r for r in held_out if self._frames[r.id].earth_m is None] or held_out
         scored = held_out[:: math.ceil(len(held_out) / (SCORED if estimate is None else SETTLED))]
         frames = (self._frames[record.id] for record in scored)

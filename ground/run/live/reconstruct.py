@@ -226,7 +226,7 @@ class LiveReconstruction:
         self._missing = (
             f"{arrivals.received} frames received, {count} frames of {arrivals.brackets} brackets to train on "
             f"({arrivals.eclipsed} in eclipse, {arrivals.untagged} without a valid pose or the Sun's direction, "
-            f"{len(arrivals.held_out)} held out)"
+            f"{len(arrivals.damaged)} with a damaged picture, {len(arrivals.held_out)} held out)"
         )
         if self._over and count < FEWEST_FRAMES:
             raise TooFewFrames(f"{self._over}: {self._missing}; {FEWEST_FRAMES} frames are needed")
@@ -313,7 +313,7 @@ class LiveReconstruction:
             frames_received=arrivals.received,
             frames_trained=self._joined,
             frames_held_out=len(arrivals.held_out),
-            frames_unusable=arrivals.eclipsed + arrivals.untagged,
+            frames_unusable=arrivals.eclipsed + arrivals.untagged + len(arrivals.damaged),
             step=self.steps,
             share=trainer.share if trainer else 0.0,
             held_out_db=_known(shown.held_out_db),
