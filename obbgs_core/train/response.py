@@ -2,12 +2,14 @@
 
 The model is one for all exposure times. If the readings of long exposures are too bright for it and those of short
 ones too dark, by a ratio that is a power of the exposure time, then readings are that power of light. Frames are
-compared with the ones beside them, so that what changes slowly along a pass, such as the light, is no evidence, and in
-the radiance that both can read, so that a model which is too dark where it is bright is none either.
+compared with their neighbours in the bracket alone, because an exposure time that an automatic camera chose by what it
+saw says what it saw, and in the radiance that both can read, so that a model which is too dark where it is bright is no
+evidence either.
 
 Source: Mitsunaga and Nayar, Radiometric self calibration, 1999, who fit a polynomial to exposures of one view.
 """
 
+import itertools
 import logging
 import math
 from dataclasses import dataclass
@@ -16,6 +18,7 @@ import numpy as np
 import torch
 
 from obbgs_core.batches import Batch, Batches
+from obbgs_core.frames import bracket_numbers
 from obbgs_core.misfit import sampled
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
@@ -25,7 +28,7 @@ log = logging.getLogger(__name__)
 DECIDED_AT = (0.3, 0.5, 0.7)  # shares of the steps
 LEAST_STEP = 0.1  # of the logarithms of exposure times that are compared
 FEWEST_READINGS = 30
-MOST = 120  # pairs of neighbouring frames that are rendered
+MOST = 120  # pairs of neighbours in a bracket that are rendered
 FEWEST = 24  # pairs of frames that are compared
 LEFT_OUT = 10  # parts of the pass, each left out once (jackknife)
 # an exponent is used that is by so much other than 1, and by so many of its errors
@@ -44,8 +47,12 @@ class Response:
     @torch.no_grad()
     def decide(self, model: Gaussians, batches: Batches, sensor: Sensor) -> bool:
         """Take the exponent that the frames tell beside the model as it stands; return whether it is another one."""
-        last = len(batches.frames) - 2
-        starts = np.linspace(0, last, min(last + 1, MOST)).round().astype(int).tolist()
+        numbers = bracket_numbers(batches.frames)
+        pairs_of_one = [i for i, (a, b) in enumerate(itertools.pairwise(numbers)) if a == b]
+        if len(pairs_of_one) < FEWEST:
+            return False
+        chosen = np.linspace(0, len(pairs_of_one) - 1, min(len(pairs_of_one), MOST)).round().astype(int)
+        starts = [pairs_of_one[i] for i in chosen]
         told = {
             i: _told(model, batches.batch([i]), sensor) for i in sorted({*starts, *(i + 1 for i in starts)})
         }

@@ -25,7 +25,10 @@ def bent(dn: torch.Tensor, exponent: float) -> torch.Tensor:
 @pytest.mark.parametrize("exponent", [0.85, 1.0, 1.15])
 def test_the_exponent_is_found_and_a_linear_camera_stays_linear(exponent):
     model = target()
-    frames = [dataclasses.replace(f, dn=bent(f.dn, exponent)) for f in photographed(model, count=36)]
+    frames = [
+        dataclasses.replace(f, dn=bent(f.dn, exponent), bracket=i // 3)
+        for i, f in enumerate(photographed(model, count=36))
+    ]
     batches, response = Batches(frames, SENSOR.white_dn), Response()
     changed = response.decide(model, batches, SENSOR)
     assert changed == (exponent != 1)
@@ -38,7 +41,7 @@ def test_the_exponent_is_found_and_a_linear_camera_stays_linear(exponent):
 @pytest.mark.parametrize(("contrast", "size"), [(1, 1.3), (0.7, 1.3), (1.4, 1), (0.4, 1)])
 def test_a_model_that_is_wrong_is_no_evidence_against_a_linear_camera(contrast, size):
     """A training in its first steps has one: too soft, dark faces too bright or bright ones too dark."""
-    frames = photographed(target(), count=54)
+    frames = [dataclasses.replace(f, bracket=i // 3) for i, f in enumerate(photographed(target(), count=54))]
     model = target()
     value = radiance(model.sh, torch.tensor([[0.0, 0.0, 1.0]]).expand(len(model.sh), 3))[:, None]
     model.sh = from_radiance(0.35 + contrast * (value - 0.35))
@@ -52,6 +55,18 @@ def test_frames_of_one_exposure_time_tell_nothing():
     response = Response()
     assert not response.decide(model, Batches(frames, SENSOR.white_dn), SENSOR)
     assert response.exponent == 1 and np.isnan(response.error)
+
+
+def test_exposures_that_a_camera_chose_by_what_it_saw_tell_nothing():
+    # it saw less light from some sides than the model shows there, and exposed for longer until readings were the same
+    model = target()
+    frames = [
+        dataclasses.replace(f, exposure_time_s=f.exposure_time_s * (1, 2, 1.5)[i % 3])
+        for i, f in enumerate(photographed(model, count=36, exposures_s=(1e-4,)))
+    ]
+    response = Response()
+    assert not response.decide(model, Batches(frames, SENSOR.white_dn), SENSOR)
+    assert response.exponent == 1
 
 
 def test_the_loss_is_that_of_readings_to_the_power_and_its_gradient_reaches_the_light():
