@@ -12,8 +12,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from ground.commands.options import AsJson
 from ground.commands.progress import Stop, say
+from obbgs_base.command_line import OUT_HELP, AsJson
 from obbgs_base.imports import quick_imports
 
 if TYPE_CHECKING:  # both take seconds to import
@@ -24,14 +24,11 @@ PLAIN_S = 60.0  # between lines where there is no terminal
 
 
 def compare_command(
-    sessions: Annotated[Path, typer.Option("--sessions", help="Session folders, one after another.")],
-    out: Annotated[Path, typer.Option(help="The folder of the comparison; an earlier one there goes on.")],
+    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders.")],
+    out: Annotated[Path, typer.Option(help=f"{OUT_HELP}; an earlier comparison there goes on.")],
     methods: Annotated[
         str, typer.Option(help="Methods, separated by commas; a wrong name lists them all.")
     ] = "black,mean,untrained,noise,obbgs",
-    more_sessions: Annotated[
-        list[Path] | None, typer.Argument(metavar="[SESSION]...", help="More sessions, after the first.")
-    ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Trainings of each, with seeds 0, 1, ...")] = 1,
     budgets: Annotated[
         str,
@@ -51,7 +48,6 @@ def compare_command(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes of its own, of one thread each; default: one a core.")
     ] = None,
-    nice: Annotated[int, typer.Option(min=0, max=19, help="Lower the priority by so much.")] = 0,
     json_: AsJson = False,
 ) -> None:
     """Compare methods: one row for each session, method, seed, budget and condition, then a page of all rows.
@@ -59,7 +55,7 @@ def compare_command(
     Rows that are in the folder already are not made again. Ctrl-C and SIGTERM save what is running and end with exit
     code 1; the same command goes on, also after a kill.
 
-    Example: ground compare --sessions tdrs dscovr --methods black,3dgs,3dgs+exposure,obbgs --seeds 3 --out comparison
+    Example: ground compare tdrs dscovr --methods black,3dgs,3dgs+exposure,obbgs --seeds 3 --out comparison
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning threads slow each other down
     stop = Stop()
@@ -72,12 +68,11 @@ def compare_command(
             from compare.grid.origin import this_command
             from compare.grid.run import run_grid
 
-        os.nice(nice)
         chosen = load_conditions(conditions) if conditions else {AS_TAKEN: Condition()}
         names = [name.strip() for name in methods.split(",") if name.strip()]
         shares = parse_budgets(budgets)
         say(stderr, "reading the sessions")
-        facts = [session_facts(folder) for folder in (sessions, *(more_sessions or []))]
+        facts = [session_facts(folder) for folder in sessions]
         cells = cells_of(facts, names, seeds, shares, chosen, weights)
         with _shown(stderr) as on_state:
             command = this_command("ground")

@@ -17,12 +17,12 @@ from ground.commands.formats import export_command, import_command
 from ground.commands.inspect import inspect_command, measure_command
 from ground.commands.list import compare_runs_command, list_command
 from ground.commands.live import live_command
-from ground.commands.options import AsJson, ListenKey, SessionDir, listening_key
+from ground.commands.options import ListenKey, SessionDir, listening_key
 from ground.commands.runs import evaluate_command, mesh_command, reconstruct_command, report_command
 from ground.commands.systems import dictionary_command, yamcs_command
 from ground.commands.uplink import uplink_command
 from ground.commands.view import view_command
-from obbgs_base.command_line import new_app, run
+from obbgs_base.command_line import LINK_HELP, MISSION_HELP, AsJson, new_app, run
 from obbgs_base.output import output_may_fail
 
 app = new_app("The ground station: frames in, a 3D model out.")
@@ -35,16 +35,14 @@ RESEARCH = (
 @app.command("listen")
 @output_may_fail()
 def listen_command(
-    link: Annotated[str, typer.Option(help="The link's URL, such as serial:///dev/ttyUSB0?baud=921600.")],
+    link: Annotated[str, typer.Option(help=f"{LINK_HELP}.")],
     session: SessionDir,
-    mission: Annotated[Path, typer.Option(help="The mission file, the same as in flight.")] = Path(
-        "mission.yaml"
-    ),
+    mission: Annotated[Path, typer.Option(help=f"{MISSION_HELP}.")] = Path("mission.yaml"),
     exit_after: Annotated[
-        int | None, typer.Option(min=1, help="Stop when the session holds this many frames.")
+        int | None, typer.Option(min=1, help="Stop receiving when the session holds this many frames.")
     ] = None,
     idle_timeout: Annotated[
-        float | None, typer.Option(min=0, help="Stop after this many seconds without a packet.")
+        float | None, typer.Option(min=0, help="Stop after this many seconds of silence. Default: never.")
     ] = None,
     forward: Annotated[
         str | None,

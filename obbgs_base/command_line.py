@@ -12,6 +12,16 @@ from obbgs_base.errors import Interrupted, ObbgsError
 from obbgs_base.extras import how_to_install, installed_package
 from obbgs_base.output import open_standard_streams, output_may_fail
 
+# What several commands call by one name: the help of a name begins with the same words everywhere, up to a full stop,
+# a semicolon or a colon; what follows is of the command.
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+MISSION_HELP = "The mission file, the same in flight and on the ground"
+LINK_HELP = "The link's URL, such as serial:///dev/ttyUSB0?baud=921600"
+KEY_HELP = "The file of the mission's key"
+SEED_HELP = "The same seed gives the same result"
+OUT_HELP = "What to write, a file or a folder"
+SET_HELP = "A setting, NAME=VALUE; can be repeated, and a wrong name lists them all"
+
 
 class _Group(TyperGroup):
     """A group of commands whose Ctrl-C is an error with a message, like any other; click would end in silence."""

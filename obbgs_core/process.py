@@ -11,7 +11,7 @@ KEPT_BYTES = 512 * 1024**2
 
 
 def prepare_process(threads: int | None = None) -> None:
-    """Let PyTorch use some threads, by default all cores, and let freed memory stay with the process.
+    """Let PyTorch use some threads, or OMP_NUM_THREADS, or all cores; freed memory stays with the process.
 
     Each step of a training frees its images and asks for new ones of the same size. The GNU C library hands memory that
     was freed back to the system, which clears it anew for the next step; that takes a tenth of a training. With another
@@ -21,11 +21,13 @@ def prepare_process(threads: int | None = None) -> None:
         ValueError: more threads than four for each core, which would only wait for each other.
     """
     cores = os.cpu_count() or 1
-    if threads is not None and not 1 <= threads <= 4 * cores:
+    if threads is None:
+        threads = torch.get_num_threads() if os.environ.get("OMP_NUM_THREADS") else cores
+    if not 1 <= threads <= 4 * cores:
         raise ValueError(
-            f"--threads: expected 1 to {4 * cores}, four for each of this machine's {cores} cores, got {threads}"
+            f"OMP_NUM_THREADS: expected 1 to {4 * cores}, four for each of this machine's {cores} cores, got {threads}"
         )
-    torch.set_num_threads(threads or cores)
+    torch.set_num_threads(threads)
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT_BYTES)

@@ -72,9 +72,9 @@ ALL = set().union(*EXTRAS.values())
     ("missing", "tool", "arguments"),
     [
         (ALL, "ground", ["reconstruct", "--session", GOLDEN, "--name", "never"]),
-        (ALL, "ground", ["evaluate", "--session", GOLDEN, "--name", "never"]),
-        (ALL, "ground", ["report", "--session", GOLDEN, "--name", "never"]),
-        ({"plotly"}, "ground", ["report", "--session", GOLDEN, "--name", "never"]),
+        (ALL, "ground", ["evaluate", f"{GOLDEN}/runs/never"]),
+        (ALL, "ground", ["report", f"{GOLDEN}/runs/never"]),
+        ({"plotly"}, "ground", ["report", f"{GOLDEN}/runs/never"]),
         (ALL, "hil", ["demo"]),
         (ALL, "hil", ["camera"]),
         (ALL, "hil", ["scenario"]),
@@ -91,7 +91,7 @@ def test_a_command_without_its_extra_says_what_to_install(missing, tool, argumen
 
 @pytest.mark.parametrize("missing", [ALL, {"distributed"}, {"matplotlib"}])
 def test_a_comparison_without_its_extra_names_that_extra(missing):
-    done = run_without(missing, "ground", "compare", "--sessions", GOLDEN, "--out", "never")
+    done = run_without(missing, "ground", "compare", GOLDEN, "--out", "never")
     assert done.returncode == 2, done.stderr
     assert "pip install 'obbgs[compare]'" in done.stderr and not (ROOT / "never").exists()
 
@@ -201,7 +201,5 @@ def test_every_command_of_the_whole_wheel_runs_from_it(whole, tmp_path):
         whole, "ground", "reconstruct", "--session", str(session), "--name", "two", "--set", "steps=2"
     )
     assert "two" in run_installed(whole, "ground", "list", str(tmp_path))
-    hint = run_installed(
-        whole, "ground", "compare", "--sessions", str(session), "--out", str(tmp_path / "c"), code=2
-    )
+    hint = run_installed(whole, "ground", "compare", str(session), "--out", str(tmp_path / "c"), code=2)
     assert "pip install 'obbgs[compare]'" in hint

@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ground.commands.options import (
-    AsJson,
     Background,
     BackgroundGiven,
     ExportFormat,
@@ -25,6 +24,7 @@ from ground.commands.options import (
     SessionDir,
     ValuesGiven,
 )
+from obbgs_base.command_line import OUT_HELP, AsJson
 
 if TYPE_CHECKING:
     from ground.formats.photographs.poses import Registered
@@ -38,8 +38,8 @@ stderr = Console(stderr=True)
 
 def import_command(
     folder: Annotated[Path, typer.Option("--from", help="The data set's folder.")],
-    session: Annotated[Path, typer.Option(help="The session folder to make.")],
-    format_: Annotated[ImportFormat, typer.Option("--format", help="The data set's format.")],
+    session: SessionDir,
+    format_: Annotated[ImportFormat, typer.Option("--format", help="The format.")],
     values: ValuesGiven = None,
     background: BackgroundGiven = None,
     exposures: ExposuresGiven = None,
@@ -48,7 +48,7 @@ def import_command(
     poses: PosesGiven = PoseChoice.CHECK,
     frames: Annotated[
         int | None,
-        typer.Option(min=1, help="Import only the first so many pictures (of each split); default: all."),
+        typer.Option(min=1, help="Number of frames; the first of each split. Default: all."),
     ] = None,
     json_: AsJson = False,
 ) -> None:
@@ -219,18 +219,15 @@ def _photographs(
 
 
 def export_command(
-    session: SessionDir,
-    out: Annotated[Path, typer.Option(help="The folder to write.")],
-    format_: Annotated[
-        ExportFormat, typer.Option("--format", help="The format to write.")
-    ] = ExportFormat.NERF,
-    run: Annotated[
-        str | None,
-        typer.Option(
-            help="Write the poses of this run, refined as it refined them, and its split into train and test; frames "
-            "that it left out are not written."
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="A session's folder; or a run's: its poses as it refined them, its split into train and test, without "
+            "the frames that it left out."
         ),
-    ] = None,
+    ],
+    out: Annotated[Path, typer.Option(help=f"{OUT_HELP}.")],
+    format_: Annotated[ExportFormat, typer.Option("--format", help="The format.")] = ExportFormat.NERF,
     json_: AsJson = False,
 ) -> None:
     """Write a session's frames for other software, whole brackets split into train, val and test (6:2:3).
@@ -239,14 +236,14 @@ def export_command(
     (a COLMAP folder is a nerfstudio folder too: import it as that). The format ndm writes no pictures, but CCSDS
     messages: the target's attitude and rate, the camera's attitude and its path about the target with covariance.
 
-    Example: ground export --session pass-12 --run first --format nerfstudio --out pass-12-nerfstudio
+    Example: ground export pass-12/runs/first --format nerfstudio --out pass-12-nerfstudio
     """
     from ground.formats.colmap_export import export_colmap
     from ground.formats.nerf import export_nerf
     from ground.formats.nerfstudio import export_nerfstudio
     from ground.run.estimated_poses import refined_session
     from ground.run.navigation_messages import export_ndm
-    from ground.run.runs import open_run
+    from ground.run.runs import is_session, open_run, run_at
     from ground.session.folder import SessionError, open_session
 
     exporters = {
@@ -257,11 +254,11 @@ def export_command(
     if (out.exists() and not out.is_dir()) or (out / "session.json").exists():
         kind = "a session" if out.is_dir() else "a file"
         raise SessionError(f"{out} is {kind}: give a folder of its own with --out, new or empty")
-    opened = None if run is None else open_run(session, run)
+    opened = open_run(*run_at(source)) if source.is_dir() and not is_session(source) else None
     if format_ is ExportFormat.NDM:
-        counts = export_ndm(open_session(session) if opened is None else opened.session, out, opened)
+        counts = export_ndm(open_session(source) if opened is None else opened.session, out, opened)
     else:
-        read = open_session(session) if opened is None else refined_session(opened)
+        read = open_session(source) if opened is None else refined_session(opened)
         read.check_body_axes()
         counts = exporters[format_](read, out)
     text = ", ".join(f"{count} {split}" for split, count in counts.items())

@@ -9,41 +9,38 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ground.commands.options import AsJson
+from ground.commands.options import RunAt
+from obbgs_base.command_line import AsJson
 from obbgs_base.imports import quick_imports
 from obbgs_base.output import output_may_fail
-
-RunFolder = Annotated[Path, typer.Argument(help="A run's folder, such as pass-12/runs/first.")]
 
 
 @output_may_fail()
 def inspect_command(
-    run: RunFolder,
-    cad: Annotated[
-        Path | None,
-        typer.Option(help="A mesh of the design, in any position, unit and axes: GLB, OBJ, STL or PLY."),
-    ] = None,
-    with_: Annotated[
-        Path | None, typer.Option("--with", help="Another run's folder, instead of a design.")
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="Where inspection.json, .html and .glb are written; default: the run's folder."),
-    ] = None,
+    run: RunAt,
+    against: Annotated[
+        Path,
+        typer.Option(
+            help="The design, a mesh in any position, unit and axes: GLB, OBJ, STL or PLY; or another run's folder."
+        ),
+    ],
     json_: AsJson = False,
 ) -> None:
     """Tell whether a body is as it was built: missing and added parts, and panels that are turned, with 90 % intervals.
 
-    The design is laid on the run's surface whatever its size. What the frames do not show is "not seen", never missing.
-    A part as dark as the sky in all frames cannot be told from a missing one.
+    It writes inspection.json, .html and .glb into the run's folder. The design is laid on its surface whatever its
+    size. What the frames do not show is "not seen", never missing. A part as dark as the sky in all frames cannot be
+    told from a missing one.
 
-    Example: ground inspect pass-12/runs/first --cad target.glb
+    Example: ground inspect pass-12/runs/first --against target.glb
     """
     with quick_imports():
+        from ground.run.runs import run_at
         from ground.show.inspection import write_inspection
 
-    folder = run if out is None else out
-    values = write_inspection(run, cad, with_, folder)
+    _, name, runs = run_at(run)
+    folder = runs / name
+    values = write_inspection(folder, against, folder)
     if json_:
         print(json.dumps(values))
         return
@@ -65,7 +62,7 @@ def inspect_command(
 
 @output_may_fail()
 def measure_command(
-    run: RunFolder,
+    run: RunAt,
     between: Annotated[
         list[str] | None,
         typer.Option(
@@ -84,10 +81,12 @@ def measure_command(
     Example: ground measure pass-12/runs/first --between 0,0,1:0,0,-1
     """
     with quick_imports():
+        from ground.run.runs import run_at
         from ground.show.inspection import read_model
         from ground.show.measure import measured, places_of
 
-    values = measured(read_model(run), [places_of(text) for text in between or []])
+    _, name, runs = run_at(run)
+    values = measured(read_model(runs / name), [places_of(text) for text in between or []])
     if json_:
         print(json.dumps(values))
         return

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ground.commands.options import AsJson
+from obbgs_base.command_line import AsJson
 
 if TYPE_CHECKING:  # torch takes seconds to import, and --help must not wait for it
     from ground.show.listing import RunEntry, SessionEntry
@@ -21,7 +21,9 @@ def list_command(
     folders: Annotated[
         list[Path] | None, typer.Argument(help="Where to look, three levels deep; default: here.")
     ] = None,
-    check: Annotated[bool, typer.Option("--check", help="Look for damage in every picture too.")] = False,
+    pictures: Annotated[
+        bool, typer.Option("--pictures", help="Look for damage in every picture, too.")
+    ] = False,
     json_: AsJson = False,
 ) -> None:
     """Show the sessions in some folders, and their runs: frames, what is lost or damaged, method, quality, PSNR, poses.
@@ -30,7 +32,7 @@ def list_command(
     """
     from ground.show.listing import find_sessions
 
-    sessions = find_sessions(folders or [Path()], check)
+    sessions = find_sessions(folders or [Path()], pictures)
     if json_:
         print(json.dumps([dataclasses.asdict(session) for session in sessions]))
         return
@@ -41,8 +43,9 @@ def list_command(
 
 
 def compare_runs_command(
-    first: Annotated[Path, typer.Argument(help="A run's folder, such as pass-12/runs/first.")],
-    second: Annotated[Path, typer.Argument(help="Another run's folder, of any session.")],
+    runs: Annotated[
+        tuple[Path, Path], typer.Argument(metavar="RUN RUN", help="Two runs' folders, of any sessions.")
+    ],
     json_: AsJson = False,
 ) -> None:
     """Show which settings differ between two runs, and the figures of both.
@@ -51,6 +54,7 @@ def compare_runs_command(
     """
     from ground.show.listing import compare_runs
 
+    first, second = runs
     found = compare_runs(first, second)
     if json_:
         print(json.dumps(found))

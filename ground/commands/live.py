@@ -14,19 +14,16 @@ from rich.console import Console
 from flightsw.icd.auth import Key
 from flightsw.icd.mission import ConfigError, ReconstructSection, load_mission
 from ground.commands.options import (
-    AsJson,
     Overwrite,
     RunName,
-    RunsDir,
-    Seed,
     SessionDir,
-    Threads,
     listening_key,
 )
 from ground.commands.progress import Lines, Stop, say
 from ground.run.live.process import LiveProcess
 from ground.run.live.status import LiveStatus, line
 from ground.show.summary import frames_row, model_rows, table
+from obbgs_base.command_line import KEY_HELP, LINK_HELP, MISSION_HELP, AsJson
 from obbgs_base.imports import quick_imports
 from obbgs_base.output import output_may_fail
 
@@ -39,43 +36,41 @@ def live_command(
     link: Annotated[
         str | None,
         typer.Option(
-            help="Receive over this link too; default: follow a session that another process receives."
+            help=f"{LINK_HELP}, to receive over it; default: follow a session that another process receives."
         ),
     ] = None,
     mission: Annotated[
         Path | None,
-        typer.Option(help="The mission file; default: mission.yaml with --link, otherwise none is read."),
+        typer.Option(help=f"{MISSION_HELP}; default: mission.yaml with --link, otherwise none is read."),
     ] = None,
     name: RunName = "live",
-    out: RunsDir = None,
     triage: Annotated[
         bool,
         typer.Option(
-            help="Send the model up whenever it has improved by 1 dB, and ask for the order by triage."
+            "--triage",
+            help="Send the model up whenever it has improved by 1 dB, and ask for the order by triage.",
         ),
     ] = False,
     key_file: Annotated[
         Path,
         typer.Option(
             "--key",
-            help="The file of the mission's key, which authenticates answers to the spacecraft; needed for --triage.",
+            help=f"{KEY_HELP}: it authenticates answers to the spacecraft, and --triage needs it.",
         ),
     ] = Path("mission.key"),
     exit_after: Annotated[
         int | None,
-        typer.Option(min=1, help="With --link: stop receiving when the session holds this many frames."),
+        typer.Option(min=1, help="Stop receiving when the session holds this many frames; with --link."),
     ] = None,
     idle_timeout: Annotated[
         float | None,
         typer.Option(
             min=0,
-            help="With --link: stop receiving after this many seconds without a packet, default: never. Without: the "
-            "pass is over after this many seconds without a frame while no process receives, default: 30.",
+            help="Stop after this many seconds of silence. With --link: without a packet, default: never. Without: "
+            "without a frame while no process receives, default: 30.",
         ),
     ] = None,
-    seed: Seed = None,
     overwrite: Overwrite = False,
-    threads: Threads = None,
     listener: Annotated[int | None, typer.Option(hidden=True)] = None,
     json_: AsJson = False,
 ) -> None:
@@ -88,17 +83,14 @@ def live_command(
     """
     if link is None:
         key = key_file if triage else None
-        _follow(session, mission, name, out, key, idle_timeout, seed, overwrite, threads, listener, json_)
+        _follow(session, mission, name, key, idle_timeout, overwrite, listener, json_)
         return
     mission = mission or Path("mission.yaml")
     given = {
         "--session": session,
         "--mission": mission,
         "--name": name,
-        "--out": out,
         "--key": key_file if triage else None,
-        "--seed": seed,
-        "--threads": threads,
     }
     options = [str(part) for option, value in given.items() if value is not None for part in (option, value)]
     options += ["--triage"] * triage + ["--overwrite"] * overwrite
@@ -106,7 +98,7 @@ def live_command(
         link,
         session,
         mission,
-        (out or session / "runs") / name,
+        session / "runs" / name,
         options,
         exit_after,
         idle_timeout,
@@ -171,12 +163,9 @@ def _follow(
     session: Path,
     mission: Path | None,
     name: str,
-    out: Path | None,
     key: Path | None,
     idle_timeout: float | None,
-    seed: int | None,
     overwrite: bool,
-    threads: int | None,
     listener: int | None,
     as_json: bool,
 ) -> None:
@@ -191,7 +180,7 @@ def _follow(
             from ground.show.report.document import write_report
             from obbgs_core.process import prepare_process
 
-        prepare_process(threads)
+        prepare_process()
         section = load_mission(mission).reconstruct if mission else ReconstructSection()
         if section.method != "obbgs":
             raise ConfigError("mission.reconstruct.method", f"live it must be obbgs, got {section.method!r}")
@@ -206,8 +195,8 @@ def _follow(
             session,
             name,
             mission_changes(section),
-            section.seed if seed is None else seed,
-            out,
+            section.seed,
+            None,
             overwrite,
             30.0 if idle_timeout is None else idle_timeout,
             listener is not None,
@@ -216,8 +205,8 @@ def _follow(
             # the process that receives was killed: it starts a training again when it is started again
             lambda: stop.requested or listener not in (None, os.getppid()),
         )
-        metrics = evaluate(session, name, out)
-        write_report(session, name, out)
+        metrics = evaluate(session, name)
+        write_report(session, name)
     if as_json:
         print(json.dumps({"type": "summary"} | metrics))
     else:

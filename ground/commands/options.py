@@ -8,21 +8,24 @@ import typer
 
 from flightsw.icd.auth import Key
 from flightsw.icd.mission import METHODS, VARIANTS, ConfigError
+from obbgs_base.command_line import KEY_HELP, MISSION_HELP, SEED_HELP, SET_HELP
 
 SessionDir = Annotated[Path, typer.Option("--session", help="The session folder.")]
 RunName = Annotated[str, typer.Option("--name", help="The run's name: its folder below runs/.")]
-RunsDir = Annotated[
-    Path | None, typer.Option("--out", help="The folder of runs; default: runs/ in the session.")
+RunAt = Annotated[
+    Path,
+    typer.Argument(
+        metavar="RUN", help="A run's folder, such as pass-12/runs/first, or a session: its newest run."
+    ),
 ]
 ListenKey = Annotated[
     Path | None,
     typer.Option(
         "--key",
-        help="The file of the mission's key: a spacecraft with a key believes no other listener that it has stored a "
-        "frame. Default: mission.key if it is there.",
+        help=f"{KEY_HELP}: a spacecraft with a key believes no other listener that it has stored a frame. Default: "
+        "mission.key if it is there.",
     ),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 def listening_key(file: Path | None) -> Key | None:
@@ -201,22 +204,21 @@ QualityName = Annotated[
 Budget = Annotated[
     str, typer.Option(help="The largest number of Gaussians; auto: by the number of lit pixels.")
 ]
-Steps = Annotated[int | None, typer.Option(min=1, help="Number of training steps; default: the method's.")]
 SettingsGiven = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
-        help="A setting of the method, GROUP.NAME=VALUE; can be repeated. A wrong name lists them all.",
+        help=f"{SET_HELP}; of the method: steps=2000, or GROUP.NAME=VALUE.",
     ),
 ]
 ReconstructMission = Annotated[
     Path | None,
     typer.Option(
-        help="A mission file: its reconstruct section counts where no option is given; default: none is read."
+        help=f"{MISSION_HELP}; its reconstruct section counts where no option is given. Default: none is read."
     ),
 ]
 TimeLimit = Annotated[float, typer.Option(help="Seconds for each training; then the model is made as it is.")]
-Seed = Annotated[int | None, typer.Option(min=0, help="The same seed makes the same model; default: 7.")]
+Seed = Annotated[int | None, typer.Option(min=0, help=f"{SEED_HELP}; default: 7.")]
 AttitudeGiven = Annotated[
     AttitudeChoice,
     typer.Option(
@@ -226,7 +228,7 @@ AttitudeGiven = Annotated[
     ),
 ]
 BlindReference = Annotated[
-    bool, typer.Option(help="Train a second time without exposure times, for comparison.")
+    bool,
+    typer.Option("--blind-reference", help="Train a second time without exposure times, for comparison."),
 ]
-Overwrite = Annotated[bool, typer.Option(help="Replace a finished run of the same name.")]
-Threads = Annotated[int | None, typer.Option(min=1, help="Processor cores; default: all.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run of the same name.")]

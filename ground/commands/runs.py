@@ -11,7 +11,6 @@ from rich.console import Console
 
 from flightsw.icd.mission import ReconstructSection, load_mission
 from ground.commands.options import (
-    AsJson,
     AttitudeChoice,
     AttitudeGiven,
     BlindReference,
@@ -21,17 +20,16 @@ from ground.commands.options import (
     Overwrite,
     QualityName,
     ReconstructMission,
+    RunAt,
     RunName,
-    RunsDir,
     Seed,
     SessionDir,
     SettingsGiven,
-    Steps,
-    Threads,
     TimeLimit,
 )
 from ground.commands.progress import Stop, say, shares_shown, steps_shown
 from ground.show.summary import frames_row, model_rows, table
+from obbgs_base.command_line import AsJson
 from obbgs_base.errors import Interrupted
 from obbgs_base.imports import quick_imports
 from obbgs_base.output import output_may_fail
@@ -43,11 +41,9 @@ stderr = Console(stderr=True)
 def reconstruct_command(
     session: SessionDir,
     name: RunName = "run",
-    out: RunsDir = None,
     method: MethodName = None,
     quality: QualityName = None,
     budget: Budget = "auto",
-    steps: Steps = None,
     settings: SettingsGiven = None,
     mission: ReconstructMission = None,
     time_limit: TimeLimit = math.inf,
@@ -55,7 +51,6 @@ def reconstruct_command(
     blind_reference: BlindReference = False,
     attitude: AttitudeGiven = AttitudeChoice.AUTO,
     overwrite: Overwrite = False,
-    threads: Threads = None,
     json_: AsJson = False,
 ) -> None:
     """Train a model on a session, export it, score it and write its report.
@@ -78,8 +73,8 @@ def reconstruct_command(
 
             section = load_mission(mission).reconstruct if mission else ReconstructSection()
             chosen = method or section.method
-            changes = all_changes(section, chosen, quality, budget, steps, settings or [])
-            prepare_process(threads)
+            changes = all_changes(section, chosen, quality, budget, settings or [])
+            prepare_process()
             stop.raise_at_once()
 
             def on_progress(progress: Progress) -> None:
@@ -96,16 +91,15 @@ def reconstruct_command(
                 time_limit,
                 blind_reference,
                 on_progress,
-                out,
-                overwrite,
-                lambda: stop.requested,
-                attitude.value,
-                shares_shown(stderr),
+                overwrite=overwrite,
+                should_stop=lambda: stop.requested,
+                attitude=attitude.value,
+                on_search=shares_shown(stderr),
             )
             stop.raise_at_once()
             say(stderr, "scoring the model and writing its report")
-            metrics = evaluate(session, name, out)
-            report = write_report(session, name, out)
+            metrics = evaluate(session, name)
+            report = write_report(session, name)
     except KeyboardInterrupt as error:
         raise Interrupted(_interrupted(folder)) from error
     _print_metrics(metrics, json_)
@@ -113,53 +107,47 @@ def reconstruct_command(
         print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}\nreport: {report}")
 
 
-def evaluate_command(
-    session: SessionDir, name: RunName = "run", out: RunsDir = None, json_: AsJson = False
-) -> None:
+def evaluate_command(run: RunAt, json_: AsJson = False) -> None:
     """Score a finished run against its held-out frames, and against the truth if a simulator left one.
 
-    Example: ground evaluate --session demo/session --name demo --json
+    Example: ground evaluate demo/session/runs/demo --json
     """
     with quick_imports():
         from ground.run.evaluate import evaluate
+        from ground.run.runs import run_at
 
-    _print_metrics(evaluate(session, name, out), json_)
+    _print_metrics(evaluate(*run_at(run)), json_)
 
 
-def report_command(
-    session: SessionDir, name: RunName = "run", out: RunsDir = None, json_: AsJson = False
-) -> None:
+def report_command(run: RunAt, json_: AsJson = False) -> None:
     """Write report.html into the folder of a finished run again.
 
-    Example: ground report --session demo/session --name demo
+    Example: ground report demo/session/runs/demo
     """
     with quick_imports():
+        from ground.run.runs import run_at
         from ground.show.report.document import write_report
 
-    path = write_report(session, name, out)
+    path = write_report(*run_at(run))
     print(json.dumps({"report": str(path)}) if json_ else path)
 
 
 def mesh_command(
-    session: SessionDir,
-    name: RunName = "run",
-    out: RunsDir = None,
-    format_: Annotated[
-        MeshFormatName, typer.Option("--format", help="The format to write.")
-    ] = MeshFormatName.GLB,
+    run_path: RunAt,
+    format_: Annotated[MeshFormatName, typer.Option("--format", help="The format.")] = MeshFormatName.GLB,
     json_: AsJson = False,
 ) -> None:
     """Write a finished run's surface into its folder as a closed mesh: model.glb, or mesh.FORMAT.
 
-    Example: ground mesh --session demo/session --name demo --format obj
+    Example: ground mesh demo/session/runs/demo --format obj
     """
     from ground.run.estimated_poses import estimated_records, read_estimate
     from ground.run.evaluate import keep_metrics
     from ground.run.mesh_files import write_mesh
     from ground.run.model_files import model_sizes, white_radiance_of
-    from ground.run.runs import open_run
+    from ground.run.runs import open_run, run_at
 
-    run = open_run(session, name, out)
+    run = open_run(*run_at(run_path))
     training = estimated_records(run.training, read_estimate(run.folder))
     stem = "model" if format_ is MeshFormatName.GLB else "mesh"  # model.ply holds the Gaussians
     path = run.folder / f"{stem}.{format_.value}"

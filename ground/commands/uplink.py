@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flightsw.icd.mission import load_mission
-from ground.commands.options import AsJson, UplinkCommand, listening_key
+from ground.commands.options import UplinkCommand, listening_key
+from obbgs_base.command_line import KEY_HELP, LINK_HELP, MISSION_HELP, AsJson
 from obbgs_base.output import output_may_fail
 
 if TYPE_CHECKING:
@@ -22,13 +23,11 @@ def uplink_command(
     ] = None,
     arguments: Annotated[list[str] | None, typer.Argument(help="Its arguments, as above.")] = None,
     session: Annotated[Path, typer.Option("--session", help="The session folder.")] = Path("session"),
-    key_file: Annotated[Path, typer.Option("--key", help="The file of the mission's key.")] = Path(
-        "mission.key"
-    ),
+    key_file: Annotated[Path, typer.Option("--key", help=f"{KEY_HELP}.")] = Path("mission.key"),
     link: Annotated[
-        str | None, typer.Option(help="The link's URL, if no `ground listen` has it open.")
+        str | None, typer.Option(help=f"{LINK_HELP}; default: `ground listen` of the session has it open.")
     ] = None,
-    mission: Annotated[Path, typer.Option(help="The mission file; read with --link only.")] = Path(
+    mission: Annotated[Path, typer.Option(help=f"{MISSION_HELP}; read with --link only.")] = Path(
         "mission.yaml"
     ),
     timeout: Annotated[

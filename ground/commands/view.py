@@ -1,5 +1,6 @@
 """The command of `ground` that shows models in the browser."""
 
+import json
 import signal
 import threading
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from obbgs_base.command_line import AsJson
 from obbgs_base.imports import quick_imports
 from obbgs_base.output import output_may_fail
 
@@ -16,12 +18,20 @@ stderr = Console(stderr=True)
 
 @output_may_fail()
 def view_command(
-    run: Annotated[Path, typer.Argument(help="A run's folder, or a session: its newest run.")],
-    other: Annotated[Path | None, typer.Argument(help="A second one, shown beside it.")] = None,
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN...",
+            help="Folders of runs, one or two side by side, or of a session: its newest run.",
+        ),
+    ],
     host: Annotated[
         str, typer.Option(help="The address to serve at; any but this machine's own lets others watch.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="The port; 0: any that is free.")] = 8080,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="The TCP port of the page; 0: any that is free.")
+    ] = 8080,
+    json_: AsJson = False,
 ) -> None:
     """Show a model on a page in the browser, with its cameras, frames and the Sun, until stopped.
 
@@ -29,6 +39,8 @@ def view_command(
 
     Example: ground view pass-12/runs/first
     """
+    if len(runs) > 2:
+        raise ValueError(f"expected one run or two, got {len(runs)}")
     with quick_imports():
         from ground.show.viewer.door import is_loopback
         from ground.show.viewer.source import Source
@@ -39,11 +51,13 @@ def view_command(
         signal.signal(number, lambda *_: stop.set())
     if not is_loopback(host):
         stderr.print(f"serving at {host}: everyone who reaches this port sees the model and the frames")
-    sources = [Source(path) for path in (run, other) if path is not None]
-    view(
-        sources,
-        host,
-        port,
-        lambda bound: print(f"http://{host}:{bound} shows {', '.join(s.name for s in sources)}", flush=True),
-        stop.is_set,
-    )
+    sources = [Source(path) for path in runs]
+
+    def say(bound: int) -> None:
+        url, names = f"http://{host}:{bound}", [source.name for source in sources]
+        print(
+            json.dumps({"url": url, "runs": names}) if json_ else f"{url} shows {', '.join(names)}",
+            flush=True,
+        )
+
+    view(sources, host, port, say, stop.is_set)

@@ -60,7 +60,7 @@ def export_ndm(session: Session, out: Path, run: Run | None = None) -> dict[str,
     if unknown or (session.navigation.attitude == "unknown" and run is None):
         raise SessionError(
             f"{session.path}: its tags do not say how the target's axes lay in inertial ones; export a run that found "
-            "the attitude (--run NAME), or a session whose tags say it"
+            "the attitude, or a session whose tags say it"
         )
     brackets = {record.bracket for record in records}
     if len(brackets) < 2:

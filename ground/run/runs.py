@@ -116,6 +116,60 @@ def run_folder(session_dir: Path, name: str, out: Path | None = None) -> Path:
     return (session_dir / "runs" if out is None else out) / name
 
 
+def is_session(path: Path) -> bool:
+    """Return whether a folder is a session."""
+    return (path / "session.json").is_file()
+
+
+def session_of(path: Path) -> Path:
+    """Return the session that a path names, or in which the run lies, or will lie, that it names.
+
+    Raises:
+        SessionError: it names neither.
+    """
+    if is_session(path):
+        return path
+    run = path.resolve()
+    session = run.parent.parent
+    if is_session(session) and (run.parent.name == "runs" or (run / "model.ply").is_file()):
+        return session
+    if (run / "model.ply").is_file():
+        raise SessionError(f"{path} does not lie in runs/ of a session, whose frames and camera are needed")
+    raise SessionError(
+        f"{path} is neither a session (session.json) nor a run in runs/ of one; a session begins with `ground listen`, "
+        "`ground live` or `ground import`"
+    )
+
+
+def newest_run(session: Path) -> Path | None:
+    """Return the folder of a session's run whose model was renewed last; None where no run has a model."""
+    models = {
+        path: _renewed_ns(path) for path in session.glob("runs/*/model.ply") if path.parent.name[0] != "."
+    }
+    return max(models, key=lambda path: models[path]).parent if models else None
+
+
+def _renewed_ns(path: Path) -> int:
+    """Return when a file was renewed; 0 where it has been removed meanwhile."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+def run_at(path: Path) -> tuple[Path, str, Path]:
+    """Return session, name and folder of runs of the run that a path names: its folder, or a session's newest run.
+
+    Raises:
+        SessionError: the path names neither, or the session has no run with a model.
+    """
+    session = session_of(path)
+    folder = newest_run(path) if is_session(path) else path.resolve()
+    if folder is None:
+        raise SessionError(f"{path} has no run yet; `ground reconstruct --session {path}` makes one")
+    return session, folder.name, folder.parent
+
+
 def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
     """Return a finished run; `out` is the folder of runs if it is not the session's own.
 
@@ -254,7 +308,7 @@ def written_to(folder: Path) -> Iterator[None]:
     except OSError as error:
         reason = error.strerror or str(error)
         raise SessionError(
-            f"cannot write to {folder}: {reason}; use --out DIR for another folder of runs"
+            f"cannot write to {folder}: {reason}; make it writable, or copy the session to where you can write"
         ) from error
 
 

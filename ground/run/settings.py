@@ -18,7 +18,6 @@ def all_changes(
     method: str,
     quality: str | None,
     budget: str,
-    steps: int | None,
     assignments: Sequence[str],
 ) -> dict:
     """Return the changes to a method's preset: of the mission file, over those the options, over those `--set`.
@@ -27,18 +26,12 @@ def all_changes(
         ValueError: as in the functions below, or an option and `--set` say the same thing twice.
     """
     by_set = set_changes(assignments)
-    for name, option, given in (
-        ("steps", "--steps", steps is not None),
-        ("growth.max_gaussians", "--budget", budget != "auto"),
-    ):
-        if given and name in by_set:
-            raise ConfigError(f"--set {name}", f"is given by {option} too: leave one of them out")
-    return mission_changes(section) | changes_for(method, quality, budget, steps) | by_set
+    if budget != "auto" and (name := "growth.max_gaussians") in by_set:
+        raise ConfigError(f"--set {name}", "is given by --budget too: leave one of them out")
+    return mission_changes(section) | changes_for(method, quality, budget) | by_set
 
 
-def changes_for(
-    method: str, quality: str | None = None, budget: str = "auto", steps: int | None = None
-) -> dict:
+def changes_for(method: str, quality: str | None = None, budget: str = "auto") -> dict:
     """Return the changes to a method's preset that the options of a command ask for.
 
     A budget in numbers holds as it is: the number of lit pixels does not lower it.
@@ -53,8 +46,6 @@ def changes_for(
         if not (budget.isascii() and budget.isdigit()) or int(budget) < 2:
             raise ValueError(f"--budget must be auto or a number of at least 2 Gaussians, got {budget!r}")
         changes = budget_changes(config, changes, int(budget))
-    if steps is not None:
-        changes["steps"] = steps
     return changes
 
 

@@ -184,26 +184,23 @@ def cad_of_run(model: Model) -> CadMesh:
     return faces_as_parts(mesh, model.surface.pixel_m)
 
 
-def write_inspection(run: Path, cad: Path | None, other: Path | None, out: Path) -> dict:
+def write_inspection(run: Path, against: Path, out: Path) -> dict:
     """Compare a run with a design, or with another run; write inspection.json, .html and .glb, and return the values.
 
     Args:
-        cad: a mesh of the design; other: a run's folder. One of them.
+        against: a mesh of the design, or another run's folder.
         out: the folder for the three files; it is made if need be.
 
     Raises:
         SessionError, CadError: a run or the design cannot be used.
     """
-    if (cad is None) == (other is None):
-        raise ValueError("expected a design (--cad MODEL.glb) or another run (--with RUN), one of them")
     model = read_model(run)
-    if cad is not None:
-        design, against = read_cad(cad), cad.name
+    if against.is_dir():
+        second = read_model(against)
+        design, name = cad_of_run(second), f"run {second.name}"
     else:
-        assert other is not None
-        second = read_model(other)
-        design, against = cad_of_run(second), f"run {second.name}"
-    found, values = inspected(model, design, against)
+        design, name = read_cad(against), against.name
+    found, values = inspected(model, design, name)
     with written_to(out):
         out.mkdir(parents=True, exist_ok=True)
         write_whole(out / "inspection.glb", coloured_glb(found, design, model))

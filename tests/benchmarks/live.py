@@ -177,11 +177,11 @@ def measure(session_dir: Path, mission: Path, seconds: float, folder: Path) -> d
     alone = fly(folder / "listen", frames, mission, seconds, "listen")
     live = fly(folder / "live", frames, mission, seconds, "live")
     reconstruct = ["reconstruct", "--session", str(session_dir), "--mission", str(mission)]
-    reconstruct += ["--name", "afterwards", "--out", str(folder / "runs")]
+    reconstruct += ["--name", "afterwards", "--overwrite"]
     began_s = time.monotonic()
     subprocess.run([installed("ground"), *reconstruct], check=True, stdout=subprocess.DEVNULL)
     afterwards_s = time.monotonic() - began_s
-    afterwards_db = clean_psnr_db(folder / "runs" / "afterwards", session)
+    afterwards_db = clean_psnr_db(session_dir / "runs" / "afterwards", session)
     scored = [(when_s, cpu_s, clean_psnr_db(path, session)) for when_s, cpu_s, path in live.models]
     last_s = max(live.arrived_s.values())
     close = next(((s, cpu_s) for s, cpu_s, db in scored if db >= afterwards_db - CLOSE_DB), None)

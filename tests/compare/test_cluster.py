@@ -101,7 +101,7 @@ def scheduler(tmp_path) -> Iterator[str]:
 def test_a_grid_survives_a_killed_worker_and_is_not_made_twice(sessions, scheduler, compare, tmp_path):
     out, conditions = tmp_path / "out", tmp_path / "conditions.yaml"
     conditions.write_text("as taken: {}\nnoise x2: {noise: 2}\n")
-    grid = ["--sessions", *sessions, *LONG, "--conditions", conditions, "--out", out]
+    grid = [*sessions, *LONG, "--conditions", conditions, "--out", out]
     running = compare(*grid, "--scheduler", scheduler)
     await_that(lambda: training_under_way(out), running)
     os.kill(training_under_way(out)[0]["pid"], signal.SIGKILL)
@@ -130,7 +130,6 @@ def test_a_grid_survives_a_killed_worker_and_is_not_made_twice(sessions, schedul
 def test_ctrl_c_saves_a_training_and_the_same_command_goes_on(sessions, compare, tmp_path):
     out = tmp_path / "out"
     grid = [
-        "--sessions",
         sessions[0],
         "--methods",
         "3dgs",
@@ -165,7 +164,7 @@ def test_a_scheduler_that_dies_is_one_sentence_and_the_same_command_goes_on(sess
     scheduler = subprocess.Popen([*module, "--scheduler-file", str(file)], **quiet)
     await_that(file.exists, scheduler)
     address = json.loads(file.read_text())["address"]
-    running = compare("--sessions", sessions[0], *LONG, "--out", out, "--scheduler", address)
+    running = compare(sessions[0], *LONG, "--out", out, "--scheduler", address)
     await_that(lambda: (out / "work").is_dir(), running)  # no worker takes its cells
     scheduler.kill()
     scheduler.wait()
@@ -194,9 +193,7 @@ def test_a_cell_that_the_memory_does_not_hold_is_refused():
 
 
 def test_the_command_refuses_to_compare_no_method(sessions, tmp_path):
-    done = call(
-        "ground", "compare", "--sessions", str(sessions[0]), "--methods", " ,", "--out", str(tmp_path / "out")
-    )
+    done = call("ground", "compare", str(sessions[0]), "--methods", " ,", "--out", str(tmp_path / "out"))
     assert done.returncode == 1 and "no method is named" in done.stderr and not (tmp_path / "out").exists()
 
 

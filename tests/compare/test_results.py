@@ -270,6 +270,6 @@ def test_figures_of_photographs_are_written_without_a_true_surface(without_truth
 
 
 def test_the_command_says_what_is_wrong_with_its_arguments(tmp_path):
-    arguments = ["compare", "--sessions", str(tmp_path / "no"), "--out", str(tmp_path)]
+    arguments = ["compare", str(tmp_path / "no"), "--out", str(tmp_path)]
     done = call("ground", *arguments)
     assert done.returncode == 1 and "is not a session" in done.stderr and "Traceback" not in done.stderr

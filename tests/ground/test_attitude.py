@@ -67,8 +67,8 @@ def tumbling_session(folder: Path) -> Session:
 def test_commands_that_cannot_find_an_attitude_say_who_can(tmp_path):
     folder = tumbling_session(tmp_path / "session").path
     for command in (
-        ["compare", "--sessions", str(folder), "--methods", "black", "--out", str(tmp_path / "c")],
-        ["export", "--session", str(folder), "--out", str(tmp_path / "e")],
+        ["compare", str(folder), "--methods", "black", "--out", str(tmp_path / "c")],
+        ["export", str(folder), "--out", str(tmp_path / "e")],
     ):
         done = CliRunner().invoke(cli.app, command, env={"COLUMNS": "200"})
         assert done.exit_code == 1, done.output

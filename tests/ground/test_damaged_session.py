@@ -151,7 +151,7 @@ def test_ground_list_says_what_is_damaged(session, tmp_path):
     log = TelemetryLog(session)
     for number in range(3):
         log.add(APID_EVENTS, DICTIONARY.events["stopped"].pack(utc_ns=number))
-    assert listed("--check") == []
+    assert listed("--pictures") == []
     flip(session / "frames.jsonl", 2400)
     flip(session / "session.json", 800)
     flip(session / "events.jsonl", 400)
@@ -160,7 +160,7 @@ def test_ground_list_says_what_is_damaged(session, tmp_path):
     assert "session.json or its copy was damaged" in header
     assert "frames.jsonl: has 1 damaged lines" in frames and "1 frames stand in its copy only" in frames
     assert events.startswith("events.jsonl has 1 damaged lines (line 1:")
-    assert listed("--check") == [header, frames, events, "frames/000003.png is damaged"]
+    assert listed("--pictures") == [header, frames, events, "frames/000003.png is damaged"]
 
 
 def test_a_log_that_lost_its_last_lines_is_told(session, small_mission, caplog):

@@ -268,7 +268,7 @@ def test_a_mesh_that_is_made_again_takes_the_place_of_what_was_said_of_the_old_o
     metrics["completeness_mesh"] = 12.5
     (run / "metrics.json").write_text(json.dumps(metrics))
     (run / "model.glb").unlink()
-    done = call("ground", "mesh", "--session", str(tmp_path / "s"))
+    done = call("ground", "mesh", str(tmp_path / "s"))
     assert done.returncode == 0, done.stderr
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["missing_outputs"] == {"model.onnx": "torn"}

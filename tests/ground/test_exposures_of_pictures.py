@@ -382,7 +382,7 @@ def test_every_command_of_the_page_does_what_the_page_says(data, monkeypatch):
     assert len(commands) == 7
     monkeypatch.chdir(data)
     for tool, *arguments in commands:
-        quick = ["--steps", "20", "--no-blind-reference"] if arguments[0] == "reconstruct" else []
+        quick = ["--set", "steps=20"] if arguments[0] == "reconstruct" else []
         done = call(tool, *arguments, *quick)
         assert done.returncode == 0, done.stderr
     expected = {"photographed": 30, "with-colmap": 30, "with-fits": 30, "with-masks": 10, "with-orbits": 30}

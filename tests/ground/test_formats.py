@@ -613,12 +613,10 @@ def test_the_commands_import_and_export(tmp_path):
         "--json",
     )
     assert json.loads(done.stdout)["frames"] == 6
-    done = call(
-        "ground", "export", "--session", str(tmp_path / "s"), "--out", str(tmp_path / "out"), "--json"
-    )
+    done = call("ground", "export", str(tmp_path / "s"), "--out", str(tmp_path / "out"), "--json")
     assert sum(json.loads(done.stdout).values()) == 6
     for out, told in ((tmp_path / "s", "is a session"), (tmp_path / "s" / "session.json", "is a file")):
-        refused = call("ground", "export", "--session", str(tmp_path / "s"), "--out", str(out))
+        refused = call("ground", "export", str(tmp_path / "s"), "--out", str(out))
         assert refused.returncode == 1 and told in " ".join(refused.stderr.split())
     assert not (tmp_path / "s" / "train").exists()
     wrong = call(

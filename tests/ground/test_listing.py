@@ -87,7 +87,7 @@ def test_comparing_runs_names_exactly_the_settings_that_differ(passes, tmp_path)
         (("compare-runs", "{runs}/..", "{runs}/first"), "give the folder of one, such as SESSION/runs/run"),
         (("compare-runs", "{runs}/fourth", "{runs}/first"), "config.yaml cannot be read"),
         (
-            ("report", "--session", "{runs}/..", "--name", "fifth"),
+            ("report", "{runs}/fifth"),
             "config.yaml should hold the settings of a run",
         ),
     ],

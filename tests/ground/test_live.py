@@ -338,7 +338,7 @@ def test_a_key_that_cannot_be_read_is_said_before_anything_is_trained(tmp_path):
 def test_a_training_that_fails_by_itself_is_not_started_again_and_its_message_is_shown(tmp_path):
     (tmp_path / "runs" / "live").mkdir(parents=True)  # not ours to replace
     said: list[str] = []
-    options = ["--session", str(tmp_path), "--threads", "1"]
+    options = ["--session", str(tmp_path)]
     with LiveProcess(tmp_path, tmp_path / "runs" / "live", options, said.append) as training:
         with pytest.raises(TrainingFailed, match="exists and is not a finished run, so it is not replaced"):
             training.finish(lambda: False, lambda facts: None)

@@ -192,7 +192,7 @@ def test_times_of_headers_are_of_the_beginning_unless_they_say_otherwise(tmp_pat
 
 
 def test_an_export_of_a_session_comes_back(imported, tmp_path):
-    done = ground("export", "--session", imported, "--format", "ndm", "--out", tmp_path / "out")
+    done = ground("export", imported, "--format", "ndm", "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
     files = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
     assert set(files) == {"target.aem", "chaser.oem", "chaser.aem", "camera.yaml"}

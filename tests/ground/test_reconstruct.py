@@ -181,16 +181,16 @@ def test_a_checkpoint_that_another_version_saved_outlives_interrupted_runs(tmp_p
 
 def test_budget_and_quality_shape_the_training_and_nonsense_is_refused():
     standard = PRESETS["obbgs"]
-    assert changes_for("obbgs", "standard", "auto", None)["steps"] == standard.steps
-    draft = changes_for("obbgs", "draft", "auto", None)
+    assert changes_for("obbgs", "standard", "auto")["steps"] == standard.steps
+    draft = changes_for("obbgs", "draft", "auto")
     assert draft["steps"] < standard.steps / 3 and draft["growth.interval"] < standard.growth.interval
-    assert changes_for("obbgs", "draft", "900", None)["start.count"] == 900
-    tight = changes_for("obbgs", "best", "900", 50)
-    assert tight["growth.max_gaussians"] == tight["start.count"] == 900 and tight["steps"] == 50
+    assert changes_for("obbgs", "draft", "900")["start.count"] == 900
+    tight = changes_for("obbgs", "best", "900")
+    assert tight["growth.max_gaussians"] == tight["start.count"] == 900
     with pytest.raises(ValueError, match="--budget must be auto or a number"):
-        changes_for("obbgs", "standard", "many", None)
+        changes_for("obbgs", "standard", "many")
     with pytest.raises(ValueError, match="quality must be one of"):
-        changes_for("obbgs", "perfect", "auto", None)
+        changes_for("obbgs", "perfect", "auto")
 
 
 def test_truth_is_never_read_in_training(trained, tmp_path):
@@ -306,9 +306,9 @@ def test_the_command_says_what_is_wrong_in_one_line(
 
 def test_the_commands_print_json(trained):
     session, metrics = trained
-    result = CliRunner().invoke(cli.app, ["evaluate", "--session", str(session), "--json"])
+    result = CliRunner().invoke(cli.app, ["evaluate", str(session), "--json"])
     assert result.exit_code == 0 and json.loads(result.stdout)["gaussians"] == metrics["gaussians"]
-    result = CliRunner().invoke(cli.app, ["report", "--session", str(session), "--json"])
+    result = CliRunner().invoke(cli.app, ["report", str(session / "runs" / "run"), "--json"])
     assert Path(json.loads(result.stdout)["report"]).exists()
 
 

@@ -170,7 +170,7 @@ def test_pictures_of_the_documents_are_of_the_scored_poses(refined, tmp_path):
 def test_an_exported_run_has_the_poses_that_go_with_its_model_and_all_readings(refined, tmp_path):
     """Its model shows the frames of the imported session as well as those that it was made of."""
     out, again = tmp_path / "out", tmp_path / "again"
-    assert called("export", "--session", refined, "--run", "run", "--format", "colmap", "--out", out) == {
+    assert called("export", refined / "runs" / "run", "--format", "colmap", "--out", out) == {
         "train": 3 * BRACKETS - HELD_OUT,
         "val": 0,
         "test": HELD_OUT,
@@ -203,7 +203,7 @@ def test_frames_that_a_run_left_out_are_not_exported(refined, tmp_path):
     fewer = {name: [getattr(estimate, name)[i] for i in kept] for name in ("frame_ids", "brackets")}
     poses = {name: getattr(estimate, name)[3:] for name in ("tagged", "estimated")}
     write_estimate(path.parent, dataclasses.replace(estimate, **fewer, **poses))
-    counts = called("export", "--session", session, "--run", "run", "--out", tmp_path / "out")
+    counts = called("export", session / "runs" / "run", "--out", tmp_path / "out")
     assert counts == {"train": 3 * BRACKETS - HELD_OUT - 3, "val": 0, "test": HELD_OUT}
     assert not (tmp_path / "out" / "transforms_val.json").exists()  # of no frames
 
@@ -215,10 +215,10 @@ def test_a_run_that_is_exported_imported_and_trained_again_is_the_same(tmp_path)
         tmp_path / "session",
         tmp_path / "again",
     )
-    called("export", "--session", made, "--out", tmp_path / "a")
+    called("export", made, "--out", tmp_path / "a")
     called("import", "--format", "nerf", "--from", tmp_path / "a", "--session", session, "--poses", "stated")
     reconstruct(session, "run", "obbgs", STEPS)
-    called("export", "--session", session, "--run", "run", "--format", "nerfstudio", "--out", tmp_path / "b")
+    called("export", session / "runs" / "run", "--format", "nerfstudio", "--out", tmp_path / "b")
     called(
         "import", "--format", "nerfstudio", "--from", tmp_path / "b", "--session", again, "--poses", "stated"
     )

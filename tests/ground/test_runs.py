@@ -93,7 +93,7 @@ def test_the_mesh_of_a_finished_run_is_written_in_the_format_asked_for(session, 
     metrics = json.loads((copy.parent / "metrics.json").read_text())
     # as an older version wrote them
     (copy.parent / "metrics.json").write_text(json.dumps(metrics | {"mesh_triangles": 12}))
-    done = CliRunner().invoke(cli.app, ["mesh", "--session", str(session), "--format", format_, "--json"])
+    done = CliRunner().invoke(cli.app, ["mesh", str(session), "--format", format_, "--json"])
     assert done.exit_code == 0, done.output
     facts = json.loads(done.stdout)
     kept = json.loads((copy.parent / "metrics.json").read_text())
@@ -110,7 +110,7 @@ def test_the_mesh_of_a_finished_run_is_written_in_the_format_asked_for(session, 
 
 def test_the_command_trains_and_ends_well_where_the_model_is_too_large_for_onnx(session, monkeypatch):
     monkeypatch.setattr("obbgs_core.io.onnx.MAX_PROTOBUF_BYTES", 1000)
-    arguments = ["reconstruct", "--session", str(session), "--steps", "5"]
+    arguments = ["reconstruct", "--session", str(session), "--set", "steps=5"]
     done = CliRunner().invoke(cli.app, arguments, env={"COLUMNS": "200"})
     assert done.exit_code == 0, done.output
     assert "not made: model.onnx" in done.stdout and "train with a smaller budget" in done.stdout
@@ -230,11 +230,8 @@ def test_a_finished_run_is_replaced_only_when_asked_for(finished, tmp_path):
 
 def test_runs_go_to_another_folder_and_are_scored_there(session, tmp_path):
     out = tmp_path / "elsewhere" / "runs"
-    more = ["--session", str(session), "--out", str(out), "--name", "a", "--json"]
-    for command in (["reconstruct", "--steps", "5"], ["evaluate"], ["report"]):
-        done = CliRunner().invoke(cli.app, [*command, *more])
-        assert done.exit_code == 0, done.output
-        json.loads(done.stdout)
+    reconstruct(session, "a", "obbgs", QUICK, out=out)
+    assert evaluate(session, "a", out)["gaussians"] > 0 and write_report(session, "a", out).is_file()
     assert (out / "a" / "report.html").exists() and not (session / "runs").exists()
     header = json.loads((session / "session.json").read_text())
     (session / "session.json").write_text(json.dumps(header | {"created_utc": "2030-01-01T00:00:00Z"}))
@@ -293,15 +290,13 @@ def test_a_run_that_another_process_has_just_finished_is_not_replaced(session, m
     assert [path.name for path in (session / "runs").iterdir()] == ["run"]
 
 
-def test_a_folder_that_cannot_be_written_to_is_named(finished, tmp_path, monkeypatch, capsys):
+def test_a_folder_that_cannot_be_written_to_is_named(finished, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file" / "runs", Path("/proc/runs")):
-        arguments = ["ground", "reconstruct", "--session", str(finished), "--out", str(out)]
-        monkeypatch.setattr("sys.argv", arguments)
-        with pytest.raises(SystemExit) as exit_info:
-            cli.main()
-        assert exit_info.value.code == 1
-        assert f"cannot write to {out}: " in (said := capsys.readouterr().err) and "--out DIR" in said
+        with pytest.raises(
+            SessionError, match=f"cannot write to {out}: .*; make it writable, or copy the session"
+        ):
+            reconstruct(finished, out=out)
 
     def read_only(*arguments):
         raise OSError(30, "Read-only file system")
@@ -309,7 +304,9 @@ def test_a_folder_that_cannot_be_written_to_is_named(finished, tmp_path, monkeyp
     monkeypatch.setattr("ground.run.evaluate.write_whole", read_only)
     monkeypatch.setattr("ground.show.report.document.write_whole", read_only)
     for score in (evaluate, write_report):
-        with pytest.raises(SessionError, match=r"cannot write to .*: Read-only file system; use --out DIR"):
+        with pytest.raises(
+            SessionError, match=r"cannot write to .*: Read-only file system; make it writable"
+        ):
             score(finished, "run")
 
 
@@ -349,7 +346,7 @@ def test_a_mission_file_says_how_to_train_and_the_command_line_says_otherwise(se
     assert told["method"]["start"]["count"] == 300 and told["method"]["parsimony"]["prune_at"] == [0.5]
     hash(load_mission(path))  # flight plans with it as a key
     more = ["--set", "start.count=200", "--set", "light.sun_shading=linear", "--set", "rates.means=1e-3"]
-    other = resolved("other", "--method", "obbgs", "--seed", "3", "--steps", "4", *more)
+    other = resolved("other", "--method", "obbgs", "--seed", "3", "--set", "steps=4", *more)
     assert (other["method"]["name"], other["seed"], other["method"]["steps"]) == ("obbgs", 3, 4)
     assert other["method"]["start"]["count"] == 200 and other["method"]["light"]["sun_shading"] == "linear"
     assert other["method"]["rates"]["means"] == 1e-3 and other["method"]["growth"]["max_gaussians"] == 300
@@ -400,10 +397,10 @@ def test_the_choices_of_the_commands_are_those_of_the_library_and_the_dictionary
 @pytest.mark.parametrize(
     ("command", "work"),
     [
-        (["evaluate", "--session", "s"], "ground.run.evaluate.evaluate"),
-        (["report", "--session", "s"], "ground.show.report.document.write_report"),
+        (["evaluate", "s"], "ground.run.runs.run_at"),
+        (["report", "s"], "ground.run.runs.run_at"),
         (["import", "--format", "nerf", "--from", "d", "--session", "s"], "ground.formats.nerf.read_nerf"),
-        (["export", "--session", "s", "--out", "d"], "ground.session.folder.open_session"),
+        (["export", "s", "--out", "d"], "ground.session.folder.open_session"),
     ],
 )
 def test_an_interrupted_command_ends_with_one_line_and_exit_code_1(monkeypatch, capsys, command, work):
@@ -449,12 +446,12 @@ def test_the_methods_of_a_mission_file_are_those_of_the_ground():
             r"--set published\.sh_degree: is given twice",
         ),
         (["parsimony.prune_at=[0.5"], r"--set parsimony\.prune_at: is not valid YAML"),
-        (["steps=5"], "--set steps: is given by --steps too"),
+        (["growth.max_gaussians=5"], r"--set growth\.max_gaussians: is given by --budget too"),
     ],
 )
 def test_a_setting_that_is_not_there_or_of_the_wrong_kind_is_named(assignments, message):
     with pytest.raises(ConfigError, match=message):
-        all_changes(ReconstructSection(), "obbgs", None, "auto", 4, assignments)
+        all_changes(ReconstructSection(), "obbgs", None, "900", assignments)
 
 
 def test_settings_have_the_types_that_the_method_wants():
@@ -470,8 +467,11 @@ def test_settings_have_the_types_that_the_method_wants():
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_the_training_and_the_same_command_goes_on(session, number):
     command = [sys.executable, "-m", "ground.cli", "reconstruct", "--session", str(session)]
-    command += ["--steps", "100000", "--threads", "1"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    command += ["--set", "steps=100000"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+    )
     assert process.stderr is not None
     lines = []
     while "step 1 of 100000" not in (lines or [""])[-1]:
@@ -517,7 +517,7 @@ def test_an_interruption_after_the_training_says_that_the_run_is_there(session, 
         os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr("ground.run.evaluate.evaluate", interrupted)
-    done = CliRunner().invoke(cli.app, ["reconstruct", "--session", str(session), "--steps", "3"])
+    done = CliRunner().invoke(cli.app, ["reconstruct", "--session", str(session), "--set", "steps=3"])
     assert isinstance(done.exception, Interrupted)
     assert "the run is finished in" in str(done.exception) and "`ground evaluate`" in str(done.exception)
     assert (session / "runs" / "run" / "model.ply").exists()
@@ -538,9 +538,9 @@ def test_a_training_without_a_terminal_says_every_so_often_how_far_it_is(monkeyp
 
 
 def test_the_result_is_a_table_with_units_and_json_as_ever(finished):
-    session = ["--session", str(finished)]
-    shown = CliRunner().invoke(cli.app, ["evaluate", *session], env={"COLUMNS": "120"}).stdout
-    figures = json.loads(CliRunner().invoke(cli.app, ["evaluate", *session, "--json"]).stdout)
+    run = str(finished / "runs" / "run")
+    shown = CliRunner().invoke(cli.app, ["evaluate", run], env={"COLUMNS": "120"}).stdout
+    figures = json.loads(CliRunner().invoke(cli.app, ["evaluate", run, "--json"]).stdout)
     assert f"{figures['psnr_clean_db']:.2f} dB" in shown
     assert "48 received / unknown captured, 42 trained on, 6 held out" in shown
     assert f"{figures['train_seconds']:.0f} s; all 8 steps done" in shown and "MB" in shown

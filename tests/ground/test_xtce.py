@@ -191,7 +191,7 @@ def test_a_damaged_dictionary_gives_a_document_that_others_read_or_an_error_that
 
 def test_the_command_writes_the_document(tmp_path):
     file = tmp_path / "obbgs.xml"
-    result = CliRunner().invoke(app, ["dictionary", "--xtce", str(file)])
+    result = CliRunner().invoke(app, ["dictionary", "--out", str(file)])
     assert result.exit_code == 0, result.output
     assert file.read_bytes() == xtce_document()
     assert f"{len(DICTIONARY.commands)} commands" in result.output
@@ -203,7 +203,7 @@ def test_a_damaged_dictionary_ends_the_command_with_one_line(tmp_path):
         "import pathlib, sys, flightsw.icd.config as config\n"
         "read = pathlib.Path.read_bytes\n"
         "pathlib.Path.read_bytes = lambda p: b'version: [' if p.name == 'dictionary.yaml' else read(p)\n"
-        f"sys.argv = ['ground', 'dictionary', '--xtce', {str(tmp_path / 'x.xml')!r}]\n"
+        f"sys.argv = ['ground', 'dictionary', '--out', {str(tmp_path / 'x.xml')!r}]\n"
         "import ground.cli\n"
         "ground.cli.main()\n"
     )

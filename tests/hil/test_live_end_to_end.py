@@ -71,8 +71,6 @@ def test_a_model_while_the_frames_arrive_goes_up_by_itself_and_outlives_kills(tm
             session,
             "--mission",
             mission,
-            "--threads",
-            "1",
         )
         live += ("--triage", "--key", key, "--exit-after", len(shot), "--json")
         flight, ground = tools.start("flightsw", *downlink), tools.start("ground", *live)

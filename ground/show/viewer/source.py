@@ -7,6 +7,7 @@ from pathlib import Path
 from ground.run import attitude
 from ground.run.attitude import FoundAttitude
 from ground.run.estimated_poses import as_estimated, read_estimate, settled_records
+from ground.run.runs import is_session, newest_run, session_of
 from ground.session.cameras import sensor_of
 from ground.session.folder import FrameRecord, Session, SessionError, open_session
 from ground.session.training_frames import training_frame
@@ -15,7 +16,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.sensor import Sensor
 
-HEADER, MODEL, MESH = "session.json", "model.ply", "model.glb"
+MODEL, MESH = "model.ply", "model.glb"
 FileStamp = tuple[int, int, int]  # number, time and size of a file
 Stamp = tuple[FileStamp, FileStamp | None]  # of a model, and of its mesh where there is one
 
@@ -67,7 +68,7 @@ class Source:
 
     def __init__(self, path: Path):
         self.session_path = session_of(path)
-        self.folder = newest_run(path) if (path / HEADER).is_file() else path
+        self.folder = newest_run(path) if is_session(path) else path
         self._read: Stamp | None = None
 
     @property
@@ -124,14 +125,6 @@ class Source:
         return None if model is None else (model, mesh)
 
 
-def newest_run(session: Path) -> Path | None:
-    """Return the folder of a session's run whose model was renewed last; None where no run has a model."""
-    models = {
-        path: _renewed_ns(path) for path in session.glob(f"runs/*/{MODEL}") if path.parent.name[0] != "."
-    }
-    return max(models, key=lambda path: models[path]).parent if models else None
-
-
 def _file_stamp(path: Path) -> FileStamp | None:
     """Return what changes when a file is replaced whole; None where there is none."""
     try:
@@ -139,33 +132,3 @@ def _file_stamp(path: Path) -> FileStamp | None:
     except OSError:
         return None
     return status.st_ino, status.st_mtime_ns, status.st_size
-
-
-def _renewed_ns(path: Path) -> int:
-    """Return when a file was renewed; 0 where it has been removed meanwhile."""
-    try:
-        return path.stat().st_mtime_ns
-    except OSError:
-        return 0
-
-
-def session_of(path: Path) -> Path:
-    """Return the session that a path names, or in which the run lies, or will lie, that it names.
-
-    Raises:
-        SessionError: it names neither.
-    """
-    if (path / HEADER).is_file():
-        return path
-    run = path.resolve()
-    session = run.parent.parent
-    if (session / HEADER).is_file() and (run.parent.name == "runs" or (run / MODEL).is_file()):
-        return session
-    if (run / MODEL).is_file():
-        raise SessionError(
-            f"{path} does not lie in runs/ of a session, whose frames and camera the viewer needs"
-        )
-    raise SessionError(
-        f"{path} is neither a session ({HEADER}) nor a run in runs/ of one; a session begins with `ground listen`, "
-        "`ground live` or `ground import`"
-    )
