@@ -41,12 +41,13 @@ def compare_command(
         typer.Option(help="A YAML file of stability conditions; default: frames as they were taken."),
     ] = None,
     weights: Annotated[Path | None, typer.Option(help="The file of weights that mvsnet needs.")] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(help="A dask scheduler, such as tls://10.0.0.1:8786; default: processes of its own."),
-    ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes of its own, of one thread each; default: one a core.")
+        str | None,
+        typer.Option(
+            metavar="N|URL",
+            help="Processes at a time; default: one a core, of one thread each. Or the URL of a dask scheduler, such "
+            "as tls://10.0.0.1:8786.",
+        ),
     ] = None,
     json_: AsJson = False,
 ) -> None:
@@ -76,7 +77,7 @@ def compare_command(
         cells = cells_of(facts, names, seeds, shares, chosen, weights)
         with _shown(stderr) as on_state:
             command = this_command("ground")
-            summary = run_grid(cells, out, command, scheduler, workers, on_state, lambda: stop.requested)
+            summary = run_grid(cells, out, command, *_where(workers), on_state, lambda: stop.requested)
         asked = {cell.digest: (cell.session.name, cell.condition_name) for cell in cells}
         page, figures = write_page(out, asked), write_figures(out, asked)
     for label, reason in summary.failed.items():
@@ -89,6 +90,17 @@ def compare_command(
         print(f"page: {page}, and {len(figures)} figures beside it")
     if summary.failed:
         raise typer.Exit(1)
+
+
+def _where(workers: str | None) -> tuple[str | None, int | None]:
+    """Return the dask scheduler and the number of processes that --workers asks for, one of them or none."""
+    if workers is not None and "://" in workers:
+        return workers, None
+    if workers is not None and not (workers.isascii() and workers.isdigit() and int(workers) > 0):
+        raise ValueError(
+            f"--workers: expected a number of at least 1 or a URL such as tls://10.0.0.1:8786, got {workers!r}"
+        )
+    return None, None if workers is None else int(workers)
 
 
 @contextlib.contextmanager

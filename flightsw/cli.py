@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import logging
-import math
 import signal
 import threading
 from collections.abc import Sequence
@@ -22,7 +21,18 @@ from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import BracketSection, Mission, load_mission
 from flightsw.run import RunResult, run_pass
 from flightsw.sequencer import plan
-from obbgs_base.command_line import new_app, run
+from obbgs_base.command_line import (
+    BRACKET_HELP,
+    CAMERA_HELP,
+    KEY_HELP,
+    LINK_HELP,
+    MISSION_HELP,
+    OUT_HELP,
+    START_HELP,
+    AsJson,
+    new_app,
+    run,
+)
 from obbgs_base.output import output_may_fail
 
 log = logging.getLogger(__name__)
@@ -32,46 +42,30 @@ app.add_typer(mission_app, name="mission", help="Make a mission file.")
 stderr = Console(stderr=True)
 START_NOW_S = 2.0  # from the command to the first trigger of --start now: a camera takes a second to open
 
-MissionFile = Annotated[Path, typer.Option("--mission", help="The mission file, the same as on the ground.")]
+MissionFile = Annotated[Path, typer.Option("--mission", help=f"{MISSION_HELP}.")]
 StoreDir = Annotated[Path, typer.Option("--store", help="The folder of the frame store.")]
 BracketMs = Annotated[
     str | None,
-    typer.Option(
-        "--bracket", help="Exposure times in ms, such as 0.05,0.1,0.2, or auto; default: the mission's."
-    ),
+    typer.Option("--bracket", help=f"{BRACKET_HELP}; auto: chosen by what was seen. Default: the mission's."),
 ]
 Count = Annotated[int | None, typer.Option(help="Number of brackets; default: the mission's.")]
-Duration = Annotated[
-    float | None,
-    typer.Option("--for", help="Take brackets for so many seconds; instead of --count.", min=0.0),
-]
 Start = Annotated[
     str | None,
-    typer.Option(help="First trigger: now, or UTC as 2026-07-21T10:52:30Z; default: the mission's."),
-]
-Interval = Annotated[
-    float | None, typer.Option(help="Seconds from one trigger to the next; default: the mission's.")
+    typer.Option(help=f"{START_HELP}; or now. Default: the mission's."),
 ]
 CameraUrl = Annotated[
     str,
-    typer.Option(
-        "--camera",
-        help="gige://ID (or its IP address), or the scheme of an installed driver (none comes for V4L2); simulated: "
-        "hil:///path/to/socket or hil://host:port.",
-    ),
+    typer.Option("--camera", help=f"{CAMERA_HELP}."),
 ]
-LinkUrl = Annotated[
-    str, typer.Option("--link", help="The link's URL, such as serial:///dev/ttyUSB0?baud=921600.")
-]
+LinkUrl = Annotated[str, typer.Option("--link", help=f"{LINK_HELP}.")]
 KeyFiles = Annotated[
     list[Path] | None,
     typer.Option(
         "--key",
-        help="The file of a key; can be repeated, for the key that takes the other's place. Without a usable one every "
+        help=f"{KEY_HELP}; can be repeated, for the key that takes the other's place. Without a usable one every "
         "command is refused.",
     ),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 @app.command("capture")
@@ -79,13 +73,11 @@ def capture_command(
     camera: CameraUrl,
     bracket: BracketMs = None,
     count: Count = None,
-    interval: Interval = None,
-    duration: Duration = None,
     start: Start = None,
     mission: MissionFile = Path("mission.yaml"),
     store: StoreDir = Path("store"),
     link: Annotated[
-        str | None, typer.Option(help="Send the frames over this link too, until all are confirmed.")
+        str | None, typer.Option(help=f"{LINK_HELP}: send the frames over it too, until all are confirmed.")
     ] = None,
     json_: AsJson = False,
 ) -> None:
@@ -96,7 +88,7 @@ def capture_command(
 
     Example: flightsw capture --bracket 0.05,0.1,0.2 --count 40 --camera hil:///tmp/camera.sock --store store
     """
-    plan_of = with_bracket(load_mission(mission), bracket, count, interval, duration, start)
+    plan_of = with_bracket(load_mission(mission), bracket, count, start)
     _run(plan_of, store, camera, link, exit_when_empty=True, as_json=json_)
 
 
@@ -114,7 +106,7 @@ def serve(
 
     Example: flightsw serve --camera gige://192.168.0.10 --link 'serial:///dev/ttyS1?baud=921600' --key mission.key
     """
-    plan_of = with_bracket(load_mission(mission), None, None, None, start=start)
+    plan_of = with_bracket(load_mission(mission), start=start)
     _run(plan_of, store, camera, link, exit_when_empty=False, as_json=json_, key_files=key or ())
 
 
@@ -123,7 +115,9 @@ def downlink(
     link: LinkUrl,
     mission: MissionFile = Path("mission.yaml"),
     store: StoreDir = Path("store"),
-    exit_when_empty: Annotated[bool, typer.Option(help="Stop when every frame is confirmed.")] = False,
+    exit_when_empty: Annotated[
+        bool, typer.Option("--exit-when-empty", help="Stop when every frame is confirmed.")
+    ] = False,
     key: KeyFiles = None,
     json_: AsJson = False,
 ) -> None:
@@ -137,25 +131,24 @@ def downlink(
 @app.command()
 def triage(
     model: Annotated[Path, typer.Option(help="The model, a run's model.onnx.")],
-    frames: Annotated[Path, typer.Option(help="A frame store, or a folder of frames as .obf files.")],
+    store: StoreDir = Path("store"),
     mission: MissionFile = Path("mission.yaml"),
-    top: Annotated[int, typer.Option(help="How many frames to print.")] = 20,
     json_: AsJson = False,
 ) -> None:
     """Rank stored frames by how badly the model predicts them and how new their view is, as the downlink would.
 
-    Example: flightsw triage --model model.onnx --frames store
+    Example: flightsw triage --model model.onnx --store store
     """
     from flightsw.triage import rank_frames  # only this command needs onnxruntime
 
     K = np.array(load_mission(mission).camera.K)
-    ranked, unreadable = rank_frames(model, frames, K)
+    ranked, unreadable = rank_frames(model, store, K)
     if json_:
         rows = [{**vars(r), "path": str(r.path)} for r in ranked]
         print(json.dumps({"ranked": rows, "unreadable": unreadable}))
         return
     print("rank  frame  worst tile chi²  mean chi²  tile (row, column)")
-    for place, r in enumerate(ranked[:top], start=1):
+    for place, r in enumerate(ranked, start=1):
         print(
             f"{place:4d}  {r.frame_id:5d}  {r.worst_chi2:15.2f}  {r.mean_chi2:9.3f}  "
             f"({r.tile_row_px}, {r.tile_column_px})"
@@ -210,45 +203,41 @@ def plan_command(mission: MissionFile = Path("mission.yaml"), json_: AsJson = Fa
 def service_command(
     camera: CameraUrl,
     link: LinkUrl,
-    mission: MissionFile = Path("/etc/obbgs/mission.yaml"),
-    key: Annotated[
-        Path | None, typer.Option(help="Where the key will lie; default: mission.key in /var/lib/obbgs.")
-    ] = None,
-    user: Annotated[str, typer.Option(help="The user that it runs as; it is not made here.")] = "obbgs",
+    json_: AsJson = False,
 ) -> None:
-    """Print the systemd unit that runs `flightsw serve` of this installation as a user of its own.
+    """Print the systemd unit that runs `flightsw serve` of this installation as a user of its own, obbgs.
 
-    Frames are kept in /var/lib/obbgs/store. The unit's first lines say how to make the user and where to put the unit.
+    Its mission file is /etc/obbgs/mission.yaml; frames are kept in /var/lib/obbgs/store, the key in mission.key beside
+    it. The unit's first lines say how to make
+    the user and where to put the unit.
 
     Example: flightsw service --camera gige://192.168.0.10 --link 'can://can0?fd=true' > obbgs-flight.service
     """
     from flightsw.service import unit
 
-    print(unit(camera, link, mission, key, user), end="")
+    text = unit(camera, link)
+    print(json.dumps({"unit": text}) if json_ else text, end="\n" if json_ else "")
 
 
 @mission_app.command("new")
 def mission_new(
-    out: Annotated[
-        Path, typer.Argument(help="The mission file to write; one that is there is not replaced.")
-    ],
+    out: Annotated[Path, typer.Option(help=f"{OUT_HELP}; a file that is there is not replaced.")],
     target_tle: Annotated[
         Path, typer.Option(help="A file with the target's two-line elements, or an OMM of CCSDS.")
     ],
     chaser_tle: Annotated[Path, typer.Option(help="The same of the spacecraft with the camera.")],
     target_size: Annotated[float, typer.Option(help="The target's largest dimension, m.")],
-    picture: Annotated[str, typer.Option(help="Width and height of the picture, px.")] = "1024x1024",
+    picture: Annotated[
+        str, typer.Option(help="Width and height of the picture, px; 1024x768x3: in colour.")
+    ] = "1024x1024",
     focal_length: Annotated[float, typer.Option(help="Of the lens, mm.")] = 100.0,
     pixel_pitch: Annotated[float, typer.Option(help="From one pixel to the next, micrometres.")] = 5.5,
-    colour: Annotated[bool, typer.Option("--colour", help="The camera takes colour.")] = False,
-    start: Annotated[
-        str | None,
-        typer.Option(help="First trigger, UTC as 2026-07-21T10:52:30Z; default: an hour from now."),
-    ] = None,
+    start: Annotated[str | None, typer.Option(help=f"{START_HELP}; default: an hour from now.")] = None,
+    json_: AsJson = False,
 ) -> None:
     """Write a mission file, commented as the example is; then look at it with plan, and calibrate the camera.
 
-    Example: flightsw mission new mission.yaml --target-tle target.tle --chaser-tle chaser.tle --target-size 6
+    Example: flightsw mission new --out mission.yaml --target-tle target.tle --chaser-tle chaser.tle --target-size 6
     """
     from flightsw.new_mission import write_mission
 
@@ -260,16 +249,20 @@ def mission_new(
         picture,
         focal_length,
         pixel_pitch,
-        3 if colour else 1,
         start,
     )
+    if json_:
+        print(json.dumps({"mission": str(out)}))
+        return
     print(f"wrote {out}; next: flightsw plan --mission {out}, and the calibrated figures of the camera")
 
 
 @app.command()
 def selftest(
-    camera: Annotated[str | None, typer.Option("--camera", help="Take one bracket with this camera.")] = None,
-    link: Annotated[str | None, typer.Option("--link", help="Open this link and send packets.")] = None,
+    camera: Annotated[str | None, typer.Option("--camera", help=f"{CAMERA_HELP}: takes one bracket.")] = None,
+    link: Annotated[
+        str | None, typer.Option("--link", help=f"{LINK_HELP}: is opened, and packets are sent.")
+    ] = None,
     loopback: Annotated[
         bool,
         typer.Option(
@@ -280,7 +273,8 @@ def selftest(
     mission: MissionFile = Path("mission.yaml"),
     store: StoreDir = Path("store"),
     key: Annotated[
-        list[Path] | None, typer.Option("--key", help="Check this key and its counter; can be repeated.")
+        list[Path] | None,
+        typer.Option("--key", help=f"{KEY_HELP}: is checked with its counter; can be repeated."),
     ] = None,
     json_: AsJson = False,
 ) -> None:
@@ -332,10 +326,8 @@ def fsck_command(
 
 def with_bracket(
     mission: Mission,
-    bracket: str | None,
-    count: int | None,
-    interval: float | None,
-    duration: float | None = None,
+    bracket: str | None = None,
+    count: int | None = None,
     start: str | None = None,
 ) -> Mission:
     """Return the mission with the bracket section and the first trigger changed by the command line.
@@ -356,15 +348,6 @@ def with_bracket(
             ) from error
     if count is not None:
         changes["count"] = count
-    if interval is not None:
-        changes["interval_s"] = interval
-    if duration is not None:
-        if count is not None:
-            raise ConfigError("--for", "says how many brackets, as --count does; give one of them")
-        if not math.isfinite(duration):
-            raise ConfigError("--for", f"expected a time in seconds, got {duration:g}")
-        spacing_s = dataclasses.replace(mission.bracket, **changes).interval_s
-        changes["count"] = max(1, math.ceil(duration / spacing_s))
     section: BracketSection = dataclasses.replace(mission.bracket, **changes)
     orbit = mission.orbit
     if start is not None:

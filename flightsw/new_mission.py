@@ -25,7 +25,6 @@ def write_mission(
     picture: str,
     focal_length_mm: float,
     pixel_pitch_um: float,
-    channels: int,
     start_utc: str | None = None,
 ) -> None:
     """Write the example with these figures, after reading it as every part does.
@@ -33,17 +32,17 @@ def write_mission(
     Args:
         target_tle, chaser_tle: files with two lines, or three with a name, or with an OMM of CCSDS.
         target_size_m: largest dimension.
-        picture: width and height, px, as 1024x1024; the line of sight meets its middle.
-        channels: 1 or 3.
+        picture: width and height, px, as 1024x1024, or 1024x1024x3 in colour; the line of sight meets its middle.
         start_utc: ISO 8601; None: an hour from now.
 
     Raises:
         ConfigError: an option or an element is wrong, or `out` is there already or cannot be written.
     """
-    size = re.fullmatch(r"(\d{1,5})x(\d{1,5})", picture)
+    size = re.fullmatch(r"(\d{1,5})x(\d{1,5})(x[13])?", picture)
     if size is None:
         raise ConfigError(
-            "--picture", f"expected width and height in pixels, such as 1024x768, got {picture!r}"
+            "--picture",
+            f"expected width and height in pixels, such as 1024x768, or 1024x768x3 in colour, got {picture!r}",
         )
     for option, value in (
         ("--target-size", target_size_m),
@@ -52,7 +51,7 @@ def write_mission(
     ):
         if not (math.isfinite(value) and value > 0):
             raise ConfigError(option, f"must be positive, got {value:g}")
-    width, height = map(int, size.groups())
+    width, height = int(size[1]), int(size[2])
     focal_px = 1e3 * focal_length_mm / pixel_pitch_um
     field_deg = 2 * math.degrees(math.atan(width / 2 / focal_px))
     if start_utc is None:
@@ -71,7 +70,7 @@ def write_mission(
         ("fy_px", f"{focal_px:.1f}", ""),
         ("cx_px", f"{width / 2:g}", None),
         ("cy_px", f"{height / 2:g}", ""),
-        ("channels", str(channels), None),
+        ("channels", "3" if size[3] == "x3" else "1", None),
         ("target_extent_m", f"{target_size_m:g}", None),
     ):
         text = _set(text, key, value, remark)

@@ -9,10 +9,13 @@ from flightsw.icd.link_url import parse_link_url
 
 TEMPLATE = Path(__file__).with_name("obbgs-flight.service")
 STATE = Path("/var/lib/obbgs")
+MISSION = Path("/etc/obbgs/mission.yaml")
 HIDDEN = ("/home", "/root", "/run/user")  # from a service, by ProtectHome
 
 
-def unit(camera_url: str, link_url: str, mission: Path, key: Path | None, user: str) -> str:
+def unit(
+    camera_url: str, link_url: str, mission: Path = MISSION, key: Path | None = None, user: str = "obbgs"
+) -> str:
     """Return the text of the unit; its first lines say how to install it.
 
     Args:

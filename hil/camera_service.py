@@ -1,5 +1,6 @@
 """The simulated camera as a service: its frames rendered beforehand or when asked for, until it is stopped."""
 
+import json
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +27,7 @@ def serve_camera(
     prerender: bool,
     stop_event: Callable[[], threading.Event],
     console: Console,
+    as_json: bool = False,
 ) -> None:
     """Serve the world's camera until stopped; its URL goes to stdout, progress and counts to the console.
 
@@ -58,7 +60,7 @@ def serve_camera(
             else CameraServer(world.mission, farm.radiance, listen, 0, world.pose_at, real_time)
         )
         with serving as server:
-            print(server.url, flush=True)
+            print(json.dumps({"url": server.url}) if as_json else server.url, flush=True)
             while not stop.wait(1.0):
                 server.check()
             counts = f"{server.late_frames} late, {server.failures} failed"

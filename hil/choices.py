@@ -2,9 +2,21 @@
 
 from typing import Literal
 
-CameraKind = Literal["hil", "gige"]  # a socket of our own protocol, or GigE Vision on 127.0.0.1
 LinkKind = Literal["serial", "slcan", "slcan-fd"]  # a serial line, or a CAN or CAN FD bus with slcan adapters
-FaultKind = Literal["none", "standard"]  # standard: hil.links.faults.STANDARD_FAULTS and a cut in the middle
 SensorKind = Literal["paper", "spacecam"]  # hil.sky.sensor.PRESETS
 NavigationKind = Literal["realistic", "perfect"]  # with the errors of hil.world.navigation_errors, or exact
 NAVIGATION: NavigationKind = "realistic"  # unless something else is asked for
+
+
+def navigation_of(text: str) -> tuple[NavigationKind, int]:
+    """Return the kind and the seed of navigation errors that `realistic`, `realistic:SEED` or `perfect` names.
+
+    Raises:
+        ValueError: another text.
+    """
+    kind, colon, seed = text.partition(":")
+    if text == "perfect":
+        return "perfect", 1
+    if kind == "realistic" and (not colon or (seed.isascii() and seed.isdigit())):
+        return "realistic", int(seed or 1)
+    raise ValueError(f"--navigation: expected realistic, realistic:SEED or perfect, got {text!r}")

@@ -15,23 +15,21 @@ import typer
 from rich.console import Console
 from rich.progress import TaskID
 
-from flightsw.icd.frame import Attitude
 from flightsw.icd.mission import load_mission
-from hil.choices import NAVIGATION, CameraKind, FaultKind, LinkKind, NavigationKind, SensorKind
+from hil.choices import LinkKind, navigation_of
 from hil.sky import SHIPPED, SHIPPED_FOIL, Materials
-from obbgs_base.command_line import new_app, refuse_beside, run
+from obbgs_base.command_line import MISSION_HELP, OUT_HELP, SET_HELP, AsJson, new_app, run
 from obbgs_base.locks import one_command_in
 from obbgs_base.output import output_may_fail
 
 app = new_app("The simulated world: sky, target, camera and link, so that a pass runs on a desk.")
-MissionFile = Annotated[Path, typer.Option("--mission", help="The mission file.")]
+MissionFile = Annotated[Path, typer.Option("--mission", help=f"{MISSION_HELP}.")]
 Mesh = Annotated[
     Path,
     typer.Option(
         "--mesh", help="The target: GLB, OBJ or STL; default: the shipped spacecraft.", show_default=False
     ),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 ScenarioName = Annotated[
     str,
     typer.Option(
@@ -39,18 +37,31 @@ ScenarioName = Annotated[
     ),
 ]
 Navigation = Annotated[
-    NavigationKind,
+    str,
     typer.Option(
-        help="realistic: poses err by 0.1 degrees of boresight, 2 % of the range along the track, 0.2 % of the spin "
-        "rate, 20 ms and 0.02 degrees of noise, and the tags say so; perfect: tags are exact."
+        "--navigation",
+        help="The errors of navigation: realistic or realistic:SEED: 0.1 degrees of boresight, 2 % of the range along "
+        "the track, 0.2 % of the spin rate, 20 ms and 0.02 degrees of noise, and the tags say so; perfect: tags are "
+        "exact.",
     ),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of the navigation errors.")]
-KnownAttitude = Annotated[
-    Attitude | None,
+Gige = Annotated[
+    bool, typer.Option("--gige", help="GigE Vision on 127.0.0.1 instead of this project's own protocol.")
+]
+Bus = Annotated[
+    LinkKind,
     typer.Option(
-        help="What flight knows of the target's attitude; default: what the mission says. With unknown, its tags are "
-        "in inertial axes."
+        "--bus", help="What the link is; slcan: a CAN bus, slcan-fd: a CAN FD bus (data at 5 Mbit/s)."
+    ),
+]
+LinkTrouble = Annotated[
+    str,
+    typer.Option(
+        "--faults",
+        help="What the link does to packets (CAN: frames): none; standard: 2 % each lost, flipped, doubled and "
+        "reordered, and in a demo a cut of 5 s; or fractions for loss, bit_flip, duplicate and reorder, latency in "
+        "seconds, overrun (serial: without flow control), one_shot (CAN: what is destroyed is not repeated) and the "
+        "seed of it all, as in loss=0.02,latency=0.2,seed=3.",
     ),
 ]
 RealTime = Annotated[
@@ -64,42 +75,30 @@ RealTime = Annotated[
 @app.command()
 @output_may_fail()
 def demo(
-    out: Annotated[Path, typer.Option(help="Everything is written below this folder.")] = Path("demo"),
+    out: Annotated[Path, typer.Option(help=f"{OUT_HELP}.")] = Path("demo"),
     mission: MissionFile = Path("mission.yaml"),
     mesh: Mesh = SHIPPED,
-    camera: Annotated[
-        CameraKind,
-        typer.Option(help="hil: this project's own protocol on a socket; gige: GigE Vision on 127.0.0.1."),
-    ] = "hil",
-    link: Annotated[
-        LinkKind,
-        typer.Option(
-            help="serial: a serial line; slcan: a CAN bus, slcan-fd: a CAN FD bus, both at 1 Mbit/s."
-        ),
-    ] = "serial",
-    faults: Annotated[
-        FaultKind,
-        typer.Option(
-            help="standard: 2 % of the packets each lost, damaged, doubled and reordered, and a cut of 5 s."
-        ),
-    ] = "none",
+    gige: Gige = False,
+    bus: Bus = "serial",
+    faults: LinkTrouble = "none",
     scenario: ScenarioName = "",
     real_time: RealTime = 0.0,
-    navigation: Navigation = NAVIGATION,
-    seed: Seed = 1,
-    attitude: KnownAttitude = None,
+    navigation: Navigation = "realistic",
     json_: AsJson = False,
 ) -> None:
     """Simulate a whole pass, from rendered frames over flight, link and ground to a model and its report.
 
-    Example: hil demo --camera gige --link slcan --faults standard --scenario tumbling --out demo
+    Example: hil demo --gige --bus slcan --faults standard --scenario tumbling --out demo
     """
     from hil.demo import run_demo
+    from hil.links.faults import LinkFaults
     from hil.processes import unwind_on_sigterm
     from hil.simulated_pass import PassConfig
 
     unwind_on_sigterm()
-    config = PassConfig(camera, link, faults, scenario, navigation, real_time, seed, attitude)
+    kind, seed = navigation_of(navigation)
+    LinkFaults.parse(faults)  # refused before anything is written
+    config = PassConfig(gige, bus, faults, scenario, kind, real_time, seed)
     figures = run_demo(out, mission, mesh, config, Console(stderr=json_))
     if json_:
         print(json.dumps(figures))
@@ -114,20 +113,15 @@ def camera(
     mission: MissionFile = Path("mission.yaml"),
     mesh: Mesh = SHIPPED,
     cache: Annotated[Path, typer.Option(help="Folder in which rendered frames are kept.")] = Path("renders"),
-    gige: Annotated[
-        bool, typer.Option("--gige", help="Serve GigE Vision on 127.0.0.1 instead of --listen.")
-    ] = False,
+    gige: Gige = False,
     scenario: ScenarioName = "",
-    inputs: Annotated[
+    out: Annotated[
         Path,
         typer.Option(
-            help="With --scenario: where the mission.yaml and navigation states for flight and ground are written; the "
-            "three options below are of these."
+            help=f"{OUT_HELP}; with --scenario: the mission.yaml and navigation states of flight and ground."
         ),
     ] = Path("scenario"),
-    navigation: Navigation = NAVIGATION,
-    seed: Seed = 1,
-    attitude: KnownAttitude = None,
+    navigation: Navigation = "realistic",
     real_time: RealTime = 0.0,
     prerender: Annotated[
         bool,
@@ -137,6 +131,7 @@ def camera(
             "gives no times then sees the planned moment nearest to the simulated time, over and over.",
         ),
     ] = False,
+    json_: AsJson = False,
 ) -> None:
     """Serve the simulated camera until stopped; prints its URL. Frames are rendered when a client requests them.
 
@@ -148,66 +143,49 @@ def camera(
     from hil.camera_service import serve_camera
     from hil.processes import unwind_on_sigterm
     from hil.world.navigation import write_flight_inputs
-    from hil.world.world import load_world, told
+    from hil.world.world import load_world
 
-    world = load_world(told(load_mission(mission), attitude), scenario)
+    kind, seed = navigation_of(navigation)
+    world = load_world(load_mission(mission), scenario)
     with contextlib.ExitStack() as held:
         if scenario:
             # while this serves: flight and ground read what is written there
-            held.enter_context(one_command_in(inputs, "hil"))
-            written = write_flight_inputs(world, inputs, seed if navigation == "realistic" else None)
+            held.enter_context(one_command_in(out, "hil"))
+            written = write_flight_inputs(world, out, seed if kind == "realistic" else None)
             print(f"start flight with --mission {written.mission_path}", file=sys.stderr)
         unwind_on_sigterm()  # while rendering; then a signal ends the service
         where = None if gige else listen
-        serve_camera(world, mesh, cache, where, real_time, prerender, _stop_event, Console(stderr=True))
+        console = Console(stderr=True)
+        serve_camera(world, mesh, cache, where, real_time, prerender, _stop_event, console, json_)
 
 
 @app.command()
 @output_may_fail()
 def link(
-    can: Annotated[
-        bool, typer.Option(help="Two slcan adapters on a CAN bus instead of a serial line.")
-    ] = False,
-    fd: Annotated[
-        bool, typer.Option(help="The bus is CAN FD, data phase at 5 Mbit/s; implies --can.")
-    ] = False,
-    baud: Annotated[
-        int, typer.Option(min=10, max=100_000_000, help="Serial: bits per second; a byte takes 10.")
-    ] = 921_600,
-    bitrate: Annotated[int, typer.Option(help="CAN: bits per second.")] = 1_000_000,
-    latency: Annotated[
-        float, typer.Option(help="Delay from one end to the other, s, in addition to the transmission time.")
-    ] = 0.0,
-    loss: Annotated[float, typer.Option(help="Fraction of packets (CAN: frames) lost.")] = 0.0,
-    flip: Annotated[float, typer.Option(help="Fraction of packets (CAN: frames) with a flipped bit.")] = 0.0,
-    duplicate: Annotated[float, typer.Option(help="Fraction of them sent twice.")] = 0.0,
-    reorder: Annotated[float, typer.Option(help="Fraction of them that changes places with the next.")] = 0.0,
-    overrun: Annotated[
-        bool, typer.Option(help="Serial: no flow control; bytes that are not read in time are lost.")
-    ] = False,
-    one_shot: Annotated[
-        bool, typer.Option(help="CAN: the controller does not repeat a frame that is destroyed on the bus.")
-    ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the random faults.")] = 0,
+    bus: Bus = "serial",
+    rate: Annotated[
+        int | None,
+        typer.Option(
+            min=10,
+            max=100_000_000,
+            help="Bits per second; default: 921600 of a serial line, 1000000 of a CAN bus.",
+        ),
+    ] = None,
+    faults: LinkTrouble = "none",
+    json_: AsJson = False,
 ) -> None:
     """Run a virtual serial line or CAN bus with faults until stopped; prints the URLs of both ends, then the counts.
 
     While it runs it reads commands from standard input, one a line: cut, mend, latency 0.2, loss 0.1, and bit_flip,
     duplicate or reorder with a fraction. SIGUSR1 and SIGUSR2 also cut and mend.
 
-    Example: hil link --baud 921600 --loss 0.02 --flip 0.01 --seed 3
+    Example: hil link --rate 115200 --faults loss=0.02,bit_flip=0.01,seed=3
     """
-    from hil.links.faults import Faults
-    from hil.links.virtual_can import VirtualCan
+    from hil.links.by_name import virtual_link
+    from hil.links.faults import LinkFaults
     from hil.links.virtual_link import VirtualLink, control, run_link
-    from hil.links.virtual_serial import VirtualSerial
 
-    faults = Faults(loss, flip, duplicate, reorder)
-    line: VirtualLink
-    if can or fd:
-        line = VirtualCan(bitrate, fd, faults, seed, latency, one_shot)
-    else:
-        line = VirtualSerial(baud, faults, seed, latency, flow_control=not overrun)
+    line = virtual_link(bus, LinkFaults.parse(faults), rate or 921_600, rate or 1_000_000)
 
     def read_commands() -> None:
         if isinstance(sys.stdin, io.TextIOWrapper):
@@ -221,7 +199,8 @@ def link(
     def ready(line: VirtualLink) -> None:
         signal.signal(signal.SIGUSR1, lambda *_: line.cut())
         signal.signal(signal.SIGUSR2, lambda *_: line.mend())
-        print(f"flight {line.flight_url}\nground {line.ground_url}", flush=True)
+        urls = {"flight": line.flight_url, "ground": line.ground_url}
+        print(json.dumps(urls) if json_ else "\n".join(map(" ".join, urls.items())), flush=True)
         threading.Thread(target=read_commands, daemon=True).start()
 
     stop = _stop_event()
@@ -233,17 +212,15 @@ def link(
 def scenario(
     name: Annotated[str, typer.Argument(help="A ready-made scenario or a YAML file.")] = "fly-around",
     fly_around: Annotated[
-        bool, typer.Option("--fly-around", help="Design a fly-around about the mission's target instead.")
-    ] = False,
-    mission: MissionFile = Path("mission.yaml"),
-    radial: Annotated[
-        float, typer.Option(min=0.0, help="With --fly-around: half of the ellipse's height, m.")
-    ] = 200.0,
-    out_of_plane: Annotated[
-        float | None,
-        typer.Option(min=0.0, help="Half of its width across the orbit, m; default: that of constant range."),
+        str | None,
+        typer.Option(
+            metavar="HEIGHT[,WIDTH]",
+            help="Design a fly-around about the mission's target instead: half of the ellipse's height and of its "
+            "width across the orbit, m, such as 150,200. Default of the width: that of constant range.",
+        ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Where --fly-around writes the chaser's TLE.")] = Path(
+    mission: MissionFile = Path("mission.yaml"),
+    out: Annotated[Path, typer.Option(help=f"{OUT_HELP}; the chaser's TLE of --fly-around.")] = Path(
         "chaser.tle"
     ),
     json_: AsJson = False,
@@ -253,16 +230,16 @@ def scenario(
     The errors are distances between the orbit of the printed elements and the intended one, the unrounded one without
     the rounding to a TLE's digits. Elements (da to diy) are relative orbital elements in metres.
 
-    Example: hil scenario tumbling --json; hil scenario --fly-around --radial 150 --out chaser.tle
+    Example: hil scenario tumbling --json; hil scenario --fly-around 150 --out chaser.tle
     """
     from hil.world.fly_around import FlyAround, design
     from hil.world.scenario import describe, load_scenario
 
-    if not fly_around:
+    if fly_around is None:
         facts = describe(load_scenario(name))
     else:
         orbit = load_mission(mission).orbit
-        wanted = FlyAround(radial, -1.0 if out_of_plane is None else out_of_plane)
+        wanted = FlyAround(*_half_axes(fly_around))
         made = design(orbit.target_tle, wanted, orbit.start_utc_ns, span_s=0.0)  # at least one orbit
         out.write_text("\n".join(made.chaser_tle) + "\n")
         facts = {**dataclasses.asdict(made), "half_width_m": wanted.half_width_m, "written": str(out)}
@@ -272,57 +249,42 @@ def scenario(
 @app.command()
 @output_may_fail()
 def dataset(
-    context: typer.Context,
-    out: Annotated[
-        Path, typer.Option(help="The data set's folder; with --set it holds one folder a target.")
-    ],
+    out: Annotated[Path, typer.Option(help=f"{OUT_HELP}; with --targets it holds a folder for each.")],
     mesh: Annotated[
-        Path | None, typer.Option(help="The target: GLB, OBJ or STL; default: the shipped spacecraft.")
+        Path | None,
+        typer.Option(
+            help="The target: GLB, OBJ or STL; default: the shipped spacecraft. With --targets: the folder of their "
+            "meshes, default: here."
+        ),
     ] = None,
-    set_: Annotated[
+    targets: Annotated[
         str | None,
-        typer.Option("--set", help="A data set of several targets: obr-st, obr-st-small or a YAML file."),
+        typer.Option(help="A data set of several targets: obr-st, obr-st-small or a YAML file."),
     ] = None,
-    meshes: Annotated[Path, typer.Option(help="Folder of the set's meshes.")] = Path(),
-    scenario: Annotated[str, typer.Option(help="A ready-made scenario or a YAML file.")] = "fly-around",
-    frames: Annotated[
-        int, typer.Option(help="Number of frames, a multiple of the bracket's exposures.")
-    ] = 363,
-    size: Annotated[int, typer.Option(help="Width and height of a frame, px.")] = 800,
-    bracket: Annotated[str, typer.Option(help="Exposure times in ms, comma separated.")] = "0.05,0.1,0.2",
-    sensor: Annotated[
-        SensorKind,
-        typer.Option(help="paper: 8 bits with the noise of Jiang et al. 2025; spacecam: a scientific CMOS."),
-    ] = "paper",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 1,
-    materials: Annotated[
-        Materials,
-        typer.Option(help="own: those of the mesh; foil: crinkled foil, and cell glass where it is dark."),
-    ] = "own",
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help=f"{SET_HELP}; of the data set: scenario, frames, size_px, bracket_ms, sensor (paper: 8 bits with the "
+            "noise of Jiang et al. 2025; spacecam: a scientific CMOS), seed, materials (own, or foil: crinkled foil, "
+            "and cell glass where it is dark).",
+        ),
+    ] = None,
     cache: Annotated[Path, typer.Option(help="Folder in which rendered frames are kept.")] = Path("renders"),
-    workers: Annotated[int, typer.Option(min=1, help="Number of Blender processes.")] = 2,
     json_: AsJson = False,
 ) -> None:
     """Make a data set with its truth, as a session and in NeRF-synthetic layout; an interrupted one is continued.
 
-    Example: hil dataset --mesh TDRS.glb --scenario fly-around --frames 363 --size 800 --bracket 0.05,0.1,0.2 --out tdrs
+    Example: hil dataset --mesh TDRS.glb --set scenario=v-bar --set frames=90 --set size_px=200 --out tdrs
     """
-    from flightsw.icd.mission import build
-    from hil.dataset import DatasetConfig, Progress, load_dataset_config, make_dataset, target_meshes
+    from hil.dataset import Progress, load_dataset_config, make_dataset, target_meshes
     from hil.progress import progress_bar
 
-    if set_ is not None:
-        own = ("mesh", "scenario", "frames", "size", "bracket", "sensor", "seed", "materials")
-        refuse_beside(context, "--set", own)
-        config = load_dataset_config(set_)
-        jobs = [(path, out / path.stem) for path in target_meshes(config, meshes)]
+    config = load_dataset_config(targets, settings or ())
+    if targets is not None:
+        jobs = [(path, out / path.stem) for path in target_meshes(config, mesh or Path())]
     else:
-        times_ms = [float(text) for text in bracket.split(",")]
-        settings = {"scenario": scenario, "frames": frames, "size_px": size, "bracket_ms": times_ms}
-        config = build(
-            DatasetConfig, {**settings, "sensor": sensor, "seed": seed, "materials": materials}, "dataset"
-        )
-        jobs = [(mesh or (SHIPPED_FOIL if materials == "foil" else SHIPPED), out)]
+        jobs = [(mesh or (SHIPPED_FOIL if config.materials == "foil" else SHIPPED), out)]
     with progress_bar(Console(stderr=True), label_width=20) as bars:
         tasks: dict[str, TaskID] = {}
 
@@ -335,7 +297,7 @@ def dataset(
         made = {}
         for path, folder in jobs:
             with one_command_in(folder, "hil"):
-                made[path.stem] = make_dataset(config, path, folder, cache, workers, show)
+                made[path.stem] = make_dataset(config, path, folder, cache, on_progress=show)
     if json_:
         print(json.dumps(made))
     for target_name, facts in () if json_ else made.items():
@@ -345,13 +307,14 @@ def dataset(
 
 @app.command()
 def target(
-    out: Annotated[Path, typer.Option(help="The GLB to write.")] = Path("spacecraft.glb"),
+    out: Annotated[Path, typer.Option(help=f"{OUT_HELP}.")] = Path("spacecraft.glb"),
     materials: Annotated[
         Materials,
         typer.Option(
             help="own: nearly matt; foil: crinkled gold foil, glossy cell glass and a polished dish."
         ),
     ] = "own",
+    json_: AsJson = False,
 ) -> None:
     """Write the shipped target, a parametric spacecraft, as binary glTF; the bytes are the same on every machine.
 
@@ -359,7 +322,20 @@ def target(
     """
     shipped = SHIPPED_FOIL if materials == "foil" else SHIPPED
     out.write_bytes(shipped.read_bytes())  # not built again: rounding differs between processors
-    print(out)
+    print(json.dumps({"mesh": str(out)}) if json_ else out)
+
+
+def _half_axes(text: str) -> list[float]:
+    """Return half of a fly-around's height and, where it is given, of its width, m."""
+    try:
+        axes = [float(part) for part in text.split(",")]
+    except ValueError:
+        axes = []
+    if len(axes) not in (1, 2) or not all(0 <= axis < float("inf") for axis in axes):
+        raise ValueError(
+            f"--fly-around: expected HEIGHT or HEIGHT,WIDTH in metres, such as 150,200, got {text!r}"
+        )
+    return axes
 
 
 UNITS = {"_m_per_orbit": " m per orbit", "_m": " m", "_s": " s", "_deg": " deg"}  # by the suffix of a name

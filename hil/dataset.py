@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import inspect
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 import ground.session.truth
-from flightsw.icd.config import ConfigError, build, in_file, parse_yaml
+from flightsw.icd.config import ConfigError, assignment, build, in_file, parse_yaml
 from flightsw.icd.frame import Frame, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.sequencer import Shot, plan
@@ -80,15 +80,24 @@ class Progress:
     total: int
 
 
-def load_dataset_config(name: str | Path) -> DatasetConfig:
-    """Return a ready-made data set's configuration by its name, or the one in a YAML file.
+def load_dataset_config(name: str | Path | None, changes: Sequence[str] = ()) -> DatasetConfig:
+    """Return a ready-made data set's configuration by its name, or the one in a YAML file; with changes to it.
+
+    Args:
+        name: None: one with the defaults, for one target.
+        changes: texts such as `frames=90`.
 
     Raises:
         ConfigError: it does not exist or is wrong; the message names the file and the key's path.
     """
+    given = dict(assignment(text) for text in changes)
+    if name is None:
+        return build(DatasetConfig, given, "dataset")
     path, content = ready_made(name, DATASETS, "data set")
     with in_file(path):
-        return build(DatasetConfig, parse_yaml(content, "dataset"), "dataset")
+        tree = parse_yaml(content, "dataset")
+        config = build(DatasetConfig, tree, "dataset")
+    return build(DatasetConfig, tree | given, "dataset") if given else config
 
 
 def target_meshes(config: DatasetConfig, folder: Path) -> list[Path]:

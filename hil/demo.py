@@ -104,8 +104,9 @@ def simulate_pass(
             inputs = write_flight_inputs(world, out / "scenario", seed)
             mission_path, errors = inputs.mission_path, inputs.errors
             world = replace(world, mission=load_mission(mission_path))
+        camera = "gige" if config.gige else "hil"
         console.print(
-            f"[bold]2/4 Pass[/]  flight and ground, {config.camera} camera, {config.link} link between, "
+            f"[bold]2/4 Pass[/]  flight and ground, {camera} camera, {config.link} link between, "
             f"faults: {config.faults}"
         )
         simulation = fly(out, world, mission_path, farm.radiance, config, console)

@@ -22,11 +22,10 @@ from flightsw.icd.mission import Mission
 from flightsw.icd.quaternion import quat_to_matrix
 from hil.cameras.gige import GigeCameraServer
 from hil.cameras.virtual import CameraServer
-from hil.choices import NAVIGATION, CameraKind, FaultKind, LinkKind, NavigationKind
-from hil.links.faults import STANDARD_CUT_S, STANDARD_FAULTS, Faults
-from hil.links.virtual_can import VirtualCan
+from hil.choices import NAVIGATION, LinkKind, NavigationKind
+from hil.links.by_name import virtual_link
+from hil.links.faults import LinkFaults
 from hil.links.virtual_link import VirtualLink
-from hil.links.virtual_serial import VirtualSerial
 from hil.processes import end, installed, tied
 from hil.progress import progress_bar
 from hil.world.world import World
@@ -35,7 +34,6 @@ from obbgs_base.errors import ObbgsError
 # the pass has failed when nothing was captured or received for this long, and for as long as frames without any
 # compression would take that the link carries side by side
 STALL_S = 60.0
-FAULT_SEED = 1
 FAULT_WORDS = {
     "lost",
     "destroyed",
@@ -56,9 +54,9 @@ class PassError(ObbgsError):
 class PassConfig:
     """What a pass is simulated with."""
 
-    camera: CameraKind = "hil"
+    gige: bool = False  # GigE Vision on 127.0.0.1 instead of our own protocol on a socket
     link: LinkKind = "serial"  # serial: at the mission's baud rate; CAN at 1 Mbit/s
-    faults: FaultKind = "none"
+    faults: str = "none"  # as `LinkFaults.parse` takes them
     scenario: str = ""  # a ready-made one or a YAML file; empty: the mission's own orbits and attitude
     navigation: NavigationKind = NAVIGATION
     real_time: float = 0.0  # how many times as fast as real time the simulated clock runs; 0: lock step
@@ -67,15 +65,12 @@ class PassConfig:
 
     def open_link(self, mission: Mission) -> VirtualLink:
         """Return the link, not yet running."""
-        faults = STANDARD_FAULTS if self.faults == "standard" else Faults()
-        if self.link == "serial":
-            return VirtualSerial(mission.link.baud_rate, faults, FAULT_SEED)
-        return VirtualCan(fd=self.link == "slcan-fd", faults=faults, seed=FAULT_SEED)
+        return virtual_link(self.link, LinkFaults.parse(self.faults), mission.link.baud_rate)
 
     @property
     def cut_s(self) -> float:
         """How long the link is cut in the middle of the pass, 0 for no cut."""
-        return STANDARD_CUT_S if self.faults == "standard" else 0.0
+        return LinkFaults.parse(self.faults).cut_s
 
 
 def fly(
@@ -104,7 +99,7 @@ def fly(
         _run_flight_and_ground(out, mission, mission_path, line, camera.url, cut, config, console)
         link_figures = _link_figures(line, config, cut)
         camera_figures = {
-            "kind": config.camera,
+            "kind": "gige" if config.gige else "hil",
             "pace": f"{config.real_time:g} times real time" if config.real_time else "lock step",
             "exposures": camera.exposures,
             "late_frames": camera.late_frames,
@@ -139,7 +134,7 @@ def _open_camera(
 ) -> Iterator[CameraServer | GigeCameraServer]:
     """Serve the camera; the socket is in a folder of its own, since its path must be short."""
     more = {"pose_at": world.pose_at, "real_time": config.real_time}
-    if config.camera == "gige":
+    if config.gige:
         with GigeCameraServer(world.mission, radiance, **more) as camera:
             yield camera
         return

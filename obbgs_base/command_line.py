@@ -2,7 +2,6 @@
 
 import logging
 import sys
-from collections.abc import Iterable
 from typing import Annotated, Any
 
 import typer
@@ -15,6 +14,13 @@ from obbgs_base.output import open_standard_streams, output_may_fail
 # What several commands call by one name: the help of a name begins with the same words everywhere, up to a full stop,
 # a semicolon or a colon; what follows is of the command.
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+CAMERA_HELP = (
+    "The camera's URL, such as gige://ID (or its IP address), or with the scheme of an installed driver (none comes "
+    "for V4L2), or simulated hil:///path/to/socket or hil://host:port"
+)
+BRACKET_HELP = "Exposure times in ms, such as 0.05,0.1,0.2"
+START_HELP = "First trigger, UTC as 2026-07-21T10:52:30Z"
+FRAMES_HELP = "Number of frames"
 MISSION_HELP = "The mission file, the same in flight and on the ground"
 LINK_HELP = "The link's URL, such as serial:///dev/ttyUSB0?baud=921600"
 KEY_HELP = "The file of the mission's key"
@@ -55,18 +61,6 @@ def new_app(summary: str) -> typer.Typer:
         pass
 
     return app
-
-
-def refuse_beside(context: typer.Context, option: str, others: Iterable[str]) -> None:
-    """Refuse options, by the names of their parameters, that would have no effect beside another one.
-
-    Raises:
-        ValueError: one of them was given.
-    """
-    for name in others:
-        source = context.get_parameter_source(name)
-        if source is not None and source.name == "COMMANDLINE":
-            raise ValueError(f"--{name} has no effect beside {option}: leave one of them out")
 
 
 def run(app: typer.Typer, tool: str) -> None:

@@ -3,6 +3,7 @@
 import importlib.util
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,6 +21,7 @@ LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
 WIDEST_README = 100  # columns
 LARGEST_README = 8192  # bytes
 MOST_WORDS = 60_000  # of all pages in docs/
+MOST_OPTIONS = 150  # and arguments, over all commands
 LONGEST_RELEASE = 40  # lines of CHANGELOG.md
 
 
@@ -44,12 +46,36 @@ def test_the_documents_are_short_enough_to_be_read():
     assert [r.splitlines()[0] for r in releases if len(r.strip().splitlines()) > LONGEST_RELEASE] == []
 
 
-def test_the_page_of_commands_is_that_of_the_command_lines():
+@pytest.fixture(scope="module")
+def maker() -> Any:
+    """The script that writes the page of commands."""
     spec = importlib.util.spec_from_file_location("make_commands", ROOT / "docs" / "make_commands.py")
     assert spec and spec.loader
-    maker = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(maker)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_of_commands_is_that_of_the_command_lines(maker):
     assert (ROOT / "docs" / "commands.md").read_text() == maker.page(), "run: python docs/make_commands.py"
+
+
+def test_a_name_means_the_same_in_all_commands_and_there_are_not_too_many(maker):
+    meanings = maker.meanings()
+    assert {name: said for name, said in meanings.items() if len(set(said.values())) > 1} == {}
+    assert sum(map(len, meanings.values())) + 1 <= MOST_OPTIONS  # and --json, which all have
+    commands = [command for tool in maker.TOOLS for command in maker.commands(tool)]
+    assert len(commands) > 30 and "flightsw mission new" in dict(commands)
+    assert [
+        name for name, command in commands if not any("--json" in option.opts for option in command.params)
+    ] == []
+    of_today = [page for page in PAGES if page.name != "CHANGELOG.md" and page.parent.name != "experiments"]
+    pages = [*of_today, *(ROOT / "examples").glob("*.ipynb")]
+    text = "\n".join(path.read_text() for path in pages)
+    ours = re.findall(r"(?:flightsw|ground|hil) [a-z-]+[^`|\n]*", text)
+    given = {option for words in ours for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", words)}
+    known = {option.strip("`") for name in meanings for option in name.split(", ")}
+    assert given - known - {"--json", "--help", "--version", "--install-completion"} == set()
 
 
 def test_every_page_is_in_the_site():

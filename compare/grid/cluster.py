@@ -91,7 +91,7 @@ def share_memory(workers: int, needs_mb: list[float], available: float) -> tuple
     if largest > available:
         raise CompareError(
             f"a cell needs about {largest / 1e3:.1f} GB of memory, {available / 1e3:.1f} GB are available: give a "
-            "smaller budget of Gaussians, such as --budgets 1@100000, or run on another machine with --scheduler"
+            "smaller budget of Gaussians, such as --budgets 1@100000, or run on another machine with --workers URL"
         )
     count = max(1, min(workers, int(available // max(largest, 1.0))))
     return count, available / count

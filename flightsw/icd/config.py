@@ -105,6 +105,18 @@ def parse_yaml(content: bytes, path: str) -> Any:
         raise ConfigError(path, f"is not valid YAML: {' '.join(str(error).split())}") from error
 
 
+def assignment(text: str, option: str = "--set") -> tuple[str, Any]:
+    """Return name and value of a text such as `steps=60`; the value is YAML.
+
+    Raises:
+        ConfigError: not such a text.
+    """
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip():
+        raise ConfigError(option, f"expected NAME=VALUE, got {text!r}")
+    return name.strip(), parse_yaml(value.encode(), f"{option} {name.strip()}")
+
+
 def _refuse_large(content: bytes, most: int, path: str) -> None:
     require(len(content) <= most, path, f"has {len(content)} bytes, at most {most} are read")
 

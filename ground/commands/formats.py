@@ -24,7 +24,7 @@ from ground.commands.options import (
     SessionDir,
     ValuesGiven,
 )
-from obbgs_base.command_line import OUT_HELP, AsJson
+from obbgs_base.command_line import FRAMES_HELP, OUT_HELP, AsJson
 
 if TYPE_CHECKING:
     from ground.formats.photographs.poses import Registered
@@ -48,7 +48,7 @@ def import_command(
     poses: PosesGiven = PoseChoice.CHECK,
     frames: Annotated[
         int | None,
-        typer.Option(min=1, help="Number of frames; the first of each split. Default: all."),
+        typer.Option(min=1, help=f"{FRAMES_HELP}; the first of each split. Default: all."),
     ] = None,
     json_: AsJson = False,
 ) -> None:

@@ -36,7 +36,7 @@ def live_command(
     link: Annotated[
         str | None,
         typer.Option(
-            help=f"{LINK_HELP}, to receive over it; default: follow a session that another process receives."
+            help=f"{LINK_HELP}; it receives over it. Default: follow a session that another process receives."
         ),
     ] = None,
     mission: Annotated[

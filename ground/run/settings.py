@@ -6,8 +6,8 @@ Changes are named as in `preset`: `steps`, or `growth.interval` for a setting of
 import operator
 from collections.abc import Sequence
 
-from flightsw.icd.config import names_like
-from flightsw.icd.mission import ConfigError, ReconstructSection, build, parse_yaml
+from flightsw.icd.config import assignment, names_like
+from flightsw.icd.mission import ConfigError, ReconstructSection, build
 from obbgs_core.methods.config import MethodConfig
 from obbgs_core.methods.presets import budget_changes, preset, quality_changes
 from obbgs_core.settings import known_names
@@ -67,11 +67,7 @@ def set_changes(assignments: Sequence[str]) -> dict:
     """
     changes: dict[str, object] = {}
     for text in assignments:
-        key, equals, value = text.partition("=")
-        key = key.strip()
-        if not equals or not key:
-            raise ConfigError("--set", f"expected key=value, got {text!r}")
-        given = parse_yaml(value.encode(), f"--set {key}")
+        key, given = assignment(text)
         group, dot, name = key.partition(".")
         tree = {group: {name: given} if dot else given}
         for name, setting in checked_settings(tree, "--set").items():

@@ -102,7 +102,7 @@ def test_a_grid_survives_a_killed_worker_and_is_not_made_twice(sessions, schedul
     out, conditions = tmp_path / "out", tmp_path / "conditions.yaml"
     conditions.write_text("as taken: {}\nnoise x2: {noise: 2}\n")
     grid = [*sessions, *LONG, "--conditions", conditions, "--out", out]
-    running = compare(*grid, "--scheduler", scheduler)
+    running = compare(*grid, "--workers", scheduler)
     await_that(lambda: training_under_way(out), running)
     os.kill(training_under_way(out)[0]["pid"], signal.SIGKILL)
     _, told = running.communicate()
@@ -164,7 +164,7 @@ def test_a_scheduler_that_dies_is_one_sentence_and_the_same_command_goes_on(sess
     scheduler = subprocess.Popen([*module, "--scheduler-file", str(file)], **quiet)
     await_that(file.exists, scheduler)
     address = json.loads(file.read_text())["address"]
-    running = compare(sessions[0], *LONG, "--out", out, "--scheduler", address)
+    running = compare(sessions[0], *LONG, "--out", out, "--workers", address)
     await_that(lambda: (out / "work").is_dir(), running)  # no worker takes its cells
     scheduler.kill()
     scheduler.wait()

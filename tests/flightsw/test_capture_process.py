@@ -118,7 +118,7 @@ def test_a_full_store_never_ends_the_pass(tmp_path, small_mission, policy, refus
 
 def test_automatic_brackets_find_a_target_darker_than_expected(tmp_path, small_mission):
     with camera(small_mission, radiance=0.01) as server:
-        result, err = finish(start(tmp_path, server, "--bracket", "auto", "--for", "150"))
+        result, err = finish(start(tmp_path, server, "--bracket", "auto", "--count", "6"))
     assert result["capture"]["stored"] == 18, err  # six triggers 27 s apart
     store = FrameStore(tmp_path / "store")
     frames = [decode_frame(store.read(stored.frame_id)) for stored in store.frames]

@@ -37,9 +37,9 @@ def test_the_example_is_the_project_s_mission_file():
 
 def test_a_new_mission_has_what_was_given_and_passes_its_checks(tmp_path, elements):
     out = tmp_path / "new.yaml"
-    options = ["--target-tle", elements[0], "--chaser-tle", elements[1], "--target-size", "2.5", "--colour"]
-    options += ["--picture", "1600x1200", "--focal-length", "200", "--pixel-pitch", "4", "--start", START]
-    done = call("flightsw", "mission", "new", str(out), *options)
+    options = ["--target-tle", elements[0], "--chaser-tle", elements[1], "--target-size", "2.5"]
+    options += ["--picture", "1600x1200x3", "--focal-length", "200", "--pixel-pitch", "4", "--start", START]
+    done = call("flightsw", "mission", "new", "--out", str(out), *options)
     assert done.returncode == 0, done.stderr
     mission = load_mission(out)
     assert mission.orbit == MISSION.orbit and mission.bracket.target_extent_m == 2.5
@@ -57,7 +57,7 @@ def test_a_new_mission_has_what_was_given_and_passes_its_checks(tmp_path, elemen
         planned.returncode == 0
         and "1600 x 1200 px see 1.83 x 1.38 degrees; a target of 2.5 m" in planned.stdout
     )
-    again = call("flightsw", "mission", "new", str(out), *options)
+    again = call("flightsw", "mission", "new", "--out", str(out), *options)
     assert again.returncode == 2 and "exists already" in again.stderr
 
 
@@ -80,7 +80,6 @@ def test_a_wrong_figure_is_named_and_nothing_is_written(tmp_path, elements, chan
         "picture": "1024x1024",
         "focal_length_mm": 100.0,
         "pixel_pitch_um": 5.5,
-        "channels": 1,
         "start_utc": START,
     }
     with pytest.raises(ConfigError, match=re.escape(message)):
@@ -171,6 +170,6 @@ def test_a_unit_that_could_not_start_is_not_made(installed, change, message):
 
 
 def test_the_first_trigger_is_an_hour_from_now_where_none_is_given(tmp_path, elements):
-    write_mission(tmp_path / "new.yaml", Path(elements[0]), Path(elements[1]), 6.0, "64x64", 10.0, 5.0, 1)
+    write_mission(tmp_path / "new.yaml", Path(elements[0]), Path(elements[1]), 6.0, "64x64", 10.0, 5.0)
     start = datetime.fromisoformat(load_mission(tmp_path / "new.yaml").orbit.start_utc)
     assert abs((start - datetime.now(start.tzinfo)).total_seconds() - 3600) < 600

@@ -99,7 +99,7 @@ def test_command_prints_the_ranking(model, tmp_path):
     (tmp_path / "frames").mkdir()
     frame = frame_of(Renderer(model), 3, 0.0, seed=0)
     (tmp_path / "frames" / "00000003.obf").write_bytes(encode_frame(frame))
-    arguments = ["triage", "--model", str(model), "--frames", str(tmp_path), "--json"]
+    arguments = ["triage", "--model", str(model), "--store", str(tmp_path), "--json"]
     result = CliRunner().invoke(app, [*arguments, "--mission", str(GOLDEN / "mission.yaml")])
     assert result.exit_code == 0 and json.loads(result.stdout)["ranked"][0]["frame_id"] == 3
     (tmp_path / "frames" / "00000004.obf").write_bytes(b"damaged")

@@ -435,7 +435,7 @@ def test_the_methods_of_a_mission_file_are_those_of_the_ground():
             ["sun_shading=linear"],
             r"unknown key; expected one of \d+ names, nearest to it: .*light\.sun_shading",
         ),
-        (["light.sun_shading"], "expected key=value, got 'light.sun_shading'"),
+        (["light.sun_shading"], "expected NAME=VALUE, got 'light.sun_shading'"),
         (["rates.means=fast"], r"rates\.means: expected a number, got 'fast'"),
         (["start.kind=nowhere"], r"start\.kind: expected one of random, hull, got 'nowhere'"),
         (["start=hull"], "start: expected a mapping of keys, got 'hull'"),

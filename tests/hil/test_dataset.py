@@ -173,10 +173,10 @@ def test_a_second_command_with_the_same_folder_is_refused_and_the_first_one_ends
         str(out),
         "--cache",
         str(tmp_path / "renders"),
-        "--frames",
-        "3",
-        "--size",
-        "16",
+        "--set",
+        "frames=3",
+        "--set",
+        "size_px=16",
     ]
     first = subprocess.Popen(
         [installed("hil"), *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -217,12 +217,12 @@ def test_a_set_of_two_targets_is_one_command_and_one_file(cache, tmp_path):
         trimesh.creation.box(extents=size).export(meshes / f"{name}.stl")
     tree = {"scenario": "sparse", "frames": 3, "size_px": 16, "targets": ["Cube", "Plank"]}
     (tmp_path / "two.yaml").write_text(yaml.safe_dump(tree))
-    arguments = ["dataset", "--set", str(tmp_path / "two.yaml"), "--meshes", str(meshes), "--json"]
-    arguments += ["--out", str(tmp_path / "out"), "--cache", str(cache), "--workers", "1"]
+    arguments = ["dataset", "--targets", str(tmp_path / "two.yaml"), "--mesh", str(meshes), "--json"]
+    arguments += ["--out", str(tmp_path / "out"), "--cache", str(cache)]
     done = CliRunner().invoke(cli.app, arguments)
     assert done.exit_code == 0 and set(json.loads(done.stdout)) == {"Cube", "Plank"}
-    refused = CliRunner().invoke(cli.app, [*arguments, "--size", "32"])
-    assert "--size has no effect beside --set" in str(refused.exception)
+    refused = CliRunner().invoke(cli.app, [*arguments, "--set", "size_px=2"])
+    assert "dataset.size_px: expected 8 to 8192, got 2" in str(refused.exception)
     assert open_session(tmp_path / "out" / "Plank" / "session").frames[2].exposure_time_s == 2e-4
 
 

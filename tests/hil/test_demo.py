@@ -117,7 +117,7 @@ def test_every_frame_crosses_a_faulty_can_bus_from_a_gige_camera(
     mission, tmp_path, monkeypatch, the_only_camera_on_loopback
 ):
     monkeypatch.setattr("hil.simulated_pass.STANDARD_CUT_S", 2.0)  # five timer intervals of the link
-    config = PassConfig(camera="gige", link="slcan-fd", faults="standard")
+    config = PassConfig(gige=True, link="slcan-fd", faults="standard")
     world = load_world(load_mission(mission))
     figures = fly(tmp_path, world, mission, noise, config, Console(stderr=True))
     assert figures["frames"] == {"captured": 15, "received": 15, "without_valid_pose": 0}
@@ -165,9 +165,10 @@ def test_a_tumbling_target_is_flown_in_time_and_its_truth_is_kept(quick, tmp_pat
 
 def test_impossible_options_are_refused_before_anything_is_written(mission, tmp_path, monkeypatch, capsys):
     for chosen, reason in (
-        (("--link", "radio"), "'radio' is not one of 'serial', 'slcan', 'slcan-fd'"),
-        (("--camera", "usb"), "'usb' is not one of 'hil', 'gige'"),
-        (("--faults", "all"), "'all' is not one of 'none', 'standard'"),
+        (("--bus", "radio"), "'radio' is not one of 'serial', 'slcan', 'slcan-fd'"),
+        (("--faults", "all"), "--faults: expected none, standard, or loss,"),
+        (("--faults", "loss=2"), "as in loss=0.02,seed=3; got 'loss=2'"),
+        (("--navigation", "realistic:x"), "expected realistic, realistic:SEED or perfect, got 'realistic:x'"),
         (("--scenario", "fly_around"), "expected a YAML file or one of approach"),
         (("--real-time", "-1"), "0 (lock step) or positive"),
     ):
@@ -260,7 +261,7 @@ def test_a_pass_that_cannot_start_leaves_only_rendered_frames(quick, tmp_path, t
     out = tmp_path / "demo"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind((LOOPBACK, GVCP_PORT))
-        config = PassConfig(camera="gige", scenario="tumbling")
+        config = PassConfig(gige=True, scenario="tumbling")
         with pytest.raises(OSError, match="is in use"):
             simulate_pass(out, quick, SHIPPED, config, Console(stderr=True))
     assert [path.name for path in out.iterdir()] == ["renders"]

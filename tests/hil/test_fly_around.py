@@ -115,7 +115,7 @@ def test_a_fly_around_needs_a_size():
 
 def test_the_command_prints_numbers_with_units_and_the_tle_as_it_is(tmp_path):
     out = tmp_path / "chaser.tle"
-    command = [str(Path(sys.executable).with_name("hil")), "scenario", "--fly-around", "--radial", "200"]
+    command = [str(Path(sys.executable).with_name("hil")), "scenario", "--fly-around", "200"]
     root = Path(__file__).parents[2]
     printed = subprocess.run(
         [*command, "--out", str(out)], cwd=root, capture_output=True, text=True, check=True

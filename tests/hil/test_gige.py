@@ -311,13 +311,14 @@ def test_the_command_line_captures_from_the_fake_camera_now(tmp_path):
         "bit_depth: 12": "bit_depth: 8",
         "black_dn: 64.0": "black_dn: 4.0",
         "frame_spacing_s: 0.5": "frame_spacing_s: 0.2",
+        "interval_s: 27.0": "interval_s: 0.5",
     }.items():
         text = text.replace(old, new)
     (tmp_path / "mission.yaml").write_text(text)
     command = [
         str(Path(sys.executable).with_name("flightsw")),
         "capture",
-        *("--camera", "gige://127.0.0.1", "--bracket", "10,20", "--for", "1.1", "--interval", "0.5"),
+        *("--camera", "gige://127.0.0.1", "--bracket", "10,20", "--count", "3"),
         *("--start", "now", "--mission", str(tmp_path / "mission.yaml"), "--store", str(tmp_path / "store")),
         "--json",
     ]

@@ -127,10 +127,10 @@ def test_a_tied_process_is_the_command_itself():
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["dataset", "--out", "{tmp}", "--seed", "-1"], "--seed"),
-        (["scenario", "--fly-around", "--out-of-plane", "-5", "--out", "{tmp}"], "--out-of-plane"),
-        (["link", "--baud", "99999999999999999999"], "--baud"),
-        (["link", "--seed", "-1"], "--seed"),
+        (["dataset", "--out", "{tmp}", "--set", "frames=-3"], "dataset.frames"),
+        (["scenario", "--fly-around", "200,-5", "--out", "{tmp}"], "--fly-around"),
+        (["link", "--rate", "99999999999999999999"], "--rate"),
+        (["link", "--faults", "seed=-1"], "--faults"),
     ],
 )
 def test_a_number_out_of_range_is_refused_before_anything_is_done(tmp_path, arguments, told):

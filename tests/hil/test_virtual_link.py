@@ -198,10 +198,14 @@ def test_run_link_names_its_ends_and_returns_its_counts():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "scheme"), [(["--baud", "115200"], "serial"), (["--fd", "--one-shot"], "slcan")]
+    ("arguments", "scheme"),
+    [
+        (["--rate", "115200", "--faults", "seed=3"], "serial"),
+        (["--bus", "slcan-fd", "--faults", "one_shot,seed=3"], "slcan"),
+    ],
 )
 def test_the_link_command_prints_its_ends_executes_its_input_and_prints_its_counts(arguments, scheme):
-    command = [sys.executable, "-m", "hil.cli", "link", "--seed", "3", *arguments]
+    command = [sys.executable, "-m", "hil.cli", "link", *arguments]
     with subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True) as process:
         assert process.stdout and process.stdin and process.stderr
         try:

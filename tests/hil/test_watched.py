@@ -82,7 +82,7 @@ def test_a_camera_takes_the_place_of_one_that_was_killed_and_leaves_the_socket_o
 def test_a_second_camera_does_not_replace_what_flight_reads_for_the_first(small_mission, tmp_path):
     with one_command_in(tmp_path / "scenario", "hil"):
         camera = ("camera", "--mission", tmp_path / "small.yaml", "--scenario", "v-bar")
-        done = call("hil", *camera, "--inputs", tmp_path / "scenario")
+        done = call("hil", *camera, "--out", tmp_path / "scenario")
         assert done.returncode == 1 and "another hil command works in" in done.stderr
         assert [path.name for path in (tmp_path / "scenario").iterdir()] == ["lock"]
 
