@@ -182,7 +182,7 @@ def test_every_command_of_the_flight_wheel_runs_from_it(flight, tmp_path):
     assert run_installed(flight, "flightsw", "--version") == f"obbgs-flight {version}\n"
     mission = ("--mission", str(ROOT / "mission.yaml"))
     assert "pass: brackets 0 to " in run_installed(flight, "flightsw", "plan", *mission)
-    model = ("--model", str(ROOT / "no.onnx"), "--frames", str(tmp_path))
+    model = ("--model", str(ROOT / "no.onnx"), "--store", str(tmp_path))
     hint = run_installed(flight, "flightsw", "triage", *model, *mission, code=2)
     assert "pip install 'obbgs-flight[onnx]'" in hint
     assert "no frame store" in run_installed(flight, "flightsw", "fsck", "--store", str(tmp_path), code=1)
