@@ -181,7 +181,7 @@ def link(
 
     Example: hil link --rate 115200 --faults loss=0.02,bit_flip=0.01,seed=3
     """
-    from hil.links.by_name import virtual_link
+    from hil.link_by_name import virtual_link
     from hil.links.faults import LinkFaults
     from hil.links.virtual_link import VirtualLink, control, run_link
 

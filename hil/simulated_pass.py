@@ -23,7 +23,7 @@ from flightsw.icd.quaternion import quat_to_matrix
 from hil.cameras.gige import GigeCameraServer
 from hil.cameras.virtual import CameraServer
 from hil.choices import NAVIGATION, LinkKind, NavigationKind
-from hil.links.by_name import virtual_link
+from hil.link_by_name import virtual_link
 from hil.links.faults import LinkFaults
 from hil.links.virtual_link import VirtualLink
 from hil.processes import end, installed, tied
