@@ -5,6 +5,7 @@ The boxes depend on a seed alone, so that figures of two versions of the code ar
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +29,7 @@ FRAME_SPACING_S = 0.5
 FILLS = 0.7  # of the field of view by the target's largest dimension at the mean range
 SAMPLES = 4  # along each side of a pixel
 CLOUD_POINTS = 20_000
+HELD_OUT = 8  # every eighth bracket
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ class Pass:
     size_m: float
     range_m: float
     span_s: float
+    held_out: list[int]  # frames, by index, that no training sees
 
 
 def body(seed: int) -> list[Box]:
@@ -107,14 +110,18 @@ def _pictures(seed: int, scale: float, poses: bytes, K: bytes, size_px: int) -> 
     return stacked[:, 0], stacked[:, 1]
 
 
-def motion_and_suns(scenario: Scenario, brackets: int) -> tuple[NominalMotion, np.ndarray]:
-    """Return the true motion of a scenario's first brackets as they are spread over its whole duration, and its Sun.
+def bracket_times_s(scenario: Scenario, brackets: int, spacing_s: float = FRAME_SPACING_S) -> np.ndarray:
+    """Return the times [F] of brackets that are spread over a scenario's whole duration, their frames so far apart."""
+    triggers = np.linspace(0, scenario.duration_s, brackets)
+    return (triggers[:, None] + spacing_s * np.arange(len(EXPOSURES_S))).ravel()
+
+
+def motion_and_suns(scenario: Scenario, times_s: np.ndarray) -> tuple[NominalMotion, np.ndarray]:
+    """Return the true motion of a scenario at some times [F], and its Sun.
 
     The second are the directions [F, 3] towards the Sun in the frames, unit, body frame.
     """
     scene, start_ns = Scene(scenario), scenario.orbit.start_utc_ns
-    times_s = np.repeat(np.linspace(0, scenario.duration_s, brackets), len(EXPOSURES_S))
-    times_s += np.tile(np.arange(len(EXPOSURES_S)) * FRAME_SPACING_S, brackets)
     states = [scene.state(start_ns + round(t * 1e9)) for t in times_s]
     target, section = states[0].target, scenario.attitude
     radial = target.position_m / np.linalg.norm(target.position_m)
@@ -139,13 +146,31 @@ def motion_and_suns(scenario: Scenario, brackets: int) -> tuple[NominalMotion, n
 
 
 def photographed(target: int | Path, scenario: Scenario, brackets: int, size_px: int, seed: int) -> Pass:
-    """Return the frames of a scenario about a body, with exact poses.
+    """Return the frames of a scenario about a body, with exact poses; every eighth bracket is held out.
 
     Args:
         target: seed of a body of boxes, which have their own light; or a mesh, on which the scenario's Sun shines.
         seed: of the noise.
     """
-    motion, towards = motion_and_suns(scenario, brackets)
+    of_bracket = np.repeat(np.arange(brackets), len(EXPOSURES_S))
+    exposures_s = EXPOSURES_S * brackets
+    held_out = np.flatnonzero(of_bracket % HELD_OUT == HELD_OUT - 1).tolist()
+    times_s = bracket_times_s(scenario, brackets)
+    return taken(target, scenario, times_s, exposures_s, of_bracket.tolist(), held_out, size_px, seed)
+
+
+def taken(
+    target: int | Path,
+    scenario: Scenario,
+    times_s: np.ndarray,
+    exposures_s: Sequence[float],
+    brackets: Sequence[int],
+    held_out: list[int],
+    size_px: int,
+    seed: int,
+) -> Pass:
+    """Return frames of a scenario as `photographed` does, taken at these times and exposures, of these brackets."""
+    motion, towards = motion_and_suns(scenario, times_s)
     range_m = float(np.linalg.norm(motion.position_m, axis=1).mean())
     focal_px = size_px / 2 / np.tan(np.radians(scenario.fov_deg) / 2)
     size_m = FILLS * size_px * range_m / focal_px
@@ -163,15 +188,15 @@ def photographed(target: int | Path, scenario: Scenario, brackets: int, size_px:
     radiance = torch.from_numpy(light * SENSOR.full_scale_radiance(EXPOSURES_S[1]) / white)[..., None].float()
     rng, frames = np.random.default_rng(seed), []
     for i, pose in enumerate(motion.world_to_camera):
-        exposure_s = EXPOSURES_S[i % len(EXPOSURES_S)]
+        exposure_s, bracket = exposures_s[i], brackets[i]
         expected = SENSOR.expected_dn(radiance[i], exposure_s)
         sigma = SENSOR.variance_dn2(expected).sqrt().numpy()
         dn = torch.from_numpy(converted(expected.numpy(), sigma, SENSOR.white_dn, rng).astype(np.float32))
-        world_to_camera, bracket = torch.from_numpy(pose).float(), i // len(EXPOSURES_S)
+        world_to_camera = torch.from_numpy(pose).float()
         frames.append(
             TrainingFrame(
                 dn, exposure_s, world_to_camera, torch.from_numpy(K).float(), i, bracket, sun_dir=suns[i]
             )
         )
     coverage = torch.from_numpy(alpha).float()
-    return Pass(frames, motion, radiance, coverage, cloud_m, size_m, range_m, scenario.duration_s)
+    return Pass(frames, motion, radiance, coverage, cloud_m, size_m, range_m, scenario.duration_s, held_out)

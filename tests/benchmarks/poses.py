@@ -44,7 +44,6 @@ from tests.benchmarks.rows import shown
 from tests.benchmarks.targets import LARGEST_DIMENSION
 
 SCENARIOS = ("fly-around", "tumbling", "v-bar")
-HELD_OUT = 8  # every eighth bracket
 TARGETS_HELP = "seeds of bodies of boxes, or meshes, which Blender renders under the scenario's Sun"
 FACTORS = {"correlated_1": 1.0, "correlated_3": 3.0, "correlated_10": 10.0}
 
@@ -188,8 +187,8 @@ def scored(seen: Pass, condition: str, config: MethodConfig, seed: int) -> dict:
 
 def divided(seen: Pass) -> tuple[list[int], list[int]]:
     """Return the indices of the frames for training and of those that are held out."""
-    held_out = [i for i, f in enumerate(seen.frames) if (f.bracket or 0) % HELD_OUT == HELD_OUT - 1]
-    return [i for i in range(len(seen.frames)) if i not in set(held_out)], held_out
+    held_out = set(seen.held_out)
+    return [i for i in range(len(seen.frames)) if i not in held_out], seen.held_out
 
 
 def scores(seen: Pass, frames: list[TrainingFrame], result: TrainResult) -> dict[str, float | str]:
