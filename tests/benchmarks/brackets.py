@@ -59,15 +59,15 @@ def main() -> None:
     )
     parser.add_argument("--targets", nargs="+", type=int, default=[0], help="seeds of bodies of boxes")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--brackets", type=int, default=49)
-    parser.add_argument("--size", type=int, default=100, help="pixels along a side")
+    parser.add_argument("--brackets", type=int, default=35)
+    parser.add_argument("--size", type=int, default=64, help="pixels along a side")
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--json", action="store_true", help="print rows as JSON lines")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     config: MethodConfig = preset("obbgs", {"steps": arguments.steps})
-    for target, scenario, seed, layout in itertools.product(
-        arguments.targets, arguments.scenarios, arguments.seeds, arguments.layouts
+    for seed, target, scenario, layout in itertools.product(
+        arguments.seeds, arguments.targets, arguments.scenarios, arguments.layouts
     ):
         seen = pass_of(layout, target, scenario, arguments.brackets, arguments.size, seed)
         for condition in arguments.conditions:
