@@ -58,7 +58,7 @@ class CaptureCounts:
 def plan(
     mission: Mission, times_s: Callable[[int], tuple[float, ...]] = lambda trigger_utc_ns: ()
 ) -> Iterator[Shot]:
-    """Yield the pass's exposures: brackets `interval_s` apart, their frames `frame_spacing_s` apart, shortest first.
+    """Yield the pass's exposures: brackets `interval_s` apart, their frames `spacing_s` apart, shortest first.
 
     `times_s` may give other exposure times than the mission's; it is called when a bracket's first exposure is due.
     """
@@ -66,8 +66,9 @@ def plan(
     for bracket_id in range(bracket.count):
         trigger_ns = mission.orbit.start_utc_ns + round(bracket_id * bracket.interval_s * NS)
         exposures_s = sorted(times_s(trigger_ns) or bracket.exposure_times_s)
+        spacing_s = bracket.spacing_s(len(exposures_s))
         for index, exposure_time_s in enumerate(exposures_s):
-            start_ns = trigger_ns + round(index * bracket.frame_spacing_s * NS)
+            start_ns = trigger_ns + round(index * spacing_s * NS)
             yield Shot(bracket_id, index, len(exposures_s), exposure_time_s, start_ns)
 
 

@@ -43,8 +43,9 @@ def write_truth(
     """
     pose_at = pose_at or partial(pose_tag, mission)
     session = open_session(folder)
-    # The frames of a bracket are taken centimetres apart: one of them stands for all.
-    first_of_bracket = {record.bracket: record for record in reversed(session.frames)}
+    # Frames of a bracket that are taken within a second are centimetres apart: one of them stands for all.
+    tight = session.frame_spacing_s <= 1
+    first_of_bracket = {record.bracket if tight else record.id: record for record in reversed(session.frames)}
     centres = [pose_at(record.mid_exposure_utc_ns).position_body_m for record in first_of_bracket.values()]
     vertices, faces = farm.surface()
     mesh = trimesh.Trimesh(vertices, faces, process=False)

@@ -68,7 +68,8 @@ class TrainingFrame:
     world_to_camera: Tensor
     K: Tensor
     id: int = 0  # names the frame in messages; where ids are not unique, its place in the list does
-    bracket: int | None = None  # frames of one trigger share a pose correction
+    bracket: int | None = None  # frames of one trigger; they share a pose correction
+    own_pose: bool = False  # it does not: it was taken so long before or after that its pose errs by itself
     pose_covariance: Tensor | None = None
     sun_dir: Tensor | None = None
     background: float = 0.0
@@ -241,6 +242,11 @@ def bracket_numbers(frames: list[TrainingFrame]) -> list[int]:
     numbers: dict[int, int] = {}
     keys = [-1 - position if f.bracket is None else f.bracket for position, f in enumerate(frames)]
     return [numbers.setdefault(key, len(numbers)) for key in keys]
+
+
+def pose_numbers(frames: list[TrainingFrame]) -> list[int]:
+    """Return which pose correction each frame has, counted from 0: its bracket's, or its own."""
+    return bracket_numbers([dataclasses.replace(f, bracket=None) if f.own_pose else f for f in frames])
 
 
 def averaged(dn: Tensor, factor: int, white_dn: float) -> Tensor:

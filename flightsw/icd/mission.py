@@ -131,7 +131,8 @@ class BracketSection:
     exposure_min_ms: float = 0.01  # limits of the automatic choice
     exposure_max_ms: float = 20.0
     target_extent_m: float = 6.0  # largest dimension of the target, as far as known; for planning only
-    frame_spacing_s: float = 0.5
+    # from one exposure of a bracket to the next; None: they are spread evenly until the next bracket
+    frame_spacing_s: float | None = None
     interval_s: float = 27.0
     count: int = 40
 
@@ -142,6 +143,7 @@ class BracketSection:
             f"{path}.exposure_times_ms",
             f"expected 1 to 16 exposures, got {len(self.exposure_times_ms)}",
         )
+        spacing_s = self.spacing_s()
         for index, time_ms in enumerate(self.exposure_times_ms):
             require(
                 1e-3 <= time_ms <= 60_000,
@@ -149,9 +151,9 @@ class BracketSection:
                 f"expected 0.001 to 60000 ms, got {time_ms}",
             )
             require(
-                time_ms / 1e3 <= self.frame_spacing_s,
+                self.frame_spacing_s is None or time_ms / 1e3 <= spacing_s,
                 f"{path}.frame_spacing_s",
-                f"{self.frame_spacing_s} s is shorter than an exposure of {time_ms} ms",
+                f"{spacing_s} s is shorter than an exposure of {time_ms} ms",
             )
         require(
             1e-3 <= self.exposure_min_ms < self.exposure_max_ms <= 60_000,
@@ -160,16 +162,18 @@ class BracketSection:
             f"{self.exposure_min_ms} and {self.exposure_max_ms} ms",
         )
         require(
-            not self.auto or self.exposure_max_ms / 1e3 <= self.frame_spacing_s,
+            not self.auto or self.exposure_max_ms / 1e3 <= spacing_s,
             f"{path}.exposure_max_ms",
-            f"{self.exposure_max_ms} ms is longer than frame_spacing_s, {self.frame_spacing_s} s",
+            f"{self.exposure_max_ms} ms is longer than from one exposure to the next, {spacing_s:g} s",
         )
         require(
             self.target_extent_m > 0,
             f"{path}.target_extent_m",
             f"must be positive, got {self.target_extent_m}",
         )
-        shortest_s = self.frame_spacing_s * len(self.exposure_times_ms)
+        if self.frame_spacing_s is None:  # as long as the longest exposure, at least
+            spacing_s = max(self.exposure_times_s)
+        shortest_s = spacing_s * len(self.exposure_times_ms)
         require(
             self.interval_s >= shortest_s,
             f"{path}.interval_s",
@@ -181,6 +185,12 @@ class BracketSection:
     @property
     def exposure_times_s(self) -> tuple[float, ...]:
         return tuple(time_ms / 1e3 for time_ms in self.exposure_times_ms)
+
+    def spacing_s(self, exposures: int | None = None) -> float:
+        """Return the time from one exposure to the next, s, of a bracket of so many; None: as many as the mission's."""
+        if self.frame_spacing_s is not None:
+            return self.frame_spacing_s
+        return self.interval_s / (exposures or len(self.exposure_times_ms))
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ ADAPTER_S = 0.5  # for an slcan adapter's first answer
 BITS_PER_BYTE = 10  # on a serial line
 SIGMAS = 6.0  # of noise: none of a picture's pixels lies so far out by chance
 TIME_TOLERANCE = 0.1  # of an exposure time
+SPACING_S = 0.5  # from one exposure of the tested bracket to the next, at most
 CLOCK_S = 1.0  # between the asked and the stated time of an exposure
 DARK_PERCENTILE, LIT_PERCENTILE = 1.0, 99.9  # of pixels: a dead or a hot pixel proves nothing
 
@@ -181,8 +182,11 @@ def _bracket(mission: Mission, camera: Camera) -> list[tuple[float, Exposure]]:
     """Return the mission's exposure times, seconds, shortest first, with the exposures."""
     taken = []
     start_ns = mission.orbit.start_utc_ns if camera.has_own_clock else time.time_ns()
-    for index, exposure_time_s in enumerate(sorted(mission.bracket.exposure_times_s)):
-        due_ns = start_ns + round(index * mission.bracket.frame_spacing_s * NS)
+    times_s = sorted(mission.bracket.exposure_times_s)
+    # in flight they may be spread over the time to the next bracket
+    spacing_s = min(mission.bracket.spacing_s(), max(SPACING_S, times_s[-1]))
+    for index, exposure_time_s in enumerate(times_s):
+        due_ns = start_ns + round(index * spacing_s * NS)
         if not camera.has_own_clock:
             time.sleep(max(0.0, (due_ns - time.time_ns()) / NS))
         exposure = camera.expose(exposure_time_s, due_ns)

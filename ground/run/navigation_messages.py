@@ -71,7 +71,7 @@ def export_ndm(session: Session, out: Path, run: Run | None = None) -> dict[str,
     to_camera = np.stack([r.world_to_camera[:3, :3] for r in records]) @ to_body
     positions_m = np.stack([t.T @ r.position_body_m for t, r in zip(to_body, records, strict=True)])
     own = _position_covariances(session, [tagged[r.id] for r in records], records, to_camera, estimate)
-    velocities, covariances = _with_velocities(records, positions_m, own)
+    velocities, covariances = _with_velocities(records, positions_m, own, session.frames_err_alone)
     times, now_ns = [r.mid_exposure_utc_ns for r in records], round(datetime.now(UTC).timestamp()) * NS
     target, chaser = _objects(session)
     quats = [np.stack([matrix_to_quat(matrix) for matrix in turns]) for turns in (to_body, to_camera)]
@@ -152,15 +152,16 @@ def _position_covariances(
 
 
 def _with_velocities(
-    records: list[FrameRecord], positions_m: np.ndarray, covariances: np.ndarray
+    records: list[FrameRecord], positions_m: np.ndarray, covariances: np.ndarray, alone: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return velocities [N, 3] m/s, and covariances [N, 6, 6] with theirs.
 
     A velocity is the slope, at the frame's time, of the parabola through its bracket and the two nearest ones, of which
-    each counts as the mean of its frames: those share their error.
+    each counts as the mean of its frames: those share their error, unless each errs `alone`.
     """
     times_s = np.array([r.mid_exposure_utc_ns - records[0].mid_exposure_utc_ns for r in records]) / 1e9
-    of_bracket = np.unique([r.bracket for r in records], return_inverse=True)[1]
+    groups = [r.id if alone else r.bracket for r in records]
+    of_bracket = np.unique(groups, return_inverse=True)[1]
     count = of_bracket.max() + 1
     means = np.stack([(of_bracket == b) / (of_bracket == b).sum() for b in range(count)])  # [B, N]
     at_s, places = means @ times_s, means @ positions_m

@@ -23,6 +23,7 @@ session.json or a line of frames.jsonl by hand removes its entry `crc32`.
 
 import dataclasses
 import functools
+import itertools
 import logging
 import math
 import re
@@ -101,6 +102,7 @@ class FrameRecord:
     target_position_m: np.ndarray | None = None
 
 
+ERRS_ALIKE_S = 5.0  # from one exposure to the next; further apart where tags state a longer correlation
 ARRAY_SHAPES = {
     "world_to_camera": (4, 4),
     "quat_body_to_camera": (4,),
@@ -196,6 +198,22 @@ class Session:
     def nominal_exposures(self) -> bool:
         """Whether the exposure times are made up: pictures were imported that state none."""
         return self.frames_imported is not None and {r.exposure_time_s for r in self.frames} == {1.0}
+
+    @property
+    def frames_err_alone(self) -> bool:
+        """Whether the frames of a bracket are so far apart that the errors of their tags are not one and the same."""
+        return self.frame_spacing_s > max(ERRS_ALIKE_S, self.navigation.correlation_time_s)
+
+    @functools.cached_property
+    def frame_spacing_s(self) -> float:
+        """The time from one exposure of a bracket to the next, s, the median of the session; 0 without such two."""
+        apart_s = [
+            (after.mid_exposure_utc_ns - before.mid_exposure_utc_ns)
+            / (after.bracket_index - before.bracket_index)
+            for before, after in itertools.pairwise(self.frames)
+            if before.bracket == after.bracket and before.bracket_index < after.bracket_index
+        ]
+        return float(np.median(apart_s)) / 1e9 if apart_s else 0.0
 
     def K(self, record: FrameRecord) -> np.ndarray:
         """Return the pinhole matrix [3, 3] of a frame, float32, px."""

@@ -116,6 +116,7 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
         K=torch.from_numpy(session.K(record)),
         id=record.id,
         bracket=record.bracket,
+        own_pose=session.frames_err_alone,
         pose_covariance=torch.from_numpy(
             motion_covariance(record.covariance, record.world_to_camera[:3, :3])
         ),

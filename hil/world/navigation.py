@@ -98,7 +98,7 @@ def _states(
     # nobody told the filter the body's axes: it chose those that were inertial at the start
     free_axes = gcrs_to_body(start_ns).T if knowledge == "rate_only" else np.eye(3)
     step_s = section.max_gap_s / 2
-    noise = _bracket_noise(mission, errors, seed)
+    noise = _noise(mission, errors, seed)
     for number in range(int(np.ceil(_pass_s(mission) / step_s)) + 1):
         utc_ns = start_ns + round(number * step_s * NS)
         true_ns = utc_ns - round(errors.clock_s * NS) if errors else utc_ns
@@ -108,8 +108,8 @@ def _states(
         gcrs_to_camera = look_along(-relative_m, down=-np.cross(chaser.position_m, chaser.velocity_m_s))
         if errors:
             relative_m = relative_m + _position_error_m(errors, mission, target, true_ns)
-            bracket = round(number * step_s / mission.bracket.interval_s)
-            gcrs_to_camera = turned(turned(gcrs_to_camera, errors.boresight_rad), noise[bracket])
+            drawn = noise[round(number * step_s / _noise_spacing_s(mission))]
+            gcrs_to_camera = turned(turned(gcrs_to_camera, errors.boresight_rad), drawn)
         state = {
             "utc_ns": utc_ns,
             "target": {
@@ -131,12 +131,18 @@ def _states(
 def _pass_s(mission: Mission) -> float:
     bracket = mission.bracket
     frames = 16 if bracket.auto else len(bracket.exposure_times_ms)
-    return (bracket.count - 1) * bracket.interval_s + frames * bracket.frame_spacing_s + MARGIN_S
+    return (bracket.count - 1) * bracket.interval_s + frames * bracket.spacing_s(frames) + MARGIN_S
 
 
-def _bracket_noise(mission: Mission, errors: NavigationErrors | None, seed: int | None) -> np.ndarray:
-    """Return rotation vectors [N, 3] of the noise; the states half an interval around a trigger share one."""
-    count = int(_pass_s(mission) / mission.bracket.interval_s) + 2
+def _noise_spacing_s(mission: Mission) -> float:
+    """Return how long the noise stays the same: from one bracket to the next, or exposure where they are spread."""
+    bracket = mission.bracket
+    return bracket.interval_s if bracket.frame_spacing_s is not None else bracket.spacing_s()
+
+
+def _noise(mission: Mission, errors: NavigationErrors | None, seed: int | None) -> np.ndarray:
+    """Return rotation vectors [N, 3] of the noise; the states half a spacing around an exposure share one."""
+    count = int(_pass_s(mission) / _noise_spacing_s(mission)) + 2
     if errors is None:
         return np.zeros((count, 3))
     rng = np.random.default_rng([seed or 0, 1])  # another stream than that of the shared errors

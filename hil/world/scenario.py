@@ -101,9 +101,12 @@ class Scenario:
         return OrbitSection(self.target_tle, chaser_tle, self.start_utc)
 
     def bracket_section(
-        self, exposure_times_ms: tuple[float, ...], count: int | None = None
+        self, exposure_times_ms: tuple[float, ...], count: int | None = None, tight: bool = True
     ) -> BracketSection:
         """Return `count` brackets (default: the scenario's) spread evenly over the duration.
+
+        Args:
+            tight: the exposures of a bracket are half a second apart, not spread over the time to the next.
 
         Raises:
             ConfigError: they do not fit into the duration.
@@ -112,8 +115,8 @@ class Scenario:
         spacing_s = min(0.5, self.duration_s / (count * len(exposure_times_ms)))
         return BracketSection(
             exposure_times_ms=exposure_times_ms,
-            frame_spacing_s=spacing_s,
-            interval_s=self.duration_s / max(count - 1, 1),
+            frame_spacing_s=spacing_s if tight else None,
+            interval_s=self.duration_s / (max(count - 1, 1) if tight else count),
             count=count,
         )
 

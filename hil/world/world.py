@@ -74,7 +74,8 @@ def scenario_mission(mission: Mission, scenario: Scenario) -> Mission:
     is left out: flight receives it in the navigation states, if at all.
     """
     count = min(mission.bracket.count, scenario.brackets)
-    spread = scenario.bracket_section(mission.bracket.exposure_times_ms, count)
+    tight = mission.bracket.frame_spacing_s is not None
+    spread = scenario.bracket_section(mission.bracket.exposure_times_ms, count, tight)
     focal_px = mission.camera.width / 2 / np.tan(np.radians(scenario.fov_deg) / 2)
     at_centre = PoseSection()
     return dataclasses.replace(

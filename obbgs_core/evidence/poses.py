@@ -9,7 +9,7 @@ from torch import Tensor
 
 from obbgs_core.batches import Batch
 from obbgs_core.evidence import Evidence
-from obbgs_core.frames import TrainingFrame, bracket_numbers
+from obbgs_core.frames import TrainingFrame, pose_numbers
 from obbgs_core.losses import likelihood_loss
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
@@ -34,7 +34,7 @@ def validation_brackets(frames: list[TrainingFrame]) -> list[list[int]]:
 
 def every_seventh_bracket(frames: list[TrainingFrame]) -> list[list[int]]:
     """Return the frames, by index, of every seventh bracket, the fourth first; further frames change no earlier one."""
-    numbers = bracket_numbers(frames)
+    numbers = pose_numbers(frames)
     chosen = range(INTERVAL // 2, max(numbers) + 1, INTERVAL)
     return [[i for i, number in enumerate(numbers) if number == wanted] for wanted in chosen]
 

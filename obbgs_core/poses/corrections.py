@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from obbgs_base.navigation_errors import SIZE, NominalMotion, SharedParameters, displaced, jacobian
-from obbgs_core.frames import TrainingFrame, bracket_numbers
+from obbgs_core.frames import TrainingFrame, pose_numbers
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.motions import adjoints, motion_vectors, rigid_motions
@@ -37,18 +37,19 @@ class PoseCorrections:
     are exact, and shared parameters whose prior deviation is 0, are not corrected. The focal length is not estimated:
     from a distance it shows as the range does.
 
-    Frames of one bracket share their motion: the error of a navigation solution hardly changes within it. Its
-    covariance is the mean of those that the frames' tags give, each in its own camera's axes; an exact tag counts with
-    zeros. The tags of a bracket share one error instead of being independent draws, so several tags do not reduce it
-    (weighting by inverse covariances would claim so). However they are correlated, the covariance of their mean is
-    never larger than the mean of their covariances, and it is equal where the tags agree.
+    Frames of one bracket share their motion: the error of a navigation solution hardly changes within seconds. A
+    frame that says so (`own_pose`) counts as a bracket by itself. The covariance of a bracket's motion is the mean of
+    those that the frames' tags give, each in its own camera's axes; an exact tag counts with zeros. The tags of a
+    bracket share one error instead of being independent draws, so several tags do not reduce it (weighting by inverse
+    covariances would claim so). However they are correlated, the covariance of their mean is never larger than the
+    mean of their covariances, and it is equal where the tags agree.
     """
 
     # covariances as of `left_open`, when poses and surface last moved together; None: they did not yet
     together: tuple[Tensor, Tensor] | None = None
 
     def __init__(self, frames: list[TrainingFrame]):
-        self.of_frame = bracket_numbers(frames)  # the row of each frame
+        self.of_frame = pose_numbers(frames)  # the row of each frame
         count = max(self.of_frame) + 1
         self.value = torch.zeros(count, 6)
         covariances = torch.zeros(len(frames), 6, 6, dtype=torch.float64)

@@ -46,7 +46,16 @@ def test_the_shipped_mission_loads(tmp_path):
             r"mission\.bracket\.exposure_times_ms\[1\]: expected a number, got 'two'",
         ),
         ("[0.05, 0.1, 0.2]", "[]", r"mission\.bracket\.exposure_times_ms: expected 1 to 16"),
-        ("interval_s: 27.0", "interval_s: 1.0", r"mission\.bracket\.interval_s: 1\.0 s is shorter"),
+        (
+            "interval_s: 27.0",
+            "interval_s: 1.0\n  frame_spacing_s: 0.5",
+            r"mission\.bracket\.interval_s: 1\.0 s is shorter",
+        ),
+        (
+            "interval_s: 27.0",
+            "interval_s: 0.0003",
+            r"mission\.bracket\.interval_s: 0\.0003 s is shorter",
+        ),
         ("mode: spin", "mode: wobble", r"mission\.target_attitude\.mode: expected one of inertial, spin"),
         ("axis: sun", "axis: [1.0, 1.0, 0.0]", r"mission\.target_attitude\.axis: expected a unit vector"),
         ("baud_rate", "bawd_rate", r"mission\.link\.bawd_rate: unknown key; expected one of baud_rate"),

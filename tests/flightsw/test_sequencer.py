@@ -50,6 +50,18 @@ def test_every_exposure_is_planned_at_its_own_time():
     assert shots[2].mid_exposure_utc_ns - shots[2].start_utc_ns == 100_000
 
 
+def test_without_a_spacing_exposures_are_spread_evenly_over_the_pass_however_many_are_commanded():
+    mission = dataclasses.replace(
+        MISSION, bracket=dataclasses.replace(MISSION.bracket, frame_spacing_s=None, interval_s=30.0, count=4)
+    )
+    starts_s = [(shot.start_utc_ns - mission.orbit.start_utc_ns) / NS for shot in plan(mission)]
+    assert starts_s == list(range(0, 120, 10))
+    commanded = plan(mission, lambda trigger_ns: (1e-3, 2e-3, 3e-3, 4e-3, 5e-3))
+    assert [(shot.start_utc_ns - mission.orbit.start_utc_ns) / NS for shot in commanded] == list(
+        range(0, 120, 6)
+    )
+
+
 def test_one_bad_frame_is_counted_and_never_ends_the_pass(tmp_path):
     store = FrameStore(tmp_path)
     counts = capture(MISSION, Sky(failing=(4, 5)), store)

@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -18,7 +19,7 @@ from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.navigation import RelativePose, SatelliteStates, interpolate, parse_state
 from flightsw.pose import navigation_tag
 from ground.session.folder import open_session
-from ground.session.training_frames import motion_covariance, tag_covariance, training_frame
+from ground.session.training_frames import frames_of, motion_covariance, tag_covariance, training_frame
 from obbgs_core.model.pose_covariance import flaw
 from obbgs_core.poses.corrections import PoseCorrections
 
@@ -158,3 +159,30 @@ def test_what_a_tag_states_of_a_motion_is_the_motions_covariance_again(seed):
     covariance = factor @ factor.T
     there_and_back = motion_covariance(tag_covariance(covariance, turn), turn)
     np.testing.assert_allclose(there_and_back, covariance, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "apart_s, correlation_s, corrections", [(0.5, 0, 2), (4.9, 0, 2), (9, 0, 6), (9, 8, 6), (9, 30, 2)]
+)
+def test_frames_share_a_correction_where_their_tags_err_alike(tmp_path, apart_s, correlation_s, corrections):
+    """Within seconds they do; further apart as the tags' correlation time says."""
+    shutil.copytree(GOLDEN, tmp_path / "session")
+    lines = [json.loads(line) for line in (GOLDEN / "frames.jsonl").read_text().splitlines()[:6]]
+    lines = [
+        line | {"mid_exposure_utc_ns": round((27 * (i // 3) + apart_s * (i % 3)) * 1e9)}
+        for i, line in enumerate(lines)
+    ]
+    (tmp_path / "session" / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    header = json.loads((GOLDEN / "session.json").read_text())
+    header["navigation"] = {"correlation_time_s": correlation_s}
+    (tmp_path / "session" / "session.json").write_text(json.dumps(header))
+    session = open_session(tmp_path / "session")
+    assert [record.bracket_index for record in session.frames] == [0, 1, 2] * 2
+    assert session.frame_spacing_s == pytest.approx(apart_s)
+    frames = frames_of(session, session.frames)
+    assert len(PoseCorrections(frames).value) == corrections
+    assert len({frame.bracket for frame in frames}) == 2
+    without_one = dataclasses.replace(
+        session, frames=session.frames[:1] + session.frames[2:]
+    )  # lost on the link
+    assert len(PoseCorrections(frames_of(without_one, without_one.frames)).value) == min(corrections, 5)
