@@ -33,7 +33,7 @@ class Backdrop:
 
 def earth_pixels(frame: TrainingFrame) -> Tensor:
     """Return which pixels [H, W] of a frame can show the Earth or its air."""
-    height, width = frame.dn.shape[:2]
+    height, width = frame.shape[:2]
     if frame.earth_m is None:
         return torch.zeros(height, width, dtype=torch.bool)
     rays = camera_rays(frame.K.double().numpy(), width, height)

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from obbgs_core.background import Backdrop
+from obbgs_core.compact import Compact, held, part, whole
 from obbgs_core.frames import TrainingFrame, averaged, cameras_of
 from obbgs_core.model.cameras import Cameras
 
@@ -35,7 +36,7 @@ class Batch:
 
 
 class Batches:
-    """The training frames at every image scale; each scale is averaged once, when it is first asked for.
+    """The training frames at every image scale; each frame is averaged once, when it is first asked for.
 
     white_dn: the sensor's full scale.
     sky, solid: where silhouettes show empty sky, and what is solid, [H, W] bool by the frame's index; frames without a
@@ -47,17 +48,18 @@ class Batches:
         self,
         frames: list[TrainingFrame],
         white_dn: float,
-        sky: dict[int, Tensor] | None = None,
+        sky: Mapping[int, Tensor | Compact] | None = None,
         windows: Tensor | None = None,
-        solid: dict[int, Tensor] | None = None,
+        solid: Mapping[int, Tensor | Compact] | None = None,
     ):
         self.frames, self.white_dn = frames, white_dn
-        self._masks = (sky or {}, solid or {})
+        self._masks = {"sky": dict(sky or {}), "solid": dict(solid or {})}
         self._backdrops: dict[int, Backdrop] = {}
-        self._behind: dict[tuple[int, str], list[Tensor]] = {}
         self._windows = windows
-        self._images: dict[int, list[Tensor]] = {}
-        self._shares: dict[int, tuple[list[Tensor] | None, ...]] = {}
+        height, width = frames[0].shape[:2]
+        # [F, 4] what a batch can show of each frame
+        self._reached = None if windows is None else common(windows, width, height)
+        self._images: dict[tuple[str, int, int], Tensor] = {}  # by name, factor and frame
 
     def cameras(self, indices: list[int]) -> Cameras:
         """Return the cameras of whole frames, with nothing behind the target."""
@@ -81,44 +83,30 @@ class Batches:
             sky: [H, W] bool, without the target; it is only used where silhouettes' sky is.
         """
         self._backdrops = backdrops
-        if self._masks[0]:
-            self._masks = (self._masks[0] | sky, self._masks[1])
-        self._images, self._shares, self._behind = {}, {}, {}  # copies keep those that they have
+        if self._masks["sky"]:
+            self._masks = self._masks | {"sky": self._masks["sky"] | {i: held(m) for i, m in sky.items()}}
+        self._images = {}  # copies keep those that they have
 
     def batch(self, indices: list[int], scale: float = 1.0) -> Batch:
         """Return given frames, averaged to `scale` (1 / whole number) of their size, or windows of one size of them."""
         factor = round(1 / scale)
-        if factor not in self._images:
-            readings = [
-                self._backdrops[i].dn if i in self._backdrops else f.dn for i, f in enumerate(self.frames)
-            ]
-            images = [averaged(dn, factor, self.white_dn) for dn in readings]
-            if self._backdrops:
-                nothing = torch.zeros_like(images[0])
-                for name in ("radiance", "sigma"):
-                    self._behind[factor, name] = [
-                        averaged(getattr(self._backdrops[i], name), factor, torch.inf)
-                        if i in self._backdrops
-                        else nothing
-                        for i in range(len(self.frames))
-                    ]
-            self._shares[factor] = tuple(self._shares_at(m, images[0].shape[:2], factor) for m in self._masks)
-            self._images[factor] = images  # last: another thread may ask meanwhile
         cameras, share, shown = self._shown(indices, factor)
 
-        def stacked(images: list[Tensor]) -> Tensor:
-            return torch.stack([images[i][part] for i, part in zip(indices, shown, strict=True)])
+        def stacked(name: str) -> Tensor:
+            return torch.stack(
+                [self._image(name, factor, i)[place] for i, place in zip(indices, shown, strict=True)]
+            )
 
-        sky, solid = (None if shares is None else stacked(shares) for shares in self._shares[factor])
+        sky, solid = (stacked(name) if self._masks[name] else None for name in ("sky", "solid"))
         cameras = cameras.scaled(1 / factor) if factor > 1 else cameras
         doubt = None
         if any(i in self._backdrops for i in indices):
-            cameras = dataclasses.replace(cameras, backdrop=stacked(self._behind[factor, "radiance"]))
-            doubt = stacked(self._behind[factor, "sigma"])
+            cameras = dataclasses.replace(cameras, backdrop=stacked("radiance"))
+            doubt = stacked("sigma")
         return Batch(
             indices,
             cameras,
-            stacked(self._images[factor]),
+            stacked("dn"),
             torch.tensor([self.frames[i].exposure_time_s for i in indices]).view(-1, 1, 1, 1),
             factor * factor,
             share,
@@ -126,6 +114,40 @@ class Batches:
             solid,
             doubt,
         )
+
+    def _image(self, name: str, factor: int, index: int) -> Tensor:
+        """Return what batches can show of a frame, averaged: dn, sky or solid, or its backdrop's radiance or sigma."""
+        if (name, factor, index) in self._images:
+            return self._images[name, factor, index]
+        rows, columns = self._reach(factor, index)
+        backdrop = self._backdrops.get(index)
+        if name in self._masks:
+            mask = self._masks[name].get(index)
+            if mask is None:
+                size = self.frames[index].part(rows, columns).shape[:2]
+                image = torch.zeros([-(-side // factor) for side in size])
+            else:
+                image = part(mask, rows, columns).float()
+                image = F.avg_pool2d(image[None], factor, ceil_mode=True)[0] if factor > 1 else image
+        elif name == "dn":
+            frame = self.frames[index]
+            dn = frame.part(rows, columns) if backdrop is None else backdrop.dn[rows, columns]
+            image = averaged(dn, factor, self.white_dn)
+        else:
+            nothing = torch.zeros_like(self.frames[index].part(rows, columns))
+            image = nothing if backdrop is None else getattr(backdrop, name)[rows, columns]
+            image = averaged(image, factor, torch.inf)
+        if factor > 1 or not self.frames[index].is_compact:
+            self._images[name, factor, index] = image
+        return image
+
+    def _reach(self, factor: int, index: int) -> tuple[slice, slice]:
+        """Return which rows and columns of a frame batches of this factor can show."""
+        if self._reached is None or GRID_PX % factor:
+            return slice(None), slice(None)
+        left, top, right, bottom = self._reached[index].tolist()
+        right, bottom = (factor * -(-end // factor) for end in (right, bottom))  # of whole pixels
+        return slice(top, bottom), slice(left, right)
 
     def _shown(self, indices: list[int], factor: int) -> tuple[Cameras, float, list[tuple[slice, slice]]]:
         """Return the cameras of what is shown of some frames, its share of their pixels, and where it lies."""
@@ -137,23 +159,16 @@ class Batches:
         K[:, :2, 2] -= parts[:, :2]
         width, height = (parts[0, 2:] - parts[0, :2]).tolist()
         share = width * height / (cameras.width * cameras.height)
+        if self._reached is not None:  # images begin there
+            parts = parts - self._reached[indices][:, :2].repeat(1, 2)
         ends = (parts // factor + (parts % factor > 0)).tolist()  # rounded up, as averaging does at the edge
         shown = [(slice(top, bottom), slice(left, right)) for left, top, right, bottom in ends]
         return dataclasses.replace(cameras, K=K, width=width, height=height), share, shown
 
-    def _shares_at(self, masks: dict[int, Tensor], size: torch.Size, factor: int) -> list[Tensor] | None:
-        """Return each frame's shares of a mask [H, W], those without one share one image of zeros; None if none has."""
-        if not masks:
-            return None
-        unknown = torch.zeros(size)
-        shares = {
-            i: F.avg_pool2d(mask[None].float(), factor, ceil_mode=True)[0] if factor > 1 else mask.float()
-            for i, mask in masks.items()
-        }
-        return [shares.get(i, unknown) for i in range(len(self.frames))]
 
-
-def windows(frames: Sequence[TrainingFrame], means: Tensor, certain: Mapping[int, Tensor]) -> Tensor:
+def windows(
+    frames: Sequence[TrainingFrame], means: Tensor, certain: Mapping[int, Tensor | Compact]
+) -> Tensor:
     """Return the window [F, 4] of each frame that the target lies in: left, top, right and bottom, px, int64.
 
     It holds the start of the training as the frame's pose projects it. All are wider by as much as the certain light
@@ -165,19 +180,21 @@ def windows(frames: Sequence[TrainingFrame], means: Tensor, certain: Mapping[int
         means: [N, 3] m, centres of the first Gaussians, body frame.
         certain: [H, W], where silhouettes of some of the frames show light for certain, by the index of the frame.
     """
-    height, width = frames[0].dn.shape[:2]
+    height, width = frames[0].shape[:2]
     reached = torch.stack([_projected(frame, means) for frame in frames])
-    whole = torch.tensor([0, 0, width, height])
+    all_of_it = torch.tensor([0, 0, width, height])
     outwards = torch.tensor([-1, -1, 1, 1])
     beyond = [
-        ((_bounds(light) - reached[i]) * outwards).amax() for i, light in certain.items() if light.any()
+        ((_bounds(light) - reached[i]) * outwards).amax()
+        for i, light in ((i, whole(mask)) for i, mask in certain.items())
+        if light.any()
     ]
     margin = MARGIN_PX + max([0.0, *(float(b) for b in beyond if b.isfinite())])
     begin = ((reached[:, :2] - margin) / GRID_PX).floor() * GRID_PX
     end = ((reached[:, 2:] + margin) / GRID_PX).ceil() * GRID_PX
-    found = torch.cat([begin, end], dim=1).clamp(min=torch.zeros(4), max=whole[[2, 3, 2, 3]].float())
+    found = torch.cat([begin, end], dim=1).clamp(min=torch.zeros(4), max=all_of_it[[2, 3, 2, 3]].float())
     inside = (found.isfinite().all(dim=1) & (found[:, 2:] > found[:, :2]).all(dim=1))[:, None]
-    return torch.where(inside, found.nan_to_num(), whole.float()).long()
+    return torch.where(inside, found.nan_to_num(), all_of_it.float()).long()
 
 
 def common(windows: Tensor, width: int, height: int) -> Tensor:

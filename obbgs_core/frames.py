@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from obbgs_base.navigation_errors import SharedParameters
+from obbgs_core.compact import Compact, hold_compact, part
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.model.cameras import Cameras, stacked_suns
 from obbgs_core.model.pose_covariance import flaw
@@ -79,6 +80,24 @@ class TrainingFrame:
     inertial_to_body: Tensor | None = None
     earth_m: Tensor | None = None
 
+    @property
+    def shape(self) -> torch.Size:
+        """Of dn, [H, W, C]."""
+        return self.__dict__["_dn"].shape
+
+    @property
+    def is_compact(self) -> bool:
+        """Whether dn is held in little memory, so that reading it takes time."""
+        return isinstance(self.__dict__["_dn"], Compact)
+
+    def part(self, rows: slice, columns: slice) -> Tensor:
+        """Return some rows and columns of dn [h, w, C]."""
+        return part(self.__dict__["_dn"], rows, columns)
+
+
+# 360 pictures of 12 megapixels take 18 GB in single precision
+hold_compact(TrainingFrame, ["dn"])
+
 
 def sun_span_deg(frames: list[TrainingFrame]) -> float:
     """Return the largest angle between the Sun's directions in two frames; 0 where it is not known in all."""
@@ -103,7 +122,7 @@ def camera_extent_m(frames: list[TrainingFrame]) -> float:
 
 def cameras_of(frames: list[TrainingFrame]) -> Cameras:
     """Return the cameras of some frames of one size and background, with their Sun where it is known in all."""
-    height, width = frames[0].dn.shape[:2]
+    height, width = frames[0].shape[:2]
     poses, K = torch.stack([f.world_to_camera for f in frames]), torch.stack([f.K for f in frames])
     suns, psf_sigma_px = stacked_suns([f.sun_dir for f in frames]), frames[0].psf_sigma_px
     background = frames[0].background
@@ -118,7 +137,7 @@ def sampling_rates(means: Tensor, frames: list[TrainingFrame]) -> Tensor:
     """
     rate = torch.zeros(len(means))
     for frame in frames:
-        height, width = frame.dn.shape[:2]
+        height, width = frame.shape[:2]
         x, y, z = (means @ frame.world_to_camera[:3, :3].T + frame.world_to_camera[:3, 3]).unbind(dim=1)
         depth = z.clamp(min=1e-6)
         u = frame.K[0, 0] * x / depth + frame.K[0, 2]
@@ -146,24 +165,22 @@ def usable(
     if len(frames) < FEWEST_FRAMES:
         raise TooFewFrames(f"a reconstruction needs at least {FEWEST_FRAMES} frames, got {len(frames)}")
     frames = [
-        dataclasses.replace(
-            f, **{name: getattr(f, name).detach().float() for name in ("dn", "world_to_camera", "K")}
-        )
+        dataclasses.replace(f, **{name: _single(getattr(f, name)) for name in ("dn", "world_to_camera", "K")})
         for f in frames
     ]
     if len({f.id for f in frames}) < len(frames):  # ids that name no frame: places in the list do
         frames = [dataclasses.replace(f, id=position) for position, f in enumerate(frames)]
     for f in frames:
-        if f.dn.ndim != 3 or f.dn.shape[2] not in (1, 3) or min(f.dn.shape[:2]) < 3:
+        if len(f.shape) != 3 or f.shape[2] not in (1, 3) or min(f.shape[:2]) < 3:
             raise ReconstructionError(
-                f"frame {f.id}: expected a picture [H, W, 1 or 3] of at least 3x3 pixels, got {list(f.dn.shape)}"
+                f"frame {f.id}: expected a picture [H, W, 1 or 3] of at least 3x3 pixels, got {list(f.shape)}"
             )
         if f.world_to_camera.shape != (4, 4) or f.K.shape != (3, 3):
             shapes = f"{list(f.world_to_camera.shape)} and {list(f.K.shape)}"
             raise ReconstructionError(
                 f"frame {f.id}: expected world_to_camera [4, 4] and K [3, 3], got {shapes}"
             )
-    shapes = {tuple(f.dn.shape) for f in frames}
+    shapes = {tuple(f.shape) for f in frames}
     if len(shapes) > 1:
         raise ReconstructionError(f"all frames must have one size and channel count, got {sorted(shapes)}")
     backgrounds = sorted({f.background for f in frames})
@@ -235,6 +252,10 @@ def _pinhole_fault(frame: TrainingFrame, white_dn: float) -> str | None:
             "shifted into 16 must be shifted back, or white_dn be that of the readings"
         )
     return None
+
+
+def _single(values: Tensor) -> Tensor:
+    return values.detach().float() if values.requires_grad or values.dtype != torch.float32 else values
 
 
 def bracket_numbers(frames: list[TrainingFrame]) -> list[int]:

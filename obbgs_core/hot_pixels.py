@@ -54,9 +54,9 @@ def without_hot_pixels(frames: list[TrainingFrame], sensor: Sensor) -> tuple[lis
 def hot_pixels(frames: list[TrainingFrame], sensor: Sensor) -> Tensor:
     """Return which pixels [H, W] read more than their neighbours wherever those show empty sky."""
     dark_dn, sigma_dn = dark_reading(sensor)
-    sigma_dn /= math.sqrt(frames[0].dn.shape[2])
+    sigma_dn /= math.sqrt(frames[0].shape[2])
     apart_dn = sigma_dn * math.sqrt(1 + 1 / 8)
-    total, count = torch.zeros(2, *frames[0].dn.shape[:2])
+    total, count = torch.zeros(2, *frames[0].shape[:2])
     for frame in frames[:: math.ceil(len(frames) / LOOKED_AT)]:
         grey = frame.dn.mean(dim=2)
         around = _around(grey) / _around(torch.ones_like(grey))

@@ -96,7 +96,7 @@ def levelled(frames: list[TrainingFrame], sensor: Sensor) -> tuple[list[Training
         The frames and the sensor with which their readings say of the light what those given say of light and
         departure; those given where the stated level fits. And the level.
     """
-    channels = frames[0].dn.shape[2]
+    channels = frames[0].shape[2]
     nothing = torch.zeros(len(frames), channels, 3)
     ids = [f.id for f in frames]
     told = SkyLevel(ids, nothing, torch.full_like(nothing, math.inf))
@@ -135,7 +135,7 @@ def _basis(rows: int, columns: int) -> Tensor:
 
 def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tensor, float]:
     """Return planes [F, C, 3] and their variances, infinite where a frame shows no sky, and a reading's deviation."""
-    height, width, channels = frames[0].dn.shape
+    height, width, channels = frames[0].shape
     px = max(2, round(min(height, width) / BLOCKS))
     if sensor.jpeg is not None:  # within its blocks readings are not independent
         px = BLOCK_PX * max(1, round(px / BLOCK_PX))
@@ -365,7 +365,7 @@ def _without(
     A reading clipped at zero says "at most this much", one at full scale "at least this much". Both still do after the
     field was taken off, if all readings are clipped again at levels that no field moves the old ones beyond.
     """
-    height, width = frames[0].dn.shape[:2]
+    height, width = frames[0].shape[:2]
     corner = planes_dn[..., 1:].abs().sum(dim=2)
     lowest = min(0.0, float((planes_dn[..., 0] - corner).min()))
     highest = max(0.0, float((planes_dn[..., 0] + corner).max()))

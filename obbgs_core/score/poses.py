@@ -102,7 +102,7 @@ def _settled(model: Gaussians, frame: TrainingFrame, sensor: Sensor) -> Tensor:
     if not int(poses.rank[0]):
         return frame.world_to_camera
     exposure_s = torch.tensor(frame.exposure_time_s).view(1, 1, 1, 1)
-    for factor in (f for f in SCALES if f == 1 or min(frame.dn.shape[:2]) >= f * SMALLEST_PX):
+    for factor in (f for f in SCALES if f == 1 or min(frame.shape[:2]) >= f * SMALLEST_PX):
         dn, cameras = averaged(frame.dn, factor, sensor.white_dn)[None], whole.scaled(1 / factor)
         for _ in range(STEPS):
             at = poses.cameras([0], cameras)

@@ -35,7 +35,7 @@ def shown_points(points_m: np.ndarray, frames: Sequence[TrainingFrame], sensor: 
     dark_dn, sigma_dn = dark_reading(sensor)
     light, weight, views = torch.zeros(3, len(points))
     for frame in frames:
-        signal = (frame.dn.mean(dim=-1) - dark_dn) / (sigma_dn / math.sqrt(frame.dn.shape[2]))
+        signal = (frame.dn.mean(dim=-1) - dark_dn) / (sigma_dn / math.sqrt(frame.shape[2]))
         index, pixel = _in_view(points, frame)
         light[index] += frame.exposure_time_s * signal.flatten()[pixel]
         weight[index] += frame.exposure_time_s**2
@@ -45,7 +45,7 @@ def shown_points(points_m: np.ndarray, frames: Sequence[TrainingFrame], sensor: 
 
 def _in_view(points: Tensor, frame: TrainingFrame) -> tuple[Tensor, Tensor]:
     """Return the points [K] that a camera has in view, by their index, and the index [K] of the pixel of each."""
-    pose, K, (height, width) = frame.world_to_camera, frame.K, frame.dn.shape[:2]
+    pose, K, (height, width) = frame.world_to_camera, frame.K, frame.shape[:2]
     p = points @ pose[:3, :3].T + pose[:3, 3]
     z = p[:, 2]
     u, v = (K[i, i] * p[:, i] / z + K[i, 2] for i in (0, 1))

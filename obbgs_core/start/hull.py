@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
+from obbgs_core.compact import hold_compact
 from obbgs_core.sensor import Sensor, dark_reading
 
 log = logging.getLogger(__name__)
@@ -72,6 +73,9 @@ class Silhouette:
             return self
         likely, lit = (_dilated(mask[None, None], reach_px)[0, 0] for mask in (self.likely, ~self.sky))
         return dataclasses.replace(self, likely=likely, sky=~lit, grown_px=self.grown_px + reach_px)
+
+
+hold_compact(Silhouette, ["certain", "likely", "sky"])
 
 
 def silhouette(dn: Tensor, sensor: Sensor, world_to_camera: Tensor, K: Tensor) -> Silhouette:

@@ -165,7 +165,7 @@ def _colours(
 ) -> Tensor:
     """Return the coefficients of degree 0 [N, C] that Gaussians at points start with."""
     if grey:
-        noise = torch.rand(len(points), frames[0].dn.shape[2], generator=rng)
+        noise = torch.rand(len(points), frames[0].shape[2], generator=rng)
         full_scale = sensor.full_scale_radiance(mean_exposure_s(frames))
         return sh.from_radiance((0.5 + sh.C0 * noise / 255) * full_scale)
     return sh.from_radiance(_seen_radiance(points, frames, sensor))
@@ -201,14 +201,14 @@ def _round_gaussians(
 
 def _seen_radiance(points: Tensor, frames: list[TrainingFrame], sensor: Sensor) -> Tensor:
     """Return the mean radiance [N, C] that some of the frames show where the points project, occlusion ignored."""
-    total, seen = torch.zeros(len(points), frames[0].dn.shape[2]), torch.zeros(len(points), 1)
+    total, seen = torch.zeros(len(points), frames[0].shape[2]), torch.zeros(len(points), 1)
     frames = [frame for frame in frames if frame.earth_m is None] or frames
     for frame in frames[:: max(1, len(frames) // VIEWS_FOR_COLOUR)]:
         p = points @ frame.world_to_camera[:3, :3].T + frame.world_to_camera[:3, 3]
         z = p[:, 2].clamp(min=1e-6)
         u = (frame.K[0, 0] * p[:, 0] / z + frame.K[0, 2]).long()
         v = (frame.K[1, 1] * p[:, 1] / z + frame.K[1, 2]).long()
-        height, width = frame.dn.shape[:2]
+        height, width = frame.shape[:2]
         inside = ((p[:, 2] > 1e-6) & (u >= 0) & (v >= 0) & (u < width) & (v < height))[:, None]
         signal = frame.dn[v.clamp(0, height - 1), u.clamp(0, width - 1)] - sensor.black_dn
         total += inside * signal.clamp(min=0) / (sensor.dn_per_radiance_s * frame.exposure_time_s)

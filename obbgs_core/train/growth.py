@@ -69,7 +69,7 @@ class Growth:
         if config.published.depth_scale:
             near_m = config.published.depth_scale * setup.unit_m
             depth_weight = near_camera_weight(gaussians.means, cameras, near_m)
-        height, width = setup.frames[0].dn.shape[:2]  # half of it is the unit of the published threshold
+        height, width = setup.frames[0].shape[:2]  # half of it is the unit of the published threshold
         half_x_px, half_y_px = 0.5 * cameras.scale * width, 0.5 * cameras.scale * height
         if config.growth.grown_share:  # ranks by the gradient itself
             half_x_px = half_y_px = max(half_x_px, half_y_px)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from obbgs_core.batches import Batches, windows
+from obbgs_core.compact import Compact, held, whole
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import (
     FEWEST_FRAMES,
@@ -157,8 +158,8 @@ def prepare(
     outlines, poses, why = settled(lit, seen, config.poses.refine != "never", refined)
     posed = lit if poses is None else poses.frames(lit)
     noise += _unusual_unit(lit, sensor)
-    certain = {i: outline.certain for i, outline in outlines.items()}
-    config, budget = _limited(config, [int(mask.sum()) for mask in certain.values()])
+    certain = {i: held(outline.certain) for i, outline in outlines.items()}
+    config, budget = _limited(config, [int(whole(mask).sum()) for mask in certain.values()])
     given = (posed, list(outlines.values()), sensor, config.start, published.sh_degree, rng)
     gaussians, radius_m, start = first_gaussians(*given, published.grey_start)
     _check_nearness(gaussians.means.detach(), posed)
@@ -208,7 +209,7 @@ def _lit(frames: list[TrainingFrame], shown: list[bool]) -> list[TrainingFrame]:
 
 def _masks(
     outlines: dict[int, Silhouette], config: MethodConfig, span_deg: float, frames: list[TrainingFrame]
-) -> tuple[dict[int, Tensor], dict[int, Tensor]]:
+) -> tuple[dict[int, Tensor | Compact], dict[int, Tensor | Compact]]:
     """Return where silhouettes show empty sky, and what is solid, by the frame's index; empty where not asked for.
 
     What is dark under one Sun is lit under another, which tells it from dust: where the Sun moves nothing is solid. Nor
@@ -216,9 +217,9 @@ def _masks(
     neither: what stands behind the target in them follows from the model.
     """
     outlines = {i: outline for i, outline in outlines.items() if frames[i].earth_m is None}
-    sky = {i: outline.sky for i, outline in outlines.items()} if config.loss.sky_weight else {}
+    sky = {i: held(outline.sky) for i, outline in outlines.items()} if config.loss.sky_weight else {}
     used = config.loss.solid_weight and not config.light.moves(span_deg) and not frames[0].background
-    return sky, {i: outline.solid for i, outline in outlines.items()} if used else {}
+    return sky, {i: held(outline.solid) for i, outline in outlines.items()} if used else {}
 
 
 def _check_nearness(points: Tensor, frames: list[TrainingFrame]) -> None:

@@ -127,7 +127,7 @@ class TrainingState:
         # the method's own memory only where neither the Sun nor the poses can move
         still = as_tagged and not is_open and not setup.sun_moves
         memory = config.rates.second_memory if still else SECOND_MEMORY
-        channels = setup.frames[0].dn.shape[2]
+        channels = setup.frames[0].shape[2]
         state = TrainingState(
             rng=start.rng,
             gaussians=start.gaussians,

@@ -1,0 +1,86 @@
+"""Pictures in little memory: what is read is what was given, bit for bit, and trainings are the same."""
+
+import dataclasses
+import tracemalloc
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from obbgs_core import compact, preset
+from obbgs_core.compact import Compact, held, part, whole
+from obbgs_core.train.trainer import Trainer
+from tests import scenes
+
+
+@st.composite
+def pictures(draw) -> torch.Tensor:
+    """Pictures of one value around a rectangle, of every type that pictures and masks have."""
+    height, width = draw(st.integers(1, 9)), draw(st.integers(1, 20))
+    channels = draw(st.sampled_from([(), (1,), (3,)]))
+    kind = draw(st.sampled_from([np.float32, np.uint8, np.uint16, np.float64, bool]))
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    picture = np.broadcast_to(rng.integers(0, 2, channels), (height, width, *channels)).astype(kind)
+    top, left = draw(st.integers(0, height)), draw(st.integers(0, width))
+    inside = picture[top : draw(st.integers(0, height)), left : draw(st.integers(0, width))]
+    largest = draw(st.sampled_from([2, 256, 5000, 70_000]))
+    inside[...] = (rng.integers(0, largest, inside.shape) / draw(st.sampled_from([1, 3]))).astype(kind)
+    return torch.from_numpy(picture)
+
+
+@given(pictures(), st.data())
+def test_every_part_of_a_picture_is_what_was_given(picture, data):
+    small = Compact.of(picture)
+    found = small.tensor()
+    assert found.dtype == picture.dtype and torch.equal(found, picture)
+    rows, columns = (
+        slice(*sorted(data.draw(st.lists(st.integers(0, side), min_size=2, max_size=2))))
+        for side in picture.shape[:2]
+    )
+    assert torch.equal(small.part(rows, columns), picture[rows, columns])
+    found.numpy()[...] = 0  # a copy
+    assert torch.equal(small.tensor(), picture)
+
+
+def test_large_pictures_are_held_in_the_memory_of_what_they_show():
+    dn = torch.full((1500, 1000, 1), 64.0)
+    dn[300:700, 200:600] = torch.randint(0, 4096, (400, 400, 1)).float()
+    tracemalloc.start()
+    frame = scenes.photographed(scenes.target(), 1)[0]
+    frame = dataclasses.replace(frame, dn=dn)
+    others = [dataclasses.replace(frame, id=number) for number in range(20)]
+    taken, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert taken < 1e6  # 16 bits of 400x400 pixels, once; NumPy tells tracemalloc, PyTorch does not
+    assert all(torch.equal(other.dn, dn) for other in others[:2])
+    assert others[0].shape == dn.shape
+    changed = others[1].dn
+    changed[0, 0] = 7.0  # of a copy
+    assert torch.equal(others[1].dn, dn)
+    assert torch.equal(dataclasses.replace(frame, dn=changed).dn, changed)
+
+
+def test_what_is_small_stays_as_it_is():
+    dn = torch.rand(20, 20, 1)
+    assert held(dn) is dn and whole(dn) is dn
+    assert torch.equal(part(dn, slice(2, 4), slice(3, 9)), dn[2:4, 3:9])
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.25])
+def test_a_training_on_compact_frames_is_the_same_to_the_bit(monkeypatch, scale):
+    def trained() -> list[torch.Tensor]:
+        frames = scenes.photographed(scenes.target(), 12, size_px=45)
+        trainer = Trainer(frames, scenes.SENSOR, preset("obbgs", {"steps": 30}), seed=1)
+        for _ in range(6):
+            trainer.step()
+        batch = trainer.setup.batches.batch([1, 3], scale)
+        assert trainer.setup.frames[0].is_compact == (compact.FEWEST_PX < 45**2)
+        masks = [mask for mask in (batch.sky, batch.solid) if mask is not None]
+        return [batch.dn, *masks, trainer.state.model.means.detach(), torch.tensor(trainer.setup.radius_m)]
+
+    as_given = trained()
+    monkeypatch.setattr(compact, "FEWEST_PX", 1)
+    for ours, theirs in zip(trained(), as_given, strict=True):
+        assert torch.equal(ours, theirs)
