@@ -170,11 +170,14 @@ def plan_command(mission: MissionFile = Path("mission.yaml"), json_: AsJson = Fa
     """
     from flightsw.planning import pass_plan
 
-    planned = pass_plan(load_mission(mission))
+    loaded = load_mission(mission)
+    planned = pass_plan(loaded)
     if json_:
         print(json.dumps(dataclasses.asdict(planned)))
         return
     print(f"camera: {planned.view}")
+    bracket = loaded.bracket
+    print(f"exposures: {bracket.spacing_s():g} s apart, a bracket every {bracket.interval_s:g} s")
     for problem in planned.problems:
         print(f"warning: {problem}")
     print(
