@@ -1,8 +1,8 @@
 """How much memory a training takes on large pictures: the peak of the process, stage by stage.
 
 The frames are those of a small pass (`tests.benchmarks.passes`), each pixel a block of pixels of the sensor, with noise
-of its own, in the middle third of pictures that are black elsewhere as flight sends them. A few are made and come again
-under other numbers, each held by itself: what they show matters to no figure of this benchmark.
+of its own, in the middle third of pictures that are black elsewhere as flight sends them. A few places are taken again
+and again: what frames show matters to no figure of this benchmark.
 
     python -m tests.benchmarks.memory --frames 360 --json
 """
@@ -34,21 +34,21 @@ def frames_of(count: int, width: int, height: int) -> list[TrainingFrame]:
     top, left = (height - side) // 2, (width - side) // 2
     small = photographed(0, load_scenario("fly-around"), BRACKETS, SMALL_PX, seed=0)
     rng, made = np.random.default_rng(0), []
-    for frame, radiance in zip(small.frames, small.radiance, strict=True):
+    noise = rng.standard_normal((2 * side, 2 * side, 1), dtype=np.float32)
+    for number in range(count):
+        frame, radiance = (given[number % len(small.frames)] for given in (small.frames, small.radiance))
         expected = SENSOR.expected_dn(radiance, frame.exposure_time_s)
-        block = expected.numpy().repeat(factor, 0).repeat(factor, 1)
-        sigma = SENSOR.variance_dn2(torch.from_numpy(block)).sqrt().numpy()
-        noisy = block + sigma * rng.standard_normal(block.shape, dtype=np.float32)
+        sigma = SENSOR.variance_dn2(expected).sqrt()
+        block, sigma = (values.numpy().repeat(factor, 0).repeat(factor, 1) for values in (expected, sigma))
+        y, x = rng.integers(0, side, 2)
+        noisy = block + sigma * noise[y : y + side, x : x + side]
         dn = np.full((height, width, 1), SENSOR.black_dn, dtype=np.float32)
         dn[top : top + side, left : left + side] = noisy.round().clip(0, SENSOR.white_dn)
         K = frame.K * factor
         K[:, 2] = torch.tensor([left, top, 0.0]) + K[:, 2] * torch.tensor([1.0, 1.0, 0.0])
         K[2, 2] = 1.0
-        made.append(dataclasses.replace(frame, dn=torch.from_numpy(dn), K=K))
-    return [
-        dataclasses.replace(f, dn=f.dn.clone(), id=number, bracket=number // 3)
-        for number, f in ((n, made[n % len(made)]) for n in range(count))
-    ]
+        made.append(dataclasses.replace(frame, dn=torch.from_numpy(dn), K=K, id=number, bracket=number // 3))
+    return made
 
 
 def peak_gb() -> float:
