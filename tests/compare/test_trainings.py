@@ -11,7 +11,7 @@ import torch
 from compare import trainings
 from compare.case import Case, load_case
 from compare.energy import EnergyMeter
-from compare.follow import FEW_MARKS, MARKS, Follower, image_of
+from compare.follow import MARKS, SURFACE_MARKS, Follower, image_of
 from compare.opponents.reconstruction import Reconstruction, Work
 from compare.trainings import reconstruct_gaussians
 from compare.validation import withheld
@@ -143,7 +143,7 @@ def test_the_curve_is_measured_on_the_way_and_goes_on_after_an_interruption(case
     assert [round(point["share"] * STEPS) for point in curve] == [*sorted(due - {STEPS}), STEPS]
     assert all({"seconds", "cpu_seconds", "psnr_clean_db", "chamfer"} <= set(point) for point in curve)
     of_surface = [round(point["share"] * STEPS) for point in curve[:-1] if "f_02_surface" in point]
-    assert of_surface == sorted({math.ceil(mark * STEPS - 1e-9) for mark in FEW_MARKS})
+    assert of_surface == sorted({math.ceil(mark * STEPS - 1e-9) for mark in SURFACE_MARKS})
     assert curve[-1]["share"] == 1
     assert curve[-1]["psnr_clean_db"] == pytest.approx(
         case.image_scores([image_of(result, f) for f in case.held_out])["psnr_clean_db"],
