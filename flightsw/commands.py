@@ -127,16 +127,21 @@ class KeyRing:
     A key that cannot be used is left out, since without commands frames are still taken and sent.
 
     problems: why keys were left out.
+    without_counter: those that were left out for their counter alone. They open no command, but the ground's answers
+        about frames are authenticated with them all the same.
     """
 
     def __init__(self, key_files: Iterable[Path]):
         self.counters: list[ReplayCounter] = []
         self.problems: list[str] = []
+        self.without_counter: list[Key] = []
         for key_file in key_files:
             try:
                 counter = ReplayCounter(key_file)
             except ConfigError as error:
                 self.problems.append(str(error))
+                with contextlib.suppress(ConfigError, OSError, UnicodeDecodeError):
+                    self.without_counter.append(Key.parse(key_file.read_text(), str(key_file)))
                 continue
             if self.of(counter.key.spi) is not None:
                 self.problems.append(f"{key_file}: another key has the number {counter.key.spi} already")

@@ -332,7 +332,7 @@ class _Downlink:
     def _renew_answer_keys(self) -> None:
         """Have frames delivered by no receipt that was made with a key that is retired now."""
         valid = [own.key for own in self._key_ring.counters if not own.is_retired]
-        self._answer_keys[:] = map(answer_key, valid)
+        self._answer_keys[:] = map(answer_key, valid + self._key_ring.without_counter)
 
     def send_last_telemetry(self) -> None:
         """Send the queued telemetry and the event that the software stops."""

@@ -103,6 +103,29 @@ def test_what_is_commanded_survives_a_restart(spacecraft, name, arguments, expec
     assert load_settings(spacecraft.store.folder, spacecraft.mission) == replace(before, **expected)
 
 
+@pytest.mark.parametrize(
+    ("name", "arguments", "end"),
+    [
+        ("delete", {"first_frame": 2, "last_frame": 1}, ("refused", "frames 2 to 1 are none")),
+        ("resend", {"first_frame": 2, "last_frame": 1}, ("refused", "frames 2 to 1 are none")),
+        ("delete", {"first_frame": 7, "last_frame": 9}, ("completed", "0 frames deleted")),
+        ("resend", {"first_frame": 1, "last_frame": 9}, ("completed", "1 frames put into the outbox again")),
+    ],
+)
+def test_a_range_of_frames_is_taken_as_far_as_they_are_there(spacecraft, name, arguments, end):
+    spacecraft.store.mark_delivered(1)  # of three, which all wait
+    if name == "delete":
+        spacecraft.send("arm", command="delete")
+    assert spacecraft.send(name, **arguments)[-1] == end
+    assert spacecraft.store.outbox() == ([0, 1, 2] if end[1].startswith("1 frames") else [0, 2])
+    assert len(spacecraft.store.frames) == 3
+
+
+def test_a_second_check_of_the_store_waits_for_nothing_and_says_which_one_goes_on(spacecraft):
+    spacecraft.commander.receive(spacecraft.seal("fsck"))
+    assert ("failed", "command 1 checks the store already") in spacecraft.send("fsck")
+
+
 def test_a_replay_has_no_effect_is_counted_and_answered_with_the_same_reports(spacecraft):
     packet = spacecraft.seal("near", near=2)
     spacecraft.commander.receive(packet)

@@ -573,3 +573,25 @@ def test_a_retired_key_makes_no_receipts_any_more_from_that_moment(
     keys.close()
     assert progress.delivered == (0 if is_retired else 3)
     assert len(store.outbox()) == 3 - progress.delivered
+
+
+@pytest.mark.parametrize("damage", [b"", b"41", None], ids=["empty", "cut off", "gone"])
+@pytest.mark.parametrize("is_owner", [True, False])
+def test_without_a_usable_counter_it_is_told_and_frames_go_down_against_authentic_receipts(
+    store, small_mission, tmp_path, damage, is_owner
+):
+    save_settings(store.folder, Settings("oldest"))
+    own, other = make_key(tmp_path / "key"), make_key(tmp_path / "other")
+    for name in ("key.received", "key.received.copy"):
+        (tmp_path / name).unlink(missing_ok=True)
+        if damage is not None:
+            (tmp_path / name).write_bytes(damage)
+    keys, link = KeyRing([tmp_path / "key"]), AnsweringLink(own if is_owner else other)
+    link.incoming.append(link.ground.encode(APID_COMMANDS, seal(own, 42, Command("ping", {}).pack())))
+    progress = fly(link, store, small_mission, 20.0, keys=keys)
+    keys.close()
+    told = [values["problem"] for name, values in link.unpacked(APID_EVENTS, "events") if name == "error"]
+    assert "no command is taken with a key" in told[0] and "neither the counter nor its copy" in told[0]
+    ((_, refused),) = link.unpacked(APID_REPORTS, "reports")
+    assert refused["stage"] == "refused" and "neither the counter nor its copy" in refused["text"]
+    assert progress.delivered == (3 if is_owner else 0)

@@ -14,7 +14,9 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import KroghInterpolator
 from scipy.spatial.transform import Rotation
 from sgp4.api import jday
+from skyfield.api import load
 from skyfield.framelib import ICRS_to_J2000
+from skyfield.sgp4lib import TEME
 
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import load_mission
@@ -34,6 +36,7 @@ GOLDEN = Path(__file__).parents[2] / "golden" / "ndm"  # made by make_messages.p
 READ = json.loads((GOLDEN / "read.json").read_text())
 MISSION = load_mission(Path(__file__).parents[3] / "mission.yaml")
 POSITION_M, ANGLE_RAD = 1e-3, 1e-9  # what the issue asks for
+TIMES = load.timescale(builtin=True)
 START_NS = READ["orekit"]["target.oem"][0][0]
 OEM, AEM = (GOLDEN / "target.oem").read_text(), (GOLDEN / "target.aem").read_text()
 
@@ -412,6 +415,204 @@ def test_files_that_do_not_go_together_are_refused():
             {"chaser.oem": relative_oem(), "target.aem": AEM.replace("EME2000", "RTN").encode()},
             "add target.oem",
         ),
+        (
+            {"chaser.oem": chaser, "target.oem": target.replace(b"EARTH", b"MOON")},
+            "target, CENTER_NAME: expected EARTH, got 'MOON'",
+        ),
     ):
         with pytest.raises(ConfigError, match=said):
             Formation.of(files)
+
+
+def message(name: str) -> str:
+    return {"OPM": OPM, "OMM": OMM}.get(name) or (GOLDEN / name).read_text()
+
+
+def read(text: str):
+    (found,) = read_messages(text.encode())
+    return read_attitude(found) if found.kind == "AEM" else read_orbit(found)
+
+
+ROW_OF_XML = "<X>-4569.104812572969</X>"
+UNUSABLE = [  # message, regular expression, what takes its place, what is said
+    ("OPM", r"7000.0 \[km\]", "7000.0 [m]", "X: expected the unit km, got m"),
+    ("OPM", r"X = 7000.0", "X = 1e400", "X: expected a number, got '1e400'"),
+    ("OPM", "MASS = 1000 .kg.", "MAN_DURATION = 1", "manoeuvres are not computed"),
+    ("OPM", "MASS = 1000 .kg.", "a heavy one", "expected KEY = value, got 'a heavy one'"),
+    ("OPM", "MASS = 1000 .kg.", "CX_X = 1e-6", "CY_X: is missing"),
+    ("OMM", "NORAD_CAT_ID = 31698", "NORAD_CAT_ID = A1698", "expected a whole number, got 'A1698'"),
+    ("OMM", "= SGP4", "= DSST", "MEAN_ELEMENT_THEORY: expected one of SGP4"),
+    ("target.oem", "CCSDS_OEM_VERS = 2.0", "HELLO", "line 1: expected CCSDS_OEM_VERS = 2.0"),
+    ("target.oem", "CCSDS_OEM", "CCSDS_CDM", "expected one of the messages OEM, AEM, OPM, OMM, got 'CDM'"),
+    ("target.oem", "(?s)META_START.*", "", "an OEM without segments"),
+    ("target.oem", "ORIGINATOR = OBBGS", "ORIGINATOR =", "ORIGINATOR: has no value"),
+    ("target.oem", "META_STOP", "META_START", "META_START inside META_START"),
+    ("target.oem", "META_START\n", "", "META_STOP without META_START"),
+    ("target.oem", "(?s)META_START.*", "hello", "expected KEY = value or META_START, got 'hello'"),
+    ("target.oem", "META_STOP\n", "META_STOP\nX = 1\n", "expected a row of numbers or META_START"),
+    ("target.oem", "(?s)META_STOP.*", "META_STOP\n", "a segment without states"),
+    ("target.oem", "= HERMITE", "= LINEAR", "expected LINEAR to have INTERPOLATION_DEGREE 1, got 7"),
+    (
+        "target.oem",
+        "(?s)(META_STOP\n\n[^\n]*\n).*",
+        r"\1",
+        "its interpolation needs 4 rows, but the segment has 1",
+    ),
+    (
+        "target.oem",
+        "START_TIME = .*",
+        "START_TIME = 2026-07-21T12:00:00",
+        "nothing of the segment is useable",
+    ),
+    ("target.oem", "OBJECT_ID = 2007-026A((?s:.*)META_START)", r"OBJECT_ID = 1\1", "expected '1' as before"),
+    (
+        "target.oem",
+        "= EME2000",
+        "= TEME\nREF_FRAME_EPOCH = 2000-01-01T00:00:00",
+        "TEME is read as that of date",
+    ),
+    ("chaser.oem", "(?<=COVARIANCE_START\n)EPOCH.*\n", "", "expected EPOCH = ..., got 'COV_REF_FRAME = RTN'"),
+    ("chaser.oem", "\n4.578126841e-09", "", "expected rows of 1, 2, 3, 4, 5 and 6 numbers, got rows of"),
+    ("chaser.oem", "\n4.578126841e-09", "\n-4.578126841e-09", "expected a positive semi-definite covariance"),
+    ("target.aem", "DATA_STOP", "", "DATA_START without DATA_STOP; the file may be cut off"),
+    ("target.aem", "(?s)DATA_START.*", "DATA_START\nDATA_STOP\n", "a segment without attitudes"),
+    ("target.aem", "= LAGRANGE", "= LINEAR", "expected LINEAR to have INTERPOLATION_DEGREE 1, got 7"),
+    ("target.aem", "= LAGRANGE", "= HERMITE", "HERMITE needs quaternions with rates, got rows of QUATERNION"),
+    ("target.aem", "= QUATERNION\n", "= SPIN\n", "ATTITUDE_TYPE: expected one of QUATERNION, .*got 'SPIN'"),
+    ("target.aem", "= EME2000", "= ITRF", "REF_FRAME_A: expected one of GCRF, .*got 'ITRF'"),
+    ("target.aem", "= SC_BODY_1", "= GCRF", "expected a frame such as EME2000 and one of the spacecraft"),
+    ("target.aem", " 0.794296244782429", " 0.9", "expected a unit quaternion, got a length of 1.0"),
+    ("euler.aem", "= 321", "= 331", "expected three axes such as ZYX or 321, got '331'"),
+    ("chaser.aem", "ANGVEL_FRAME.*\n", "", "ANGVEL_FRAME: is missing, in which angular velocities are given"),
+    ("target.oem.xml", "</oem>", "", "is not valid XML"),
+    ("target.oem.xml", ROW_OF_XML, "", "X: is missing; got Y Z"),
+    ("target.oem.xml", ROW_OF_XML, ROW_OF_XML + "<W>1</W>", "W: unknown; expected X Y Z"),
+    (
+        "target.oem.xml",
+        "<EPOCH>2026-07-21T10:50:00.000000</EPOCH>",
+        "",
+        "segment 1, stateVector 1, EPOCH: is missing",
+    ),
+    ("target.oem.xml", "stateVector", "vector", "segment 1, vector 1: unknown in the data of an OEM"),
+    ("target.oem.xml", "header>", "head>", "<oem>: expected <header> in it"),
+    ("target.oem.xml", ">OBBGS<", "> <", "ORIGINATOR: has no value"),
+]
+
+
+@pytest.mark.parametrize(("name", "old", "new", "said"), UNUSABLE)
+def test_a_message_that_cannot_be_used_says_what_was_expected(name, old, new, said):
+    changed = re.sub(old, new, message(name))
+    assert changed != message(name)
+    with pytest.raises(ConfigError, match=said) as caught:
+        read(changed)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_text_or_too_large_is_refused(monkeypatch):
+    with pytest.raises(ConfigError, match="expected KVN or XML as UTF-8"):
+        read_messages(b"\xff\xfe")
+    monkeypatch.setattr("flightsw.icd.ndm.text.MAX_NDM_BYTES", 100)
+    with pytest.raises(ConfigError, match="at most 100 are read"):
+        read_messages(OEM.encode())
+
+
+def test_a_single_state_or_attitude_holds_at_its_time_alone():
+    for text, at in ((OEM, 0), (AEM, 1)):
+        alone = re.sub(r"INTERPOLATION.*\n", "", re.sub(r"(?s)(\n2026[^\n]*\n).*", r"\1", text))
+        alone += "DATA_STOP\n" * ("DATA_START" in alone)
+        found, whole = read(alone), read(text)
+        assert found.spans == ((START_NS, START_NS),)
+        if at == 0:
+            np.testing.assert_allclose(
+                found.at(START_NS).position_m, whole.at(START_NS).position_m, atol=POSITION_M
+            )
+        else:
+            matrices = [quat_to_matrix(each.at(START_NS, None)) for each in (found, whole)]
+            assert angle(*matrices) < ANGLE_RAD
+
+
+def test_a_state_in_xml_among_others_is_that_in_keys():
+    pairs = [line.split(" = ") for line in OPM.replace(" [km/s]", "").replace(" [km]", "").splitlines()]
+    leaves = [f"<{key}>{value.partition(' [')[0]}</{key}>" for key, value in pairs]
+    own = '<USER_DEFINED parameter="MOOD">good</USER_DEFINED>'
+    header, meta, state = "".join(leaves[1:3]), "".join(leaves[3:8]), "".join(leaves[8:15])
+    body = (
+        f"<metadata>{meta}</metadata><data><COMMENT>x</COMMENT><stateVector>{state}</stateVector>{own}</data>"
+    )
+    body = f"<body><segment>{body}</segment></body>"
+    opm = f'<opm id="CCSDS_OPM_VERS" version="2.0"><header>{header}</header>{body}</opm>'
+    both = read_messages(f"<ndm><MESSAGE_ID>1</MESSAGE_ID>{opm}{opm}</ndm>".encode())
+    for found in both:
+        np.testing.assert_array_equal(
+            read_orbit(found).at(START_NS).position_m, read(OPM).at(START_NS).position_m
+        )
+    commented = re.sub("<data>", "<data><COMMENT>x</COMMENT>", message("target.oem.xml"))
+    state = read(commented).at(START_NS)
+    np.testing.assert_array_equal(state.position_m, read(message("target.oem.xml")).at(START_NS).position_m)
+
+
+def test_accelerations_are_read_over_and_teme_is_skyfield_s_to_a_second_of_arc():
+    rows = re.sub(r"(?m)^(2026.*)$", r"\1 1.0 2.0 3.0", OEM)
+    np.testing.assert_array_equal(read(rows).at(START_NS).position_m, read(OEM).at(START_NS).position_m)
+    as_teme = read(OEM.replace("EME2000", "TEME")).at(START_NS).position_m
+    as_gcrf = read(OEM.replace("EME2000", "GCRF")).at(START_NS).position_m
+    moment = TIMES.from_datetime(datetime.fromtimestamp(START_NS / NS, UTC))
+    np.testing.assert_allclose(as_teme, TEME.rotation_at(moment).T @ as_gcrf, rtol=0, atol=35.0)
+
+
+@pytest.mark.parametrize("how", ["along the axes of A", "as derivatives"])
+def test_rates_may_be_given_in_other_ways(how):
+    """The same turn: its velocity along the other frame's axes by SciPy, or the quaternion's derivative."""
+    text, whole = message("chaser.aem"), read(message("chaser.aem"))
+
+    def turned(row: re.Match) -> str:
+        epoch, *numbers = row[0].split()
+        quat, rate = np.array(numbers[:4], float), np.array(numbers[4:], float)
+        if how == "as derivatives":  # q' = q * (0, rate) / 2, scalar last
+            vector, scalar, half = quat[:3], quat[3], np.radians(rate) / 2
+            rate = np.append(scalar * half + np.cross(vector, half), -vector @ half)
+        else:
+            rate = Rotation.from_quat(quat).apply(rate)
+        return " ".join([epoch, *(f"{x:.15f}" for x in (*quat, *rate))])
+
+    changed = re.sub(r"(?m)^2026.*$", turned, text)
+    if how == "as derivatives":
+        changed = changed.replace("QUATERNION/ANGVEL", "QUATERNION/DERIVATIVE").replace(
+            "ANGVEL_FRAME = SC_BODY_1\n", ""
+        )
+    else:
+        changed = changed.replace("ANGVEL_FRAME = SC_BODY_1", "ANGVEL_FRAME = REF_FRAME_A")
+    for seconds in (13.7, 311.0):
+        at_ns = START_NS + round(seconds * NS)
+        matrices = [quat_to_matrix(each.at(at_ns, None)) for each in (read(changed), whole)]
+        assert angle(*matrices) < ANGLE_RAD
+
+
+def test_elements_that_sgp4_cannot_carry_on_have_no_state():
+    orbit = read(OMM.replace("= 15.19148901", "= 17.9"))  # below the ground
+    with pytest.raises(NoState, match="SGP4 refuses the elements"):
+        orbit.at(START_NS)
+    with pytest.raises(ConfigError, match="expected an OMM, which has mean elements, got an OPM"):
+        two_lines(OPM.encode())
+
+
+def test_a_covariance_without_directions_stays_what_it_is_in_other_axes():
+    axes = ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
+    entries = "".join(f"C{a}_{b} = {1e-6 * (a == b)}\n" for i, a in enumerate(axes) for b in axes[: i + 1])
+    found = read(OPM.replace("= GCRF", "= EME2000") + entries)
+    np.testing.assert_allclose(found.at(START_NS).covariance, np.eye(6), rtol=0, atol=1e-12)
+    assert found.at(START_NS + NS).covariance is None
+
+
+def test_the_chaser_s_attitude_in_the_axes_of_its_orbit_turns_with_it():
+    chaser, along = (
+        (GOLDEN / "chaser.oem").read_bytes(),
+        message("chaser.aem").replace("EME2000", "RTN").encode(),
+    )
+    state = read(chaser.decode()).at(START_NS + 45 * NS)
+    alone = read(message("chaser.aem").replace("EME2000", "GCRF")).at(START_NS + 45 * NS, None)
+    expected = quat_to_matrix(alone) @ local_axes("RTN", state.position_m, state.velocity_m_s)
+    for orbit in (chaser, relative_oem()):  # about the Earth, and about the target
+        files = {"target.oem": OEM.encode(), "chaser.oem": orbit, "chaser.aem": along}
+        found = Formation.of(files).at(START_NS + 45 * NS).quat_gcrs_to_chaser
+        assert angle(quat_to_matrix(found), expected) < ANGLE_RAD
