@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 import signal
 import threading
 from pathlib import Path
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from ground.formats.pictures.files import Light
     from ground.formats.pictures.views import Exported, PoseSigmas, View
 
+TIMED = (ImportFormat.NDM, ImportFormat.SPICE)  # formats whose readers need the table for the poses
+VIDEO_FRAMES = "video-frames"  # in a session that is being made of a video
 MOST_NAMED = 30  # pictures in one line; --json names all
 
 stderr = Console(stderr=True)
@@ -48,16 +51,20 @@ def import_command(
     poses: PosesGiven = PoseChoice.CHECK,
     frames: Annotated[
         int | None,
-        typer.Option(min=1, help=f"{FRAMES_HELP}; the first of each split. Default: all."),
+        typer.Option(
+            min=1,
+            help=f"{FRAMES_HELP}; the first of each split, of a video the sharpest of so many equal spans of time. "
+            "Default: all, of a video 120.",
+        ),
     ] = None,
     json_: AsJson = False,
 ) -> None:
     """Make a session of pictures with known cameras, or of photographs.
 
     Splits that the data set states are kept: `ground reconstruct` trains on train and holds out test, or val if there
-    is no test. Of images, a folder of photographs by one camera, structure from motion finds the cameras; it takes
-    minutes, and goes on where it was interrupted. Pictures are PNG, JPEG, TIFF, BMP, WebP, Radiance HDR, and with
-    obbgs[pictures] FITS, OpenEXR and DNG.
+    is no test. Of images, a folder of photographs by one camera, and of a video (--from is its file), structure from
+    motion finds the cameras; it takes minutes, and goes on where it was interrupted. Pictures are PNG, JPEG, TIFF, BMP,
+    WebP, Radiance HDR, and with obbgs[pictures] FITS, OpenEXR and DNG.
 
     Example: ground import --format shirt --from shirtv1/roe1/lightbox --frames 363 --session roe1
     """
@@ -69,14 +76,16 @@ def import_command(
     given_sigmas = None if pose_sigma is None else _pose_sigmas(pose_sigma)
     table = None if exposures in (None, UNKNOWN) else read_table(Path(exposures))
     sigmas, exported, registration = EXACT, None, None
-    timed = (ImportFormat.NDM, ImportFormat.SPICE)  # their readers need the table for the poses
-    if format_ is ImportFormat.IMAGES:
-        found = _photographs(folder, session, frames, table)
+    unposed = format_ in (ImportFormat.IMAGES, ImportFormat.VIDEO)
+    if unposed:
+        found = _photographs(format_, folder, session, frames, table)
         views, sigmas, registration = found.views, found.sigmas, found.described()
+        if format_ is ImportFormat.VIDEO and masks is not None and masks.is_file():
+            masks = _masks_of_video(masks, views, session)
     else:
         views, exported = _read(format_, folder, table)
         views = first_of_each_split(views, frames)
-        if exposures != UNKNOWN and format_ not in timed:
+        if exposures != UNKNOWN and format_ not in TIMED:
             views = with_exposures(views, table)
     views, found_poses = with_masks(views, masks), {}
     source = f"{format_.value}: {folder}"
@@ -84,7 +93,7 @@ def import_command(
     if exposures == UNKNOWN:
         views = estimated(views, given)
     in_body_axes = all(view.attitude_known for view in views)
-    if format_ is not ImportFormat.IMAGES and poses is not PoseChoice.STATED and in_body_axes:
+    if not unposed and poses is not PoseChoice.STATED and in_body_axes:
         views, found_poses = _checked_poses(views, given_sigmas or sigmas, poses is PoseChoice.MEND)
         if poses is PoseChoice.MEND:
             source += "".join(f", {len(pictures)} poses {kind}" for kind, pictures in found_poses.items())
@@ -104,13 +113,19 @@ def import_command(
             origin_moved,
             transparent_on_white=format_ is ImportFormat.NERF,
         )
+    shutil.rmtree(session / VIDEO_FRAMES, ignore_errors=True)
     if json_:
         print(json.dumps({"frames": count, "session": str(session), **(registration or {}), **found_poses}))
-        return
-    print(f"{count} frames in {session}")
-    if registration and registration["left_out"]:
+    else:
+        print(f"{count} frames in {session}")
+        _tell(registration or {})
+
+
+def _tell(registration: dict) -> None:
+    """Print which photographs structure from motion left out or turned."""
+    if registration.get("left_out"):
         print(f"left out, because they could not be registered: {', '.join(registration['left_out'])}")
-    if registration and registration["turned"]:
+    if registration.get("turned"):
         print(f"turned by 180 degrees against the others: {', '.join(registration['turned'])}")
 
 
@@ -188,10 +203,14 @@ def _pose_sigmas(text: str) -> "PoseSigmas":
 
 
 def _photographs(
-    folder: Path, session: Path, count: int | None, table: "dict[str, Light] | None"
+    format_: ImportFormat, folder: Path, session: Path, count: int | None, table: "dict[str, Light] | None"
 ) -> "Registered":
-    """Return what structure from motion makes of a folder, with a bar; SIGINT and SIGTERM stop it at its next step."""
+    """Return what structure from motion makes of a folder or a video, with a bar.
+
+    SIGINT and SIGTERM stop it at its next step.
+    """
     from ground.formats.photographs.poses import read_photographs
+    from ground.formats.photographs.video import FRAMES, write_frames
     from ground.session.folder import SessionError
 
     if (session / "session.json").exists():
@@ -205,6 +224,11 @@ def _photographs(
             TextColumn("finding cameras"), BarColumn(), TimeRemainingColumn(), console=stderr
         ) as progress:
             task = progress.add_task("register", total=1.0)
+            if format_ is ImportFormat.VIDEO:
+                pictures = session / VIDEO_FRAMES / "pictures"
+                shutil.rmtree(pictures, ignore_errors=True)
+                write_frames(folder, pictures, count or FRAMES, stop.is_set)
+                folder, count = pictures, None
             return read_photographs(
                 folder,
                 session / "registration",
@@ -216,6 +240,15 @@ def _photographs(
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _masks_of_video(video: Path, views: "list[View]", session: Path) -> Path:
+    """Return a folder with those frames of a video of masks that belong to the pictures."""
+    from ground.formats.photographs.video import write_masks
+
+    folder = session / VIDEO_FRAMES / "masks"
+    write_masks(video, folder, [view.image.name for view in views])
+    return folder
 
 
 def export_command(

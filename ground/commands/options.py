@@ -71,6 +71,7 @@ class ImportFormat(StrEnum):
     NDM = "ndm"
     SPICE = "spice"
     IMAGES = "images"
+    VIDEO = "video"
 
 
 class PixelValues(StrEnum):
@@ -163,8 +164,8 @@ MasksGiven = Annotated[
     Path | None,
     typer.Option(
         "--masks",
-        help="A folder of pictures with the names of the pictures, white where the target is; what they leave out "
-        "counts as background.",
+        help="A folder of pictures with the names of the pictures, white where the target is, or a video of them "
+        "beside a video; what they leave out counts as background.",
     ),
 ]
 PoseSigmaGiven = Annotated[
