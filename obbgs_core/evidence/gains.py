@@ -18,6 +18,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render, weighted_gradient
 from obbgs_core.sensor import Sensor
 
+ROBUST = 3.0  # deviations that a residual counts as at most
 VIEWS = 36  # training frames that are rendered at most, spread evenly; gains are scaled to all frames
 # An opaque Gaussian that no picture shows on as much as a strip, one pixel wide and so many of the target's radii long,
 # hides nothing that its neighbours do not hide too. Detail lies along edges: the limit grows with the target's width in
@@ -101,7 +102,7 @@ def next_degree_gain(
     slope, curvature, shared = (torch.zeros_like(model.sh) for _ in range(3))
     values, times = 0, 0.0
     for view in _views(model, batches, sensor, rng):
-        residual = view.residual(sensor).clamp(-3, 3)  # robust, as the loss is
+        residual = view.residual(sensor).clamp(-ROBUST, ROBUST)  # as the loss is
         g = weighted_gradient(view.radiance, view.weight * residual, model.sh, keep_graph=True)
         probe = weighted_gradient(view.radiance, view.weight * view.signs, model.sh)
         slope += g

@@ -1,6 +1,7 @@
 """Where Gaussians are added, and which are removed because they are faint: decided by the screen gradients of steps."""
 
 import dataclasses
+import logging
 import math
 from dataclasses import dataclass, field
 
@@ -9,6 +10,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from obbgs_core import obb
+from obbgs_core.batches import Batches
+from obbgs_core.evidence.budget import as_many_again, fewer, log_errors
+from obbgs_core.evidence.poses import validation_brackets
 from obbgs_core.methods.config import GrowthSettings, MethodConfig, Moment
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
@@ -23,12 +27,14 @@ from obbgs_core.published.growth import (
 from obbgs_core.published.multi_view import crossing_boxes, inside, threshold_factor
 from obbgs_core.published.smoothing import log_lowering
 from obbgs_core.render import Rendered
+from obbgs_core.train.order import FrameOrder
 from obbgs_core.train.parts import Change, Now, Seen
 from obbgs_core.train.setup import TrainingSetup
 
 # of the deviation along the longest axis: where the centres of the two Gaussians of a split along it lie. 0.6 is worse
 # (docs/experiments/043).
 LONG_AXIS_SHIFT = 0.8
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -160,6 +166,47 @@ class Growth:
             wanted &= model.scales.max(dim=1).values < published.prune_size * now.setup.unit_m
         wanted &= finite(model)
         return change.then_only(wanted) if wanted.any() else change
+
+
+@dataclass
+class Extension:
+    """Lets growth go on beyond the budget where frames could pay for more Gaussians, while held-out brackets gain.
+
+    The budget follows edges (docs/experiments/084); a body with texture all over shows more. Whether it is one is seen
+    when growth ends. From then on the validation brackets are kept back, and growth goes on while they surely gain.
+
+    errors: of the brackets kept back, when growth was last prolonged; None: it never was.
+    reason: why growth went on or ended, in words; nothing: within the budget.
+    """
+
+    errors: Tensor | None = None
+    reason: str = ""
+
+    def back(self, config: MethodConfig) -> int:
+        """Return the steps that count as done where growth is prolonged, by as many as it takes to double a model."""
+        growth = config.growth
+        steps = math.ceil(math.log(2) / math.log1p(growth.grown_share)) * growth.interval
+        return max(round(config.steps_until(growth.begin)), round(config.steps_until(growth.end)) - steps)
+
+    def goes_on(self, setup: TrainingSetup, model: Gaussians, batches: Batches, order: FrameOrder) -> bool:
+        """Return whether growth is prolonged, now that it has come to its end."""
+        brackets = order.validation_brackets or validation_brackets(setup.frames)
+        has_room = 2 * len(model) <= setup.shown and setup.config.growth.grown_share > 0 and bool(brackets)
+        if not has_room and self.errors is None:
+            return False
+        room = as_many_again(model, batches, setup.sensor)
+        goes_on, before = has_room and bool(room.justifies), self.errors
+        why = f"as many Gaussians again could gain {room.gain:,.0f} nats at a BIC penalty of {room.penalty:,.0f}"
+        if goes_on or before is not None:
+            self.errors = log_errors(model, batches, setup.sensor, brackets)
+            if before is not None:
+                gained = fewer(before, self.errors)
+                goes_on &= bool(gained.justifies)
+                why += f"; brackets kept back err {gained.gain:.1%} less, of which {gained.error:.1%} may be chance"
+            order.keep_back(brackets if goes_on or setup.keeps_unseen else [])
+        self.reason = f"growth {'goes on' if goes_on else 'ends'}: {why}"
+        log.info("%s", self.reason)
+        return goes_on
 
 
 class OpacityResets:

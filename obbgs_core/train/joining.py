@@ -98,6 +98,7 @@ def join(setup: TrainingSetup, state: TrainingState, joined: TrainingSetup, fres
     )
     state.adam.betas = fresh.adam.betas  # others where only now the Sun is known to move
     state.shadows, state.average, state.has_joined = fresh.shadows, fresh.average, True
+    state.extension = fresh.extension
     if poses.corrections is not None:
         poses.corrections = fresh.poses.corrections
         poses.moved *= len(setup.frames) / len(joined.frames)

@@ -42,6 +42,7 @@ MOST_HIDDEN = 0.01  # share of the first Gaussians that may be nearer to the cam
 # Albedos under Lambert's law turn with the Sun where no two Suns are further apart: over part of the sphere harmonics
 # describe what light from other parts and coarse shadows do, all round it they do not (experiment 075).
 TURNING_SPAN_DEG = 90.0
+GAUSSIANS_PER_PIXEL = 2  # that a picture can show: one behind each edge of a pixel
 AS_MANY_PICTURES = 35  # long exposures: the lit pixels of fewer count as those of so many (experiment 084)
 
 
@@ -61,6 +62,7 @@ class TrainingSetup:
     sun_span_deg: float  # largest angle between two frames' Suns, body frame
     start: str  # where the first Gaussians came from
     budget: str  # the largest number of Gaussians, and what limits it
+    shown: int  # Gaussians that a picture can show: more than the budget where it follows the pictures
     reference_exposure_s: float | None  # what every exposure was taken for when exposure is ignored
     dark_frames: int  # left out: nothing in them rises above the noise
     tagged_exposures_s: list[float]  # of the frames, also where the method ignores them
@@ -159,7 +161,8 @@ def prepare(
     posed = lit if poses is None else poses.frames(lit)
     noise += _unusual_unit(lit, sensor)
     certain = {i: held(outline.certain) for i, outline in outlines.items()}
-    config, budget = _limited(config, [int(whole(mask).sum()) for mask in certain.values()])
+    lit_pixels = [int(whole(mask).sum()) for mask in certain.values()]
+    config, budget = _limited(config, lit_pixels)
     given = (posed, list(outlines.values()), sensor, config.start, published.sh_degree, rng)
     gaussians, radius_m, start = first_gaussians(*given, published.grey_start)
     _check_nearness(gaussians.means.detach(), posed)
@@ -181,6 +184,9 @@ def prepare(
         sun_span_deg=span_deg,
         start=start + hot + noise,
         budget=budget,
+        shown=GAUSSIANS_PER_PIXEL * sum(lit_pixels) // len(lit_pixels)
+        if config.growth.gaussians_per_root_pixel
+        else 0,
         reference_exposure_s=reference_exposure_s,
         dark_frames=len(checked) - len(lit),
         tagged_exposures_s=[f.exposure_time_s for f, shows in zip(frames, shown, strict=True) if shows],

@@ -29,7 +29,7 @@ from obbgs_core.render.shadows import ShadowMap, Shadows
 from obbgs_core.settings import flat
 from obbgs_core.train.adam import FIRST_MEMORY, SECOND_MEMORY, Adam, Average
 from obbgs_core.train.fit import Fit
-from obbgs_core.train.growth import Growth, OpacityResets, finite
+from obbgs_core.train.growth import Extension, Growth, OpacityResets, finite
 from obbgs_core.train.objective import Neighbours
 from obbgs_core.train.order import FrameOrder
 from obbgs_core.train.parts import Change, Now, Part, Seen
@@ -40,7 +40,7 @@ from obbgs_core.train.selection import Harmonics, Highlights, Pruning
 from obbgs_core.train.setup import Start, TrainingSetup
 
 log = logging.getLogger(__name__)
-FORMAT = 18  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 19  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,7 @@ class TrainingState:
     harmonics: Harmonics
     highlights: Highlights = field(default_factory=Highlights)
     fit: Fit = field(default_factory=Fit)
+    extension: Extension = field(default_factory=Extension)  # of growth
     response: Response = field(default_factory=Response)
     average: Average = field(default_factory=Average)  # of the models of the last steps
     deviation_m: Tensor | None = None  # [N] of the 3D filter; None: the method has none
@@ -285,6 +286,7 @@ SAVED = [
     *(TrainingState, Gaussians, Adam, Average, Growth, Compensation, FrameOrder, Harmonics, Highlights),
     *(
         Fit,
+        Extension,
         Response,
         Poses,
         PoseDecision,

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from obbgs_base.errors import Interrupted
-from obbgs_core.batches import Batch
+from obbgs_core.batches import Batch, Batches
 from obbgs_core.compiled import torch_on_one_thread
 from obbgs_core.errors import Diverged
 from obbgs_core.evidence.radiance import described
@@ -155,6 +155,7 @@ class Trainer:
         state.seconds += time.monotonic() - began
         info = self._recorded(loss.item())
         state.steps_done = state.poses.set_back(setup, state.steps_done)
+        self._prolong_growth()
         return info
 
     def _decide(self, moment: Moment, seen: Seen) -> None:
@@ -204,17 +205,32 @@ class Trainer:
         due = state.steps_done in {round(config.steps_until(share)) for share in DECIDED_AT}
         if not due or state.fit.misfit is None or setup.sun_moves:
             return
-        corrections = state.poses.corrections
-        batches = (
-            setup.batches if corrections is None else setup.batches.posed(corrections.frames(setup.frames))
-        )
-        if state.response.decide(state.model, batches, setup.sensor):
-            self._use_response()
+        if state.response.decide(state.model, self._batches, setup.sensor):
+            self._use_found()
 
-    def _use_response(self) -> None:
-        """Let the setup's sensor have the response that is known."""
-        sensor = dataclasses.replace(self.setup.sensor, response=self.state.response.exponent)
-        self.setup = dataclasses.replace(self.setup, sensor=sensor)
+    def _prolong_growth(self) -> None:
+        """Set the schedule back where growth has come to its end and is to go on."""
+        state, setup, config = self.state, self.setup, self.setup.config
+        at_end = state.steps_done == round(config.steps_until(config.growth.end))
+        if at_end and state.extension.goes_on(setup, state.model, self._batches, state.order):
+            state.steps_done = state.extension.back(config)
+            self._use_found()
+
+    @property
+    def _batches(self) -> Batches:
+        """The training's images with the poses as they are estimated so far."""
+        setup, poses = self.setup, self.state.poses.corrections
+        return setup.batches if poses is None else setup.batches.posed(poses.frames(setup.frames))
+
+    def _use_found(self) -> None:
+        """Let the setup have what was found of the sensor's response and of the budget."""
+        setup, found = self.setup, self.state
+        sensor = dataclasses.replace(setup.sensor, response=found.response.exponent)
+        config, most = setup.config, setup.config.growth.max_gaussians
+        if found.extension.errors is not None:
+            growth = dataclasses.replace(config.growth, max_gaussians=max(most, setup.shown))
+            config = dataclasses.replace(config, growth=growth)
+        self.setup = dataclasses.replace(setup, sensor=sensor, config=config)
 
     def _recorded(self, loss: float) -> StepInfo:
         """Return how the training stands, and keep it in the history."""
@@ -261,7 +277,7 @@ class Trainer:
         joined, fresh = self._prepared(every, self.state.poses.corrections)
         join(self.setup, self.state, joined, fresh)
         self.setup, self._given = joined, every
-        self._use_response()
+        self._use_found()
         self.state.seconds += time.monotonic() - began
 
     def withhold(self) -> None:
@@ -348,7 +364,8 @@ class Trainer:
             start=setup.start,
             budget=setup.budget,
             appearance=described(state.gaussians, state.harmonics.reason, state.highlights.reason),
-            growth=f"until step {min(state.steps_done, round(setup.config.steps_until(setup.config.growth.end)))}",
+            growth=f"until step {min(state.steps_done, round(setup.config.steps_until(setup.config.growth.end)))}"
+            + (f" of the schedule ({reason})" if (reason := state.extension.reason) else ""),
             poses=state.poses.report,
             pose_estimate=state.poses.estimate(setup, state.model, state.order),
             exposing=self.exposing,
@@ -376,7 +393,7 @@ class Trainer:
         self.state = state
         if state.poses.placed_by is not None:
             self.setup, _ = self._prepared(self._given, state.poses.placed_by)
-        self._use_response()
+        self._use_found()
         return True
 
 
