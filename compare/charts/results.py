@@ -38,6 +38,8 @@ METRICS = (
     Metric("psnr_srgb_db", "sRGB, dB", "{:.2f}", True),
     Metric("ssim_clean", "SSIM", "{:.4f}", True),
     Metric("lpips", "LPIPS", "{:.4f}", False),
+    Metric("ssim_srgb", "SSIM, sRGB", "{:.4f}", True),
+    Metric("lpips_srgb", "LPIPS, sRGB", "{:.4f}", False),
     *(
         Metric(f"{key}_{radius}_surface", f"{title} .{radius}, %", "{:.1f}", True)
         for radius in ("01", "02")

@@ -55,7 +55,8 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
     - scored_frames: "held_out", or "training" where nothing was held out and the training frames are scored.
     - psnr_noisy_db: against the frames as received.
     - psnr_srgb_db, psnr_linear_db: of imported pictures in colour, the same of display values (sRGB-coded, black 0,
-      full scale 1), as most publications measure it, and of values that are linear in light.
+      full scale 1), as most publications measure it, and of values that are linear in light. ssim_srgb and lpips_srgb
+      (as lpips_clean): of display values.
 
     - interval_90_noisy, and with truth interval_90_clean and interval_90_half_width: how often the model's intervals
       hold, as in `interval_scores`; chi2_held_out, chi2_held_out_both: as in `stated_error_scores`, of the poses as

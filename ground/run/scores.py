@@ -51,6 +51,8 @@ def display_scores(
 ) -> dict[str, float]:
     """Return psnr_srgb_db and psnr_linear_db of pairs as in `noisy_psnr_db`: of display values, and of linear ones.
 
+    Of display values, for which they were made, ssim_srgb and lpips_srgb too, the latter as in `clean_scores`.
+
     Args:
         encoding: of the pairs, `srgb` or `linear`.
     """
@@ -58,12 +60,15 @@ def display_scores(
     convert = from_srgb if encoding == "srgb" else to_srgb
     other = "psnr_linear_db" if encoding == "srgb" else "psnr_srgb_db"
     figures: dict[str, list[float]] = {"psnr_srgb_db": [], "psnr_linear_db": []}
+    shown: list[tuple[Tensor, Tensor]] = []
     for pair in images:
         signals = [((image - black) / (1 - black)).clamp(min=0) for image in pair]
         converted = [torch.from_numpy(convert(signal.numpy())) for signal in signals]
         for key in figures:
             figures[key].append(psnr_db(*(converted if key == other else signals)))
-    return {key: _mean(values) for key, values in figures.items()}
+        image, read = converted if other == "psnr_srgb_db" else signals
+        shown.append((image.clamp(max=1), read.clamp(max=1)))
+    return {key: _mean(values) for key, values in figures.items()} | _similar(shown, "srgb")
 
 
 def clean_scores(views: Sequence[ScoredView]) -> dict[str, float]:
@@ -86,10 +91,15 @@ def clean_scores(views: Sequence[ScoredView]) -> dict[str, float]:
     foreground_db = foreground_psnr_db((view.image, view.clean, view.coverage) for view in views)
     if not math.isnan(foreground_db):
         figures["psnr_clean_foreground_db"] = foreground_db
-    figures["ssim_clean"] = _mean([ssim(view.image, view.clean) for view in views])
-    if min(views[0].image.shape[:2]) >= SMALLEST_PX:
+    return figures | _similar([(view.image, view.clean) for view in views], "clean")
+
+
+def _similar(pairs: Sequence[tuple[Tensor, Tensor]], name: str) -> dict[str, float]:
+    """Return ssim_NAME and lpips_NAME of pairs of images in 0..1, means over them."""
+    figures = {f"ssim_{name}": _mean([ssim(*pair) for pair in pairs])}
+    if min(pairs[0][0].shape[:2]) >= SMALLEST_PX:
         try:
-            figures["lpips_clean"] = _mean([lpips(view.image, view.clean, network="alex") for view in views])
+            figures[f"lpips_{name}"] = _mean([lpips(*pair, network="alex") for pair in pairs])
         except WeightsMissing as error:
             log.info("LPIPS is left out: %s", error)
     return figures

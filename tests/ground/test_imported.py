@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 from skimage import color
+from skimage.color import colorconv  # of itself: color loads it lazily
 from skimage.metrics import peak_signal_noise_ratio
 
 from ground.commands.options import PixelValues
@@ -37,6 +38,7 @@ from ground.session.training_frames import split, training_frame
 from ground.show.report.document import write_report
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.render import render
+from obbgs_core.score.metrics import ssim
 from tests.scenes import intrinsics, photographed, pose, target
 
 SIZE_PX = 24
@@ -262,18 +264,20 @@ def test_a_run_on_white_is_scored_in_display_values_and_in_light(tmp_path, rende
     metrics = evaluate(tmp_path / "s", "run")
     run = open_run(tmp_path / "s", "run")
     assert (metrics["frames_trained"], metrics["frames_held_out"]) == (8, 3)
-    display = []
+    display, similar = [], []
     for record in run.scored:
         truth = run.session.dn(record) / run.sensor.white_dn
         ours = predicted_image(run.gaussians, run.session, record, run.sensor, 1.0).numpy()
         if values is Values.DECODE:  # scikit-image's curve
-            matrix = color.colorconv.rgb_from_xyz.T
+            matrix = colorconv.rgb_from_xyz.T
             truth, ours = (
                 color.xyz2rgb(np.linalg.solve(matrix.T, image.reshape(-1, 3).T).T.reshape(image.shape))
                 for image in (truth, ours)
             )
         display.append(peak_signal_noise_ratio(truth, ours, data_range=1.0))
+        similar.append(ssim(*(torch.from_numpy(image).double() for image in (ours, truth))))
     assert metrics["psnr_srgb_db"] == pytest.approx(np.mean(display), abs=1e-3)
+    assert metrics["ssim_srgb"] == pytest.approx(np.mean(similar), abs=1e-3)
     kept = "psnr_srgb_db" if values is Values.DISPLAY else "psnr_linear_db"
     assert metrics[kept] == pytest.approx(metrics["psnr_noisy_db"], abs=1e-4)
     # a white picture without the target is what the background alone would give

@@ -148,6 +148,8 @@ def _details(m: dict) -> list[tuple[str, str]]:
         "psnr_noisy_db": f"PSNR of {scored_frames(m)} against their noisy readings, dB",
         "psnr_srgb_db": "… of display values (sRGB), dB",
         "psnr_linear_db": "… of values that are linear in light, dB",
+        "ssim_srgb": "SSIM of display values",
+        "lpips_srgb": "LPIPS of display values (AlexNet, 0 is identical)",
         "psnr_radiance_db": "PSNR of scene-linear radiance (brightest pixel = 1), dB",
         "ssim_clean": "SSIM, clean (structural similarity, 1 is identical)",
         "chi2_held_out": "chi² of held-out frames: squared error over the variance of the noise",
