@@ -18,6 +18,11 @@ EVEN, FACING = (
 NARROWEST_PX = 5.0  # width of a plate whose turn is looked at
 ATTACHED = 0.8  # of a piece's samples within a plate's box: it moves with it
 BESIDE_PX = 2.0
+OUTLINE_PX, OUTLINE = (
+    2.5,
+    0.25,
+)  # a sample whose neighbours so near lie to one side, by that share of it, on the mean
+HELD = 0.8  # of a plate's outline joins the rest of the design: it is a face of a body, which does not turn by itself
 TURNS_DEG = (-24.0, -16.0, -8.0, 8.0, 16.0, 24.0)
 TRIED = 3  # starts that are refined
 MOST_POINTS = 2000  # of the surface, that a plate is laid on
@@ -69,7 +74,11 @@ def is_turned(turn: Turn) -> bool:
 
 
 def plates_of(design: Samples, pixel_m: float) -> list[Plate]:
-    """Return the flat panels of a design (body axes, m), largest first, each piece of the design in one at most."""
+    """Return the flat panels of a design (body axes, m), largest first, each piece of the design in one at most.
+
+    A flat piece whose outline joins the rest of the design all around is a face of a body, and no panel: models round
+    such faces where no frame shows them, which would pass for a turn.
+    """
     pieces = np.zeros(len(design.points), dtype=np.int64)
     for part in np.unique(design.part):
         own = np.flatnonzero(design.part == part)
@@ -86,6 +95,8 @@ def plates_of(design: Samples, pixel_m: float) -> list[Plate]:
         inside = _in_box(design.points, plate, BESIDE_PX * pixel_m)
         share = np.bincount(np.searchsorted(order, pieces), inside) / counts
         members = np.flatnonzero((share[np.searchsorted(order, pieces)] > ATTACHED) & ~taken)
+        if _held(design.points, plate, members, pixel_m) > HELD:
+            continue
         taken[members] = True
         plates.append(Plate(plate.part, plate.own, members, plate.middle, plate.axes, plate.extent))
     return plates
@@ -106,6 +117,18 @@ def _plate(design: Samples, own: np.ndarray, pixel_m: float) -> Plate | None:
     if (np.abs(design.normals[own] @ axes[2]) > FACING).mean() < EVEN:
         return None
     return Plate(int(design.part[own[0]]), own, own, (low + high) / 2 @ axes, axes, extent)
+
+
+def _held(points: np.ndarray, plate: Plate, members: np.ndarray, pixel_m: float) -> float:
+    """Return the share of a plate's outline that joins what of a design [N, 3] does not move with it."""
+    own, reach = points[plate.own] @ plate.axes[:2].T, OUTLINE_PX * pixel_m
+    near = KDTree(own).query_ball_point(own, reach)
+    middles = np.array([own[indices].mean(axis=0) for indices in near])
+    outline = np.linalg.norm(middles - own, axis=1) > OUTLINE * reach
+    rest = np.delete(points, members, axis=0)
+    if not outline.any() or not len(rest):
+        return 0.0
+    return float((KDTree(rest).query(points[plate.own[outline]])[0] < BESIDE_PX * pixel_m).mean())
 
 
 def _in_box(points: np.ndarray, plate: Plate, margin: float) -> np.ndarray:

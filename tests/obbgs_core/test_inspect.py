@@ -9,7 +9,7 @@ from obbgs_core.inspect.alignment import Surface, aligned
 from obbgs_core.inspect.cad import CadError, CadMesh, read_cad, sampled
 from obbgs_core.inspect.faces import flat_faces, largest_dimension
 from obbgs_core.inspect.findings import Inspection, inspect
-from obbgs_core.inspect.plates import is_turned
+from obbgs_core.inspect.plates import is_turned, plates_of
 from obbgs_core.inspect.shown import Views
 
 PIXEL_M = 0.03
@@ -87,6 +87,19 @@ def test_a_turned_panel_is_told_with_its_angle(tmp_path):
     (turn,) = [turn for turn in result.turns if is_turned(turn)]
     assert result.parts[turn.plate.part] == "panel"
     assert turn.interval[0] < np.radians(12.0) < turn.interval[1]
+
+
+def test_a_face_of_a_box_is_no_panel(tmp_path):
+    """Only what stands free can turn: the design's box comes in six faces, as designs often do."""
+    scene, box = body(), trimesh.creation.box([0.8, 0.6, 1.0])
+    scene.delete_geometry("bus")
+    for number, facet in enumerate(box.facets):
+        scene.add_geometry(
+            box.submesh([facet], append=True), node_name=f"face {number}", geom_name=f"face {number}"
+        )
+    design = as_cad(scene, tmp_path)
+    found_plates = plates_of(sampled(design, 0.7 * PIXEL_M), PIXEL_M)
+    assert {design.names[plate.part] for plate in found_plates} == {"panel"}
 
 
 def test_missing_and_added_parts_are_told_apart(tmp_path):
