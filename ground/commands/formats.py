@@ -71,6 +71,7 @@ def import_command(
     from ground.formats.photographs.exposures import UNKNOWN, estimated, read_table, with_exposures
     from ground.formats.pictures.masks import with_masks
     from ground.formats.pictures.placement import placed
+    from ground.formats.pictures.screen import with_screen_masks
     from ground.formats.pictures.views import EXACT, Values, first_of_each_split, write_session
 
     given_sigmas = None if pose_sigma is None else _pose_sigmas(pose_sigma)
@@ -87,6 +88,8 @@ def import_command(
         views = first_of_each_split(views, frames)
         if exposures != UNKNOWN and format_ not in TIMED:
             views = with_exposures(views, table)
+    if masks is not None and masks.name == "screen" and not masks.exists():
+        views, masks = with_screen_masks(views, session / "masks"), None
     views, found_poses = with_masks(views, masks), {}
     source = f"{format_.value}: {folder}"
     given = None if values is None else Values(values.value)

@@ -164,8 +164,10 @@ MasksGiven = Annotated[
     Path | None,
     typer.Option(
         "--masks",
+        metavar="FOLDER|VIDEO|screen",
         help="A folder of pictures with the names of the pictures, white where the target is, or a video of them "
-        "beside a video; what they leave out counts as background.",
+        "beside a video; screen: all that has the plain colour of the pictures' borders is left out. What masks leave "
+        "out counts as background.",
     ),
 ]
 PoseSigmaGiven = Annotated[

@@ -123,7 +123,8 @@ def write_session(
     if judged.bright_borders > len(views) / 2 and not target.background:
         log.warning(
             "the borders of %d of %d pictures are bright (%.0f %% of full scale) where the background counts as black: "
-            "give --background white if it is white, or --masks if other things are in the pictures",
+            "give --background white if it is white, --masks screen if it is of one other colour, or --masks FOLDER if "
+            "other things are in the pictures",
             *(judged.bright_borders, len(views), 100 * judged.border),
         )
     (folder / "frames").mkdir(parents=True, exist_ok=True)
