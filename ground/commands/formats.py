@@ -69,9 +69,7 @@ def import_command(
     Example: ground import --format shirt --from shirtv1/roe1/lightbox --frames 363 --session roe1
     """
     from ground.formats.photographs.exposures import UNKNOWN, estimated, read_table, with_exposures
-    from ground.formats.pictures.masks import with_masks
     from ground.formats.pictures.placement import placed
-    from ground.formats.pictures.screen import with_screen_masks
     from ground.formats.pictures.views import EXACT, Values, first_of_each_split, write_session
 
     given_sigmas = None if pose_sigma is None else _pose_sigmas(pose_sigma)
@@ -88,9 +86,7 @@ def import_command(
         views = first_of_each_split(views, frames)
         if exposures != UNKNOWN and format_ not in TIMED:
             views = with_exposures(views, table)
-    if masks is not None and masks.name == "screen" and not masks.exists():
-        views, masks = with_screen_masks(views, session / "masks"), None
-    views, found_poses = with_masks(views, masks), {}
+    views, found_poses = _masked(views, masks, session), {}
     source = f"{format_.value}: {folder}"
     given = None if values is None else Values(values.value)
     if exposures == UNKNOWN:
@@ -243,6 +239,16 @@ def _photographs(
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _masked(views: "list[View]", masks: Path | None, session: Path) -> "list[View]":
+    """Return the views with the masks of a folder, or with those of the plain screen that they stand in front of."""
+    from ground.formats.pictures.masks import with_masks
+    from ground.formats.pictures.screen import with_screen_masks
+
+    if masks is not None and masks.name == "screen" and not masks.exists():
+        views, masks = with_screen_masks(views, session / "masks"), None
+    return with_masks(views, masks)
 
 
 def _masks_of_video(video: Path, views: "list[View]", session: Path) -> Path:

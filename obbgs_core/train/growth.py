@@ -34,6 +34,7 @@ from obbgs_core.train.setup import TrainingSetup
 # of the deviation along the longest axis: where the centres of the two Gaussians of a split along it lie. 0.6 is worse
 # (docs/experiments/043).
 LONG_AXIS_SHIFT = 0.8
+MOST_TIMES = 2  # that growth is prolonged: a training is half as long again at most
 log = logging.getLogger(__name__)
 
 
@@ -175,10 +176,12 @@ class Extension:
     The budget follows edges (docs/experiments/084); a body with texture all over shows more. Whether it is one is seen
     when growth ends. From then on the validation brackets are kept back, and growth goes on while they surely gain.
 
-    errors: of the brackets kept back, when growth was last prolonged; None: it never was.
+    times: that growth was prolonged.
+    errors: of the brackets kept back, when it last was; None: it never was.
     reason: why growth went on or ended, in words; nothing: within the budget.
     """
 
+    times: int = 0
     errors: Tensor | None = None
     reason: str = ""
 
@@ -195,7 +198,8 @@ class Extension:
         if not has_room and self.errors is None:
             return False
         room = as_many_again(model, batches, setup.sensor)
-        goes_on, before = has_room and bool(room.justifies), self.errors
+        goes_on = has_room and self.times < MOST_TIMES and bool(room.justifies)
+        before = self.errors
         why = f"as many Gaussians again could gain {room.gain:,.0f} nats at a BIC penalty of {room.penalty:,.0f}"
         if goes_on or before is not None:
             self.errors = log_errors(model, batches, setup.sensor, brackets)
@@ -204,6 +208,7 @@ class Extension:
                 goes_on &= bool(gained.justifies)
                 why += f"; brackets kept back err {gained.gain:.1%} less, of which {gained.error:.1%} may be chance"
             order.keep_back(brackets if goes_on or setup.keeps_unseen else [])
+        self.times += goes_on
         self.reason = f"growth {'goes on' if goes_on else 'ends'}: {why}"
         log.info("%s", self.reason)
         return goes_on

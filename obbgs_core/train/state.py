@@ -40,7 +40,7 @@ from obbgs_core.train.selection import Harmonics, Highlights, Pruning
 from obbgs_core.train.setup import Start, TrainingSetup
 
 log = logging.getLogger(__name__)
-FORMAT = 19  # of checkpoints; raise it when the fields of a class below change
+FORMAT = 20  # of checkpoints; raise it when the fields of a class below change
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,12 @@ RNG = np.random.default_rng(0)
 
 def masked(folder, picture) -> np.ndarray:
     """Return the mask [H, W] of a picture [H, W, 3] in 0..1."""
-    path = folder / "a.png"
+    return read_mask(with_screen_masks([view_of(folder / "a.png", picture)], folder / "masks")[0])
+
+
+def view_of(path, picture) -> View:
     path.write_bytes(imagecodecs.png_encode((255 * picture).clip(0, 255).round().astype(np.uint8)))
-    view = View(path, np.eye(4), Intrinsics(SIZE, SIZE, 50.0, 50.0, SIZE / 2, SIZE / 2))
-    return read_mask(with_screen_masks([view], folder / "masks")[0])
+    return View(path, np.eye(4), Intrinsics(SIZE, SIZE, 50.0, 50.0, SIZE / 2, SIZE / 2))
 
 
 @given(
@@ -54,3 +56,13 @@ def test_a_target_is_told_from_a_screen_that_is_lit_unevenly_also_where_it_leave
 def test_a_border_of_several_colours_is_refused_with_the_remedy(tmp_path, picture):
     with pytest.raises(FormatError, match=r"not of one colour.*--masks a folder"):
         masked(tmp_path, picture)
+
+
+def test_a_picture_that_the_target_fills_has_the_screen_of_the_others(tmp_path):
+    empty = np.ones((SIZE, SIZE, 3)) * [0.1, 0.2, 0.7]
+    full = RNG.random((SIZE, SIZE, 3)) * [0.9, 0.9, 0.3]
+    full[20:28, 20:28] = empty[0, 0]
+    views = [view_of(tmp_path / f"{i}.png", picture) for i, picture in enumerate((empty, empty, full))]
+    masks = [read_mask(v) for v in with_screen_masks(views, tmp_path / "masks")]
+    assert not masks[0].any()
+    assert not masks[2][21:27, 21:27].any() and masks[2].mean() == pytest.approx(1 - 64 / SIZE**2, abs=0.01)
