@@ -187,14 +187,16 @@ class Extension:
 
     def back(self, config: MethodConfig) -> int:
         """Return the steps that count as done where growth is prolonged, by as many as it takes to double a model."""
-        growth = config.growth
-        steps = math.ceil(math.log(2) / math.log1p(growth.grown_share)) * growth.interval
-        return max(round(config.steps_until(growth.begin)), round(config.steps_until(growth.end)) - steps)
+        steps = math.ceil(math.log(2) / math.log1p(config.growth.grown_share)) * config.growth.interval
+        return round(config.steps_until(config.growth.end)) - steps
 
     def goes_on(self, setup: TrainingSetup, model: Gaussians, batches: Batches, order: FrameOrder) -> bool:
         """Return whether growth is prolonged, now that it has come to its end."""
         brackets = order.validation_brackets or validation_brackets(setup.frames)
-        has_room = 2 * len(model) <= setup.shown and setup.config.growth.grown_share > 0 and bool(brackets)
+        config, growth = setup.config, setup.config.growth
+        has_room = 2 * len(model) <= setup.shown and growth.grown_share > 0 and bool(brackets)
+        # the models of shorter trainings are too coarse to judge by what they do not explain
+        has_room = has_room and self.back(config) >= config.steps_until(growth.begin)
         if not has_room and self.errors is None:
             return False
         room = as_many_again(model, batches, setup.sensor)

@@ -23,7 +23,7 @@ from obbgs_core.published import mcmc
 from obbgs_core.published.growth import outliers
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.adam import learning_rates
+from obbgs_core.train.adam import FIRST_MEMORY, SECOND_MEMORY, learning_rates
 from obbgs_core.train.backdrops import doubted, renew
 from obbgs_core.train.joining import begun_again, check_joinable, join, release, withhold
 from obbgs_core.train.objective import DROPPED_UNTIL, dropped, image_loss, priors
@@ -213,8 +213,10 @@ class Trainer:
         state, setup, config = self.state, self.setup, self.setup.config
         at_end = state.steps_done == round(config.steps_until(config.growth.end))
         if at_end and state.extension.goes_on(setup, state.model, self._batches, state.order):
-            state.steps_done = state.extension.back(config)
             self._use_found()
+            state.steps_done = state.extension.back(self.setup.config)
+            # the more Gaussians there are, the fewer readings tell the gradient of each
+            state.adam.betas = (FIRST_MEMORY, SECOND_MEMORY)
 
     @property
     def _batches(self) -> Batches:
