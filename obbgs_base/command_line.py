@@ -94,7 +94,7 @@ def run(app: typer.Typer, tool: str) -> None:
 def in_words(error: OSError) -> str:
     """Return what an error of the system says, without its number: `FILE: No such file or directory`."""
     if error.strerror is None:
-        return str(error)
+        return str(error) or type(error).__name__  # a TimeoutError may say nothing
     return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
 
 

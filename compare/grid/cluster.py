@@ -61,18 +61,25 @@ def connected(scheduler: str | None, workers: int | None, needs_mb: list[float])
                 yield client
             return
         count, limit_mb = share_memory(workers or os.cpu_count() or 1, needs_mb, available_mb())
-        with (
-            LocalCluster(
-                n_workers=min(count, max(1, len(needs_mb))),
-                threads_per_worker=1,
-                memory_limit=int(limit_mb * 1e6),
-                security=Security.temporary(),
-                dashboard_address="127.0.0.1:0",
-                silence_logs=50,
-                preload="compare.grid.local_worker",
-            ) as cluster,
-            Client(cluster, set_as_default=False) as client,
-        ):
+        with contextlib.ExitStack() as held:
+            try:
+                cluster = held.enter_context(
+                    LocalCluster(
+                        n_workers=min(count, max(1, len(needs_mb))),
+                        threads_per_worker=1,
+                        memory_limit=int(limit_mb * 1e6),
+                        security=Security.temporary(),
+                        dashboard_address="127.0.0.1:0",
+                        silence_logs=50,
+                        preload="compare.grid.local_worker",
+                    )
+                )
+                client = held.enter_context(Client(cluster, set_as_default=False))
+            except TimeoutError as error:
+                raise CompareError(
+                    "the processes of this comparison did not start in time, as on a machine that is very busy: the "
+                    "same command tries again"
+                ) from error
             yield client
 
 

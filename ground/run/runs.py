@@ -183,7 +183,7 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
     folder = run_folder(session.path, name, out)
     if not (folder / "metrics.json").is_file():
         raise SessionError(
-            f"{folder} is not a finished run; make one with `ground reconstruct --name {name}`"
+            f"{folder} is not a finished run; make one with `ground reconstruct --session {session_dir} --name {name}`"
         )
     if not (folder / "model.ply").is_file():
         raise SessionError(f"{folder} has lost its model.ply: make the run again with `ground reconstruct`")

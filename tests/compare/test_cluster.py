@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 from compare.errors import CompareError
 from compare.grid.cluster import connected, share_memory
 from ground import cli
+from obbgs_base.command_line import in_words
 from tests.commands import call
 from tests.small_sessions import small_session
 
@@ -195,6 +196,16 @@ def test_a_cell_that_the_memory_does_not_hold_is_refused():
 def test_the_command_refuses_to_compare_no_method(sessions, tmp_path):
     done = call("ground", "compare", str(sessions[0]), "--methods", " ,", "--out", str(tmp_path / "out"))
     assert done.returncode == 1 and "no method is named" in done.stderr and not (tmp_path / "out").exists()
+
+
+def test_processes_that_do_not_start_in_time_are_told_in_one_sentence(monkeypatch):
+    def busy(**settings):
+        raise TimeoutError
+
+    monkeypatch.setattr("compare.grid.cluster.LocalCluster", busy)
+    with pytest.raises(CompareError, match=r"did not start in time.* the same command tries again"):
+        connected(None, 1, [10.0]).__enter__()
+    assert in_words(TimeoutError()) == "TimeoutError"
 
 
 def test_a_comparison_s_own_cluster_takes_only_its_own_credentials():

@@ -1,6 +1,7 @@
 """What the report says of estimated poses, on frames of a known model whose tags were made to err."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from ground.run.runs import Run
 from ground.session.cameras import sensor_of
 from ground.session.folder import Navigation, open_session
 from ground.session.training_frames import split
+from ground.show.report.document import pass_name
 from ground.show.report.poses import pose_history, poses_section
 from obbgs_base.navigation_errors import SIZE, SharedParameters
 from obbgs_core.poses.estimate import PoseEstimate
@@ -82,6 +84,17 @@ def test_the_residual_is_that_of_noise_from_the_right_poses_only(example):
     assert 0.7 < np.median(history.chi2_estimated) < 1.4  # the model is the truth
     assert (history.chi2_tagged > 2 * history.chi2_estimated).mean() > 0.8
     assert history.misfits == []
+
+
+def test_a_tag_that_places_the_target_beside_the_picture_has_the_residual_of_a_picture_without_it(example):
+    run, estimate, _ = example
+    place, tagged, aside = 4, estimate.tagged.copy(), np.eye(4)
+    aside[0, 3] = 1e3  # m to the right
+    tagged[place] = aside @ tagged[place]
+    row = pose_history(run, estimate).frame_ids.index(estimate.frame_ids[place])
+    history = pose_history(run, dataclasses.replace(estimate, tagged=tagged))
+    assert history.chi2_tagged[row] > 10 * history.chi2_estimated[row]
+    assert pass_name(Path("/a/pass-12")) == "pass-12" and pass_name(Path("/a/demo/session")) == "demo"
 
 
 def test_the_section_tells_values_with_both_deviations_and_what_the_frames_do_not_determine(example):

@@ -31,6 +31,12 @@ DECISIONS = {  # of metrics.json
 }
 
 
+def pass_name(session: Path) -> str:
+    """Return the name of a session's folder; that of the folder around it where it is just `session`."""
+    folder = session.resolve()
+    return folder.parent.name if folder.name == "session" else folder.name
+
+
 def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
     """Write report.html into a run's folder and return its path; `out` is the folder of runs, if not the session's own.
 
@@ -40,7 +46,7 @@ def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
     run = open_run(session_dir, name, out)
     truth = Truth(run.session) if Truth.exists(run.session) else None
     content = page(
-        f"Reconstruction of {run.session.path.resolve().parent.name}, run {name}",
+        f"Reconstruction of {pass_name(run.session.path)}, run {name}",
         f"Method {run.metrics['method']}, {run.metrics['frames_received']} frames received, session of "
         f"{run.session.created_utc}.",
         [

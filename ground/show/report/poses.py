@@ -89,22 +89,30 @@ def pose_history(run: Run, estimate: PoseEstimate) -> PoseHistory:
         motion_vectors(estimated @ torch.linalg.inv(tagged)).numpy(),
         PoseCorrections(frames).covariances.numpy(),
         doubts_left(run.session, [records[number] for number in ids], estimate),
-        _residuals(run, frames, tagged),
-        _residuals(run, frames, estimated),
+        *_residuals(run, frames, tagged, estimated),
     )
 
 
 @torch.no_grad()
-def _residuals(run: Run, frames: list[TrainingFrame], poses: torch.Tensor) -> np.ndarray:
-    """Return chi² on the target [P] of the finished model from given poses; NaN where it is not in the picture."""
-    found = []
-    for frame, pose in zip(frames, poses, strict=True):
-        rendered = render(run.gaussians, cameras_of([replace(frame, world_to_camera=pose.float())]))
+def _residuals(
+    run: Run, frames: list[TrainingFrame], tagged: torch.Tensor, estimated: torch.Tensor
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return chi² on the target of the finished model from the tagged and from the estimated poses, [P] each.
+
+    Both count the pixels that show the model from either pose, so that a tag which places the target beside the picture
+    has the residual of a picture without it; NaN where it is in the picture from neither.
+    """
+    found: tuple[list[float], list[float]] = ([], [])
+    for frame, *poses in zip(frames, tagged, estimated, strict=True):
+        both = [
+            render(run.gaussians, cameras_of([replace(frame, world_to_camera=pose.float())]))
+            for pose in poses
+        ]
+        seen = torch.maximum(both[0].alpha, both[1].alpha)
         exposure_s = torch.tensor([run.metrics.get("reference_exposure_s") or frame.exposure_time_s])
-        found.append(
-            fit_figures(rendered.radiance, rendered.alpha, exposure_s, frame.dn[None], run.sensor)[0]
-        )
-    return np.array(found)
+        for values, rendered in zip(found, both, strict=True):
+            values.append(fit_figures(rendered.radiance, seen, exposure_s, frame.dn[None], run.sensor)[0])
+    return np.array(found[0]), np.array(found[1])
 
 
 def poses_section(run: Run) -> str:
