@@ -23,6 +23,7 @@ from obbgs_core.inspect.cad import CadMesh, Samples, groups_within, read_cad, sa
 from obbgs_core.inspect.findings import FEWEST_VIEWS, Inspection, inspect
 from obbgs_core.inspect.plates import is_turned, plates_of
 from obbgs_core.inspect.shown import views_showing
+from tests.benchmarks.rows import shown
 
 KINDS = ("panel", "missing", "added", "none")
 DEGREES, SIZES_PX = (2.0, 20.0), (3.0, 20.0)
@@ -99,8 +100,8 @@ def _put_on(target: Target, rng: np.random.Generator) -> tuple[CadMesh, dict]:
         new = len(target.body.names)
         alone = CadMesh(vertices, box.faces, np.full(len(box.faces), new), ("",) * new + ("put on",))
         both = joined(target.design, sampled(alone, spacing))
-        shown = views_showing(both, target.model.views, target.pixel_m) >= FEWEST_VIEWS
-        if shown[both.part == new].mean() > BOX_SHOWN:
+        by = views_showing(both, target.model.views, target.pixel_m) >= FEWEST_VIEWS
+        if by[both.part == new].mean() > BOX_SHOWN:
             cad = CadMesh(
                 np.concatenate([target.body.vertices, vertices]),
                 np.concatenate([target.body.triangles, box.faces + len(target.body.vertices)]),
@@ -290,7 +291,7 @@ def main() -> None:
             continue
         if name not in targets:
             targets[name] = Target(arguments.runs / f"{name}-100/runs/run", arguments.cads / f"{name}.glb")
-        rows.append(row_of(targets[name], name, number))
+        rows.append(json.loads(shown(row_of(targets[name], name, number), "inspect", as_json=True)))
         with arguments.out.open("a") as file:
             file.write(json.dumps(rows[-1]) + "\n")
         print(json.dumps(rows[-1]), flush=True)
