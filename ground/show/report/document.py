@@ -15,6 +15,7 @@ from ground.show.plots import histogram_figure, training_figures
 from ground.show.report.attitude import attitude_section
 from ground.show.report.frames import brightness, frames_section, scored_section
 from ground.show.report.poses import poses_section
+from ground.show.report.sizes import sizes_section
 from ground.show.report.sky import sky_section
 from ground.show.splat_view import splat_view
 from ground.show.telemetry_plots import broken_limits, housekeeping_series, telemetry_figures
@@ -52,6 +53,7 @@ def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
         [
             _model(run),
             _result(run, truth),
+            sizes_section(run),
             frames_section(run),
             scored_section(run, truth),
             attitude_section(run),

@@ -1,0 +1,32 @@
+"""The report's section on the body's sizes: lengths and areas as `ground measure` tells them, with their errors."""
+
+import html
+
+from ground.run.runs import Run
+from ground.session.folder import SessionError
+from ground.show.inspection import read_model
+from ground.show.measure import measured
+from ground.show.page import section, two_tables
+
+
+def sizes_section(run: Run) -> str:
+    """Return the section; nothing for a run without a mesh, or with one of which no frames show anything."""
+    try:
+        values = measured(read_model(run.folder))
+    except SessionError:
+        return ""
+    unit = html.escape(values["unit"])
+    rows = [(f"largest dimension, {unit}", told(values["largest_dimension"]))]
+    for face in values["faces"]:
+        rows.append((f"{face['name']}, length x width", f"{told(face['length'])} x {told(face['width'])}"))
+        rows.append(("… its area, squared", told(face["area"])))
+    note = (
+        "Intervals hold the true value with a probability of 90 %: they count the error of the scale, "
+        f"{values['size_sigma_percent']:.2g} % (one standard deviation), and that of edges in the model, whose pixels "
+        f"are {values['pixel']:.2g} {unit} wide. Faces are the flat ones that the frames show, largest first."
+    )
+    return section("Sizes", note, two_tables(rows))
+
+
+def told(value: dict) -> str:
+    return f"{value['value']:.4g} ± {value['half_width_90']:.2g}"
