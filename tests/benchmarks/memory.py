@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print rows as JSON lines")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    began, row = time.process_time(), {"frames": arguments.frames, "steps": arguments.steps}
+    began, row = time.process_time(), {"condition": f"{arguments.frames} frames", "steps": arguments.steps}
     row |= {"target": f"{arguments.width}x{arguments.height}", "peak_gb_imports": peak_gb()}
     frames = frames_of(arguments.frames, arguments.width, arguments.height)
     row["peak_gb_frames"] = peak_gb()
