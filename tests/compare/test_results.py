@@ -12,6 +12,7 @@ from compare.case import load_case
 from compare.charts.figures import write_figures
 from compare.charts.page import write_page
 from compare.charts.results import Results, pareto, with_best
+from compare.command import _line
 from compare.grid.rows import Rows
 from compare.references import black, noise
 from compare.views import SHOWN, WORST, read_views, write_views
@@ -267,6 +268,12 @@ def test_figures_of_photographs_are_written_without_a_true_surface(without_truth
     rows.add(row("obbgs", target="B", psnr_clean_db=40.0, chamfer=0.02, seconds=60.0))
     names = {path.name for path in write_figures(without_truth)}
     assert {"speed-A.png", "speed-B.png", "gain-obbgs.png"} <= names and "gain-jiang2025.png" not in names
+
+
+def test_the_line_of_a_row_without_truth_has_the_psnr_against_the_noisy_frames():
+    row = {"method": "mean", "target": "pass-12", "condition": "as taken", "seed": 0, "psnr_noisy_db": 27.371}
+    assert _line(row) == "mean, pass-12, as taken, seed 0: 27.37 dB against the noisy frames"
+    assert _line(row | {"psnr_clean_db": 30.0}) == "mean, pass-12, as taken, seed 0: 30.00 dB"
 
 
 def test_the_command_says_what_is_wrong_with_its_arguments(tmp_path):
