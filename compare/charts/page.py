@@ -144,7 +144,7 @@ def _table(results: Results, target: str | None) -> str:
             words = f"No result: {html.escape(reason.rstrip('.'))}."
             cells = [cells[0], f'<td class="words" colspan="{max(1, len(shown))}"><div>{words}</div></td>']
         lines.append(f"<tr>{''.join(cells)}</tr>")
-    head = "".join(f"<th>{html.escape(m.title)}</th>" for m in shown)
+    head = "".join(f'<th class="n">{html.escape(m.title)}</th>' for m in shown)
     title = "<h3>Mean of the targets</h3>" if target is None else ""
     rows = f"<tr><th>method</th>{head}</tr>{''.join(lines)}"
     return f'{title}<div class="scroll"><table class="scores">{rows}</table></div>'
@@ -211,7 +211,7 @@ def _failures(results: Results, out: Path) -> str:
         width_px = CELL_PX * (1 + len(results.trained))
         drawn = legend(zip(VERDICTS, VERDICT_COLOURS, strict=True))
         drawn += f'<div class="scroll"><div style="min-width: {width_px}px">{plot(failure_figure(results))}</div></div>'
-    return section("Where methods fail", note, drawn + pictures)
+    return section("Where methods fail", note, drawn + pictures) if drawn or pictures else ""
 
 
 def _size(results: Results) -> str:
@@ -258,8 +258,8 @@ def _side_by_side(results: Results, out: Path) -> str:
         truth = tone(kept[0][1].expected, kept[0][1].sensor)
         cells = [picture(truth, "expected", "expected")]
         for name, view in kept:
-            _, render, error = _compared(view)
-            cells.append(f'<div>{render}{error}<div class="label">{html.escape(name)}</div></div>')
+            _, render, error = _compared(view, f"{html.escape(name)}, ")
+            cells.append(f"<div>{render}{error}</div>")
         body.append(f'<div class="grid views">{"".join(cells)}</div>')
     return section("Side by side", note, "".join(body)) if body else ""
 
@@ -277,10 +277,10 @@ def error_of(view: KeptView) -> np.ndarray:
     return np.clip(error / ERROR_FULL_SCALE, 0, 1)
 
 
-def _compared(view: KeptView) -> list[str]:
+def _compared(view: KeptView, name: str = "") -> list[str]:
     return [
         picture(tone(view.expected, view.sensor), "expected", f"{view.exposure_time_s * 1e3:g} ms"),
-        picture(tone(view.image, view.sensor), "render", f"{view.psnr_db:.1f} dB"),
+        picture(tone(view.image, view.sensor), "render", f"{name}{view.psnr_db:.1f} dB"),
         picture(heat(error_of(view)), "error", "&nbsp;"),
     ]
 

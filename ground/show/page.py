@@ -28,6 +28,7 @@ p.note { color: var(--soft); margin: 4px 0 14px; font-size: 13.5px; }
 .card span { color: var(--soft); font-size: 13px; }
 table { border-collapse: collapse; width: 100%; font-size: 14px; }
 td, th { text-align: left; padding: 5px 10px; border-bottom: 1px solid var(--line); vertical-align: top; }
+th.n { text-align: right; }
 td.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
 .grid { display: grid; gap: 6px; }
 .grid img { width: 100%; display: block; background: #000; border-radius: 3px; image-rendering: pixelated; }

@@ -1,5 +1,6 @@
 """Means, verdicts, gains and Pareto fronts that are worked out from rows, and the page made of them."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -196,6 +197,13 @@ def test_the_page_shows_every_part(comparison):
     for words in (*titles, "Relative gains over 3dgs", "40.50", "No result: the loss became nan.", "abc1234"):
         assert words in body
     assert 'src="http' not in page and "<link" not in page
+
+
+def test_pictures_name_their_method_and_a_section_without_content_goes(comparison, tmp_path):
+    assert re.search(r"[a-z0-9]+, \d+\.\d dB</", write_page(comparison).read_text())
+    rows = Rows(tmp_path)
+    rows.add(row("black", psnr_clean_db=20.0))
+    assert "Where methods fail" not in write_page(tmp_path).read_text()
 
 
 @pytest.fixture(scope="module")
