@@ -42,6 +42,11 @@ TOO_VARIED = 4.0  # nor is one whose variance is above that of noise by so many 
 # Nothing is darker than the sky: where more blocks than this share are far below the plane, it lies in the target.
 MOST_BELOW = 0.02
 FAR_BELOW = 4.0
+# Flight sends what is far from the target as the black level, in areas wider than this, px. Empty sky of noise that is
+# clear of rounding reads one number all over such a square as good as never.
+CUT_PX, CLEAR_NOISE_DN = 5, 1.0
+CUT_BELOW = 2.0  # deviations of a reading: where flight has cut, the sky is lower than that above black
+CUT_BLOCK_PX = 4  # blocks are as small in passes that were cut, since what is left of the sky is a rim
 FIRST_SWEEPS, SWEEPS = 30, 6  # of the first plane, and of the plane through sky
 # Of a reading's deviation: a level that departs by less from the stated black, in the mean of squares over frames and
 # pixels, is no reason to doubt it. Windows of 25 pixels tell sky from a face of 0.2 (`start.hull.FAINTEST_SIGMA`).
@@ -126,6 +131,17 @@ def field(plane_dn: Tensor, height: int, width: int) -> Tensor:
     return torch.einsum("hwk,ck->hwc", _basis(height, width).to(plane_dn), plane_dn)
 
 
+def cut_pixels(dn: Tensor, sensor: Sensor) -> Tensor:
+    """Return which pixels [H, W] of readings dn [H, W, C] flight has not sent: they read the black level all over."""
+    if (
+        not CLEAR_NOISE_DN < _noise_dn(sensor) < sensor.black_dn
+    ):  # or half of all readings are clipped to it anyway
+        return torch.zeros(dn.shape[:2], dtype=torch.bool)
+    as_black = (dn == int(sensor.black_dn)).all(dim=2)[None, None].float()
+    inside = 1 - F.max_pool2d(1 - as_black, CUT_PX, 1, CUT_PX // 2)
+    return F.max_pool2d(inside, CUT_PX, 1, CUT_PX // 2)[0, 0] > 0
+
+
 def _basis(rows: int, columns: int) -> Tensor:
     """Return 1 and the place from -1 at the left and upper edges to 1 at the others, of cells [rows, columns, 3]."""
     y, x = ((torch.arange(n) + 0.5) * 2 / n - 1 for n in (rows, columns))
@@ -137,6 +153,9 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
     """Return planes [F, C, 3] and their variances, infinite where a frame shows no sky, and a reading's deviation."""
     height, width, channels = frames[0].shape
     px = max(2, round(min(height, width) / BLOCKS))
+    cut = torch.stack([cut_pixels(f.dn, sensor) for f in frames])
+    if cut.any():
+        px = min(px, CUT_BLOCK_PX)
     if sensor.jpeg is not None:  # within its blocks readings are not independent
         px = BLOCK_PX * max(1, round(px / BLOCK_PX))
     rows, columns = height // px, width // px
@@ -145,22 +164,25 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
         return nothing, torch.full_like(nothing, math.inf), 1.0
     pooled = [_block_moments(f.dn, px) for f in frames]
     mean, variance = (torch.stack(moments) for moments in zip(*pooled, strict=True))  # [F, C, B]
+    known = F.max_pool2d(cut[:, None].float(), px)[:, 0].flatten(1) == 0  # [F, B]
+    shown = known.sum(dim=1) >= FEWEST_BLOCKS
+    known |= ~shown[:, None]
     whole = _basis(height, width)[: rows * px, : columns * px].movedim(-1, 0)[None]
     basis = F.avg_pool2d(whole, px)[0].flatten(1).T.double()  # [B, 3]
-    quiet = variance.mean(dim=1).quantile(QUIET_SHARE, dim=1).median()
+    quiet = _quantile(variance.mean(dim=1), known, QUIET_SHARE).median()
     sigma_dn = max(math.sqrt(float(quiet)) / CLIPPED_SIGMA, math.sqrt(1 / 12))
     levels = _levels(mean.mean(dim=1), sigma_dn)
     even = torch.zeros(len(frames), 3).double()
-    even[:, 0] = levels.quantile(LOW_SHARE, dim=1)
+    even[:, 0] = _quantile(levels, known, LOW_SHARE)
     found = [
-        _through_sky(start, basis, mean, variance, (px * px, rows), sigma_dn, sensor)
-        for start in (_low_planes(basis, levels, sigma_dn), even)
+        _through_sky(start, basis, mean, variance, known, (px * px, rows), sigma_dn, sensor)
+        for start in (_low_planes(basis, levels, known, sigma_dn), even)
     ]
     # of the two planes of a frame that with more sky; the noise as most frames show it
     first = found[0].count >= found[1].count
     plane = torch.where(first[:, None], found[0].plane, found[1].plane)
     sky = torch.where(first[:, None], found[0].sky, found[1].sky)
-    usable = found[0].count.maximum(found[1].count) > 0
+    usable = shown & (found[0].count.maximum(found[1].count) > 0)
     sigma_dn = max(found, key=lambda f: int(f.count.sum())).sigma_dn
     planes, variances = [], []
     for channel in range(channels):
@@ -195,6 +217,7 @@ def _through_sky(
     basis: Tensor,
     mean: Tensor,
     variance: Tensor,
+    known: Tensor,
     size: tuple[int, int],
     sigma_dn: float,
     sensor: Sensor,
@@ -204,6 +227,7 @@ def _through_sky(
     Args:
         plane: [F, 3] the first planes.
         mean, variance: [F, C, B] of the readings of each block.
+        known: [F, B] bool, the blocks that are as the camera read them.
         size: pixels of a block, and rows of blocks.
     """
     grey, scatter, readings = mean.mean(dim=1), variance.mean(dim=1), size[0] * mean.shape[1]
@@ -211,7 +235,7 @@ def _through_sky(
     expected, spread = _moments(plane, basis, sigma_dn, sensor)
     for _ in range(SWEEPS):
         of_mean = spread / readings + _of_coding(sensor, readings)
-        sky = _sky_blocks(grey, scatter, expected, spread, of_mean, readings, size[1])
+        sky = _sky_blocks(grey, scatter, known, expected, spread, of_mean, readings, size[1])
         plane, _ = _fitted(plane, basis, grey, sky, sigma_dn, sensor)
         _, spread = _moments(plane, basis, sigma_dn, sensor)
         ratio = (scatter * sky).sum(dim=1) / (spread * sky).sum(dim=1)
@@ -219,7 +243,8 @@ def _through_sky(
             sigma_dn *= math.sqrt(float(ratio.nanmedian()))
         expected, spread = _moments(plane, basis, sigma_dn, sensor)
     of_mean = spread / readings + _of_coding(sensor, readings)
-    below = (grey < expected - FAR_BELOW * of_mean.sqrt()).double().mean(dim=1)
+    far = torch.where(known, FAR_BELOW * of_mean.sqrt(), CUT_BELOW * spread.sqrt())
+    below = (grey < expected - far).double().mean(dim=1)
     count = sky.sum(dim=1)
     return _Fit(plane, sky, count * ((count >= FEWEST_BLOCKS) & (below <= MOST_BELOW)), sigma_dn)
 
@@ -272,16 +297,21 @@ def _levels(mean: Tensor, sigma_dn: float) -> Tensor:
     return level
 
 
-def _low_planes(basis: Tensor, mean: Tensor, sigma_dn: float) -> Tensor:
-    """Return planes [F, 3] below which LOW_SHARE of the blocks' levels [F, B] lie.
+def _quantile(values: Tensor, known: Tensor, share: float) -> Tensor:
+    """Return the value of each row [F] below which a share of its known values [F, B] lie."""
+    return values.where(known, torch.nan).nanquantile(share, dim=1)
+
+
+def _low_planes(basis: Tensor, mean: Tensor, known: Tensor, sigma_dn: float) -> Tensor:
+    """Return planes [F, 3] below which LOW_SHARE of the known blocks' levels [F, B] lie.
 
     Source: Koenker and Bassett, Regression quantiles, 1978; by iteratively reweighted least squares.
     """
-    weight, planes = torch.ones_like(mean), torch.zeros(len(mean), 3).double()
+    weight, planes = known.to(mean), torch.zeros(len(mean), 3).double()
     for _ in range(FIRST_SWEEPS):
         planes = _solved(basis, mean, weight)
         above = mean - planes @ basis.T
-        weight = torch.where(above > 0, LOW_SHARE, 1 - LOW_SHARE) / (above.abs() + 0.05 * sigma_dn)
+        weight = known * torch.where(above > 0, LOW_SHARE, 1 - LOW_SHARE) / (above.abs() + 0.05 * sigma_dn)
     return planes
 
 
@@ -300,22 +330,24 @@ def _moments(planes: Tensor, basis: Tensor, sigma_dn: float, sensor: Sensor) -> 
 def _sky_blocks(
     mean: Tensor,
     variance: Tensor,
+    known: Tensor,
     expected: Tensor,
     spread: Tensor,
     of_mean: Tensor,
     readings: int,
     rows: int,
 ) -> Tensor:
-    """Return which blocks [F, B] read and scatter as empty sky, and have no neighbours that do not.
+    """Return which known blocks [F, B] read and scatter as empty sky, and have no neighbours that do not.
 
     of_mean: [F, B] the variance of the mean of a block.
     """
     lit = (mean - expected).abs() > FAR * of_mean.sqrt()
     lit |= variance > spread * (1 + TOO_VARIED * math.sqrt(2 / readings))
+    lit &= known
     grid = lit.double().view(len(lit), 1, rows, -1)
     near = F.max_pool2d(grid, 3, 1, 1).view(len(lit), -1) > 0
-    enough = (~near).sum(dim=1, keepdim=True) >= FEWEST_BLOCKS
-    return torch.where(enough, ~near, ~lit)
+    enough = (~near & known).sum(dim=1, keepdim=True) >= FEWEST_BLOCKS
+    return known & torch.where(enough, ~near, ~lit)
 
 
 def _fitted(
@@ -376,6 +408,7 @@ def _without(
         off = field(plane, height, width) - (black_dn - sensor.black_dn)
         dn = (frame.dn - off).clamp(0, white_dn)
         dn[frame.dn <= 0], dn[frame.dn >= sensor.white_dn] = 0.0, white_dn
+        dn[cut_pixels(frame.dn, sensor)] = black_dn
         corrected.append(dataclasses.replace(frame, dn=dn))
     return corrected, dataclasses.replace(sensor, black_dn=black_dn, white_dn=white_dn)
 

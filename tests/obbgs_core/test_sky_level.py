@@ -94,6 +94,22 @@ def test_nothing_is_measured_where_the_target_fills_the_picture_or_in_front_of_a
     assert levelled(white, SENSOR)[2].fits
 
 
+def test_what_flight_has_cut_is_no_sky_and_stays_black():
+    """Around the target a rim of the sky is left, and its level is that of the whole picture."""
+    sensor = dataclasses.replace(SENSOR, read_noise_dn=6.0)
+    true = torch.tensor([4.0 + n % 2 for n in range(12)])
+    frames = seen(sensor, planes([(level, 1.0, 0.0) for level in true.tolist()]), blocked=0.0)
+    for f in frames:
+        f.dn[35:60, 30:66] += 800 + 20 * torch.arange(36.0)[:, None]
+        sent = torch.zeros(SIZE_PX, SIZE_PX, dtype=torch.bool)
+        sent[26:69, 21:75] = True  # flight's margin is 9 px
+        f.dn[~sent] = sensor.black_dn
+    corrected, told, level = levelled(frames, sensor)
+    assert (level.planes_dn[:, 0, 0] - true).abs().max() < 0.25 * sensor.read_noise_dn
+    for f in corrected:
+        assert (f.dn[:24] == told.black_dn).all() and (f.dn[71:] == told.black_dn).all()
+
+
 def test_what_a_clipped_reading_says_stays_true():
     """A reading at zero or at full scale is a bound on the light; so are the corrected ones, for no more than that."""
     frames = seen(DARK, planes([(4.0, 2.0, 0.0)] * 6))
