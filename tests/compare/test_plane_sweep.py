@@ -121,7 +121,7 @@ def test_a_textured_spacecraft_becomes_a_cloud_on_its_surface(scene):
     def on_step(share, seconds, snapshot):
         shares.append(share)
         if len(shares) == 15:
-            early.append(len(snapshot().points))
+            early.append(len(snapshot(True).points))
 
     result = reconstruct_mvs(frames, raycast.SENSOR, Work(on_step=on_step), settings=FEW)
     pixel_m = 4.5 / 120
