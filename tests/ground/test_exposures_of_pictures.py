@@ -379,6 +379,8 @@ def write_fits(path: Path, image: np.ndarray) -> None:
 def test_every_command_of_the_page_does_what_the_page_says(data, monkeypatch):
     page = (Path(__file__).parents[2] / "docs/own-pictures.md").read_text()
     commands = [shlex.split(block) for block in re.findall(r"```sh\n(.*?)```", page, re.S)]
+    # a video and kernels are made and imported by tests of their own
+    commands = [command for command in commands if not {"video", "spice"} & set(command)]
     assert len(commands) == 7
     monkeypatch.chdir(data)
     for tool, *arguments in commands:
