@@ -15,12 +15,9 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from flightsw.downlink import run_downlink
-from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.icd.frame import encode_frame
 from flightsw.icd.model_file import OPERATORS, ModelUnfit, check_model
 from flightsw.model_process import Limits, tried
-from flightsw.ports import open_link
 from flightsw.ranking import RANKING_S, Ranking
 from flightsw.settings import Settings, save_settings
 from flightsw.store import FrameStore
@@ -38,7 +35,7 @@ from tests.scenes import ball
 SENSOR = Sensor(64, 4095, 4e7, 4, 8)
 SMALL = Limits(time_s=3.0)
 ENDLESS = Limits(time_s=1000.0)
-PATIENT_S = 60.0
+PATIENT_S = 120.0
 
 
 @pytest.fixture
@@ -421,26 +418,74 @@ def test_a_disk_that_refuses_keeps_no_model_from_ranking(ranking, monkeypatch, c
     assert "it cannot be kept: [Errno 30]" in caplog.text and "tried again at the next start" in caplog.text
 
 
-def test_frames_come_down_while_a_model_hangs_and_it_is_gone_at_the_end(
-    tmp_path, small_mission, make_frame, monkeypatch
+FLIGHT = """
+import functools, sys
+import flightsw.ranking as ranking
+from flightsw.cli import main
+from flightsw.model_process import Limits
+limits = Limits(time_s=float(sys.argv.pop(1)))
+ranking.RANKING_S, ranking.TriageWorker = 1.0, functools.partial(ranking.TriageWorker, limits=limits)
+main()
+"""
+
+
+def models_of(flight: subprocess.Popen) -> list[int]:
+    """Return the processes of models that belong to a flight process."""
+    children = Path(f"/proc/{flight.pid}/task").glob("*/children")
+    return [int(number) for each in children for number in each.read_text().split()]
+
+
+def wait_for(is_so, patience_s: float = PATIENT_S) -> None:
+    end_s = time.monotonic() + patience_s
+    while not is_so() and time.monotonic() < end_s:
+        time.sleep(0.02)
+    assert is_so()
+
+
+def test_a_hanging_model_stops_neither_the_link_nor_the_end_of_the_flight_process(
+    tmp_path, small_mission, make_frame
 ):
-    monkeypatch.setattr("flightsw.ranking.RANKING_S", 1.0)
+    """Over a pseudo-terminal: with a limit that it never reaches frames come down all the same, and SIGTERM ends both.
+
+    With a limit of 1 s it is told and set aside, and its process is gone while flight goes on.
+    """
     store, session, ended = FrameStore(tmp_path / "store"), tmp_path / "session", threading.Event()
     for number in range(4):
         store.put(make_frame(number))
-    that_turns(store.folder / "model.onnx", AT_ONCE)
+    model, failed = that_turns(store.folder / "model.onnx", AT_ONCE), store.folder / "model.onnx.failed"
     save_settings(store.folder, Settings(priority="triage"))
-    with VirtualSerial(3_000_000) as line, open_link(line.flight_url, FLIGHT_SIDE) as link:
+
+    def told() -> str:
+        events = session / "events.jsonl"
+        return events.read_text() if events.exists() else ""
+
+    with VirtualSerial(3_000_000) as line:
         arguments = (line.ground_url, session, small_mission)
         ground = threading.Thread(target=listen, args=arguments, kwargs={"should_stop": ended.is_set})
         ground.start()
+        command = ["downlink", "--link", line.flight_url, "--store", str(store.folder)]
+        command += ["--mission", str(tmp_path / "small.yaml")]
         try:
-            sent = run_downlink(store, link, small_mission, exit_when_empty=True)
+            for limit_s in (1000.0, 1.0):
+                flight = subprocess.Popen([sys.executable, "-c", FLIGHT, str(limit_s), *command])
+                try:
+                    if limit_s > 1:
+                        wait_for(lambda: not store.outbox())
+                        (hanging,) = models_of(flight)
+                        assert model.exists()
+                    else:
+                        wait_for(lambda: "did not come to an end within 1 s" in told())
+                        assert failed.exists() and not model.exists() and not models_of(flight)
+                    flight.terminate()
+                    assert flight.wait(PATIENT_S) == 0
+                finally:
+                    flight.kill()
+                    flight.wait()
+                assert not Path(f"/proc/{hanging}").exists()
         finally:
             ended.set()
             ground.join(30)
-    assert sent.delivered == 4 and not store.outbox()
-    assert not any("triage" in thread.name for thread in threading.enumerate())
+    assert len((session / "frames.jsonl").read_text().splitlines()) == 4
 
 
 def node(kind: str, **attributes: object) -> onnx.NodeProto:
