@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import TaskID
 
 from flightsw.icd.mission import load_mission
-from hil.choices import LinkKind, navigation_of
+from hil.choices import SKY, LinkKind, SkyKind, navigation_of
 from hil.sky import SHIPPED, SHIPPED_FOIL, Materials
 from obbgs_base.command_line import MISSION_HELP, OUT_HELP, SET_HELP, AsJson, new_app, run
 from obbgs_base.locks import one_command_in
@@ -84,6 +84,13 @@ def demo(
     scenario: ScenarioName = "",
     real_time: RealTime = 0.0,
     navigation: Navigation = "realistic",
+    sky: Annotated[
+        SkyKind,
+        typer.Option(
+            help="real: the Earth with clouds and limb from the orbit, stars, the Sun's stray light, and a dark level "
+            "that drifts; black: nothing but the target."
+        ),
+    ] = SKY,
     json_: AsJson = False,
 ) -> None:
     """Simulate a whole pass, from rendered frames over flight, link and ground to a model and its report.
@@ -98,7 +105,7 @@ def demo(
     unwind_on_sigterm()
     kind, seed = navigation_of(navigation)
     LinkFaults.parse(faults)  # refused before anything is written
-    config = PassConfig(gige, bus, faults, scenario, kind, real_time, seed)
+    config = PassConfig(gige, bus, faults, scenario, kind, real_time, seed, sky=sky)
     figures = run_demo(out, mission, mesh, config, Console(stderr=json_))
     if json_:
         print(json.dumps(figures))

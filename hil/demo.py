@@ -23,6 +23,7 @@ from hil.truth import write_truth
 from hil.world.clock import SimulatedClock
 from hil.world.navigation import write_flight_inputs
 from hil.world.scenario import true_exposures
+from hil.world.surroundings import Surroundings
 from hil.world.world import load_world, told
 from obbgs_base.errors import ObbgsError
 from obbgs_base.locks import one_command_in
@@ -109,7 +110,8 @@ def simulate_pass(
             f"[bold]2/4 Pass[/]  flight and ground, {camera} camera, {config.link} link between, "
             f"faults: {config.faults}"
         )
-        simulation = fly(out, world, mission_path, farm.radiance, config, console)
+        around = Surroundings(world.mission, farm.alpha) if config.sky == "real" else None
+        simulation = fly(out, world, mission_path, farm.radiance, config, console, around)
         if errors is not None:
             simulation["navigation"] |= errors.described()
         console.print("[bold]3/4 Truth[/] the simulator's own record, for the evaluation only")

@@ -22,12 +22,13 @@ from flightsw.icd.mission import Mission
 from flightsw.icd.quaternion import quat_to_matrix
 from hil.cameras.gige import GigeCameraServer
 from hil.cameras.virtual import CameraServer
-from hil.choices import NAVIGATION, LinkKind, NavigationKind
+from hil.choices import NAVIGATION, SKY, LinkKind, NavigationKind, SkyKind
 from hil.link_by_name import virtual_link
 from hil.links.faults import LinkFaults
 from hil.links.virtual_link import VirtualLink
 from hil.processes import end, installed, tied
 from hil.progress import progress_bar
+from hil.world.surroundings import Surroundings
 from hil.world.world import World
 from obbgs_base.errors import ObbgsError
 
@@ -62,6 +63,7 @@ class PassConfig:
     real_time: float = 0.0  # how many times as fast as real time the simulated clock runs; 0: lock step
     seed: int = 1  # of the navigation errors
     attitude: Attitude | None = None  # what flight knows of the target's; None: what the mission says
+    sky: SkyKind = SKY  # real: with Earth, stars, stray light and a dark level that drifts
 
     def open_link(self, mission: Mission) -> VirtualLink:
         """Return the link, not yet running."""
@@ -80,6 +82,7 @@ def fly(
     radiance: Callable[[PoseTag], np.ndarray],
     config: PassConfig,
     console: Console,
+    surroundings: Surroundings | None = None,
 ) -> dict[str, dict]:
     """Run flight and ground until every frame is across; return what was simulated, by part.
 
@@ -88,13 +91,14 @@ def fly(
     Args:
         mission_path: the file of the world's mission.
         radiance: gives the scene-linear radiance [H, W, C] for a true pose.
+        surroundings: what else the camera sees; None: a black sky.
 
     Raises:
         PassError: a process failed or stalled, or a frame was lost or altered on its way.
         CaptureError, OSError: the GigE camera cannot be served: Aravis is missing, or its port is taken.
     """
     mission = world.mission
-    with config.open_link(mission) as line, _open_camera(world, radiance, config) as camera:
+    with config.open_link(mission) as line, _open_camera(world, radiance, surroundings, config) as camera:
         cut = _Cut(line, config.cut_s, _planned_frames(mission))
         _run_flight_and_ground(out, mission, mission_path, line, camera.url, cut, config, console)
         link_figures = _link_figures(line, config, cut)
@@ -110,6 +114,7 @@ def fly(
     return {
         "scenario": {
             "name": config.scenario or "the mission's own orbits and attitude",
+            "sky": config.sky,
             "brackets": mission.bracket.count,
             "interval_s": round(mission.bracket.interval_s, 1),
         },
@@ -130,10 +135,13 @@ def _planned_frames(mission: Mission) -> int:
 
 @contextlib.contextmanager
 def _open_camera(
-    world: World, radiance: Callable[[PoseTag], np.ndarray], config: PassConfig
+    world: World,
+    radiance: Callable[[PoseTag], np.ndarray],
+    surroundings: Surroundings | None,
+    config: PassConfig,
 ) -> Iterator[CameraServer | GigeCameraServer]:
     """Serve the camera; the socket is in a folder of its own, since its path must be short."""
-    more = {"pose_at": world.pose_at, "real_time": config.real_time}
+    more = {"pose_at": world.pose_at, "real_time": config.real_time, "surroundings": surroundings}
     if config.gige:
         with GigeCameraServer(world.mission, radiance, **more) as camera:
             yield camera

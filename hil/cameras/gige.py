@@ -24,6 +24,7 @@ from flightsw.pose import pose_tag
 from hil.sky.sensor import expose
 from hil.watched import WatchedThread
 from hil.world.clock import SimulatedClock
+from hil.world.surroundings import Surroundings
 
 log = logging.getLogger(__name__)
 DESCRIPTION = Path(__file__).with_name("gige.xml")
@@ -54,6 +55,7 @@ class GigeCameraServer:
 
     Args:
         radiance: gives the scene-linear radiance [H, W, C] for a true pose.
+        surroundings: what else is in the pictures; None: a black sky.
         pose_at: UTC ns to the true pose; by default the mission's own orbits and attitude.
         real_time: with a factor a picture that was requested with its time is sent no earlier than its exposure has
             ended on the simulated clock; 0 is lock step.
@@ -73,8 +75,10 @@ class GigeCameraServer:
         pose_at: Callable[[int], PoseTag] | None = None,
         real_time: float = 0.0,
         moments: Sequence[int] = (),
+        surroundings: Surroundings | None = None,
     ):
         self.mission, self.radiance, self.seed = mission, radiance, seed
+        self.surroundings = surroundings
         self.moments = moments
         self.pose_at = pose_at or functools.partial(pose_tag, mission)
         self.clock = SimulatedClock(mission, real_time)
@@ -179,13 +183,17 @@ class GigeCameraServer:
         mid_ns = start_utc_ns + half_ns if timed else self._moment_for(start_utc_ns + half_ns)
         gain = 10 ** (self._read(GAIN_TENTH_DB) / 200)
         camera = self.mission.camera
-        amplified = dataclasses.replace(
-            camera,
-            dn_per_radiance_s=camera.dn_per_radiance_s * gain,
-            electrons_per_dn=camera.electrons_per_dn / gain,
-        )
         try:
-            radiance = self.radiance(self.pose_at(mid_ns))
+            pose = self.pose_at(mid_ns)
+            radiance, true = self.radiance(pose), camera
+            if self.surroundings is not None:
+                radiance = self.surroundings.light(radiance, pose, mid_ns)
+                true = self.surroundings.camera(mid_ns)
+            amplified = dataclasses.replace(
+                true,
+                dn_per_radiance_s=camera.dn_per_radiance_s * gain,
+                electrons_per_dn=camera.electrons_per_dn / gain,
+            )
             dn = expose(radiance, exposure_s, amplified, np.random.default_rng(noise_seed))
             self._picture = self._encode(dn, camera)
         except Exception as error:  # whatever fails in rendering, later triggers must be served

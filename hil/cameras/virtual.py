@@ -26,6 +26,7 @@ from hil.sky.blender import BlenderError
 from hil.sky.sensor import expose
 from hil.watched import WatchedThread
 from hil.world.clock import SimulatedClock
+from hil.world.surroundings import Surroundings
 
 log = logging.getLogger(__name__)
 MAX_SOCKET_PATH_BYTES = 107  # sun_path of Linux
@@ -38,6 +39,7 @@ class CameraServer:
 
     Args:
         radiance: gives the scene-linear radiance [H, W, C] for a true pose.
+        surroundings: what else is in the pictures; None: a black sky.
         listen: path of a Unix socket, or hil:///path/to/socket, or hil://host:port (port 0 chooses a free one).
         pose_at: UTC ns to the true pose; by default the mission's own orbits and attitude.
         real_time: how many times as fast as real time the simulated clock runs; 0 is lock step.
@@ -56,8 +58,10 @@ class CameraServer:
         seed: int = 0,
         pose_at: Callable[[int], PoseTag] | None = None,
         real_time: float = 0.0,
+        surroundings: Surroundings | None = None,
     ):
         self.mission, self.radiance, self.seed = mission, radiance, seed
+        self.surroundings = surroundings
         self.pose_at = pose_at or partial(pose_tag, mission)
         self.clock = SimulatedClock(mission, real_time)
         self.exposures = self.failures = 0
@@ -145,9 +149,13 @@ class CameraServer:
         if not 0 < exposure_time_s <= 60:
             raise ValueError(f"exposure_time_s must be in 0 to 60, got {exposure_time_s}")
         mid_ns = start_utc_ns + round(exposure_time_s * 5e8)
-        radiance = self.radiance(self.pose_at(mid_ns))
+        pose, camera = self.pose_at(mid_ns), self.mission.camera
+        radiance = self.radiance(pose)
+        if self.surroundings is not None:
+            radiance = self.surroundings.light(radiance, pose, mid_ns)
+            camera = self.surroundings.camera(mid_ns)
         rng = np.random.default_rng((self.seed, mid_ns))
-        dn = expose(radiance, exposure_time_s, self.mission.camera, rng)
+        dn = expose(radiance, exposure_time_s, camera, rng)
         pixels = np.ascontiguousarray(dn, dtype="<u2").tobytes()
         self.clock.release(start_utc_ns + round(exposure_time_s * 1e9), self._closing.wait)
         self.exposures += 1

@@ -177,7 +177,7 @@ def read_out(
     if sensor.vignetting:
         light *= 1 - sensor.vignetting * _squared_distance(*light.shape[:2])[..., None]
     if sensor.psf_sigma_px:
-        light = gaussian_filter(light, sensor.psf_sigma_px, axes=(0, 1), mode="constant")
+        light = gaussian_filter(light, sensor.psf_sigma_px, axes=(0, 1), mode="nearest")
     if sensor.exposure_error:
         exposure_time_s *= max(0.0, 1 + sensor.exposure_error * rng.standard_normal())
     if sensor.colour == "bayer":
