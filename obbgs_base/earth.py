@@ -144,6 +144,8 @@ def fractal(points: np.ndarray, finest: float, seed: int) -> np.ndarray:
 
 def _value_noise(points: np.ndarray, seed: int) -> np.ndarray:
     """Return noise [N] of mean 0 and about unit variance, interpolated smoothly between values on a lattice."""
+    if not len(points):
+        return np.zeros(0)
     corner = np.floor(points)
     share = points - corner
     smooth = share * share * (3 - 2 * share)

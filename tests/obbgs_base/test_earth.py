@@ -116,3 +116,11 @@ def test_stray_light_falls_with_the_suns_angle():
     sun = np.array([math.sin(math.radians(60)), 0, math.cos(math.radians(60))])
     light = stray_light(rays, sun)[0]
     np.testing.assert_allclose(light / light[1], [(60 / 80) ** 2, 1, (60 / 40) ** 2])
+
+
+def test_air_above_the_limb_is_seen_where_no_ray_meets_the_ground():
+    position = np.array([0.0, 0.0, RADIUS_M + 500e3])
+    dip = math.acos((RADIUS_M + 10e3) / (RADIUS_M + 500e3))  # a ray that passes 10 km above the ground
+    rays = np.array([[[math.cos(dip), 0.0, -math.sin(dip)]]])
+    light = earth_radiance(rays, position, np.array([1.0, 0.0, 0.0]), 1e-4)
+    assert (light > 0).all()
