@@ -277,10 +277,11 @@ def dataset(
             "and cell glass where it is dark).",
         ),
     ] = None,
-    cache: Annotated[Path, typer.Option(help="Folder in which rendered frames are kept.")] = Path("renders"),
     json_: AsJson = False,
 ) -> None:
     """Make a data set with its truth, as a session and in NeRF-synthetic layout; an interrupted one is continued.
+
+    Rendered pictures are kept in renders/ beside the data set, so that another one of the same views finds them.
 
     Example: hil dataset --mesh TDRS.glb --set scenario=v-bar --set frames=90 --set size_px=200 --out tdrs
     """
@@ -292,6 +293,7 @@ def dataset(
         jobs = [(path, out / path.stem) for path in target_meshes(config, mesh or Path())]
     else:
         jobs = [(mesh or (SHIPPED_FOIL if config.materials == "foil" else SHIPPED), out)]
+    cache = out.absolute().parent / "renders"
     with progress_bar(Console(stderr=True), label_width=20) as bars:
         tasks: dict[str, TaskID] = {}
 

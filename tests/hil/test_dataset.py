@@ -171,8 +171,6 @@ def test_a_second_command_with_the_same_folder_is_refused_and_the_first_one_ends
         "dataset",
         "--out",
         str(out),
-        "--cache",
-        str(tmp_path / "renders"),
         "--set",
         "frames=3",
         "--set",
@@ -210,7 +208,7 @@ def test_the_meshes_of_a_set_are_found_and_a_missing_one_is_named(tmp_path):
     assert [path.stem for path in target_meshes(config, tmp_path)] == list(config.targets)
 
 
-def test_a_set_of_two_targets_is_one_command_and_one_file(cache, tmp_path):
+def test_a_set_of_two_targets_is_one_command_and_one_file(tmp_path):
     meshes = tmp_path / "meshes"
     meshes.mkdir()
     for name, size in (("Cube", (6, 6, 6)), ("Plank", (6, 2, 1))):
@@ -218,11 +216,12 @@ def test_a_set_of_two_targets_is_one_command_and_one_file(cache, tmp_path):
     tree = {"scenario": "sparse", "frames": 3, "size_px": 16, "targets": ["Cube", "Plank"]}
     (tmp_path / "two.yaml").write_text(yaml.safe_dump(tree))
     arguments = ["dataset", "--targets", str(tmp_path / "two.yaml"), "--mesh", str(meshes), "--json"]
-    arguments += ["--out", str(tmp_path / "out"), "--cache", str(cache)]
+    arguments += ["--out", str(tmp_path / "out")]
     done = CliRunner().invoke(cli.app, arguments)
     assert done.exit_code == 0 and set(json.loads(done.stdout)) == {"Cube", "Plank"}
     refused = CliRunner().invoke(cli.app, [*arguments, "--set", "size_px=2"])
     assert "dataset.size_px: expected 8 to 8192, got 2" in str(refused.exception)
+    assert (tmp_path / "renders").is_dir()
     assert open_session(tmp_path / "out" / "Plank" / "session").frames[2].exposure_time_s == 2e-4
 
 
