@@ -116,7 +116,7 @@ def noise(pose) -> np.ndarray:
 def test_every_frame_crosses_a_faulty_can_bus_from_a_gige_camera(
     mission, tmp_path, monkeypatch, the_only_camera_on_loopback
 ):
-    monkeypatch.setattr("hil.simulated_pass.STANDARD_CUT_S", 2.0)  # five timer intervals of the link
+    monkeypatch.setattr("hil.links.faults.STANDARD_CUT_S", 2.0)  # five timer intervals of the link
     config = PassConfig(gige=True, link="slcan-fd", faults="standard")
     world = load_world(load_mission(mission))
     figures = fly(tmp_path, world, mission, noise, config, Console(stderr=True))
