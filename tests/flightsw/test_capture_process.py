@@ -143,9 +143,8 @@ def test_poses_from_a_navigation_file_go_into_the_frames_and_gaps_are_counted(tm
         lines.append(json.dumps(entry))
     (tmp_path / "states.jsonl").write_text("\n".join(lines) + "\n")
     path = tmp_path / "small.yaml"
-    path.write_text(
-        path.read_text() + f"navigation: {{source: 'file://{tmp_path}/states.jsonl', wait_s: 0.0}}\n"
-    )
+    tight = path.read_text().replace("# frame_spacing_s: 0.5", "frame_spacing_s: 0.5")
+    path.write_text(f"{tight}navigation: {{source: 'file://{tmp_path}/states.jsonl', wait_s: 0.0}}\n")
     mission = load_mission(path)
     with camera(mission) as server:
         result, err = finish(start(tmp_path, server, "--count", "3"))

@@ -84,16 +84,7 @@ def test_a_session_keeps_who_was_left_out_and_how_far_the_poses_can_err(register
 def test_a_pose_sigma_of_the_command_line_goes_into_every_tag(registered, tmp_path, monkeypatch):
     """An import of a folder with known cameras, here made by the writer of nerfstudio's layout."""
     write_session(registered.views, tmp_path / "first", "images: here")
-    run(
-        monkeypatch,
-        "export",
-        "--session",
-        tmp_path / "first",
-        "--out",
-        tmp_path / "n",
-        "--format",
-        "nerfstudio",
-    )
+    run(monkeypatch, "export", tmp_path / "first", "--out", tmp_path / "n", "--format", "nerfstudio")
     arguments = ("--format", "nerfstudio", "--from", tmp_path / "n", "--session", tmp_path / "second")
     run(monkeypatch, "import", *arguments, "--pose-sigma", "0.2,0.01")
     expected = np.diag(np.repeat([0.01**2, np.radians(0.2) ** 2], 3))

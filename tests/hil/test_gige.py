@@ -310,7 +310,6 @@ def test_the_command_line_captures_from_the_fake_camera_now(tmp_path):
         "height: 256": f"height: {SIZE_PX}",
         "bit_depth: 12": "bit_depth: 8",
         "black_dn: 64.0": "black_dn: 4.0",
-        "frame_spacing_s: 0.5": "frame_spacing_s: 0.2",
         "interval_s: 27.0": "interval_s: 0.5",
     }.items():
         text = text.replace(old, new)

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import imagecodecs
 import numpy as np
 
@@ -48,6 +47,8 @@ def write_frames(
         FormatError: it is no video, or no frame can be read.
         Interrupted: `should_stop` returned true.
     """
+    import cv2  # here and below: the ground station starts without it
+
     times_s, sharpness, numbers = [], [], []
     with_frames = _opened(video)
     rate, stated = (float(with_frames.get(key)) for key in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT))
@@ -94,6 +95,8 @@ def write_masks(
 
 
 def _write(video: Path, folder: Path, numbers: Sequence[int], should_stop: Callable[[], bool]) -> None:
+    import cv2
+
     folder.mkdir(parents=True, exist_ok=True)
     wanted = set(numbers)
     for number, _, frame in _frames(_opened(video), video, should_stop):
@@ -111,6 +114,8 @@ def _write(video: Path, folder: Path, numbers: Sequence[int], should_stop: Calla
 
 def _opened(video: Path) -> Any:
     """Return an open reader of a video."""
+    import cv2
+
     if not video.is_file():
         raise FormatError(f"{video} is not a file: expected a video")
     with open(video, "rb") as file:
@@ -132,6 +137,8 @@ def _frames(
     reader: Any, video: Path, should_stop: Callable[[], bool]
 ) -> Iterator[tuple[int, float, np.ndarray]]:
     """Yield number, presentation time, s, and pixels [H, W, 3] bytes, blue first, of the frames that can be decoded."""
+    import cv2
+
     number = -1
     try:
         while reader.grab():
@@ -151,6 +158,8 @@ def _frames(
 
 
 def _sharpness(frame: np.ndarray) -> float:
+    import cv2
+
     grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
     share = SHARPNESS_PX / max(grey.shape)
     if share < 1:
