@@ -5,6 +5,7 @@ import contextlib
 import dataclasses
 import difflib
 import json
+import math
 import re
 import reprlib
 import types
@@ -42,6 +43,19 @@ def require(condition: bool, path: str, problem: str) -> None:
     """Raise a ConfigError unless the condition holds."""
     if not condition:
         raise ConfigError(path, problem)
+
+
+def require_counts(section: object, path: str, **counts: int) -> None:
+    """Raise a ConfigError unless a section's values of these names hold so many numbers."""
+    for name, count in counts.items():
+        got = len(getattr(section, name))
+        require(got == count, f"{path}.{name}", f"expected {count} numbers, got {got}")
+
+
+def require_unit_quaternion(quat: tuple[float, ...], path: str) -> None:
+    """Raise a ConfigError unless a quaternion has the length 1."""
+    length = math.hypot(*quat)
+    require(abs(length - 1) < 1e-6, path, f"expected a unit quaternion, got length {length:.6f}")
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from flightsw.icd.config import require
+from flightsw.icd.config import require, require_counts, require_unit_quaternion
 from flightsw.icd.frame import Attitude
 from obbgs_base.navigation_errors import LENGTHS, SharedParameters
 
@@ -55,15 +55,8 @@ class PoseSection:
 
     def __post_init__(self):
         path = "mission.pose"
-        for name, count in (("quat_chaser_to_camera", 4), ("camera_position_m", 3)):
-            got = len(getattr(self, name))
-            require(got == count, f"{path}.{name}", f"expected {count} numbers, got {got}")
-        length = math.hypot(*self.quat_chaser_to_camera)
-        require(
-            abs(length - 1) < 1e-6,
-            f"{path}.quat_chaser_to_camera",
-            f"expected a unit quaternion, got length {length:.6f}",
-        )
+        require_counts(self, path, quat_chaser_to_camera=4, camera_position_m=3)
+        require_unit_quaternion(self.quat_chaser_to_camera, f"{path}.quat_chaser_to_camera")
         for name in ("sigma_position_m", "sigma_attitude_deg", "correlation_time_s"):
             require(
                 getattr(self, name) >= 0,

@@ -8,73 +8,49 @@ Without target.aem the target's attitude is unknown, and `ground reconstruct` fi
 """
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from flightsw.icd.config import MAX_YAML_BYTES, build, in_file, parse_yaml, require
+from flightsw.icd.config import (
+    MAX_YAML_BYTES,
+    build,
+    in_file,
+    parse_yaml,
+    require_counts,
+    require_unit_quaternion,
+)
 from flightsw.icd.ndm.formation import Formation, Geometry, role_of
 from flightsw.icd.ndm.orbit import NoState
 from flightsw.icd.ndm.text import MAX_NDM_BYTES
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.icd.reference_frames import EARTH_RADIUS_M, low_precision_sun
-from ground.formats.photographs.brackets import brackets_of
-from ground.formats.photographs.exposures import middle_utc_ns, with_exposures
-from ground.formats.pictures.files import FormatError, Light, pictures_in
-from ground.formats.pictures.lens import Intrinsics
+from ground.formats.photographs.brackets import in_brackets
+from ground.formats.photographs.exposures import middle_utc_ns, unposed_pictures
+from ground.formats.pictures.files import FormatError, Light
+from ground.formats.pictures.lens import StatedLens
 from ground.formats.pictures.view import View
-from ground.formats.pictures.views import unposed
 from obbgs_base.files import read_bounded
 
 CAMERA = "camera.yaml"
 
 
-@dataclass(frozen=True)
-class Camera:
+@dataclass(frozen=True, kw_only=True)
+class Camera(StatedLens):
     """The lens, and where the camera is on the chaser.
 
-    fy_px: null: as fx_px. cx_px, cy_px: where the line of sight meets the pictures; null: their middle.
-    distortion: k1, k2, p1, p2, k3 as of OpenCV.
     quat_chaser_to_camera, camera_position_m: as in a mission file.
-    times: what the pictures' own times are of; those of a table, and DATE-AVG of FITS, are of the middle.
     """
 
     fx_px: float
-    fy_px: float | None = None
-    cx_px: float | None = None
-    cy_px: float | None = None
-    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     quat_chaser_to_camera: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
     camera_position_m: tuple[float, ...] = (0.0, 0.0, 0.0)
-    times: Literal["start", "middle"] = "start"
 
     def __post_init__(self):
-        for name, count in (("distortion", 5), ("quat_chaser_to_camera", 4), ("camera_position_m", 3)):
-            got = len(getattr(self, name))
-            require(got == count, f"camera.{name}", f"expected {count} numbers, got {got}")
-        length = math.hypot(*self.quat_chaser_to_camera)
-        require(
-            abs(length - 1) < 1e-6,
-            "camera.quat_chaser_to_camera",
-            f"expected a unit quaternion, got length {length:.6f}",
-        )
-        for name in ("fx_px", "fy_px"):
-            value = getattr(self, name)
-            require(value is None or value > 0, f"camera.{name}", f"must be positive, got {value}")
-
-    def lens(self, width: int, height: int) -> Intrinsics:
-        return Intrinsics(
-            width,
-            height,
-            self.fx_px,
-            self.fx_px if self.fy_px is None else self.fy_px,
-            width / 2 if self.cx_px is None else self.cx_px,
-            height / 2 if self.cy_px is None else self.cy_px,
-            self.distortion,
-        )
+        self.check(self.fx_px, "camera")
+        require_counts(self, "camera", quat_chaser_to_camera=4, camera_position_m=3)
+        require_unit_quaternion(self.quat_chaser_to_camera, "camera.quat_chaser_to_camera")
 
 
 def read_ndm(folder: Path, table: dict[str, Light] | None = None) -> list[View]:
@@ -101,10 +77,8 @@ def read_ndm(folder: Path, table: dict[str, Light] | None = None) -> list[View]:
         formation = Formation.of(files)
     if formation.chaser_attitude is None:
         raise FormatError(f"{folder}: chaser.aem is missing, which says where the camera looks")
-    pictures = folder / "images" if (folder / "images").is_dir() else folder
-    views = with_exposures([unposed(pictures / name) for name in pictures_in(pictures)], table)
-    posed = [_posed(view, camera, formation, table or {}) for view in views]
-    return [view for group in brackets_of(posed) for view in group] if posed else []
+    posed = [_posed(view, camera, formation, table or {}) for view in unposed_pictures(folder, table)]
+    return in_brackets(posed)
 
 
 def _posed(view: View, camera: Camera, formation: Formation, table: dict[str, Light]) -> View:
@@ -128,7 +102,7 @@ def _posed(view: View, camera: Camera, formation: Formation, table: dict[str, Li
     return dataclasses.replace(
         view,
         world_to_camera=pose,
-        intrinsics=camera.lens(view.intrinsics.width, view.intrinsics.height),
+        intrinsics=camera.lens(view.intrinsics.width, view.intrinsics.height, camera.fx_px),
         mid_exposure_utc_ns=utc_ns,
         sun_dir_body=to_body @ sun,
         in_eclipse=_in_eclipse(found, sun),

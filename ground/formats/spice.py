@@ -10,24 +10,29 @@ Source: the SPICE toolkit, https://naif.jpl.nasa.gov/naif/, through its Python p
 import contextlib
 import dataclasses
 import logging
-import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from flightsw.icd.config import MAX_YAML_BYTES, build, in_file, parse_yaml, require
+from flightsw.icd.config import (
+    MAX_YAML_BYTES,
+    build,
+    in_file,
+    parse_yaml,
+    require,
+    require_counts,
+    require_unit_quaternion,
+)
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
-from ground.formats.photographs.brackets import brackets_of
-from ground.formats.photographs.exposures import middle_utc_ns, with_exposures
-from ground.formats.pictures.files import FormatError, Light, pictures_in, within
-from ground.formats.pictures.lens import Intrinsics
+from ground.formats.photographs.brackets import in_brackets
+from ground.formats.photographs.exposures import middle_utc_ns, unposed_pictures
+from ground.formats.pictures.files import FormatError, Light, within
+from ground.formats.pictures.lens import Intrinsics, StatedLens
 from ground.formats.pictures.view import View
-from ground.formats.pictures.views import unposed
 from obbgs_base.files import read_bounded
 
 SCENE = "spice.yaml"
@@ -39,8 +44,8 @@ SPANS_NAMED = 12  # in a message
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Scene:
+@dataclass(frozen=True, kw_only=True)
+class Scene(StatedLens):
     """What a folder's kernels are asked for. Bodies and frames are names, or numbers as text, that the kernels know.
 
     kernels: their files, loaded in this order; where two cover a time, the later one counts.
@@ -49,7 +54,6 @@ class Scene:
     camera_frame: axes fixed to the camera; null: those that the instrument's IK names.
     instrument: whose field of view an IK gives, which makes the lens; not needed with fx_px.
     quat_frame_to_camera: from the camera frame to x right, y down, z forwards in the picture, scalar first.
-    fx_px and on: as in camera.yaml of the format ndm.
     """
 
     kernels: tuple[str, ...]
@@ -60,26 +64,12 @@ class Scene:
     instrument: str | None = None
     quat_frame_to_camera: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
     fx_px: float | None = None
-    fy_px: float | None = None
-    cx_px: float | None = None
-    cy_px: float | None = None
-    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    times: Literal["start", "middle"] = "start"
 
     def __post_init__(self):
         require(bool(self.kernels), "spice.kernels", "expected the names of kernels, got none")
-        for name, count in (("distortion", 5), ("quat_frame_to_camera", 4)):
-            got = len(getattr(self, name))
-            require(got == count, f"spice.{name}", f"expected {count} numbers, got {got}")
-        length = math.hypot(*self.quat_frame_to_camera)
-        require(
-            abs(length - 1) < 1e-6,
-            "spice.quat_frame_to_camera",
-            f"expected a unit quaternion, got length {length:.6f}",
-        )
-        for name in ("fx_px", "fy_px"):
-            value = getattr(self, name)
-            require(value is None or value > 0, f"spice.{name}", f"must be positive, got {value}")
+        self.check(self.fx_px, "spice")
+        require_counts(self, "spice", quat_frame_to_camera=4)
+        require_unit_quaternion(self.quat_frame_to_camera, "spice.quat_frame_to_camera")
         told = self.instrument is not None
         require(
             told or self.camera_frame is not None,
@@ -117,8 +107,7 @@ def read_spice(folder: Path, table: dict[str, Light] | None = None) -> list[View
         ) from error
     with in_file(folder / SCENE):
         scene = build(Scene, parse_yaml(content, "spice"), "spice")
-    pictures = folder / "images" if (folder / "images").is_dir() else folder
-    views = with_exposures([unposed(pictures / name) for name in pictures_in(pictures)], table)
+    views = unposed_pictures(folder, table)
     paths = [within(folder, name, folder / SCENE) for name in scene.kernels]
     with _loaded(paths):
         for body in (scene.spacecraft, scene.body):
@@ -136,7 +125,7 @@ def read_spice(folder: Path, table: dict[str, Light] | None = None) -> list[View
             "de440s.bsp",
             scene.body,
         )
-    return [view for group in brackets_of(posed) for view in group] if posed else []
+    return in_brackets(posed)
 
 
 def _posed(
@@ -229,23 +218,16 @@ def _camera(scene: Scene, where: Path) -> tuple[str, np.ndarray | None]:
 def _lens(scene: Scene, corners: np.ndarray | None, width: int, height: int, image: Path) -> Intrinsics:
     if corners is None:
         assert scene.fx_px is not None
-        fx_px, fy_px, cx_px, cy_px = scene.fx_px, scene.fx_px, width / 2, height / 2
-    else:
-        low, high = (pick(corners[:, :2] / corners[:, 2:], axis=0) for pick in (np.min, np.max))
-        fx_px, fy_px = (float(value) for value in np.array([width, height]) / (high - low))
-        cx_px, cy_px = -low[0] * fx_px, -low[1] * fy_px
-        if scene.fy_px is None and abs(fx_px - fy_px) > ALIKE * fx_px:
-            raise FormatError(
-                f"{image}: has {width}x{height} pixels, but the field of view of {scene.instrument} measures "
-                f"{np.degrees(high[0] - low[0]):.4g} by {np.degrees(high[1] - low[1]):.4g} degrees: a picture of a "
-                "part of the sensor; give fx_px, cx_px and cy_px"
-            )
-    given = (scene.fy_px, scene.cx_px, scene.cy_px)
-    fy_px, cx_px, cy_px = (
-        float(found if told is None else told)
-        for told, found in zip(given, (fy_px, cx_px, cy_px), strict=True)
-    )
-    return Intrinsics(width, height, fx_px, fy_px, cx_px, cy_px, scene.distortion)
+        return scene.lens(width, height, scene.fx_px)
+    low, high = (pick(corners[:, :2] / corners[:, 2:], axis=0) for pick in (np.min, np.max))
+    fx_px, fy_px = (float(value) for value in np.array([width, height]) / (high - low))
+    if scene.fy_px is None and abs(fx_px - fy_px) > ALIKE * fx_px:
+        raise FormatError(
+            f"{image}: has {width}x{height} pixels, but the field of view of {scene.instrument} measures "
+            f"{np.degrees(high[0] - low[0]):.4g} by {np.degrees(high[1] - low[1]):.4g} degrees: a picture of a "
+            "part of the sensor; give fx_px, cx_px and cy_px"
+        )
+    return scene.lens(width, height, fx_px, (fy_px, -low[0] * fx_px, -low[1] * fy_px))
 
 
 @contextlib.contextmanager

@@ -1,6 +1,5 @@
 """Pictures with times and SPICE kernels become a session and a model; the kernels are made by SPICE's own writers."""
 
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -8,24 +7,28 @@ import pytest
 import spiceypy
 import tifffile
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
-from flightsw.icd.mission import load_mission
 from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.orbit import propagate, sun_direction_gcrs
-from flightsw.pose import pose_tag, target_attitude
-from ground import cli
+from flightsw.pose import target_attitude
 from ground.formats.photographs.exposures import read_table
 from ground.formats.spice import read_spice
 from ground.run.runs import open_run
 from ground.session.folder import open_session
+from tests.golden_pass import (
+    GRID_NS,
+    MISSION,
+    SESSION,
+    TAKEN_NS,
+    check_poses,
+    gcrs_to_cameras,
+    ground,
+    imported_from,
+    utc,
+    write_pictures,
+)
 
-GOLDEN = Path(__file__).parents[1] / "golden"
-MISSION = load_mission(GOLDEN / "mission.yaml")
-SESSION = open_session(GOLDEN / "session")
-NS = 1_000_000_000
 EARTH, SUN, TARGET, CHASER, CAMERA = 399, 10, -900, -901, -901_000  # NAIF's numbers, and our own below zero
-POSITION_M = 1e-3
 ANGLE_RAD = 1e-7  # the target turns by 4e-8 while the light is under way
 LIGHT_KM_S = 299_792.458
 AROUND_SUN = np.array([0.0, 29.8, 0.0]), np.array([1.496e8, 0.0, 0.0])  # km/s, km: the Earth's
@@ -99,15 +102,6 @@ instrument: CHASER_CAMERA
 """
 
 
-def ground(*arguments: object):
-    return CliRunner().invoke(cli.app, [str(a) for a in arguments])
-
-
-def utc(time_ns: int) -> str:
-    seconds, ns = divmod(time_ns, NS)
-    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%S") + f".{ns:09}"
-
-
 def write_texts(folder: Path, width: int, height: int, focal_px: float) -> None:
     """Write the leap seconds, clocks, frames, and an instrument whose axis meets the picture's middle."""
     x, y = width / 2 / focal_px, height / 2 / focal_px
@@ -155,19 +149,11 @@ def uniform(et: np.ndarray, velocity_km_s: np.ndarray, place_km: np.ndarray) -> 
 def folder(tmp_path_factory) -> Path:
     """The golden pass as SPICE has it: chaser about target about Earth about the Sun."""
     folder = tmp_path_factory.mktemp("pass")
-    (folder / "images").mkdir()
-    rows = ["name,exposure_time_s,mid_exposure_utc"]
-    for record in SESSION.frames:
-        dn = np.clip(SESSION.dn(record).astype(float) - 64.0, 0, None) / (4095 - 64) * 65535
-        name = f"shot_{record.id:03}.tif"
-        tifffile.imwrite(folder / "images" / name, np.rint(dn).astype(np.uint16))
-        rows.append(f"{name},{record.exposure_time_s!r},{utc(record.mid_exposure_utc_ns)}")
-    (folder / "table.csv").write_text("\n".join(rows) + "\n")
+    write_pictures(folder)
     (folder / "spice.yaml").write_text(SCENE)
     camera = SESSION.camera
     write_texts(folder, camera.width, camera.height, camera.fx_px)
-    taken = [record.mid_exposure_utc_ns for record in SESSION.frames]
-    grid = list(range(taken[0] - 60 * NS, taken[-1] + 60 * NS, 10 * NS))
+    taken, grid = TAKEN_NS, GRID_NS
     with spiceypy.KernelPool([str(folder / name) for name in ("leap.tls", "clocks.tsc")]):
         et, shots = (np.array([spiceypy.utc2et(utc(t)) for t in times]) for times in (grid, taken))
         target, chaser = (
@@ -184,38 +170,22 @@ def folder(tmp_path_factory) -> Path:
         write_paths(folder / "paths.bsp", [*paths, (SUN, 0, et, sun)])
         attitudes = np.array([target_attitude(MISSION, t) for t in grid])
         write_attitude(folder / "target.bc", -900_000, TARGET, et, attitudes)
-        cameras = [
-            quat_to_matrix(pose_tag(MISSION, t).quat_body_to_camera) @ target_attitude(MISSION, t)
-            for t in taken
-        ]
-        turned = np.array([MOUNTED.as_matrix().T @ camera for camera in cameras])
+        turned = MOUNTED.as_matrix().T @ gcrs_to_cameras()
         write_attitude(folder / "chaser.bc", CAMERA, CHASER, shots, turned)
     return folder
 
 
 @pytest.fixture(scope="module")
 def imported(folder, tmp_path_factory) -> Path:
-    session = tmp_path_factory.mktemp("imported") / "session"
-    options = ("--poses", "stated", "--exposures", folder / "table.csv")
-    done = ground("import", "--format", "spice", "--from", folder, "--session", session, *options)
-    assert done.exit_code == 0, done.output
-    return session
+    return imported_from(folder, "spice", tmp_path_factory.mktemp("imported") / "session")
 
 
 def test_an_import_has_the_poses_that_flight_tags(imported):
     """Satellites side by side share their motion about the Sun, so that light time and aberration cancel: 5 cm each."""
     session = open_session(imported)
-    assert len(session.frames) == len(SESSION.frames) and session.navigation.attitude == "known"
+    check_poses(session, ANGLE_RAD)
     assert session.camera.fx_px == pytest.approx(SESSION.camera.fx_px)
     for ours, flight in zip(session.frames, SESSION.frames, strict=True):
-        tag = pose_tag(MISSION, flight.mid_exposure_utc_ns)
-        assert (ours.bracket, ours.bracket_index) == (flight.bracket, flight.bracket_index)
-        assert ours.mid_exposure_utc_ns == flight.mid_exposure_utc_ns
-        np.testing.assert_allclose(ours.position_body_m, tag.position_body_m, rtol=0, atol=POSITION_M)
-        turn = ours.world_to_camera[:3, :3] @ quat_to_matrix(tag.quat_body_to_camera).T
-        assert np.linalg.norm(turn - turn.T) / 2**1.5 < ANGLE_RAD
-        assert tag.sun_dir_body @ ours.sun_dir_body > np.cos(np.radians(0.02))
-        assert ours.quat_inertial_to_body is not None
         body = quat_to_matrix(ours.quat_inertial_to_body)
         np.testing.assert_allclose(body, target_attitude(MISSION, flight.mid_exposure_utc_ns), atol=ANGLE_RAD)
     assert spiceypy.ktotal("ALL") == 0  # nothing stays in the pool of the process

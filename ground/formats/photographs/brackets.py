@@ -28,6 +28,11 @@ def alike(views: Sequence[View]) -> bool:
     return max(times_s) <= (1 + EQUAL_EXPOSURES) * min(times_s)
 
 
+def in_brackets(views: Sequence[View]) -> list[View]:
+    """Return pictures in the order of `brackets_of`, each with its bracket."""
+    return [view for group in brackets_of(views) for view in group] if views else []
+
+
 def brackets_of(views: Sequence[View]) -> list[list[View]]:
     """Return the views in groups that were taken from one place, numbered as brackets; each alone where none are seen.
 

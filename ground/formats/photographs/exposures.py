@@ -20,9 +20,9 @@ from flightsw.icd.config import in_file
 from flightsw.icd.ndm.text import Value
 from flightsw.icd.ndm.times import parse_epoch, utc_ns
 from ground.formats.photographs.epipolar import matched_points
-from ground.formats.pictures.files import FormatError, Light, read_header
+from ground.formats.pictures.files import FormatError, Light, pictures_in, read_header
 from ground.formats.pictures.view import View, colours_of, grey_light, has_display_values, read_image
-from ground.formats.pictures.views import Values
+from ground.formats.pictures.views import Values, unposed
 
 log = logging.getLogger(__name__)
 COLUMNS = ("name", "exposure_time_s", "iso", "f_number", "gain", "mid_exposure_utc")
@@ -133,6 +133,12 @@ def with_exposures(views: Sequence[View], table: dict[str, Light] | None = None)
         dataclasses.replace(view, exposure_time_s=time_s, exposure_stated=True)
         for view, time_s in zip(timed, seconds, strict=True)
     ]
+
+
+def unposed_pictures(folder: Path, table: dict[str, Light] | None) -> list[View]:
+    """Return the pictures of a folder, or of images/ in it, as in `unposed` and `with_exposures`."""
+    pictures = folder / "images" if (folder / "images").is_dir() else folder
+    return with_exposures([unposed(pictures / name) for name in pictures_in(pictures)], table)
 
 
 def middle_utc_ns(image: Path, stated: Literal["start", "middle"], row: Light | None) -> int:

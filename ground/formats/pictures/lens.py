@@ -6,10 +6,12 @@ Source: OpenCV's model, radial k1, k2, k3 and tangential p1, p2.
 import functools
 import math
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from flightsw.icd.config import require, require_counts
 from ground.formats.pictures.files import MOST_PX
 
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -61,6 +63,41 @@ class Intrinsics:
         roots = np.roots(np.where(np.abs(slope) < LEAST_COEFFICIENT, 0.0, slope))
         real = [root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0]
         return math.sqrt(min(real)) if real else math.inf
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatedLens:
+    """A lens as a file beside pictures states it besides its focal length fx_px, and what the times of these are of.
+
+    fy_px: null: as fx_px. cx_px, cy_px: where the line of sight meets the pictures; null: their middle. distortion: k1,
+    k2, p1, p2, k3 as of OpenCV.
+    times: what the pictures' own times are of; those of a table, and DATE-AVG of FITS, are of the middle.
+    """
+
+    fy_px: float | None = None
+    cx_px: float | None = None
+    cy_px: float | None = None
+    distortion: tuple[float, ...] = NO_DISTORTION
+    times: Literal["start", "middle"] = "start"
+
+    def check(self, fx_px: float | None, path: str) -> None:
+        """Raise a ConfigError where a value cannot be; path names the file's root."""
+        require_counts(self, path, distortion=len(NO_DISTORTION))
+        for name, value in (("fx_px", fx_px), ("fy_px", self.fy_px)):
+            require(value is None or value > 0, f"{path}.{name}", f"must be positive, got {value}")
+
+    def lens(
+        self, width: int, height: int, fx_px: float, found: tuple[float, float, float] | None = None
+    ) -> Intrinsics:
+        """Return the lens of a picture of this size, px.
+
+        Args:
+            found: fy, cx and cy as something else tells them, px, which count where they are not stated.
+        """
+        stated = (self.fy_px, self.cx_px, self.cy_px)
+        found = found or (fx_px, width / 2, height / 2)
+        fy_px, cx_px, cy_px = (float(f if s is None else s) for s, f in zip(stated, found, strict=True))
+        return Intrinsics(width, height, fx_px, fy_px, cx_px, cy_px, self.distortion)
 
 
 @functools.lru_cache
