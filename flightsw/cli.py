@@ -211,8 +211,7 @@ def service_command(
     """Print the systemd unit that runs `flightsw serve` of this installation as a user of its own, obbgs.
 
     Its mission file is /etc/obbgs/mission.yaml; frames are kept in /var/lib/obbgs/store, the key in mission.key beside
-    it. The unit's first lines say how to make
-    the user and where to put the unit.
+    it. The unit's first lines say how to make the user and where to put the unit.
 
     Example: flightsw service --camera gige://192.168.0.10 --link 'can://can0?fd=true' > obbgs-flight.service
     """

@@ -27,9 +27,8 @@ from obbgs_base.output import output_may_fail
 
 app = new_app("The ground station: frames in, a 3D model out.")
 stderr = Console(stderr=True)
-RESEARCH = (
-    "compare.command"  # found by its name: the part `compare` imports the ground station, never the reverse
-)
+# found by its name: the part `compare` imports the ground station, never the reverse
+RESEARCH = "compare.command"
 
 
 @app.command("listen")

@@ -133,9 +133,8 @@ def field(plane_dn: Tensor, height: int, width: int) -> Tensor:
 
 def cut_pixels(dn: Tensor, sensor: Sensor) -> Tensor:
     """Return which pixels [H, W] of readings dn [H, W, C] flight has not sent: they read the black level all over."""
-    if (
-        not CLEAR_NOISE_DN < _noise_dn(sensor) < sensor.black_dn
-    ):  # or half of all readings are clipped to it anyway
+    # with less noise, or a black level below it, many readings of the sky are exactly that
+    if not CLEAR_NOISE_DN < _noise_dn(sensor) < sensor.black_dn:
         return torch.zeros(dn.shape[:2], dtype=torch.bool)
     as_black = (dn == int(sensor.black_dn)).all(dim=2)[None, None].float()
     inside = 1 - F.max_pool2d(1 - as_black, CUT_PX, 1, CUT_PX // 2)

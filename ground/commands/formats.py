@@ -142,12 +142,11 @@ def _read(
     from ground.formats.spice import read_spice
 
     described = {ImportFormat.NERF: read_nerf, ImportFormat.NERFSTUDIO: read_nerfstudio}
+    timed = {ImportFormat.NDM: read_ndm, ImportFormat.SPICE: read_spice}
     if format_ in described:
         return described[format_](folder)
-    if format_ is ImportFormat.NDM:
-        return read_ndm(folder, table), None
-    if format_ is ImportFormat.SPICE:
-        return read_spice(folder, table), None
+    if format_ in timed:
+        return timed[format_](folder, table), None
     plain = {
         ImportFormat.COLMAP: read_colmap,
         ImportFormat.SHIRT: read_shirt,

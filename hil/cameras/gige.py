@@ -24,7 +24,7 @@ from flightsw.pose import pose_tag
 from hil.sky.sensor import expose
 from hil.watched import WatchedThread
 from hil.world.clock import SimulatedClock
-from hil.world.surroundings import Surroundings
+from hil.world.surroundings import Surroundings, seen
 
 log = logging.getLogger(__name__)
 DESCRIPTION = Path(__file__).with_name("gige.xml")
@@ -185,10 +185,7 @@ class GigeCameraServer:
         camera = self.mission.camera
         try:
             pose = self.pose_at(mid_ns)
-            radiance, true = self.radiance(pose), camera
-            if self.surroundings is not None:
-                radiance = self.surroundings.light(radiance, pose, mid_ns)
-                true = self.surroundings.camera(mid_ns)
+            radiance, true = seen(self.mission, self.radiance, self.surroundings, pose, mid_ns)
             amplified = dataclasses.replace(
                 true,
                 dn_per_radiance_s=camera.dn_per_radiance_s * gain,

@@ -26,7 +26,7 @@ from hil.sky.blender import BlenderError
 from hil.sky.sensor import expose
 from hil.watched import WatchedThread
 from hil.world.clock import SimulatedClock
-from hil.world.surroundings import Surroundings
+from hil.world.surroundings import Surroundings, seen
 
 log = logging.getLogger(__name__)
 MAX_SOCKET_PATH_BYTES = 107  # sun_path of Linux
@@ -149,11 +149,8 @@ class CameraServer:
         if not 0 < exposure_time_s <= 60:
             raise ValueError(f"exposure_time_s must be in 0 to 60, got {exposure_time_s}")
         mid_ns = start_utc_ns + round(exposure_time_s * 5e8)
-        pose, camera = self.pose_at(mid_ns), self.mission.camera
-        radiance = self.radiance(pose)
-        if self.surroundings is not None:
-            radiance = self.surroundings.light(radiance, pose, mid_ns)
-            camera = self.surroundings.camera(mid_ns)
+        pose = self.pose_at(mid_ns)
+        radiance, camera = seen(self.mission, self.radiance, self.surroundings, pose, mid_ns)
         rng = np.random.default_rng((self.seed, mid_ns))
         dn = expose(radiance, exposure_time_s, camera, rng)
         pixels = np.ascontiguousarray(dn, dtype="<u2").tobytes()

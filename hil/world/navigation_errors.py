@@ -20,9 +20,8 @@ DRIFT = 0.0002
 SPIN_RATE = 0.002  # relative
 BORESIGHT_DEG = 0.1
 CLOCK_S = 0.02
-NOISE_DEG = (
-    0.02  # about each axis of the camera, independent from bracket to bracket, or exposure if far apart
-)
+# about each axis of the camera, independent from bracket to bracket, or from exposure to exposure if far apart
+NOISE_DEG = 0.02
 LOW, HIGH = 0.5, 1.5  # the shared errors are uniform between these shares of their sizes, of either sign
 RMS = float(np.sqrt((LOW**2 + LOW * HIGH + HIGH**2) / 3))  # of that distribution
 

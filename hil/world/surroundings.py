@@ -78,6 +78,25 @@ class Surroundings:
         )
 
 
+def seen(
+    mission: Mission,
+    target: Callable[[PoseTag], np.ndarray],
+    surroundings: Surroundings | None,
+    pose: PoseTag,
+    utc_ns: int,
+) -> tuple[np.ndarray, CameraSection]:
+    """Return the radiance [H, W, C] that a camera has before it at a time, and the camera as it then is.
+
+    Args:
+        target: gives the target's radiance for a true pose.
+        surroundings: what else is in the picture; None: a black sky.
+    """
+    radiance = target(pose)
+    if surroundings is None:
+        return radiance, mission.camera
+    return surroundings.light(radiance, pose, utc_ns), surroundings.camera(utc_ns)
+
+
 def gcrs_to_ground(utc_ns: int) -> np.ndarray:
     """Return the rotation [3, 3] from GCRS to axes that turn with the Earth, without precession, nutation, UT1 - UTC.
 

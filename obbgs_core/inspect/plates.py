@@ -18,10 +18,8 @@ EVEN, FACING = (
 NARROWEST_PX = 5.0  # width of a plate whose turn is looked at
 ATTACHED = 0.8  # of a piece's samples within a plate's box: it moves with it
 BESIDE_PX = 2.0
-OUTLINE_PX, OUTLINE = (
-    2.5,
-    0.25,
-)  # a sample whose neighbours so near lie to one side, by that share of it, on the mean
+# a sample is of the outline if the mean of its neighbours so near lies by that share of the distance to one side
+OUTLINE_PX, OUTLINE = 2.5, 0.25
 HELD = 0.8  # of a plate's outline joins the rest of the design: it is a face of a body, which does not turn by itself
 TURNS_DEG = (-24.0, -16.0, -8.0, 8.0, 16.0, 24.0)
 TRIED = 3  # starts that are refined

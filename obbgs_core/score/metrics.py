@@ -11,10 +11,8 @@ from torch import Tensor
 from obbgs_core.losses import SSIM_WINDOW, ssim_map
 
 COMPLETENESS_RADIUS = 0.01  # in the units above
-F_RADII = {
-    "01": 0.01,
-    "02": 0.02,
-}  # within which a point of one surface finds the other, by the figures' names
+# within which a point of one surface finds the other, by the figures' names
+F_RADII = {"01": 0.01, "02": 0.02}
 EVEN_CELL = 0.005  # of the grid that makes two surfaces equally dense: half of the smaller radius
 MU = 5000.0  # of the mu-law by which HDR pictures are compared
 # Of two dense surfaces some way apart, scipy's default tree takes four times as long for the same distances.

@@ -16,10 +16,10 @@ def sizes_section(run: Run) -> str:
     except SessionError:
         return ""
     unit = html.escape(values["unit"])
-    rows = [(f"largest dimension, {unit}", told(values["largest_dimension"]))]
+    rows = [(f"largest dimension, {unit}", _told(values["largest_dimension"]))]
     for face in values["faces"]:
-        rows.append((f"{face['name']}, length x width", f"{told(face['length'])} x {told(face['width'])}"))
-        rows.append(("… its area, squared", told(face["area"])))
+        rows.append((f"{face['name']}, length x width", f"{_told(face['length'])} x {_told(face['width'])}"))
+        rows.append(("… its area, squared", _told(face["area"])))
     note = (
         "Intervals hold the true value with a probability of 90 %: they count the error of the scale, "
         f"{values['size_sigma_percent']:.2g} % (one standard deviation), and that of edges in the model, whose pixels "
@@ -28,5 +28,6 @@ def sizes_section(run: Run) -> str:
     return section("Sizes", note, two_tables(rows))
 
 
-def told(value: dict) -> str:
+def _told(value: dict) -> str:
+    """Return a value and half of the width of its interval, as `measured` gives them."""
     return f"{value['value']:.4g} ± {value['half_width_90']:.2g}"
