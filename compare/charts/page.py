@@ -47,11 +47,13 @@ def write_page(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyTyp
             f" {results.replaced} more rows are left out: they bear the same names, and their condition, session or "
             "settings have changed since, or are not those asked for."
         )
-    targets = f"{len(results.targets)} target{'s' if len(results.targets) != 1 else ''}"
+    targets, conditions = (
+        f"{len(names)} {word}{'s' if len(names) != 1 else ''}"
+        for names, word in ((results.targets, "target"), (results.conditions, "condition"))
+    )
     content = page(
         "Comparison of methods",
-        f"{len(results.rows)} rows: {len(results.labels)} methods, {targets}, "
-        f"{len(results.conditions)} conditions.{replaced}",
+        f"{len(results.rows)} rows: {len(results.labels)} methods, {targets}, {conditions}.{replaced}",
         [
             _tables(results),
             _speed(results),

@@ -32,6 +32,7 @@ th.n { text-align: right; }
 td.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
 .grid { display: grid; gap: 6px; }
 .grid img { width: 100%; display: block; background: #000; border-radius: 3px; image-rendering: pixelated; }
+.grid .label, .grid figcaption { overflow-wrap: anywhere; }
 .grid .label { color: var(--soft); font-size: 13px; align-self: center; }
 .grid figure { margin: 0; } .grid figcaption { color: var(--soft); font-size: 12px; text-align: center; }
 details { margin: 10px 0; } summary { cursor: pointer; color: var(--soft); font-size: 13.5px; }
@@ -65,6 +66,7 @@ pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px;
   .grid .label, .grid figcaption { font-size: 10px; }
   dl { grid-template-columns: minmax(0, 1fr); } dd { margin: 0 0 6px; }
   .compared { grid-template-columns: repeat(3, minmax(0, 1fr)); }
+  .scores td:first-child { white-space: normal; overflow-wrap: anywhere; min-width: 32vw; }
   .scores td.n { white-space: nowrap; } .scores td.words { min-width: 0; } .scores td.words div { width: 52vw; }
   .compared .label { grid-column: 1 / -1; font-size: 12px; margin-top: 8px; } .compared .head { display: none; }
 }

@@ -1,6 +1,7 @@
 """Means, verdicts, gains and Pareto fronts that are worked out from rows, and the page made of them."""
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -242,6 +243,21 @@ def test_a_target_without_truth_beside_one_with_it_is_scored_by_its_noisy_frames
         "fails",
         "B: 20.00 dB, +0.50 dB against the best image without training",
     )
+
+
+def test_long_names_of_methods_break_on_a_phone(comparison, tmp_path):
+    name = "3dgs+exposure+hull+mask+l1+fast"
+    shutil.copytree(comparison, tmp_path / "long")
+    rows = tmp_path / "long" / "rows.jsonl"
+    rows.write_text(rows.read_text().replace('"obbgs"', f'"{name}"'))
+    path = write_page(tmp_path / "long")
+    with chromium() as browser, opened(browser, as_url(path), 390, 800) as page:
+        assert page.locator("figcaption", has_text=name).count()
+        assert page.evaluate("document.documentElement.scrollWidth") == 390
+        widest = (
+            "Math.max(...[...document.querySelectorAll('.scores td:first-child')].map(e => e.clientWidth))"
+        )
+        assert page.evaluate(widest) < 195
 
 
 @pytest.mark.parametrize("folder", ["comparison", "without_truth"])

@@ -16,14 +16,16 @@ def sizes_section(run: Run) -> str:
     except SessionError:
         return ""
     unit = html.escape(values["unit"])
-    rows = [(f"largest dimension, {unit}", _told(values["largest_dimension"]))]
+    squared = "m²" if unit == "m" else "the squares of these"
+    rows = [("largest dimension", _told(values["largest_dimension"]))]
     for face in values["faces"]:
         rows.append((f"{face['name']}, length x width", f"{_told(face['length'])} x {_told(face['width'])}"))
-        rows.append(("… its area, squared", _told(face["area"])))
+        rows.append(("… its area", _told(face["area"])))
     note = (
-        "Intervals hold the true value with a probability of 90 %: they count the error of the scale, "
-        f"{values['size_sigma_percent']:.2g} % (one standard deviation), and that of edges in the model, whose pixels "
-        f"are {values['pixel']:.2g} {unit} wide. Faces are the flat ones that the frames show, largest first."
+        f"Lengths are in {unit}, areas in {squared}. Intervals hold the true value with a probability of 90 %: they "
+        f"count the error of the scale, {values['size_sigma_percent']:.2g} % (one standard deviation), and that of "
+        f"edges in the model, whose pixels are {values['pixel']:.2g} {unit} wide. Faces are the flat ones that the "
+        "frames show, largest first."
     )
     return section("Sizes", note, two_tables(rows))
 
