@@ -124,12 +124,15 @@ def run_downlink(
             try:
                 if now_s >= next_look_s:
                     utc_ns()  # so that a step of the clock is seen, and told, soon
-                    if downlink.store_is_open(now_s, store_may_open):
+                    is_open = downlink.store_is_open(now_s, store_may_open)
+                    if is_open:
                         downlink.look(now_s)
                     on_progress(downlink.progress())
                     looked_s = clock_s()
-                    # where a look takes long, most of the time is the link's all the same
-                    next_look_s = looked_s + max(OUTBOX_S, LINK_OVER_LOOK * (looked_s - now_s))
+                    # Where a look takes long, most of the time is the link's all the same. At the start another thread
+                    # opens the store, and the first frame goes out as soon as it is open.
+                    pause_s = max(OUTBOX_S, LINK_OVER_LOOK * (looked_s - now_s)) if is_open else WAIT_S
+                    next_look_s = looked_s + pause_s
                 if downlink.turn(now_s):
                     on_progress(downlink.progress())
                 downlink.fill(now_s)

@@ -484,6 +484,25 @@ def test_without_a_store_that_can_be_read_commands_are_obeyed_and_it_is_told_why
     assert (housekeeping[0]["frames_stored"], housekeeping[-1]["frames_stored"]) == (0, 1)
 
 
+def test_the_first_frame_goes_out_as_soon_as_another_thread_lets_the_store_be_opened(store, small_mission):
+    link, begins_s = ListLink(), []
+
+    def should_stop() -> bool:
+        if not begins_s and link.files():
+            begins_s.append(link.now_s)
+        return link.now_s > 1.0
+
+    run_downlink(
+        FrameStore(store.folder, open_now=False),
+        link,
+        small_mission,
+        should_stop=should_stop,
+        clock_s=lambda: link.now_s,
+        store_may_open=lambda: link.now_s >= 0.05,  # between two looks at the outbox
+    )
+    assert begins_s and begins_s[0] < 0.05 + 3 * WAIT_S
+
+
 def test_containers_that_read_as_zeros_cost_these_frames_alone(store, small_mission):
     """As after a power cut on XFS, or ext4 with data=writeback: index and outbox have them."""
     store.path(0).write_bytes(bytes(store.path(0).stat().st_size))
