@@ -1,12 +1,14 @@
 """The interactive figures of a comparison's page."""
 
 from collections.abc import Callable
+from statistics import fmean
 from typing import Any
 
 import plotly.graph_objects as go
 from plotly.colors import qualitative
 
-from compare.charts.results import VERDICTS, Results, pareto
+from compare.charts.results import VERDICTS, Metric, Results, pareto
+from compare.charts.severity import Series
 from ground.show.plots import ticks_1_2_5
 
 COLOURS = (*qualitative.D3, *qualitative.Set2)
@@ -170,6 +172,57 @@ def failure_figure(results: Results) -> go.Figure:
     )
     figure.update_xaxes(side="top")
     return _sized(figure, 110 + 30 * len(conditions))
+
+
+def severity_figure(results: Results, series: Series, metric: Metric) -> go.Figure | None:
+    """Return a score against the severity of conditions of one kind, a line a method; None where nothing has it.
+
+    Means over targets; the band is from the lowest to the highest seed.
+    """
+    figure, colour = go.Figure(), colour_of(results)
+    places = [series.label(value) for value, _ in series.conditions]
+    for label in results.trained:
+        rows = [
+            [row for t in results.targets for row in results.of(label, t, c)] for _, c in series.conditions
+        ]
+        by_seed = [
+            {seed: fmean(v) for seed in {row["seed"] for row in of} if (v := _values(of, metric.key, seed))}
+            for of in rows
+        ]
+        drawn = [(place, list(of.values())) for place, of in zip(places, by_seed, strict=True) if of]
+        if len(drawn) < 2:
+            continue
+        x = [place for place, _ in drawn]
+        if any(len(values) > 1 for _, values in drawn):
+            figure.add_scatter(
+                x=[*x, *x[::-1]],
+                y=[*(max(values) for _, values in drawn), *(min(values) for _, values in drawn[::-1])],
+                fill="toself",
+                line={"width": 0},
+                fillcolor=colour(label),
+                opacity=0.2,
+                mode="lines",
+                hoverinfo="skip",
+            )
+        figure.add_scatter(
+            x=x,
+            y=[fmean(values) for _, values in drawn],
+            mode="lines+markers",
+            name=label,
+            line={"color": colour(label), "width": 2},
+            hovertemplate=f"{label}, %{{x}}: %{{y:.2f}}<extra></extra>",
+        )
+    if not figure.data:
+        return None
+    figure.update_xaxes(
+        type="category", categoryorder="array", categoryarray=places, title_text=series.kind.title
+    )
+    figure.update_yaxes(title_text=metric.title)
+    return _sized(figure, 300)
+
+
+def _values(rows: list[dict[str, Any]], key: str, seed: int) -> list[float]:
+    return [row[key] for row in rows if row["seed"] == seed and row.get(key) is not None]
 
 
 def gain_figure(results: Results, label: str, base: str) -> go.Figure:

@@ -13,10 +13,12 @@ from compare.charts.charts import (
     colour_of,
     failure_figure,
     gain_figure,
+    severity_figure,
     size_figures,
     speed_figures,
 )
-from compare.charts.results import HOLDS_DB, MARGIN_DB, SHAKEN_DB, VERDICTS, Metric, Results
+from compare.charts.results import HOLDS_DB, MARGIN_DB, METRICS, SHAKEN_DB, VERDICTS, Metric, Results
+from compare.charts.severity import LEAST_F_PERCENT, Breaking, F, Series, breaking, series_of
 from compare.grid.rows import Rows
 from compare.grid.worker import VIEWS
 from compare.methods import reference_names
@@ -58,6 +60,7 @@ def write_page(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyTyp
             _tables(results),
             _speed(results),
             _failures(results, out),
+            _breaking(results),
             _size(results),
             _gains(results),
             _side_by_side(results, out),
@@ -214,6 +217,43 @@ def _failures(results: Results, out: Path) -> str:
         drawn = legend(zip(VERDICTS, VERDICT_COLOURS, strict=True))
         drawn += f'<div class="scroll"><div style="min-width: {width_px}px">{plot(failure_figure(results))}</div></div>'
     return section("Where methods fail", note, drawn + pictures) if drawn or pictures else ""
+
+
+def _breaking(results: Results) -> str:
+    """Return where each method breaks, kind of condition by kind, and the curves of its scores until there."""
+    found = [
+        (series, {label: point for label in results.trained if (point := breaking(results, label, series))})
+        for series in series_of(results)
+    ]
+    found = [(series, points) for series, points in found if points]
+    if not found:
+        return ""
+    note = (
+        "The mildest condition at which a method is broken on any target: it ends in an error, its score is below the "
+        f"better one of a black image and the mean image, or F of the surface within .02 is below {LEAST_F_PERCENT:g} "
+        "%. Where it never broke, the most severe condition that it was tried at. Point at a cell for the reason. The "
+        "curves are means over targets, their bands from the lowest to the highest seed."
+    )
+    labels = [label for label in results.trained if any(label in points for _, points in found)]
+    head = "".join(f"<th>{html.escape(label)}</th>" for label in labels)
+    lines, curves = [], ""
+    for series, points in found:
+        cells = "".join(_breaking_cell(series, points.get(label)) for label in labels)
+        lines.append(f"<tr><td>{html.escape(series.kind.title)}</td>{cells}</tr>")
+        metrics = [results.score, next(metric for metric in METRICS if metric.key == F)]
+        figures = [severity_figure(results, series, metric) for metric in metrics]
+        curves += beside(plot(figure) for figure in figures if figure is not None)
+    table = f'<div class="scroll"><table class="scores"><tr><th>condition</th>{head}</tr>{"".join(lines)}</table></div>'
+    return section("Where each method breaks", note, table + _methods_legend(results) + curves)
+
+
+def _breaking_cell(series: Series, point: Breaking | None) -> str:
+    """Return a cell of the table of breaking points."""
+    if point is None:
+        return "<td></td>"
+    words = [f"<b>{html.escape(series.label(value))}</b>" for value in point.broken_at]
+    words += [f"holds at {html.escape(series.label(value))}" for value in point.held]
+    return f'<td title="{html.escape("; ".join(point.why))}">{", ".join(words)}</td>'
 
 
 def _size(results: Results) -> str:

@@ -235,9 +235,17 @@ class Results:
 
     def floor(self, target: str, condition: str) -> float | None:
         """Return the score of the best of black, mean and untrained on a target; None where none is there."""
+        return self._best_of(("black", "mean", "untrained"), target, condition)
+
+    def nothing(self, target: str, condition: str) -> float | None:
+        """Return the score of the better one of a black image and the mean image; None where neither is there."""
+        return self._best_of(("black", "mean"), target, condition)
+
+    def _best_of(self, methods: tuple[str, ...], target: str, condition: str) -> float | None:
+        """Return the best score of some methods, under a condition or else as taken; None where none is there."""
         found = []
         for label in self.labels:
-            if self.method_of[label] in ("black", "mean", "untrained"):
+            if self.method_of[label] in methods:
                 key = self.score_of(target).key
                 value = self.mean(label, target, condition, key)
                 found.append(self.mean(label, target, self.base, key) if value is None else value)

@@ -14,6 +14,7 @@ from compare.case import load_case
 from compare.charts.figures import write_figures
 from compare.charts.page import write_page
 from compare.charts.results import Results, pareto, with_best
+from compare.charts.severity import breaking, series_of
 from compare.command import _line
 from compare.grid.rows import Rows
 from compare.references import black, noise
@@ -137,6 +138,50 @@ def test_rows_stand_under_the_names_that_their_session_and_condition_have_today(
     assert renamed.conditions == ["b", "a"] and renamed.replaced == 0
 
 
+def of_noise(method: str, times: float | None, psnr_db: float, **figures) -> dict:
+    made = row(method, "as taken" if times is None else f"noise x{times:g}", psnr_clean_db=psnr_db, **figures)
+    return made if times is None else made | {"changes": {"noise": times}}
+
+
+def test_a_method_breaks_at_the_mildest_condition_at_which_it_is_worse_than_no_model():
+    scores = {None: 40.0, 0.5: 20.0, 2.0: 38.0, 4.0: 25.0, 8.0: 30.0}  # less noise is not severe
+    rows = [of_noise("obbgs", times, score) for times, score in scores.items()]
+    rows += [of_noise("3dgs", times, 30.0) for times in (None, 2.0, 4.0)]
+    rows += [row("black", psnr_clean_db=24.0), row("mean", psnr_clean_db=26.0)]
+    results = Results([*rows, row("obbgs", "eclipse", psnr_clean_db=1.0) | {"changes": {"eclipse": [0, 1]}}])
+    (series,) = series_of(results)
+    assert [value for value, _ in series.conditions] == [0.5, 1.0, 2.0, 4.0, 8.0]
+    broken, held = breaking(results, "obbgs", series), breaking(results, "3dgs", series)
+    assert broken is not None and (broken.broken_at, broken.held) == ((4.0,), ())
+    assert broken.why == ("A: 25.00 dB, and 26.00 dB without any model",)
+    assert held is not None and (held.broken_at, held.held) == ((), (4.0,))
+    assert breaking(results, "black", series) is None  # no condition was asked of it
+
+
+def test_a_model_of_another_shape_is_broken_however_good_its_pictures_are():
+    rows = [of_noise("obbgs", times, 40.0, f_02_surface=f) for times, f in ((None, 80.0), (2.0, 49.0))]
+    results = Results([*rows, row("black", psnr_clean_db=24.0)])
+    point = breaking(results, "obbgs", series_of(results)[0])
+    assert point is not None and point.broken_at == (2.0,) and "49.0 %" in point.why[0]
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "order"),
+    [
+        ("frames", (24, 12), [["as taken", "24", "12"]]),
+        ("response_gamma", (0.9, 1.1, 1.4), [["1", "0.9"], ["1", "1.1", "1.4"]]),
+        ("exposure_ratios", ([1.0, 4.0, 16.0], [1.0, 1.0, 1.0]), [["1", "4"]]),
+    ],
+)
+def test_conditions_are_walked_from_the_frames_as_taken_to_the_most_severe(key, values, order):
+    rows = [row("obbgs", psnr_clean_db=40.0)]
+    rows += [
+        row("obbgs", f"{key} {value}", psnr_clean_db=30.0) | {"changes": {key: value}} for value in values
+    ]
+    (series,) = series_of(Results(rows))
+    assert [[series.label(value) for value, _ in side] for side in series.outwards()] == order
+
+
 def test_trainings_of_several_budgets_are_told_apart():
     rows = [
         row("3dgs", psnr_clean_db=30.0),
@@ -191,6 +236,8 @@ def test_the_page_shows_every_part(comparison):
     titles = (
         "Speed against accuracy",
         "Where methods fail",
+        "Where each method breaks",
+        "noise, times that of the camera",
         "Size against accuracy",
         "Worst views",
         "Side by side",
