@@ -110,7 +110,7 @@ def simulate_pass(
             f"[bold]2/4 Pass[/]  flight and ground, {camera} camera, {config.link} link between, "
             f"faults: {config.faults}"
         )
-        around = Surroundings(world.mission, farm.alpha) if config.sky == "real" else None
+        around = Surroundings(world.mission, farm.alpha, world.orbits_at) if config.sky == "real" else None
         simulation = fly(out, world, mission_path, farm.radiance, config, console, around)
         if errors is not None:
             simulation["navigation"] |= errors.described()

@@ -24,6 +24,7 @@ EXTRAS = {
     "pictures": {"astropy", "rawpy", "OpenEXR"},  # and those of ground
     "spice": {"spiceypy"},  # and those of ground
     "compare": {"dask", "distributed", "matplotlib", "psutil", "pycolmap"},  # and those of ground
+    "basilisk": {"Basilisk"},  # and those of hil
     "view": {"viser"},  # and those of ground
 }
 
@@ -50,13 +51,14 @@ def how_to_install(error: ModuleNotFoundError, extra: str) -> str | None:
     """Return how to get a missing module that belongs to an extra of this package; None for any other module.
 
     Args:
-        extra: the one to name, ground or hil; modules that only comparisons, the viewer, kernels or some kinds of
-            pictures need are in extras of theirs.
+        extra: the one to name, ground or hil; modules that only comparisons, the viewer, kernels, Basilisk or
+            some kinds of pictures need are in extras of theirs.
     """
     module = (error.name or "").partition(".")[0]
     if not any(module in modules for modules in EXTRAS.values()):
         return None
-    extra = next((name for name in ("compare", "view", "pictures", "spice") if module in EXTRAS[name]), extra)
+    own = (name for name, modules in EXTRAS.items() if name != "ground" and module in modules)
+    extra = next(own, extra)
     return (
         f"this command needs {module}, which is not installed: {install_command(extra)}, "
         f"or in a clone of the project: pip install '.[{extra}]'"

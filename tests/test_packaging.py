@@ -96,6 +96,13 @@ def test_a_comparison_without_its_extra_names_that_extra(missing):
     assert "pip install 'obbgs[compare]'" in done.stderr and not (ROOT / "never").exists()
 
 
+def test_a_scenario_by_basilisk_without_it_names_that_extra():
+    done = run_without({"Basilisk"}, "hil", "scenario", "v-bar-drag")
+    assert done.returncode == 2, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("hil: this command needs Basilisk, ") and "pip install 'obbgs[basilisk]'" in line
+
+
 @pytest.mark.parametrize(
     ("tool", "arguments"),
     [
@@ -121,6 +128,7 @@ def test_every_extra_of_the_package_is_known_to_the_message():
         "opencv-contrib-python-headless": "cv2",
         "scikit-image": "skimage",
         "pillow": "PIL",
+        "bsk": "Basilisk",
     }  # where the package has another name
     listed = {extra: requirements(extra)[len(requirements()) :] for extra in EXTRAS}
     names = {extra: {modules.get(r.name, r.name) for r in wanted} for extra, wanted in listed.items()}

@@ -88,6 +88,23 @@ def attitude(
     return tumbling
 
 
+def motion_at_start(
+    section: AttitudeSection, target_tle: tuple[str, ...], start_utc_ns: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return gcrs_to_body [3, 3] and the target's angular velocity [3], rad/s about its body axes, at the start."""
+    gcrs_to_body = attitude(section, target_tle, start_utc_ns, horizon_s=1.0)(start_utc_ns)
+    rates_rad_s = {
+        "inertial": np.zeros(3),
+        "spin": np.array([0.0, 0.0, 2 * np.pi / section.period_s]),
+        "tumble": np.radians(section.rates_deg_s),
+    }
+    if section.mode != "lvlh":
+        return gcrs_to_body, rates_rad_s[section.mode]
+    state = propagate(target_tle, start_utc_ns)
+    momentum = np.cross(state.position_m, state.velocity_m_s)
+    return gcrs_to_body, gcrs_to_body @ momentum / (state.position_m @ state.position_m)
+
+
 def tumble(
     inertia: np.ndarray, rates_rad_s: np.ndarray, quat_body_to_gcrs: np.ndarray, horizon_s: float
 ) -> OdeSolution:

@@ -14,7 +14,7 @@ from flightsw.icd.config import MAX_YAML_BYTES, ConfigError, parse_yaml
 from flightsw.icd.mission import Mission, NavigationSection
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.icd.tle import orbit_axes
-from flightsw.orbit import OrbitState, propagate
+from flightsw.orbit import OrbitState
 from flightsw.pose import look_along
 from hil.world.navigation_errors import NOISE_DEG, NavigationErrors, draw, stated_sigmas, turned
 from hil.world.world import World
@@ -102,8 +102,7 @@ def _states(
     for number in range(int(np.ceil(_pass_s(mission) / step_s)) + 1):
         utc_ns = start_ns + round(number * step_s * NS)
         true_ns = utc_ns - round(errors.clock_s * NS) if errors else utc_ns
-        target = propagate(mission.orbit.target_tle, true_ns)
-        chaser = propagate(mission.orbit.chaser_tle, true_ns)
+        target, chaser = world.orbits_at(true_ns)
         relative_m = chaser.position_m - target.position_m
         gcrs_to_camera = look_along(-relative_m, down=-np.cross(chaser.position_m, chaser.velocity_m_s))
         if errors:

@@ -17,6 +17,7 @@ from flightsw.orbit import OrbitState, propagate, sun_direction_gcrs, sunlit_fra
 from flightsw.pose import look_along, pose_tag
 from flightsw.sequencer import plan
 from hil.world.attitude import Attitude, AttitudeSection, attitude
+from hil.world.basilisk import BasiliskSection, Flown, flown
 from hil.world.fly_around import Design, FlyAround, RelativeElements, design
 from obbgs_base.files import read_bounded
 
@@ -63,6 +64,7 @@ class Scenario:
     relative_elements: RelativeElements | None = None
     fly_around: FlyAround | None = None
     attitude: AttitudeSection = field(default_factory=AttitudeSection)
+    basilisk: BasiliskSection | None = None  # where given, Basilisk moves both from the start on
     sha256: str = ""  # of the file's bytes
 
     def __post_init__(self):
@@ -121,6 +123,15 @@ class Scenario:
         )
 
 
+def sgp4_orbits(orbit: OrbitSection, utc_ns: int) -> tuple[OrbitState, OrbitState]:
+    """Return the states of target and chaser that their elements give at a time.
+
+    Raises:
+        OrbitError: an orbit cannot be propagated so far.
+    """
+    return propagate(orbit.target_tle, utc_ns), propagate(orbit.chaser_tle, utc_ns)
+
+
 @dataclass(frozen=True)
 class SceneState:
     """The geometry and the light at one time; directions are unit vectors in the target's body frame."""
@@ -138,11 +149,18 @@ class SceneState:
 
 
 class Scene:
-    """A scenario's state at any time from its start on."""
+    """A scenario's state at any time from its start on; `orbits_at` gives the states of target and chaser.
+
+    Raises:
+        ModuleNotFoundError: the scenario asks for Basilisk, which is not installed.
+    """
 
     def __init__(self, scenario: Scenario):
         self.scenario = scenario
         self.orbit = scenario.orbit
+        self.orbits_at = functools.partial(sgp4_orbits, self.orbit)
+        if scenario.basilisk is not None:
+            self.orbits_at = self._flown(scenario.basilisk, scenario.attitude).orbits_at
         self.gcrs_to_body = self.attitude_of(scenario.attitude)
         sigma = PoseSection()  # the tag's stated uncertainty; the pose itself is exact
         variances = [sigma.sigma_position_m**2, np.radians(sigma.sigma_attitude_deg) ** 2]
@@ -150,8 +168,16 @@ class Scene:
 
     def attitude_of(self, section: AttitudeSection) -> Attitude:
         """Return the attitude as a function of time that a target of this orbit and start would have."""
-        orbit, horizon_s = self.orbit, self.scenario.duration_s + HORIZON_MARGIN_S
-        return attitude(section, orbit.target_tle, orbit.start_utc_ns, horizon_s)
+        if self.scenario.basilisk is not None:
+            return self._flown(self.scenario.basilisk, section).gcrs_to_body
+        return attitude(section, self.orbit.target_tle, self.orbit.start_utc_ns, self._horizon_s)
+
+    @property
+    def _horizon_s(self) -> float:
+        return self.scenario.duration_s + HORIZON_MARGIN_S
+
+    def _flown(self, section: BasiliskSection, start: AttitudeSection) -> Flown:
+        return flown(section, start, self.orbit, self._horizon_s)
 
     def state(self, utc_ns: int) -> SceneState:
         """Return the geometry and the light at a time.
@@ -160,8 +186,7 @@ class Scene:
             OrbitError: an orbit cannot be propagated so far, or the time is outside the ephemeris.
             ValueError: the camera's roll is undefined, or a tumble is not known at that time.
         """
-        target = propagate(self.orbit.target_tle, utc_ns)
-        chaser = propagate(self.orbit.chaser_tle, utc_ns)
+        target, chaser = self.orbits_at(utc_ns)
         relative_m = chaser.position_m - target.position_m
         gcrs_to_camera = look_along(-relative_m, down=-np.cross(chaser.position_m, chaser.velocity_m_s))
         gcrs_to_body = self.gcrs_to_body(utc_ns)

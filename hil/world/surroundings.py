@@ -5,6 +5,7 @@ Everything follows from the orbit and the time, in proportion to the target by p
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 
@@ -15,7 +16,8 @@ from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import CameraSection, Mission
 from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.icd.reference_frames import julian_date
-from flightsw.orbit import propagate, sunlit_fraction
+from flightsw.orbit import OrbitState, sunlit_fraction
+from hil.world.scenario import sgp4_orbits
 from obbgs_base.earth import camera_rays, earth_radiance, sees_earth, stray_light
 from obbgs_base.stars import star_radiance
 
@@ -30,10 +32,17 @@ class Surroundings:
 
     Args:
         alpha: gives how much of each pixel the target covers, [H, W] uint8, for a true pose.
+        orbits_at: UTC ns to the states of target and chaser; by default the mission's own.
     """
 
-    def __init__(self, mission: Mission, alpha: Callable[[PoseTag], np.ndarray]):
+    def __init__(
+        self,
+        mission: Mission,
+        alpha: Callable[[PoseTag], np.ndarray],
+        orbits_at: Callable[[int], tuple[OrbitState, OrbitState]] | None = None,
+    ):
         self._mission, self._alpha = mission, alpha
+        self._orbits_at = orbits_at or functools.partial(sgp4_orbits, mission.orbit)
         camera = mission.camera
         self._rays = camera_rays(np.array(camera.K), camera.width, camera.height)
         K = np.diag([1 / COARSE, 1 / COARSE, 1.0]) @ np.array(camera.K)
@@ -49,7 +58,7 @@ class Surroundings:
         assert pose.quat_inertial_to_body is not None  # of a true pose
         to_body = quat_to_matrix(pose.quat_inertial_to_body)
         to_camera = pose.world_to_camera[:3, :3] @ to_body
-        from_earth_m = propagate(self._mission.orbit.target_tle, utc_ns).position_m
+        from_earth_m = self._orbits_at(utc_ns)[0].position_m
         from_earth_m = from_earth_m + to_body.T @ pose.position_body_m
         sun = pose.world_to_camera[:3, :3] @ pose.sun_dir_body
         position_m = to_camera @ from_earth_m

@@ -10,9 +10,10 @@ import numpy as np
 from flightsw.icd.frame import Attitude as Knowledge
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, PoseSection, TargetAttitudeSection
+from flightsw.orbit import OrbitState
 from flightsw.pose import pose_tag, target_attitude
 from hil.world.attitude import Attitude
-from hil.world.scenario import Scenario, Scene, load_scenario
+from hil.world.scenario import Scenario, Scene, load_scenario, sgp4_orbits
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,7 @@ class World:
 
     mission: Mission  # what flight is given: it may know less of the target's attitude than this world does
     pose_at: Callable[[int], PoseTag]  # of the camera
+    orbits_at: Callable[[int], tuple[OrbitState, OrbitState]]  # of target and chaser
     attitude_if: Callable[
         [float], Attitude
     ]  # of the target, if its rate at the start were larger by this share
@@ -47,7 +49,8 @@ def load_world(mission: Mission, scenario: str = "") -> World:
                 target_attitude, dataclasses.replace(true_mission, target_attitude=section)
             )
 
-        return World(mission, functools.partial(pose_tag, true_mission), spinning)
+        orbits_at = functools.partial(sgp4_orbits, mission.orbit)
+        return World(mission, functools.partial(pose_tag, true_mission), orbits_at, spinning)
     loaded = load_scenario(scenario)
     scene, section = Scene(loaded), loaded.attitude
 
@@ -56,7 +59,7 @@ def load_world(mission: Mission, scenario: str = "") -> World:
         faster = dataclasses.replace(section, rates_deg_s=rates, period_s=section.period_s / (1 + share))
         return scene.attitude_of(faster)
 
-    return World(scenario_mission(mission, loaded), lambda ns: scene.state(ns).pose, turning)
+    return World(scenario_mission(mission, loaded), lambda ns: scene.state(ns).pose, scene.orbits_at, turning)
 
 
 def told(mission: Mission, knowledge: Knowledge | None) -> Mission:

@@ -52,7 +52,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--scenarios", nargs="+", choices=poses.SCENARIOS, default=list(poses.SCENARIOS))
+    names = (*poses.SCENARIOS, *poses.BY_BASILISK)
+    parser.add_argument("--scenarios", nargs="+", choices=names, default=list(poses.SCENARIOS))
     parser.add_argument("--layouts", nargs="+", choices=LAYOUTS, default=list(LAYOUTS))
     parser.add_argument(
         "--conditions", nargs="+", choices=poses.CONDITIONS, default=["exact", "correlated_1"]

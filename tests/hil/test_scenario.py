@@ -11,10 +11,11 @@ from flightsw.pose import pose_tag
 from hil.world.scenario import SCENARIOS, Scenario, Scene, describe, load_scenario
 
 NAMES = ["approach", "eclipse", "fly-around", "slow-tumble", "sparse", "tumbling", "v-bar"]
+BY_BASILISK = ["fly-around-disturbed", "tumbling-disturbed", "v-bar-drag"]  # tests/hil/test_basilisk.py
 
 
 def test_the_ready_made_scenarios_are_these():
-    assert sorted(path.stem for path in SCENARIOS.glob("*.yaml")) == NAMES
+    assert sorted(path.stem for path in SCENARIOS.glob("*.yaml")) == sorted(NAMES + BY_BASILISK)
 
 
 @pytest.mark.parametrize("name", ["fly-around", "approach"])
@@ -113,6 +114,26 @@ def test_brackets_are_spread_over_the_duration():
 
 
 @pytest.mark.parametrize(
+    ("change", "key", "wrong"),
+    [
+        ("degree: 6", "degree: 1", "basilisk.gravity_degree"),
+        ("degree: 6", "degree: 7", "basilisk.gravity_degree"),
+        ("5.0e-13", "-5.0e-13", "basilisk.density_kg_m3"),
+        ("mass_kg: 60.0", "mass_kg: 0.0", "basilisk.chaser.mass_kg"),
+        ("[0.1, 0.0, 0.2]", "[0.1, 0.0]", "basilisk.target.drag_offset_m"),
+        ("solar_pressure", "sun", "basilisk.sun"),
+    ],
+)
+def test_a_wrong_disturbance_is_refused_by_name_without_basilisk(tmp_path, change, key, wrong):
+    path = tmp_path / "mine.yaml"
+    text = (SCENARIOS / "fly-around-disturbed.yaml").read_text()
+    assert load_scenario("fly-around-disturbed").basilisk is not None and change in text
+    path.write_text(text.replace(change, key))
+    with pytest.raises(ConfigError, match=rf"scenario\.{wrong}: "):
+        load_scenario(path)
+
+
+@pytest.mark.parametrize(
     ("change", "key"),
     [
         ("radial_m: 200.0", "radial_m: -1.0"),
@@ -135,5 +156,5 @@ def test_a_wrong_scenario_is_refused_by_name(tmp_path, change, key):
 
 
 def test_an_unknown_scenario_is_answered_with_the_known_ones():
-    with pytest.raises(ConfigError, match="fly-around, slow-tumble, sparse, tumbling"):
+    with pytest.raises(ConfigError, match="fly-around, fly-around-disturbed, slow-tumble, sparse, tumbling"):
         load_scenario("fly_around")

@@ -30,7 +30,7 @@ from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displa
 
 NS = 1_000_000_000
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")
-NAMES = sorted(path.stem for path in SCENARIOS.glob("*.yaml"))
+NAMES = sorted(p.stem for p in SCENARIOS.glob("*.yaml") if load_scenario(p).basilisk is None)
 
 
 def few_brackets(world: World, count: int, interval_s: float) -> World:
