@@ -6,6 +6,7 @@ from coarse to fine, and stands behind the model: a field of each frame's own, n
 mean, and how much the Earth scatters about it is known from the same pixels.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +16,9 @@ from torch import Tensor
 from obbgs_base.earth import THICK_CLOUD, camera_rays, sees_earth
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
+
+# Of a model's alpha between neighbouring pixels, if all frames but one show black sky: its outlines err by so much
+OUTLINE = 0.6
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,11 @@ def earth_pixels(frame: TrainingFrame) -> Tensor:
     return torch.from_numpy(sees_earth(rays, -frame.earth_m.double().numpy()))
 
 
+def black_share(frames: Sequence[TrainingFrame]) -> float:
+    """Return the share of frames that have black sky behind the target."""
+    return sum(frame.earth_m is None for frame in frames) / len(frames)
+
+
 def backdrop(frame: TrainingFrame, sensor: Sensor, near_target: Tensor) -> Backdrop:
     """Return a frame without the Earth beside the target, and the Earth behind it.
 
@@ -57,6 +66,24 @@ def backdrop(frame: TrainingFrame, sensor: Sensor, near_target: Tensor) -> Backd
     only_earth = (earth & ~near_target)[..., None]
     dn = torch.where(only_earth, sensor.black_dn, frame.dn)
     return Backdrop(dn, seen.clamp(min=0) * held, sigma * held)
+
+
+def doubt(alpha: Tensor, radiance: Tensor, sigma: Tensor, black: float) -> Tensor:
+    """Return by how much the light that comes from behind a model may err, in its pictures [B, H, W, C].
+
+    What stands there errs by `sigma`; and where the model's outline errs, as much more or less is seen of it. In front
+    of black sky, dark Gaussians around a bright face make its outline sharp. In front of the Earth they show, so that
+    outlines come out true and their light wrong. They are therefore left to the frames with black sky, as far as there
+    are any.
+
+    Args:
+        alpha: [B, H, W] of the model; radiance, sigma: [B, H, W, C] of what stands behind.
+        black: the share of frames whose sky is black, from which outlines are learnt.
+    """
+    change = F.max_pool2d(alpha[:, None], 3, 1, 1) + F.max_pool2d(-alpha[:, None], 3, 1, 1)
+    through = (1 - alpha)[..., None] * sigma
+    outline = OUTLINE * black * change.movedim(1, -1) * radiance
+    return (through.square() + outline.square()).sqrt()
 
 
 def weighed(dn: Tensor, predicted_dn: Tensor, sigma_dn: Tensor, behind_dn: Tensor, white_dn: float) -> Tensor:

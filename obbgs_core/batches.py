@@ -80,11 +80,10 @@ class Batches:
         """Put something behind the target in some frames, by their index, and say where they show nothing else.
 
         Args:
-            sky: [H, W] bool, without the target; it is only used where silhouettes' sky is.
+            sky: [H, W] bool, without the target.
         """
         self._backdrops = backdrops
-        if self._masks["sky"]:
-            self._masks = self._masks | {"sky": self._masks["sky"] | {i: held(m) for i, m in sky.items()}}
+        self._masks = self._masks | {"sky": self._masks["sky"] | {i: held(m) for i, m in sky.items()}}
         self._images = {}  # copies keep those that they have
 
     def batch(self, indices: list[int], scale: float = 1.0) -> Batch:

@@ -98,6 +98,11 @@ def first_gaussians(
         raise ReconstructionError(
             "the origin of the body's axes lies behind every camera that sees light: poses must have it in the target"
         )
+    if radius == 0 and all(f.earth_m is not None for f in frames):
+        raise ReconstructionError(
+            f"all {len(frames)} frames have the Earth behind the target, and none shows it on black sky or in front of "
+            "an even part of the Earth, such as an ocean: take frames with the camera away from the Earth"
+        )
     if radius == 0:
         raise ReconstructionError(
             f"all {len(frames)} frames are black (eclipse, or exposures too short): nothing rises above the noise"

@@ -4,7 +4,7 @@ import dataclasses
 
 import torch
 
-from obbgs_core.background import backdrop, grown, weighed
+from obbgs_core.background import backdrop, black_share, doubt, grown, weighed
 from obbgs_core.batches import Batch
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.model.gaussians import Gaussians
@@ -23,9 +23,8 @@ def renew(setup: TrainingSetup, state: TrainingState) -> None:
     indices = [i for i, f in enumerate(setup.frames) if f.earth_m is not None]
     if not indices or setup.config.published.loss != "likelihood":
         return
-    due = (
-        state.steps_done % EVERY_STEPS == 0 and state.poses.round is None
-    )  # a round asks about one and the same
+    # a round of poses asks about one and the same
+    due = state.steps_done % EVERY_STEPS == 0 and state.poses.round is None
     if due or set(state.near_target) != set(indices):
         poses = state.poses.corrections
         batches = setup.batches if poses is None else setup.batches.posed(poses.frames(setup.frames))
@@ -38,17 +37,18 @@ def renew(setup: TrainingSetup, state: TrainingState) -> None:
         return
     near = state.near_target
     seen = {i: backdrop(setup.frames[i], setup.sensor, near[i]) for i in indices}
-    setup.batches.stand(seen, {i: ~near[i] for i in indices})
+    setup.batches.stand(seen, {i: ~near[i] for i in indices if setup.config.loss.sky_weight})
 
 
 @torch.no_grad()
-def doubted(batch: Batch, rendered: Rendered, sensor: Sensor) -> Batch:
-    """Return a step's frames with less pull where it is uncertain what stands behind the model."""
-    if batch.doubt is None:
+def doubted(setup: TrainingSetup, batch: Batch, rendered: Rendered) -> Batch:
+    """Return a step's frames with less pull where it is uncertain what is seen behind the model."""
+    sensor, behind = setup.sensor, batch.cameras.backdrop
+    if batch.doubt is None or behind is None:
         return batch
     prediction = sensor.predicted(rendered.radiance, batch.exposure_time_s)
     gain = sensor.dn_per_radiance_s * batch.exposure_time_s
-    behind_dn = gain * (1 - rendered.alpha)[..., None] * batch.doubt
+    behind_dn = gain * doubt(rendered.alpha, behind, batch.doubt, black_share(setup.frames))
     dn = weighed(batch.dn, prediction.expected_dn, prediction.sigma_dn, behind_dn, sensor.white_dn)
     return dataclasses.replace(batch, dn=dn)
 

@@ -269,7 +269,7 @@ def _limited(config: MethodConfig, lit_pixels: list[int]) -> tuple[MethodConfig,
     pictures = max(len(lit_pixels), AS_MANY_PICTURES)
     lit = sum(lit_pixels) * pictures // len(lit_pixels)
     if factor and factor * math.sqrt(lit) < most:
-        most = max(1, round(factor * math.sqrt(lit)))
+        most = max(2, round(factor * math.sqrt(lit)))  # the fewest that a start may have
         budget = (
             f"at most {most:,} Gaussians instead of {config.growth.max_gaussians:,}: {factor:g} times the square root "
             f"of the {lit:,} pixels that {'are' if pictures == len(lit_pixels) else 'would be'} lit in {pictures} long "

@@ -131,7 +131,7 @@ class Trainer:
         model, drops = state.model, setup.dropout > 0 and moment.share < DROPPED_UNTIL
         drawn_model = dropped(model, setup.dropout, state.rng) if drops else model
         rendered = self._compensated(render(drawn_model, batch.cameras, sunlit=sunlit), batch)
-        batch = doubted(batch, rendered, setup.sensor)
+        batch = doubted(setup, batch, rendered)
         loss, residual = image_loss(rendered, batch, setup.sensor, config, state.fit.misfit)
         if not torch.isfinite(loss):
             raise Diverged(state.steps_done, loss.item())

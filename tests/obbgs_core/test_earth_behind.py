@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from obbgs_base.earth import RADIUS_M
-from obbgs_core.background import backdrop, earth_pixels, filled, weighed
+from obbgs_core.background import OUTLINE, backdrop, doubt, earth_pixels, filled, weighed
+from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.methods.presets import preset
 from obbgs_core.model.cameras import Cameras
@@ -126,6 +127,21 @@ def test_doubt_acts_as_noise_of_its_own():
     assert weighed(dn, prediction, sigma, torch.tensor(0.0), 255.0) == dn
 
 
+def test_outlines_that_err_show_more_or_less_of_what_is_behind_them():
+    """A step of alpha that lies anywhere within a share of a pixel errs by that share of the light behind it."""
+    alpha, radiance = torch.zeros(1, 9, 12), torch.full((1, 9, 12, 3), 0.6)
+    alpha[..., 6:] = 1.0
+    known, share = torch.zeros_like(radiance), 0.5
+    alone = doubt(alpha, radiance, known, share)
+    torch.testing.assert_close(alone[:, :, 5:7], torch.full((1, 9, 2, 3), share * OUTLINE * 0.6))
+    assert not alone[:, :, :5].any() and not alone[:, :, 7:].any()
+    both = doubt(alpha, radiance, torch.full_like(radiance, 0.2), share)
+    torch.testing.assert_close(both[:, :, :5], torch.full((1, 9, 5, 3), 0.2))
+    torch.testing.assert_close(both[:, :, 5], torch.full((1, 9, 3), math.hypot(0.2, share * OUTLINE * 0.6)))
+    assert not doubt(alpha, radiance, known, 0.0).any()  # no other frame shows the outlines
+    assert not doubt(alpha, known, known, share).any()  # nothing stands behind
+
+
 def test_in_front_of_an_even_earth_the_target_stands_out_and_in_front_of_clouds_nothing_is_known():
     frame = scenes.photographed(spacecraft(), 3)[2]
     cameras = Cameras(frame.world_to_camera[None], frame.K[None], scenes.SIZE_PX, scenes.SIZE_PX)
@@ -161,6 +177,19 @@ def test_the_earth_in_half_of_the_frames_costs_little(black):
     half = psnr_db(train(earthly(black, lambda i: i % 2), scenes.SENSOR, quick()).gaussians)
     # 2.03 dB on a processor without AVX2, less on others: what the Earth costs is measured by results, not here
     assert half > plain - 4
+
+
+def test_frames_that_all_have_the_earth_say_where_nothing_else_is(black):
+    trainer = Trainer(earthly(black[:12], lambda number: True, contrast=0.0), scenes.SENSOR, quick())
+    trainer.step()
+    sky = trainer.setup.batches.batch(list(range(12))).sky
+    assert sky is not None and (sky.flatten(1).mean(dim=1) > 0.1).all()
+
+
+def test_frames_that_all_have_clouds_behind_the_target_are_refused_in_words(black):
+    clouded = earthly(black[:12], lambda number: True)
+    with pytest.raises(ReconstructionError, match="all 12 frames have the Earth behind the target, and none"):
+        Trainer(clouded, scenes.SENSOR, quick())
 
 
 def test_a_training_with_the_earth_goes_on_from_its_checkpoint_as_it_was(black, tmp_path):
