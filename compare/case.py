@@ -206,7 +206,10 @@ def load_case(folder: Path, sector_deg: float = 0.0) -> Case:
         )
     records = list(map(truth.posed, held_out))
     scored = [
-        dataclasses.replace(training_frame(session, record), pose_covariance=None) for record in records
+        dataclasses.replace(
+            training_frame(session, record), pose_covariance=None, rates=None
+        )  # truth stands still
+        for record in records
     ]
     true = [tuple(map(torch.from_numpy, truth.radiance(record))) for record in records]
     return Case(

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
+from scipy import ndimage
 
 from compare.case import Case
 from compare.errors import CompareError
@@ -27,7 +28,8 @@ from obbgs_core.jpeg import JpegCoding
 from obbgs_core.model.motions import rigid_motions
 from obbgs_core.sensor import Sensor
 
-NOISE, SHUTTER, DARK, POSE, LOSS, STRAY, HOT = range(7)  # streams of random numbers, one a purpose
+NOISE, SHUTTER, DARK, POSE, LOSS, STRAY, HOT, MOTION = range(8)  # streams of random numbers, one a purpose
+BLUR_STEP_PX = 0.25  # between the shifted copies that are averaged
 MOST_ELECTRONS = 1e15  # NumPy's Poisson refuses about 9e18
 UNCERTAIN_SHIFT_M = 1e-6  # of a pose error that turns only: a covariance must not be singular
 
@@ -47,6 +49,8 @@ class Condition:
       each at another place (`compare.sky_behind`); methods are told where the Earth is, as navigation would.
     - stars: a field of stars behind the target, where one of magnitude 6 reads so many deviations of the noise in the
       longest exposure; real ones are far fainter than that beside a target in sunlight.
+    - blur_px: the camera turns evenly while the shutter is open, so that the picture moves by so many pixels in a
+      direction at random; methods are told the rate.
     - stray_gradient: the same, from 0 at one corner of the picture to this share at another, in a direction at random.
 
     These need no truth:
@@ -73,6 +77,7 @@ class Condition:
     stray_gradient: float = 0.0
     earth: float = 0.0
     stars: float = 0.0
+    blur_px: float = 0.0
     synthetic_bracket: tuple[float, ...] = ()
     believed_noise: float = 1.0
     believed_gain: float = 1.0
@@ -89,7 +94,7 @@ class Condition:
     def __post_init__(self):
         for name in ("noise", "response_gamma", "believed_noise", "believed_gain"):
             require(getattr(self, name) > 0, name, f"expected more than 0, got {getattr(self, name):g}")
-        for name in ("exposure_error", "stars", "frames", "missing_exposure", "pose_error_deg"):
+        for name in ("exposure_error", "stars", "blur_px", "frames", "missing_exposure", "pose_error_deg"):
             require(getattr(self, name) >= 0, name, f"expected 0 or more, got {getattr(self, name):g}")
         require(
             self.exposure_error <= MOST_EXPOSURE_ERROR,
@@ -133,7 +138,7 @@ class Condition:
     def exposes_anew(self) -> bool:
         """Whether frames are made from the truth."""
         changed = (self.exposure_ratios, self.exposure_error, self.pedestal, self.stray_gradient)
-        changed += (self.earth, self.stars)
+        changed += (self.earth, self.stars, self.blur_px)
         return any(changed) or (self.noise, self.response_gamma) != (1, 1)
 
     def stated(self) -> dict[str, Any]:
@@ -242,11 +247,29 @@ def _exposed_anew(case: Case, condition: Condition) -> list[TrainingFrame]:
         light, coverage = view(frame)
         scene = behind(frame, condition.earth, star_gain)
         light = light.astype(float) + (1 - coverage[..., None]) * scene.radiance
+        light, rates = _blurred(light, frame, exposure_s, condition.blur_px)
         added_dn = _added_dn(frame, case.sensor, condition)
         dn = read_out(light, exposure_s * longer, case.sensor, condition, _random(NOISE, frame), added_dn)
         dn = torch.from_numpy(dn.astype(np.float32))
-        frames.append(dataclasses.replace(frame, dn=dn, exposure_time_s=exposure_s, earth_m=scene.earth_m))
+        frames.append(
+            dataclasses.replace(frame, dn=dn, exposure_time_s=exposure_s, earth_m=scene.earth_m, rates=rates)
+        )
     return frames
+
+
+def _blurred(
+    light: np.ndarray, frame: TrainingFrame, exposure_s: float, blur_px: float
+) -> tuple[np.ndarray, torch.Tensor | None]:
+    """Return light [H, W, C] as a camera sees it that turns evenly, and the target's rates as in `TrainingFrame`."""
+    if not blur_px:
+        return light, None
+    angle = _random(MOTION, frame).uniform(0, 2 * math.pi)
+    x, y = blur_px * math.cos(angle), blur_px * math.sin(angle)
+    copies = math.ceil(blur_px / BLUR_STEP_PX)
+    shares = (np.arange(copies) + 0.5) / copies - 0.5
+    moved = [ndimage.shift(light, (share * y, share * x, 0), order=3) for share in shares]
+    turn = torch.tensor([-y / frame.K[1, 1], x / frame.K[0, 0], 0, 0, 0, 0]) / exposure_s
+    return np.mean(moved, axis=0).clip(min=0), turn
 
 
 def _star_gain(sensor: Sensor, condition: Condition, longest_s: float) -> float:

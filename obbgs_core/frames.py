@@ -60,6 +60,8 @@ class TrainingFrame:
     navigation: errors that all frames of the pass share, the same in all of them; None: there are none.
     earth_m: [3] m, from the camera to the Earth's centre, in the camera's axes; None: it is not in the picture, or not
         known.
+    rates: [6] how the target moves in front of the camera: rad/s about the camera's axes, m/s along them, so that long
+        exposures are blurred; None: it stands still, or moves by less than shows.
     time_s: since the navigation's epoch; inertial_to_body: [3, 3] float64, the attitude that the pose assumes; None:
         the body's axes are inertial. Only the navigation needs them.
     """
@@ -79,6 +81,7 @@ class TrainingFrame:
     time_s: float = 0.0
     inertial_to_body: Tensor | None = None
     earth_m: Tensor | None = None
+    rates: Tensor | None = None
 
     @property
     def shape(self) -> torch.Size:
@@ -125,8 +128,17 @@ def cameras_of(frames: list[TrainingFrame]) -> Cameras:
     height, width = frames[0].shape[:2]
     poses, K = torch.stack([f.world_to_camera for f in frames]), torch.stack([f.K for f in frames])
     suns, psf_sigma_px = stacked_suns([f.sun_dir for f in frames]), frames[0].psf_sigma_px
-    background = frames[0].background
-    return Cameras(poses, K, width, height, sun_dir=suns, psf_sigma_px=psf_sigma_px, background=background)
+    motion = None
+    if any(f.rates is not None for f in frames):
+        still = torch.zeros(6)
+        motion = torch.stack([still if f.rates is None else f.rates * f.exposure_time_s for f in frames])
+    return Cameras(
+        *(poses, K, width, height),
+        sun_dir=suns,
+        psf_sigma_px=psf_sigma_px,
+        background=frames[0].background,
+        motion=motion,
+    )
 
 
 @torch.no_grad()

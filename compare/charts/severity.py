@@ -33,6 +33,7 @@ KINDS = (
     Kind("pedestal", "pedestal, share of full scale", 0.0),
     Kind("stray_gradient", "stray light up to, share of full scale", 0.0),
     Kind("earth", "frames with the Earth, share", 0.0),
+    Kind("blur_px", "motion during the exposure, px", 0.0),
     Kind("pose_error_deg", "pose errors, degrees", 0.0),
     Kind("exposure_error", "errors of exposure times, share", 0.0),
     Kind("exposure_ratios", "each exposure over the one before", 1.0),

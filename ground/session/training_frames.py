@@ -10,6 +10,7 @@ from flightsw.icd.quaternion import quat_to_matrix
 from ground.session.cameras import sun_direction
 from ground.session.earth import earth_m
 from ground.session.folder import SPLITS, FrameRecord, Session, SessionError
+from ground.session.motion import rates
 from obbgs_core.frames import Navigation, TrainingFrame
 
 log = logging.getLogger(__name__)
@@ -127,6 +128,7 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
         time_s=(record.mid_exposure_utc_ns - session.navigation.epoch_utc_ns) / 1e9,
         inertial_to_body=None if assumed is None else torch.from_numpy(quat_to_matrix(assumed)),
         earth_m=None if earth is None else torch.from_numpy(earth).float(),
+        rates=rates(session, record),
     )
 
 

@@ -20,6 +20,8 @@ class Cameras:
     scale: pixels of these images for one of the sensor, along a side; below 1 where pixels were averaged.
     background: radiance, the same in all channels, of what is seen where no Gaussian is; space is black.
     backdrop: [C, H, W, channels] (no gradient), what is added to that in each picture; None: nothing.
+    motion: [C, 6] (no gradient), how the target moves while the shutter is open: a rotation vector about the camera's
+        axes (rad) and a shift along them (m), half before the moment of the pose and half after; None: it stands still.
     """
 
     world_to_camera: Tensor
@@ -32,6 +34,7 @@ class Cameras:
     scale: float = 1.0
     background: float = 0.0
     backdrop: Tensor | None = None
+    motion: Tensor | None = None
 
     def __post_init__(self):
         count = self.world_to_camera.shape[0]
@@ -39,6 +42,7 @@ class Cameras:
             ("world_to_camera", (count, 4, 4)),
             ("K", (count, 3, 3)),
             ("sun_dir", (count, 3)),
+            ("motion", (count, 6)),
         ):
             value = getattr(self, name)
             if value is not None and tuple(value.shape) != shape:
@@ -83,8 +87,11 @@ class Cameras:
         """Return one of the cameras, still of shape [1, ...]."""
         sun_dir = None if self.sun_dir is None else self.sun_dir[index : index + 1]
         backdrop = None if self.backdrop is None else self.backdrop[index : index + 1]
+        motion = None if self.motion is None else self.motion[index : index + 1]
         pose, K = self.world_to_camera[index : index + 1], self.K[index : index + 1]
-        return dataclasses.replace(self, world_to_camera=pose, K=K, sun_dir=sun_dir, backdrop=backdrop)
+        return dataclasses.replace(
+            self, world_to_camera=pose, K=K, sun_dir=sun_dir, backdrop=backdrop, motion=motion
+        )
 
     def scaled(self, factor: float) -> "Cameras":
         """Return the cameras of images resized by `factor` (0.5: half as wide and high, rounded up).

@@ -5,6 +5,7 @@ from torch import Tensor
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.backends import rasterize
+from obbgs_core.render.moving import at_moments, averaged, repeated
 from obbgs_core.render.native import native_kernels
 from obbgs_core.render.projection import Projected, project
 from obbgs_core.render.rendered import Rendered, ScreenGradients, weighted_gradient
@@ -36,7 +37,8 @@ def render(
     Front-to-back compositing on the cameras' background (Kerbl et al. 2023): alpha = min(0.99, opacity·exp(-d²/2)),
     where d is the Mahalanobis distance from the projected mean; contributions under 1/255 are skipped, and a pixel is
     finished before its transmittance would fall below 1e-4. What a pixel averages over is the model's `footprint`;
-    where that lowers a Gaussian's peak, it lowers the 1/255 as much.
+    where that lowers a Gaussian's peak, it lowers the 1/255 as much. Where the target moves while the shutter is open,
+    the images are the mean of three moments, and depths those of the middle one.
 
     Args:
         backend: `native` (C++, float32), `native-KERNEL` (the same with one of `native_kernels()`), `reference` (plain
@@ -54,7 +56,11 @@ def render(
         sunlit = None
     elif suns is not None and sunlit is None:
         sunlit = sunlit_shares(gaussians, suns, backend)
-    rendered = rasterize(gaussians, cameras, backend, suns, sunlit, added)
+    if cameras.motion is None:
+        rendered = rasterize(gaussians, cameras, backend, suns, sunlit, added)
+    else:
+        of_moments = (repeated(suns), repeated(sunlit), repeated(added))
+        rendered = averaged(rasterize(gaussians, at_moments(cameras), backend, *of_moments))
     if cameras.background or cameras.backdrop is not None:
         rendered.radiance = rendered.radiance + (1 - rendered.alpha)[..., None] * cameras.behind
     return rendered

@@ -116,6 +116,8 @@ class TrainingSetup:
                 digest.update(repr((f.time_s, attitude, f.navigation.tree())).encode())
             if f.earth_m is not None:
                 digest.update(repr(f.earth_m.tolist()).encode())
+            if f.rates is not None:
+                digest.update(f"rates {f.rates.tolist()}".encode())
             if f.own_pose:
                 digest.update(b"own pose")
             digest.update(repr((f.exposure_time_s, f.bracket, known, f.psf_sigma_px)).encode())

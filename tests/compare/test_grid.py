@@ -24,8 +24,11 @@ from compare.grid.worker import _rounded_all, run_cell
 from compare.methods import method
 from flightsw.icd.config import ConfigError
 from ground.session.folder import SessionError
+from obbgs_core.frames import cameras_of
 from obbgs_core.methods.presets import preset, quality_changes
+from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
+from tests import scenes
 from tests.benchmarks import targets
 from tests.small_sessions import small_session
 
@@ -178,6 +181,26 @@ def test_shot_noise_has_the_variance_of_its_electrons():
     dn = read_out(np.full((200, 200), 1000.0), 1.0, sensor, Condition(), np.random.default_rng(1))
     expected = float(sensor.variance_dn2(torch.tensor(1064.0)))  # shot, read and rounding
     assert dn.var() == pytest.approx(expected, rel=0.04)  # 40,000 readings: deviation 0.7 %
+
+
+def test_blurred_frames_are_what_a_moving_target_looks_like_at_the_told_rate(case):
+    """The true model, as `small_session` made it, drawn with the rates and without."""
+    true, sensor = scenes.target(), case.sensor
+    frames = frames_under(case, blur_px=4.0, noise=1e-3)
+    still = [dataclasses.replace(frame, rates=None) for frame in frames]
+    rms_dn = []
+    for told in (frames, still):
+        errors = [
+            sensor.expected_dn(render(true, cameras_of([f])).radiance[0], torch.tensor(f.exposure_time_s))
+            - f.dn
+            for f in told
+            if f.dn.max() < sensor.white_dn
+        ]
+        rms_dn.append(torch.stack(errors).square().mean().sqrt())
+    assert rms_dn[0] < 0.15 * rms_dn[1]
+    turns = torch.stack([frame.rates[:3] * frame.exposure_time_s for frame in frames])
+    focal_px = torch.stack([frame.K[0, 0] for frame in frames])
+    torch.testing.assert_close(turns.norm(dim=1) * focal_px, torch.full((len(frames),), 4.0))
 
 
 def test_hot_pixels_are_the_same_in_all_frames(case):
