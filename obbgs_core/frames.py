@@ -93,6 +93,21 @@ class TrainingFrame:
         """Whether dn is held in little memory, so that reading it takes time."""
         return isinstance(self.__dict__["_dn"], Compact)
 
+    @property
+    def moved_px(self) -> float:
+        """How far a target that fills the picture moves in it while the shutter is open, at most, px."""
+        if self.rates is None:
+            return 0.0
+        (height, width), K = self.shape[:2], self.K.double()
+        centre, rates = self.world_to_camera[:3, 3].double(), self.rates.double()
+        half = torch.stack([width / K[0, 0], height / K[1, 1], min(width / K[0, 0], height / K[1, 1])]) / 2
+        points = centre + centre[2] * torch.cat([half.diag(), -half.diag(), torch.zeros(1, 3)])
+        points = points[points[:, 2] > 0]
+        speed = torch.linalg.cross(rates[:3].expand_as(points), points) + rates[3:]
+        across = (speed[:, :2] - points[:, :2] / points[:, 2:] * speed[:, 2:]) / points[:, 2:]
+        moved = (across * K.diag()[:2]).norm(dim=1) * self.exposure_time_s
+        return float(moved.max()) if len(moved) else 0.0
+
     def part(self, rows: slice, columns: slice) -> Tensor:
         """Return some rows and columns of dn [h, w, C]."""
         return part(self.__dict__["_dn"], rows, columns)

@@ -11,14 +11,13 @@ from obbgs_core.model.motions import motion_vectors
 APART_S = 0.2  # tags nearer to one another tell the rate no better than they err
 MOST_TURN_RAD = 1.0  # between two tags; after more, the motion in between is not known
 NEAR = 16  # frames before and after, by number, among which the next ones in time are looked for
-SHOWN_PX = 0.2  # less movement during an exposure is left out
 
 
 def rates(session: Session, record: FrameRecord) -> torch.Tensor | None:
     """Return the target's rates [6] at a frame, as `TrainingFrame.rates`: rad/s and m/s in the camera's axes.
 
-    None comes back for imported pictures, whose cameras may have stood still for each of them; where no tag is near
-    enough; and where nothing that the picture shows at the target's distance moves by more than 0.2 px.
+    None comes back for imported pictures, whose cameras may have stood still for each of them, and where no tag is near
+    enough.
     """
     if session.frames_imported is not None or not record.pose_valid:
         return None
@@ -30,7 +29,7 @@ def rates(session: Session, record: FrameRecord) -> torch.Tensor | None:
     twist = motion_vectors(torch.from_numpy(motion)[None])[0] / interval_s
     if float(twist[:3].norm()) * interval_s > MOST_TURN_RAD:
         return None
-    return twist.float() if _moved_px(session, record, twist.numpy()) > SHOWN_PX else None
+    return twist.float()
 
 
 def _neighbour(session: Session, record: FrameRecord, sign: int) -> FrameRecord | None:
@@ -43,16 +42,3 @@ def _neighbour(session: Session, record: FrameRecord, sign: int) -> FrameRecord 
     near = session.frames[max(0, place - NEAR) : place + NEAR + 1]
     posed = [other for other in near if other.pose_valid and apart_s(other) >= APART_S]
     return min(posed, key=apart_s, default=None)
-
-
-def _moved_px(session: Session, record: FrameRecord, twist: np.ndarray) -> float:
-    """Return how far a target that fills the picture moves in it during the exposure, at most, px."""
-    K, centre = session.K(record).astype(float), record.world_to_camera[:3, 3].astype(float)
-    size = np.array([session.camera.width / K[0, 0], session.camera.height / K[1, 1], 0]) / 2
-    size[2] = size[:2].min()
-    points = centre + centre[2] * np.concatenate([np.diag(size), -np.diag(size), np.zeros((1, 3))])
-    points = points[points[:, 2] > 0]
-    speed = np.cross(twist[:3], points) + twist[3:]
-    across = (speed[:, :2] - points[:, :2] / points[:, 2:] * speed[:, 2:]) / points[:, 2:]
-    moved = np.linalg.norm(across * np.diag(K)[:2], axis=1) * record.exposure_time_s
-    return float(moved.max(initial=0.0))

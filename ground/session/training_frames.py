@@ -1,5 +1,6 @@
 """From a session's frames to those of a training: which are used, which are held out for testing, in what form."""
 
+import dataclasses
 import logging
 from collections.abc import Sequence
 
@@ -14,6 +15,7 @@ from ground.session.motion import rates
 from obbgs_core.frames import Navigation, TrainingFrame
 
 log = logging.getLogger(__name__)
+SHOWN_PX = 0.2  # a target that moves by less during an exposure is taken as standing still
 TEST_INTERVAL = 8  # every eighth bracket is held out
 
 
@@ -110,7 +112,7 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
     """
     dn, assumed = session.dn(record).astype(np.float32), record.quat_inertial_to_body
     earth = earth_m(session, record, dn)
-    return TrainingFrame(
+    frame = TrainingFrame(
         dn=torch.from_numpy(dn.reshape(*dn.shape[:2], session.camera.channels)),
         exposure_time_s=record.exposure_time_s,
         world_to_camera=torch.tensor(record.world_to_camera, dtype=torch.float32),
@@ -130,6 +132,7 @@ def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
         earth_m=None if earth is None else torch.from_numpy(earth).float(),
         rates=rates(session, record),
     )
+    return frame if frame.moved_px > SHOWN_PX else dataclasses.replace(frame, rates=None)
 
 
 def navigation_of(session: Session) -> Navigation | None:

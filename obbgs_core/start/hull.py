@@ -51,7 +51,7 @@ class Silhouette:
     certain: light with few false alarms; likely: light with few misses; sky: empty, with few false alarms. Nearly all
     empty pixels that are far from light pass as sky, a fifth of those right beside a faint face, and one in forty of a
     face of FAINTEST_SIGMA.
-    grown_px: by how much likely light was grown, and sky shrunk.
+    grown_px: by how much likely light was grown, and sky shrunk, or by how much motion spread the light.
     """
 
     certain: Tensor

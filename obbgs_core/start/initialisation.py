@@ -1,5 +1,6 @@
 """The first Gaussians: on the visual hull of the long exposures, or at random."""
 
+import dataclasses
 import logging
 import math
 from collections.abc import Mapping
@@ -69,7 +70,9 @@ def silhouettes(
             outlines[i] = earth_silhouette(f, sensor)
             continue
         light = hull.light(f.dn, sensor, f.background, f.exposure_time_s)
-        outlines[i] = hull.silhouette(light, sensor, f.world_to_camera, f.K)
+        outline = hull.silhouette(light, sensor, f.world_to_camera, f.K)
+        moved = f.rates is not None
+        outlines[i] = dataclasses.replace(outline, grown_px=math.ceil(f.moved_px / 2)) if moved else outline
     return outlines
 
 

@@ -55,7 +55,7 @@ def test_what_no_picture_shows_is_left_out(moving):
     """A point at half the picture's width goes by 0.05 rad/s times that, and by what the other rates add."""
     slowest_px_s = 0.05 * FOCAL_PX / 4
     shown, not_shown = (exposed_for(moving, share / slowest_px_s) for share in (0.4, 0.02))
-    assert rates(shown, shown.frames[3]) is not None and rates(not_shown, not_shown.frames[3]) is None
+    assert frames_of(shown)[3].rates is not None and frames_of(not_shown)[3].rates is None
 
 
 def test_pictures_that_were_imported_are_taken_as_standing_still(moving):
