@@ -70,7 +70,13 @@ def import_command(
     """
     from ground.formats.photographs.exposures import UNKNOWN, estimated, read_table, with_exposures
     from ground.formats.pictures.placement import placed
-    from ground.formats.pictures.views import EXACT, Values, first_of_each_split, write_session
+    from ground.formats.pictures.views import (
+        EXACT,
+        Values,
+        first_of_each_split,
+        with_stated_errors,
+        write_session,
+    )
 
     given_sigmas = None if pose_sigma is None else _pose_sigmas(pose_sigma)
     table = None if exposures in (None, UNKNOWN) else read_table(Path(exposures))
@@ -97,6 +103,8 @@ def import_command(
         if poses is PoseChoice.MEND:
             source += "".join(f", {len(pictures)} poses {kind}" for kind, pictures in found_poses.items())
     views, origin_moved = placed(views)
+    if not unposed and given_sigmas is None and exported is None and in_body_axes:
+        views = with_stated_errors(views)  # what an export of ours does not state is exact
     with Progress(TextColumn("importing"), BarColumn(), TimeRemainingColumn(), console=stderr) as progress:
         task = progress.add_task("import", total=len(views))
         count = write_session(

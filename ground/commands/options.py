@@ -176,7 +176,8 @@ PoseSigmaGiven = Annotated[
         "--pose-sigma",
         metavar="DEG,M",
         help="How far the poses can err, as standard deviations in degrees and metres; the training "
-        "corrects them within it. Default: exact poses; for the format images what its features say.",
+        "corrects them if the pictures say that they do. Default: a pixel; for our own exports and the format images "
+        "what they say.",
     ),
 ]
 PosesGiven = Annotated[

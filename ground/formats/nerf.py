@@ -208,8 +208,9 @@ def read_frame(frame: dict[str, Any], image: Path, intrinsics: Intrinsics, where
     try:
         time_ns, bracket = frame.get("mid_exposure_utc_ns"), frame.get("bracket")
         sun = np.array(frame.get("sun_dir_body", (0.0, 0.0, 0.0)), dtype=np.float64)
-        covariance = np.array(frame.get("pose_covariance", np.zeros((6, 6))), dtype=np.float64)
-        if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
+        told = frame.get("pose_covariance")
+        covariance = None if told is None else np.array(told, dtype=np.float64)
+        if covariance is not None and (covariance.shape != (6, 6) or not np.isfinite(covariance).all()):
             raise ValueError(f"pose_covariance: expected finite [6, 6], got {covariance.tolist()}")
         exposure_time_s = float(frame.get("exposure_time_s", 1.0))
         mask = frame.get("mask_path")

@@ -15,6 +15,8 @@ from obbgs_core.sensor import Sensor
 
 CELLS = 1024  # along each axis of the body
 KNEE = 2.0  # of the robust penalty, as in `losses.charbonnier`
+# of a picture, that are asked: those where it changes most. Of a photograph they tell nearly all that it can tell.
+MOST_PIXELS = 8192
 
 
 @dataclass(frozen=True)
@@ -92,12 +94,16 @@ def pose_information(
         exposure_time_s, dn, averaged_pixels: as for `losses.likelihood_loss`.
         cell_m: above 0: edge of the cubes that the surface is divided into. The values of a cube in a picture are then
             counted as one, because what a model still gets wrong is alike in neighbouring pixels and channels.
+
+    Of pictures that show more than `MOST_PIXELS` of the target those are asked in which it changes most.
     """
     gradients, curvatures, cells, dispersions = [], [], [], []
     for i in range(len(radiance)):
         seen = alpha[i] > ON_TARGET_ALPHA
         lit, deep = (_of_nine(image) for image in (seen.float(), torch.where(seen, depth[i], 0.0)))
         near = lit > 0
+        seen_values = int(near.sum()) * radiance.shape[-1]
+        near = _steepest(near, slopes[i])
         slope = slopes[i][near]  # [n, C, 2]
         # those beside the target are as deep as its edge
         points = _points(torch.where(seen, depth[i], deep / lit.clamp(min=1)), near, cameras.K[i])  # [n, 3]
@@ -115,7 +121,7 @@ def pose_information(
             numbers = _cell_numbers((points.double() - pose[:3, 3]) @ pose[:3, :3], cell_m)
             numbers, place = numbers.unique(return_inverse=True)
             place = place.repeat_interleave(radiance.shape[-1])  # of each row
-            weight = weight * len(numbers) / max(1, len(place))
+            weight = weight * len(numbers) / max(1, seen_values)
             told = rows, rows[:, 3:] @ pose[:3, :3], weight, residual
             cells.append(_cell_information(numbers, place, *told))
         gradients.append(rows.T @ (weight * residual))
@@ -123,6 +129,16 @@ def pose_information(
         dispersions.append(residual.square().mean())
     dispersion = torch.stack(dispersions)
     return PoseInformation(torch.stack(gradients), torch.stack(curvatures), cells or None, cell_m, dispersion)
+
+
+def _steepest(near: Tensor, slopes: Tensor) -> Tensor:
+    """Return those of chosen pixels [H, W] in which a picture changes most, by its slopes [H, W, C, 2]."""
+    if int(near.sum()) <= MOST_PIXELS:
+        return near
+    steepness = torch.where(near, slopes.square().sum(dim=(2, 3)), -1.0).flatten()
+    chosen = torch.zeros_like(near).flatten()
+    chosen[steepness.topk(MOST_PIXELS).indices] = True
+    return chosen.view_as(near)
 
 
 def _cell_numbers(points: Tensor, cell_m: float) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from obbgs_core.evidence.poses import correction_evidence
+from obbgs_core.frames import pose_numbers
 from obbgs_core.methods.config import SET_BACK_AT, SET_BACK_TO, SET_BACKS, Moment
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.answers import PoseRound, Question
@@ -27,6 +28,7 @@ ALIGNED_FROM = 0.05  # the same, of poses that were aligned before the start (ex
 # In so many rounds the poses would move during a whole training if they moved as often as before `SET_BACK_AT`, or as
 # after it (experiment 079).
 EARLY_ROUNDS, LATE_ROUNDS = 60, 25
+MANY_BRACKETS = 40  # of more, rounds are the rarer the more there are, so that all take no more time
 SURFACE_UNTIL = 0.5  # share of the steps until which the Gaussians go along with the surface's cells then
 CELLS = 12  # of the surface along the target's radius
 # after which the answer of a round is used, at most: about as many as it takes where a core is free (experiment 083)
@@ -256,7 +258,8 @@ def is_turn(setup: TrainingSetup, moment: Moment) -> bool:
 def steps_between(setup: TrainingSetup, share: float) -> int:
     """Return the number of steps from one round to the next at a share of the steps."""
     rounds = EARLY_ROUNDS if share < SET_BACK_AT else LATE_ROUNDS
-    return max(1, round((setup.config.steps_until(1) - setup.config.steps_until(0)) / rounds))
+    rarer = max(1.0, (1 + max(pose_numbers(setup.frames))) / MANY_BRACKETS)
+    return max(1, round(rarer * (setup.config.steps_until(1) - setup.config.steps_until(0)) / rounds))
 
 
 def _delay(steps: int) -> int:

@@ -1,6 +1,7 @@
 """What a stranger's data set says is kept: its splits, background, encoding, and the intrinsics of each picture."""
 
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -39,6 +40,7 @@ from ground.show.report.document import write_report
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.render import render
 from obbgs_core.score.metrics import ssim
+from tests.commands import call
 from tests.scenes import intrinsics, photographed, pose, target
 
 SIZE_PX = 24
@@ -402,3 +404,34 @@ def test_pictures_of_two_sizes_are_refused_with_both_named(tmp_path):
     with pytest.raises(FormatError, match=r"r_1\.png.*48x24 and the first is 24x24"):
         write_session(views, tmp_path / "s", "nerf")
     assert not (tmp_path / "s").exists()
+
+
+# --- stated cameras ---
+
+
+@pytest.mark.parametrize(("given", "deviation_px"), [((), 1.0), (("--pose-sigma", "0,0"), 0.0)])
+def test_stated_cameras_may_err_by_a_pixel_unless_someone_says_that_they_are_exact(
+    tmp_path, given, deviation_px
+):
+    nerf_folder(tmp_path / "d", {"train": 3, "test": 2}, camera_angle_x=0.7)
+    command = ("import", "--format", "nerf", "--from", tmp_path / "d", "--session", tmp_path / "s")
+    assert call("ground", *command, "--poses", "stated", *given).returncode == 0
+    session = open_session(tmp_path / "s")
+    for record in session.frames:
+        camera = record.world_to_camera
+        moved_px = []
+        for axis in range(2):  # of the target's picture by the camera's turn and by its place
+            away = np.linalg.norm(camera[:3, 3])
+            turn, place = (math.sqrt(record.covariance[i, i]) for i in (3 + axis, axis))
+            moved_px += [session.camera.fx_px * turn, session.camera.fx_px * place / away]
+        np.testing.assert_allclose(moved_px, deviation_px)
+
+
+def test_what_an_export_of_ours_does_not_state_is_exact(tmp_path):
+    views, _ = read_nerf(nerf_folder(tmp_path / "d", {"train": 3, "test": 2}))
+    write_session(views, tmp_path / "s", "nerf")
+    for format_ in ("nerf", "nerfstudio"):
+        where = ("--from", tmp_path / format_, "--session", tmp_path / f"again-{format_}")
+        call("ground", "export", tmp_path / "s", "--out", tmp_path / format_, "--format", format_)
+        assert call("ground", "import", "--format", format_, *where).returncode == 0
+        assert not any(r.covariance.any() for r in open_session(tmp_path / f"again-{format_}").frames)

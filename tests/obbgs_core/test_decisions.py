@@ -176,7 +176,7 @@ def own_error(model: Gaussians, frames: list[TrainingFrame], indices: list[int])
 @pytest.mark.usefixtures("tested_late")
 @pytest.mark.parametrize("tags", ["exact", "uncertain, and no evidence against them"])
 def test_where_the_sun_moves_brackets_not_yet_seen_tell_the_models_own_error(tags, monkeypatch):
-    no_evidence = CorrectionEvidence(torch.tensor([-1.0, -2.0, -3.0]))
+    no_evidence = CorrectionEvidence(torch.tensor([-1.0, -2.0, -3.0]), torch.zeros(3), torch.ones(3))
     monkeypatch.setattr(poses, "correction_evidence", lambda *_: no_evidence)
     frames, unseen = under_a_moving_sun()
     frames = frames if tags == "exact" else tagged(frames, wrong=False)

@@ -9,6 +9,7 @@ import torch
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.methods.presets import preset
 from obbgs_core.poses.answers import Answer, Question
+from obbgs_core.train.poses import steps_between
 from obbgs_core.train.trainer import Trainer, train
 from tests.scenes import QUICK, SENSOR, move_poses_in, photographed, tagged, target
 
@@ -63,3 +64,9 @@ def test_an_error_in_the_background_ends_the_training(doubted, monkeypatch, use_
     monkeypatch.setattr(Question, "answer", broken)
     with pytest.raises(MemoryError, match="no room for pictures"):
         train(doubted, SENSOR, CONFIG)
+
+
+@pytest.mark.parametrize(("brackets", "apart"), [(12, 17), (40, 17), (80, 33), (120, 50)])
+def test_rounds_of_more_brackets_are_rarer_so_that_all_take_no_more_time(brackets, apart):
+    frames = photographed(target(5), brackets, size_px=16)
+    assert steps_between(Trainer(frames, SENSOR, preset("obbgs")).setup, 0.1) == apart

@@ -45,8 +45,28 @@ class PoseSigmas:
         if not all(0 <= value < math.inf for value in (self.rotation_rad, self.position_m)):
             raise ValueError(f"expected deviations of at least 0, got {self}")
 
+    @property
+    def covariance(self) -> np.ndarray:
+        """The covariance [6, 6] of a pose, as in a session's frames."""
+        return np.diag(np.repeat([self.position_m**2, self.rotation_rad**2], 3))
+
 
 EXACT = PoseSigmas(0.0, 0.0)
+STATED_ERROR_PX = 1.0  # by which a stated camera's turn and its place may each move the picture of the target
+
+
+def with_stated_errors(views: Sequence[View]) -> list[View]:
+    """Return the views with covariances of their poses: where none is stated, that of an error of about a pixel.
+
+    Cameras of calibrated rigs and of structure from motion err by as much; trainings test whether these do.
+    """
+    return [view if view.covariance is not None else _with_stated_error(view) for view in views]
+
+
+def _with_stated_error(view: View) -> View:
+    rotation_rad = STATED_ERROR_PX / view.intrinsics.fx_px
+    range_m = float(np.linalg.norm(view.world_to_camera[:3, 3]))
+    return dataclasses.replace(view, covariance=PoseSigmas(rotation_rad, rotation_rad * range_m).covariance)
 
 
 class Values(StrEnum):
@@ -353,11 +373,10 @@ def _foreign_camera(intrinsics: Intrinsics, channels: int, bit_depth: int, longe
 
 def _frame(view: View, number: int, dn: np.ndarray, camera: CameraSection, sigmas: PoseSigmas) -> Frame:
     w2c = view.world_to_camera
-    same_for_all = np.diag(np.repeat([sigmas.position_m**2, sigmas.rotation_rad**2], 3))
     pose = PoseTag(
         quat_body_to_camera=matrix_to_quat(w2c[:3, :3]),
         position_body_m=-w2c[:3, :3].T @ w2c[:3, 3],
-        covariance=view.covariance if sigmas == EXACT and view.covariance is not None else same_for_all,
+        covariance=view.covariance if sigmas == EXACT and view.covariance is not None else sigmas.covariance,
         sun_dir_body=view.sun_dir_body,
         in_eclipse=view.in_eclipse,
         valid=True,
