@@ -146,13 +146,13 @@ def _gain(
     place = len(batch.indices) // 2
     index, dn = batch.indices[place], batch.dn[place, None]
     images = (batch.exposure_time_s[place, None], dn, sensor, batch.averaged_pixels)
-    errors, square = [], None
+    errors, square = [], torch.empty(0)
     for _ in range(FIT_STEPS + 1):
         cameras = poses.cameras([index], batch.cameras.one(place))
         rendered, slopes = render_with_slopes(model, cameras)
-        errors.append(likelihood_loss(rendered.radiance, *images)[1][0].square().sum(dim=2))
-        if square is None:
+        if not errors:
             square = _checkerboard(rendered.alpha[0] > ON_TARGET_ALPHA)
+        errors.append(likelihood_loss(rendered.radiance, *images)[1][0].square().sum(dim=2))
         # a picture without slopes says nothing of its pose
         views = (rendered.radiance, torch.where((square % 2 == 0)[..., None, None], slopes, 0.0))
         poses.gather([index], pose_information(*views, rendered.alpha, rendered.depth, cameras, *images))
