@@ -170,7 +170,5 @@ def _checkerboard(shown: Tensor) -> Tensor:
     """Return the number [H, W] of the square that a pixel of the target is in, odd on black ones; -2 beside it."""
     side = max(SMALLEST_SQUARE_PX, round(math.sqrt(int(shown.sum())) / SQUARES))
     rows, columns = (torch.arange(size) // side for size in shown.shape)
-    width = (
-        int(columns[-1]) // 2 * 2 + 3
-    )  # odd, so that the number's parity is that of row and column together
+    width = int(columns[-1]) // 2 * 2 + 3  # odd: a number is even where row and column are so together
     return torch.where(shown, rows[:, None] * width + columns, -2)

@@ -28,7 +28,7 @@ ALIGNED_FROM = 0.05  # the same, of poses that were aligned before the start (ex
 # In so many rounds the poses would move during a whole training if they moved as often as before `SET_BACK_AT`, or as
 # after it (experiment 079).
 EARLY_ROUNDS, LATE_ROUNDS = 60, 25
-MANY_BRACKETS = 40  # of more, rounds are the rarer the more there are, so that all take no more time
+MANY_BRACKETS = 50  # of more, rounds are the rarer the more there are, so that all take no more time
 SURFACE_UNTIL = 0.5  # share of the steps until which the Gaussians go along with the surface's cells then
 CELLS = 12  # of the surface along the target's radius
 # after which the answer of a round is used, at most: about as many as it takes where a core is free (experiment 083)
