@@ -69,14 +69,8 @@ def import_command(
     Example: ground import --format shirt --from shirtv1/roe1/lightbox --frames 363 --session roe1
     """
     from ground.formats.photographs.exposures import UNKNOWN, estimated, read_table, with_exposures
-    from ground.formats.pictures.placement import placed
-    from ground.formats.pictures.views import (
-        EXACT,
-        Values,
-        first_of_each_split,
-        with_stated_errors,
-        write_session,
-    )
+    from ground.formats.pictures.placement import placed, with_stated_errors
+    from ground.formats.pictures.views import EXACT, Values, first_of_each_split, write_session
 
     given_sigmas = None if pose_sigma is None else _pose_sigmas(pose_sigma)
     table = None if exposures in (None, UNKNOWN) else read_table(Path(exposures))
@@ -103,7 +97,7 @@ def import_command(
         if poses is PoseChoice.MEND:
             source += "".join(f", {len(pictures)} poses {kind}" for kind, pictures in found_poses.items())
     views, origin_moved = placed(views)
-    if not unposed and given_sigmas is None and exported is None and in_body_axes:
+    if given_sigmas is None and exported is None:
         views = with_stated_errors(views)  # what an export of ours does not state is exact
     with Progress(TextColumn("importing"), BarColumn(), TimeRemainingColumn(), console=stderr) as progress:
         task = progress.add_task("import", total=len(views))
@@ -124,12 +118,12 @@ def import_command(
     if json_:
         print(json.dumps({"frames": count, "session": str(session), **(registration or {}), **found_poses}))
     else:
-        print(f"{count} frames in {session}")
-        _tell(registration or {})
+        _tell(count, session, registration or {})
 
 
-def _tell(registration: dict) -> None:
-    """Print which photographs structure from motion left out or turned."""
+def _tell(count: int, session: Path, registration: dict) -> None:
+    """Print how many frames there are, and which photographs structure from motion left out or turned."""
+    print(f"{count} frames in {session}")
     if registration.get("left_out"):
         print(f"left out, because they could not be registered: {', '.join(registration['left_out'])}")
     if registration.get("turned"):

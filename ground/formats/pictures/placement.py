@@ -11,12 +11,13 @@ import numpy as np
 
 from ground.formats.pictures.files import FormatError
 from ground.formats.pictures.view import View
-from ground.formats.pictures.views import read_grey
+from ground.formats.pictures.views import PoseSigmas, read_grey
 
 log = logging.getLogger(__name__)
 IN_SIGHT = 0.5  # share of the pictures that show the origin where it can stay
 # mean square of the sine between lines of sight, across every direction; less tells no distance
 LEAST_SPREAD = 1e-4
+STATED_ERROR_PX = 1.0  # by which a stated camera's turn and its place may each move the picture of the target
 
 
 def placed(views: Sequence[View]) -> tuple[list[View], np.ndarray | None]:
@@ -84,3 +85,18 @@ def _moved(view: View, origin: np.ndarray) -> View:
     pose = view.world_to_camera.copy()
     pose[:3, 3] += pose[:3, :3] @ origin
     return dataclasses.replace(view, world_to_camera=pose)
+
+
+def with_stated_errors(views: Sequence[View]) -> list[View]:
+    """Return the views with covariances of their poses: where none is stated, that of an error of about a pixel.
+
+    Cameras of calibrated rigs and of structure from motion err by as much; trainings test whether these do. Poses about
+    a target of unknown attitude state none.
+    """
+    return [v if v.covariance is not None or not v.attitude_known else _with_stated_error(v) for v in views]
+
+
+def _with_stated_error(view: View) -> View:
+    rotation_rad = STATED_ERROR_PX / view.intrinsics.fx_px
+    range_m = float(np.linalg.norm(view.world_to_camera[:3, 3]))
+    return dataclasses.replace(view, covariance=PoseSigmas(rotation_rad, rotation_rad * range_m).covariance)

@@ -52,21 +52,6 @@ class PoseSigmas:
 
 
 EXACT = PoseSigmas(0.0, 0.0)
-STATED_ERROR_PX = 1.0  # by which a stated camera's turn and its place may each move the picture of the target
-
-
-def with_stated_errors(views: Sequence[View]) -> list[View]:
-    """Return the views with covariances of their poses: where none is stated, that of an error of about a pixel.
-
-    Cameras of calibrated rigs and of structure from motion err by as much; trainings test whether these do.
-    """
-    return [view if view.covariance is not None else _with_stated_error(view) for view in views]
-
-
-def _with_stated_error(view: View) -> View:
-    rotation_rad = STATED_ERROR_PX / view.intrinsics.fx_px
-    range_m = float(np.linalg.norm(view.world_to_camera[:3, 3]))
-    return dataclasses.replace(view, covariance=PoseSigmas(rotation_rad, rotation_rad * range_m).covariance)
 
 
 class Values(StrEnum):
