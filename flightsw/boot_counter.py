@@ -6,6 +6,7 @@ from pathlib import Path
 
 from flightsw.store import RESERVE, write_with_reserve
 from obbgs_base.checked import read_twice, write_twice
+from obbgs_base.errors import in_words
 
 log = logging.getLogger(__name__)
 LOST = 1 << 31  # a number from here on was drawn at random, since the last one could not be read or kept
@@ -23,11 +24,11 @@ def count_boot(folder: Path) -> int:
         boot = 1 if known is None else (int(known["boot"]) + 1) % (1 << 32)
     except (OSError, ValueError, KeyError, TypeError) as error:
         boot = LOST + secrets.randbits(31)
-        log.error("the number of starts is lost, it goes on from %d: %s", boot, error)
+        log.error("the number of starts is lost, it goes on from %d: %s", boot, in_words(error))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_twice(path, {"boot": boot}, lambda file, data: write_with_reserve(file, data, folder / RESERVE))
     except OSError as error:
         boot = LOST + secrets.randbits(31)
-        log.error("the number of this start cannot be kept, %d stands for it: %s", boot, error)
+        log.error("the number of this start cannot be kept, %d stands for it: %s", boot, in_words(error))
     return boot

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from flightsw.downlink import DownlinkProgress
 from flightsw.fsck import fsck
-from flightsw.icd.config import ConfigError
+from flightsw.icd.config import ConfigError, keys_below, require
 from flightsw.icd.mission import BracketSection, Mission, load_mission
 from flightsw.run import RunResult, run_pass
 from flightsw.sequencer import plan
@@ -213,7 +213,7 @@ def service_command(
     Its mission file is /etc/obbgs/mission.yaml; frames are kept in /var/lib/obbgs/store, the key in mission.key beside
     it. The unit's first lines say how to make the user and where to put the unit.
 
-    Example: flightsw service --camera gige://192.168.0.10 --link 'can://can0?fd=true' > obbgs-flight.service
+    Example: flightsw service --camera gige://192.168.0.10 --link 'can://can0?fd=1' > obbgs-flight.service
     """
     from flightsw.service import unit
 
@@ -234,7 +234,9 @@ def mission_new(
     ] = "1024x1024",
     focal_length: Annotated[float, typer.Option(help="Of the lens, mm.")] = 100.0,
     pixel_pitch: Annotated[float, typer.Option(help="From one pixel to the next, micrometres.")] = 5.5,
-    start: Annotated[str | None, typer.Option(help=f"{START_HELP}; default: an hour from now.")] = None,
+    start: Annotated[
+        str | None, typer.Option(help=f"{START_HELP}; or now. Default: an hour from now.")
+    ] = None,
     json_: AsJson = False,
 ) -> None:
     """Write a mission file, commented as the example is; then look at it with plan, and calibrate the camera.
@@ -295,6 +297,7 @@ def selftest(
             if finding.advice:
                 print(f"{'':20} -> {finding.advice}")
 
+    require(link is not None or not loopback, "--loopback", "tests a link: name it with --link")
     findings = self_test(load_mission(mission), store, camera, link, loopback, key or (), on_finding=show)
     failed = sum(finding.state == "failed" for finding in findings)
     if json_:
@@ -350,11 +353,13 @@ def with_bracket(
             ) from error
     if count is not None:
         changes["count"] = count
-    section: BracketSection = dataclasses.replace(mission.bracket, **changes)
+    with keys_below("--count", "mission.bracket.count"):
+        section: BracketSection = dataclasses.replace(mission.bracket, **changes)
     orbit = mission.orbit
     if start is not None:
         now = datetime.now(UTC) + timedelta(seconds=START_NOW_S)
-        orbit = dataclasses.replace(orbit, start_utc=now.isoformat() if start == "now" else start)
+        with keys_below("--start", "mission.orbit.start_utc"):
+            orbit = dataclasses.replace(orbit, start_utc=now.isoformat() if start == "now" else start)
     return dataclasses.replace(mission, bracket=section, orbit=orbit)
 
 
@@ -427,6 +432,7 @@ def _progress() -> Progress:
         TimeRemainingColumn(),
         console=stderr,
         transient=True,
+        disable=not stderr.is_terminal,  # elsewhere nothing is left of it but an empty line
     )
 
 

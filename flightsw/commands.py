@@ -31,6 +31,7 @@ from flightsw.icd.telemetry import DICTIONARY
 from flightsw.settings import Settings, load_settings, save_settings
 from flightsw.store import RESERVE, FrameStore, keep_reserve, write_with_reserve
 from obbgs_base.checked import copy_of, each_copy, read_twice, write_twice
+from obbgs_base.errors import in_words, reason
 from obbgs_base.files import set_aside, write_whole
 
 log = logging.getLogger(__name__)
@@ -63,7 +64,9 @@ class ReplayCounter:
                 key_file.with_name(self.path.name + ".lock"), os.O_WRONLY | os.O_CREAT, 0o600
             )
         except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(str(key_file), f"cannot read the key and its counter: {error}") from error
+            raise ConfigError(
+                str(key_file), f"cannot read the key and its counter: {reason(error)}"
+            ) from error
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self.last = self._read()
@@ -104,12 +107,12 @@ class ReplayCounter:
         try:
             write_with_reserve(self.path, content, self._reserve)
         except OSError as error:
-            raise StoreError(f"cannot keep the command counter: {error}") from error
+            raise StoreError(f"cannot keep the command counter: {in_words(error)}") from error
         self.last = counter
         try:
             write_with_reserve(copy_of(self.path), content, self._reserve)
         except OSError as error:
-            log.warning("the copy of the command counter cannot be written: %s", error)
+            log.warning("the copy of the command counter cannot be written: %s", in_words(error))
         self._keep_reserve()
 
     def close(self) -> None:
@@ -356,7 +359,7 @@ class Commander:
                 raise AuthError("the file is not the one that was announced")
             write_whole(path, content)
         except (AuthError, OSError) as error:
-            self._note(upload.command, "failed", str(error))
+            self._note(upload.command, "failed", reason(error))
             return None
         self._verifying[path] = upload.command
         return path
@@ -501,7 +504,9 @@ class Commander:
             tree = read_twice(path, log.warning)
             begun = [Deletion.from_tree(each) for each in tree["deletions"]] if tree is not None else []
         except (OSError, ValueError, TypeError, KeyError) as error:
-            log.error("a deletion of the run before may be left half done, command it again: %s", error)
+            log.error(
+                "a deletion of the run before may be left half done, command it again: %s", in_words(error)
+            )
             if not isinstance(error, OSError):
                 for each in filter(Path.exists, (path, copy_of(path))):
                     with contextlib.suppress(OSError):  # it is said again after the next start
@@ -527,7 +532,7 @@ class Commander:
                 for each in (path, copy_of(path)):
                     each.unlink(missing_ok=True)
         except OSError as error:
-            raise StoreError(f"cannot note what is to be deleted: {error}") from error
+            raise StoreError(f"cannot note what is to be deleted: {in_words(error)}") from error
 
     def _change(self, **changes: object) -> None:
         settings: Settings = dataclasses.replace(self.settings, **changes)  # type: ignore[arg-type]

@@ -34,6 +34,7 @@ from flightsw.ranking import Ranking
 from flightsw.settings import Settings, load_settings
 from flightsw.store import FrameStore
 from flightsw.triage_worker import ModelVerified
+from obbgs_base.errors import in_words
 
 log = logging.getLogger(__name__)
 
@@ -245,9 +246,9 @@ class _Downlink:
     def _store_failed(self, error: Exception, now_s: float) -> None:
         """Say why there are no frames to send, once for each reason, and leave the store alone for a while."""
         self._store_retry_s = now_s + STORE_RETRY_S
-        if str(error) != self._store_problem:
-            self._store_problem = str(error)
-            log.error("%s; commands are obeyed, and it is tried again every %g s", error, STORE_RETRY_S)
+        if (problem := in_words(error)) != self._store_problem:
+            self._store_problem = problem
+            log.error("%s; commands are obeyed, and it is tried again every %g s", problem, STORE_RETRY_S)
 
     def start_again(self, error: Exception) -> None:
         """Begin anew after a failure and a pause; the log's error is an event to the ground.

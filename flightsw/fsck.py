@@ -18,6 +18,7 @@ from flightsw.store_index import (
 )
 from flightsw.transfer_numbers import FILE, numbers_line, parse_numbers, random_number
 from obbgs_base.checked import checked_line, copy_of, parse_checked_line, read_twice
+from obbgs_base.errors import in_words, reason
 from obbgs_base.files import sync_folder, write_whole
 
 TWICE = (
@@ -115,7 +116,7 @@ class _Check:
                 self._transaction()
                 self._files_that_stand_twice()
         except OSError as error:
-            raise StoreError(f"cannot check {self.folder}: {error}") from error
+            raise StoreError(f"cannot check {self.folder}: {in_words(error)}") from error
         self.report.frames = len(found)
         return self.report
 
@@ -234,7 +235,7 @@ class _Check:
                 except FileNotFoundError:
                     continue
                 except (OSError, ValueError) as error:
-                    damaged.append(f"{each.name}: {error}")
+                    damaged.append(f"{each.name}: {reason(error)}")
             if len(damaged) == 1 and self._note(f"{damaged[0]}; the good one of the two replaces it"):
                 read_twice(path, lambda problem: None)
             elif len(damaged) == 2:

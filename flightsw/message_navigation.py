@@ -12,6 +12,7 @@ from flightsw.icd.ndm.orbit import NoState
 from flightsw.icd.ndm.text import MAX_NDM_BYTES
 from flightsw.navigation import SatelliteStates
 from flightsw.orbit import propagate
+from obbgs_base.errors import reason
 from obbgs_base.files import read_bounded
 
 SCHEME = "ndm://"
@@ -35,7 +36,7 @@ class MessageNavigation:
             paths = [path for path in sorted(folder.iterdir()) if role_of(path.name)]
             self.formation = Formation.of({path.name: read_bounded(path, MAX_NDM_BYTES) for path in paths})
         except OSError as error:
-            raise NavigationError(f"no navigation messages in {folder}: {error.strerror}") from error
+            raise NavigationError(f"no navigation messages in {folder}: {reason(error)}") from error
         except ConfigError as error:
             raise NavigationError(f"{folder}: {error}") from error
         self._target_tle = target_tle

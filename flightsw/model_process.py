@@ -23,6 +23,7 @@ from flightsw.errors import TriageError, TriageMissing
 from flightsw.icd.frame import decode_frame
 from flightsw.icd.packet import PacketError
 from flightsw.triage import Renderer, rank_frame
+from obbgs_base.errors import reason
 
 NICENESS = 10  # the link and capture have priority
 FIRST_TO_GO = (
@@ -77,7 +78,7 @@ def main() -> None:
     try:
         renderer = tried(Path(task.model), task.width, task.height, K)
     except (TriageError, OSError, MemoryError) as error:
-        problem = str(error) or "it needs more memory than it may have"
+        problem = "it needs more memory than it may have" if isinstance(error, MemoryError) else reason(error)
         _answer({"problem": problem, "is_unfit": not isinstance(error, TriageMissing | OSError)})
         return
     _answer({"sha256": renderer.sha256.hex()})
@@ -108,7 +109,7 @@ def ranking(renderer: Renderer, container: Path, K: np.ndarray) -> dict[str, Any
     try:
         ranked = rank_frame(renderer, decode_frame(container.read_bytes()), container, K)
     except (PacketError, OSError, TriageError, MemoryError) as error:
-        return {"problem": str(error) or repr(error)}
+        return {"problem": reason(error)}
     return dataclasses.asdict(ranked) | {"path": str(container)}
 
 

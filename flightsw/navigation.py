@@ -32,6 +32,7 @@ import numpy as np
 from flightsw.errors import NavigationError
 from flightsw.icd.mission import NavigationSection
 from flightsw.icd.quaternion import quat_to_matrix, slerp
+from obbgs_base.errors import reason
 
 MAX_LINE_BYTES = 16_384
 MAX_STATES = 4096  # kept behind the newest one
@@ -229,7 +230,7 @@ class NavigationStream:
             try:
                 self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
             except OSError as error:
-                raise NavigationError(f"no navigation states in {path}: {error.strerror}") from error
+                raise NavigationError(f"no navigation states in {path}: {reason(error)}") from error
 
     def close(self) -> None:
         for stream in (self._socket, self._descriptor):

@@ -5,10 +5,11 @@ import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from flightsw.icd.config import ConfigError, build, in_file, parse_yaml
+from flightsw.icd.config import ConfigError, build, in_file, keys_below, parse_yaml, require
 from flightsw.icd.mission import Mission
 from flightsw.icd.ndm.orbit import two_lines
 from flightsw.icd.ndm.text import MAX_NDM_BYTES, is_message
+from obbgs_base.errors import reason
 from obbgs_base.files import read_bounded, write_whole
 
 EXAMPLE = Path(__file__).with_name(
@@ -33,29 +34,29 @@ def write_mission(
         target_tle, chaser_tle: files with two lines, or three with a name, or with an OMM of CCSDS.
         target_size_m: largest dimension.
         picture: width and height, px, as 1024x1024, or 1024x1024x3 in colour; the line of sight meets its middle.
-        start_utc: ISO 8601; None: an hour from now.
+        start_utc: ISO 8601, or now; None: an hour from now.
 
     Raises:
         ConfigError: an option or an element is wrong, or `out` is there already or cannot be written.
     """
-    size = re.fullmatch(r"(\d{1,5})x(\d{1,5})(x[13])?", picture)
+    size = re.fullmatch(r"(\d{1,9})x(\d{1,9})(x[13])?", picture)
     if size is None:
         raise ConfigError(
             "--picture",
             f"expected width and height in pixels, such as 1024x768, or 1024x768x3 in colour, got {picture!r}",
         )
-    for option, value in (
-        ("--target-size", target_size_m),
-        ("--focal-length", focal_length_mm),
-        ("--pixel-pitch", pixel_pitch_um),
+    for option, value, least, most, unit in (
+        ("--target-size", target_size_m, 0.01, 1000, "m"),
+        ("--focal-length", focal_length_mm, 1, 100_000, "mm"),
+        ("--pixel-pitch", pixel_pitch_um, 0.5, 100, "micrometres"),
     ):
-        if not (math.isfinite(value) and value > 0):
-            raise ConfigError(option, f"must be positive, got {value:g}")
+        require(least <= value <= most, option, f"expected {least:g} to {most:g} {unit}, got {value:g}")
     width, height = int(size[1]), int(size[2])
     focal_px = 1e3 * focal_length_mm / pixel_pitch_um
     field_deg = 2 * math.degrees(math.atan(width / 2 / focal_px))
-    if start_utc is None:
-        start_utc = (datetime.now(UTC) + UNTIL_FIRST_TRIGGER).strftime("%Y-%m-%dT%H:%M:00Z")
+    if start_utc in (None, "now"):
+        first = datetime.now(UTC) + (UNTIL_FIRST_TRIGGER if start_utc is None else timedelta(0))
+        start_utc = first.strftime("%Y-%m-%dT%H:%M:%SZ")
     text = EXAMPLE.read_text()
     text = re.sub(r"  # TanDEM-X .*\n", "", text)
     for key, path in (("target_tle", target_tle), ("chaser_tle", chaser_tle)):
@@ -74,14 +75,20 @@ def write_mission(
         ("target_extent_m", f"{target_size_m:g}", None),
     ):
         text = _set(text, key, value, remark)
-    with in_file(out):
+    with (
+        keys_below("--picture: width", "mission.camera.width"),
+        keys_below("--picture: height", "mission.camera.height"),
+        keys_below("--start", "mission.orbit.start_utc"),
+        keys_below(str(target_tle), "mission.orbit.target_tle"),
+        keys_below(str(chaser_tle), "mission.orbit.chaser_tle"),
+    ):
         build(Mission, parse_yaml(text.encode(), "mission"), "mission")
     if out.exists():
         raise ConfigError(str(out), "exists already; choose another name, or remove it first")
     try:
         write_whole(out, text.encode())
     except OSError as error:
-        raise ConfigError(str(out), f"cannot be written: {error.strerror}") from error
+        raise ConfigError(str(out), f"cannot be written: {reason(error)}") from error
 
 
 def _elements(path: Path) -> list[str]:
@@ -92,8 +99,8 @@ def _elements(path: Path) -> list[str]:
             text = "\n".join(two_lines(content)) if is_message(content) else content.decode()
         lines = [line.rstrip() for line in text.splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise ConfigError(str(path), f"cannot read the two-line elements: {reason}") from error
+        why = reason(error) if isinstance(error, OSError) else "it is no text"
+        raise ConfigError(str(path), f"cannot read the two-line elements: {why}") from error
     elements = lines[-2:]
     if len(lines) not in (2, 3) or any('"' in line or "\\" in line for line in elements):
         raise ConfigError(

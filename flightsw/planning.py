@@ -69,18 +69,23 @@ def pass_plan(mission: Mission) -> PassPlan:
     end_ns = triggers[-1] + round(mission.bracket.interval_s * NS)
     crossings = shadow_crossings(mission.orbit.target_tle, triggers[0], end_ns)
     shadow = [(_utc(utc_ns), "enters" if enters else "leaves") for utc_ns, enters in crossings]
-    ranges_m = [bracket.range_m for bracket in brackets]
-    view, problems = field_of_view(mission, min(ranges_m), max(ranges_m))
+    view, problems = field_of_view(mission, [bracket.range_m for bracket in brackets])
+    if stale := sum(not bracket.pose_valid for bracket in brackets):
+        problems.append(
+            f"the elements are more than {mission.orbit.max_element_age_days:g} days from {stale} of {len(brackets)} "
+            "brackets, whose poses will be marked invalid: are orbit.start_utc and the elements right?"
+        )
     return PassPlan(view, problems, brackets, passes, shadow)
 
 
-def field_of_view(mission: Mission, least_m: float, greatest_m: float) -> tuple[str, list[str]]:
+def field_of_view(mission: Mission, ranges_m: list[float]) -> tuple[str, list[str]]:
     """Return in words the camera's field of view, how much of it the target fills, and what is implausible about it.
 
     Args:
-        least_m, greatest_m: range of the target in the pass.
+        ranges_m: of the target at each bracket.
     """
     camera, extent_m = mission.camera, mission.bracket.target_extent_m
+    least_m, greatest_m = min(ranges_m), max(ranges_m)
     degrees = [
         float(np.degrees(np.arctan((size - centre) / focal) + np.arctan(centre / focal)))
         for size, centre, focal in (
@@ -109,13 +114,13 @@ def field_of_view(mission: Mission, least_m: float, greatest_m: float) -> tuple[
         )
     if most_px < FEWEST_PX:
         problems.append(
-            f"the target is {most_px:.1f} px at {least_m:.0f} m, fewer than {FEWEST_PX} px show nothing: are fx_px and "
-            "bracket.target_extent_m right?"
+            f"the target is {most_px:.1f} px at {least_m:.0f} m, fewer than {FEWEST_PX} px show nothing: are the "
+            "orbits, fx_px and bracket.target_extent_m right?"
         )
     if least_px > side_px:
         problems.append(
-            f"the target does not fit into the picture even at {greatest_m:.0f} m: are fx_px and "
-            "bracket.target_extent_m right?"
+            f"the target does not fit into the picture even at {greatest_m:.0f} m: are the orbits, "
+            "fx_px and bracket.target_extent_m right?"
         )
     return view, problems
 

@@ -13,6 +13,7 @@ from flightsw.icd.packet import PacketError
 from flightsw.store import FrameStore
 from flightsw.triage import Ranked, sending_order, sent_view
 from flightsw.triage_worker import ModelFailed, ModelVerified, TriageWorker
+from obbgs_base.errors import in_words
 from obbgs_base.files import sync_folder
 
 log = logging.getLogger(__name__)
@@ -136,7 +137,9 @@ class Ranking:
                 os.replace(result.path, self.model_path)
                 sync_folder(self._store.folder)
             except OSError as error:
-                log.warning("the model is used until the next start only, it cannot be kept: %s", error)
+                log.warning(
+                    "the model is used until the next start only, it cannot be kept: %s", in_words(error)
+                )
         else:
             with contextlib.suppress(OSError):
                 result.path.unlink()
@@ -158,4 +161,4 @@ class Ranking:
         try:
             os.replace(self.model_path, self.model_path.with_name("model.onnx.failed"))
         except OSError as error:
-            log.warning("the model that failed is tried again at the next start: %s", error)
+            log.warning("the model that failed is tried again at the next start: %s", in_words(error))

@@ -11,6 +11,7 @@ from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import BracketSection, Mission
 from flightsw.store import RESERVE, write_with_reserve
 from obbgs_base.checked import copy_of, read_twice, write_twice
+from obbgs_base.errors import in_words, reason
 from obbgs_base.files import set_aside
 
 log = logging.getLogger(__name__)
@@ -64,7 +65,7 @@ def load_settings(folder: Path, mission: Mission) -> Settings:
         tree["max_error_dn"] = tree.pop("near")
         settings = Settings(**tree)
     except (OSError, ValueError, TypeError, KeyError) as error:
-        log.error("%s is not usable: safe mode, and the mission's own settings: %s", path, error)
+        log.error("%s is not usable: safe mode, and the mission's own settings: %s", path, reason(error))
         safe = dataclasses.replace(default, safe_mode=True)
         if isinstance(error, OSError):  # the disk may be read again later
             return safe
@@ -93,4 +94,4 @@ def save_settings(folder: Path, settings: Settings) -> None:
     try:
         write_twice(folder / FILE, tree, lambda file, data: write_with_reserve(file, data, folder / RESERVE))
     except OSError as error:
-        raise StoreError(f"cannot keep the settings: {error}") from error
+        raise StoreError(f"cannot keep the settings: {in_words(error)}") from error

@@ -32,6 +32,7 @@ from flightsw.store_index import (
 )
 from flightsw.transfer_numbers import TransferNumbers, random_number, store_identity
 from obbgs_base.checked import checked_line, read_twice, write_twice
+from obbgs_base.errors import in_words
 from obbgs_base.files import append_line, sync_folder, write_whole
 
 log = logging.getLogger(__name__)
@@ -328,7 +329,11 @@ class FrameStore:
     def _tell_refusal(self, action: str, error: OSError) -> None:
         if not self._refusal_told:
             self._refusal_told = True
-            log.error("the store cannot be written to, what it holds is sent: cannot %s: %s", action, error)
+            log.error(
+                "the store cannot be written to, what it holds is sent: cannot %s: %s",
+                action,
+                in_words(error),
+            )
 
     def _markers(self) -> list[int]:
         names = (entry.name for entry in os.scandir(self._outbox))
@@ -471,7 +476,7 @@ class FrameStore:
             try:
                 state.add(index_entry(path, path.read_bytes()))
             except OSError as error:  # a bad sector costs this frame alone
-                log.warning("frame %d cannot be read: %s", frame_id, error)
+                log.warning("frame %d cannot be read: %s", frame_id, in_words(error))
                 if dropped is None:
                     state.add(DroppedFrame(frame_id, "damaged"))
             except PacketError as error:
@@ -618,4 +623,4 @@ def _disk_errors(action: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise StoreError(f"cannot {action}: {error}") from error
+        raise StoreError(f"cannot {action}: {in_words(error)}") from error

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from flightsw.icd.transfer import STORE_BYTES
 from obbgs_base.checked import checked_line, has_checksum, parse_checked_line, read_twice, write_twice
+from obbgs_base.errors import in_words
 
 log = logging.getLogger(__name__)
 FILE = "transaction"
@@ -94,10 +95,10 @@ def store_identity(folder: Path, write: Write) -> bytes:
             if len(store) == STORE_BYTES:
                 return store
     except (OSError, ValueError, KeyError, TypeError) as error:
-        log.error("the store's identity is lost and drawn again: %s", error)
+        log.error("the store's identity is lost and drawn again: %s", in_words(error))
     store = secrets.token_bytes(STORE_BYTES)
     try:
         write_twice(path, {"store": store.hex()}, write)
     except OSError as error:
-        log.error("the store's identity cannot be kept: %s", error)
+        log.error("the store's identity cannot be kept: %s", in_words(error))
     return store

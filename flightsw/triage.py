@@ -17,6 +17,7 @@ from flightsw.errors import TriageError, TriageMissing
 from flightsw.icd.frame import FLAG_ECLIPSE, FLAG_POSE_VALID, Frame, decode_frame, read_header
 from flightsw.icd.model_file import MAX_MODEL_BYTES, SENSOR_METADATA, ModelUnfit, check_model
 from flightsw.icd.packet import PacketError
+from obbgs_base.errors import reason
 from obbgs_base.extras import install_command
 
 TILE_ROWS, TILE_COLUMNS = 20, 40  # px, as in the ground's densification
@@ -63,7 +64,7 @@ def verified_model(path: Path) -> bytes:
         content = path.read_bytes()
         check_model(content)
     except OSError as error:
-        raise TriageError(f"{path}: {error.strerror}") from error
+        raise TriageError(f"{path}: {reason(error)}") from error
     except ModelUnfit as error:
         raise TriageError(f"{path} {error}") from error
     return content

@@ -9,6 +9,8 @@ import socket
 import time
 from collections.abc import Callable
 
+from obbgs_base.errors import reason
+
 log = logging.getLogger(__name__)
 
 
@@ -24,7 +26,7 @@ def notify(state: str) -> None:
             channel.setblocking(False)  # a full queue must not stop the flight software
             channel.sendto(state.encode(), address)
     except OSError as error:
-        log.warning("the service manager was not told %s: %s", state, error)
+        log.warning("the service manager was not told %s: %s", state, reason(error))
 
 
 class Watchdog:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from obbgs_base.errors import Interrupted, ObbgsError
+from obbgs_base.errors import Interrupted, ObbgsError, in_words
 from obbgs_base.extras import how_to_install, installed_package
 from obbgs_base.output import open_standard_streams, output_may_fail
 
@@ -89,13 +89,6 @@ def run(app: typer.Typer, tool: str) -> None:
         _end(tool, str(error), 2)
     except OSError as error:
         _end(tool, in_words(error), 1)
-
-
-def in_words(error: OSError) -> str:
-    """Return what an error of the system says, without its number: `FILE: No such file or directory`."""
-    if error.strerror is None:
-        return str(error) or type(error).__name__  # a TimeoutError may say nothing
-    return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
 
 
 class _ToStderr(logging.StreamHandler):

@@ -1,6 +1,10 @@
-"""The base class of every error that is raised on purpose."""
+"""The base class of every error that is raised on purpose, and what errors of the system say in words."""
 
+import os
+import re
 from typing import ClassVar
+
+NUMBER = re.compile(r"\s*\[(Errno|Error Code) -?\d+\]:?")
 
 
 class ObbgsError(Exception):
@@ -14,3 +18,21 @@ class ObbgsError(Exception):
 
 class Interrupted(ObbgsError):
     """Work was asked to stop before its end; the message says what is kept."""
+
+
+def reason(error: BaseException) -> str:
+    """Return what went wrong as one line, of a system's error without number and file: `No such file or directory`."""
+    said = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        said = str(error.strerror)
+        if error.errno and NUMBER.search(said):  # pyserial repeats the error that it met, with its file
+            said = os.strerror(error.errno)
+    return (
+        NUMBER.sub("", " ".join(said.split())).strip() or type(error).__name__
+    )  # a TimeoutError may say nothing
+
+
+def in_words(error: BaseException) -> str:
+    """Return what went wrong as one line, with the file of a system's error before it: `FILE: Permission denied`."""
+    file = getattr(error, "filename", None) if isinstance(error, OSError) else None
+    return reason(error) if file is None else f"{os.fspath(file)}: {reason(error)}"

@@ -12,6 +12,8 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
+from obbgs_base.errors import reason
+
 log = logging.getLogger(__name__)
 MAX_WAITING_BYTES = 1 << 20  # printed and not yet taken; a screen of the console has some 20 kB
 LAST_S = 2.0  # at the end, for what still waits
@@ -144,7 +146,7 @@ class _Writer(io.RawIOBase):
             except BlockingIOError:  # another process has set it so
                 select.select([], [self._descriptor], [])
             except OSError as error:
-                return error.strerror or str(error)
+                return reason(error)
         return ""
 
     def _lose(self, piece: bytes, reason: str) -> None:

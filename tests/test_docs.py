@@ -2,11 +2,13 @@
 
 import importlib.util
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from flightsw.icd.link_url import parse_link_url
 from tests.benchmarks.figures import PAGES as PAGES_WITH_FIGURES
 from tests.benchmarks.figures import blocks, wrong
 
@@ -76,6 +78,31 @@ def test_a_name_means_the_same_in_all_commands_and_there_are_not_too_many(maker)
     given = {option for words in ours for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", words)}
     known = {option.strip("`") for name in meanings for option in name.split(", ")}
     assert given - known - {"--json", "--help", "--version", "--install-completion"} == set()
+
+
+def shown(page: Path) -> list[list[str]]:
+    """Return the words of each command of ours in a page's shell blocks."""
+    blocks = re.findall(r"(?ms)^```sh\n(.*?)^```", page.read_text())
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    words = [shlex.split(line, comments=True) for line in lines]
+    return [each[: each.index(">")] if ">" in each else each for each in words if each]
+
+
+def test_every_command_that_is_shown_is_one_that_is_taken(maker):
+    """Each option and argument is given to its command's own parser, each link and camera to the reader of URLs."""
+    known = {tuple(name.split()): command for tool in maker.TOOLS for name, command in maker.commands(tool)}
+    taken = set()
+    for words in [words for page in PAGES if "experiments" not in page.parts for words in shown(page)]:
+        name = next((tuple(words[:n]) for n in (3, 2) if tuple(words[:n]) in known), None)
+        if name is None or "..." in words:
+            continue
+        given = known[name].make_context(" ".join(name), words[len(name) :]).params
+        if (link := given.get("link")) and not link.endswith("_URL"):  # FLIGHT_URL: as printed by hil link
+            parse_link_url(link)
+        camera = given.get("camera")
+        assert camera is None or camera.split("://")[0] in ("hil", "gige", "mine"), words
+        taken.add(name)
+    assert len(taken) > 25
 
 
 def test_every_page_is_in_the_site():

@@ -166,3 +166,39 @@ def test_no_function_is_longer_than_a_screen_and_a_half():
                 if lines > LONGEST_FUNCTION:
                     long[f"{name}.{node.name}"] = lines
     assert long == {}
+
+
+OF_THE_SYSTEM = {
+    "OSError",
+    "FileNotFoundError",
+    "PermissionError",
+    "TimeoutError",
+    "CanError",
+    "CanOperationError",
+}
+TELLING = {"log.info", "log.warning", "log.error", "str"}
+
+
+def test_what_the_system_says_is_told_in_words():
+    """An error of the system says `[Errno 2] ...: 'FILE'`; `reason` and `in_words` leave the number out."""
+    as_it_stands = []
+    for name, path in modules().items():
+        for handler in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(handler, ast.ExceptHandler) or handler.type is None:
+                continue
+            caught = {getattr(n, "id", getattr(n, "attr", "")) for n in ast.walk(handler.type)}
+            if (
+                not caught & OF_THE_SYSTEM or name == "hil.sky.blender_worker"
+            ):  # Blender's Python has no obbgs_base
+                continue
+            for node in ast.walk(handler):
+                told = [node.value] if isinstance(node, ast.FormattedValue) and node.conversion == -1 else []
+                if (
+                    isinstance(node, ast.Call)
+                    and ast.unparse(node.func) in TELLING
+                    and "%r" not in ast.unparse(node)
+                ):
+                    told = node.args
+                if any(isinstance(each, ast.Name) and each.id == handler.name for each in told):
+                    as_it_stands.append(f"{name}:{node.lineno}")
+    assert as_it_stands == []

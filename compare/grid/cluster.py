@@ -11,6 +11,7 @@ from distributed import Client, LocalCluster
 from distributed.security import Security
 
 from compare.errors import CompareError
+from obbgs_base.errors import reason
 
 log = logging.getLogger(__name__)
 USED_MEMORY = 0.9  # of what is available: the rest is for everybody else
@@ -56,7 +57,7 @@ def connected(scheduler: str | None, workers: int | None, needs_mb: list[float])
             try:
                 client = Client(scheduler, timeout="30s", set_as_default=False)
             except (OSError, ValueError, TypeError) as error:
-                raise CompareError(f"no dask scheduler answers at {scheduler}: {error}") from error
+                raise CompareError(f"no dask scheduler answers at {scheduler}: {reason(error)}") from error
             with client:
                 yield client
             return

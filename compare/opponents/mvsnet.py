@@ -15,6 +15,7 @@ from compare.opponents.depth_maps import DepthMap, FusionSettings, reconstruct_b
 from compare.opponents.mvsnet_network import MULTIPLE, STRIDE, MvsNet
 from compare.opponents.reconstruction import Reconstruction, Work
 from compare.opponents.stereo_views import View, Views, depth_range_m, neighbours, prepare
+from obbgs_base.errors import reason
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
@@ -81,7 +82,7 @@ def load_network(path: Path) -> tuple[MvsNet, str, str]:
         content = path.read_bytes()
     except OSError as error:
         raise WeightsUnfit(
-            f"{path}: cannot be read ({error.strerror}); give a checkpoint of MVSNet"
+            f"{path}: cannot be read ({reason(error)}); give a checkpoint of MVSNet"
         ) from error
     try:
         kept = torch.load(path, map_location="cpu", weights_only=True)

@@ -20,7 +20,7 @@ from compare.opponents.nerf_field import EncodingSize, Field
 from compare.opponents.nerf_pictures import Nerf
 from compare.opponents.nerf_rays import Occupancy, on_device, rays_of
 from compare.opponents.reconstruction import Reconstruction, Work
-from obbgs_base.errors import Interrupted
+from obbgs_base.errors import Interrupted, reason
 from obbgs_base.files import set_aside, write_whole
 from obbgs_core.errors import Diverged, ReconstructionError
 from obbgs_core.frames import TrainingFrame, cameras_of, mean_exposure_s, usable
@@ -291,7 +291,7 @@ class Training:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(path, content.getvalue())
         except OSError as error:  # a full disk must not end the training
-            log.warning("step %d: %s cannot be written: %s", self.steps_done, path, error)
+            log.warning("step %d: %s cannot be written: %s", self.steps_done, path, reason(error))
             return False
         return True
 
@@ -303,7 +303,7 @@ class Training:
             saved = torch.load(path, map_location="cpu", weights_only=True)
             why = "" if saved["fingerprint"] == self.fingerprint else "belongs to another training or version"
         except (pickle.UnpicklingError, RuntimeError, OSError, EOFError, LookupError, TypeError) as error:
-            saved, why = {}, f"is damaged or of another version ({error})"
+            saved, why = {}, f"is damaged or of another version ({reason(error)})"
         if why:
             kept = set_aside(path).name
             log.warning(

@@ -5,6 +5,7 @@ import functools
 from typing import Any
 
 from flightsw.errors import CaptureError
+from obbgs_base.errors import reason
 
 # GenICam pixel formats (PFNC 2.x) that are understood here: name, number, bits of a sample, Bayer pattern.
 PIXEL_FORMATS = {
@@ -110,7 +111,7 @@ class Aravis:
             self._glib = ctypes.CDLL("libglib-2.0.so.0")
         except OSError as error:
             raise CaptureError(
-                f"Aravis is missing ({error}); on Debian: apt-get install libaravis-0.8-0"
+                f"Aravis is missing ({reason(error)}); on Debian: apt-get install libaravis-0.8-0"
             ) from error
         self._glib.g_clear_error.argtypes = (ctypes.POINTER(ctypes.POINTER(_GError)),)
         self._gobject.g_object_unref.argtypes = (P,)

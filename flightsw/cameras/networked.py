@@ -12,6 +12,7 @@ import numpy as np
 
 from flightsw.cameras.camera import OWN_CLOCK_ANSWER_S, Exposure
 from flightsw.errors import CameraLost, CaptureError
+from obbgs_base.errors import reason
 
 CONNECT_S = 10.0
 MAX_BYTES = 8192 * 8192 * 3 * 2
@@ -56,7 +57,9 @@ class NetworkedCamera:
                 host, _, port = address.rpartition(":")
                 connection = socket.create_connection((host, int(port)), timeout=CONNECT_S)
         except (OSError, ValueError) as error:
-            raise CameraLost(f"no camera at {self._url}: {error}; start the camera's server") from error
+            raise CameraLost(
+                f"no camera at {self._url}: {reason(error)}; start the camera's server"
+            ) from error
         connection.settimeout(OWN_CLOCK_ANSWER_S)
         self._stream = connection.makefile("rwb")
         connection.close()  # the stream keeps the connection
@@ -80,7 +83,7 @@ class NetworkedCamera:
             raise
         except (OSError, KeyError, TypeError, ValueError) as error:
             self.close()
-            raise CameraLost(f"the camera's reply cannot be read: {error}") from error
+            raise CameraLost(f"the camera's reply cannot be read: {reason(error)}") from error
 
     def close(self) -> None:
         """Close the connection; the next exposure connects anew."""

@@ -35,6 +35,7 @@ class ConfigError(ObbgsError, ValueError):
     exit_code = 2
 
     def __init__(self, path: str, problem: str, file: str = ""):
+        problem = " ".join(problem.splitlines())  # what came may hold the ends of lines
         super().__init__(f"{file}: {path}: {problem}" if file else f"{path}: {problem}")
         self.path, self.problem, self.file = path, problem, file
 
@@ -69,11 +70,11 @@ def in_file(file: str | Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def keys_below(path: str, own_path: str) -> Iterator[None]:
-    """Let a ConfigError about a key below `own_path`, as a section calls itself, name it below `path` instead."""
+    """Let a ConfigError about `own_path`, as a section calls itself, or a key below it name `path` instead."""
     try:
         yield
     except ConfigError as error:
-        if not error.path.startswith(f"{own_path}."):
+        if not error.path.startswith((f"{own_path}.", f"{own_path}[")) and error.path != own_path:
             raise
         moved = path + error.path.removeprefix(own_path)
         raise ConfigError(moved, error.problem, error.file) from error.__cause__
@@ -116,7 +117,8 @@ def parse_yaml(content: bytes, path: str) -> Any:
     except ConfigError:
         raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # 2026-13-01 is a ValueError of PyYAML's
-        raise ConfigError(path, f"is not valid YAML: {' '.join(str(error).split())}") from error
+        problem = re.sub(r',? in "<byte string>",', " at", " ".join(str(error).split()))
+        raise ConfigError(path, f"is not valid YAML: {problem}") from error
 
 
 def assignment(text: str, option: str = "--set") -> tuple[str, Any]:

@@ -14,6 +14,7 @@ from flightsw.icd.pose_sections import (
     TargetAttitudeSection,
 )
 from flightsw.icd.tle import check_tle
+from obbgs_base.errors import reason
 from obbgs_base.files import read_bounded
 
 Checksum = Literal["crc-32", "crc-32c", "modular"]  # of CFDP
@@ -39,7 +40,9 @@ class OrbitSection:
         try:
             moment = datetime.fromisoformat(self.start_utc)
         except ValueError as error:
-            raise ConfigError(path, f"expected ISO 8601, got {self.start_utc!r}") from error
+            raise ConfigError(
+                path, f"expected a time such as 2026-07-21T10:52:30Z, got {self.start_utc!r}"
+            ) from error
         require(moment.tzinfo is not None, path, "say the time zone: end the time with Z")
         require(
             2000 <= moment.year <= 2052,
@@ -307,7 +310,10 @@ def load_mission(path: str | Path) -> Mission:
     try:
         content = read_bounded(Path(path), MAX_YAML_BYTES)
     except OSError as error:
-        raise ConfigError(str(path), f"cannot read the mission file: {error.strerror}") from error
+        advice = "; name one with --mission, `flightsw mission new` makes one" * isinstance(
+            error, FileNotFoundError
+        )
+        raise ConfigError(str(path), f"cannot read the mission file: {reason(error)}{advice}") from error
     with in_file(path):
         tree = parse_yaml(content, "mission")
         return build(Mission, tree, "mission", sha256=hashlib.sha256(content).hexdigest())

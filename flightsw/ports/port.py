@@ -13,7 +13,7 @@ import can
 
 from flightsw.icd.can import IsoTpChannels
 from flightsw.icd.link_url import parse_link_url
-from obbgs_base.errors import ObbgsError
+from obbgs_base.errors import ObbgsError, reason
 
 log = logging.getLogger(__name__)
 
@@ -92,9 +92,9 @@ class Port:
             self._open()
         except self.OPEN_ERRORS as error:
             if must_be_there:
-                raise LinkError(f"cannot open {self.url.device}: {error}") from error
+                raise LinkError(f"cannot open {self.url.device}: {reason(error)}") from error
             self._is_outage = True
-            log.warning("%s is awaited: it cannot be opened yet: %s", self.url.device, error)
+            log.warning("%s is awaited: it cannot be opened yet: %s", self.url.device, reason(error))
 
     def __enter__(self) -> Self:
         return self
@@ -144,7 +144,7 @@ class Port:
     def _hang_up(self, error: Exception) -> None:
         self._note_bytes()
         if not self._is_outage:
-            log.warning("%s hung up: %s", self.url.device, error)
+            log.warning("%s hung up: %s", self.url.device, reason(error))
             self.hang_ups += 1
         self._is_outage = True
         self._bytes_at_outage = (self.bytes_read, self.bytes_written)

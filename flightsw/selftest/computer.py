@@ -16,6 +16,7 @@ from flightsw.icd.frame import Frame, PoseTag, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.icd.reference_frames import DAY_NS, UNIX_EPOCH_JD
 from flightsw.selftest.finding import Finding
+from obbgs_base.errors import reason
 from obbgs_base.files import write_whole
 
 NS = 1_000_000_000
@@ -91,7 +92,7 @@ def check_disk(mission: Mission, store: Path) -> list[Finding]:
     except OSError as error:
         probe.unlink(missing_ok=True)
         advice = "mount the disk for writing, give this user the folder (chown), or name another --store"
-        return [Finding.failed("disk", f"{folder} cannot be written: {error.strerror or error}", advice)]
+        return [Finding.failed("disk", f"{folder} cannot be written: {reason(error)}", advice)]
     if not came_back:
         advice = "replace the disk: it does not keep what is written"
         return [Finding.failed("disk", f"{folder} returned other bytes than were written", advice)]

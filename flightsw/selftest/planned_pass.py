@@ -14,6 +14,7 @@ from flightsw.pose import open_navigation
 from flightsw.selftest.finding import Finding
 
 NS = 1_000_000_000
+MOST_LOOKED_AT = 400  # brackets, spread over the pass, for the range of the target
 NEWER = "put newer two-line elements into the mission file, on the ground as well"
 
 
@@ -77,15 +78,15 @@ def check_view(mission: Mission) -> list[Finding]:
     Says nothing where the orbits cannot be computed, which `check_orbit` tells.
     """
     orbit, bracket = mission.orbit, mission.bracket
-    span_ns = round((bracket.count - 1) * bracket.interval_s * NS)
     ranges_m = []
-    for utc_ns in (orbit.start_utc_ns, orbit.start_utc_ns + span_ns):
+    for trigger in np.linspace(0, bracket.count - 1, min(bracket.count, MOST_LOOKED_AT)).round().tolist():
+        utc_ns = orbit.start_utc_ns + round(trigger * bracket.interval_s * NS)
         try:
             states = [propagate(tle, utc_ns) for tle in (orbit.target_tle, orbit.chaser_tle)]
         except OrbitError:
             return []
         ranges_m.append(float(np.linalg.norm(states[0].position_m - states[1].position_m)))
-    view, problems = field_of_view(mission, min(ranges_m), max(ranges_m))
+    view, problems = field_of_view(mission, ranges_m)
     advice = "correct mission.camera and bracket.target_extent_m, and look at `flightsw plan`"
     return [Finding.warning("view", problem, advice) for problem in problems] or [Finding.ok("view", view)]
 

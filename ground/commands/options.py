@@ -9,6 +9,7 @@ import typer
 from flightsw.icd.auth import Key
 from flightsw.icd.mission import METHODS, VARIANTS, ConfigError
 from obbgs_base.command_line import KEY_HELP, MISSION_HELP, SEED_HELP, SET_HELP
+from obbgs_base.errors import reason
 
 SessionDir = Annotated[Path, typer.Option("--session", help="The session folder.")]
 RunName = Annotated[str, typer.Option("--name", help="The run's name: its folder below runs/.")]
@@ -40,7 +41,7 @@ def listening_key(file: Path | None) -> Key | None:
     try:
         return Key.parse(path.read_text(), str(path))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(str(path), f"cannot read the key: {error}") from error
+        raise ConfigError(str(path), f"cannot read the key: {reason(error)}") from error
 
 
 class Quality(StrEnum):

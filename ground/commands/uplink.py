@@ -10,6 +10,7 @@ import typer
 from flightsw.icd.mission import load_mission
 from ground.commands.options import UplinkCommand, listening_key
 from obbgs_base.command_line import KEY_HELP, LINK_HELP, MISSION_HELP, AsJson
+from obbgs_base.errors import reason
 from obbgs_base.output import output_may_fail
 
 if TYPE_CHECKING:
@@ -96,8 +97,7 @@ def _text_of(script: Path | None) -> str:
     try:
         return script.read_text()
     except (OSError, UnicodeDecodeError) as error:
-        reason = (isinstance(error, OSError) and error.strerror) or error
-        raise SessionError(f"the script {script} cannot be read: {reason}") from error
+        raise SessionError(f"the script {script} cannot be read: {reason(error)}") from error
 
 
 def _sent(

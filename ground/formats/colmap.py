@@ -15,6 +15,7 @@ from flightsw.icd.quaternion import quat_to_matrix
 from ground.formats.pictures.files import FormatError, within
 from ground.formats.pictures.lens import Intrinsics
 from ground.formats.pictures.view import View
+from obbgs_base.errors import in_words
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +50,7 @@ def read_colmap(folder: Path) -> list[View]:
         try:
             found[model] = _read(model)
         except (ValueError, IndexError, KeyError, struct.error, OSError, OverflowError) as error:
-            raise FormatError(f"{model}: damaged or not a COLMAP model: {error}") from error
+            raise FormatError(f"{model}: damaged or not a COLMAP model: {in_words(error)}") from error
     if not found:
         raise FormatError(f"{folder}: no cameras and images files (.bin or .txt), nor in sparse/0")
     largest = max(found, key=lambda model: len(found[model]))

@@ -15,6 +15,7 @@ from ground.formats.axes import rigid_inverse
 from ground.formats.pictures.files import FormatError, pictures_in, read_header, within
 from ground.formats.pictures.lens import Intrinsics
 from ground.formats.pictures.view import View
+from obbgs_base.errors import reason
 
 COLUMNS = 17
 ROTATION_TOLERANCE = 1e-3
@@ -35,7 +36,7 @@ def read_llff(folder: Path) -> list[View]:
         with open(path, "rb") as file:
             rows = np.load(file, allow_pickle=False)
     except (OSError, ValueError, EOFError, MemoryError) as error:
-        raise FormatError(f"{path}: the poses cannot be read: {error}") from error
+        raise FormatError(f"{path}: the poses cannot be read: {reason(error)}") from error
     if rows.ndim != 2 or rows.shape[1] != COLUMNS or rows.dtype.kind != "f" or not np.isfinite(rows).all():
         raise FormatError(
             f"{path}: expected rows of {COLUMNS} finite numbers, got {rows.dtype} {list(rows.shape)}"

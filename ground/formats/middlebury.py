@@ -12,6 +12,7 @@ import numpy as np
 from ground.formats.pictures.files import FormatError, image_size, within
 from ground.formats.pictures.lens import Intrinsics
 from ground.formats.pictures.view import View
+from obbgs_base.errors import reason
 
 NUMBERS = 21  # of a picture: K, R and t
 ROTATION_TOLERANCE = 1e-3
@@ -32,7 +33,7 @@ def read_middlebury(folder: Path) -> list[View]:
         if int(count) != len(views):
             raise ValueError(f"expected {int(count)} pictures, as the first line says, got {len(views)}")
     except (OSError, ValueError) as error:
-        raise FormatError(f"{stated[0]}: {error}") from error
+        raise FormatError(f"{stated[0]}: {reason(error)}") from error
     return views
 
 

@@ -31,6 +31,7 @@ from ground.formats.photographs.exposures import middle_utc_ns, unposed_pictures
 from ground.formats.pictures.files import FormatError, Light
 from ground.formats.pictures.lens import StatedLens
 from ground.formats.pictures.view import View
+from obbgs_base.errors import in_words
 from obbgs_base.files import read_bounded
 
 CAMERA = "camera.yaml"
@@ -69,7 +70,7 @@ def read_ndm(folder: Path, table: dict[str, Light] | None = None) -> list[View]:
         files = {path.name: read_bounded(path, MAX_NDM_BYTES) for path in paths}
     except OSError as error:
         raise FormatError(
-            f"{error.filename}: {error.strerror}; expected {CAMERA}, target.oem, chaser.oem and chaser.aem there"
+            f"{in_words(error)}; expected {CAMERA}, target.oem, chaser.oem and chaser.aem there"
         ) from error
     with in_file(folder / CAMERA):
         camera = build(Camera, parse_yaml(content, "camera"), "camera")

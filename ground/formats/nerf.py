@@ -21,6 +21,7 @@ from ground.formats.pictures.files import KINDS, FormatError, image_size, within
 from ground.formats.pictures.lens import Intrinsics
 from ground.formats.pictures.views import Exported, View
 from ground.session.folder import SPLITS, FrameRecord, Session
+from obbgs_base.errors import reason
 from obbgs_base.files import read_bounded, write_whole
 
 log = logging.getLogger(__name__)
@@ -178,7 +179,7 @@ def load_transforms(path: Path) -> dict[str, Any]:
     try:
         tree = parse_json(read_bounded(path, MAX_JSON_BYTES), "transforms")
     except (OSError, ConfigError) as error:
-        raise FormatError(f"{path}: {error}") from error
+        raise FormatError(f"{path}: {reason(error)}") from error
     frames = tree.get("frames") if isinstance(tree, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise FormatError(f'{path}: expected an object with a list "frames"')

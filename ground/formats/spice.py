@@ -33,6 +33,7 @@ from ground.formats.photographs.exposures import middle_utc_ns, unposed_pictures
 from ground.formats.pictures.files import FormatError, Light, within
 from ground.formats.pictures.lens import Intrinsics, StatedLens
 from ground.formats.pictures.view import View
+from obbgs_base.errors import in_words
 from obbgs_base.files import read_bounded
 
 SCENE = "spice.yaml"
@@ -102,7 +103,7 @@ def read_spice(folder: Path, table: dict[str, Light] | None = None) -> list[View
         content = read_bounded(folder / SCENE, MAX_YAML_BYTES)
     except OSError as error:
         raise FormatError(
-            f"{error.filename}: {error.strerror}; expected {SCENE}, which names the kernels, the spacecraft, the "
+            f"{in_words(error)}; expected {SCENE}, which names the kernels, the spacecraft, the "
             "body and their frames"
         ) from error
     with in_file(folder / SCENE):

@@ -32,6 +32,7 @@ from ground.link.uplink import Uplinker, listening
 from ground.session.folder import SessionError
 from ground.session.telemetry import TelemetryLog
 from ground.session.writer import SessionWriter
+from obbgs_base.errors import in_words, reason
 from obbgs_base.files import write_whole
 
 log = logging.getLogger(__name__)
@@ -272,7 +273,7 @@ class _Ingest:
             return Verdict.REJECTED
         except OSError as error:
             self._store_failures += 1
-            log.error("frame %s cannot be written, the spacecraft keeps it: %s", name, error)
+            log.error("frame %s cannot be written, the spacecraft keeps it: %s", name, reason(error))
             return Verdict.UNSTORED
         if is_new:
             self.frames_received += 1
@@ -302,7 +303,7 @@ class _Ingest:
         try:
             self._writer.save(summary.losses, summary.bytes_received, self._telemetry.flight)
         except OSError as error:
-            log.error("session.json cannot be written: %s", error)
+            log.error("session.json cannot be written: %s", in_words(error))
 
     def status(self, now_s: float) -> Status:
         telemetry = self._telemetry

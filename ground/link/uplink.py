@@ -30,6 +30,7 @@ from flightsw.icd.transfer import UPLINK, Sender
 from ground.session.folder import SessionError
 from ground.session.telemetry import plain
 from obbgs_base.checked import checked_line, copy_of, each_copy, parse_line, read_twice, write_twice
+from obbgs_base.errors import reason
 from obbgs_base.files import append_line, write_whole
 
 log = logging.getLogger(__name__)
@@ -66,7 +67,7 @@ def make_key(path: Path, spi: int = 1) -> Key:
     except FileExistsError as error:
         raise ConfigError(str(error.filename), "exists already; a key is never overwritten") from error
     except OSError as error:
-        raise ConfigError(str(path), f"cannot write the key: {error.strerror}") from error
+        raise ConfigError(str(path), f"cannot write the key: {reason(error)}") from error
     return key
 
 
@@ -93,7 +94,7 @@ def move_counter(path: Path, last_used: int) -> int:
                 )
             _keep_counter(sent, key, counter)
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(str(path), f"cannot use the key and its counter: {error}") from error
+        raise ConfigError(str(path), f"cannot use the key and its counter: {reason(error)}") from error
     return counter
 
 
@@ -201,7 +202,7 @@ def submit(session: Path, key_file: Path, command: Command, model: Path | None, 
             }
             write_whole(folder / f"{counter:020d}.json", checked_line(job))
     except OSError as error:
-        raise SessionError(f"cannot leave the command in {folder}: {error.strerror or error}") from error
+        raise SessionError(f"cannot leave the command in {folder}: {reason(error)}") from error
     return counter
 
 
@@ -214,7 +215,7 @@ def check_model(model: Path) -> None:
     try:
         check_for_triage(model.read_bytes())
     except OSError as error:
-        raise ConfigError(str(model), f"cannot read the model: {error.strerror}") from error
+        raise ConfigError(str(model), f"cannot read the model: {reason(error)}") from error
     except ModelUnfit as error:
         raise ConfigError(str(model), f"{error}; expected a run's model.onnx") from error
 
@@ -223,7 +224,7 @@ def _model_command(model: Path) -> tuple[bytes, Command]:
     try:
         content = model.read_bytes()
     except OSError as error:
-        raise ConfigError(str(model), f"cannot read the model: {error.strerror}") from error
+        raise ConfigError(str(model), f"cannot read the model: {reason(error)}") from error
     if not 0 < len(content) <= MAX_MODEL_BYTES:
         raise ConfigError(
             str(model),
@@ -262,7 +263,7 @@ def _next_counter(key_file: Path, folder: Path) -> Iterator[tuple[Key, int]]:
             _keep_counter(sent, key, counter)
             yield key, counter
     except (FileNotFoundError, PermissionError, UnicodeDecodeError) as error:
-        raise ConfigError(str(key_file), f"cannot use the key and its counter: {error}") from error
+        raise ConfigError(str(key_file), f"cannot use the key and its counter: {reason(error)}") from error
 
 
 @contextlib.contextmanager
@@ -293,7 +294,7 @@ def outcome(session: Path, counter: int) -> dict[str, Any] | None:
     try:
         return read_twice(path, lambda problem: log.warning("%s", problem), mend=False)
     except (OSError, ValueError) as error:
-        raise SessionError(f"the result of command {counter} cannot be read: {error}") from error
+        raise SessionError(f"the result of command {counter} cannot be read: {reason(error)}") from error
 
 
 def note_end(session: Path, done: dict[str, Any], utc_ns: int) -> None:
@@ -302,7 +303,9 @@ def note_end(session: Path, done: dict[str, Any], utc_ns: int) -> None:
     try:
         append_line(session / HISTORY, checked_line(line))
     except OSError as error:
-        log.error("the end of command %d is missing in %s: %s", done["counter"], session / HISTORY, error)
+        log.error(
+            "the end of command %d is missing in %s: %s", done["counter"], session / HISTORY, reason(error)
+        )
 
 
 def is_waiting(session: Path, counter: int) -> bool:
@@ -328,7 +331,7 @@ def listening(session: Path) -> Iterator[None]:
             session.mkdir(parents=True, exist_ok=True)
             lock = opened.enter_context(open(session / "listener.lock", "wb"))
         except OSError as error:
-            raise SessionError(f"cannot write the session {session}: {error}") from error
+            raise SessionError(f"cannot write the session {session}: {reason(error)}") from error
         for tried in range(LOCK_TRIES):
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -350,7 +353,9 @@ def is_listening(session: Path) -> bool:
     except BlockingIOError:
         return True
     except OSError as error:
-        raise SessionError(f"cannot tell whether a process listens into {session}: {error}") from error
+        raise SessionError(
+            f"cannot tell whether a process listens into {session}: {reason(error)}"
+        ) from error
     return False
 
 
@@ -450,7 +455,9 @@ class Uplinker:
         except OSError as error:
             if not self._is_unreadable:
                 log.error(
-                    "no command is taken from %s, where this user may not look: %s", self._folder, error
+                    "no command is taken from %s, where this user may not look: %s",
+                    self._folder,
+                    reason(error),
                 )
             self._is_unreadable = True
             names = [f"{counter:020d}.json" for counter in self.jobs]  # as far as is known
@@ -462,7 +469,7 @@ class Uplinker:
             try:
                 self.jobs[counter] = self._read(counter)
             except OSError as error:  # perhaps another user's
-                log.error("command %d cannot be read and is not sent: %s", counter, error)
+                log.error("command %d cannot be read and is not sent: %s", counter, reason(error))
                 self._left_alone.add(counter)
             except DAMAGED as error:
                 log.error("command %d is damaged: %s", counter, error)
@@ -493,7 +500,7 @@ class Uplinker:
             try:
                 (self._folder / f"{counter:020d}{suffix}").unlink(missing_ok=True)
             except OSError as error:
-                log.error("the files of command %d cannot be removed: %s", counter, error)
+                log.error("the files of command %d cannot be removed: %s", counter, reason(error))
                 self._left_alone.add(counter)
 
     def _end(self, job: Job, stage: str, text: str) -> None:
@@ -510,7 +517,7 @@ class Uplinker:
         try:
             write_twice(self._folder / f"{name}.done.json", done)
         except OSError as error:
-            log.error("the end of command %d cannot be written: %s", job.counter, error)
+            log.error("the end of command %d cannot be written: %s", job.counter, reason(error))
         self._remove(job.counter)
         self.jobs.pop(job.counter, None)
         self._on_end(job.counter, job.command, stage, text)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from flightsw.icd.config import ConfigError
 from ground.link.xtce.document import ROOT_CONTAINER, SYSTEM, xtce_document
+from obbgs_base.errors import reason
 
 TELEMETRY_PORT, WEB_PORT = 10015, 8090  # Yamcs' own defaults
 MAX_PACKET_BYTES = 65_542  # of a space packet with its header
@@ -163,4 +164,4 @@ def write_yamcs(folder: Path, port: int = TELEMETRY_PORT, web_port: int = WEB_PO
         part.replace(folder)
     except OSError as error:
         shutil.rmtree(part, ignore_errors=True)
-        raise ConfigError(str(folder), f"cannot be written: {error.strerror}") from error
+        raise ConfigError(str(folder), f"cannot be written: {reason(error)}") from error

@@ -13,6 +13,7 @@ from ground.run.attitude_choice import chosen_by_training
 from ground.session.cameras import sensor_of
 from ground.session.folder import FrameRecord, Navigation, Session, SessionError
 from ground.session.training_frames import training_frame
+from obbgs_base.errors import reason
 from obbgs_base.files import write_whole
 from obbgs_core.attitude.estimate import estimate_motion
 from obbgs_core.attitude.outlines import centred
@@ -66,7 +67,7 @@ class FoundAttitude:
             )
             return FoundAttitude(int(tree["epoch_utc_ns"]), motion)
         except (OSError, ValueError, LookupError, TypeError) as error:
-            raise SessionError(f"{path} cannot be read: {error}; make the run again") from error
+            raise SessionError(f"{path} cannot be read: {reason(error)}; make the run again") from error
 
 
 def find_attitude(

@@ -6,6 +6,7 @@ import numpy as np
 
 from ground.session.cameras import cameras_of, median_sun_direction
 from ground.session.folder import FrameRecord, Session, SessionError
+from obbgs_base.errors import reason
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.mesh import SurfaceMesh
 
@@ -60,7 +61,7 @@ def read_mesh_points(path: Path, count: int, seed: int = 0) -> np.ndarray:
         AttributeError,
         NotImplementedError,
     ) as error:
-        raise SessionError(f"{path} is damaged: {error}") from error
+        raise SessionError(f"{path} is damaged: {reason(error)}") from error
     return np.asarray(points) @ Z_UP_TO_Y_UP[:3, :3]  # the inverse of a rotation is its transpose
 
 

@@ -30,6 +30,7 @@ from ground.session.folder import (
     read_records,
 )
 from ground.session.training_frames import split, training_frame
+from obbgs_base.errors import reason
 from obbgs_base.files import UNUSED, read_bounded
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame
@@ -267,7 +268,7 @@ def read_config(folder: Path) -> dict:
     try:
         settings = parse_yaml(read_bounded(path, MAX_YAML_BYTES), "config")
     except (OSError, ConfigError) as error:
-        raise SessionError(f"{path} cannot be read: {error}; make the run again") from error
+        raise SessionError(f"{path} cannot be read: {reason(error)}; make the run again") from error
     if not (isinstance(settings, dict) and isinstance(settings.get("method"), dict)):
         raise SessionError(
             f"{path} should hold the settings of a run, with those of a method; make the run again"
@@ -284,7 +285,7 @@ def read_metrics(path: Path) -> dict:
     try:
         metrics = json.loads(path.read_bytes())
     except (OSError, ValueError) as error:  # a UnicodeDecodeError is a ValueError too
-        raise SessionError(f"{path} cannot be read: {error}; make the run again") from error
+        raise SessionError(f"{path} cannot be read: {reason(error)}; make the run again") from error
     if not isinstance(metrics, dict):
         raise SessionError(f"{path} should hold an object; make the run again")
     for key, kind in NEEDED_METRICS.items():
@@ -306,9 +307,8 @@ def written_to(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = error.strerror or str(error)
         raise SessionError(
-            f"cannot write to {folder}: {reason}; make it writable, or copy the session to where you can write"
+            f"cannot write to {folder}: {reason(error)}; make it writable, or copy the session to where you can write"
         ) from error
 
 

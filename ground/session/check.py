@@ -14,6 +14,7 @@ from ground.session.folder import (
     shortened_logs,
 )
 from obbgs_base.checked import copy_of, read_lines, read_lines_twice
+from obbgs_base.errors import in_words
 
 
 def damage(session: Path, with_pictures: bool = False) -> list[str]:
@@ -37,7 +38,7 @@ def damage(session: Path, with_pictures: bool = False) -> list[str]:
         if with_pictures:
             found += _pictures(session)
     except (OSError, SessionError) as error:
-        return [str(error)]
+        return [in_words(error)]
     return found
 
 

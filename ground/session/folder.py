@@ -41,7 +41,7 @@ from flightsw.icd.frame import Attitude
 from flightsw.icd.mission import CameraSection
 from ground.session.telemetry import FlightCounts
 from obbgs_base.checked import Lines, copy_of, names_checksum, read_lines, read_lines_twice, read_twice
-from obbgs_base.errors import ObbgsError
+from obbgs_base.errors import ObbgsError, reason
 from obbgs_base.files import read_bounded
 from obbgs_base.navigation_errors import SharedParameters
 
@@ -258,7 +258,7 @@ class Session:
         except FileNotFoundError as error:
             raise MissingFrames(f"frame {record.id}: {path} is not there", (record.id,)) from error
         except OSError as error:
-            raise SessionCorrupt(f"frame {record.id}: {path} cannot be read: {error}") from error
+            raise SessionCorrupt(f"frame {record.id}: {path} cannot be read: {reason(error)}") from error
 
 
 def open_session(folder: str | Path) -> Session:
@@ -326,7 +326,7 @@ def read_header(folder: Path) -> dict[str, Any]:
     except (FileNotFoundError, NotADirectoryError) as error:
         raise SessionError(f"{folder} is not a session: it has no session.json") from error
     except OSError as error:
-        raise SessionError(f"{path} cannot be read: {error}") from error
+        raise SessionError(f"{path} cannot be read: {reason(error)}") from error
     except ConfigError as error:
         raise SessionCorrupt(f"{path}: {error}") from error
     except ValueError as error:
@@ -448,7 +448,7 @@ def read_frame_lines(folder: Path) -> Lines:
     try:
         lines = read_lines_twice(folder / "frames.jsonl", "id")
     except OSError as error:
-        raise SessionError(f"{folder / 'frames.jsonl'} cannot be read: {error}") from error
+        raise SessionError(f"{folder / 'frames.jsonl'} cannot be read: {reason(error)}") from error
     if damage := damage_of(lines):
         _tell(f"{folder / 'frames.jsonl'}{damage}")
     return lines

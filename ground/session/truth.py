@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from ground.session.folder import FrameRecord, Session, SessionError
+from obbgs_base.errors import in_words
 from obbgs_base.ply import PlyError, read_ply, write_ply
 
 GO_ON = "simulate the pass again, or move the folder away to go on without the truth"
@@ -134,7 +135,7 @@ class Truth:
         except KeyError as error:
             raise SessionError(f"{self.folder} is damaged: truth.json has no {error}; {GO_ON}") from error
         except (OSError, ValueError, TypeError, AttributeError) as error:
-            raise SessionError(f"{self.folder} is damaged: {error}; {GO_ON}") from error
+            raise SessionError(f"{self.folder} is damaged: {in_words(error)}; {GO_ON}") from error
         if session.attitude_estimated or session.navigation.attitude == "rate_only":
             self._turn_to_axes_of(session)
 
@@ -203,4 +204,4 @@ def read_points(path: Path) -> np.ndarray:
         vertices = read_ply(path).tables["vertex"]
         return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
     except (OSError, KeyError, PlyError) as error:
-        raise SessionError(f"{path} is damaged: {error}") from error
+        raise SessionError(f"{path} is damaged: {in_words(error)}") from error

@@ -29,6 +29,7 @@ from ground.session.folder import (
 )
 from ground.session.telemetry import FlightCounts
 from obbgs_base.checked import append_twice, checked_text, copy_of, write_twice
+from obbgs_base.errors import in_words
 from obbgs_base.files import set_aside, write_whole
 
 log = logging.getLogger(__name__)
@@ -58,7 +59,7 @@ class SessionWriter:
             self._sha256_of = self._mended_lines()
             self.save({}, 0)
         except OSError as error:
-            raise SessionError(f"cannot write the session {self.folder}: {error}") from error
+            raise SessionError(f"cannot write the session {self.folder}: {in_words(error)}") from error
 
     @property
     def frame_count(self) -> int:

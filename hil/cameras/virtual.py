@@ -27,6 +27,7 @@ from hil.sky.sensor import expose
 from hil.watched import WatchedThread
 from hil.world.clock import SimulatedClock
 from hil.world.surroundings import Surroundings, seen
+from obbgs_base.errors import in_words, reason
 
 log = logging.getLogger(__name__)
 MAX_SOCKET_PATH_BYTES = 107  # sun_path of Linux
@@ -75,7 +76,7 @@ class CameraServer:
                         header, pixels = camera.answer(line)
                         self.wfile.write(json.dumps(header).encode() + b"\n" + pixels)
                 except OSError as error:
-                    log.warning("a client disconnected during a request: %s", error)
+                    log.warning("a client disconnected during a request: %s", in_words(error))
 
         address = _address(listen)
         if isinstance(address, str):
@@ -217,7 +218,7 @@ def _make_way(path: Path) -> None:
             path.unlink(missing_ok=True)
             return
         except OSError as error:
-            raise OSError(f"{path} cannot be listened on: {error}; choose another socket") from error
+            raise OSError(f"{path} cannot be listened on: {reason(error)}; choose another socket") from error
     raise OSError(
         f"{path} is in use: another simulated camera serves there; stop it or choose another socket"
     )

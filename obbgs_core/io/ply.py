@@ -33,6 +33,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from obbgs_base.errors import reason
 from obbgs_base.files import write_whole
 from obbgs_base.ply import PlyError, read_ply
 from obbgs_core.errors import ExportError, ReconstructionError
@@ -202,7 +203,9 @@ def load_ply(path: Path) -> Gaussians:
     try:
         content = read_ply(path)
     except (PlyError, OSError) as error:
-        raise ReconstructionError(f"{path} is not a model written by this software: {error}") from error
+        raise ReconstructionError(
+            f"{path} is not a model written by this software: {reason(error)}"
+        ) from error
     columns = content.tables.get("vertex", {})
     if "radiance_sh_0_0" not in columns:
         raise ReconstructionError(

@@ -24,6 +24,7 @@ from pathlib import Path
 import gsply
 import torch
 
+from obbgs_base.errors import reason
 from obbgs_base.files import write_whole
 from obbgs_core.errors import ExportError, ReconstructionError
 from obbgs_core.io.ply import display_sh, radiance_sh, require_writable
@@ -105,7 +106,7 @@ def load_spz(path: Path) -> Gaussians:
         _check_size(path.read_bytes())
         packed = gsply.read_spz(path)
     except (ValueError, zlib.error, EOFError, OSError) as error:
-        raise ReconstructionError(f"{path} is damaged: {error}") from error
+        raise ReconstructionError(f"{path} is damaged: {reason(error)}") from error
     means, log_scales, quats, opacity_logits, f_dc = (
         torch.from_numpy(array.copy())
         for array in (packed.means, packed.scales, packed.quats, packed.opacities, packed.sh0)

@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from obbgs_base.errors import reason
 from obbgs_base.files import write_whole
 from obbgs_core.errors import ReconstructionError
 
@@ -192,7 +193,7 @@ def _load(network: str, file: Path) -> dict[str, Tensor]:
     except FileNotFoundError:
         raise WeightsMissing(file) from None
     except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise ReconstructionError(f"{file} is damaged ({error}); fetch it again: {FETCH}") from error
+        raise ReconstructionError(f"{file} is damaged ({reason(error)}); fetch it again: {FETCH}") from error
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
@@ -292,7 +293,7 @@ def main() -> int:
         for file in fetch(weights_folder()):
             print(file)
     except (ReconstructionError, OSError) as error:
-        print(f"lpips: {error}", file=sys.stderr)
+        print(f"lpips: {reason(error)}", file=sys.stderr)
         return 1
     return 0
 

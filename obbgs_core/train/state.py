@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from obbgs_base.errors import reason
 from obbgs_base.files import set_aside, write_whole
 from obbgs_core.errors import Diverged
 from obbgs_core.evidence.poses import validation_brackets
@@ -261,8 +262,7 @@ class TrainingState:
                 saved = torch.load(path, weights_only=True)
             if saved["format"] != FORMAT:
                 raise ValueError(f"expected format {FORMAT}, got {saved['format']}")
-            difference = identity.difference(saved["identity"])
-            if not difference:
+            if not (difference := identity.difference(saved["identity"])):
                 return saved["state"]
             why = f"belongs to another training, which differs {difference}"
         except (
@@ -275,7 +275,7 @@ class TrainingState:
             ValueError,
         ) as error:
             # half a file, or one that another version of this program saved, with other classes
-            why = f"is damaged or of another version ({error})"
+            why = f"is damaged or of another version ({reason(error)})"
         kept = set_aside(path).name
         log.warning("%s %s: it is not used; it is kept as %s, and this training begins anew", path, why, kept)
         return None

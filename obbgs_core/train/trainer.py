@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from obbgs_base.errors import Interrupted
+from obbgs_base.errors import Interrupted, reason
 from obbgs_core.batches import Batch, Batches
 from obbgs_core.compiled import torch_on_one_thread
 from obbgs_core.errors import Diverged
@@ -91,7 +91,7 @@ def _saved(trainer: "Trainer", checkpoint: Path | None) -> Path | None:
     try:
         trainer.save(checkpoint)
     except OSError as error:  # a full disk must not end the training
-        log.warning("step %d: %s cannot be written: %s", trainer.state.steps_done, checkpoint, error)
+        log.warning("step %d: %s cannot be written: %s", trainer.state.steps_done, checkpoint, reason(error))
         return None
     return checkpoint
 

@@ -12,6 +12,7 @@ import pytest
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import load_mission
 from flightsw.new_mission import EXAMPLE, write_mission
+from flightsw.planning import pass_plan
 from flightsw.selftest.planned_pass import check_orbit, check_view
 from flightsw.service import unit
 from tests.commands import call
@@ -65,14 +66,16 @@ def test_a_new_mission_has_what_was_given_and_passes_its_checks(tmp_path, elemen
     ("change", "message"),
     [
         ({"picture": "1024"}, "--picture: expected width and height"),
-        ({"target_size_m": 0.0}, "--target-size: must be positive"),
-        ({"focal_length_mm": float("nan")}, "--focal-length: must be positive"),
-        ({"picture": "9000x9000"}, "mission.camera.width: expected 1 to 8192"),
-        ({"start_utc": "soon"}, "mission.orbit.start_utc: expected ISO 8601"),
+        ({"target_size_m": 0.0}, "--target-size: expected 0.01 to 1000 m"),
+        ({"focal_length_mm": float("nan")}, "--focal-length: expected 1 to 100000 mm"),
+        ({"picture": "9000x9000"}, "--picture: width: expected 1 to 8192, got 9000"),
+        ({"start_utc": "soon"}, "--start: expected a time such as"),
+        ({"focal_length_mm": 1e9}, "--focal-length: expected 1 to 100000 mm, got 1e+09"),
+        ({"chaser_tle": Path("torn.tle")}, "torn.tle[0]: checksum is 0, but the line adds up to"),
         ({"target_tle": Path("nowhere")}, "nowhere: cannot read the two-line elements: No such file"),
     ],
 )
-def test_a_wrong_figure_is_named_and_nothing_is_written(tmp_path, elements, change, message):
+def test_a_wrong_figure_is_named_and_nothing_is_written(tmp_path, elements, change, message, monkeypatch):
     given = {
         "target_tle": Path(elements[0]),
         "chaser_tle": Path(elements[1]),
@@ -82,6 +85,9 @@ def test_a_wrong_figure_is_named_and_nothing_is_written(tmp_path, elements, chan
         "pixel_pitch_um": 5.5,
         "start_utc": START,
     }
+    torn = "\n".join(f"{line[:68]}{'0' if line[68] != '0' else '1'}" for line in MISSION.orbit.chaser_tle)
+    (tmp_path / "torn.tle").write_text(torn)
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=re.escape(message)):
         write_mission(tmp_path / "new.yaml", **(given | change))
     assert not (tmp_path / "new.yaml").exists()
@@ -104,6 +110,25 @@ def test_implausible_figures_are_told_by_plan_and_selftest(tmp_path, old, new, w
     found = check_view(load_mission(path))
     assert {finding.state for finding in found} == {"warning"}
     assert word in " ".join(finding.found for finding in found)
+
+
+def test_plan_and_selftest_state_the_same_ranges():
+    """The target comes nearest in the middle of the pass, where neither its first nor its last bracket sees it."""
+    planned = pass_plan(MISSION)
+    (found,) = check_view(MISSION)
+    assert (
+        found.found == planned.view and f"at {min(b.range_m for b in planned.brackets):.0f} m" in found.found
+    )
+    assert planned.problems == []
+
+
+def test_a_plan_says_that_its_poses_will_be_stale(tmp_path):
+    path = tmp_path / "late.yaml"
+    path.write_text(
+        (ROOT / "mission.yaml").read_text().replace("2026-07-21T10:52:30Z", "2026-09-21T10:52:30Z")
+    )
+    (problem,) = [text for text in pass_plan(load_mission(path)).problems if "elements" in text]
+    assert problem.startswith("the elements are more than 7 days from 40 of 40 brackets")
 
 
 def test_a_line_of_sight_far_from_the_picture_is_refused(tmp_path):

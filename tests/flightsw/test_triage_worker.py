@@ -415,7 +415,7 @@ def test_a_disk_that_refuses_keeps_no_model_from_ranking(ranking, monkeypatch, c
         made.start()
         worker.to_give = [ModelFailed("the model took too long")]
         made.collect()
-    assert "it cannot be kept: [Errno 30]" in caplog.text and "tried again at the next start" in caplog.text
+    assert "it cannot be kept: " in caplog.text and "tried again at the next start" in caplog.text
 
 
 FLIGHT = """

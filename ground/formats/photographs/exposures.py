@@ -23,6 +23,7 @@ from ground.formats.photographs.epipolar import matched_points
 from ground.formats.pictures.files import FormatError, Light, pictures_in, read_header
 from ground.formats.pictures.view import View, colours_of, grey_light, has_display_values, read_image
 from ground.formats.pictures.views import Values, unposed
+from obbgs_base.errors import reason
 
 log = logging.getLogger(__name__)
 COLUMNS = ("name", "exposure_time_s", "iso", "f_number", "gain", "mid_exposure_utc")
@@ -51,7 +52,7 @@ def read_table(path: Path) -> dict[str, Light]:
             raise FormatError(f"{path}: expected a table of at most {LARGEST_TABLE >> 20} MiB")
         rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines(), strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FormatError(f"{path}: the table cannot be read: {error}") from error
+        raise FormatError(f"{path}: the table cannot be read: {reason(error)}") from error
     names = [name.strip() for name in rows[0]] if rows else []
     if (
         "name" not in names

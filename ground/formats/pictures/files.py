@@ -20,6 +20,7 @@ import imagecodecs
 import numpy as np
 
 from ground.session.folder import SessionError
+from obbgs_base.errors import reason
 
 MOST_PX = 8192  # a side, that of a session's camera
 MOST_FILE_BYTES = 1 << 30
@@ -179,7 +180,7 @@ def _kind(path: Path) -> str:
             start = file.read(16)
         size = path.stat().st_size
     except OSError as error:
-        raise FormatError(f"{path}: the picture cannot be read: {error.strerror or error}") from error
+        raise FormatError(f"{path}: the picture cannot be read: {reason(error)}") from error
     if not start:
         raise FormatError(
             f"{path}: the picture is an empty file, as an interrupted copy leaves; copy it again"

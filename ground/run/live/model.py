@@ -15,6 +15,7 @@ from ground.run.runs import is_live
 from ground.session.cameras import cameras_of, median_sun_direction, predicted_image, sensor_of
 from ground.session.folder import FrameRecord
 from ground.session.training_frames import training_frame
+from obbgs_base.errors import reason
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.io.ply import save_ply
 from obbgs_core.model.gaussians import Gaussians
@@ -60,7 +61,7 @@ class ShownModel:
         try:
             self._write(gaussians, estimate)
         except OSError as error:  # a full disk must not end the training
-            log.warning("step %d: %s cannot be renewed: %s", step, self._folder / "model.ply", error)
+            log.warning("step %d: %s cannot be renewed: %s", step, self._folder / "model.ply", reason(error))
             return False
         self.gaussians, self.step, self.held_out_db = gaussians, step, offered_db
         self.estimate = estimate

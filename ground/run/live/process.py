@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from ground.run.live.status import read_status
-from obbgs_base.command_line import in_words
-from obbgs_base.errors import Interrupted, ObbgsError
+from obbgs_base.errors import Interrupted, ObbgsError, in_words
 
 LOG = "live.log"  # in the session: what the training says
 NICENESS = 10

@@ -21,7 +21,7 @@ from ground.run.reconstruct import KNOWN, finish_run
 from ground.run.runs import check_replaceable, run_folder, unfinished_folder, unfinished_run
 from ground.session.cameras import sensor_of
 from ground.session.folder import SessionError
-from obbgs_base.errors import Interrupted
+from obbgs_base.errors import Interrupted, reason
 from obbgs_core.compiled import Background
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.frames import FEWEST_FRAMES
@@ -327,7 +327,7 @@ class LiveReconstruction:
         try:
             status.write(self._part if state == "finished" else self._folder)
         except OSError as error:  # a full disk must not end the training
-            log.warning("%s cannot be renewed: %s", self._folder / LIVE_STATUS, error)
+            log.warning("%s cannot be renewed: %s", self._folder / LIVE_STATUS, reason(error))
         self._on_status(status)
 
     def save(self) -> None:
@@ -338,7 +338,7 @@ class LiveReconstruction:
         try:
             self.trainer.save(path)
         except OSError as error:
-            log.warning("step %d: %s cannot be written: %s", self.steps, path, error)
+            log.warning("step %d: %s cannot be written: %s", self.steps, path, reason(error))
             return
         self._saved_step = self.steps
         for other in self._part.iterdir():

@@ -13,6 +13,7 @@ from ground.run.live.model import ShownModel
 from ground.run.model_files import exposure_times_s
 from ground.session.cameras import sensor_of
 from ground.session.folder import FrameRecord, Session
+from obbgs_base.errors import reason
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.estimate import PoseEstimate
@@ -37,7 +38,7 @@ class LiveUplink:
         try:
             Key.parse(key_file.read_text(), str(key_file))
         except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(str(key_file), f"cannot read the key: {error}") from error
+            raise ConfigError(str(key_file), f"cannot read the key: {reason(error)}") from error
         self.state = ""
         self._session_dir, self._key_file = session_dir, key_file
         # the model on board or on its way there, with the poses that it was trained with

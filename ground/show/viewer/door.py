@@ -21,7 +21,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from ground.show.viewer.messages import wrong
-from obbgs_base.errors import ObbgsError
+from obbgs_base.errors import ObbgsError, reason
 
 log = logging.getLogger(__name__)
 POLICY_VIOLATION = 1008  # RFC 6455, section 7.4.1
@@ -143,8 +143,8 @@ def _check_free(host: str, port: int) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
     except OSError as error:
-        raise ViewError(_taken(host, port, error.strerror or str(error))) from error
+        raise ViewError(_taken(host, port, reason(error))) from error
 
 
-def _taken(host: str, port: int, reason: str) -> str:
-    return f"cannot listen on {host} port {port}: {reason}; give another with --port, 0 for any that is free"
+def _taken(host: str, port: int, why: str) -> str:
+    return f"cannot listen on {host} port {port}: {why}; give another with --port, 0 for any that is free"

@@ -33,6 +33,7 @@ from ground.show.viewer.scene import (
 from ground.show.viewer.source import Source
 from ground.show.viewer.splats import CHI2_SHOWN, DEVIATION_SHOWN, legend, seen_exposure_s
 from ground.show.viewer.waiting import awaited
+from obbgs_base.errors import reason
 from obbgs_core.errors import ReconstructionError
 
 log = logging.getLogger(__name__)
@@ -95,7 +96,7 @@ def view(
                     try:
                         viewer.renew(i, source)
                     except (SessionError, ReconstructionError, OSError, ValueError) as error:
-                        log.warning("%s is not shown anew: %s", source.name, error)
+                        log.warning("%s is not shown anew: %s", source.name, reason(error))
     finally:
         server.stop()
 
