@@ -15,6 +15,7 @@ from ground.run.runs import Run
 from ground.session.folder import FrameRecord, Session, SessionError
 from ground.session.training_frames import frames_of, tag_covariance, training_frame
 from ground.session.truth import Truth
+from obbgs_base.errors import reason
 from obbgs_base.files import write_whole
 from obbgs_base.navigation_errors import SharedParameters, jacobian
 from obbgs_core.frames import TrainingFrame
@@ -49,7 +50,7 @@ def read_estimate(folder: Path) -> PoseEstimate | None:
     try:
         return PoseEstimate.of(json.loads(path.read_bytes()))
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise SessionError(f"{path} cannot be read: {error}; make the run again") from error
+        raise SessionError(f"{path} cannot be read: {reason(error)}; make the run again") from error
 
 
 def estimated_records(records: list[FrameRecord], estimate: PoseEstimate | None) -> list[FrameRecord]:
@@ -61,6 +62,20 @@ def estimated_records(records: list[FrameRecord], estimate: PoseEstimate | None)
         return records
     poses = estimate.by_frame()
     return [_placed(record, poses[record.id]) for record in records if record.id in poses]
+
+
+def posed_frames(frames: list[TrainingFrame], estimate: PoseEstimate | None) -> list[TrainingFrame]:
+    """Return training frames with the poses that a training of theirs found, as `estimated_records` does."""
+    if estimate is None:
+        return frames
+    poses = estimate.by_frame()
+    return [
+        dataclasses.replace(
+            frame, world_to_camera=torch.from_numpy(poses[frame.id]).to(frame.world_to_camera)
+        )
+        for frame in frames
+        if frame.id in poses
+    ]
 
 
 def as_estimated(session: Session, estimate: PoseEstimate | None) -> Session:

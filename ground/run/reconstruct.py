@@ -11,7 +11,7 @@ from typing import Literal
 
 from ground.run.attitude import FILE as ATTITUDE_FILE
 from ground.run.attitude import FoundAttitude, find_attitude, in_body_axes, refined_motion
-from ground.run.estimated_poses import estimated_records, write_estimate
+from ground.run.estimated_poses import estimated_records, posed_frames, write_estimate
 from ground.run.model_files import Outputs, model_sizes, write_models
 from ground.run.record import training_metrics, write_config, write_history
 from ground.run.runs import (
@@ -26,6 +26,7 @@ from ground.session.cameras import sensor_of
 from ground.session.folder import FrameRecord, Session, open_session
 from ground.session.training_frames import frames_of, split
 from obbgs_core.errors import ReconstructionError
+from obbgs_core.frames import TrainingFrame
 from obbgs_core.methods.config import MethodConfig
 from obbgs_core.methods.presets import preset
 from obbgs_core.train.result import StepInfo, TrainResult
@@ -67,8 +68,8 @@ def reconstruct(
 
     Args:
         changes: settings that differ from the method's preset.
-        blind_reference: train a second time with every exposure time replaced by their geometric mean, to measure
-            what knowing the exposure brings.
+        blind_reference: train a second time with every exposure time replaced by their geometric mean, on the poses
+            that the first training found, to measure what knowing the exposure brings.
         out: the folder of runs; None: runs/ in the session.
         overwrite: replace a finished run of the same name.
         should_stop: called after each step and before each file; True saves the work and raises Interrupted.
@@ -95,17 +96,20 @@ def reconstruct(
     sensor = sensor_of(session.camera)
     configs = {KNOWN: config}
     if blind_reference and config.exposure_aware:
-        configs[BLIND] = dataclasses.replace(config, exposure_aware=False)
+        as_given = dataclasses.replace(
+            config.poses, refine="never"
+        )  # both models are seen from the same poses
+        configs[BLIND] = dataclasses.replace(config, exposure_aware=False, poses=as_given)
     kept = [ATTITUDE_FILE, *(_checkpoint(label) for label in configs)]
     with unfinished_run(folder, overwrite, kept) as part:
         found = _attitude(session, training, attitude, part / ATTITUDE_FILE, on_search, should_stop)
         if found is not None:
             session = in_body_axes(session, found)
             training, held_out = split(session)
-            configs = {label: _refining(config) for label, config in configs.items()}
+            configs[KNOWN] = _refining(config)
         frames = frames_of(session, training)
 
-        def trained(label: str, config: MethodConfig) -> TrainResult:
+        def trained(label: str, config: MethodConfig, frames: list[TrainingFrame]) -> TrainResult:
             def on_step(info: StepInfo) -> None:
                 on_progress(Progress(label, info))
 
@@ -115,10 +119,10 @@ def reconstruct(
             return result
 
         outputs = Outputs(part, should_stop)
-        result, blind = trained(KNOWN, configs[KNOWN]), None
+        result, blind = trained(KNOWN, configs[KNOWN], frames), None
         if BLIND in configs:
             try:
-                blind = trained(BLIND, configs[BLIND])
+                blind = trained(BLIND, configs[BLIND], posed_frames(frames, result.pose_estimate))
             except ReconstructionError as error:
                 outputs.miss("blind.ply", str(error))
         finish_run(outputs, folder, {KNOWN: result, BLIND: blind}, session, training, held_out, seed)

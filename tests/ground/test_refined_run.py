@@ -18,6 +18,7 @@ from scipy.ndimage import center_of_mass
 from typer.testing import CliRunner
 
 from ground import cli, frames_of, predicted_image, sensor_of, split
+from ground.run import reconstruct as reconstructing
 from ground.run.estimated_poses import read_estimate, write_estimate
 from ground.run.evaluate import evaluate
 from ground.run.reconstruct import reconstruct
@@ -27,6 +28,7 @@ from ground.show.report.document import write_report
 from ground.show.viewer.source import Source
 from ground.show.viewer.viewer import _compared
 from obbgs_core.score.metrics import psnr_db
+from obbgs_core.train import train
 from tests.browser import as_url, chromium, opened
 from tests.ground.test_telemetry_plots import packet, written
 from tests.scenes import move_poses_in
@@ -36,6 +38,7 @@ STEPS = {"steps": 60, "start.count": 400, "growth.max_gaussians": 600}
 BRACKETS, HELD_OUT = 16, 6  # frames of the brackets 7 and 15
 ZOOM = 5  # of make_picture, from 40 to 200 pixels
 A_PIXEL = 1.0  # pictures from the tags are 6 pixels off
+trained_on: list = []  # the frames of each training of `refined`
 
 
 @pytest.fixture(scope="module")
@@ -44,11 +47,25 @@ def refined(tmp_path_factory) -> Path:
     session = erring_session(tmp_path_factory.mktemp("refined") / "session", brackets=BRACKETS)
     with pytest.MonkeyPatch.context() as patch:
         move_poses_in(patch, 2)
-        reconstruct(session, "run", "obbgs", STEPS)
+        patch.setattr(reconstructing, "train", lambda *given: trained_on.append(given[0]) or train(*given))
+        reconstruct(session, "run", "obbgs", STEPS, blind_reference=True)
     metrics = evaluate(session, "run")
     assert metrics["poses"].startswith("refined") and metrics["pose_error_tagged_px"] > 5
     assert metrics["pose_error_px"] < 0.5
     return session
+
+
+def test_the_training_without_exposure_times_has_the_poses_from_which_both_models_are_seen(refined):
+    estimate = read_estimate(refined / "runs" / "run")
+    assert estimate is not None
+    tagged, blind = trained_on[-2:]
+    assert [frame.id for frame in blind] == estimate.frame_ids
+    for frame, pose in zip(blind, estimate.estimated, strict=True):
+        np.testing.assert_allclose(frame.world_to_camera.numpy(), pose, atol=1e-5)
+    assert (
+        max(abs(a.world_to_camera - b.world_to_camera).max() for a, b in zip(tagged, blind, strict=True))
+        > 1e-3
+    )
 
 
 def without_truth(session: Path, folder: Path) -> Path:
@@ -79,14 +96,17 @@ def test_the_reports_held_out_views_are_those_of_the_headline(refined, tmp_path,
     headline_db = evaluate(session, "run")[key]
     section = held_out_section(session)
     shown = pictures_of(section)
-    rows = list(zip(shown[::3], shown[1::3], shown[2::3], strict=True))
+    rows = list(zip(*(shown[i::5] for i in range(5)), strict=True))
     assert len(rows) == HELD_OUT
-    values_db = [float(render[2].removesuffix(" dB")) for _, render, _ in rows]
+    values_db = [float(render[2].removesuffix(" dB")) for _, render, *_ in rows]
     assert np.mean(values_db) == pytest.approx(headline_db, abs=0.051)  # captions have one digit
     assert f"its mean over all {HELD_OUT} frames is {headline_db:.2f} dB" in section
-    for frame, render, error in rows:
+    for frame, render, error, blind, _ in rows:
         assert (frame[0], render[0], error[0]) == (reference, "render", "error")
         assert frame[1].max() > 50 and shift_px(frame[1], render[1]) < A_PIXEL
+        assert (
+            shift_px(frame[1], blind[1]) < A_PIXEL
+        )  # trained without exposure times, seen from the same poses
 
 
 def test_ranges_of_report_and_viewer_are_those_of_the_refined_poses(refined):

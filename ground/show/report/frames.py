@@ -87,7 +87,7 @@ def scored_section(run: Run, truth: Truth | None) -> str:
             else " Poses were refined: each frame is seen from the pose that settles on its own picture."
         )
     if run.blind:
-        note += " Blind: the same training with every exposure time replaced by their mean."
+        note += " Blind: the same training from the same poses, every exposure time replaced by their mean."
     title = "Training views (nothing was held out)" if training else "Held-out views"
     return section(f"{title}: {'truth' if truth else 'frame'}, render, error", note, "".join(body))
 
