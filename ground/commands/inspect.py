@@ -84,28 +84,29 @@ def measure_command(
         from ground.run.runs import run_at
         from ground.show.inspection import read_model
         from ground.show.measure import measured, places_of
+        from ground.show.sizes import with_deviation
 
     _, name, runs = run_at(run)
     values = measured(read_model(runs / name), [places_of(text) for text in between or []])
     if json_:
         print(json.dumps(values))
         return
+
+    def told(value: dict) -> str:
+        return with_deviation(value["value"], value["half_width_90"])
+
     table = Table(title=f"Sizes, {values['unit']} (90 %: ±)")
     for heading in ("", "length", "width", "area"):
         table.add_column(heading, overflow="fold")
     largest = values["largest_dimension"]
-    table.add_row("largest dimension", _half(largest))
+    table.add_row("largest dimension", told(largest))
     for face in values["faces"]:
-        table.add_row(face["name"], _half(face["length"]), _half(face["width"]), _half(face["area"]))
+        table.add_row(face["name"], told(face["length"]), told(face["width"]), told(face["area"]))
     for distance in values["distances"]:
-        table.add_row("between the points", _half(distance))
+        table.add_row("between the points", told(distance))
     Console().print(table)
 
 
 def _told(values: dict, key: str, unit: str) -> str:
     low, high = values[f"{key}_interval_90"]
     return f"{values[key]:.3g} {unit} ({low:.3g} to {high:.3g})"
-
-
-def _half(value: dict) -> str:
-    return f"{value['value']:.4g} ± {value['half_width_90']:.2g}"

@@ -68,6 +68,7 @@ def reconstruct_command(
                 from ground.run.evaluate import evaluate
                 from ground.run.reconstruct import Progress, reconstruct
                 from ground.run.settings import all_changes
+                from ground.session.folder import read_header
                 from ground.show.report.document import write_report
                 from obbgs_core.process import prepare_process
 
@@ -81,6 +82,7 @@ def reconstruct_command(
                 stop.defer()
                 show(progress.label, progress.info)
 
+            read_header(session)  # what is no session is told before anything else
             say(stderr, f"reading the frames of {session}")
             folder = reconstruct(
                 session,

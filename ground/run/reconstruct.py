@@ -96,17 +96,14 @@ def reconstruct(
     sensor = sensor_of(session.camera)
     configs = {KNOWN: config}
     if blind_reference and config.exposure_aware:
-        as_given = dataclasses.replace(
-            config.poses, refine="never"
-        )  # both models are seen from the same poses
-        configs[BLIND] = dataclasses.replace(config, exposure_aware=False, poses=as_given)
+        configs[BLIND] = dataclasses.replace(_refining(config, "never"), exposure_aware=False)
     kept = [ATTITUDE_FILE, *(_checkpoint(label) for label in configs)]
     with unfinished_run(folder, overwrite, kept) as part:
         found = _attitude(session, training, attitude, part / ATTITUDE_FILE, on_search, should_stop)
         if found is not None:
             session = in_body_axes(session, found)
             training, held_out = split(session)
-            configs[KNOWN] = _refining(config)
+            configs[KNOWN] = _refining(config, "always")
         frames = frames_of(session, training)
 
         def trained(label: str, config: MethodConfig, frames: list[TrainingFrame]) -> TrainResult:
@@ -187,11 +184,14 @@ def _attitude(
     return found
 
 
-def _refining(config: MethodConfig) -> MethodConfig:
-    """Return a method that refines poses wherever it may: an attitude from outlines errs for certain."""
-    if config.poses.refine != "auto":
+def _refining(config: MethodConfig, refine: Literal["never", "always"]) -> MethodConfig:
+    """Return a method that refines poses never, as they are refined already; or always, unless it is told never to.
+
+    An attitude from outlines errs for certain.
+    """
+    if refine == "always" and config.poses.refine != "auto":
         return config
-    return dataclasses.replace(config, poses=dataclasses.replace(config.poses, refine="always"))
+    return dataclasses.replace(config, poses=dataclasses.replace(config.poses, refine=refine))
 
 
 def _checkpoint(label: str) -> str:

@@ -72,6 +72,11 @@ pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px;
 }
 """
 
+# while the page is read, a figure takes the room of those that will stand beside it
+FITTED = (
+    '<script>document.querySelectorAll(".js-plotly-plot").forEach(plot => Plotly.Plots.resize(plot))</script>'
+)
+
 
 def page(title: str, subtitle: str, sections: Iterable[str], plots: bool = True) -> str:
     """Return the whole page; title and subtitle are plain text, sections HTML; `plots`: some of them hold figures."""
@@ -80,7 +85,7 @@ def page(title: str, subtitle: str, sections: Iterable[str], plots: bool = True)
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style>'
         f"{f'<script>{get_plotlyjs()}</script>' if plots else ''}</head><body><main><h1>{title}</h1>"
-        f'<p class="note">{html.escape(subtitle)}</p>{"".join(sections)}</main></body></html>'
+        f'<p class="note">{html.escape(subtitle)}</p>{"".join(sections)}</main>{FITTED if plots else ""}</body></html>'
     )
 
 
@@ -98,6 +103,8 @@ def cards(entries: Iterable[tuple[str, str]]) -> str:
 def two_tables(rows: list[tuple[str, str]]) -> str:
     """Return rows of label and value as two tables side by side, read down the left one first."""
     half = (len(rows) + 1) // 2
+    while half < len(rows) and rows[half][0].startswith("…"):  # it belongs to the row before
+        half += 1
     return f'<div class="two">{_table(rows[:half])}{_table(rows[half:])}</div>'
 
 
@@ -141,6 +148,11 @@ def picture(image: np.ndarray, alt: str, caption: str) -> str:
     png = imagecodecs.png_encode(np.ascontiguousarray(image), level=9)
     source = "data:image/png;base64," + base64.b64encode(bytes(png)).decode()
     return f'<figure><img alt="{alt}" src="{source}"><figcaption>{caption}</figcaption></figure>'
+
+
+def unbroken(text: str) -> str:
+    """Return text that stays in one line."""
+    return text.replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def plot(figure: go.Figure) -> str:

@@ -1,5 +1,7 @@
 """How large a model is, and how sure that is: the error of its scale, and whether its unit is known."""
 
+import math
+
 import numpy as np
 
 from flightsw.icd.quaternion import quat_to_matrix
@@ -17,6 +19,14 @@ FRAMES = 60  # at most, over which the size's deviation is worked out
 def states_time(session: Session, record: FrameRecord) -> bool:
     """Return whether a frame's time is its own: pictures are imported in many formats that state none."""
     return session.frames_imported is None or record.mid_exposure_utc_ns > YEAR_2000_NS
+
+
+def with_deviation(value: float, deviation: float) -> str:
+    """Return a value and its deviation in words, both to the second digit of the deviation: 0.254 ± 0.099."""
+    if not (math.isfinite(value) and math.isfinite(deviation)) or deviation <= 0:
+        return f"{value:.4g} ± {deviation:.2g}"
+    decimals = max(0, 1 - math.floor(math.log10(float(f"{deviation:.1e}"))))
+    return f"{value:.{decimals}f} ± {deviation:.{decimals}f}"
 
 
 def states_scale(session: Session) -> bool:

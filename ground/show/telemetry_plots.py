@@ -74,7 +74,9 @@ def telemetry_figures(series: list[Series]) -> list[go.Figure]:
         if each.values.min() == each.values.max():  # a scale of thousandths around a constant says nothing
             value = each.values[0] / factor
             figure.update_yaxes(range=[value - max(1.0, abs(value)), value + max(1.0, abs(value))])
-        title = {"text": f"{each.item.name.replace('_', ' ')}{unit_of(each.item)}", "font": {"size": 12}}
+        figure.update_xaxes(ticksuffix=" s")
+        figure.update_yaxes(tickformat=",")
+        title = {"text": f"{named(each.item)}{unit_of(each.item)}", "font": {"size": 12}}
         figure.update_layout(height=HEIGHT_PX, title=title, margin={"l": 45, "r": 15, "t": 30, "b": 25})
         figures.append(figure)
     return figures
@@ -99,6 +101,11 @@ def broken_limits(series: list[Series]) -> list[tuple[str, str]]:
 def _is_housekeeping(line: dict[str, Any]) -> bool:
     is_packet = line.get("packet") == "housekeeping"
     return is_packet and all(type(line.get(name)) in (int, float) for name in ("utc_ns", *SHOWN))
+
+
+def named(item: Item) -> str:
+    """Return an item's name in words, without the unit that stands beside it."""
+    return item.name.removesuffix("_bytes").removesuffix("_percent").replace("_", " ")
 
 
 def unit_of(item: Item) -> str:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from ground import cli
 from ground.run.runs import open_run
 from ground.show.report.sizes import sizes_section
+from ground.show.sizes import with_deviation
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 UNIT = 25.4  # of the design's file, per metre
@@ -64,7 +65,7 @@ def test_sizes_are_those_of_the_mesh(run):
     assert all(face["area"]["value"] <= mesh.area for face in values["faces"])
     text = sizes_section(open_run(run.parents[1], run.name))
     told = values["largest_dimension"]
-    assert f"{told['value']:.4g} ± {told['half_width_90']:.2g}" in text
+    assert with_deviation(told["value"], told["half_width_90"]) in text
 
 
 def test_a_part_of_the_design_that_is_not_there_is_told(run):

@@ -110,7 +110,7 @@ def test_the_reports_held_out_views_are_those_of_the_headline(refined, tmp_path,
 
 
 def test_ranges_of_report_and_viewer_are_those_of_the_refined_poses(refined):
-    page = write_report(refined, "run").read_text()
+    page = write_report(refined, "run").read_text().replace("\N{NO-BREAK SPACE}", " ")
     frames = Source(refined / "runs" / "run").load().session.frames
     told = re.findall(r"frame (\d+), ([\d.,]+ m)", page)
     assert len(told) > 10
@@ -148,13 +148,34 @@ def test_the_report_can_be_read_on_a_phone_and_begins_with_words(refined, tmp_pa
         assert page.evaluate("document.documentElement.scrollWidth") == PHONE_PX
         assert page.evaluate(BROKEN_NUMBERS) == []
         words = page.evaluate(WORDS)
-        assert {"known exposure", "cpu percent, %", "from the tagged pose"} <= {word[0] for word in words}
+        assert {"known exposure", "cpu, %", "from the tagged pose"} <= {word[0] for word in words}
         assert [(a[0], b[0]) for a, b in combinations(words, 2) if overlap_px(a, b) > 1] == []
         assert not re.search("nats|BIC", page.locator("p.note").all_inner_texts()[1])
         decided = page.locator("dd", has_text="nats at a BIC penalty").first
         assert not decided.is_visible()
         page.get_by_text("What the training decided").click()
         assert decided.is_visible()
+
+
+# figures and their titles that reach beyond the place that they have, by how many pixels
+TOO_WIDE = """() => [...document.querySelectorAll(".js-plotly-plot")].flatMap(plot =>
+  [...plot.querySelectorAll(".main-svg, .xtitle, .gtitle")].map(part => [
+    part.textContent.slice(0, 40),
+    part.getBoundingClientRect().right - plot.parentElement.parentElement.getBoundingClientRect().right,
+  ])).filter(([_, px]) => px > 1)"""
+
+
+@pytest.mark.parametrize("width_px", [1440, 1000])
+def test_figures_that_stand_side_by_side_keep_to_their_places_from_the_first_look(
+    refined, tmp_path, width_px
+):
+    """The first of a row is drawn while the page has no others yet, so as wide as the whole row."""
+    session = without_truth(refined, tmp_path / "session")
+    written(session, *(packet(second) for second in range(20)))
+    with chromium() as browser, opened(browser, as_url(write_report(session, "run")), width_px, 900) as page:
+        page.wait_for_selector(".js-plotly-plot .xtitle")
+        page.wait_for_timeout(500)
+        assert page.locator(".beside").count() == 2 and page.evaluate(TOO_WIDE) == []
 
 
 def overlap_px(one: list, other: list) -> float:

@@ -14,6 +14,7 @@ from ground.session.folder import Navigation, open_session
 from ground.session.training_frames import split
 from ground.show.report.document import pass_name
 from ground.show.report.poses import pose_history, poses_section
+from ground.show.sizes import with_deviation
 from obbgs_base.navigation_errors import SIZE, SharedParameters
 from obbgs_core.poses.estimate import PoseEstimate
 from tests import scenes
@@ -101,7 +102,7 @@ def test_the_section_tells_values_with_both_deviations_and_what_the_frames_do_no
     run, *_ = example
     page = poses_section(run).replace("\N{NO-BREAK SPACE}", " ")
     assert (
-        "boresight, camera x" in page and "0.6303 ± 0.057 (stated ± 1.1) deg" in page
+        "boresight, camera x" in page and "0.630 ± 0.057 (stated ± 1.1) deg" in page
     )  # 0.011 rad in degrees
     assert "boresight, camera z: not determined by the frames" in page
     assert "relative position" not in page  # exact by the tags
@@ -115,6 +116,17 @@ def test_a_bracket_whose_residual_stands_out_is_named(example):
     moved[place] = turn @ moved[place]
     history = pose_history(run, dataclasses.replace(estimate, estimated=moved))
     assert history.misfits == [estimate.frame_ids[place]]
+
+
+def test_values_are_told_to_the_second_digit_of_their_deviation():
+    told = {
+        (0.9181, 0.0986): "0.918 ± 0.099",
+        (-0.0004902, 0.00067): "-0.00049 ± 0.00067",
+        (0.254, 0.0996): "0.25 ± 0.10",
+        (12345.6, 234.0): "12346 ± 234",
+        (0.3, 0.0): "0.3 ± 0",
+    }
+    assert {pair: with_deviation(*pair) for pair in told} == told
 
 
 def test_frames_that_were_left_out_are_named_whatever_the_metrics_hold(example):

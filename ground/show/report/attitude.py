@@ -7,6 +7,7 @@ from ground.run.attitude import FILE, FoundAttitude, refined_motion
 from ground.run.estimated_poses import read_estimate
 from ground.run.runs import Run
 from ground.show.page import legend, plot, section, two_tables
+from ground.show.sizes import with_deviation
 from obbgs_base.free_rotation import free_rotation
 from obbgs_core.attitude.target_motion import TargetMotion
 from obbgs_core.model.gaussians import Gaussians
@@ -59,7 +60,7 @@ def rotation_rows(motion: TargetMotion, before: TargetMotion | None) -> list[tup
         ("one turn", f"{facts['period_s']:.2f} s"),
     ]
     for name, value, sigma in zip("xy", facts["inertia_ratios"], facts["inertia_ratios_sigma"], strict=False):
-        rows.append((f"moment of inertia about {name} over that about z", f"{value:.4f} ± {sigma:.2g}"))
+        rows.append((f"moment of inertia about {name} over that about z", with_deviation(value, sigma)))
     if before is not None:
         outlines = before.facts()
         rows += [
@@ -76,7 +77,7 @@ def _axis(facts: dict) -> str:
 
 
 def _rate(facts: dict) -> str:
-    return f"{facts['rate_deg_s']:.5g} ± {facts['rate_sigma_deg_s']:.2g} deg/s"
+    return f"{with_deviation(facts['rate_deg_s'], facts['rate_sigma_deg_s'])} deg/s"
 
 
 def axis_figure(gaussians: Gaussians, motion: TargetMotion, times_s: np.ndarray) -> go.Figure:

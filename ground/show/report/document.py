@@ -3,6 +3,7 @@
 import html
 import json
 import math
+from datetime import datetime
 from pathlib import Path
 
 from ground.run.card import chi2_explained, frames_captured, scored_frames
@@ -49,7 +50,7 @@ def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
     content = page(
         f"Reconstruction of {pass_name(run.session.path)}, run {name}",
         f"Method {run.metrics['method']}, {run.metrics['frames_received']} frames received, session of "
-        f"{run.session.created_utc}.",
+        f"{datetime.fromisoformat(run.session.created_utc):%Y-%m-%d %H:%M} UTC.",
         [
             _model(run),
             _result(run, truth),

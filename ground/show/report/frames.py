@@ -13,7 +13,7 @@ from ground.session.exposures import in_ms
 from ground.session.folder import FrameRecord
 from ground.session.spread import evenly_spread
 from ground.session.truth import Truth
-from ground.show.page import grid, label, picture, section
+from ground.show.page import grid, label, picture, section, unbroken
 from ground.show.pictures import ERROR_FULL_SCALE, bounding_box, heat, tone
 from obbgs_core.score.metrics import psnr_db
 
@@ -42,11 +42,13 @@ def frames_section(run: Run) -> str:
             if record is None:
                 cells.append(label("missing"))
                 continue
-            caption = f"frame {record.id}" + ("" if nominal else f", {range_in_words(record)}")
+            caption = unbroken(f"frame {record.id}") + (
+                "" if nominal else f", {unbroken(range_in_words(record))}"
+            )
             if not is_same:
                 caption += f", {_exposure(run, record)}"
             if record.saturated:
-                caption += f"<br>{record.saturated:,} px saturated"
+                caption += f"<br>{unbroken(f'{record.saturated:,} px')} saturated"
             received = run.session.dn(record).astype(np.float32) / run.sensor.white_dn
             image = _tone(run, received.reshape(*received.shape[:2], -1))
             cells.append(picture(image, f"frame {record.id}", caption))

@@ -12,7 +12,8 @@ from plotly.subplots import make_subplots
 from ground.run.estimated_poses import doubts_left, read_estimate
 from ground.run.runs import Run
 from ground.session.spread import evenly_spread
-from ground.show.page import legend, plot, section, two_tables
+from ground.show.page import legend, plot, section, two_tables, unbroken
+from ground.show.sizes import with_deviation
 from obbgs_base.navigation_errors import LENGTHS
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.losses import fit_figures
@@ -42,7 +43,7 @@ MISFIT_DEVIATIONS = 6.0  # of the median absolute deviation, scaled to that of a
 
 @dataclass(frozen=True)
 class PoseHistory:
-    """The poses' corrections along the pass, a row for each bracket in the order of time.
+    """The poses' corrections along the pass, a row for each bracket, or frame that errs alone, in the order of time.
 
     A correction is the small motion in front of the tagged pose that gives the estimated one: a rotation vector (rad),
     then a shift (m), along the camera's axes.
@@ -122,19 +123,22 @@ def poses_section(run: Run) -> str:
         return ""
     history = pose_history(run, estimate)
     misfits = history.misfits
+    alone = len(history.frame_ids) == len(estimate.frame_ids)  # each frame has a correction of its own
+    each = "frame" if alone else "bracket"
     note = (
         "What the training found the pose tags to err by. Corrections are along the camera's axes (z along the line of "
         "sight), dotted lines are the standard deviations that the tags state. Ellipses lie across the line of sight: "
         "pale what the tags allow, dark what is left in doubt, one standard deviation each. The residual is 1 where "
-        "only noise is left; it compares the finished model with the longest exposure of each bracket."
+        "only noise is left; it compares the finished model with "
+        f"{'each frame' if alone else 'the longest exposure of each bracket'}."
     )
     told = (
-        "No bracket's residual stands out from the others."
+        f"No {each}'s residual stands out from the others."
         if not misfits
         else (
-            f"The residual of {len(misfits)} of {len(history.frame_ids)} brackets stands out, those of the frames "
-            f"{', '.join(map(str, misfits))}: their poses may err by more than their tags say, or something "
-            "passed before the camera."
+            f"The residual of {len(misfits)} of {len(history.frame_ids)} {each}s stands out (frame"
+            f"{'s' * (len(misfits) > 1)} {', '.join(map(str, misfits))}): the poses may err by more than the tags "
+            "say, or something passed before the camera."
         )
     )
     if left_out := run.metrics.get("misfit_frames"):
@@ -164,15 +168,10 @@ def shared_rows(estimate: PoseEstimate) -> list[tuple[str, str]]:
         for i in np.flatnonzero(priors):
             axis = f" {axes[i]}" if axes else ""
             doubt = ": not determined by the frames" if {name, f"{name}[{i}]"} & doubted else ""
-            value = _unbroken(f"{values[i]:.4g} ± {left[i]:.2g}") + " "
-            value += _unbroken(f"(stated ± {priors[i]:.2g}) {unit}")
+            value = unbroken(with_deviation(values[i], left[i])) + " "
+            value += unbroken(f"(stated ± {priors[i]:.2g}) {unit}")
             rows.append((f"{words}{axis}{doubt}", value))
     return rows
-
-
-def _unbroken(text: str) -> str:
-    """Return text that stays in one line."""
-    return text.replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def correction_figure(history: PoseHistory) -> go.Figure:

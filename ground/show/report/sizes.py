@@ -7,6 +7,7 @@ from ground.session.folder import SessionError
 from ground.show.inspection import read_model
 from ground.show.measure import measured
 from ground.show.page import section, two_tables
+from ground.show.sizes import with_deviation
 
 
 def sizes_section(run: Run) -> str:
@@ -32,4 +33,4 @@ def sizes_section(run: Run) -> str:
 
 def _told(value: dict) -> str:
     """Return a value and half of the width of its interval, as `measured` gives them."""
-    return f"{value['value']:.4g} ± {value['half_width_90']:.2g}"
+    return with_deviation(value["value"], value["half_width_90"])

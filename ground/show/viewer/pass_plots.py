@@ -1,6 +1,7 @@
 """The pass beside the model: housekeeping as plots with limits, events and commands; live, or replayed at any speed."""
 
 import html
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -17,6 +18,7 @@ from ground.show.telemetry_plots import (
     LIMIT_COLOURS,
     Series,
     housekeeping_series,
+    named,
     near_limits,
     unit_of,
 )
@@ -24,6 +26,7 @@ from ground.show.telemetry_plots import (
 TELEMETRY, EVENTS = "telemetry.jsonl", "events.jsonl"
 EVENTS_SHOWN = 30
 PLOT_PX, PANEL_PX = 120, 330
+STEPS_A_SECOND = 10  # of the slider; the replay itself goes on between them
 SPEEDS = {"1x": 1.0, "10x": 10.0, "100x": 100.0, "1000x": 1000.0}
 SEVERITY_COLOURS = {"info": "inherit", "warning": LIMIT_COLOURS["yellow"], "error": LIMIT_COLOURS["red"]}
 
@@ -80,6 +83,7 @@ class PassPlots:
         self._read: tuple[int, ...] = ()  # sizes of the files as they were read
         self._series: list[Series] = []
         self._events: list[Event] = []
+        self._replayed_s = self._shown_s = 0.0  # how far the replay is, and what the slider says of it
         self.controls: Controls | None = None  # None before the first housekeeping
 
     def tick(self, elapsed_s: float) -> None:
@@ -96,14 +100,16 @@ class PassPlots:
         if self.controls is None:
             self.controls = self._built()
         controls, end_s = self.controls, float(self._series[0].seconds[-1])
-        controls.place.max = max(end_s, 1.0)
+        controls.place.max = max(math.ceil(end_s * STEPS_A_SECOND) / STEPS_A_SECOND, 1.0)
         if controls.replay.value:
-            seconds = min(
-                float(controls.place.value) + elapsed_s * SPEEDS.get(controls.speed.value, 1.0), end_s
-            )
-            controls.place.value = seconds
-            self._on_time(self._series[0].start_utc_ns + round(1e9 * seconds))
-            self._draw(controls, seconds)
+            if controls.place.value != self._shown_s:  # someone has moved the slider
+                self._replayed_s = float(controls.place.value)
+            self._replayed_s += elapsed_s * SPEEDS.get(controls.speed.value, 1.0)
+            self._replayed_s = min(self._replayed_s, end_s)
+            self._shown_s = math.ceil(self._replayed_s * STEPS_A_SECOND) / STEPS_A_SECOND
+            controls.place.value = self._shown_s
+            self._on_time(self._series[0].start_utc_ns + round(1e9 * self._replayed_s))
+            self._draw(controls, self._replayed_s)
         elif changed:
             self._draw(controls, np.inf)
 
@@ -113,7 +119,7 @@ class PassPlots:
         with panel.add_tab("Telemetry"):
             replay = gui.add_checkbox("Replay the pass", initial_value=False)
             speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="10x")
-            place = gui.add_slider("Seconds", min=0.0, max=1.0, step=0.1, initial_value=0.0)
+            place = gui.add_slider("Seconds", min=0.0, max=1.0, step=1 / STEPS_A_SECOND, initial_value=0.0)
             controls = Controls(
                 replay, speed, place, gui.add_html(""), {s.item.name: self._plot(s) for s in self._series}
             )
@@ -127,8 +133,11 @@ class PassPlots:
             data=plotted(series, series),
             series=drawn_lines(series),
             scales={"x": uplot.Scale(time=False)},
-            axes=(uplot.Axis(stroke="#9aa5b1"), uplot.Axis(stroke="#9aa5b1", size=64)),
-            title=f"{series.item.name.replace('_', ' ')}{unit_of(series.item)}",
+            axes=(
+                uplot.Axis(stroke="#9aa5b1", label="s", labelSize=16, labelGap=-4, size=28),
+                uplot.Axis(stroke="#9aa5b1", size=64),
+            ),
+            title=f"{named(series.item)}{unit_of(series.item)}",
             legend=uplot.Legend(show=False),
             height=PLOT_PX,
         )
@@ -171,7 +180,7 @@ def _told(known: list[Series], events: list[Event]) -> str:
     broken = [(s, s.limits[-1]) for s in known if len(s.values) and s.limits[-1] != "green"]
     start_s = known[0].start_utc_ns / 1e9
     lines = [
-        f'<b style="color: {LIMIT_COLOURS[limit]}">{s.item.name.replace("_", " ")} {_in_words(s)}</b>'
+        f'<b style="color: {LIMIT_COLOURS[limit]}">{named(s.item)} {_in_words(s)}</b>'
         for s, limit in sorted(broken, key=lambda pair: pair[1] != "red")
     ]
     for event in events[: -EVENTS_SHOWN - 1 : -1]:

@@ -3,7 +3,7 @@
 import numpy as np
 import viser
 
-from ground.show.sizes import size_deviation, states_scale
+from ground.show.sizes import size_deviation, states_scale, with_deviation
 from ground.show.turntable import metres_per_pixel
 from ground.show.viewer.scene import RADIUS, Placed
 from ground.show.viewer.source import Shown
@@ -46,9 +46,9 @@ def measured(shown: Shown, first_m: np.ndarray, second_m: np.ndarray) -> str:
     share = size_deviation(shown.tagged, shown.estimate)
     error = float(np.hypot(share * length, 0.5 * metres_per_pixel(shown.session) * 2**0.5))
     if not states_scale(shown.session):
-        return f"{length:.4g} ± {error:.2g} units of the imported poses, whose scale in metres is not stated"
+        return f"{with_deviation(length, error)} units of the imported poses, whose scale in metres is not stated"
     why = f"size known to {100 * share:.2g} %" if share else "poses stated as exact"
-    return f"{length:.4g} ± {error:.2g} m (one standard deviation: {why}, each end to half a pixel)"
+    return f"{with_deviation(length, error)} m (one standard deviation: {why}, each end to half a pixel)"
 
 
 class Ruler:
