@@ -83,7 +83,7 @@ def test_a_name_means_the_same_in_all_commands_and_there_are_not_too_many(maker)
 def shown(page: Path) -> list[list[str]]:
     """Return the words of each command of ours in a page's shell blocks."""
     blocks = re.findall(r"(?ms)^```sh\n(.*?)^```", page.read_text())
-    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    lines = [line for block in blocks for line in re.split(r"\n|; ", block.replace("\\\n", " "))]
     words = [shlex.split(line, comments=True) for line in lines]
     return [each[: each.index(">")] if ">" in each else each for each in words if each]
 
