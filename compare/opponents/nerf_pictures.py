@@ -97,23 +97,25 @@ class Nerf:
         return pieces
 
     @torch.no_grad()
-    def depth_map(self, camera: Cameras) -> tuple[Tensor, Tensor]:
-        """Return the depths [H, W] m at which one camera's rays lose half of their light, and their slopes, m/px.
+    def depth_map(self, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the depths [H, W] m at which one camera's rays lose half of their light, their slopes, m/px, and the
+        light [H, W] of the pixels.
 
         A depth is infinite where a ray loses less, or where the pixel is as dark as the sky. Slopes [H, W, 2] are
         differences of the neighbours' depths.
         """
         axis = camera.world_to_camera[0, 2, :3].to(self.occupancy.density.device)
-        pieces = []
+        pieces, lights = [], []
         for rays, middle in self._pieces(camera):
             samples = self.visible(rays, middle)
             colours, depths = self.composited(rays, samples)
             distance = half_depths(depths, samples, len(middle), self.step_length)
-            bright = colours.mean(dim=1) > FAINTEST_SURFACE
+            lights.append(colours.mean(dim=1))
+            bright = lights[-1] > FAINTEST_SURFACE
             depth = 2 * self.radius_m * distance * (rays.directions @ axis)
             pieces.append(torch.where(bright, depth, torch.inf))
-        depth = torch.cat(pieces).cpu().reshape(camera.height, camera.width)
-        return depth, slopes(depth)
+        depth, light = (torch.cat(of).cpu().reshape(camera.height, camera.width) for of in (pieces, lights))
+        return depth, slopes(depth), light
 
     def surface(self, cameras: Cameras, count: int, most_views: int | None = None) -> Tensor:
         """Return points [count, 3] m, evenly spread over the surface that the cameras see; [0, 3] if they see none.

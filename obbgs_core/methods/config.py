@@ -45,7 +45,7 @@ class LossSettings:
     normal_weight: float = 0.02
     # of the mean shortest scale over the target's radius: flat Gaussians are surface (070)
     flat_weight: float = 15.0
-    sky_weight: float = 1.0  # of the mean alpha of pixels that show no light: space is empty (005, 055)
+    sky_weight: float = 4.0  # of the mean alpha of pixels that show no light: space is empty (005, 055, 101)
     # of the mean transmittance of pixels that certainly show light, where the Sun stands still and the sky is black:
     # what is dark is opaque too (092)
     solid_weight: float = 1.0
@@ -144,7 +144,6 @@ class SparseSettings:
     """What few frames need; between `FEW` and `MANY` a share of it (038)."""
 
     dropout: float = number(0.3, most=0.9)  # share of the Gaussians that each step leaves out (DropGaussian)
-    sky_weight: float = 3.0  # in place of `loss.sky_weight`, if it is more
 
     def __post_init__(self):
         check(self, "sparse")
@@ -194,13 +193,8 @@ class MethodConfig:
     def for_frames(self, count: int) -> "MethodConfig":
         """Return the settings as they are for so many frames."""
         few = few_share(count)
-        sky_weight = max(self.loss.sky_weight, few * self.sparse.sky_weight)
         sh_degree = min(self.light.max_sh_degree, FEW_SH_DEGREE) if few else self.light.max_sh_degree
-        return dataclasses.replace(
-            self,
-            light=dataclasses.replace(self.light, max_sh_degree=sh_degree),
-            loss=dataclasses.replace(self.loss, sky_weight=sky_weight),
-        )
+        return dataclasses.replace(self, light=dataclasses.replace(self.light, max_sh_degree=sh_degree))
 
     def stages(self) -> list[tuple[int, float, int]]:
         """Return the stages of the training: the first step, counted from 0, the image scale and the frames of a step.

@@ -59,7 +59,7 @@ _3DGS = MethodConfig(
     parsimony=ParsimonySettings(prune_at=(), keep_above_opacity=1.0),
     light=LightSettings(max_sh_degree=0, sun_span_deg=0.0, highlights=False),
     poses=PoseSettings(refine="never"),
-    sparse=SparseSettings(dropout=0.0, sky_weight=0.0),
+    sparse=SparseSettings(dropout=0.0),
     published=PublishedSettings(
         length_unit="cameras",
         radiance_unit="full_scale",

@@ -26,6 +26,8 @@ THIN_COPIES = 2
 NORMAL_NEIGHBOURS = 64  # fewer follow the noise of the depth maps, more round off the edges
 CANDIDATES = 900_000  # pixels of all views together that are compared with every view
 OVERSAMPLING = 4  # points before they are thinned out, at least, for each that is returned
+# of the mean light, which a view's planes have as weight where it shows none
+LEAST_LIGHT = 0.003
 FINEST_CELL = 1e-5  # of the surface's extent
 BISECTIONS = 18  # of the logarithm of the cell size
 
@@ -39,8 +41,8 @@ def surface_points(
     A pixel of a depth map is used if it is solid, or covered by three tenths by something thin, if it is on no depth
     edge and not seen at a grazing angle, if two other views see a surface at its depth, and if no more views see
     through it than see it. Each gives points at random places on its patch of plane; of those, one is kept in every
-    cell of a cubic grid that is as fine as the count allows. The same seed gives the same points. Both are empty,
-    [0, 3], if no pixel is left.
+    cell of a cubic grid that is as fine as the count allows. They then move towards where views with more light see
+    the surface (`_where_lit`). The same seed gives the same points. Both are empty, [0, 3], if no pixel is left.
 
     Args:
         gaussians: on the CPU, as the cameras.
@@ -53,7 +55,7 @@ def surface_points(
     gaussians = bright(gaussians, cameras)
     if len(gaussians) == 0:
         return torch.zeros(0, 3), torch.zeros(0, 3)
-    return fused_points(lambda c: with_thin_parts(gaussians, cameras.one(c)), cameras, count, seed)
+    return fused_points(lambda c: _seen(gaussians, cameras.one(c)), cameras, count, seed)
 
 
 @torch.no_grad()
@@ -66,30 +68,36 @@ def surface_positions(gaussians: Gaussians, cameras: Cameras, count: int = 100_0
     gaussians = bright(gaussians, cameras)
     if len(gaussians) == 0:
         return torch.zeros(0, 3)
-    return _fused(lambda c: with_thin_parts(gaussians, cameras.one(c)), cameras, count, seed)[0]
+    return _fused(lambda c: _seen(gaussians, cameras.one(c)), cameras, count, seed)[0]
+
+
+def _seen(gaussians: Gaussians, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the depth map of one camera, its slopes, and how far the light [H, W] is from that of the background."""
+    light = render(gaussians, camera).radiance[0].mean(dim=-1) - camera.background
+    return *with_thin_parts(gaussians, camera), light.abs()
 
 
 @torch.no_grad()
 def fused_points(
-    depth_and_slope: Callable[[int], tuple[Tensor, Tensor]], cameras: Cameras, count: int, seed: int = 0
+    seen: Callable[[int], tuple[Tensor, Tensor, Tensor]], cameras: Cameras, count: int, seed: int = 0
 ) -> tuple[Tensor, Tensor]:
     """Return points and normals as `surface_points` does, of whatever gives the depths of each camera.
 
     Args:
-        depth_and_slope: from the index of a camera to depths [H, W] m, infinite where nothing solid is seen, and
-            their slopes [H, W, 2] m/px.
+        seen: from the index of a camera to depths [H, W] m, infinite where nothing solid is seen, their slopes
+            [H, W, 2] m/px, and the light [H, W] in any unit, 0 where a pixel is as the background is.
 
     Raises:
         ValueError: no camera, or a count under 1.
     """
-    points, seen_by = _fused(depth_and_slope, cameras, count, seed)
+    points, seen_by = _fused(seen, cameras, count, seed)
     if len(points) == 0:
         return points, torch.zeros(0, 3)
     return points, _fitted_normals(points, cameras.centres[seen_by] - points)
 
 
 def _fused(
-    depth_and_slope: Callable[[int], tuple[Tensor, Tensor]], cameras: Cameras, count: int, seed: int
+    seen: Callable[[int], tuple[Tensor, Tensor, Tensor]], cameras: Cameras, count: int, seed: int
 ) -> tuple[Tensor, Tensor]:
     """Return points [count, 3] on the seen surface, and the index [count] of the camera that sees each."""
     if len(cameras) == 0 or count < 1:
@@ -97,12 +105,13 @@ def _fused(
     generator = torch.Generator().manual_seed(seed)
     views, patches = [], []
     for c in range(len(cameras)):
-        depth, slope = depth_and_slope(c)
+        depth, slope, light = seen(c)
         low_m, high_m = _neighbourhood(depth)
         pixels = _candidates(
             depth, slope, low_m, high_m, cameras.K[c], -(-CANDIDATES // len(cameras)), generator
         )
-        views.append(_View(low_m, high_m))
+        tangents = slope * cameras.K[c].diagonal()[:2] / depth[:, :, None]
+        views.append(_View(low_m, high_m, depth, tangents.half(), light.half()))
         patches.append(torch.cat([torch.full((len(pixels), 1), float(c)), pixels], dim=1))
     patch = torch.cat(patches)  # [P, 6]: camera, u, v, depth, slopes
     patch = patch[_confirmed(_back_project(patch, cameras), views, cameras)]
@@ -114,7 +123,7 @@ def _fused(
     patch[:, 1:3] += shift
     points = _back_project(patch, cameras)
     chosen = _evenly(points, count, generator)
-    return points[chosen], patch[chosen, 0].long()
+    return _where_lit(points[chosen], patch[chosen], views, cameras), patch[chosen, 0].long()
 
 
 def with_thin_parts(
@@ -200,6 +209,25 @@ class _View:
 
     low_m: Tensor  # [H, W] m, least depth of a pixel and its neighbours; infinite if all are sky
     high_m: Tensor  # [H, W] m, greatest such depth; 0 if all are sky
+    depth_m: Tensor  # [H, W], infinite in the sky
+    tangents: Tensor  # [H, W, 2] of the angle between the surface and the image plane
+    light: Tensor  # [H, W]
+
+    def plane(self, index: Tensor, p: Tensor, uv: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how far behind places the planes are that are seen there, and by which gradient that changes.
+
+        Args:
+            index: [P] of the pixel; p: [P, 3] m, places in the camera's frame; uv: [P, 2] px, where they project.
+
+        Returns:
+            [P] m along the line of sight, not finite in the sky, and [P, 3], across the plane, in the camera's frame.
+        """
+        depth_m, focal = self.depth_m.flatten()[index], K.diagonal()[:2]
+        slope = self.tangents.flatten(0, 1)[index].float() * depth_m[:, None] / focal  # m/px
+        behind_m = depth_m + (slope * (uv - uv.floor() - 0.5)).sum(dim=1) - p[:, 2]
+        across = slope / p[:, 2:]
+        along = -1 - (across * (uv - K[:2, 2])).sum(dim=1)
+        return behind_m, torch.cat([across * focal, along[:, None]], dim=1)
 
 
 def _evenly(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -236,22 +264,57 @@ def _confirmed(points: Tensor, views: list[_View], cameras: Cameras) -> Tensor:
     """Return which points [P] enough views confirm."""
     agreeing, through = torch.zeros(len(points)), torch.zeros(len(points))
     for c, view in enumerate(views):
-        R, t, K = cameras.world_to_camera[c, :3, :3], cameras.world_to_camera[c, :3, 3], cameras.K[c]
-        p = points @ R.T + t
+        p, _, index, seen = _on_image(points, cameras, c)
         z = p[:, 2]
-        uv = (p / z[:, None]) @ K.T
-        column, row = uv[:, 0].floor(), uv[:, 1].floor()
-        seen = (z > cameras.near_m) & (column >= 0) & (column < cameras.width)
-        seen &= (row >= 0) & (row < cameras.height)
-        index = torch.where(seen, row * cameras.width + column, 0).long()
         low_m, high_m = view.low_m.flatten()[index], view.high_m.flatten()[index]
-        tolerance_m = SAME_DEPTH_PX * z / K[0, 0]
+        tolerance_m = SAME_DEPTH_PX * z / cameras.K[c, 0, 0]
         agrees = seen & (z >= low_m - tolerance_m) & (z <= high_m + tolerance_m)
         agreeing += agrees
         through += seen & (z < low_m - tolerance_m)
     # a point's own view is among those that agree
     others = min(AGREEING_VIEWS, len(cameras) - 1)
     return (agreeing > others) & (through <= agreeing)
+
+
+def _where_lit(points: Tensor, patch: Tensor, views: list[_View], cameras: Cameras) -> Tensor:
+    """Return points [P, 3] of patches [P, 6], moved towards the planes that views see within two pixels' width of them.
+
+    A face that shows no light may lie anywhere behind a lit one, or before it, without a trace in the pictures. Planes
+    therefore have weight by the light that shows them, and a point moves to their mean by the share of the light that
+    its own view lacks, against the view with the most.
+
+    Source: Curless and Levoy, A volumetric method for building complex models from range images, 1996, who weight the
+    depths of scans by how sure they are.
+    """
+    least_light = LEAST_LIGHT * sum(float(view.light.float().mean()) for view in views) / len(views)
+    moved, weights, most = torch.zeros_like(points), torch.zeros(len(points)), torch.zeros(len(points))
+    own = torch.zeros(len(points))
+    for c, view in enumerate(views):
+        p, uv, index, seen = _on_image(points, cameras, c)
+        behind_m, gradient = view.plane(index, p, uv, cameras.K[c])
+        light = view.light.flatten()[index].float() + least_light
+        near = seen & (behind_m.abs() < SAME_DEPTH_PX * p[:, 2] / cameras.K[c, 0, 0])
+        squares = gradient.square().sum(dim=1)
+        weight = torch.where(near, light / squares, 0.0)
+        to_plane = -(behind_m / squares)[:, None] * gradient @ cameras.world_to_camera[c, :3, :3]
+        moved += torch.where(near[:, None], weight[:, None] * to_plane, 0.0)
+        weights += weight
+        most = torch.where(near, torch.maximum(most, light), most)
+        own = torch.where(patch[:, 0] == c, light, own)
+    share = (1 - own / most.clamp(min=1e-30)).clamp(0, 1)
+    return points + (share / weights.clamp(min=1e-30))[:, None] * moved
+
+
+def _on_image(points: Tensor, cameras: Cameras, c: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return points [P, 3] in one camera's frame, where they project [P, 2] px, the index of their pixel [P], and
+    whether they lie on the image [P]."""
+    R, t, K = cameras.world_to_camera[c, :3, :3], cameras.world_to_camera[c, :3, 3], cameras.K[c]
+    p = points @ R.T + t
+    uv = ((p / p[:, 2:]) @ K.T)[:, :2]
+    column, row = uv.floor().unbind(dim=1)
+    seen = (p[:, 2] > cameras.near_m) & (column >= 0) & (column < cameras.width)
+    seen &= (row >= 0) & (row < cameras.height)
+    return p, uv, torch.where(seen, row * cameras.width + column, 0).long(), seen
 
 
 def _fitted_normals(points: Tensor, to_camera: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from tests.scenes import SENSOR, photographed, tagged, target
 SMALL = {"steps": 120, "start.count": 400, "growth.max_gaussians": 900}
 # the published schedules in a hundredth of their steps
 PUBLISHED = SMALL | {"growth.interval": 6, "published.opacity_reset_interval": 40, "growth.begin": 0.1}
-MANY_EXPECTED = {"sparse.dropout": 0.0, "sparse.sky_weight": 0.0}
+MANY_EXPECTED = {"sparse.dropout": 0.0}
 
 
 def trained(frames: list[TrainingFrame], method: str, sensor=SENSOR, **changes) -> Trainer:

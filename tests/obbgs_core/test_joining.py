@@ -20,7 +20,7 @@ from tests.scenes import EXPOSURES_S, QUICK, SENSOR, SIZE_PX, photographed, tagg
 
 STEPS = 120
 # as `ground live` trains: what helps few frames alone is left off while more are to come
-MANY_EXPECTED = {"sparse.dropout": 0.0, "sparse.sky_weight": 0.0}
+MANY_EXPECTED = {"sparse.dropout": 0.0}
 CONFIG = preset("obbgs", QUICK | MANY_EXPECTED | {"steps": STEPS})
 
 

@@ -35,7 +35,7 @@ from obbgs_core.train.trainer import Trainer
 log = logging.getLogger(__name__)
 STEPS = 1000  # of the schedule, which begins again when the last frames have joined
 # what helps few frames alone would shape the model that the many frames to come inherit
-MANY_EXPECTED = {"sparse.dropout": 0.0, "sparse.sky_weight": 0.0}
+MANY_EXPECTED = {"sparse.dropout": 0.0}
 FEWEST_BRACKETS = 4  # that the first hull is carved of, while more may come
 JOIN_STEPS = 60  # at least, from frames that join to the next
 # at least so many times what the last joining took, from one to the next while frames arrive
