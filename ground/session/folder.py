@@ -261,6 +261,12 @@ class Session:
             raise SessionCorrupt(f"frame {record.id}: {path} cannot be read: {reason(error)}") from error
 
 
+def pass_name(session: Path) -> str:
+    """Return the name of a session's folder; that of the folder around it where it is just `session`."""
+    folder = session.resolve()
+    return folder.parent.name if folder.name == "session" else folder.name
+
+
 def open_session(folder: str | Path) -> Session:
     """Return the session in a folder, without an unfinished last line of frames.jsonl.
 

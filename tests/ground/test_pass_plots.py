@@ -89,16 +89,18 @@ def test_a_replay_goes_at_its_speed_shows_no_future_and_tells_the_time(session):
 
 
 def test_the_slider_of_a_replay_shows_tenths_of_seconds_and_loses_no_time(tmp_path):
-    """A pass of 17.12796 s; at 1x a quarter of a second passes between two looks, which is no whole tenth."""
+    """Housekeeping of 17.12796 s; at 1x a quarter of a second passes between two looks, which is no whole tenth."""
     last = packet(0) | {"utc_ns": 17_127_960_000}
     written(tmp_path, packet(0), packet(9), last)
+    event = {"utc_ns": 18 * 10**9, "severity": "info", "text": "flight software stopped"}
+    (tmp_path / "events.jsonl").write_text(json.dumps(event) + "\n")
     times: list[int] = []
     server = opened("127.0.0.1", 0)
     try:
         plots = PassPlots(server, tmp_path, times.append)
         plots.tick(0.25)
         controls = plots.controls
-        assert controls is not None and controls.place.max == 17.2
+        assert controls is not None and controls.place.max == 18
         controls.replay.value, controls.speed.value = True, "1x"
         for _ in range(6):
             plots.tick(0.25)
@@ -109,7 +111,9 @@ def test_the_slider_of_a_replay_shows_tenths_of_seconds_and_loses_no_time(tmp_pa
         assert times[-1] == 12_250_000_000
         controls.speed.value = "100x"
         plots.tick(0.25)
-        assert times[-1] == 17_127_960_000 and controls.place.value == controls.place.max
+        plots.tick(0.25)  # on to the last event, which came after the last housekeeping
+        assert times[-1] == 18_000_000_000 and "stopped" in controls.told.content
+        assert controls.place.value == controls.place.max
     finally:
         server.stop()
 

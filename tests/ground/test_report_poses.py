@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 from ground.run.estimated_poses import write_estimate
 from ground.run.runs import Run
 from ground.session.cameras import sensor_of
-from ground.session.folder import Navigation, open_session
+from ground.session.folder import Navigation, open_session, pass_name
 from ground.session.training_frames import split
-from ground.show.report.document import pass_name
 from ground.show.report.poses import pose_history, poses_section
 from ground.show.sizes import with_deviation
 from obbgs_base.navigation_errors import SIZE, SharedParameters

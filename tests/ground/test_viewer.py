@@ -27,7 +27,7 @@ from ground.session.cameras import predicted_image
 from ground.session.folder import SessionError
 from ground.show.pictures import tone
 from ground.show.sizes import size_deviation
-from ground.show.viewer import ruler, splats, viewer
+from ground.show.viewer import ruler, scene, splats, viewer
 from ground.show.viewer.door import ViewError, opened, refused
 from ground.show.viewer.scene import UNCERTAINTY, Placed
 from ground.show.viewer.source import Shown, Source
@@ -575,5 +575,12 @@ def test_on_a_phone_the_panel_starts_folded_and_a_touch_opens_it(bare):
         title = page.get_by_text("obbgs", exact=True).first
         title.wait_for()
         waited_for(lambda: title.bounding_box()["y"] > 600)
+        (client,) = bare.server.get_clients().values()
+        position = np.asarray(client.camera.position)
+        seen = 2 * np.arctan(np.tan(client.camera.fov / 2) * client.camera.aspect)  # from left to right
+        waited_for(lambda: np.linalg.norm(client.camera.position) * np.tan(seen / 2) > 1.2 * scene.RADIUS)
+        np.testing.assert_allclose(
+            np.cross(position, client.camera.position), 0, atol=1e-3
+        )  # moved back only
         title.click()
         waited_for(lambda: title.bounding_box()["y"] < 600)

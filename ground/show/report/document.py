@@ -9,7 +9,7 @@ from pathlib import Path
 from ground.run.card import chi2_explained, frames_captured, scored_frames
 from ground.run.runs import Run, open_run, read_config, written_to
 from ground.session.cameras import median_sun_direction
-from ground.session.folder import SessionError
+from ground.session.folder import SessionError, pass_name
 from ground.session.truth import Truth
 from ground.show.page import as_yaml, beside, cards, fold, legend, page, plot, section, two_tables
 from ground.show.plots import histogram_figure, training_figures
@@ -31,12 +31,6 @@ DECISIONS = {  # of metrics.json
     "budget": "budget",
     "start": "start",
 }
-
-
-def pass_name(session: Path) -> str:
-    """Return the name of a session's folder; that of the folder around it where it is just `session`."""
-    folder = session.resolve()
-    return folder.parent.name if folder.name == "session" else folder.name
 
 
 def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:

@@ -99,7 +99,8 @@ class PassPlots:
             return
         if self.controls is None:
             self.controls = self._built()
-        controls, end_s = self.controls, float(self._series[0].seconds[-1])
+        controls = self.controls
+        end_s = max(float(self._series[0].seconds[-1]), *(event.seconds for event in self._events), 0.0)
         controls.place.max = max(math.ceil(end_s * STEPS_A_SECOND) / STEPS_A_SECOND, 1.0)
         if controls.replay.value:
             if controls.place.value != self._shown_s:  # someone has moved the slider

@@ -9,7 +9,7 @@ from ground.run.attitude import FoundAttitude
 from ground.run.estimated_poses import as_estimated, read_estimate, settled_records
 from ground.run.runs import is_session, newest_run, session_of
 from ground.session.cameras import sensor_of
-from ground.session.folder import FrameRecord, Session, SessionError, open_session
+from ground.session.folder import FrameRecord, Session, SessionError, open_session, pass_name
 from ground.session.training_frames import training_frame
 from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
@@ -73,7 +73,7 @@ class Source:
 
     @property
     def name(self) -> str:
-        session = self.session_path.resolve().name
+        session = pass_name(self.session_path)
         return session if self.folder is None else f"{session}/{self.folder.resolve().name}"
 
     def is_ready(self) -> bool:

@@ -110,7 +110,7 @@ class Viewer:
         self.frames = _in_time(placed[0])
         self._controls()
         self._start_camera()
-        server.on_client_connect(self._limit_zoom)
+        server.on_client_connect(self._frame)
         for client in server.get_clients().values():  # who waited for the model
             self._reset(client)
         self.draw_all()
@@ -308,6 +308,17 @@ class Viewer:
         camera.position, camera.look_at = self.start
         camera.near, camera.far = RADIUS / 10, 100 * RADIUS
 
+    def _frame(self, client: viser.ClientHandle) -> None:
+        """Let a client begin with the whole model in view, from further away where its window is narrow."""
+        self._limit_zoom(client)
+        if client.camera.aspect < 1:
+            self._place(client)
+
+    def _place(self, client: viser.ClientHandle) -> None:
+        position, look_at = self.start
+        client.camera.position = look_at + (position - look_at) / min(1.0, client.camera.aspect)
+        client.camera.look_at = look_at
+
     def _limit_zoom(self, client: viser.ClientHandle) -> None:
         client.camera.max_orbit_distance = FARTHEST * RADIUS
         client.camera.min_orbit_distance = NEAREST * RADIUS
@@ -315,7 +326,7 @@ class Viewer:
     def _reset(self, client: viser.ClientHandle | None) -> None:
         if client is not None:
             client.camera.up_direction = (0.0, 0.0, 1.0)
-            client.camera.position, client.camera.look_at = self.start
+            self._place(client)
             client.camera.fov = FIELD_RAD
             self._limit_zoom(client)
 
