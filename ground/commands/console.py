@@ -342,7 +342,12 @@ def alarms(status: Status) -> list[tuple[str, str]]:
 
 
 def events_once(events: list[dict[str, Any]]) -> list[tuple[dict[str, Any], int]]:
-    """Return events, the newest first, each sentence once with how often it came: resending repeats a refusal."""
+    """Return events, the newest first, each sentence once with how often it came: resending repeats a refusal.
+
+    A refusal is told where its command ends, and not once more by the spacecraft's event about it.
+    """
+    ended = {event.get("problem") for event in events if event.get("event") == "command"}
+    events = [e for e in events if e.get("event") != "command_refused" or e.get("problem") not in ended]
     counts: dict[str, int] = {}
     newest: dict[str, dict[str, Any]] = {}
     for event in reversed(events):

@@ -30,7 +30,7 @@ from flightsw.ports import Link, open_link
 from ground.link.forward import Forwarder
 from ground.link.uplink import Uplinker, listening
 from ground.session.folder import SessionError
-from ground.session.telemetry import TelemetryLog
+from ground.session.telemetry import TelemetryLog, refusal
 from ground.session.writer import SessionWriter
 from obbgs_base.errors import in_words, reason
 from obbgs_base.files import write_whole
@@ -294,7 +294,12 @@ class _Ingest:
     def _note_end(self, counter: int, command: str, stage: str, text: str) -> None:
         self._commands_ended += 1
         severity = "info" if stage == "completed" else "warning"
-        line = {"event": "command", "severity": severity, "text": f"{command} {counter} {stage}: {text}"}
+        line = {
+            "event": "command",
+            "severity": severity,
+            "text": f"command {counter}, {command}, {stage}: {text}",
+        }
+        line["problem"] = refusal(counter, text)
         self._telemetry.events.append({"received_utc_ns": time.time_ns()} | line)
         self._on_event(self._telemetry.events[-1])
 

@@ -165,6 +165,11 @@ class TelemetryLog:
             self.write_failures += 1
 
 
+def refusal(counter: int, text: str) -> str:
+    """Return the problem of the spacecraft's event about a refused command, which its report tells as well."""
+    return f"counter {counter}: {text}"
+
+
 def plain(line: dict[str, Any]) -> dict[str, Any]:
     """Return values that JSON can hold: bytes become hexadecimal text."""
     return {name: value.hex() if isinstance(value, bytes) else value for name, value in line.items()}

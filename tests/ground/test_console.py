@@ -6,6 +6,8 @@ import os
 import select
 import termios
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import imagecodecs
 import numpy as np
@@ -29,7 +31,7 @@ from ground.commands.console import (
     size,
 )
 from ground.commands.terminal_pictures import COLUMNS, LatestPicture, stretched
-from ground.link.ingest import ListenSummary, Status
+from ground.link.ingest import ListenSummary, Status, _Ingest
 from ground.session.telemetry import TelemetryLog
 from obbgs_base.checked import parse_checked_line
 
@@ -315,6 +317,25 @@ def test_a_refusal_that_came_several_times_is_shown_once_and_counted():
     drawn = screen(ConsoleView(LINK, HERE), now)
     assert drawn.count("command refused: forged") == 1 and "forged (3 times)" in drawn
     assert [count for _, count in events_once(now.events)] == [3, 1]
+
+
+def test_a_refusal_is_told_where_its_command_ends_and_not_once_more():
+    """The spacecraft sends a report and an event about it; another command's refusal stays."""
+    told: list[dict] = []
+    log: Any = SimpleNamespace(
+        _commands_ended=0, _telemetry=SimpleNamespace(events=told), _on_event=lambda event: None
+    )
+    _Ingest._note_end(log, 9, "retire", "refused", "not armed")
+    (ended,) = told
+    refused = {
+        "received_utc_ns": 0,
+        "severity": "warning",
+        "event": "command_refused",
+        "text": "command refused: x",
+    }
+    same, other = refused | {"problem": "counter 9: not armed"}, refused | {"problem": "counter 8: forged"}
+    assert [event for event, _ in events_once([same, ended, other])] == [other, ended]
+    assert ended["text"] == "command 9, retire, refused: not armed"
 
 
 def test_keys_are_read_from_a_terminal_one_by_one_and_it_is_left_as_it_was(monkeypatch):

@@ -44,6 +44,16 @@ def test_events_and_commands_are_one_list_in_the_order_of_time(session):
         (60, "warning"),
     ]
     assert found[-1].text == "command near 9 refused: forged"
+    refused = {
+        "utc_ns": 70 * 10**9,
+        "severity": "warning",
+        "event": "command_refused",
+        "text": "command refused",
+    }
+    for problem in ("counter 1: forged", "counter 2: forged"):  # the first is told by the end of the command
+        with open(session / "events.jsonl", "a") as file:
+            file.write("\n" + json.dumps(refused | {"problem": problem}) + "\n")
+    assert len(pass_events(session, 10 * 10**9)) == len(found) + 1
 
 
 def test_a_plot_shows_what_was_known_and_the_limits_that_are_near(session):

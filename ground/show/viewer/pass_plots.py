@@ -13,6 +13,7 @@ from viser import uplot
 
 from ground.link.uplink import HISTORY
 from ground.session.folder import read_log
+from ground.session.telemetry import refusal
 from ground.show.telemetry_plots import (
     BYTES_PER_MB,
     LIMIT_COLOURS,
@@ -42,12 +43,17 @@ class Event:
 
 def pass_events(session: Path, start_utc_ns: int) -> list[Event]:
     """Return events and ends of commands in the order of time; lines that are damaged are left out."""
-    found = []
+    found, commands = [], read_log(session / HISTORY)
+    ended = {
+        refusal(line["counter"], line["text"]) for line in commands if {"counter", "text"} <= line.keys()
+    }
     for line in read_log(session / EVENTS):
+        if line.get("event") == "command_refused" and line.get("problem") in ended:
+            continue  # told where the command ends
         utc_ns, text = line.get("utc_ns", line.get("received_utc_ns")), line.get("text")
         if type(utc_ns) is int and isinstance(text, str):
             found.append(Event((utc_ns - start_utc_ns) / 1e9, str(line.get("severity", "info")), text))
-    for line in read_log(session / HISTORY):
+    for line in commands:
         utc_ns, stage = line.get("ended_utc_ns"), line.get("stage")
         if type(utc_ns) is int:
             severity = "info" if stage == "completed" else "warning"
