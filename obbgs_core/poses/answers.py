@@ -1,6 +1,7 @@
 """What pictures of a model say of the poses that they were taken from, asked while the training goes on."""
 
 import dataclasses
+from collections.abc import Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 
@@ -24,6 +25,8 @@ class Question:
     """Frames that are asked, and the model and poses that they are asked about.
 
     indices: of the frames; poses: [B, 4, 4] theirs, world to camera; cell_m: edge of the cells of the surface.
+    coarse: the frames whose pictures are averaged to a share of their size, by index: where a pose may err by more than
+        a pattern repeats, such as solar cells, the pattern must not be seen.
     """
 
     model: Gaussians
@@ -32,15 +35,15 @@ class Question:
     poses: Tensor
     sensor: Sensor
     cell_m: float
+    coarse: Mapping[int, float]
 
     @torch.no_grad()
     def answer(self) -> "Answer":
         """Render the model and compare it with the frames' readings."""
-        told, misfits = [], []
-        for first in range(0, len(self.indices), RENDERED):
-            batch = self.batches.batch(self.indices[first : first + RENDERED])
-            poses = self.poses[first : first + RENDERED]
-            cameras = dataclasses.replace(batch.cameras, world_to_camera=poses)
+        told, misfits, parts = [], [], self._parts()
+        for scale, places in parts:
+            batch = self.batches.batch([self.indices[k] for k in places], scale)
+            cameras = dataclasses.replace(batch.cameras, world_to_camera=self.poses[places])
             rendered, slopes = render_with_slopes(self.model, cameras)
             images = (rendered.radiance, slopes, rendered.alpha, rendered.depth)
             readings = (batch.exposure_time_s, batch.dn, self.sensor, batch.averaged_pixels)
@@ -50,14 +53,26 @@ class Question:
                 at = slice(one, one + 1)
                 seen = (radiance[at], batch.exposure_time_s[at], dn[at])
                 misfits.append(relative_misfit(*seen, self.sensor, batch.averaged_pixels))
+        asked = [k for _, places in parts for k in places]
+        order = sorted(range(len(asked)), key=asked.__getitem__)
+        cells = [cell for t in told for cell in t.cells or []]
         information = PoseInformation(
-            torch.cat([t.gradient for t in told]),
-            torch.cat([t.curvature for t in told]),
-            [cell for t in told for cell in t.cells or []],
+            torch.cat([t.gradient for t in told])[order],
+            torch.cat([t.curvature for t in told])[order],
+            [cells[k] for k in order] if cells else [],
             self.cell_m,
         )
-        dispersion = torch.cat([t.dispersion for t in told if t.dispersion is not None])
-        return Answer(self.indices, information, dispersion, torch.tensor(misfits))
+        dispersion = torch.cat([t.dispersion for t in told if t.dispersion is not None])[order]
+        return Answer(self.indices, information, dispersion, torch.tensor(misfits)[order])
+
+    def _parts(self) -> list[tuple[float, list[int]]]:
+        """Return which frames are rendered at a time, by their places among the indices, and at which scale."""
+        scales = [self.coarse.get(index, 1.0) for index in self.indices]
+        parts = []
+        for scale in sorted(set(scales), reverse=True):
+            places = [k for k, of_frame in enumerate(scales) if of_frame == scale]
+            parts += [(scale, places[first : first + RENDERED]) for first in range(0, len(places), RENDERED)]
+        return parts
 
 
 @dataclass(frozen=True)

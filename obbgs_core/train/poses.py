@@ -39,6 +39,8 @@ LEFT_OUT_FROM = 0.6
 # above the median
 FAR_DEVIATIONS = 6.0
 FAR_FACTOR = 6.0  # and the residual as a share of the picture's light is above the median by this factor
+# shares of the steps until which frames that have the Earth are asked in pictures of these shares of their size
+COARSE_UNTIL = ((0.15, 0.25), (0.3, 0.5))
 log = logging.getLogger(__name__)
 
 
@@ -187,7 +189,13 @@ class Poses:
         steps = steps_between(setup, now.moment.share)
         since = done - setup.config.steps_until(LEFT_OUT_FROM)
         return PoseRound(
-            _question(setup, now.model, poses, [members[done // steps % len(members)] for members in shown]),
+            _question(
+                setup,
+                now.model,
+                poses,
+                [members[done // steps % len(members)] for members in shown],
+                next((scale for until, scale in COARSE_UNTIL if now.moment.share < until), 1.0),
+            ),
             shown,
             answered_at=now.taken + _delay(steps),
             judges=0 <= since < steps_between(setup, LEFT_OUT_FROM),
@@ -294,8 +302,13 @@ def standing_out(dispersion: Tensor, misfit: Tensor) -> Tensor:
     return far & (misfit > FAR_FACTOR * misfit.nanmedian())
 
 
-def _question(setup: TrainingSetup, model: Gaussians, poses: PoseCorrections, indices: list[int]) -> Question:
-    """Return what frames are asked about a model and their poses as they stand; training may go on meanwhile."""
+def _question(
+    setup: TrainingSetup, model: Gaussians, poses: PoseCorrections, indices: list[int], scale: float = 1.0
+) -> Question:
+    """Return what frames are asked about a model and their poses as they stand; training may go on meanwhile.
+
+    scale: of the pictures that have the Earth, and so no silhouette to be aligned by.
+    """
     given = (
         setup.batches.posed(setup.frames),
         indices,
@@ -303,4 +316,5 @@ def _question(setup: TrainingSetup, model: Gaussians, poses: PoseCorrections, in
         setup.sensor,
         cell_m(setup),
     )
-    return Question(model.copied(), *given)
+    coarse = {i: scale for i in indices if scale < 1 and setup.frames[i].earth_m is not None}
+    return Question(model.copied(), *given, coarse)
