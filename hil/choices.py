@@ -5,7 +5,7 @@ from typing import Literal
 LinkKind = Literal["serial", "slcan", "slcan-fd"]  # a serial line, or a CAN or CAN FD bus with slcan adapters
 SensorKind = Literal["paper", "spacecam"]  # hil.sky.sensor.PRESETS
 SkyKind = Literal["real", "black"]  # with what hil.world.surroundings draws, or nothing but the target
-SKY: SkyKind = "black"  # unless something else is asked for
+SKY: SkyKind = "real"  # unless something else is asked for
 NavigationKind = Literal["realistic", "perfect"]  # with the errors of hil.world.navigation_errors, or exact
 NAVIGATION: NavigationKind = "realistic"  # unless something else is asked for
 
