@@ -82,7 +82,7 @@ def _tables(results: Results) -> str:
 
 def _explained(results: Results) -> str:
     """Return what the columns and rows that are there mean."""
-    methods = set(results.method_of.values())
+    methods = {row["method"] for row in results.rows if not (row.get("error") or row.get("failed"))}
     notes = []
     if results.truth:
         notes.append(
@@ -349,7 +349,7 @@ def _origin(results: Results) -> str:
     early = sum(bool(row.get("converged")) for row in results.rows)
     note = (
         f"Every row is a line of rows.jsonl with its own commit, machine, load and date. {early} trainings ended early "
-        "because their curve had moved by less than 0.05 dB over its last fifth (`converged`)."
+        "because their curve had moved by less than 0.05 dB over its last fifth (converged)."
     )
     return section(
         "Where the rows come from", note, f'<div class="scroll"><table>{"".join(lines)}</table></div>'

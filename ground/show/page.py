@@ -62,6 +62,7 @@ pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px;
   main { padding: 16px 8px 40px; } section { padding: 14px 12px; } h1 { font-size: 21px; overflow-wrap: anywhere; }
   .cards { grid-template-columns: minmax(0, 1fr); } .two > * { min-width: 0; }
   .card b { font-size: 20px; } td { padding: 5px 4px; overflow-wrap: anywhere; }
+  td:first-child { overflow-wrap: break-word; }
   td.n { white-space: normal; overflow-wrap: normal; } .grid { gap: 3px; }
   .grid .label, .grid figcaption { font-size: 10px; }
   dl { grid-template-columns: minmax(0, 1fr); } dd { margin: 0 0 6px; }

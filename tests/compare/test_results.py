@@ -292,6 +292,15 @@ def test_a_target_without_truth_beside_one_with_it_is_scored_by_its_noisy_frames
     )
 
 
+# a program that returns the letters at which words of an element are broken between two lines
+BROKEN_WORDS = """cell => [...cell.textContent.matchAll(/\\w+/g)].filter(word => {
+  const range = document.createRange();
+  range.setStart(cell.firstChild, word.index);
+  range.setEnd(cell.firstChild, word.index + word[0].length);
+  return new Set([...range.getClientRects()].map(box => Math.round(box.top))).size > 1;
+}).map(word => word[0])"""
+
+
 def test_long_names_of_methods_break_on_a_phone(comparison, tmp_path):
     name = "3dgs+exposure+hull+mask+l1+fast"
     shutil.copytree(comparison, tmp_path / "long")
@@ -324,6 +333,17 @@ def test_the_page_is_one_column_on_a_phone_and_shows_no_empty_chart(folder, requ
         body = page.locator("body").inner_text()
         assert "Relative gains over 3dgs" in body and "CompareError" not in body and "Diverged" not in body
         assert ("No truth is known" in body) == ("SSIM" not in body and "Chamfer" not in body)
+        assert (
+            page.evaluate(f"[...document.querySelectorAll('td:first-child')].flatMap({BROKEN_WORDS})") == []
+        )
+
+
+def test_a_row_without_a_result_is_not_explained_as_if_it_had_one(without_truth, tmp_path):
+    shutil.copytree(without_truth, tmp_path / "page")
+    rows = Rows(tmp_path / "page")
+    rows.add(row("noise", error="CompareError: noise needs a session with its truth"))
+    page = write_page(tmp_path / "page").read_text()
+    assert "noise needs a session with its truth" in page and "the noisy frame itself" not in page
 
 
 def test_figures_are_written_as_png(comparison):
