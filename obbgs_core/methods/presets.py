@@ -1,5 +1,7 @@
 """The methods by name: `obbgs` is what the settings are at their defaults, published methods differ from it."""
 
+import logging
+import math
 from dataclasses import fields, replace
 from typing import Any
 
@@ -17,6 +19,9 @@ from obbgs_core.published.settings import PublishedSettings
 from obbgs_core.settings import changed
 from obbgs_core.start.initialisation import StartSettings
 
+log = logging.getLogger(__name__)
+GAUSSIANS_PER_PIXEL = 2  # that a picture can show: one behind each edge of a pixel
+AS_MANY_PICTURES = 35  # long exposures: the lit pixels of fewer count as those of so many (experiment 084)
 # Kerbl et al., 3D Gaussian Splatting, 2023
 _3DGS = MethodConfig(
     name="3dgs",
@@ -225,3 +230,45 @@ def budget_changes(config: MethodConfig, changes: dict[str, Any], gaussians: int
     start = min(gaussians, changes.get("start.count", config.start.count))
     limits = {"growth.max_gaussians": gaussians, "growth.gaussians_per_root_pixel": 0, "start.count": start}
     return changes | limits
+
+
+def limited(
+    config: MethodConfig, lit_pixels: list[int], textured_pixels: int
+) -> tuple[MethodConfig, int, str]:
+    """Return a method with no more Gaussians than its budget and the lit pixels allow, and the budget in words.
+
+    Between them stands how many Gaussians a picture can show, 0 where the budget is what was asked for. A body with
+    texture all over begins with a Gaussian for each pixel that shows it, and may have as many as a picture can show:
+    growth, which begins at edges, does not reach it in time.
+
+    Args:
+        lit_pixels: of each long exposure. A few of them show as much detail of the target as many, and count as so
+            many.
+        textured_pixels: of a picture of a target that has texture all over, else 0.
+    """
+    most, factor, first = (
+        config.growth.max_gaussians,
+        config.growth.gaussians_per_root_pixel,
+        config.start.count,
+    )
+    budget = f"at most {most:,} Gaussians"
+    pictures = max(len(lit_pixels), AS_MANY_PICTURES)
+    lit = sum(lit_pixels) * pictures // len(lit_pixels)
+    shown = GAUSSIANS_PER_PIXEL * sum(lit_pixels) // len(lit_pixels) if factor else 0
+    if factor and textured_pixels > first and shown > most:
+        first, most = textured_pixels, shown
+        budget = (
+            f"at most {most:,} Gaussians instead of {config.growth.max_gaussians:,}: as many as a picture can show, "
+            f"because {textured_pixels:,} of its pixels show texture all over the target"
+        )
+    elif factor and factor * math.sqrt(lit) < most:
+        most = max(1, round(factor * math.sqrt(lit)))
+        budget = (
+            f"at most {most:,} Gaussians instead of {config.growth.max_gaussians:,}: {factor:g} times the square root "
+            f"of the {lit:,} pixels that {'are' if pictures == len(lit_pixels) else 'would be'} lit in {pictures} long "
+            "exposures"
+        )
+    log.info("budget: %s", budget)
+    growth = replace(config.growth, max_gaussians=most)
+    start = replace(config.start, count=min(first, most))
+    return replace(config, growth=growth, start=start), shown, budget

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import hashlib
 import logging
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -27,6 +26,7 @@ from obbgs_core.frames import (
 )
 from obbgs_core.hot_pixels import without_hot_pixels
 from obbgs_core.methods.config import MethodConfig, few_share
+from obbgs_core.methods.presets import limited
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.sensor import Sensor
@@ -34,6 +34,7 @@ from obbgs_core.sky_level import SkyLevel, levelled, with_noise_seen
 from obbgs_core.start.alignment import settled
 from obbgs_core.start.hull import Silhouette, light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
+from obbgs_core.start.texture import textured_pixels
 
 log = logging.getLogger(__name__)
 # full scale at the mean exposure may be a radiance between this and its inverse without harm
@@ -42,8 +43,6 @@ MOST_HIDDEN = 0.01  # share of the first Gaussians that may be nearer to the cam
 # Albedos under Lambert's law turn with the Sun where no two Suns are further apart: over part of the sphere harmonics
 # describe what light from other parts and coarse shadows do, all round it they do not (experiment 075).
 TURNING_SPAN_DEG = 90.0
-GAUSSIANS_PER_PIXEL = 2  # that a picture can show: one behind each edge of a pixel
-AS_MANY_PICTURES = 35  # long exposures: the lit pixels of fewer count as those of so many (experiment 084)
 
 
 @dataclass(frozen=True)
@@ -154,8 +153,8 @@ def prepare(
     checked, sensor, sky_level = levelled(checked, sensor)
     checked, hot = without_hot_pixels(checked, sensor)
     sensor, noise = with_noise_seen(checked, sensor)
-    shown = [shows_light(light(f.dn, sensor, f.background, f.exposure_time_s), sensor) for f in checked]
-    lit = _lit(checked, shown)
+    lighted = [shows_light(light(f.dn, sensor, f.background, f.exposure_time_s), sensor) for f in checked]
+    lit = _lit(checked, lighted)
     config = asked.for_frames(len(lit))
     published = config.published
     rng, seen = torch.Generator().manual_seed(seed), silhouettes(lit, sensor, known)
@@ -164,7 +163,7 @@ def prepare(
     noise += _unusual_unit(lit, sensor)
     certain = {i: held(outline.certain) for i, outline in outlines.items()}
     lit_pixels = [int(whole(mask).sum()) for mask in certain.values()]
-    config, budget = _limited(config, lit_pixels)
+    config, shown, budget = limited(config, lit_pixels, textured_pixels(posed, certain, sensor))
     given = (posed, list(outlines.values()), sensor, config.start, published.sh_degree, rng)
     gaussians, radius_m, start = first_gaussians(*given, published.grey_start)
     _check_nearness(gaussians.means.detach(), posed)
@@ -186,12 +185,10 @@ def prepare(
         sun_span_deg=span_deg,
         start=start + hot + noise,
         budget=budget,
-        shown=GAUSSIANS_PER_PIXEL * sum(lit_pixels) // len(lit_pixels)
-        if config.growth.gaussians_per_root_pixel
-        else 0,
+        shown=shown,
         reference_exposure_s=reference_exposure_s,
         dark_frames=len(checked) - len(lit),
-        tagged_exposures_s=[f.exposure_time_s for f, shows in zip(frames, shown, strict=True) if shows],
+        tagged_exposures_s=[f.exposure_time_s for f, shows in zip(frames, lighted, strict=True) if shows],
         silhouettes=seen,
         outlines=outlines,
         start_means=gaussians.means.detach(),
@@ -259,25 +256,3 @@ def _unusual_unit(frames: list[TrainingFrame], sensor: Sensor) -> str:
     )
     log.warning(unusual)
     return f"; {unusual}"
-
-
-def _limited(config: MethodConfig, lit_pixels: list[int]) -> tuple[MethodConfig, str]:
-    """Return the method with no more Gaussians than its budget and the lit pixels allow, and the budget in words.
-
-    lit_pixels: of each long exposure. A few of them show as much detail of the target as many, and count as so many.
-    """
-    most, factor = config.growth.max_gaussians, config.growth.gaussians_per_root_pixel
-    budget = f"at most {most:,} Gaussians"
-    pictures = max(len(lit_pixels), AS_MANY_PICTURES)
-    lit = sum(lit_pixels) * pictures // len(lit_pixels)
-    if factor and factor * math.sqrt(lit) < most:
-        most = max(2, round(factor * math.sqrt(lit)))  # the fewest that a start may have
-        budget = (
-            f"at most {most:,} Gaussians instead of {config.growth.max_gaussians:,}: {factor:g} times the square root "
-            f"of the {lit:,} pixels that {'are' if pictures == len(lit_pixels) else 'would be'} lit in {pictures} long "
-            "exposures"
-        )
-    log.info("budget: %s", budget)
-    growth = dataclasses.replace(config.growth, max_gaussians=most)
-    start = dataclasses.replace(config.start, count=min(config.start.count, most))
-    return dataclasses.replace(config, growth=growth, start=start), budget

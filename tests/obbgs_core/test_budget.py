@@ -4,12 +4,15 @@ import dataclasses
 
 import pytest
 import torch
+from torch import Tensor
 
 from obbgs_core.batches import Batches
 from obbgs_core.evidence.budget import as_many_again, fewer
 from obbgs_core.evidence.gains import VIEWS
-from obbgs_core.methods.presets import budget_changes, preset
+from obbgs_core.frames import TrainingFrame
+from obbgs_core.methods.presets import budget_changes, limited, preset
 from obbgs_core.render import render
+from obbgs_core.start.texture import textured_pixels
 from obbgs_core.train.trainer import Trainer, train
 from tests.scenes import SENSOR, photographed, target
 
@@ -70,3 +73,42 @@ def test_a_budget_that_is_asked_for_holds(textured):
     config = preset("obbgs", budget_changes(preset("obbgs"), SMALL, 80))
     result = train(textured, SENSOR, config)
     assert len(result.history) == config.steps and max(info.gaussians for info in result.history) <= 80
+
+
+def pictures_of(squares_px: int, noise: float) -> tuple[list[TrainingFrame], dict[int, Tensor]]:
+    """Return frames of a disc of radius 40 px with a checkerboard of so many pixels on it, and where it is."""
+    rows, columns = torch.meshgrid(torch.arange(100), torch.arange(100), indexing="ij")
+    disc = (rows - 50) ** 2 + (columns - 50) ** 2 < 40**2
+    bright = 1 + 0.3 * ((rows // squares_px + columns // squares_px) % 2)
+    rng, frames = torch.Generator().manual_seed(0), []
+    for seen in photographed(target(5), count=3, size_px=100):
+        dn = SENSOR.black_dn + 0.3 * (SENSOR.white_dn - SENSOR.black_dn) * bright * disc
+        dn = dn + noise * SENSOR.variance_dn2(dn).sqrt() * torch.randn(100, 100, generator=rng)
+        frames.append(dataclasses.replace(seen, dn=dn[..., None]))
+    return frames, dict.fromkeys(range(3), disc)
+
+
+def test_texture_all_over_is_counted_in_pixels_and_faces_with_edges_or_noise_have_none():
+    fine, disc = pictures_of(1, noise=0.0)
+    assert textured_pixels(fine, disc, SENSOR) == pytest.approx(torch.pi * 39**2, rel=0.02)
+    assert textured_pixels(pictures_of(2, noise=1.0)[0], disc, SENSOR) > 4_000
+    assert textured_pixels(pictures_of(25, noise=0.0)[0], disc, SENSOR) == 0  # four edges a face
+    assert textured_pixels(pictures_of(100, noise=1.0)[0], disc, SENSOR) == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "textured", "first", "most"),
+    [
+        ({}, 0, 3_000, 10_000),
+        ({}, 2_900, 3_000, 10_000),  # as many first Gaussians as ever see to them
+        ({}, 14_000, 14_000, 60_000),  # two for each pixel of the target
+        ({"growth.gaussians_per_root_pixel": 0.0}, 14_000, 3_000, 10_000),  # as was asked for
+    ],
+)
+def test_a_body_with_texture_all_over_begins_with_a_gaussian_for_each_pixel_that_shows_it(
+    changes, textured, first, most
+):
+    config, shown, budget = limited(preset("obbgs", changes), [30_000] * 40, textured)
+    assert (config.start.count, config.growth.max_gaussians) == (first, most)
+    assert shown == (60_000 if config.growth.gaussians_per_root_pixel else 0)
+    assert ("texture" in budget) == (first > 3_000)
