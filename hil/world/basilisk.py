@@ -228,7 +228,7 @@ class _Simulation:
         hull.hub.r_CN_NInit, hull.hub.v_CN_NInit = state.position_m.tolist(), state.velocity_m_s.tolist()
         hull.hub.sigma_BNInit = sigma_bn[:, None].tolist()
         hull.hub.omega_BN_BInit = rate_rad_s[:, None].tolist()
-        # an Earth of its own: one that is shared tells its mass to the last spacecraft only
+        # an Earth of its own: GravBodyData keeps where one spacecraft reads its mass and axes
         earth = gravityEffector.GravBodyData()
         earth.planetName, earth.isCentralBody = "earth", True
         earth.mu, earth.radEquator = EARTH_MU_M3_S2, EARTH_RADIUS_M

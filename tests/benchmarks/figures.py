@@ -77,6 +77,7 @@ FILES = {
     "lego": "lego",
     "ngp": "instant-ngp-200x200",
     "bodies": "bodies",
+    "brackets": "brackets",
     "poses": "poses",
     "photographs": "photographs",
     "rasterizer": "rasterizer",

@@ -14,7 +14,7 @@ from flightsw.orbit import OrbitState, propagate, sun_position_gcrs, sunlit_frac
 from flightsw.pose import PoseTagger
 from flightsw.sequencer import plan
 from hil.world.attitude import AttitudeSection, attitude
-from hil.world.basilisk import EARTH_MU_M3_S2, EARTH_RATE_RAD_S, BasiliskSection, Craft, flown
+from hil.world.basilisk import EARTH_MU_M3_S2, BasiliskSection, Craft, flown
 from hil.world.navigation import write_flight_inputs
 from hil.world.scenario import Scenario, Scene, load_scenario
 from hil.world.world import load_world
@@ -24,6 +24,7 @@ pytest.importorskip("Basilisk", reason="needs Basilisk: pip install 'obbgs[basil
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")
 NS = 1_000_000_000
+EARTH_TURNS_RAD_S = np.array([0, 0, 2 * np.pi / 86_164.1])  # a sidereal day
 V_BAR, TUMBLING = load_scenario("v-bar"), load_scenario("tumbling")
 START_NS, PASS_S = V_BAR.orbit.start_utc_ns, V_BAR.duration_s
 END_NS = START_NS + round(PASS_S * NS)
@@ -114,7 +115,7 @@ def test_drag_moves_the_lighter_chaser_along_the_track_as_theory_says():
     air = {"density_kg_m3": 5e-13, "scale_height_m": 1e9}  # as dense at each height
     pushed, free = (orbits(**more).orbits_at(END_NS)[1] for more in (air | {"chaser": craft}, {}))
     start = propagate(V_BAR.orbit.chaser_tle, START_NS)
-    through_air_m_s = start.velocity_m_s - np.cross([0, 0, EARTH_RATE_RAD_S], start.position_m)
+    through_air_m_s = start.velocity_m_s - np.cross(EARTH_TURNS_RAD_S, start.position_m)
     a = 0.5 * 5e-13 * 2.2 * 0.9 / 60.0 * through_air_m_s @ through_air_m_s
     n = np.sqrt(EARTH_MU_M3_S2 / np.linalg.norm(start.position_m) ** 3)
     phase = n * PASS_S
@@ -169,7 +170,7 @@ def test_torques_begin_to_turn_a_target_at_rest_as_theory_says(cause):
     found = orbits(dataclasses.replace(V_BAR, attitude=section), 2 * after_s, **disturbances)
     to_body, target = found.gcrs_to_body(START_NS), found.start[0]
     radius_m = float(np.linalg.norm(target.position_m))
-    air_m_s = target.velocity_m_s - np.cross([0, 0, EARTH_RATE_RAD_S], target.position_m)
+    air_m_s = target.velocity_m_s - np.cross(EARTH_TURNS_RAD_S, target.position_m)
     torque_n_m = {
         "gravity": torque_of_gravity(inertia, to_body @ -target.position_m / radius_m, radius_m),
         "leak": np.array(leak),
