@@ -21,11 +21,14 @@ def prepare_process(threads: int | None = None) -> None:
         ValueError: more threads than four for each core, which would only wait for each other.
     """
     cores = os.cpu_count() or 1
-    if threads is None:
-        threads = torch.get_num_threads() if os.environ.get("OMP_NUM_THREADS") else cores
+    # read here: PyTorch takes what it cannot use for something else without a word
+    stated = (
+        os.environ.get("OMP_NUM_THREADS", "").strip().partition(",")[0] if threads is None else str(threads)
+    )
+    threads = cores if not stated else int(stated) if stated.isdecimal() else 0
     if not 1 <= threads <= 4 * cores:
         raise ValueError(
-            f"OMP_NUM_THREADS: expected 1 to {4 * cores}, four for each of this machine's {cores} cores, got {threads}"
+            f"OMP_NUM_THREADS: expected 1 to {4 * cores}, four for each of this machine's {cores} cores, got {stated!r}"
         )
     torch.set_num_threads(threads)
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)

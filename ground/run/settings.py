@@ -6,7 +6,7 @@ Changes are named as in `preset`: `steps`, or `growth.interval` for a setting of
 import operator
 from collections.abc import Sequence
 
-from flightsw.icd.config import assignment, names_like
+from flightsw.icd.config import assignment, keys_below, names_like
 from flightsw.icd.mission import ConfigError, ReconstructSection, build
 from obbgs_core.methods.config import MethodConfig
 from obbgs_core.methods.presets import budget_changes, preset, quality_changes
@@ -70,7 +70,9 @@ def set_changes(assignments: Sequence[str]) -> dict:
         key, given = assignment(text)
         group, dot, name = key.partition(".")
         tree = {group: {name: given} if dot else given}
-        for name, setting in checked_settings(tree, "--set").items():
+        with keys_below(f"--set {key}", f"--set.{key}"):
+            checked = checked_settings(tree, "--set")
+        for name, setting in checked.items():
             if name in changes:
                 raise ConfigError(f"--set {name}", "is given twice")
             changes[name] = setting

@@ -430,13 +430,13 @@ def test_the_methods_of_a_mission_file_are_those_of_the_ground():
 @pytest.mark.parametrize(
     ("assignments", "message"),
     [
-        (["stepz=3"], r"stepz: unknown key; expected one of \d+ names, nearest to it: steps"),
+        (["stepz=3"], r"^--set stepz: unknown key; expected one of \d+ names, nearest to it: steps"),
         (
             ["sun_shading=linear"],
             r"unknown key; expected one of \d+ names, nearest to it: .*light\.sun_shading",
         ),
         (["light.sun_shading"], "expected NAME=VALUE, got 'light.sun_shading'"),
-        (["rates.means=fast"], r"rates\.means: expected a number, got 'fast'"),
+        (["rates.means=fast"], r"^--set rates\.means: expected a number, got 'fast'"),
         (["start.kind=nowhere"], r"start\.kind: expected one of random, hull, got 'nowhere'"),
         (["start=hull"], "start: expected a mapping of keys, got 'hull'"),
         (["published.sh_degree=9"], r"published\.sh_degree must be from 0 to 3, got 9"),
