@@ -70,6 +70,7 @@ FILES = {
     "foil": "foil-400x400",
     "sector": "sector-200x200",
     "sky": "sky-100x100",
+    "bars": "sky-bars-100x100",
     "size": "size-200x200",
     "mesh": "mesh-400x400",
     "demo": "demo",
