@@ -23,13 +23,24 @@ from compare.grid.rows import Rows
 from compare.grid.worker import VIEWS
 from compare.methods import reference_names
 from compare.views import SHOWN, WORST, KeptView, read_views
-from ground.show.page import beside, label, legend, page, picture, plot, section
+from ground.show.page import beside, fold, label, legend, page, picture, plot, section
 from ground.show.pictures import ERROR_FULL_SCALE, heat, tone
 from obbgs_base.files import write_whole
 
 PAGE = "compare.html"
 WORST_SHOWN = 6
 CELL_PX = 90  # of a method in a map of conditions, at least
+COLUMNS = (
+    "Clean figures compare with noiseless exposures of held-out views, full scale as 1; foreground counts only "
+    "the pixels that the target covers; pooled is of the mean squared error over all views together, which "
+    "single nearly exact views do not lift. Best on the way is the highest clean PSNR of a curve: what a "
+    "method would reach if the truth told it when to stop. Mu-law is of radiance after log(1 + 5000 x). "
+    "Distances are in units where the target's largest dimension is 2. Precision, recall and their mean F, "
+    "within .01 and .02, and Chamfer of the surface compare the surface that the training views see with the "
+    "true one, both thinned to one point in each cell of 0.005; surface complete and accuracy are of 100,000 "
+    "points on it (complete: within 0.01 of a point). Those of centres, of Gaussians that may be out of sight, "
+    "only help to find faults. Seconds to a quality are of the processor, read on the way without measuring."
+)
 
 
 def write_page(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyType({})) -> Path:
@@ -77,7 +88,9 @@ def _tables(results: Results) -> str:
     body = _table(results, None) if len(results.targets) > 1 else ""
     for target in results.targets:
         body += f"<h3>{html.escape(target)}</h3>{_table(results, target)}"
-    return section(f"Scores, {html.escape(results.base)}", _explained(results), body)
+    columns = f'<p class="note">{COLUMNS}</p>'
+    folded = fold("What the columns mean", columns) if results.truth else ""
+    return section(f"Scores, {html.escape(results.base)}", _explained(results), folded + body)
 
 
 def _explained(results: Results) -> str:
@@ -86,15 +99,7 @@ def _explained(results: Results) -> str:
     notes = []
     if results.truth:
         notes.append(
-            "Clean figures compare with noiseless exposures of held-out views, full scale as 1; foreground counts only "
-            "the pixels that the target covers; pooled is of the mean squared error over all views together, which "
-            "single nearly exact views do not lift. Best on the way is the highest clean PSNR of a curve: what a "
-            "method would reach if the truth told it when to stop. Mu-law is of radiance after log(1 + 5000 x). "
-            "Distances are in units where the target's largest dimension is 2. Precision, recall and their mean F, "
-            "within .01 and .02, and Chamfer of the surface compare the surface that the training views see with the "
-            "true one, both thinned to one point in each cell of 0.005; surface complete and accuracy are of 100,000 "
-            "points on it (complete: within 0.01 of a point). Those of centres, of Gaussians that may be out of sight, "
-            "only help to find faults. Seconds to a quality are of the processor, read on the way without measuring."
+            "Clean PSNR compares with noiseless exposures of held-out views; 6 dB more halve the error."
         )
     if not all(results.score_of(target).key == "psnr_clean_db" for target in results.targets):
         which = (

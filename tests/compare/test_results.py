@@ -245,6 +245,9 @@ def test_the_page_shows_every_part(comparison):
     for words in (*titles, "Relative gains over 3dgs", "40.50", "No result: the loss became nan.", "abc1234"):
         assert words in body
     assert 'src="http' not in page and "<link" not in page
+    note = re.search(r'<h2>Scores.*?<p class="note">(.*?)</p>', body)
+    assert note is not None and len(note[1].split()) < 60  # what the columns mean is behind a fold
+    assert "<summary>What the columns mean</summary>" in body and "Precision, recall and their mean F" in body
 
 
 def test_pictures_name_their_method_and_a_section_without_content_goes(comparison, tmp_path):
