@@ -239,7 +239,7 @@ def limited(
 
     Between them stands how many Gaussians a picture can show, 0 where the budget is what was asked for. A body with
     texture all over begins with a Gaussian for each pixel that shows it, and may have as many as a picture can show:
-    growth, which begins at edges, does not reach it in time.
+    growth, which begins at edges, does not reach it in time. Numbers that were asked for stay.
 
     Args:
         lit_pixels: of each long exposure. A few of them show as much detail of the target as many, and count as so
@@ -255,7 +255,8 @@ def limited(
     pictures = max(len(lit_pixels), AS_MANY_PICTURES)
     lit = sum(lit_pixels) * pictures // len(lit_pixels)
     shown = GAUSSIANS_PER_PIXEL * sum(lit_pixels) // len(lit_pixels) if factor else 0
-    if factor and textured_pixels > first and shown > most:
+    as_usual = (first, most) == (StartSettings().count, GrowthSettings().max_gaussians)
+    if factor and as_usual and textured_pixels > first and shown > most:
         first, most = textured_pixels, shown
         budget = (
             f"at most {most:,} Gaussians instead of {config.growth.max_gaussians:,}: as many as a picture can show, "

@@ -103,6 +103,8 @@ def test_texture_all_over_is_counted_in_pixels_and_faces_with_edges_or_noise_hav
         ({}, 2_900, 3_000, 10_000),  # as many first Gaussians as ever see to them
         ({}, 14_000, 14_000, 60_000),  # two for each pixel of the target
         ({"growth.gaussians_per_root_pixel": 0.0}, 14_000, 3_000, 10_000),  # as was asked for
+        ({"start.count": 200}, 14_000, 200, 10_000),
+        ({"growth.max_gaussians": 8_000}, 14_000, 3_000, 8_000),
     ],
 )
 def test_a_body_with_texture_all_over_begins_with_a_gaussian_for_each_pixel_that_shows_it(
