@@ -195,6 +195,10 @@ def _areas(corners: np.ndarray) -> np.ndarray:
 
 
 def _normals(corners: np.ndarray) -> np.ndarray:
-    """Return the unit normals [F, 3] of triangles with corners [F, 3, 3], outwards by the right-hand rule."""
+    """Return the unit normals [F, 3] of triangles with corners [F, 3, 3], outwards by the right-hand rule.
+
+    That of a triangle without area is zero.
+    """
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)

@@ -263,7 +263,7 @@ def limited(
             f"because {textured_pixels:,} of its pixels show texture all over the target"
         )
     elif factor and factor * math.sqrt(lit) < most:
-        most = max(1, round(factor * math.sqrt(lit)))
+        most = max(2, round(factor * math.sqrt(lit)))  # the fewest that a start may have
         budget = (
             f"at most {most:,} Gaussians instead of {config.growth.max_gaussians:,}: {factor:g} times the square root "
             f"of the {lit:,} pixels that {'are' if pictures == len(lit_pixels) else 'would be'} lit in {pictures} long "

@@ -23,6 +23,7 @@ from ground.session.folder import Navigation, Session, SessionError, open_sessio
 from ground.session.training_frames import training_frame
 from ground.session.truth import Truth
 from ground.show.report.attitude import attitude_section
+from ground.show.sizes import with_deviation
 from obbgs_base.errors import Interrupted
 from obbgs_base.navigation_errors import SharedParameters, displaced
 from obbgs_core.attitude.estimate import AttitudeUndetermined
@@ -171,7 +172,8 @@ def test_an_interrupted_run_goes_on_with_the_attitude_that_it_found(tmp_path):
     assert figures["psnr_clean_db"] > expected["psnr_clean_db"] - 1.5
     assert figures["chamfer"] < 1.3 * expected["chamfer"]
     page = attitude_section(open_run(session.path, "first"))
-    assert "refined together with the model" in page and f"{facts['rate_deg_s']:.5g} ±" in page
+    rate = with_deviation(facts["rate_deg_s"], facts["rate_sigma_deg_s"])
+    assert "refined together with the model" in page and f"{rate} deg/s" in page
     assert attitude_section(open_run(known, "first")) == ""
 
 

@@ -264,7 +264,8 @@ def test_the_report_shows_every_frame_of_automatic_brackets_with_its_time(sessio
     assert all(f"exposure {place}<" in page for place in (1, 2, 3)) and "exposure 4" not in page
     for record in (run.session.frames[0], run.session.frames[-1]):
         shown = f"{float(f'{1e3 * record.exposure_time_s:.4g}'):g} ms"
-        assert f"frame {record.id}, {np.linalg.norm(record.position_body_m):.4g} m, {shown}" in page
+        away = f"{np.linalg.norm(record.position_body_m):.4g}"
+        assert f"frame\N{NO-BREAK SPACE}{record.id}, {away}\N{NO-BREAK SPACE}m, {shown}" in page
     held_out = scored_section(run, None)
     assert held_out.count('alt="render"') == len(run.scored) == 6
 

@@ -3,6 +3,7 @@
 import json
 import re
 from datetime import UTC, datetime, timedelta
+from fractions import Fraction
 from pathlib import Path
 
 import erfa
@@ -113,7 +114,7 @@ def test_gaps_and_useable_times_are_kept_to():
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(2, 9), st.integers(0, 10**6), st.data())
-def test_polynomials_are_scipy_s(count, seed, data):
+def test_polynomials_are_those_of_scipy_and_of_fractions(count, seed, data):
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.uniform(5.0, 60.0, count))
     values, rates = rng.normal(size=(2, count, 3))
@@ -121,13 +122,32 @@ def test_polynomials_are_scipy_s(count, seed, data):
     np.testing.assert_allclose(
         lagrange(times, values, at), KroghInterpolator(times, values)(at), rtol=1e-6, atol=1e-6
     )
-    both = KroghInterpolator(np.repeat(times, 2), np.stack([values, rates], axis=1).reshape(-1, 3))
     value, rate = hermite(times, values, rates, at)
-    scale = 1 + np.abs(both(at)).max()
-    np.testing.assert_allclose(value, both(at), rtol=0, atol=1e-5 * scale)
-    np.testing.assert_allclose(
-        rate, both.derivative(at), rtol=0, atol=1e-5 * (1 + np.abs(both.derivative(at)).max())
-    )
+    expected, expected_rate = exact_hermite(times, values, rates, at)
+    np.testing.assert_allclose(value, expected, rtol=0, atol=1e-7 * (1 + np.abs(expected).max()))
+    np.testing.assert_allclose(rate, expected_rate, rtol=0, atol=1e-7 * (1 + np.abs(expected_rate).max()))
+
+
+def exact_hermite(times, values, rates, at: float) -> np.ndarray:
+    """Return value and rate [2, 3] by Newton's divided differences of fractions, exactly."""
+    nodes, found = [Fraction(time) for time in np.repeat(times, 2)], []
+    for value, rate in zip(values.T, rates.T, strict=True):
+        column = [Fraction(each) for each in np.repeat(value, 2)]
+        coefficients = [column[0]]
+        for order in range(1, len(nodes)):
+            column = [
+                Fraction(rate[(i + order) // 2])
+                if nodes[i + order] == nodes[i]
+                else (column[i + 1] - column[i]) / (nodes[i + order] - nodes[i])
+                for i in range(len(nodes) - order)
+            ]
+            coefficients.append(column[0])
+        polynomial = slope = Fraction(0)
+        for node, coefficient in zip(reversed(nodes), reversed(coefficients), strict=True):
+            slope = slope * (Fraction(at) - node) + polynomial
+            polynomial = polynomial * (Fraction(at) - node) + coefficient
+        found.append((float(polynomial), float(slope)))
+    return np.array(found).T
 
 
 @given(st.integers(1, 8), st.integers(0, 100))
