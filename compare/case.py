@@ -23,7 +23,7 @@ from ground.run.scores import (
     noisy_psnr_db,
 )
 from ground.session.cameras import exposed, sensor_of
-from ground.session.folder import FrameRecord, Session, open_session, read_header
+from ground.session.folder import FrameRecord, Session, open_session, pass_name, read_header
 from ground.session.training_frames import split, training_frame
 from ground.session.truth import Truth
 from obbgs_core.frames import TrainingFrame, cameras_of
@@ -202,18 +202,17 @@ def load_case(folder: Path, sector_deg: float = 0.0) -> Case:
     if truth is None:
         scored = [training_frame(session, record) for record in held_out]
         return Case(
-            case_name(folder), sensor, given, scored, [], [], None, session=session, calibration=calibration
+            pass_name(folder), sensor, given, scored, [], [], None, session=session, calibration=calibration
         )
     records = list(map(truth.posed, held_out))
     scored = [
-        dataclasses.replace(
-            training_frame(session, record), pose_covariance=None, rates=None
-        )  # truth stands still
+        # the truth is that of a target that stands still
+        dataclasses.replace(training_frame(session, record), pose_covariance=None, rates=None)
         for record in records
     ]
     true = [tuple(map(torch.from_numpy, truth.radiance(record))) for record in records]
     return Case(
-        case_name(folder),
+        pass_name(folder),
         sensor,
         given,
         scored,
@@ -254,12 +253,6 @@ def _sector(training: list[FrameRecord], width_deg: float) -> Callable[[FrameRec
 
     middle_deg = azimuth_deg(training[len(training) // 2])
     return lambda record: abs((azimuth_deg(record) - middle_deg + 180) % 360 - 180) <= width_deg / 2
-
-
-def case_name(folder: Path) -> str:
-    """Return what a session is called: its folder's name, or that of the folder above one named `session`."""
-    folder = folder.resolve()
-    return folder.parent.name if folder.name == "session" else folder.name
 
 
 def content_digest(folder: Path) -> str:

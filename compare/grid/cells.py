@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from compare.case import case_name, content_digest
+from compare.case import content_digest
 from compare.conditions import Condition
 from compare.errors import CompareError
 from compare.methods import Method, method
-from ground.session.folder import open_session
+from ground.session.folder import open_session, pass_name
 
-FORMAT = 1  # of a cell's digest; raise it when what is scored changes its meaning
+FORMAT = 2  # of a cell's digest; raise it when what is scored changes its meaning
 BASE_MB = 600.0  # a process with PyTorch before any work
 FRAME_COPIES = 4  # readings, prepared batches at several scales, silhouettes, truth
 # of a Gaussian's 59 numbers: parameters, gradient and two moments, and what growth and checkpoints copy of them
@@ -76,7 +76,7 @@ def session_facts(folder: Path) -> SessionFacts:
     camera = session.camera
     return SessionFacts(
         folder.resolve(),
-        case_name(folder),
+        pass_name(folder),
         content_digest(folder),
         max(camera.width, camera.height),
         len(session.frames),
