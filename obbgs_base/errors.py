@@ -27,9 +27,8 @@ def reason(error: BaseException) -> str:
         said = str(error.strerror)
         if error.errno and NUMBER.search(said):  # pyserial repeats the error that it met, with its file
             said = os.strerror(error.errno)
-    return (
-        NUMBER.sub("", " ".join(said.split())).strip() or type(error).__name__
-    )  # a TimeoutError may say nothing
+    words = NUMBER.sub("", " ".join(said.split())).strip()
+    return words or type(error).__name__  # a TimeoutError may say nothing
 
 
 def in_words(error: BaseException) -> str:

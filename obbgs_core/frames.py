@@ -13,6 +13,7 @@ from obbgs_base.navigation_errors import SharedParameters
 from obbgs_core.compact import Compact, hold_compact, part
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.model.cameras import Cameras, stacked_suns
+from obbgs_core.model.motions import point_flow
 from obbgs_core.model.pose_covariance import flaw
 
 VIEW_MARGIN = 0.15  # of the image's width and height: what lies as far outside still counts as in view
@@ -98,15 +99,14 @@ class TrainingFrame:
         """How far a target that fills the picture moves in it while the shutter is open, at most, px."""
         if self.rates is None:
             return 0.0
-        (height, width), K = self.shape[:2], self.K.double()
-        centre, rates = self.world_to_camera[:3, 3].double(), self.rates.double()
-        half = torch.stack([width / K[0, 0], height / K[1, 1], min(width / K[0, 0], height / K[1, 1])]) / 2
+        K, centre = self.K.double(), self.world_to_camera[:3, 3].double()
+        height, width = self.shape[:2]
+        sides = torch.stack([width / K[0, 0], height / K[1, 1]])
+        half = torch.cat([sides, sides.min()[None]]) / 2
         points = centre + centre[2] * torch.cat([half.diag(), -half.diag(), torch.zeros(1, 3)])
         points = points[points[:, 2] > 0]
-        speed = torch.linalg.cross(rates[:3].expand_as(points), points) + rates[3:]
-        across = (speed[:, :2] - points[:, :2] / points[:, 2:] * speed[:, 2:]) / points[:, 2:]
-        moved = (across * K.diag()[:2]).norm(dim=1) * self.exposure_time_s
-        return float(moved.max()) if len(moved) else 0.0
+        way = point_flow(points, K.expand(len(points), 3, 3)) @ self.rates.double() * self.exposure_time_s
+        return float(way.norm(dim=1).max()) if len(points) else 0.0
 
     def part(self, rows: slice, columns: slice) -> Tensor:
         """Return some rows and columns of dn [h, w, C]."""

@@ -242,10 +242,10 @@ def _breaking(results: Results) -> str:
     labels = [label for label in results.trained if any(label in points for _, points in found)]
     head = "".join(f"<th>{html.escape(label)}</th>" for label in labels)
     lines, curves = [], ""
+    metrics = [results.score, next(metric for metric in METRICS if metric.key == F)]
     for series, points in found:
         cells = "".join(_breaking_cell(series, points.get(label)) for label in labels)
         lines.append(f"<tr><td>{html.escape(series.kind.title)}</td>{cells}</tr>")
-        metrics = [results.score, next(metric for metric in METRICS if metric.key == F)]
         figures = [severity_figure(results, series, metric) for metric in metrics]
         curves += beside(plot(figure) for figure in figures if figure is not None)
     table = f'<div class="scroll"><table class="scores"><tr><th>condition</th>{head}</tr>{"".join(lines)}</table></div>'

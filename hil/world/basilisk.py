@@ -35,15 +35,18 @@ BEFORE_S = 0.1  # what is known before the start, by the first polynomial: clock
 
 @dataclass(frozen=True)
 class Craft:
-    """What a spacecraft's disturbances depend on; it is a sphere to the air and to sunlight."""
+    """What a spacecraft's disturbances depend on; it is a sphere to the air and to sunlight.
+
+    area_m2: seen from the direction of flight and from the Sun; 0: neither drag nor solar pressure.
+    reflection: 1 of a black sphere; solar pressure is in proportion to it.
+    drag_offset_m: where drag acts, from the centre of mass, body axes.
+    """
 
     mass_kg: float = 1000.0
-    area_m2: float = (
-        0.0  # seen from the direction of flight and from the Sun; 0: neither drag nor solar pressure
-    )
+    area_m2: float = 0.0
     drag_coefficient: float = 2.2
-    reflection: float = 1.3  # 1: a black sphere; solar pressure is in proportion to it
-    drag_offset_m: tuple[float, ...] = (0.0, 0.0, 0.0)  # where drag acts, from the centre of mass, body axes
+    reflection: float = 1.3
+    drag_offset_m: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)

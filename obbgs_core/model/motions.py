@@ -56,6 +56,15 @@ def adjoints(poses: Tensor) -> Tensor:
     return found
 
 
+def point_flow(points: Tensor, K: Tensor) -> Tensor:
+    """Return how the pixels of points [n, 3] m, camera axes, move [n, 2, 6] px with a motion; K [n, 3, 3]."""
+    x, y, z = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2], points[:, 2]
+    zero = torch.zeros_like(x)
+    along_x = torch.stack([-x * y, 1 + x * x, -y, 1 / z, zero, -x / z], dim=-1)
+    along_y = torch.stack([-1 - y * y, x * y, x, zero, 1 / z, -y / z], dim=-1)
+    return K[:, [0, 1], [0, 1], None] * torch.stack([along_x, along_y], dim=1)
+
+
 def cross_matrices(v: Tensor) -> Tensor:
     """Return [..., 3, 3] with cross(v) @ x = v x x."""
     x, y, z = v.unbind(-1)

@@ -4,9 +4,9 @@ import torch
 from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.model.motions import adjoints, rigid_motions
+from obbgs_core.model.motions import adjoints, point_flow, rigid_motions
 from obbgs_core.poses.corrections import PoseCorrections
-from obbgs_core.poses.registration import PoseInformation, point_flow
+from obbgs_core.poses.registration import PoseInformation
 
 ROUNDS = 8  # of aligning, Gauss-Newton
 # deviations of poses that a training has refined, and of those that silhouettes say, of projections on the target

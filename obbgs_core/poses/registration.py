@@ -11,6 +11,7 @@ from torch import Tensor
 
 from obbgs_core.losses import ON_TARGET_ALPHA
 from obbgs_core.model.cameras import Cameras
+from obbgs_core.model.motions import point_flow
 from obbgs_core.sensor import Sensor
 
 CELLS = 1024  # along each axis of the body
@@ -174,15 +175,6 @@ def _points(depth: Tensor, at: Tensor, K: Tensor) -> Tensor:
     rows, columns = torch.nonzero(at, as_tuple=True)
     x, y = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
     return torch.stack([x * z, y * z, z], dim=1)
-
-
-def point_flow(points: Tensor, K: Tensor) -> Tensor:
-    """Return how the pixels of points [n, 3] m, camera axes, move [n, 2, 6] px with a motion; K [n, 3, 3]."""
-    x, y, z = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2], points[:, 2]
-    zero = torch.zeros_like(x)
-    along_x = torch.stack([-x * y, 1 + x * x, -y, 1 / z, zero, -x / z], dim=-1)
-    along_y = torch.stack([-1 - y * y, x * y, x, zero, 1 / z, -y / z], dim=-1)
-    return K[:, [0, 1], [0, 1], None] * torch.stack([along_x, along_y], dim=1)
 
 
 def _residual(

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.model.motions import cross_matrices
+from obbgs_core.model.motions import cross_matrices, point_flow
 from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.poses.gauge import joined
-from obbgs_core.poses.registration import PoseInformation, point_flow
+from obbgs_core.poses.registration import PoseInformation
 from obbgs_core.start import hull
 from obbgs_core.start.silhouette_coherence import coherence, most_coherent, seen_from
 

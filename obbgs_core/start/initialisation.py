@@ -71,8 +71,8 @@ def silhouettes(
             continue
         light = hull.light(f.dn, sensor, f.background, f.exposure_time_s)
         outline = hull.silhouette(light, sensor, f.world_to_camera, f.K)
-        moved = f.rates is not None
-        outlines[i] = dataclasses.replace(outline, grown_px=math.ceil(f.moved_px / 2)) if moved else outline
+        spread_px = math.ceil(f.moved_px / 2)
+        outlines[i] = dataclasses.replace(outline, grown_px=spread_px) if spread_px else outline
     return outlines
 
 

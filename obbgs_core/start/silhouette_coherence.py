@@ -10,8 +10,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from obbgs_core.frames import TrainingFrame
+from obbgs_core.model.motions import point_flow
 from obbgs_core.poses.corrections import PoseCorrections
-from obbgs_core.poses.registration import point_flow
 from obbgs_core.start import hull
 
 log = logging.getLogger(__name__)

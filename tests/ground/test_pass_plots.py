@@ -36,6 +36,13 @@ def session(tmp_path):
     return tmp_path
 
 
+@pytest.fixture
+def server():
+    made = opened("127.0.0.1", 0)
+    yield made
+    made.stop()
+
+
 def test_events_and_commands_are_one_list_in_the_order_of_time(session):
     found = pass_events(session, 10 * 10**9)
     assert [(event.seconds, event.severity) for event in found] == [
@@ -65,88 +72,78 @@ def test_a_plot_shows_what_was_known_and_the_limits_that_are_near(session):
     assert len(drawn_lines(whole)) == 4
 
 
-def test_a_replay_goes_at_its_speed_shows_no_future_and_tells_the_time(session):
+def test_a_replay_goes_at_its_speed_shows_no_future_and_tells_the_time(session, server):
     times: list[int] = []
-    server = opened("127.0.0.1", 0)
-    try:
-        plots = PassPlots(server, session, times.append)
+    plots = PassPlots(server, session, times.append)
+    plots.tick(0.25)
+    controls = plots.controls
+    assert controls is not None and len(controls.plots["outbox_frames"].data[0]) == 11
+    assert "disk free 10 MB" in controls.told.content and "&lt;error&gt; at 65" in controls.told.content
+    controls.replay.value, controls.speed.value = True, "100x"
+    plots.tick(0.25)
+    assert times == [25 * 10**9] and len(controls.plots["outbox_frames"].data[0]) == 3
+    assert "at 20" in controls.told.content and "at 65" not in controls.told.content
+    assert "disk free" not in controls.told.content
+    for _ in range(8):
         plots.tick(0.25)
-        controls = plots.controls
-        assert controls is not None and len(controls.plots["outbox_frames"].data[0]) == 11
-        assert "disk free 10 MB" in controls.told.content and "&lt;error&gt; at 65" in controls.told.content
-        controls.replay.value, controls.speed.value = True, "100x"
-        plots.tick(0.25)
-        assert times == [25 * 10**9] and len(controls.plots["outbox_frames"].data[0]) == 3
-        assert "at 20" in controls.told.content and "at 65" not in controls.told.content
-        assert "disk free" not in controls.told.content
-        for _ in range(8):
-            plots.tick(0.25)
-        assert times[-1] == 100 * 10**9 and controls.place.value == 100
-        assert LIMIT_COLOURS["red"] in controls.told.content and "near 9 refused" in controls.told.content
-        with open(session / "telemetry.jsonl", "a") as file:
-            file.write("\n" + json.dumps(packet(110)) + "\n")
-        controls.replay.value = False
-        plots.tick(0.25)  # live again: what has come is drawn
-        assert len(controls.plots["outbox_frames"].data[0]) == 12
-        with open(session / "telemetry.jsonl", "a") as file:
-            file.write(json.dumps(packet(120, outbox_frames=900)) + "\n")
-        lines = len(controls.plots["outbox_frames"].series)
-        plots.tick(0.25)  # the limit of 1,000 is near now
-        plot = controls.plots["outbox_frames"]
-        assert len(plot.series) == len(plot.data) == lines + 1
-    finally:
-        server.stop()
+    assert times[-1] == 100 * 10**9 and controls.place.value == 100
+    assert LIMIT_COLOURS["red"] in controls.told.content and "near 9 refused" in controls.told.content
+    with open(session / "telemetry.jsonl", "a") as file:
+        file.write("\n" + json.dumps(packet(110)) + "\n")
+    controls.replay.value = False
+    plots.tick(0.25)  # live again: what has come is drawn
+    assert len(controls.plots["outbox_frames"].data[0]) == 12
+    with open(session / "telemetry.jsonl", "a") as file:
+        file.write(json.dumps(packet(120, outbox_frames=900)) + "\n")
+    lines = len(controls.plots["outbox_frames"].series)
+    plots.tick(0.25)  # the limit of 1,000 is near now
+    plot = controls.plots["outbox_frames"]
+    assert len(plot.series) == len(plot.data) == lines + 1
 
 
-def test_the_slider_of_a_replay_shows_tenths_of_seconds_and_loses_no_time(tmp_path):
+def test_the_slider_of_a_replay_shows_tenths_of_seconds_and_loses_no_time(tmp_path, server):
     """Housekeeping of 17.12796 s; at 1x a quarter of a second passes between two looks, which is no whole tenth."""
     last = packet(0) | {"utc_ns": 17_127_960_000}
     written(tmp_path, packet(0), packet(9), last)
     event = {"utc_ns": 18 * 10**9, "severity": "info", "text": "flight software stopped"}
     (tmp_path / "events.jsonl").write_text(json.dumps(event) + "\n")
     times: list[int] = []
-    server = opened("127.0.0.1", 0)
-    try:
-        plots = PassPlots(server, tmp_path, times.append)
+    plots = PassPlots(server, tmp_path, times.append)
+    plots.tick(0.25)
+    controls = plots.controls
+    assert controls is not None and controls.place.max == 18
+    controls.replay.value, controls.speed.value = True, "1x"
+    for _ in range(6):
         plots.tick(0.25)
-        controls = plots.controls
-        assert controls is not None and controls.place.max == 18
-        controls.replay.value, controls.speed.value = True, "1x"
-        for _ in range(6):
-            plots.tick(0.25)
-            assert controls.place.value == round(controls.place.value, 1)
-        assert times[-1] == 1_500_000_000
-        controls.place.value = 12.0  # moved by someone
-        plots.tick(0.25)
-        assert times[-1] == 12_250_000_000
-        controls.speed.value = "100x"
-        plots.tick(0.25)
-        plots.tick(0.25)  # on to the last event, which came after the last housekeeping
-        assert times[-1] == 18_000_000_000 and "stopped" in controls.told.content
-        assert controls.place.value == controls.place.max
-    finally:
-        server.stop()
+        assert controls.place.value == round(controls.place.value, 1)
+    assert times[-1] == 1_500_000_000
+    controls.place.value = 12.0  # moved by someone
+    plots.tick(0.25)
+    assert times[-1] == 12_250_000_000
+    controls.speed.value = "100x"
+    plots.tick(0.25)
+    plots.tick(0.25)  # on to the last event, which came after the last housekeeping
+    assert times[-1] == 18_000_000_000 and "stopped" in controls.told.content
+    assert controls.place.value == controls.place.max
 
 
-def test_the_page_draws_a_plot_for_each_item_and_a_session_without_telemetry_has_no_panel(session, tmp_path):
-    server = opened("127.0.0.1", 0)
-    try:
-        empty = PassPlots(server, tmp_path / "nothing")
-        empty.tick(0.25)
-        assert empty.controls is None
-        plots = PassPlots(server, session)
-        plots.tick(0.25)
-        assert plots.controls is not None
-        with (
-            chromium() as browser,
-            page_of(browser, f"http://127.0.0.1:{server.get_port()}", 900, 800) as page,
-        ):
-            page.get_by_text("Replay the pass").wait_for()
-            page.wait_for_function(
-                f"document.querySelectorAll('.uplot canvas').length == {len(plots.controls.plots)}"
-            )
-            page.get_by_text("command near 9 refused: forged").wait_for()
-            texts = page.locator(".uplot").first.inner_text()  # its title; the axes are drawn on the canvas
-            assert texts.startswith("frames stored")
-    finally:
-        server.stop()
+def test_the_page_draws_a_plot_for_each_item_and_a_session_without_telemetry_has_no_panel(
+    session, tmp_path, server
+):
+    empty = PassPlots(server, tmp_path / "nothing")
+    empty.tick(0.25)
+    assert empty.controls is None
+    plots = PassPlots(server, session)
+    plots.tick(0.25)
+    assert plots.controls is not None
+    with (
+        chromium() as browser,
+        page_of(browser, f"http://127.0.0.1:{server.get_port()}", 900, 800) as page,
+    ):
+        page.get_by_text("Replay the pass").wait_for()
+        page.wait_for_function(
+            f"document.querySelectorAll('.uplot canvas').length == {len(plots.controls.plots)}"
+        )
+        page.get_by_text("command near 9 refused: forged").wait_for()
+        texts = page.locator(".uplot").first.inner_text()  # its title; the axes are drawn on the canvas
+        assert texts.startswith("frames stored")
