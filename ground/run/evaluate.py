@@ -102,7 +102,7 @@ def evaluate(session_dir: Path, name: str, out: Path | None = None) -> dict:
         figures |= display_scores(pairs, run.sensor, run.session.encoding)
     truth = Truth(run.session) if Truth.exists(run.session) else None
     if truth is not None:
-        motion, (clouds, seen) = None, _geometry(run, truth)
+        motion, (clouds, seen) = None, _geometry(run, truth, estimate)
         if estimate is not None:
             alignment = Alignment.of(estimate, run.session, truth)
             motion = alignment.motion.numpy()
@@ -135,7 +135,9 @@ def keep_metrics(run: Run, metrics: dict) -> None:
         write_whole(run.folder / "model_card.md", model_card(run.session.created_utc, metrics).encode())
 
 
-def _geometry(run: Run, truth: Truth) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+def _geometry(
+    run: Run, truth: Truth, estimate: PoseEstimate | None
+) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
     """Return the model's points by the names of their scores, and which points of the true surface the frames show."""
     clouds = {"": run.gaussians.means.double().numpy()}
     if (run.folder / "surface.ply").exists():
@@ -144,7 +146,11 @@ def _geometry(run: Run, truth: Truth) -> tuple[dict[str, np.ndarray], np.ndarray
         clouds["_mesh"] = read_mesh_points(run.folder / "model.glb", SURFACE_POINTS)
     if run.session.background:
         return clouds, None
-    training = [run.on_black_sky(truth.posed(record)) for record in run.training]
+    found = {
+        record.id: torch.from_numpy(record.world_to_camera).float()
+        for record in estimated_records(run.training, estimate)
+    }
+    training = [run.on_black_sky(truth.posed(record), found.get(record.id)) for record in run.training]
     return clouds, shown_points(truth.cloud_m, training, run.sensor)
 
 

@@ -90,9 +90,16 @@ class Run:
         )  # still says no more than "at least this much"
         return dataclasses.replace(frame, dn=dn)
 
-    def on_black_sky(self, record: FrameRecord) -> TrainingFrame:
-        """Return a frame as if the sky was as black as stated, and the Earth not in view, as the model shows it."""
-        return without_earth(self.gaussians, self.without_sky_level(record), self.sensor)
+    def on_black_sky(self, record: FrameRecord, seen_from: Tensor | None = None) -> TrainingFrame:
+        """Return a frame as if the sky was as black as stated, and the Earth not in view, as the model shows it.
+
+        Args:
+            seen_from: [4, 4] world_to_camera from which the model shows where the target is; None: the frame's own.
+        """
+        frame = self.without_sky_level(record)
+        placed = frame if seen_from is None else dataclasses.replace(frame, world_to_camera=seen_from)
+        black = without_earth(self.gaussians, placed, self.sensor)
+        return dataclasses.replace(black, world_to_camera=frame.world_to_camera)
 
     @functools.cached_property
     def _sky_planes_dn(self) -> dict[int, Tensor]:

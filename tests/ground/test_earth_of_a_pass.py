@@ -16,12 +16,17 @@ from flightsw.icd.tle import position_gcrs_m
 from flightsw.pose import pose_tag
 from ground.run.evaluate import evaluate
 from ground.run.reconstruct import reconstruct
+from ground.run.runs import Run
+from ground.session.cameras import sensor_of
 from ground.session.folder import open_session
 from ground.session.training_frames import frames_of, training_frame
 from ground.session.writer import SessionWriter
+from ground.show.report.poses import pose_history
 from obbgs_base.earth import camera_rays, earth_radiance
+from obbgs_base.navigation_errors import SIZE, SharedParameters
 from obbgs_core.background import earth_pixels
 from obbgs_core.model.cameras import Cameras
+from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.render import render
 from tests import scenes
 
@@ -106,16 +111,49 @@ def test_a_frame_may_state_the_targets_place_itself(mission, tmp_path):
     assert torch.equal(training_frame(without, stated).earth_m, training_frame(session, record).earth_m)
 
 
-def test_a_pass_with_the_earth_makes_a_model_like_that_of_a_black_sky(mission, tmp_path):
-    """Scored on what is left of the held-out frames without the Earth, which those in front of it have for the most."""
+def opaque_target():
     small = scenes.target()
-    target = dataclasses.replace(
+    return dataclasses.replace(
         small,
         means=1.5 * small.means,
         log_scales=small.log_scales + np.log(1.5),
         opacity_logits=small.opacity_logits + 4,
     )
-    psnr_db = {}
+
+
+def test_the_report_looks_for_a_target_in_front_of_the_earth_where_its_pose_was_found(mission, tmp_path):
+    """The model is the truth; tags place it 20 px beside itself."""
+    target, count = opaque_target(), 4
+    session = flown(mission, tmp_path / "session", [SHOWS_IT_S + n for n in range(count)], True, target)
+    true = np.array([record.world_to_camera for record in session.frames])
+    aside = np.eye(4)
+    aside[0, 3] = 20 / 1800 * true[0, 2, 3]
+    tagged = [dataclasses.replace(r, world_to_camera=aside @ r.world_to_camera) for r in session.frames]
+    sigmas = SharedParameters(boresight_rad=np.full(3, 0.02))
+    session = dataclasses.replace(
+        session, frames=tuple(tagged), navigation=dataclasses.replace(session.navigation, sigmas=sigmas)
+    )
+    none = np.zeros((count, 6))
+    estimate = PoseEstimate(
+        frame_ids=[record.id for record in tagged],
+        brackets=list(range(count)),
+        tagged=np.array([record.world_to_camera for record in tagged]),
+        estimated=true,
+        shared=SharedParameters(),
+        shared_prior=sigmas,
+        shared_posterior=sigmas,
+        shared_covariance=np.zeros((SIZE, SIZE)),
+        **dict.fromkeys(("own", "own_prior", "own_posterior"), none),
+    )
+    run = Run(session.path, session, tagged, [], sensor_of(session.camera), target, None, {})
+    history = pose_history(run, estimate)
+    assert all(frame.earth_m is not None for frame in frames_of(session))
+    assert (history.chi2_estimated < 0.02 * history.chi2_tagged).all()
+
+
+def test_a_pass_with_the_earth_makes_a_model_like_that_of_a_black_sky(mission, tmp_path):
+    """Scored on what is left of the held-out frames without the Earth, which those in front of it have for the most."""
+    target, psnr_db = opaque_target(), {}
     for name, earth in (("black", False), ("earth", True)):
         times_s = [44.0 * (n // 2) + n % 2 for n in range(48)]
         session = flown(mission, tmp_path / name, times_s, earth, target)

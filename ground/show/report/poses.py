@@ -81,8 +81,10 @@ def pose_history(run: Run, estimate: PoseEstimate) -> PoseHistory:
     rows = sorted(longest, key=lambda row: records[estimate.frame_ids[longest[row]]].mid_exposure_utc_ns)
     places = [longest[row] for row in rows]
     ids = [estimate.frame_ids[place] for place in places]
-    frames = [run.on_black_sky(records[number]) for number in ids]
     tagged, estimated = (torch.from_numpy(poses[places]) for poses in (estimate.tagged, estimate.estimated))
+    frames = [
+        run.on_black_sky(records[number], pose.float()) for number, pose in zip(ids, estimated, strict=True)
+    ]
     times_ns = np.array([records[number].mid_exposure_utc_ns for number in ids])
     return PoseHistory(
         ids,
