@@ -233,11 +233,12 @@ def _breaking(results: Results) -> str:
     found = [(series, points) for series, points in found if points]
     if not found:
         return ""
+    of_surface = f", or F of the surface within .02 is below {LEAST_F_PERCENT:g} %" if results.truth else ""
     note = (
-        "The mildest condition at which a method is broken on any target: it ends in an error, its score is below the "
-        f"better one of a black image and the mean image, or F of the surface within .02 is below {LEAST_F_PERCENT:g} "
-        "%. Where it never broke, the most severe condition that it was tried at. Point at a cell for the reason. The "
-        "curves are means over targets, their bands from the lowest to the highest seed."
+        "The mildest condition, in bold, at which a method is broken on any target: it ends in an error, or its score "
+        f"is below the better one of a black image and the mean image{of_surface}. Where it never broke, the most "
+        "severe condition that it was tried at. Point at a cell for the reason. The curves are means over targets, "
+        "their bands from the lowest to the highest seed."
     )
     labels = [label for label in results.trained if any(label in points for _, points in found)]
     head = "".join(f"<th>{html.escape(label)}</th>" for label in labels)
