@@ -30,15 +30,33 @@ SET_HELP = "A setting, NAME=VALUE; can be repeated, and a wrong name lists them 
 
 
 class _Group(TyperGroup):
-    """A group of commands whose Ctrl-C is an error with a message, like any other; click would end in silence."""
+    """A group of commands whose Ctrl-C is an error with a message, like any other; click would end in silence.
+
+    What it says of a wrong value is in our words, not in those of the library that reads values for Typer.
+    """
 
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
+        except typer.BadParameter as error:
+            if isinstance(error.__cause__, ValueError):
+                error.message = _refusal(error.message, error.__cause__)
+            raise
         except KeyboardInterrupt as error:
             raise Interrupted(
                 "interrupted; nothing is half written, the same command goes on where it can"
             ) from error
+
+
+def _refusal(message: str, error: ValueError) -> str:
+    """Return what was expected and what came, of "Input should be a valid integer, unable to" and such."""
+    said, is_library, expected = message.partition("Input should be ")
+    if said or not is_library:  # of our own choices
+        return message.removeprefix("Value error, ")
+    expected = expected.partition(", unable to")[0]
+    given = getattr(error, "errors", lambda: [])()
+    came = f", got {given[0]['input']!r}" if given else ""
+    return f"expected {'' if expected.startswith('a ') else 'a number '}{expected}{came}"
 
 
 def _show_version(wanted: bool) -> None:

@@ -84,6 +84,14 @@ class TrainingFrame:
     earth_m: Tensor | None = None
     rates: Tensor | None = None
 
+    def __repr__(self) -> str:
+        height, width, channels = self.shape
+        bracket = "" if self.bracket is None else f" of bracket {self.bracket}"
+        return (
+            f"<frame {self.id}{bracket}: {width}x{height} pixels, {channels} channel{'s' * (channels > 1)}, "
+            f"{1e3 * self.exposure_time_s:g} ms>"
+        )
+
     @property
     def shape(self) -> torch.Size:
         """Of dn, [H, W, C]."""

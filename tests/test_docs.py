@@ -1,6 +1,7 @@
 """The documents are true: their links lead somewhere, the page of commands is that of today's command lines."""
 
 import importlib.util
+import pkgutil
 import re
 import shlex
 from pathlib import Path
@@ -8,6 +9,8 @@ from typing import Any
 
 import pytest
 
+import ground
+import obbgs_core
 from flightsw.icd.link_url import parse_link_url
 from tests.benchmarks.figures import PAGES as PAGES_WITH_FIGURES
 from tests.benchmarks.figures import blocks, wrong
@@ -103,6 +106,19 @@ def test_every_command_that_is_shown_is_one_that_is_taken(maker):
         assert camera is None or camera.split("://")[0] in ("hil", "gige", "mine"), words
         taken.add(name)
     assert len(taken) > 25
+
+
+def test_every_public_name_of_the_library_is_there_and_says_what_it_is():
+    names = re.findall(r"(?m)^::: (\S+)$", (ROOT / "docs" / "library.md").read_text())
+    assert len(names) > 20
+    public = set()
+    for name in names:
+        found = pkgutil.resolve_name(name)
+        assert found.__doc__, name
+        public.add(name.rpartition(".")[2])
+    assert {*obbgs_core.__all__, *ground.__all__} - {
+        "PRESETS"
+    } <= public  # its methods are named in a sentence
 
 
 def test_every_page_is_in_the_site():

@@ -139,7 +139,8 @@ class Item:
             raise ValueError(f"{self.name}: expected a finite number, got {number!r}")
         if self.range and not self.range[0] <= number <= self.range[1]:
             low, high = self.range
-            raise ValueError(f"{self.name}: expected {low:g} to {high:g} {self.unit}, got {number}")
+            unit = f" {self.unit}" if self.unit else ""
+            raise ValueError(f"{self.name}: expected {low:g} to {high:g}{unit}, got {number}")
 
     def limit(self, value: Any) -> Limit:
         """Tell whether a value is as it should be."""

@@ -114,10 +114,8 @@ def say(console: Console, text: str) -> None:
 
 
 def _state(info: "StepInfo") -> str:
-    return (
-        f"PSNR {info.psnr_db:.1f} dB chi² {info.chi2:.1f} {info.gaussians} Gaussians "
-        f"{info.seconds_left:.0f} s left"
-    )
+    left = "" if info.seconds_left is None else f" {info.seconds_left:.0f} s left"
+    return f"PSNR {info.psnr_db:.1f} dB chi² {info.chi2:.1f} {info.gaussians} Gaussians{left}"
 
 
 class Stop:

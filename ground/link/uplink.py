@@ -40,6 +40,16 @@ COUNTER_MARGIN = 1 << 20  # that `move_counter` leaves for commands that were se
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # elapsed time counts from this start of the computer
 LAST_FRAME = (1 << 32) - 1
 HISTORY = "commands.jsonl"
+EXAMPLES = {  # of the commands that take arguments
+    "bracket": "bracket 0.02,0.05,0.1",
+    "near": "near 2",
+    "priority": "priority oldest",
+    "model": "model pass-12/runs/first/model.onnx",
+    "arm": "arm delete",
+    "delete": "delete 0 39",
+    "resend": "resend 0 39` or `resend all",
+    "retire": "retire 1",
+}
 POLL_S = 0.2  # between looks at the folder
 LOCK_TRIES = 5  # to become the session's listener
 RESEND_INTERVALS = 2  # timer intervals before an unanswered command is sent again
@@ -102,8 +112,19 @@ def parse_command(name: str, arguments: list[str]) -> tuple[Command, Path | None
     """Return the command that a command line asks for, and the model file of `model`.
 
     Raises:
-        ValueError: no such command, or not its arguments.
+        ValueError: no such command, or not its arguments, or one out of range; the message repeats what was given.
     """
+    given = " ".join([name, *arguments])
+    try:
+        command, model = _parsed(name, arguments)
+        if model is None:
+            command.pack()
+    except ValueError as error:
+        raise ValueError(f"`{given}`: {error}") from error
+    return command, model
+
+
+def _parsed(name: str, arguments: list[str]) -> tuple[Command, Path | None]:
     match name, arguments:
         case "ping" | "safe" | "resume" | "fsck", []:
             return Command(name, {}), None
@@ -126,8 +147,9 @@ def parse_command(name: str, arguments: list[str]) -> tuple[Command, Path | None
             return Command(name, frames), None
         case "retire", [key]:
             return Command(name, {"key": _number(key, int)}), None
-    given = " ".join([name, *arguments])
-    raise ValueError(f"not a command with its arguments: {given!r}; see `ground uplink --help`")
+    Command(name, {})  # refused where there is none of this name
+    example = EXAMPLES.get(name)
+    raise ValueError(f"expected `{example}`" if example else "expected no arguments")
 
 
 def parse_script(text: str) -> list[tuple[Command, Path | None]]:
@@ -141,10 +163,8 @@ def parse_script(text: str) -> list[tuple[Command, Path | None]]:
         try:
             if words := shlex.split(line, comments=True):
                 commands.append(parse_command(words[0], words[1:]))
-                command, model = commands[-1]
-                if model is None:
-                    command.pack()
-                elif not model.is_file():
+                _, model = commands[-1]
+                if model is not None and not model.is_file():
                     raise ValueError(f"{model} is no file")
         except ValueError as error:
             raise ValueError(f"line {number} of the script: {error}") from error
@@ -164,7 +184,8 @@ def _number(text: str, kind: type) -> Any:
     try:
         return kind(text)
     except ValueError as error:
-        raise ValueError(f"expected a number, got {text!r}") from error
+        expected = "a whole number" if kind is int else "a number"
+        raise ValueError(f"expected {expected}, got {text!r}") from error
 
 
 def submit(session: Path, key_file: Path, command: Command, model: Path | None, expires_s: float) -> int:

@@ -101,6 +101,13 @@ class FrameRecord:
     # [3] of the target from the Earth's centre, GCRS, m; None: its two-line elements say it, if there are any
     target_position_m: np.ndarray | None = None
 
+    def __repr__(self) -> str:
+        pose = "" if self.pose_valid else ", no valid pose"
+        return (
+            f"<frame {self.id}: exposure {self.bracket_index} of bracket {self.bracket}, "
+            f"{1e3 * self.exposure_time_s:g} ms{pose}>"
+        )
+
 
 ERRS_ALIKE_S = 5.0  # from one exposure to the next; further apart where tags state a longer correlation
 ARRAY_SHAPES = {
@@ -171,6 +178,11 @@ class Session:
     navigation: Navigation
     registration: Mapping[str, Any] | None  # of photographs: what structure from motion made of them
     attitude_estimated: bool = False  # poses are in axes of the target that were found
+
+    def __repr__(self) -> str:
+        size = f"{self.camera.width}x{self.camera.height} pixels"
+        brackets = len({record.bracket for record in self.frames})
+        return f"<{self.path}: {len(self.frames):,} frames of {size} in {brackets:,} brackets>"
 
     def check_body_axes(self) -> None:
         """Check that poses are in axes of the target.

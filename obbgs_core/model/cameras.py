@@ -60,6 +60,9 @@ class Cameras:
     def __len__(self) -> int:
         return self.world_to_camera.shape[0]
 
+    def __repr__(self) -> str:
+        return f"<{len(self)} camera{'s' * (len(self) != 1)} of {self.width}x{self.height} pixels>"
+
     @property
     def centres(self) -> Tensor:
         """Camera centres [C, 3], m, body frame."""

@@ -1,6 +1,7 @@
 """The model: N anisotropic Gaussians with opacity and scene-linear radiance."""
 
 import dataclasses
+import math
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
@@ -103,6 +104,14 @@ class Gaussians:
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    def __repr__(self) -> str:
+        _, coefficients, channels = self.sh.shape
+        lobes = ", with highlights" if self.has_highlights else ""
+        return (
+            f"<{len(self):,} Gaussians in {channels} channel{'s' * (channels > 1)}, shading {self.shading}, "
+            f"harmonics of degree {math.isqrt(coefficients) - 1}{lobes}>"
+        )
 
     @property
     def scales(self) -> Tensor:

@@ -24,7 +24,7 @@ class StepInfo:
     chi2: float  # running mean squared normalised residual where the model is; 1 is pure noise
     gaussians: int
     seconds: float  # spent so far, before a kill too
-    seconds_left: float  # if the pace per pixel stays as it is
+    seconds_left: float | None  # if the pace per pixel stays as it is; None: before there is a pace
 
 
 @dataclass(frozen=True)

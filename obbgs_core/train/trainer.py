@@ -399,9 +399,12 @@ class Trainer:
         return True
 
 
-def _seconds_left(state: TrainingState, config: MethodConfig) -> float:
-    """Return the time that the remaining steps will take: their work at the pace of the last steps."""
-    stages = config.stages()
+def _seconds_left(state: TrainingState, config: MethodConfig) -> float | None:
+    """Return the time that the remaining steps will take, at the pace since the first of them or the last set-back."""
+    last, done, stages = state.history[: -PACE_STEPS - 1 : -1], state.steps_done, config.stages()
+    counted = [info for back, info in enumerate(last, 1) if info.step == done - back]
+    if not counted:
+        return None
 
     def work(first: int, last: int) -> float:
         ends = [*(start for start, _, _ in stages[1:]), config.steps]
@@ -411,9 +414,5 @@ def _seconds_left(state: TrainingState, config: MethodConfig) -> float:
         )
 
     again = state.poses.set_backs * work(*(round(config.steps_until(s)) for s in (SET_BACK_TO, SET_BACK_AT)))
-    before = state.history[-PACE_STEPS] if len(state.history) >= PACE_STEPS else None
-    if before is not None and before.step >= state.steps_done:  # the schedule was set back since
-        before = None
-    since, spent = (before.step, state.seconds - before.seconds) if before else (0, state.seconds)
-    left = work(state.steps_done, config.steps) + again
-    return spent / max(work(since, state.steps_done), 1e-9) * left
+    spent = state.seconds - counted[-1].seconds
+    return spent / work(counted[-1].step, done) * (work(done, config.steps) + again)

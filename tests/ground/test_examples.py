@@ -76,4 +76,8 @@ def test_the_shipped_session_is_small_and_opens():
     first = frames_of(session, session.frames[:1])[0]
     assert torch.equal(first.dn[..., 0], torch.from_numpy(session.dn(session.frames[0]).astype("float32")))
     result = train(frames, sensor_of(session.camera), preset("obbgs", {"steps": 1, "start.count": 50}))
+    for shown in (session, session.frames[0], first, result.gaussians):
+        assert "\n" not in repr(shown) and len(repr(shown)) < 120
+    assert repr(session).endswith("small_session: 120 frames of 64x64 pixels in 40 brackets>")
+    assert repr(first) == "<frame 0 of bracket 0: 64x64 pixels, 1 channel, 0.05 ms>"
     assert str(result) == repr(result) and "\n" not in repr(result) and "1 steps in" in repr(result)

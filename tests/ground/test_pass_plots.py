@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from ground.show.telemetry_plots import LIMIT_COLOURS, housekeeping_series
+from ground.show.telemetry_plots import LIMIT_COLOURS, housekeeping_series, telemetry_figures
 from ground.show.viewer.door import opened
 from ground.show.viewer.pass_plots import PassPlots, drawn_lines, pass_events, plotted, up_to
 from tests.browser import chromium
@@ -66,10 +66,22 @@ def test_events_and_commands_are_one_list_in_the_order_of_time(session):
 def test_a_plot_shows_what_was_known_and_the_limits_that_are_near(session):
     whole = next(s for s in housekeeping_series(session) if s.item.name == "disk_free_bytes")
     seconds, values, *limits = plotted(up_to(whole, 35), whole)
-    np.testing.assert_array_equal(seconds, [0, 10, 20, 30])
+    np.testing.assert_array_equal(seconds, [0, 10, 10, 20, 20, 30, 30])
     assert (values == 5000).all()  # MB
     assert [set(limit) for limit in limits] == [{1000.0}, {100.0}]
     assert len(drawn_lines(whole)) == 4
+
+
+def test_a_plot_is_drawn_in_steps_as_the_report_draws_it(session):
+    """Seen as a line, what plotly's shape `hv` stands for: a value holds until the next one comes."""
+    whole = next(s for s in housekeeping_series(session) if s.item.name == "outbox_frames")
+    (figure,) = telemetry_figures([whole])
+    assert figure.data[0].line.shape == "hv"
+    x, y = figure.data[0].x, figure.data[0].y
+    seconds, values, *_ = plotted(whole, whole)
+    corners = list(zip(seconds, values, strict=True))
+    steps = [corner for i in range(len(x) - 1) for corner in ((x[i], y[i]), (x[i + 1], y[i]))]
+    assert corners == [*steps, (x[-1], y[-1])] and len(set(y)) > 1
 
 
 def test_a_replay_goes_at_its_speed_shows_no_future_and_tells_the_time(session, server):
@@ -77,11 +89,11 @@ def test_a_replay_goes_at_its_speed_shows_no_future_and_tells_the_time(session, 
     plots = PassPlots(server, session, times.append)
     plots.tick(0.25)
     controls = plots.controls
-    assert controls is not None and len(controls.plots["outbox_frames"].data[0]) == 11
+    assert controls is not None and len(controls.plots["outbox_frames"].data[0]) == 21
     assert "disk free 10 MB" in controls.told.content and "&lt;error&gt; at 65" in controls.told.content
     controls.replay.value, controls.speed.value = True, "100x"
     plots.tick(0.25)
-    assert times == [25 * 10**9] and len(controls.plots["outbox_frames"].data[0]) == 3
+    assert times == [25 * 10**9] and len(controls.plots["outbox_frames"].data[0]) == 5
     assert "at 20" in controls.told.content and "at 65" not in controls.told.content
     assert "disk free" not in controls.told.content
     for _ in range(8):
@@ -92,7 +104,7 @@ def test_a_replay_goes_at_its_speed_shows_no_future_and_tells_the_time(session, 
         file.write("\n" + json.dumps(packet(110)) + "\n")
     controls.replay.value = False
     plots.tick(0.25)  # live again: what has come is drawn
-    assert len(controls.plots["outbox_frames"].data[0]) == 12
+    assert len(controls.plots["outbox_frames"].data[0]) == 23
     with open(session / "telemetry.jsonl", "a") as file:
         file.write(json.dumps(packet(120, outbox_frames=900)) + "\n")
     lines = len(controls.plots["outbox_frames"].series)

@@ -25,6 +25,7 @@ from ground import cli
 from ground.link.ingest import listen
 from ground.link.uplink import (
     COUNTER_MARGIN,
+    EXAMPLES,
     Uplinker,
     check_model,
     in_words,
@@ -85,11 +86,31 @@ def test_a_command_line_becomes_a_command(words, expected):
 
 
 @pytest.mark.parametrize(
-    "words", [["fire"], ["ping", "now"], ["bracket"], ["bracket", "a,b"], ["near", "2.5"], ["delete", "3"]]
+    ("words", "told"),
+    [
+        ("fire", "`fire`: no command 'fire'; there are "),
+        ("ping now", "`ping now`: expected no arguments"),
+        ("bracket", "`bracket`: expected `bracket 0.02,0.05,0.1`"),
+        ("bracket a,b", "`bracket a,b`: expected a number, got 'a'"),
+        ("near x", "`near x`: expected a whole number, got 'x'"),
+        ("near 99", "`near 99`: near: expected 0 to 16 DN, got 99"),
+        ("delete 3", "`delete 3`: expected `delete 0 39`"),
+        ("resend x", "`resend x`: expected `resend 0 39` or `resend all`"),
+        ("priority newest", "`priority newest`: order: expected one of oldest, triage, thumbnail-first"),
+        ("retire 99999", "`retire 99999`: key: expected 1 to 65534, got 99999"),
+    ],
 )
-def test_a_command_line_that_is_none_says_so(words):
-    with pytest.raises(ValueError, match=r"not a command|expected a number"):
-        parse_command(words[0], words[1:])
+def test_a_command_line_that_is_none_repeats_what_was_given_and_says_what_is_expected(words, told):
+    name, *arguments = words.split()
+    with pytest.raises(ValueError) as caught:
+        parse_command(name, arguments)
+    assert str(caught.value).startswith(told) and "\n" not in str(caught.value)
+
+
+def test_what_a_message_expects_is_taken():
+    for name, example in EXAMPLES.items():
+        for words in example.split("` or `"):
+            assert parse_command(name, words.split()[1:])[0].name == name
 
 
 def test_every_command_has_a_counter_of_its_own_even_when_made_at_once(session, key_file):
@@ -303,7 +324,7 @@ def test_a_script_is_read_whole_before_anything_is_sent(tmp_path):
     for text, told in (
         ("ping\nnear 99", "line 2 of the script"),
         (f"ping\nping\nmodel {tmp_path / 'none.onnx'}", "line 3 of the script: .*is no file"),
-        ("fire", "line 1 of the script: not a command"),
+        ("fire", "line 1 of the script: `fire`: no command 'fire'"),
         ("bracket '0.05", "line 1 of the script"),
         ("# nothing\n", "holds no command"),
     ):

@@ -311,6 +311,14 @@ def test_the_chi2_of_a_good_model_is_near_one(frames):
     assert result.history[-1].seconds_left == pytest.approx(0, abs=1e-6)
 
 
+def test_what_came_before_the_first_step_tells_nothing_of_the_time_left(frames):
+    trainer = Trainer(frames, SENSOR, preset("obbgs", QUICK))
+    trainer.state.seconds += 1e6  # such as a start on a machine that does much else
+    first, second = trainer.step(), trainer.step()
+    assert first.seconds_left is None
+    assert second.seconds_left is not None and 0 < second.seconds_left < 1e6
+
+
 def test_black_frames_are_left_out_and_counted(frames):
     black = dataclasses.replace(frames[0], dn=torch.full_like(frames[0].dn, SENSOR.black_dn))
     trainer = Trainer([*frames, black, black], SENSOR, preset("obbgs", QUICK))

@@ -176,10 +176,14 @@ def drawn_lines(whole: Series) -> tuple[uplot.Series, ...]:
 
 
 def plotted(known: Series, whole: Series) -> tuple[np.ndarray, ...]:
-    """Return a plot's columns: seconds, values (bytes in MB), then the limits that are near."""
+    """Return a plot's columns: seconds, values (bytes in MB), then the limits that are near.
+
+    A value stands until the next one comes, as in the report: each has a point where it came and one where it ended.
+    """
     factor = BYTES_PER_MB if known.item.unit == "B" else 1.0
-    limits = [np.full(len(known.seconds), bound / factor) for bound, _ in near_limits(whole)]
-    return (known.seconds, known.values / factor, *limits)
+    seconds, values = np.repeat(known.seconds, 2)[1:], np.repeat(known.values / factor, 2)[:-1]
+    limits = [np.full(len(seconds), bound / factor) for bound, _ in near_limits(whole)]
+    return (seconds, values, *limits)
 
 
 def _told(known: list[Series], events: list[Event]) -> str:
