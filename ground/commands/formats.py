@@ -134,7 +134,7 @@ def _read(
     format_: ImportFormat, folder: Path, table: "dict[str, Light] | None"
 ) -> "tuple[list[View], Exported | None]":
     """Return the pictures of a data set whose cameras are known, and what our own export says of them."""
-    from ground.formats.colmap import read_colmap
+    from ground.formats.colmap import read_colmap_and_export
     from ground.formats.llff import read_llff
     from ground.formats.middlebury import read_middlebury
     from ground.formats.ndm import read_ndm
@@ -143,14 +143,17 @@ def _read(
     from ground.formats.shirt import read_shirt
     from ground.formats.spice import read_spice
 
-    described = {ImportFormat.NERF: read_nerf, ImportFormat.NERFSTUDIO: read_nerfstudio}
+    described = {
+        ImportFormat.NERF: read_nerf,
+        ImportFormat.NERFSTUDIO: read_nerfstudio,
+        ImportFormat.COLMAP: read_colmap_and_export,
+    }
     timed = {ImportFormat.NDM: read_ndm, ImportFormat.SPICE: read_spice}
     if format_ in described:
         return described[format_](folder)
     if format_ in timed:
         return timed[format_](folder, table), None
     plain = {
-        ImportFormat.COLMAP: read_colmap,
         ImportFormat.SHIRT: read_shirt,
         ImportFormat.LLFF: read_llff,
         ImportFormat.MIDDLEBURY: read_middlebury,
@@ -275,8 +278,8 @@ def export_command(
 ) -> None:
     """Write a session's frames for other software, whole brackets split into train, val and test (6:2:3).
 
-    Pictures have 8 bits. Beside them lie the readings of 16 bits, which `ground import` takes with the sensor's figures
-    (a COLMAP folder is a nerfstudio folder too: import it as that). The format ndm writes no pictures, but CCSDS
+    Pictures have 8 bits. Beside them lie the readings of 16 bits, which `ground import` takes with exposure times and
+    the sensor's figures, of a COLMAP folder with the cameras of its model. The format ndm writes no pictures, but CCSDS
     messages: the target's attitude and rate, the camera's attitude and its path about the target with covariance.
 
     Example: ground export pass-12/runs/first --format nerfstudio --out pass-12-nerfstudio

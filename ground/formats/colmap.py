@@ -4,6 +4,7 @@ COLMAP's own library, pycolmap 4.2.1, reads these files too, but never ends on s
 oracle of the tests. Source: colmap.github.io/format.html.
 """
 
+import dataclasses
 import logging
 import struct
 from collections.abc import Callable, Iterator
@@ -12,9 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from flightsw.icd.quaternion import quat_to_matrix
+from ground.formats.nerf import as_exported
+from ground.formats.nerfstudio import read_nerfstudio
 from ground.formats.pictures.files import FormatError, within
 from ground.formats.pictures.lens import Intrinsics
-from ground.formats.pictures.view import View
+from ground.formats.pictures.placement import with_stated_errors
+from ground.formats.pictures.views import Exported, View
 from obbgs_base.errors import in_words
 
 log = logging.getLogger(__name__)
@@ -29,6 +33,7 @@ MODELS = {
 }
 PARAMETERS = dict(MODELS.values())
 SUFFIXES = (".bin", ".txt")
+ROUNDED = 1e-6  # a pose of ours that went through a model's quaternion differs by less, m
 
 
 def read_colmap(folder: Path) -> list[View]:
@@ -67,6 +72,37 @@ def read_colmap(folder: Path) -> list[View]:
         for name, (pose, lens) in found[largest].items()
     ]
     return sorted(views, key=lambda view: view.image.name)
+
+
+def read_colmap_and_export(folder: Path) -> tuple[list[View], Exported | None]:
+    """Return the pictures of a COLMAP model; of a folder that we exported with what COLMAP has no place for.
+
+    Exposure times, readings of 16 bits and the sensor's figures come from transforms.json of `export_nerfstudio`.
+    Cameras are those of the model: other software may have changed them, and then they err as stated cameras do.
+
+    Raises:
+        FormatError: as `read_colmap` and `read_nerfstudio`.
+    """
+    views = read_colmap(folder)
+    if not (folder / "transforms.json").is_file():
+        return views, None
+    told, exported = read_nerfstudio(folder)
+    if exported is None:
+        return views, None
+    told_of = {view.image: view for view in told}
+    return as_exported([_completed(view, told_of.get(view.image)) for view in views], exported)
+
+
+def _completed(view: View, told: View | None) -> View:
+    """Return a view with what our export says of its picture, but its own camera."""
+    if told is None:
+        return view
+    completed = dataclasses.replace(
+        told, world_to_camera=view.world_to_camera, intrinsics=view.intrinsics, split=view.split
+    )
+    if np.allclose(view.world_to_camera, told.world_to_camera, rtol=0, atol=ROUNDED):
+        return completed
+    return with_stated_errors([dataclasses.replace(completed, covariance=None)])[0]
 
 
 def _models(folder: Path) -> Iterator[Path]:

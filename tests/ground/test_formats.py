@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from flightsw.icd.frame import encode_frame
 from flightsw.icd.quaternion import quat_to_matrix
 from ground.formats.axes import opengl_to_world_to_camera, world_to_camera_to_opengl
-from ground.formats.colmap import read_colmap
+from ground.formats.colmap import read_colmap, read_colmap_and_export
 from ground.formats.colmap_export import export_colmap
 from ground.formats.nerf import export_nerf, read_nerf, split_frames
 from ground.formats.nerfstudio import export_nerfstudio, read_nerfstudio
@@ -223,6 +223,31 @@ def test_colmap_reads_what_we_export(tmp_path, session, cameras):
         same = views[view.image.name]
         np.testing.assert_allclose(same.world_to_camera, view.world_to_camera, atol=1e-9)
         assert same.split == ("train" if view.split == "train" else "test")
+
+
+def test_a_colmap_export_comes_back_with_its_exposures_and_readings_and_the_cameras_of_its_model(
+    tmp_path, session
+):
+    """One of the cameras is moved by COLMAP's own library, as its bundle adjustment would."""
+    export_colmap(session, tmp_path / "c")
+    place = tmp_path / "c" / "sparse" / "0"
+    model = pycolmap.Reconstruction(str(place))
+    moved = session.frames[0]
+    changed = moved.world_to_camera[:3] + np.array([[0, 0, 0, 0.25]] * 3)
+    model.frames[model.images[moved.id + 1].frame_id].rig_from_world = pycolmap.Rigid3d(changed)
+    model.write(str(place))
+    views, exported = read_colmap_and_export(tmp_path / "c")
+    assert exported is not None and exported.camera == session.camera
+    write_session(views, tmp_path / "again", "colmap", exported=exported)
+    again = open_session(tmp_path / "again")
+    for before, after in zip(session.frames, again.frames, strict=True):
+        assert after.exposure_time_s == before.exposure_time_s and after.bracket == before.bracket
+        np.testing.assert_array_equal(again.dn(after), session.dn(before))
+        expected = changed if before is moved else before.world_to_camera[:3]
+        np.testing.assert_allclose(after.world_to_camera[:3], expected, atol=1e-9)
+        if before is not moved:
+            np.testing.assert_allclose(after.covariance, before.covariance)
+    assert again.frames[0].covariance.any()  # of the moved one nobody states it: about a pixel
 
 
 def changed_frames(session, change):
