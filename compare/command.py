@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from compare.errors import for_people
 from ground.commands.progress import Stop, say
 from obbgs_base.command_line import OUT_HELP, AsJson
 from obbgs_base.imports import quick_imports
@@ -140,7 +141,7 @@ def _line(row: dict) -> str:
     """Return a row in a line of text."""
     what = f"{row['method']}, {row['target']}, {row['condition']}, seed {row['seed']}"
     if "error" in row:
-        return f"{what}: {row['error']}"
+        return f"{what}: {for_people(row['error'])}"
     psnr = ("psnr_clean_db", "{:.2f} dB")
     if row.get("psnr_clean_db") is None:  # no simulator left a truth
         psnr = ("psnr_noisy_db", "{:.2f} dB against the noisy frames")

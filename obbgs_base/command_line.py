@@ -25,6 +25,7 @@ MISSION_HELP = "The mission file, the same in flight and on the ground"
 LINK_HELP = "The link's URL, such as serial:///dev/ttyUSB0?baud=921600"
 KEY_HELP = "The file of the mission's key"
 SEED_HELP = "The same seed gives the same result"
+PARTS = ("flightsw", "ground", "compare", "hil", "obbgs_core", "obbgs_base")
 OUT_HELP = "What to write, a file or a folder"
 SET_HELP = "A setting, NAME=VALUE; can be repeated, and a wrong name lists them all"
 
@@ -91,7 +92,7 @@ def run(app: typer.Typer, tool: str) -> None:
     """
     open_standard_streams()
     handler = _ToStderr()
-    handler.setFormatter(logging.Formatter("%(name)s: %(message)s"))
+    handler.setFormatter(_AsSaidBy(tool))
     handler.setLevel(logging.WARNING)
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     try:
@@ -107,6 +108,21 @@ def run(app: typer.Typer, tool: str) -> None:
         _end(tool, str(error), 2)
     except OSError as error:
         _end(tool, in_words(error), 1)
+
+
+class _AsSaidBy(logging.Formatter):
+    """Begins a message as those of errors do; the module's name stands in the logs of sessions and runs.
+
+    Where a library of others says something, its name is told.
+    """
+
+    def __init__(self, tool: str):
+        super().__init__("%(message)s")
+        self._tool = tool
+
+    def format(self, record: logging.LogRecord) -> str:
+        of = "" if record.name.partition(".")[0] in PARTS else f" of {record.name}"
+        return f"{self._tool}: {record.levelname.lower()}{of}: {super().format(record)}"
 
 
 class _ToStderr(logging.StreamHandler):

@@ -1,13 +1,13 @@
 """The rows of a comparison brought together: means over seeds, by method, target and condition."""
 
 import math
-import re
 import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
+from compare.errors import for_people
 from compare.methods import reference_names
 
 # losses against the frames as taken up to which a method holds, or is only shaken
@@ -65,7 +65,6 @@ METRICS = (
 # of the paper's figure: relative gains of these, the first three of pictures, the others of geometry; where no truth is
 # known, of noisy PSNR, which all sessions have
 GAINS = ("psnr_clean_db", "ssim_clean", "lpips", "chamfer", "completeness_centres", "hausdorff")
-CLASS_NAME = re.compile(r"^[A-Z]\w*: ")  # that a row's error begins with, for programs
 
 
 CLEAN, NOISY = METRICS[0], next(metric for metric in METRICS if metric.key == "psnr_noisy_db")
@@ -199,7 +198,7 @@ class Results:
         """Return in words why a cell has no result; None where it has one or was not asked for."""
         return next(
             (
-                CLASS_NAME.sub("", str(row.get("error") or row.get("failed")))
+                for_people(str(row.get("error") or row.get("failed")))
                 for row in self.of(label, target, condition)
                 if row.get("error") or row.get("failed")
             ),

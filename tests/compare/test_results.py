@@ -368,6 +368,8 @@ def test_the_line_of_a_row_without_truth_has_the_psnr_against_the_noisy_frames()
     row = {"method": "mean", "target": "pass-12", "condition": "as taken", "seed": 0, "psnr_noisy_db": 27.371}
     assert _line(row) == "mean, pass-12, as taken, seed 0: 27.37 dB against the noisy frames"
     assert _line(row | {"psnr_clean_db": 30.0}) == "mean, pass-12, as taken, seed 0: 30.00 dB"
+    refused = row | {"error": "CompareError: pass-12 has no truth"}
+    assert _line(refused) == "mean, pass-12, as taken, seed 0: pass-12 has no truth"
 
 
 def test_the_command_says_what_is_wrong_with_its_arguments(tmp_path):

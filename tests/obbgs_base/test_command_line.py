@@ -1,9 +1,12 @@
 """What every command says of a value that it does not take: what was expected and what came, in our words."""
 
+import logging
 import re
 
 import pytest
+import typer
 
+from obbgs_base.command_line import new_app, run
 from tests.commands import call
 
 
@@ -23,3 +26,25 @@ def test_a_wrong_value_is_refused_in_our_words(words, told):
     said = " ".join(re.sub("[│╭╮╰╯─]", " ", ended.stderr).split())  # without the box around it
     assert ended.returncode == 2 and told in said
     assert "Value error" not in said and "Input should" not in said
+
+
+def test_a_warning_begins_with_the_command_and_names_no_module_of_ours(capsys, monkeypatch):
+    app = new_app("A tool.")
+
+    @app.command()
+    def warn() -> None:
+        logging.getLogger("ground.formats.somewhere").warning("nothing states %s", "the times")
+        logging.getLogger("distributed.nanny").error("restarted")
+
+    @app.command()
+    def other() -> None:
+        raise typer.Exit
+
+    monkeypatch.setattr("sys.argv", ["ground", "warn"])
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    with pytest.raises(SystemExit):
+        run(app, "ground")
+    assert capsys.readouterr().err.splitlines() == [
+        "ground: warning: nothing states the times",
+        "ground: error of distributed.nanny: restarted",
+    ]
