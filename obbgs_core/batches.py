@@ -16,6 +16,7 @@ from obbgs_core.model.cameras import Cameras
 
 # windows begin at multiples of it, so that the pixels averaged for a coarse image lie in one window
 GRID_PX = 16
+MAIN_MEMORY = torch.device("cpu")
 MARGIN_PX = 8.0  # around the start, besides what silhouettes show beyond it
 
 
@@ -59,7 +60,8 @@ class Batches:
         height, width = frames[0].shape[:2]
         # [F, 4] what a batch can show of each frame
         self._reached = None if windows is None else common(windows, width, height)
-        self._images: dict[tuple[str, int, int], Tensor] = {}  # by name, factor and frame
+        # by name, factor, frame and where they are
+        self._images: dict[tuple[str, int, int, torch.device], Tensor] = {}
 
     def cameras(self, indices: list[int]) -> Cameras:
         """Return the cameras of whole frames, with nothing behind the target."""
@@ -86,14 +88,19 @@ class Batches:
         self._masks = self._masks | {"sky": self._masks["sky"] | {i: held(m) for i, m in sky.items()}}
         self._images = {}  # copies keep those that they have
 
-    def batch(self, indices: list[int], scale: float = 1.0) -> Batch:
-        """Return given frames, averaged to `scale` (1 / whole number) of their size, or windows of one size of them."""
+    def batch(self, indices: list[int], scale: float = 1.0, device: torch.device = MAIN_MEMORY) -> Batch:
+        """Return given frames, averaged to `scale` (1 / whole number) of their size, or windows of one size of them.
+
+        Args:
+            device: where the images are, backdrops included; they stay there for the next time. Poses are in main
+                memory.
+        """
         factor = round(1 / scale)
         cameras, share, shown = self._shown(indices, factor)
 
         def stacked(name: str) -> Tensor:
             return torch.stack(
-                [self._image(name, factor, i)[place] for i, place in zip(indices, shown, strict=True)]
+                [self._image(name, factor, i, device)[place] for i, place in zip(indices, shown, strict=True)]
             )
 
         sky, solid = (stacked(name) if self._masks[name] else None for name in ("sky", "solid"))
@@ -102,11 +109,12 @@ class Batches:
         if any(i in self._backdrops for i in indices):
             cameras = dataclasses.replace(cameras, backdrop=stacked("radiance"))
             doubt = stacked("sigma")
+        exposures_s = torch.tensor([self.frames[i].exposure_time_s for i in indices])
         return Batch(
             indices,
             cameras,
             stacked("dn"),
-            torch.tensor([self.frames[i].exposure_time_s for i in indices]).view(-1, 1, 1, 1),
+            exposures_s.view(-1, 1, 1, 1).to(device),
             factor * factor,
             share,
             sky,
@@ -114,10 +122,18 @@ class Batches:
             doubt,
         )
 
-    def _image(self, name: str, factor: int, index: int) -> Tensor:
+    def _image(self, name: str, factor: int, index: int, device: torch.device) -> Tensor:
+        """Return what `_averaged` does, on a device; whole frames are not kept twice in main memory."""
+        key = (name, factor, index, device)
+        if key in self._images:
+            return self._images[key]
+        image = self._averaged(name, factor, index).to(device)
+        if factor > 1 or device != MAIN_MEMORY or not self.frames[index].is_compact:
+            self._images[key] = image
+        return image
+
+    def _averaged(self, name: str, factor: int, index: int) -> Tensor:
         """Return what batches can show of a frame, averaged: dn, sky or solid, or its backdrop's radiance or sigma."""
-        if (name, factor, index) in self._images:
-            return self._images[name, factor, index]
         rows, columns = self._reach(factor, index)
         backdrop = self._backdrops.get(index)
         if name in self._masks:
@@ -136,8 +152,6 @@ class Batches:
             nothing = torch.zeros_like(self.frames[index].part(rows, columns))
             image = nothing if backdrop is None else getattr(backdrop, name)[rows, columns]
             image = averaged(image, factor, torch.inf)
-        if factor > 1 or not self.frames[index].is_compact:
-            self._images[name, factor, index] = image
         return image
 
     def _reach(self, factor: int, index: int) -> tuple[slice, slice]:

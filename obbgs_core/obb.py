@@ -66,7 +66,7 @@ def behind_tile(
     top, left = tile
     z = means @ world_to_camera[2, :3] + world_to_camera[2, 3]
     seen = depth[top : top + TILE_ROWS, left : left + TILE_COLUMNS]
-    farthest = seen.max() * (1 + SURFACE_MARGIN)
+    farthest = (seen.max() * (1 + SURFACE_MARGIN)).item()
     x, y = means2d.unbind(-1)
     inside = (x >= left) & (x < left + TILE_COLUMNS) & (y >= top) & (y < top + TILE_ROWS)
     return inside & (z > 0) & (z <= farthest)

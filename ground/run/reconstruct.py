@@ -29,6 +29,7 @@ from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.methods.config import MethodConfig
 from obbgs_core.methods.presets import preset
+from obbgs_core.render import backend_for
 from obbgs_core.train.result import StepInfo, TrainResult
 from obbgs_core.train.trainer import train
 
@@ -87,6 +88,7 @@ def reconstruct(
     if not time_limit_s > 0:
         raise ValueError(f"the time limit must be longer than 0 s, got {time_limit_s:g}")
     config = preset(method, changes)
+    backend_for(config.device)  # before frames are read
     session = open_session(session_dir)
     folder = run_folder(session.path, name, out)
     check_replaceable(folder, overwrite)

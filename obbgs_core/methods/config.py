@@ -170,6 +170,9 @@ class MethodConfig:
     # share of the steps from which on the models after each step are averaged; 1: the model is that of the last step
     # (071)
     averaged_from: float = fraction(0.88)
+    # where pictures are rendered and compared; auto: cuda where that can be used; warp: the kernels of cuda on this
+    # processor, for tests (not measured on a GPU)
+    device: Literal["cpu", "cuda", "auto", "warp"] = "cpu"
     # above 0: stop after growth when the running chi² falls to this; 1 is pure noise (002)
     chi2_end: float = 1.0
     start: StartSettings = field(default_factory=StartSettings)

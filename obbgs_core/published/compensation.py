@@ -32,7 +32,7 @@ class Compensation:
             indices: of the frames, B.
             full_scale: [B, 1, 1, 1] the radiance of full scale in each.
         """
-        return mapped(radiance, self.value[indices], full_scale)
+        return mapped(radiance, self.value[indices].to(radiance.device), full_scale)
 
     @torch.no_grad()
     def step(self, share: float) -> None:

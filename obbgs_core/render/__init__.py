@@ -5,6 +5,7 @@ from torch import Tensor
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.backends import rasterize
+from obbgs_core.render.device import DEVICES, backend_for, pictures_at
 from obbgs_core.render.moving import at_moments, averaged, repeated
 from obbgs_core.render.native import native_kernels
 from obbgs_core.render.projection import Projected, project
@@ -15,8 +16,10 @@ __all__ = [
     "Projected",
     "Rendered",
     "ScreenGradients",
+    "backend_for",
     "lit_from",
     "native_kernels",
+    "pictures_at",
     "project",
     "render",
     "shadow_map",
@@ -42,7 +45,8 @@ def render(
 
     Args:
         backend: `native` (C++, float32), `native-KERNEL` (the same with one of `native_kernels()`), `reference` (plain
-            PyTorch, any dtype and device), or `auto`: native where it can run.
+            PyTorch, any dtype and device), `cuda` (float32; images stay on the GPU), `warp` (the kernels of `cuda` on
+            this processor), or `auto`: native where it can run.
         sunlit: [C, N] visibility of each camera's Sun from each Gaussian, 0..1, only used under Lambert's law; computed
             from shadow maps (`sunlit_shares`) where it is not given.
         added: [C, N, channels] radiance of each Gaussian towards each camera, on top of the model's own.
@@ -55,7 +59,7 @@ def render(
     if gaussians.shading != "lambert":
         sunlit = None
     elif suns is not None and sunlit is None:
-        sunlit = sunlit_shares(gaussians, suns, backend)
+        sunlit = sunlit_shares(gaussians, suns, "auto" if backend in DEVICES else backend)
     if cameras.motion is None:
         rendered = rasterize(gaussians, cameras, backend, suns, sunlit, added)
     else:

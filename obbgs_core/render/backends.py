@@ -5,6 +5,7 @@ from torch import Tensor
 
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.render.device import DEVICES, render_on_device
 from obbgs_core.render.highlights import highlights
 from obbgs_core.render.native import native_kernels, render_native
 from obbgs_core.render.reference import render_reference
@@ -29,6 +30,8 @@ def rasterize(
     Raises:
         ValueError: an unknown backend, or one that is not available here.
     """
+    if backend in DEVICES:
+        return render_on_device(backend, gaussians, cameras, suns, sunlit, added)
     kernel = _kernel(backend, gaussians.means)
     if kernel is None:
         return render_reference(gaussians, cameras, suns, sunlit, added)
@@ -52,5 +55,7 @@ def _kernel(backend: str, like: Tensor) -> str | None:
         return native_kernels()[0]
     if name == "native" and kernel in native_kernels():
         return kernel
-    known = ", ".join(["auto", "native", *(f"native-{each}" for each in native_kernels()), "reference"])
+    known = ", ".join(
+        ["auto", "native", *(f"native-{each}" for each in native_kernels()), "reference", *DEVICES]
+    )
     raise ValueError(f"backend must be one of {known}, got {backend!r}")

@@ -22,6 +22,7 @@ class Projected:
 
     means2d: Tensor  # [C, N, 2] px
     conics: Tensor  # [C, N, 3] px⁻² (xx, xy, yy): inverse of the widened 2D covariance
+    factors: Tensor  # [C, N, 3] px⁻¹ (xx, xy, yy): L of the conic LᵀL, with a 0 below its diagonal
     peak_shares: Tensor  # [C, N] of the opacity, at the projected mean: below 1 where the peak is lowered
     depths: Tensor  # [C, N] m; 0 where the Gaussian is not drawn
     radii: Tensor  # [C, N] px, three sigma of the longer axis, rounded up; 0 where the Gaussian is not drawn
@@ -57,15 +58,19 @@ def project(gaussians: Gaussians, cameras: Cameras) -> Projected:
     xx = (M[..., 0, :] ** 2).sum(-1) + footprint
     xy = (M[..., 0, :] * M[..., 1, :]).sum(-1)
     yy = (M[..., 1, :] ** 2).sum(-1) + footprint
-    determinant = xx * yy - xy * xy
+    # the determinant of M Mᵀ as a square, and that of the widened covariance as a sum: nothing cancels
+    narrow = torch.linalg.cross(M[..., 0, :], M[..., 1, :]).square().sum(-1)
+    determinant = narrow + footprint * (xx + yy - footprint)
     drawn = drawn & torch.isfinite(determinant) & (determinant > 0)
     determinant = torch.where(drawn, determinant, torch.ones_like(determinant))
     conics = torch.stack([yy, -xy, xx], dim=-1) / determinant[..., None]
     conics = torch.where(drawn[..., None], conics, torch.zeros_like(conics))
+    tall = torch.where(drawn, yy, torch.ones_like(yy))
+    root = (tall / determinant).sqrt()
+    factors = torch.stack([root, -xy / tall * root, tall.rsqrt()], dim=-1)
+    factors = torch.where(drawn[..., None], factors, torch.zeros_like(factors))
     shares = torch.ones_like(z)
-    if lowers_peak(gaussians):
-        # the determinant of M Mᵀ as a square, in which nothing cancels; the root has no derivative at 0
-        narrow = torch.linalg.cross(M[..., 0, :], M[..., 1, :]).square().sum(-1)
+    if lowers_peak(gaussians):  # the root has no derivative at 0
         shares = (torch.where(narrow > 0, narrow, 1) / determinant).sqrt()
         drawn = drawn & (narrow > 0) & (shares >= MIN_PEAK_SHARE)
     with torch.no_grad():
@@ -73,13 +78,15 @@ def project(gaussians: Gaussians, cameras: Cameras) -> Projected:
         largest_eigenvalue = middle + (middle**2 - determinant).clamp(min=0.1).sqrt()
         radii = torch.where(drawn, RADIUS_SIGMAS * largest_eigenvalue.sqrt(), 0.0).ceil()
     depths = torch.where(drawn, z, torch.zeros_like(z))
-    return Projected(means2d, conics, shares, depths, radii)
+    return Projected(means2d, conics, factors, shares, depths, radii)
 
 
 def with_zeros_for_invalid(gaussians: Gaussians) -> tuple[Gaussians, Tensor]:
     """Return the Gaussians, all zeros in place of those that hold NaN or infinity, and which [N] are finite."""
     numbers = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    finite = torch.stack([torch.isfinite(t).reshape(len(t), -1).all(dim=1) for t in numbers]).all(dim=0)
+    finite = torch.stack(
+        [torch.isfinite(t).reshape(len(t), t.shape[1:].numel()).all(dim=1) for t in numbers]
+    ).all(dim=0)
     tensors = {
         name: torch.where(finite.reshape(-1, *[1] * (t.ndim - 1)), t, torch.zeros_like(t))
         for name, t in gaussians.tensors().items()

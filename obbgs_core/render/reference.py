@@ -1,6 +1,8 @@
 """The rasterizer in readable PyTorch, for any dtype and device; each compiled kernel is compared with it."""
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,14 +23,36 @@ MIN_DEPTH_ALPHA = 1e-6  # the depth is 0 where alpha is not above this
 BAND_ELEMENTS = 4_000_000  # pixels times Gaussians that are composited at once: bounds the memory
 
 
+class Splats(NamedTuple):
+    """One camera's Gaussians, what compositing takes of them."""
+
+    means2d: Tensor  # [N, 2] px
+    factors: Tensor  # [N, 3] px⁻¹, see `Projected`
+    opacities: Tensor  # [N]
+    cutoffs: Tensor  # [N] alphas below which a contribution is skipped
+    depths: Tensor  # [N] m, 0 for those not drawn
+    features: Tensor  # [N, F], blended like a colour
+
+
+# of splats and a picture's width and height, px: image [H, W, F], transmittance [H, W], median depth [H, W] m, and the
+# pixels [N] that each splat touches, which may be filled by the backward pass only
+Composite = Callable[[Splats, int, int], tuple[Tensor, Tensor, Tensor, Tensor]]
+
+
 def render_reference(
     gaussians: Gaussians,
     cameras: Cameras,
     suns: Tensor | None,
     sunlit: Tensor | None,
     added: Tensor | None = None,
+    composite: Composite | None = None,
 ) -> Rendered:
-    """Render with plain PyTorch; arguments as of `backends.rasterize`."""
+    """Render with plain PyTorch; arguments as of `backends.rasterize`.
+
+    Args:
+        composite: takes the place of `composite_reference`.
+    """
+    composite = composite or composite_reference
     projected = project(gaussians, cameras)
     gaussians, _ = with_zeros_for_invalid(gaussians)
     directions = gaussians.means[None] - cameras.centres[:, None]  # [C, N, 3]
@@ -37,25 +61,21 @@ def render_reference(
     screen = ScreenGradients()
     images, alphas, medians = [], [], []
     for c in range(len(cameras)):
-        means2d, conics, depths = projected.means2d[c], projected.conics[c], projected.depths[c]
-        shares = projected.peak_shares[c]
-        opacities = gaussians.opacities * shares
+        means2d, depths, shares = projected.means2d[c], projected.depths[c], projected.peak_shares[c]
         sun, share = (None if each is None else each[c] for each in (suns, sunlit))
         light = radiance_along(gaussians, directions[c], sun, share)
         if added is not None:
             light = light + added[c]
-        features = [light, depths[:, None]]
-        image, transmittance, median = composite(
+        splats = Splats(
             means2d,
-            conics,
-            opacities,
+            projected.factors[c],
+            gaussians.opacities * shares,
             MIN_ALPHA * shares.detach(),
             depths,
-            torch.cat(features, dim=1),
-            cameras.width,
-            cameras.height,
+            torch.cat([light, depths[:, None]], dim=1),
         )
-        screen.watch(c, means2d, _pixels_touched(conics, gaussians.opacities, depths))
+        image, transmittance, median, pixels = composite(splats, cameras.width, cameras.height)
+        screen.watch(c, means2d, pixels)
         images.append(image)
         alphas.append(1 - transmittance)
         medians.append(median)
@@ -72,55 +92,37 @@ def render_reference(
     )
 
 
-def composite(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    cutoffs: Tensor,
-    depths: Tensor,
-    features: Tensor,
-    width: int,
-    height: int,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Composite one camera's Gaussians front to back.
-
-    Args:
-        means2d: [N, 2] px; conics: [N, 3] px⁻²; opacities: [N]; depths: [N] m, 0 for those not drawn.
-        cutoffs: [N] alphas below which a contribution is skipped.
-        features: [N, F] of each Gaussian, blended like its colour.
-
-    Returns:
-        image [H, W, F], transmittance [H, W], median depth [H, W] m.
-    """
+def composite_reference(splats: Splats, width: int, height: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Composite one camera's Gaussians front to back, see `Composite`."""
+    depths, means2d = splats.depths, splats.means2d
     order = torch.argsort(depths, stable=True)
     order = order[depths[order] > 0]
     rows = max(1, BAND_ELEMENTS // max(1, width * len(order)))
     ys = torch.arange(height, dtype=means2d.dtype, device=means2d.device) + 0.5
     xs = torch.arange(width, dtype=means2d.dtype, device=means2d.device) + 0.5
+    k1, k2, k3 = splats.factors[order].unbind(-1)
     bands = []
     for band in ys.split(rows):
         dx = xs[None, :, None] - means2d[order, 0]  # [h, W, N]
         dy = band[:, None, None] - means2d[order, 1]
-        a, b, c = conics[order].unbind(-1)
-        power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
-        alpha = (opacities[order] * power.clamp(max=0).exp()).clamp(max=MAX_ALPHA)
-        alpha = torch.where(alpha >= cutoffs[order], alpha, torch.zeros_like(alpha))
+        power = -0.5 * ((k1 * dx + k2 * dy).square() + (k3 * dy).square())
+        alpha = (splats.opacities[order] * power.exp()).clamp(max=MAX_ALPHA)
+        alpha = torch.where(alpha >= splats.cutoffs[order], alpha, torch.zeros_like(alpha))
         after = torch.cumprod(1 - alpha, dim=-1)
         alpha = torch.where(after >= MIN_TRANSMITTANCE, alpha, torch.zeros_like(alpha))
         after = torch.cumprod(1 - alpha, dim=-1)
         before = torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], dim=-1)
         crossing = (before > 0.5) & (after <= 0.5)
-        final = after[..., -1].clone() if len(order) else torch.ones(dx.shape[:2]).to(means2d)
+        final = after[..., -1].clone() if len(order) else means2d.new_ones(len(band), width)
         median = (crossing * depths[order]).sum(-1).detach()
-        bands.append(((alpha * before) @ features[order], final, median))
+        bands.append(((alpha * before) @ splats.features[order], final, median))
     image, transmittance, median = (torch.cat(parts) for parts in zip(*bands, strict=True))
-    return image, transmittance, median
+    return image, transmittance, median, _pixels_touched(splats)
 
 
 @torch.no_grad()
-def _pixels_touched(conics: Tensor, opacities: Tensor, depths: Tensor) -> Tensor:
+def _pixels_touched(splats: Splats) -> Tensor:
     """Return the area [N] px of each ellipse that is not cut off; the kernels count the pixels instead."""
-    squared_radius = 2 * torch.log((opacities / MIN_ALPHA).clamp(min=1))  # in sigmas
-    determinant = (conics[:, 0] * conics[:, 2] - conics[:, 1] ** 2).clamp(min=1e-12)
-    area = math.pi * squared_radius / determinant.sqrt()
-    return torch.where(depths > 0, area, torch.zeros_like(area))
+    squared_radius = 2 * torch.log((splats.opacities / splats.cutoffs).clamp(min=1))  # in sigmas
+    area = math.pi * squared_radius / (splats.factors[:, 0] * splats.factors[:, 2]).clamp(min=1e-6)
+    return torch.where(splats.depths > 0, area, torch.zeros_like(area))

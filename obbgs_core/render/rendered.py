@@ -14,17 +14,18 @@ class ScreenGradients:
         default_factory=dict
     )  # [N, 2] gradient by the projected mean, loss per px
     pixels: dict[int, Tensor] = field(default_factory=dict)  # [N] pixels to which the Gaussian contributes
+    home: torch.device | None = None  # where gradients are kept that `watch` records; None: where they arise
 
     def watch(self, camera_index: int, means2d: Tensor, pixels: Tensor) -> None:
         """Record the gradient that autograd computes for the projected means [N, 2] of one camera."""
 
         def keep(gradient: Tensor | None) -> None:
             if gradient is not None:
-                self.means2d[camera_index] = gradient.detach()
+                self.means2d[camera_index] = gradient.detach().to(self.home or gradient.device)
+                self.pixels[camera_index] = pixels.to(self.home or pixels.device)
 
         if means2d.requires_grad:
             means2d.register_hook(keep)
-            self.pixels[camera_index] = pixels
 
 
 @dataclass

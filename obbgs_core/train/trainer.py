@@ -21,7 +21,7 @@ from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.published import mcmc
 from obbgs_core.published.growth import outliers
-from obbgs_core.render import Rendered, render
+from obbgs_core.render import Rendered, backend_for, pictures_at, render
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.adam import FIRST_MEMORY, SECOND_MEMORY, learning_rates
 from obbgs_core.train.backdrops import doubted, renew
@@ -105,7 +105,7 @@ class Trainer:
 
     @torch_on_one_thread()
     def __init__(self, frames: list[TrainingFrame], sensor: Sensor, config: MethodConfig, seed: int = 0):
-        began = time.monotonic()
+        began, self._backend = time.monotonic(), backend_for(config.device)
         self._given, self._stated = frames, sensor
         self.setup, start = prepare(frames, sensor, config, seed)
         self.state = TrainingState.first(self.setup, start)
@@ -123,14 +123,14 @@ class Trainer:
         moment = config.moment(state.steps_done)
         renew(setup, state)
         drawn = state.order.draw(min(moment.frames, len(setup.frames)), state.rng)
-        batch = setup.batches.batch(drawn, moment.image_scale)
+        batch = setup.batches.batch(drawn, moment.image_scale, pictures_at(self._backend))
         if state.poses.corrections is not None:
             cameras = state.poses.corrections.cameras(drawn, batch.cameras)
             batch = dataclasses.replace(batch, cameras=cameras)
         sunlit = state.shadows.sunlit(state.gaussians, batch.cameras, state.steps_done)
         model, drops = state.model, setup.dropout > 0 and moment.share < DROPPED_UNTIL
         drawn_model = dropped(model, setup.dropout, state.rng) if drops else model
-        rendered = self._compensated(render(drawn_model, batch.cameras, sunlit=sunlit), batch)
+        rendered = self._compensated(render(drawn_model, batch.cameras, self._backend, sunlit), batch)
         batch = doubted(setup, batch, rendered)
         loss, residual = image_loss(rendered, batch, setup.sensor, config, state.fit.misfit)
         if not torch.isfinite(loss):
@@ -145,7 +145,7 @@ class Trainer:
         state.growth.observe(setup, state.gaussians, seen, moment)
         if drops:  # figures are of the whole model, as it was before the step
             with torch.no_grad():
-                rendered = self._compensated(render(state.model, batch.cameras, sunlit=sunlit), batch)
+                rendered = self._compensated(render(state.model, batch.cameras, self._backend, sunlit), batch)
         self._descend(moment)
         self._decide(moment, seen)
         state.average.observe(state.gaussians, moment.share >= config.averaged_from)
