@@ -4,13 +4,13 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
+from obbgs_core.evidence.response import Response
 from obbgs_core.methods.config import MethodConfig
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.published.compensation import mapped, nearest
 from obbgs_core.sensor import Sensor
 from obbgs_core.sky_level import SkyLevel
-from obbgs_core.train.response import Response
 
 
 @dataclass(frozen=True)

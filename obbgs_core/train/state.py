@@ -17,6 +17,7 @@ from obbgs_base.errors import reason
 from obbgs_base.files import set_aside, write_whole
 from obbgs_core.errors import Diverged
 from obbgs_core.evidence.poses import validation_brackets
+from obbgs_core.evidence.response import Response
 from obbgs_core.methods.config import MethodConfig, Moment
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
@@ -35,7 +36,6 @@ from obbgs_core.train.objective import Neighbours
 from obbgs_core.train.order import FrameOrder
 from obbgs_core.train.parts import Change, Now, Part, Seen
 from obbgs_core.train.poses import PoseDecision, Poses
-from obbgs_core.train.response import Response
 from obbgs_core.train.result import StepInfo
 from obbgs_core.train.selection import Harmonics, Highlights, Pruning
 from obbgs_core.train.setup import Start, TrainingSetup

@@ -14,6 +14,7 @@ from obbgs_core.batches import Batch, Batches
 from obbgs_core.compiled import torch_on_one_thread
 from obbgs_core.errors import Diverged
 from obbgs_core.evidence.radiance import described
+from obbgs_core.evidence.response import DECIDED_AT
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.methods.config import SET_BACK_AT, SET_BACK_TO, MethodConfig, Moment
 from obbgs_core.model.gaussians import Gaussians
@@ -28,7 +29,6 @@ from obbgs_core.train.backdrops import doubted, renew
 from obbgs_core.train.joining import begun_again, check_joinable, join, release, withhold
 from obbgs_core.train.objective import DROPPED_UNTIL, dropped, image_loss, priors
 from obbgs_core.train.parts import Seen
-from obbgs_core.train.response import DECIDED_AT
 from obbgs_core.train.result import Exposing, StepInfo, TrainResult
 from obbgs_core.train.setup import TrainingSetup, prepare
 from obbgs_core.train.state import Identity, TrainingState

@@ -7,10 +7,13 @@ import pytest
 import torch
 
 from obbgs_core.batches import Batches
+from obbgs_core.evidence import response as evidence
+from obbgs_core.evidence.response import LEAST, Response
+from obbgs_core.frames import TrainingFrame
 from obbgs_core.losses import likelihood_loss
+from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import from_radiance, radiance
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.response import LEAST, Response
 from tests.scenes import SENSOR, photographed, target
 
 FULL_SCALE_DN = SENSOR.white_dn - SENSOR.black_dn
@@ -22,12 +25,18 @@ def bent(dn: torch.Tensor, exponent: float) -> torch.Tensor:
     return SENSOR.black_dn + FULL_SCALE_DN * share**exponent
 
 
+def in_brackets(frames: list[TrainingFrame], size: int | None) -> list[TrainingFrame]:
+    """Return frames in brackets of a size; None: each by itself."""
+    return [dataclasses.replace(f, bracket=None if size is None else i // size) for i, f in enumerate(frames)]
+
+
+@pytest.mark.parametrize("size", [3, None])
 @pytest.mark.parametrize("exponent", [0.85, 1.0, 1.15])
-def test_the_exponent_is_found_and_a_linear_camera_stays_linear(exponent):
+def test_the_exponent_is_found_and_a_linear_camera_stays_linear(exponent, size):
     model = target()
     frames = [
-        dataclasses.replace(f, dn=bent(f.dn, exponent), bracket=i // 3)
-        for i, f in enumerate(photographed(model, count=36))
+        dataclasses.replace(f, dn=bent(f.dn, exponent))
+        for f in in_brackets(photographed(model, count=36 if size else 60), size)
     ]
     batches, response = Batches(frames, SENSOR.white_dn), Response()
     changed = response.decide(model, batches, SENSOR)
@@ -38,14 +47,18 @@ def test_the_exponent_is_found_and_a_linear_camera_stays_linear(exponent):
     assert response.error < 0.02
 
 
-@pytest.mark.parametrize(("contrast", "size"), [(1, 1.3), (0.7, 1.3), (1.4, 1), (0.4, 1)])
-def test_a_model_that_is_wrong_is_no_evidence_against_a_linear_camera(contrast, size):
-    """A training in its first steps has one: too soft, dark faces too bright or bright ones too dark."""
-    frames = [dataclasses.replace(f, bracket=i // 3) for i, f in enumerate(photographed(target(), count=54))]
-    model = target()
+def wrong(model: Gaussians, contrast: float, size: float = 1.0) -> Gaussians:
+    """Return Gaussians whose radiances differ by more or less from a mean, and whose sizes are others."""
     value = radiance(model.sh, torch.tensor([[0.0, 0.0, 1.0]]).expand(len(model.sh), 3))[:, None]
-    model.sh = from_radiance(0.35 + contrast * (value - 0.35))
-    model.log_scales = model.log_scales + np.log(size)
+    sh = from_radiance(0.35 + contrast * (value - 0.35))
+    return dataclasses.replace(model, sh=sh, log_scales=model.log_scales + np.log(size))
+
+
+@pytest.mark.parametrize("bracket", [3, None])
+@pytest.mark.parametrize(("contrast", "size"), [(1, 1.3), (0.7, 1.3), (1.4, 1), (0.4, 1)])
+def test_a_model_that_is_wrong_is_no_evidence_against_a_linear_camera(contrast, size, bracket):
+    """A training in its first steps has one: too soft, dark faces too bright or bright ones too dark."""
+    frames, model = in_brackets(photographed(target(), count=54), bracket), wrong(target(), contrast, size)
     assert not Response().decide(model, Batches(frames, SENSOR.white_dn), SENSOR)
 
 
@@ -57,16 +70,32 @@ def test_frames_of_one_exposure_time_tell_nothing():
     assert response.exponent == 1 and np.isnan(response.error)
 
 
-def test_exposures_that_a_camera_chose_by_what_it_saw_tell_nothing():
-    # it saw less light from some sides than the model shows there, and exposed for longer until readings were the same
+@pytest.mark.parametrize("count", [36, 60])
+def test_readings_that_do_not_follow_exposure_times_are_no_response(count):
     model = target()
     frames = [
         dataclasses.replace(f, exposure_time_s=f.exposure_time_s * (1, 2, 1.5)[i % 3])
-        for i, f in enumerate(photographed(model, count=36, exposures_s=(1e-4,)))
+        for i, f in enumerate(photographed(model, count=count, exposures_s=(1e-4,)))
     ]
     response = Response()
     assert not response.decide(model, Batches(frames, SENSOR.white_dn), SENSOR)
     assert response.exponent == 1
+
+
+def test_exposures_that_a_camera_chose_by_what_it_saw_tell_nothing(monkeypatch):
+    """A model with too little contrast shows dark sides, which were exposed for longer, too bright."""
+    model = target()
+    lit = model.means[:, 0] > 0
+    model.sh = from_radiance(torch.where(lit, 0.6, 0.15)[:, None, None])
+    seen = [float(f.dn.mean()) for f in photographed(model, 90, exposures_s=(1e-4,))]
+    brighter_than = np.argsort(np.argsort(seen))
+    exposures_s = np.array([1.4e-4, 1e-4, 0.7e-4])[brighter_than * 3 // 90]
+    frames = photographed(model, 90, exposures_s=exposures_s.tolist())
+    given = wrong(model, 0.7), Batches(frames, SENSOR.white_dn), SENSOR
+    response = Response()
+    assert not response.decide(*given) and response.exponent == 1
+    monkeypatch.setattr(evidence, "MOST_CHOSEN", 1.0)  # it would have been taken for one
+    assert Response().decide(*given)
 
 
 def test_the_loss_is_that_of_readings_to_the_power_and_its_gradient_reaches_the_light():
