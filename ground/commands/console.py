@@ -178,7 +178,7 @@ class ConsoleView:
         top.add_row(Panel(_link(status, down, up), title=title), Panel(_flight(status), title="spacecraft"))
         picture = self._picture.after(status.summary.thumbnails_received, status.summary.frames_in_session)
         name = Text.assemble("session ", (printable(str(self._session)), "bold"))
-        model = [Panel(Text(model_line(status.model)), title="model")] if status.model else []
+        model = [] if status.model is None else [Panel(Text(_model(status)), title="model")]
         left = Group(
             Panel(_alarms_and_events(status, ALARMS_SHOWN + EVENTS_SHOWN), title="alarms and events"),
             Panel(_files(status, down), title=name),
@@ -206,7 +206,7 @@ class ConsoleView:
             "spacecraft": lambda: _flight(status),
             "files": lambda: _files(status, down),
             "picture": lambda: self._picture.after(summary.thumbnails_received, summary.frames_in_session),
-            "model": lambda: Text(model_line(status.model) if status.model else "none is made meanwhile"),
+            "model": lambda: Text(_model(status)),
         }
         panel = Panel(body[self.panel](), title=self.panel, height=height - 2)
         names = "  ".join(f"{number} {name}" for number, name in enumerate(PANELS, start=1))
@@ -221,8 +221,15 @@ class ConsoleView:
             f"{link_state(status)[0]}, frames {s.frames_in_session} received / {captured(status)} captured, {speed}"
             f"{s.crc_errors} CRC errors, {s.packets_missing} missing, {s.segments_resent} resent, "
             f"outbox {status.housekeeping.get('outbox_frames', '?')}"
-            + (f"; model: {model_line(status.model)}" if status.model else "")
+            + ("" if status.model is None else f"; model: {_model(status)}")
         )
+
+
+def _model(status: Status) -> str:
+    """Return how the training beside the listener stands."""
+    if status.model is None:
+        return "none is made meanwhile"
+    return model_line(status.model) if status.model else "the training starts"
 
 
 def link_state(status: Status) -> tuple[str, str]:

@@ -102,7 +102,9 @@ class Status:
     frame_header: dict[str, Any]
     events: list[dict[str, Any]]
     commands: list[tuple[int, str, str]]  # counter, name and stage of those without a result
-    model: dict[str, Any] = field(default_factory=dict)  # a `LiveStatus`; {}: no model is made meanwhile
+    model: dict[str, Any] | None = (
+        None  # a `LiveStatus`; {}: the training starts; None: no model is made meanwhile
+    )
 
 
 def listen(

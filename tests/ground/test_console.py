@@ -283,6 +283,22 @@ def test_pictures_of_any_shape_fit_the_panel(shape):
     assert (stretched(np.full(shape, 7, np.uint16)) == 0).all()
 
 
+@pytest.mark.parametrize(
+    ("model", "told"),
+    [
+        (None, "none is made meanwhile"),
+        ({}, "the training starts"),  # its process loads PyTorch still
+        ({"state": "failed", "message": "no memory"}, "failed; no memory"),  # before it said anything
+    ],
+)
+def test_the_panel_of_the_model_tells_a_training_that_starts_from_none(model, told):
+    view = ConsoleView(LINK, HERE)
+    view.press("6")
+    now = status(model=model)
+    assert told in screen(view, now, 80, 24)
+    assert (told in screen(view, now)) == (model is not None) == (told in view.line(now))
+
+
 def test_a_terminal_of_80_columns_and_24_lines_shows_alarms_then_events_and_keys_switch_panels():
     """Twenty newer events do not push a red alarm off the screen, and nothing is wider or higher than it."""
     events = [{"received_utc_ns": n, "text": f"event {n} {'x' * 90}", "severity": "info"} for n in range(30)]

@@ -90,9 +90,9 @@ class LiveProcess:
         return lines[-1] if lines else "it ended without a word"
 
     def status(self) -> dict[str, Any]:
-        """Return how the training stands, as `read_status`; {} while it has said nothing."""
+        """Return how the training stands, as `read_status`; {} while it has said nothing and has not failed."""
         facts = read_status(self._run)
-        return facts | {"state": "failed", "message": self._problem} if facts and self._problem else facts
+        return facts | {"state": "failed", "message": self._problem} if self._problem else facts
 
     def finish(self, should_stop: Callable[[], bool], on_status: Callable[[dict[str, Any]], None]) -> None:
         """Wait until the training, which knows that the pass is over, has made its run.

@@ -67,6 +67,8 @@ def line(facts: dict[str, Any]) -> str:
     """Return a status as `read_status` gives it in one line of text."""
     if not facts:
         return "its status cannot be read"
+    if "step" not in facts:  # it has failed before it said anything
+        return f"{facts['state']}; {facts['message']}"
     frames = f"{facts['frames_trained']} of {facts['frames_received']} frames"
     text = f"{facts['state']}, {frames}, step {facts['step']} ({100 * facts['share']:.0f} % of the schedule)"
     if facts["gaussians"] is not None:
