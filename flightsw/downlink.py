@@ -188,8 +188,16 @@ class _Downlink:
         self._store_problem = ""  # of which the ground was told last
         self._counts = SendingCounts()
         self._restarts = self._restarts_in_a_row = 0
+        self._told_start = False
         self._start()
-        self.events.add("started", frames_stored=store.frame_count, outbox_frames=len(self.waiting))
+        if store.is_open:
+            self._tell_start()
+
+    def _tell_start(self) -> None:
+        """Tell the ground once that flight has started, as soon as it is known what is on the disk."""
+        if not self._told_start:
+            self._told_start = True
+            self.events.add("started", frames_stored=self._store.frame_count, outbox_frames=len(self.waiting))
 
     def _start(self) -> None:
         """Begin with what is on the disk: no file in flight, no frame ranked."""
@@ -235,12 +243,14 @@ class _Downlink:
             try:
                 self._store.open()
             except StoreError as error:
+                self._tell_start()
                 self._store_failed(error, now_s)
                 return False
         if not self._has_store:
             self._commander.settings = load_settings(self._store.folder, self._mission)
             self._frames = self._new_sender()  # of this store's identity
             self._begin_with_store()
+        self._tell_start()
         return True
 
     def _store_failed(self, error: Exception, now_s: float) -> None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from obbgs_base.errors import reason
 from obbgs_base.files import append_line, write_whole
 
 CHECKED = re.compile(rb'(\{.*),(?: |\n  )"crc32": "([0-9a-f]{8})"\n?\}', re.DOTALL)
@@ -248,19 +249,19 @@ def read_twice(path: Path, on_damage: Callable[[str], None], mend: bool = True) 
     return parse_checked_line(good.removesuffix(b"\n"))
 
 
-def each_copy(path: Path, parse: Callable[[str], int]) -> tuple[list[int], list[Exception]]:
-    """Return the numbers in a file and in its copy as `parse` reads them, and what is wrong with what it cannot read.
+def each_copy(path: Path, parse: Callable[[str], int]) -> tuple[list[int], list[str]]:
+    """Return the numbers in a file and in its copy as `parse` reads them, and why it cannot read the others, in words.
 
     For a number that must never fall: the caller takes the larger. A copy that is not there yet is no problem.
     """
     values: list[int] = []
-    problems: list[Exception] = []
+    problems: list[str] = []
     for each in (path, copy_of(path)):
         try:
             values.append(parse(each.read_text()))
         except (OSError, ValueError) as error:  # of an encoding too
             if each == path or not isinstance(error, FileNotFoundError):
-                problems.append(error)
+                problems.append(reason(error))
     return values, problems
 
 

@@ -40,6 +40,7 @@ WIDE, HIGH = 120, 45  # columns and lines from which all panels have room at onc
 PANELS = ("alarms and events", "link", "spacecraft", "files", "picture", "model")
 TENDED = ("store_failures", "frames_rejected")  # counts of the ground that somebody has to look at
 FILES_SHOWN = 8
+EVENTS_REMEMBERED = 100  # refusals, without a terminal
 HOUSEKEEPING = DICTIONARY.telemetry["housekeeping"]
 COLOURS = {"green": "green", "yellow": "yellow", "red": "bold red"}
 SEVERITIES = {"info": "", "warning": "yellow", "error": "bold red"}
@@ -62,7 +63,8 @@ def statuses_shown(console: Console, as_json: bool, link: str, session: Path) ->
     On a terminal they draw a screen; elsewhere they print a line every ten seconds and each event; with `as_json` a
     line of JSON on stdout every second and for each event.
     """
-    view, next_line_s, refused = ConsoleView(link, session), float("-inf"), ""
+    view, next_line_s = ConsoleView(link, session), float("-inf")
+    refused: deque[str | None] = deque(maxlen=EVENTS_REMEMBERED)
     live = console.is_terminal and not as_json
 
     def on_status(status: Status) -> None:
@@ -81,14 +83,13 @@ def statuses_shown(console: Console, as_json: bool, link: str, session: Path) ->
                 console.print(view.line(status), markup=False, highlight=False, soft_wrap=True)
 
     def on_event(event: dict[str, Any]) -> None:
-        nonlocal refused
-        is_again = event.get("event") == "command_refused" and event["text"] == refused
-        refused = event["text"] if event.get("event") == "command_refused" else refused
+        # a refusal is told where its command ends, and a command that is resent is refused again: housekeeping counts
+        is_again = event.get("event") == "command_refused" and event.get("problem") in refused
+        if event.get("event") in ("command", "command_refused"):
+            refused.append(event.get("problem"))
         if as_json:
             print(json.dumps({"type": "event"} | event), flush=True)
-        elif (
-            not live and not is_again
-        ):  # a command that is resent is refused again; housekeeping counts how often
+        elif not live and not is_again:
             text = f"{event['severity']}: {event['text']}"
             console.print(text, markup=False, highlight=False, soft_wrap=True)
 

@@ -173,6 +173,14 @@ def test_housekeeping_comes_in_its_interval_and_says_what_is_so(store, small_mis
     assert (values["uptime_s"], values["boot"], values["restarts"]) == (5, 7, 0)
 
 
+def test_a_start_tells_what_the_store_holds_although_it_is_opened_later(store, small_mission):
+    """As at every start of `flightsw`: the link comes first, and the store is read while telemetry goes on."""
+    again, link = FrameStore(store.folder, open_now=False), ListLink()
+    fly(link, again, small_mission, 0.5, store_may_open=lambda: link.now_s > 0.2)
+    (name, values), *_ = link.unpacked(APID_EVENTS, "events")
+    assert (name, values["frames_stored"], values["outbox_frames"]) == ("started", 3, 3)
+
+
 def test_warnings_of_any_part_become_events_and_the_end_is_told(store, small_mission):
     link = ListLink()
 

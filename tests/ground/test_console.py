@@ -29,6 +29,7 @@ from ground.commands.console import (
     link_state,
     shown,
     size,
+    statuses_shown,
 )
 from ground.commands.terminal_pictures import COLUMNS, LatestPicture, stretched
 from ground.link.ingest import ListenSummary, Status, _Ingest
@@ -352,6 +353,13 @@ def test_a_refusal_is_told_where_its_command_ends_and_not_once_more():
     same, other = refused | {"problem": "counter 9: not armed"}, refused | {"problem": "counter 8: forged"}
     assert [event for event, _ in events_once([same, ended, other])] == [other, ended]
     assert ended["text"] == "command 9, retire, refused: not armed"
+    console = Console(file=io.StringIO(), width=100)
+    with statuses_shown(console, False, LINK, HERE) as (_, on_event):
+        for event in (ended, same, other, other):
+            on_event(event | {"text": event["text"] if event is ended else event["problem"]})
+    assert isinstance(console.file, io.StringIO)
+    lines = ["warning: command 9, retire, refused: not armed", "warning: counter 8: forged"]
+    assert console.file.getvalue().splitlines() == lines
 
 
 def test_keys_are_read_from_a_terminal_one_by_one_and_it_is_left_as_it_was(monkeypatch):
