@@ -21,6 +21,8 @@ from obbgs_core.start.initialisation import StartSettings
 
 log = logging.getLogger(__name__)
 GAUSSIANS_PER_PIXEL = 2  # that a picture can show: one behind each edge of a pixel
+# of the harmonics, at most, on a body with texture all over: its relief glints as no degree of two describes
+TEXTURED_SH_DEGREE = 3
 AS_MANY_PICTURES = 35  # long exposures: the lit pixels of fewer count as those of so many (experiment 084)
 # Kerbl et al., 3D Gaussian Splatting, 2023
 _3DGS = MethodConfig(
@@ -239,7 +241,8 @@ def limited(
 
     Between them stands how many Gaussians a picture can show, 0 where the budget is what was asked for. A body with
     texture all over begins with a Gaussian for each pixel that shows it, and may have as many as a picture can show:
-    growth, which begins at edges, does not reach it in time. Numbers that were asked for stay.
+    growth, which begins at edges, does not reach it in time. What it shines with may turn with the view by one degree
+    more, where frames are not few. Numbers that were asked for stay.
 
     Args:
         lit_pixels: of each long exposure. A few of them show as much detail of the target as many, and count as so
@@ -255,9 +258,12 @@ def limited(
     pictures = max(len(lit_pixels), AS_MANY_PICTURES)
     lit = sum(lit_pixels) * pictures // len(lit_pixels)
     shown = GAUSSIANS_PER_PIXEL * sum(lit_pixels) // len(lit_pixels) if factor else 0
+    light = config.light
     as_usual = (first, most) == (StartSettings().count, GrowthSettings().max_gaussians)
     if factor and as_usual and textured_pixels > first and shown > most:
         first, most = textured_pixels, shown
+        if light == LightSettings():
+            light = replace(light, max_sh_degree=TEXTURED_SH_DEGREE)
         budget = (
             f"at most {most:,} Gaussians instead of {config.growth.max_gaussians:,}: as many as a picture can show, "
             f"because {textured_pixels:,} of its pixels show texture all over the target"
@@ -272,4 +278,4 @@ def limited(
     log.info("budget: %s", budget)
     growth = replace(config.growth, max_gaussians=most)
     start = replace(config.start, count=min(first, most))
-    return replace(config, growth=growth, start=start), shown, budget
+    return replace(config, growth=growth, start=start, light=light), shown, budget

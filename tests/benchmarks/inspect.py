@@ -64,6 +64,8 @@ def faulted(target: Target, kind: str, rng: np.random.Generator) -> tuple[CadMes
 
 def _turned(target: Target, rng: np.random.Generator) -> tuple[CadMesh, dict]:
     """Turn a panel and what is fixed to it about an axis in it, through its middle or an edge."""
+    if not target.plates:
+        raise NoPlace
     plate = target.plates[rng.integers(len(target.plates))]
     angle = rng.uniform(*DEGREES)
     axis = int(rng.integers(2))
@@ -109,7 +111,7 @@ def _put_on(target: Target, rng: np.random.Generator) -> tuple[CadMesh, dict]:
                 (*target.body.names, "put on"),
             )
             return cad, {"size_px": size_px, "place": middle.tolist(), "depth_px": size_px}
-    raise SystemExit("no place for a box was found")
+    raise NoPlace
 
 
 def joined(first: Samples, second: Samples) -> Samples:
@@ -143,7 +145,7 @@ def _cut_off(target: Target, rng: np.random.Generator) -> tuple[CadMesh, dict]:
         cad = _without(target.body, part, low, high, axis, float((points @ axis).max() - size))
         depth_px = float(np.quantile(stands_off, 0.95)) / target.pixel_m
         return cad, {"size_px": size_px, "place": cut.mean(axis=0).tolist(), "depth_px": depth_px}
-    raise SystemExit("no piece to cut off was found")
+    raise NoPlace
 
 
 def _without(
@@ -168,12 +170,28 @@ def _without(
     )
 
 
+class NoPlace(Exception):
+    """A target has no place for a fault of a kind that the frames show well enough."""
+
+
+def _possible(target: Target, number: int, rng: np.random.Generator) -> tuple[str, CadMesh, dict]:
+    """Return the next kind of fault that a target can have, and the design with it as `faulted` has it.
+
+    No frame shows a panel of DSCOVR's, and nothing of it that the frames show stands off far enough to be cut off.
+    """
+    for turn in range(len(KINDS)):
+        kind = KINDS[(number + turn) % len(KINDS)]
+        try:
+            return kind, *faulted(target, kind, rng)
+        except NoPlace:
+            continue
+    raise AssertionError("an unfaulted design is always possible")
+
+
 def row_of(target: Target, name: str, number: int) -> dict:
     """Return what was found of one fault: whether it was, its stated interval, and what else was told."""
-    kinds = KINDS if target.plates else KINDS[1:]  # no frame shows a panel of DSCOVR's
-    kind = kinds[number % len(kinds)]
     rng = np.random.default_rng([number, sum(map(ord, name))])
-    cad, truth = faulted(target, kind, rng)
+    kind, cad, truth = _possible(target, number, rng)
     anywhere = np.eye(4)
     anywhere[:3, :3] = 10 ** rng.uniform(-2, 3) * Rotation.random(rng=rng).as_matrix()
     anywhere[:3, 3] = rng.normal(size=3) * np.cbrt(np.abs(np.linalg.det(anywhere[:3, :3])))

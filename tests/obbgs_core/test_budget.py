@@ -114,3 +114,7 @@ def test_a_body_with_texture_all_over_begins_with_a_gaussian_for_each_pixel_that
     assert (config.start.count, config.growth.max_gaussians) == (first, most)
     assert shown == (60_000 if config.growth.gaussians_per_root_pixel else 0)
     assert ("texture" in budget) == (first > 3_000)
+    # a relief glints; a degree that was asked for stays, as that of few frames does
+    assert config.light.max_sh_degree == (3 if first > 3_000 else 2)
+    lower = limited(preset("obbgs", changes | {"light.max_sh_degree": 1}), [30_000] * 40, textured)[0]
+    assert lower.light.max_sh_degree == 1
