@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from compare.errors import for_people
+from ground.commands.options import WorkersGiven, workers_at
 from ground.commands.progress import Stop, say
 from obbgs_base.command_line import OUT_HELP, AsJson
 from obbgs_base.imports import quick_imports
@@ -42,14 +43,7 @@ def compare_command(
         typer.Option(help="A YAML file of stability conditions; default: frames as they were taken."),
     ] = None,
     weights: Annotated[Path | None, typer.Option(help="The file of weights that mvsnet needs.")] = None,
-    workers: Annotated[
-        str | None,
-        typer.Option(
-            metavar="N|URL",
-            help="Processes at a time; default: one a core, of one thread each. Or the URL of a dask scheduler, such "
-            "as tls://10.0.0.1:8786.",
-        ),
-    ] = None,
+    workers: WorkersGiven = None,
     json_: AsJson = False,
 ) -> None:
     """Compare methods: one row for each session, method, seed, budget and condition, then a page of all rows.
@@ -78,7 +72,7 @@ def compare_command(
         cells = cells_of(facts, names, seeds, shares, chosen, weights)
         with _shown(stderr) as on_state:
             command = this_command("ground")
-            summary = run_grid(cells, out, command, *_where(workers), on_state, lambda: stop.requested)
+            summary = run_grid(cells, out, command, *workers_at(workers), on_state, lambda: stop.requested)
         asked = {cell.digest: (cell.session.name, cell.condition_name) for cell in cells}
         page, figures = write_page(out, asked), write_figures(out, asked)
     for label, reason in summary.failed.items():
@@ -91,17 +85,6 @@ def compare_command(
         print(f"page: {page}, and {len(figures)} figures beside it")
     if summary.failed:
         raise typer.Exit(1)
-
-
-def _where(workers: str | None) -> tuple[str | None, int | None]:
-    """Return the dask scheduler and the number of processes that --workers asks for, one of them or none."""
-    if workers is not None and "://" in workers:
-        return workers, None
-    if workers is not None and not (workers.isascii() and workers.isdigit() and int(workers) > 0):
-        raise ValueError(
-            f"--workers: expected a number of at least 1 or a URL such as tls://10.0.0.1:8786, got {workers!r}"
-        )
-    return None, None if workers is None else int(workers)
 
 
 @contextlib.contextmanager

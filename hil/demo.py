@@ -55,7 +55,7 @@ def _run_demo(out: Path, mission_path: Path, mesh: Path, config: PassConfig, con
     console.print("[bold]4/4 Model[/] trained with known exposure, and once more blind to it")
     session = out / "session"
     command = [installed("ground"), "reconstruct", "--session", str(session), "--name", "demo"]
-    command += ["--blind-reference", "--mission", str(mission_path)]
+    command += ["--set", "blind_reference=true", "--mission", str(mission_path)]
     finished = subprocess.run(tied([*command, "--json"]), stdout=subprocess.PIPE, text=True)
     if finished.returncode:
         raise DemoError("the reconstruction failed; its message is above")

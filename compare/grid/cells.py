@@ -11,13 +11,11 @@ from compare.case import content_digest
 from compare.conditions import Condition
 from compare.errors import CompareError
 from compare.methods import Method, method
+from ground.run.cluster import needed_mb
 from ground.session.folder import open_session, pass_name
 
+VALUE_BYTES = 16  # of a frame: readings, prepared batches at several scales, silhouettes, truth
 FORMAT = 2  # of a cell's digest; raise it when what is scored changes its meaning
-BASE_MB = 600.0  # a process with PyTorch before any work
-FRAME_COPIES = 4  # readings, prepared batches at several scales, silhouettes, truth
-# of a Gaussian's 59 numbers: parameters, gradient and two moments, and what growth and checkpoints copy of them
-GAUSSIAN_MB = 4e-6 * 59 * 8
 
 
 @dataclass(frozen=True)
@@ -170,7 +168,6 @@ def _cell(
         "condition": condition.stated(),
     }
     digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-    frames_mb = 4e-6 * FRAME_COPIES * facts.frames * facts.pixels
-    gaussians_mb = GAUSSIAN_MB * (wanted.gaussians if largest is None else largest)
-    memory_mb = BASE_MB + frames_mb + gaussians_mb + wanted.working_mb
+    gaussians = wanted.gaussians if largest is None else largest
+    memory_mb = needed_mb(facts.frames * facts.pixels, VALUE_BYTES, gaussians) + wanted.working_mb
     return Cell(facts, wanted.name, seed, Budget(share, largest), name, condition, digest, memory_mb)

@@ -13,12 +13,13 @@ from distributed import Client, Future, KilledWorker
 from compare.errors import CompareError
 from compare.follow import progress
 from compare.grid.cells import Cell
-from compare.grid.cluster import connected, fitting_hosts, threads_of
 from compare.grid.rows import Rows, locked
 from compare.grid.worker import WORK, clear_work, run_cell
+from ground.run.cluster import connected, fitting_hosts, threads_of
 from obbgs_base.errors import Interrupted
 
 POLL_S = 0.2
+LOCAL_WORKER = "compare.grid.local_worker"
 
 
 @dataclass(frozen=True)
@@ -56,8 +57,8 @@ def run_grid(
     reported and the others are made.
 
     Raises:
-        CompareError: another command works in the folder; the scheduler does not answer or is lost; a cell needs more
-            memory than any worker has.
+        CompareError: another command works in the folder, or the scheduler is lost.
+        ClusterError: the scheduler does not answer, or a cell needs more memory than any worker has.
         Interrupted: should_stop returned true; the running cells are saved.
     """
     with locked(out):
@@ -65,7 +66,7 @@ def run_grid(
         todo = [cell for cell in cells if cell.digest not in rows.rows]
         summary = Summary(were_done=len(cells) - len(todo))
         if todo:
-            with connected(scheduler, workers, [cell.memory_mb for cell in todo]) as client:
+            with connected(scheduler, workers, [cell.memory_mb for cell in todo], LOCAL_WORKER) as client:
                 _Run(client, out, command, rows, todo, len(cells), summary, on_state).work(should_stop)
         return summary
 

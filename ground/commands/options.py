@@ -44,6 +44,17 @@ def listening_key(file: Path | None) -> Key | None:
         raise ConfigError(str(path), f"cannot read the key: {reason(error)}") from error
 
 
+def workers_at(given: str | None) -> tuple[str | None, int | None]:
+    """Return the dask scheduler and the number of processes that --workers asks for, one of them or none."""
+    if given is not None and "://" in given:
+        return given, None
+    if given is not None and not (given.isascii() and given.isdigit() and int(given) > 0):
+        raise ValueError(
+            f"--workers: expected a number of at least 1 or a URL such as tls://10.0.0.1:8786, got {given!r}"
+        )
+    return None, None if given is None else int(given)
+
+
 class Quality(StrEnum):
     """How many steps and Gaussians a training may use."""
 
@@ -232,8 +243,19 @@ AttitudeGiven = Annotated[
         "where the tags say so.",
     ),
 ]
-BlindReference = Annotated[
-    bool,
-    typer.Option("--blind-reference", help="Train a second time without exposure times, for comparison."),
+SessionDirs = Annotated[
+    list[Path],
+    typer.Option(
+        "--session", help="The session folder. Several, each with an option of its own, run at a time."
+    ),
+]
+WorkersGiven = Annotated[
+    str | None,
+    typer.Option(
+        "--workers",
+        metavar="N|URL",
+        help="Processes at a time; default: one a core, of one thread each. Or the URL of a dask scheduler, such "
+        "as tls://10.0.0.1:8786.",
+    ),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run of the same name.")]

@@ -3,8 +3,9 @@
 import json
 import math
 import os
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -13,7 +14,6 @@ from flightsw.icd.mission import ReconstructSection, load_mission
 from ground.commands.options import (
     AttitudeChoice,
     AttitudeGiven,
-    BlindReference,
     Budget,
     MeshFormatName,
     MethodName,
@@ -23,23 +23,28 @@ from ground.commands.options import (
     RunAt,
     RunName,
     Seed,
-    SessionDir,
+    SessionDirs,
     SettingsGiven,
     TimeLimit,
+    WorkersGiven,
+    workers_at,
 )
 from ground.commands.progress import Stop, say, shares_shown, steps_shown
-from ground.show.summary import frames_row, model_rows, table
+from ground.show.summary import frames_row, model_rows, runs_table, table
 from obbgs_base.command_line import AsJson
 from obbgs_base.errors import Interrupted
 from obbgs_base.imports import quick_imports
 from obbgs_base.output import output_may_fail
+
+if TYPE_CHECKING:  # it imports PyTorch
+    from ground.commands import many
 
 stderr = Console(stderr=True)
 
 
 @output_may_fail()
 def reconstruct_command(
-    session: SessionDir,
+    session: SessionDirs,
     name: RunName = "run",
     method: MethodName = None,
     quality: QualityName = None,
@@ -48,33 +53,70 @@ def reconstruct_command(
     mission: ReconstructMission = None,
     time_limit: TimeLimit = math.inf,
     seed: Seed = None,
-    blind_reference: BlindReference = False,
     attitude: AttitudeGiven = AttitudeChoice.AUTO,
+    workers: WorkersGiven = None,
     overwrite: Overwrite = False,
     json_: AsJson = False,
 ) -> None:
     """Train a model on a session, export it, score it and write its report.
 
     Ctrl-C and SIGTERM save the training and end with exit code 1; the same command resumes it, also after a kill. Only
-    one process at a time makes a run.
+    one process at a time makes a run. Of several sessions one that fails does not end the others, finished runs are
+    left as they are, and a table shows them all; that needs obbgs[compare].
 
     Example: ground reconstruct --session pass-12 --name first --time-limit 120 --set light.sun_shading=linear
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning threads slow each other down
+    section = load_mission(mission).reconstruct if mission else ReconstructSection()
+    chosen, seed = method or section.method, section.seed if seed is None else seed
+    asked = _Asked(
+        name, chosen, section, quality, budget, settings or [], seed, time_limit, attitude, overwrite
+    )
+    if len(session) > 1 or workers is not None:
+        _many(session, asked, workers, json_)
+    else:
+        _one(session[0], asked, json_)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What the options of `reconstruct` ask for, whatever the session."""
+
+    name: str
+    method: str
+    section: ReconstructSection
+    quality: str | None
+    budget: str
+    settings: list[str]
+    seed: int
+    time_limit_s: float
+    attitude: AttitudeChoice
+    overwrite: bool
+
+    def changes(self) -> dict:
+        """Return the changes to the method's preset; imports PyTorch.
+
+        Raises:
+            ValueError: as in `all_changes`.
+        """
+        from ground.run.settings import all_changes
+
+        return all_changes(self.section, self.method, self.quality, self.budget, self.settings)
+
+
+def _one(session: Path, asked: _Asked, as_json: bool) -> None:
+    """Reconstruct a session in this process."""
     stop, folder = Stop(), None
     try:
         with stop.on_signals(), steps_shown(stderr) as show:
             with quick_imports():
                 from ground.run.evaluate import evaluate
                 from ground.run.reconstruct import Progress, reconstruct
-                from ground.run.settings import all_changes
                 from ground.session.folder import read_header
                 from ground.show.report.document import write_report
                 from obbgs_core.process import prepare_process
 
-            section = load_mission(mission).reconstruct if mission else ReconstructSection()
-            chosen = method or section.method
-            changes = all_changes(section, chosen, quality, budget, settings or [])
+            changes = asked.changes()
             prepare_process()
             stop.raise_at_once()
 
@@ -86,27 +128,58 @@ def reconstruct_command(
             say(stderr, f"reading the frames of {session}")
             folder = reconstruct(
                 session,
-                name,
-                chosen,
+                asked.name,
+                asked.method,
                 changes,
-                section.seed if seed is None else seed,
-                time_limit,
-                blind_reference,
+                asked.seed,
+                asked.time_limit_s,
                 on_progress,
-                overwrite=overwrite,
+                overwrite=asked.overwrite,
                 should_stop=lambda: stop.requested,
-                attitude=attitude.value,
+                attitude=asked.attitude.value,
                 on_search=shares_shown(stderr),
             )
             stop.raise_at_once()
             say(stderr, "scoring the model and writing its report")
-            metrics = evaluate(session, name)
-            report = write_report(session, name)
+            metrics = evaluate(session, asked.name)
+            report = write_report(session, asked.name)
     except KeyboardInterrupt as error:
         raise Interrupted(_interrupted(folder)) from error
-    _print_metrics(metrics, json_)
-    if not json_:
+    _print_metrics(metrics, as_json)
+    if not as_json:
         print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}\nreport: {report}")
+
+
+def _many(sessions: list[Path], asked: _Asked, workers: str | None, as_json: bool) -> None:
+    """Reconstruct sessions in processes of their own, and show what became of them in a table."""
+    stop = Stop()
+    with stop.on_signals():
+        with quick_imports():
+            from ground.commands import many
+
+        wanted = many.Asked(
+            asked.name,
+            asked.method,
+            asked.changes(),
+            asked.seed,
+            asked.time_limit_s,
+            asked.attitude.value,
+            asked.overwrite,
+        )
+
+        def on_end(session: Path, ended: "many.Ended") -> None:
+            state = ended.problem or ("was finished" if ended.was_done else "finished")
+            say(stderr, f"{session}: {state}")
+
+        say(stderr, f"reconstructing {len(sessions)} sessions")
+        found = many.reconstruct_all(sessions, wanted, *workers_at(workers), on_end, lambda: stop.requested)
+    if as_json:
+        told = {str(s): e.metrics or {"error": e.problem} for s, e in found.items()}
+        print(json.dumps({"sessions": told}))
+    else:
+        Console().print(runs_table({str(s): e.metrics or e.problem for s, e in found.items()}))
+    if any(ended.problem for ended in found.values()):
+        raise typer.Exit(1)
 
 
 def evaluate_command(run: RunAt, json_: AsJson = False) -> None:

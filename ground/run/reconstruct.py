@@ -53,7 +53,6 @@ def reconstruct(
     changes: dict | None = None,
     seed: int = 7,
     time_limit_s: float = math.inf,
-    blind_reference: bool = False,
     on_progress: Callable[[Progress], None] = lambda progress: None,
     out: Path | None = None,
     overwrite: bool = False,
@@ -68,9 +67,9 @@ def reconstruct(
     reason for each of the others. The truth of a simulator is never read here.
 
     Args:
-        changes: settings that differ from the method's preset.
-        blind_reference: train a second time with every exposure time replaced by their geometric mean, on the poses
-            that the first training found, to measure what knowing the exposure brings.
+        changes: settings that differ from the method's preset. `blind_reference`: train a second time with every
+            exposure time replaced by their geometric mean, on the poses that the first training found, to measure
+            what knowing the exposure brings.
         out: the folder of runs; None: runs/ in the session.
         overwrite: replace a finished run of the same name.
         should_stop: called after each step and before each file; True saves the work and raises Interrupted.
@@ -97,7 +96,7 @@ def reconstruct(
     training, held_out = split(session)
     sensor = sensor_of(session.camera)
     configs = {KNOWN: config}
-    if blind_reference and config.exposure_aware:
+    if config.blind_reference and config.exposure_aware:
         configs[BLIND] = dataclasses.replace(_refining(config, "never"), exposure_aware=False)
     kept = [ATTITUDE_FILE, *(_checkpoint(label) for label in configs)]
     with unfinished_run(folder, overwrite, kept) as part:

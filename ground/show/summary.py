@@ -72,6 +72,23 @@ def frames_row(metrics: dict) -> tuple[str, str]:
     return "frames", f"{metrics['frames_received']:,} received / {frames_captured(metrics)} captured, {used}"
 
 
+def runs_table(runs: dict[str, dict | str]) -> Table:
+    """Return the figures of one run of each of some sessions as a table, or why there is none, by the session."""
+    made = Table()
+    for heading in ("session", "frames", "PSNR", "Gaussians", "training"):
+        made.add_column(heading, overflow="fold")
+    for session, metrics in runs.items():
+        if isinstance(metrics, str):
+            made.add_row(*map(Text, (session, "", "", "", f"not made: {metrics}")))
+            continue
+        key = next((key for key in PSNR_LABELS if metrics.get(key) is not None), None)
+        noisy = " (noisy frames)" if key == "psnr_noisy_db" else ""
+        psnr = "" if key is None else f"{metrics[key]:.2f} dB{noisy}"
+        counts = f"{metrics['frames_trained']:,}", psnr, f"{metrics['gaussians']:,}"
+        made.add_row(*map(Text, (session, *counts, f"{metrics['train_seconds']:.0f} s")))
+    return made
+
+
 def table(title: str, rows: list[tuple[str, str]]) -> Table:
     """Return rows as a table for a terminal."""
     made = Table(title=title, show_header=False)

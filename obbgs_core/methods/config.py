@@ -173,6 +173,8 @@ class MethodConfig:
     # where pictures are rendered and compared; auto: cuda where that can be used; warp: the kernels of cuda on this
     # processor, for tests (not measured on a GPU)
     device: Literal["cpu", "cuda", "auto", "warp"] = "cpu"
+    # of a run: trained a second time without exposure times, for comparison
+    blind_reference: bool = False
     # above 0: stop after growth when the running chi² falls to this; 1 is pure noise (002)
     chi2_end: float = 1.0
     start: StartSettings = field(default_factory=StartSettings)

@@ -15,9 +15,8 @@ from distributed import Client
 from distributed.security import Security
 from typer.testing import CliRunner
 
-from compare.errors import CompareError
-from compare.grid.cluster import connected, share_memory
 from ground import cli
+from ground.run.cluster import ClusterError, connected, share_memory
 from obbgs_base.command_line import in_words
 from tests.commands import call
 from tests.small_sessions import small_session
@@ -189,7 +188,7 @@ def test_no_more_workers_are_started_than_the_memory_holds(workers, needs, avail
 
 
 def test_a_cell_that_the_memory_does_not_hold_is_refused():
-    with pytest.raises(CompareError, match=r"about 2\.0 GB of memory, 1\.0 GB are available"):
+    with pytest.raises(ClusterError, match=r"about 2\.0 GB of memory, 1\.0 GB are available"):
         share_memory(2, [2000], 1000)
 
 
@@ -202,8 +201,8 @@ def test_processes_that_do_not_start_in_time_are_told_in_one_sentence(monkeypatc
     def busy(**settings):
         raise TimeoutError
 
-    monkeypatch.setattr("compare.grid.cluster.LocalCluster", busy)
-    with pytest.raises(CompareError, match=r"did not start in time.* the same command tries again"):
+    monkeypatch.setattr("ground.run.cluster.LocalCluster", busy)
+    with pytest.raises(ClusterError, match=r"did not start in time.* the same command tries again"):
         connected(None, 1, [10.0]).__enter__()
     assert in_words(TimeoutError()) == "TimeoutError"
 

@@ -55,7 +55,7 @@ def trained(tmp_path_factory) -> tuple[Path, dict]:
     session = copy_session(tmp_path_factory.mktemp("trained"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ground.run.model_files.SURFACE_POINTS", 100_000)  # as everywhere but in these tests
-        reconstruct(session, "run", "obbgs", TRAINED, blind_reference=True)
+        reconstruct(session, "run", "obbgs", TRAINED | {"blind_reference": True})
     return session, evaluate(session, "run")
 
 

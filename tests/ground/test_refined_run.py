@@ -48,7 +48,7 @@ def refined(tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         move_poses_in(patch, 2)
         patch.setattr(reconstructing, "train", lambda *given: trained_on.append(given[0]) or train(*given))
-        reconstruct(session, "run", "obbgs", STEPS, blind_reference=True)
+        reconstruct(session, "run", "obbgs", STEPS | {"blind_reference": True})
     metrics = evaluate(session, "run")
     assert metrics["poses"].startswith("refined") and metrics["pose_error_tagged_px"] > 5
     assert metrics["pose_error_px"] < 0.5

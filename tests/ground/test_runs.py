@@ -159,7 +159,7 @@ def test_a_blind_training_that_fails_does_not_cost_the_one_that_did_not(session,
         return train(frames, sensor, config, *more)
 
     monkeypatch.setattr("ground.run.reconstruct.train", blindly_diverging)
-    reconstruct(session, "run", "obbgs", QUICK, blind_reference=True)
+    reconstruct(session, "run", "obbgs", QUICK | {"blind_reference": True})
     metrics = evaluate(session, "run")
     assert "the loss became inf at step 7" in metrics["missing_outputs"]["blind.ply"]
     assert metrics["psnr_clean_db"] > 0 and "psnr_clean_blind_db" not in metrics
@@ -193,8 +193,7 @@ def test_a_run_holds_nothing_of_an_interrupted_one_before_it(session):
             session,
             "run",
             "obbgs",
-            QUICK,
-            blind_reference=True,
+            QUICK | {"blind_reference": True},
             should_stop=lambda: (part / "blind.ply").exists(),
         )
     (part / "left.npz").write_text("by who knows whom")

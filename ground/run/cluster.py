@@ -1,4 +1,4 @@
-"""The processes that a comparison runs on: a cluster of its own on this machine, or one that a scheduler leads."""
+"""Processes for many trainings: a cluster of the command's own on this machine, or one that a scheduler leads."""
 
 import contextlib
 import logging
@@ -10,10 +10,12 @@ import psutil
 from distributed import Client, LocalCluster
 from distributed.security import Security
 
-from compare.errors import CompareError
-from obbgs_base.errors import reason
+from obbgs_base.errors import ObbgsError, reason
 
 log = logging.getLogger(__name__)
+BASE_MB = 600.0  # a process with PyTorch before any work
+# of a Gaussian's 59 numbers: parameters, gradient and two moments, and what growth and checkpoints copy of them
+GAUSSIAN_MB = 4e-6 * 59 * 8
 USED_MEMORY = 0.9  # of what is available: the rest is for everybody else
 CONFIG = {
     "distributed.scheduler.worker-ttl": "1 hour",  # a busy worker of low priority may be silent for minutes
@@ -27,22 +29,33 @@ CONFIG = {
 }
 
 
+class ClusterError(ObbgsError):
+    """There are no processes, or not enough memory; the message says why and what to do."""
+
+
+def needed_mb(values: int, bytes_of_each: float, gaussians: int) -> float:
+    """Return the memory that a training's process is estimated to need, of so many values of all frames together."""
+    return BASE_MB + 1e-6 * bytes_of_each * values + GAUSSIAN_MB * gaussians
+
+
 @contextlib.contextmanager
-def connected(scheduler: str | None, workers: int | None, needs_mb: list[float]) -> Iterator[Client]:
+def connected(
+    scheduler: str | None, workers: int | None, needs_mb: list[float], preload: str
+) -> Iterator[Client]:
     """Give a client of the scheduler at a URL, or of a cluster of this machine's own for the time of the block.
 
     Whoever reaches a scheduler has its workers run code. The own cluster therefore takes only connections with the
     credentials that it makes for itself, and a scheduler without TLS is warned of.
 
     Args:
-        scheduler: such as tls://10.0.0.1:8786; its workers must see the sessions and the comparison's folder under the
-            same paths.
+        scheduler: such as tls://10.0.0.1:8786; its workers must see the folders of the command under the same paths.
         workers: processes of the own cluster, of one thread each; None: one a core. Fewer are started where the
-            memory does not hold so many of the largest cell.
-        needs_mb: what each cell is estimated to need.
+            memory does not hold so many of the largest training.
+        needs_mb: what each training is estimated to need.
+        preload: the module that each process of the own cluster loads; its `dask_setup` is called.
 
     Raises:
-        CompareError: the scheduler does not answer, or the memory does not hold the largest cell.
+        ClusterError: the scheduler does not answer, or the memory does not hold the largest training.
     """
     logging.getLogger("distributed").setLevel(
         logging.CRITICAL
@@ -57,7 +70,7 @@ def connected(scheduler: str | None, workers: int | None, needs_mb: list[float])
             try:
                 client = Client(scheduler, timeout="30s", set_as_default=False)
             except (OSError, ValueError, TypeError) as error:
-                raise CompareError(f"no dask scheduler answers at {scheduler}: {reason(error)}") from error
+                raise ClusterError(f"no dask scheduler answers at {scheduler}: {reason(error)}") from error
             with client:
                 yield client
             return
@@ -72,20 +85,20 @@ def connected(scheduler: str | None, workers: int | None, needs_mb: list[float])
                         security=Security.temporary(),
                         dashboard_address="127.0.0.1:0",
                         silence_logs=50,
-                        preload="compare.grid.local_worker",
+                        preload=preload,
                     )
                 )
                 client = held.enter_context(Client(cluster, set_as_default=False))
             except TimeoutError as error:
-                raise CompareError(
-                    "the processes of this comparison did not start in time, as on a machine that is very busy: the "
+                raise ClusterError(
+                    "the processes of this command did not start in time, as on a machine that is very busy: the "
                     "same command tries again"
                 ) from error
             yield client
 
 
 def available_mb() -> float:
-    """Return the memory that a comparison may use on this machine."""
+    """Return the memory that a command may use on this machine."""
     return USED_MEMORY * psutil.virtual_memory().available / 1e6
 
 
@@ -93,30 +106,30 @@ def share_memory(workers: int, needs_mb: list[float], available: float) -> tuple
     """Return how many workers there is memory for, and how much each of them has (MB).
 
     Raises:
-        CompareError: the memory does not hold the largest need.
+        ClusterError: the memory does not hold the largest need.
     """
     largest = max(needs_mb, default=0.0)
     if largest > available:
-        raise CompareError(
-            f"a cell needs about {largest / 1e3:.1f} GB of memory, {available / 1e3:.1f} GB are available: give a "
-            "smaller budget of Gaussians, such as --budgets 1@100000, or run on another machine with --workers URL"
+        raise ClusterError(
+            f"a training needs about {largest / 1e3:.1f} GB of memory, {available / 1e3:.1f} GB are available: give a "
+            "smaller budget of Gaussians, or run on another machine with --workers URL"
         )
     count = max(1, min(workers, int(available // max(largest, 1.0))))
     return count, available / count
 
 
 def fitting_hosts(client: Client, need_mb: float) -> list[str] | None:
-    """Return the hosts whose workers have the memory that a cell needs; None where all have, or do not say.
+    """Return the hosts whose workers have the memory that a training needs; None where all have, or do not say.
 
     Raises:
-        CompareError: no worker has it, or the scheduler is lost.
+        ClusterError: no worker has it, or the scheduler is lost.
     """
     found = _workers(client)
     limits_mb = {address: info.get("memory_limit") or float("inf") for address, info in found.items()}
     fitting = [address for address, limit in limits_mb.items() if limit >= need_mb * 1e6]
     if found and not fitting:
-        raise CompareError(
-            f"a cell needs about {need_mb / 1e3:.1f} GB of memory, the largest worker has "
+        raise ClusterError(
+            f"a training needs about {need_mb / 1e3:.1f} GB of memory, the largest worker has "
             f"{max(limits_mb.values()) / 1e9:.1f} GB: start one with more (dask worker --memory-limit), or give a "
             "smaller budget of Gaussians"
         )
@@ -126,10 +139,10 @@ def fitting_hosts(client: Client, need_mb: float) -> list[str] | None:
 
 
 def threads_of(client: Client) -> int:
-    """Return how many cells the workers take at once.
+    """Return how many trainings the workers take at once.
 
     Raises:
-        CompareError: the scheduler is lost.
+        ClusterError: the scheduler is lost.
     """
     return sum(info["nthreads"] for info in _workers(client).values())
 
@@ -138,4 +151,4 @@ def _workers(client: Client) -> dict[str, dict]:
     try:
         return client.scheduler_info(n_workers=-1)["workers"]
     except (KeyError, OSError) as error:  # of a lost one nothing is known
-        raise CompareError("the scheduler was lost; the same command goes on from what is saved") from error
+        raise ClusterError("the scheduler was lost; the same command goes on from what is saved") from error
