@@ -203,13 +203,13 @@ def test_processes_that_do_not_start_in_time_are_told_in_one_sentence(monkeypatc
 
     monkeypatch.setattr("ground.run.cluster.LocalCluster", busy)
     with pytest.raises(ClusterError, match=r"did not start in time.* the same command tries again"):
-        connected(None, 1, [10.0]).__enter__()
+        connected(None, 1, [10.0], "compare.grid.local_worker").__enter__()
     assert in_words(TimeoutError()) == "TimeoutError"
 
 
 def test_a_comparison_s_own_cluster_takes_only_its_own_credentials():
     """A scheduler has its workers run whatever a client sends."""
-    with connected(None, 1, [10.0]) as client:
+    with connected(None, 1, [10.0], "compare.grid.local_worker") as client:
         address = client.scheduler_info()["address"]
         assert address.startswith("tls://") and client.submit(max, 3, 7).result() == 7
         plain = {"address": address.replace("tls://", "tcp://")}
