@@ -10,20 +10,17 @@ from typing import Any
 
 from distributed import Client, Future, KilledWorker
 
-from ground.run.cluster import ClusterError, connected, fitting_hosts, needed_mb, threads_of
+from ground.run.cluster import ClusterError, connected, fitting_hosts, threads_of, training_mb
 from ground.run.evaluate import evaluate
 from ground.run.reconstruct import AttitudeSource, reconstruct
 from ground.run.runs import read_metrics, run_folder
-from ground.session.folder import open_session
 from ground.show.report.document import write_report
 from obbgs_base.errors import Interrupted, ObbgsError, in_words
-from obbgs_core.methods.presets import preset
 from obbgs_core.process import prepare_process
 
 POLL_S = 0.2
 REPORT = "report.html"
 LOOK_EVERY_S = 1.0  # for a wish to stop
-VALUE_BYTES = 6  # of a frame: readings of 16 bits, averaged images, silhouettes
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,7 @@ def reconstruct_all(
         try:
             done = _finished(session, asked)
             if done is None:
-                needs_mb[session] = _need_mb(session, asked)
+                needs_mb[session] = training_mb(session, asked.method, asked.changes)
         except (ObbgsError, OSError) as error:
             done = Ended(problem=in_words(error))
         if done is not None:
@@ -177,14 +174,6 @@ def _finished(session: Path, asked: Asked) -> Ended | None:
     if not _has_run(session, asked) or not (folder / REPORT).is_file():
         return None
     return Ended(read_metrics(folder / "metrics.json"), was_done=True)
-
-
-def _need_mb(session: Path, asked: Asked) -> float:
-    """Return the memory that a session's training is estimated to need."""
-    opened, config = open_session(session), preset(asked.method, asked.changes)
-    camera = opened.camera
-    values = len(opened.frames) * camera.width * camera.height * camera.channels
-    return needed_mb(values, VALUE_BYTES, config.growth.max_gaussians)
 
 
 def _result(future: Future) -> Ended | None:

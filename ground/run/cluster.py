@@ -4,18 +4,23 @@ import contextlib
 import logging
 import os
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import dask.config
 import psutil
 from distributed import Client, LocalCluster
 from distributed.security import Security
 
+from ground.session.folder import open_session
 from obbgs_base.errors import ObbgsError, reason
+from obbgs_core.methods.presets import preset
 
 log = logging.getLogger(__name__)
 BASE_MB = 600.0  # a process with PyTorch before any work
 # of a Gaussian's 59 numbers: parameters, gradient and two moments, and what growth and checkpoints copy of them
 GAUSSIAN_MB = 4e-6 * 59 * 8
+VALUE_BYTES = 6  # of a frame: readings of 16 bits, averaged images, silhouettes
 USED_MEMORY = 0.9  # of what is available: the rest is for everybody else
 CONFIG = {
     "distributed.scheduler.worker-ttl": "1 hour",  # a busy worker of low priority may be silent for minutes
@@ -36,6 +41,17 @@ class ClusterError(ObbgsError):
 def needed_mb(values: int, bytes_of_each: float, gaussians: int) -> float:
     """Return the memory that a training's process is estimated to need, of so many values of all frames together."""
     return BASE_MB + 1e-6 * bytes_of_each * values + GAUSSIAN_MB * gaussians
+
+
+def training_mb(session_dir: Path, method: str, changes: dict[str, Any]) -> float:
+    """Return the memory that a session's training is estimated to need.
+
+    Raises:
+        SessionError, ValueError: as in `open_session` and `preset`.
+    """
+    session, config = open_session(session_dir), preset(method, changes)
+    values = len(session.frames) * session.camera.width * session.camera.height * session.camera.channels
+    return needed_mb(values, VALUE_BYTES, config.growth.max_gaussians)
 
 
 @contextlib.contextmanager
