@@ -12,7 +12,7 @@ PARTS = ("obbgs_base", "obbgs_core", "flightsw", "ground", "compare", "hil")
 LONGEST_FILE, LONGEST_FUNCTION = 800, 80  # lines
 CORE = {"obbgs_base", "obbgs_core.model", "obbgs_core"}  # what every room of the library may use
 LIBRARY = {
-    f"obbgs_core.{room}" for room in ("model", "render", "poses", "methods", "train", "io", "score")
+    f"obbgs_core.{room}" for room in ("model", "render", "poses", "methods", "train", "io", "score", "mesh")
 } | {"obbgs_core"}
 CONTRACT = {"obbgs_base", "flightsw.icd", "flightsw.icd.transfer"}
 GROUND = {"ground.session", "ground.formats"}
@@ -35,6 +35,7 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     "obbgs_core.io": CORE | {"obbgs_core.render"},
     "obbgs_core.inspect": CORE,
     "obbgs_core.score": CORE | {"obbgs_core.render", "obbgs_core.poses"},
+    "obbgs_core.mesh": CORE | {"obbgs_core.render", "obbgs_core.score"},
     "flightsw.icd": {"obbgs_base"},
     "flightsw.icd.transfer": {"obbgs_base", "flightsw.icd"},
     "flightsw.icd.ndm": {"obbgs_base", "flightsw.icd"},

@@ -25,7 +25,7 @@ def write_mesh(
     """
     # loaded here: scikit-image and manifold3d are needed for nothing else
     from obbgs_core.io.mesh import save_mesh
-    from obbgs_core.score.mesh import surface_mesh
+    from obbgs_core.mesh.solid import surface_mesh
 
     one_per_bracket = {record.bracket: record for record in training}.values()
     cameras = cameras_of(session, list(one_per_bracket))

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ground.formats.pictures.srgb import from_srgb, to_srgb
 from ground.session.exposures import MOST_OFFERED
+from obbgs_base.srgb import from_srgb, to_srgb
 from obbgs_core.score.lpips import SMALLEST_PX, WeightsMissing, lpips
 from obbgs_core.score.metrics import (
     cloud_distances,

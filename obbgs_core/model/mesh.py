@@ -15,7 +15,10 @@ class SurfaceMesh:
     vertices [V, 3] float64 m, body frame; triangles [F, 3] int64; colours [V, C] float32, C = 1 or 3, scene-linear:
     the albedo in units of the Sun's light if `is_albedo`, otherwise the mean radiance towards the views that see the
     vertex; seen_by [V] int64, the number of views, of `views`, that see it. Where that is 0 the surface only bounds
-    what no view could see, and its colour is that of the nearest vertex that was seen.
+    what no view could see, and its colour is that of the nearest place that was seen.
+
+    texture [H, W, C] float32, the same colours over the whole surface; corners [F, 3, 2] float32, where the corners of
+    the triangles lie in it, from 0 at the left and the top to 1.
     """
 
     vertices: np.ndarray
@@ -24,3 +27,5 @@ class SurfaceMesh:
     seen_by: np.ndarray
     views: int
     is_albedo: bool
+    corners: np.ndarray
+    texture: np.ndarray

@@ -26,10 +26,10 @@ from ground.formats.photographs.exposures import estimated, light_s, read_table,
 from ground.formats.photographs.poses import read_photographs
 from ground.formats.pictures.files import FormatError, Light, decode, read_header
 from ground.formats.pictures.lens import Intrinsics
-from ground.formats.pictures.srgb import to_srgb
 from ground.formats.pictures.view import View
 from ground.formats.pictures.views import Values
 from ground.session.folder import open_session
+from obbgs_base.srgb import to_srgb
 from tests import raycast
 from tests.commands import call
 

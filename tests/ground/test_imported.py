@@ -21,7 +21,6 @@ from ground.formats.colmap import read_colmap
 from ground.formats.nerf import export_nerf, read_nerf
 from ground.formats.nerfstudio import export_nerfstudio, read_nerfstudio
 from ground.formats.pictures.judgement import judge
-from ground.formats.pictures.srgb import from_srgb, to_srgb
 from ground.formats.pictures.views import (
     FormatError,
     Intrinsics,
@@ -37,6 +36,7 @@ from ground.session.cameras import cameras_of, predicted_image
 from ground.session.folder import SessionCorrupt, SessionError, open_session
 from ground.session.training_frames import split, training_frame
 from ground.show.report.document import write_report
+from obbgs_base.srgb import from_srgb, to_srgb
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.render import render
 from obbgs_core.score.metrics import ssim

@@ -10,14 +10,18 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
 from obbgs_core.errors import ExportError
 from obbgs_core.io.mesh import save_mesh
+from obbgs_core.mesh.flat_faces import flat_faces
+from obbgs_core.mesh.solid import _where_seen, surface_mesh
+from obbgs_core.mesh.texture import layout_of
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.mesh import SurfaceMesh
 from obbgs_core.render import render
-from obbgs_core.score.mesh import _where_seen, surface_mesh
 from tests import readers
 from tests.obbgs_core.test_surface import PIXEL_M, SIZE, cameras_around, discs, sphere, thin_struts
 
@@ -55,6 +59,95 @@ def test_a_plate_without_thickness_keeps_its_area_and_place():
     inner = (centres[:, :2].abs() < 0.65).all(dim=1).numpy()  # its rim, seen edge-on, is rounded
     assert gaps[inner].max() < 2 * PIXEL_M and gaps.max() < 5 * PIXEL_M
     assert np.abs(shape.vertices[:, 2]).max() < 2 * PIXEL_M
+
+
+def test_a_sheet_that_is_lit_from_one_side_is_thinner_than_a_voxel():
+    """Its dark side, ten layers behind the lit one, tells nothing of where it lies: pictures show the same without."""
+    grid = torch.linspace(-0.8, 0.8, 40)
+    x, y = (t.flatten() for t in torch.meshgrid(grid, grid, indexing="ij"))
+    lit = torch.stack([x, y, torch.zeros_like(x)], dim=1)
+    voxel_m = 1.5 * PIXEL_M * 4 / 3
+    layers = [lit - torch.tensor([0.0, 0.0, depth * voxel_m]) for depth in np.linspace(0.2, 2, 10)]
+    sheet = discs(torch.cat([lit, *layers]), torch.tensor([[0.0, 0.0, 1.0]]).expand(11 * len(x), 3), 0.03)
+    sheet.sh[len(lit) :] = -5.0  # no light
+    shape = solid(surface_mesh(sheet, cameras_around(40)))
+    assert shape.is_watertight
+    middle = shape.vertices[(np.abs(shape.vertices[:, :2]) < 0.5).all(axis=1)]
+    assert np.ptp(middle[:, 2]) < voxel_m and np.abs(middle[:, 2]).max() < voxel_m
+    assert shape.area / 2 == pytest.approx(1.66**2, rel=0.15)  # the outer discs reach beyond their centres
+
+
+@pytest.fixture(scope="module")
+def box() -> SurfaceMesh:
+    """A cube of 1.2 m, its upper half three times as bright."""
+    grid = torch.linspace(-0.6, 0.6, 28)
+    u, v = (t.flatten() for t in torch.meshgrid(grid, grid, indexing="ij"))
+    centres, normals = [], []
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            face = torch.stack([u, v, torch.full_like(u, side * 0.6)], dim=1).roll(axis + 1, dims=1)
+            centres.append(face)
+            normals.append(torch.eye(3)[axis].expand(len(u), 3))
+    cube = discs(torch.cat(centres), torch.cat(normals), 0.026)
+    cube.sh[cube.means[:, 2] > 0] = 3.0
+    return surface_mesh(cube, cameras_around(40))
+
+
+def test_the_faces_of_a_box_are_planes_and_its_edges_are_sharp(box):
+    shape = solid(box)
+    assert shape.is_watertight
+    largest = np.abs(shape.face_normals).max(axis=1)
+    straight = largest > np.cos(np.radians(2))
+    assert shape.area_faces[straight].sum() > 0.9 * shape.area
+    for axis in range(3):
+        for side in (-1, 1):
+            facing = side * shape.face_normals[:, axis] > np.cos(np.radians(2))
+            away, area = side * shape.triangles_center[facing, axis], shape.area_faces[facing]
+            plane = np.median(np.repeat(away, np.ceil(area / area.mean()).astype(int)))
+            assert abs(plane - 0.6) < 2.5 * PIXEL_M
+            assert area[np.abs(away - plane) < 0.02 * PIXEL_M].sum() > 0.9 * area.sum()
+    corners = np.array(np.meshgrid(*[[-0.6, 0.6]] * 3)).reshape(3, -1).T
+    gaps, _ = KDTree(shape.vertices).query(corners)
+    assert gaps.max() < 2 * PIXEL_M
+
+
+def test_the_texture_shows_what_lies_between_the_vertices(box):
+    """Interpolated as viewers do, at random places; a pixel beside where the light changes."""
+    height, width = box.texture.shape[:2]
+    rng = np.random.default_rng(0)
+    weights = rng.dirichlet([1, 1, 1], len(box.triangles))
+    places = np.einsum("fk,fkj->fj", weights, box.vertices[box.triangles])
+    at = np.einsum("fk,fkj->fj", weights, box.corners) * [width, height]
+    column, row = np.floor(at).astype(int).T
+    seen = box.texture[row, column, 0]
+    plain = (np.abs(places[:, 2]) > 3 * PIXEL_M) & (np.abs(places[:, 2]) < 0.5)
+    dark, bright = (0.2820948 * level for level in (1.0, 3.0))
+    expected = np.where(places[:, 2] > 0, bright, dark)
+    assert plain.sum() > 200
+    assert np.median(np.abs(seen / expected - 1)[plain]) < 0.05
+    assert (np.abs(seen / expected - 1)[plain] < 0.3).mean() > 0.95
+
+
+def test_a_ball_has_no_flat_face(ball):
+    faces, face = flat_faces(ball.vertices, ball.triangles, 1.5 * PIXEL_M)
+    assert (face >= 0).mean() < 0.3 and faces.areas.sum() < 0.3 * solid(ball).area
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 1000), st.floats(0.01, 0.3))
+def test_charts_of_a_texture_do_not_overlap_and_know_where_they_lie(seed, texel_m):
+    shape = trimesh.convex.convex_hull(np.random.default_rng(seed).normal(size=(12, 3)))
+    layout = layout_of(shape.vertices, shape.faces, texel_m)
+    assert len(np.unique(layout.texels)) == len(layout.texels)
+    assert (layout.corners >= 0).all() and (layout.corners <= [layout.width, layout.height]).all()
+    place = np.full((layout.width * layout.height, 3), np.nan)
+    place[layout.texels] = layout.places
+    middles, at = shape.triangles_center, layout.corners.mean(axis=1)
+    column, row = np.floor(at).astype(int).T
+    edges_m = np.linalg.norm(np.diff(shape.vertices[shape.edges], axis=1), axis=2).max()
+    edges = np.linalg.norm(layout.corners - np.roll(layout.corners, 1, axis=1), axis=2).max()
+    gaps = np.linalg.norm(place[row * layout.width + column] - middles, axis=1)
+    assert gaps.max() <= 0.5**0.5 * 1.001 * edges_m / edges
 
 
 def test_struts_thinner_than_a_pixel_stay_whole():
@@ -167,7 +260,10 @@ def test_trimesh_reads_the_same_closed_body_from_every_format(ball, tmp_path, fi
 def test_the_files_keep_how_many_views_saw_each_vertex(ball, tmp_path):
     save_mesh(ball, tmp_path / "mesh.glb", 1.0)
     (geometry,) = trimesh.load_scene(tmp_path / "mesh.glb").geometry.values()
-    np.testing.assert_array_equal(geometry.vertex_attributes["_SEEN_BY_VIEWS"].ravel(), ball.seen_by)
+    gaps, vertex = KDTree(ball.vertices).query(geometry.vertices)  # one stands for each piece of the texture
+    assert gaps.max() < 1e-6 and len(np.unique(vertex)) == len(ball.vertices)
+    read = geometry.vertex_attributes["_SEEN_BY_VIEWS"].ravel()
+    np.testing.assert_array_equal(read, ball.seen_by[vertex])
     save_mesh(ball, tmp_path / "mesh.ply", 1.0)
     assert b"SEEN_BY_VIEWS" in (tmp_path / "mesh.ply").read_bytes()[:600]
     with pytest.raises(ValueError, match="glb, obj, stl, ply"):
@@ -194,6 +290,7 @@ bpy.ops.import_scene.gltf(filepath={str(tmp_path / "mesh.glb")!r})
 (body,) = [o for o in bpy.data.objects if o.type == "MESH"]
 corners = [body.matrix_world @ v.co for v in body.data.vertices]
 names = sorted(a.name for a in body.data.attributes)
+names += [image.name for image in bpy.data.images if tuple(image.size) == {ball.texture.shape[1::-1]!r}]
 print("READ", json.dumps([[list(c) for c in corners[:50]], names, len(body.data.polygons)]))
 """
     done = subprocess.run(
@@ -203,4 +300,4 @@ print("READ", json.dumps([[list(c) for c in corners[:50]], names, len(body.data.
     corners, names, polygons = json.loads(line.removeprefix("READ "))
     gaps, _ = KDTree(ball.vertices).query(np.array(corners))
     assert gaps.max() < 1e-5 and polygons == len(ball.triangles)
-    assert "_SEEN_BY_VIEWS" in names and any(name.lower().startswith("col") for name in names)
+    assert {"_SEEN_BY_VIEWS", "UVMap"} < set(names) and names[-1] not in ("UVMap", "sharp_face")

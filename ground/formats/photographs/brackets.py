@@ -8,10 +8,10 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 
-from ground.formats.pictures.srgb import to_srgb
 from ground.formats.pictures.view import View, colours_of, grey_light, has_display_values, read_image
 from ground.formats.pictures.views import EQUAL_EXPOSURES
 from obbgs_base.files import write_whole
+from obbgs_base.srgb import to_srgb
 
 LONGEST_BREAK_S = 5.0  # between the frames of a bracket, where times are known
 WHOLE = 0.8  # share of the brackets that must have every exposure

@@ -7,7 +7,7 @@ import numpy as np
 
 from ground.formats.pictures.files import FormatError, decode
 from ground.formats.pictures.lens import Intrinsics
-from ground.formats.pictures.srgb import from_srgb
+from obbgs_base.srgb import from_srgb
 
 FULL_SCALE = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0}  # of alpha and masks, and of display values
 

@@ -20,11 +20,11 @@ from flightsw.icd.quaternion import matrix_to_quat
 from ground.formats.pictures.files import FormatError, decode, image_size
 from ground.formats.pictures.judgement import Judgement, judge
 from ground.formats.pictures.lens import Intrinsics, pinhole_of, undistort
-from ground.formats.pictures.srgb import from_srgb
 from ground.formats.pictures.view import FULL_SCALE, View, colours_of, grey_light, read_image, read_mask
 from ground.session.folder import ENCODINGS, SCHEMA_VERSION, SessionError
 from ground.session.writer import frame_line
 from obbgs_base.files import write_whole
+from obbgs_base.srgb import from_srgb
 
 log = logging.getLogger(__name__)
 # Other data sets do not state their noise: a small one is assumed, the same in every pixel.

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import fast_simplification
 import manifold3d
 import numpy as np
 import torch
@@ -12,13 +13,17 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from obbgs_core.errors import ExportError
+from obbgs_core.mesh.flat_faces import faces_of_simplified, flat_faces, flattened
+from obbgs_core.mesh.plates import thinned
+from obbgs_core.mesh.texture import layout_of
+from obbgs_core.mesh.triangles import geometry_of, vertex_normals
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.mesh import SurfaceMesh
 from obbgs_core.render import lit_from, render
 from obbgs_core.score.surface import bright, with_thin_parts
 
-MAX_TRIANGLES = 50_000
+MAX_TRIANGLES = 5_000
 VIEWS = 24  # are compared, evenly chosen of those given
 VOXEL_PX = 1.5  # width of a voxel in pixels, at the median depth
 CHUNK = 30_000  # nodes at a time, such that their distances stay in the processor's cache
@@ -35,10 +40,9 @@ AT_LEAST_SEEING = 2  # views; what fewer see is taken for solid
 IN_FRONT = 0.3
 BLOCK = 8  # nodes along a side that are decided on together first
 FEWEST_NODES = 8  # of a piece that is kept
-FIRST_TOLERANCE_VOXELS = 0.1  # of the simplification
-TOLERANCE_GROWTH = 1.25
-BISECTIONS = 3  # of the last step of that tolerance
-SAME_DEPTH_VOXELS = 2.0  # within which a vertex counts as seen
+COLLAPSE_RATE = 7  # of fast_simplification: how fast its threshold grows
+SAME_DEPTH_VOXELS = 2.0  # within which a place counts as seen
+SEEN_AT = 0.05  # cosine between a place's normal and the way to a view that sees it, at least
 
 
 @torch.no_grad()
@@ -51,8 +55,8 @@ def surface_mesh(
     front where a view sees past it. The distance that SEEN_THROUGH of them exceed is 0 on the surface, also of a thin
     plate, of which half of the views look at the other side. Marching cubes make triangles of the zeros, after hollows
     that no view sees into were filled, and specks and pieces that no view sees were removed. Their vertices then go to
-    the middle of what the views in front of them see, and the triangles are merged until there are few enough, such
-    that the mesh stays closed.
+    the middle of what the views in front of them see, dark sides of plates to their lit ones, those of flat faces onto
+    their planes, and the triangles are merged until there are few enough, such that the mesh stays closed.
 
     Args:
         gaussians: on the CPU, as the cameras.
@@ -89,16 +93,27 @@ def surface_mesh(
     vertices, triangles, inwards, _ = marching_cubes(volume, 0.0)
     vertices = (vertices + DRAWN_BACK_VOXELS * inwards) * voxel_m + (corner + first * voxel_m).numpy()
     vertices = _where_seen(vertices, -inwards, maps, cameras, voxel_m)
-    vertices, triangles = _simplified(vertices, triangles, max_triangles, voxel_m)
-    colours, seen_by = _appearance(
-        torch.from_numpy(vertices).float(),
-        gaussians,
-        [depth for depth, _ in seen],
-        cameras,
-        sun_dir,
-        voxel_m,
+    looks = _Looks(gaussians, [depth for depth, _ in seen], cameras, sun_dir, voxel_m)
+    light = looks.at(vertices, -inwards, np.zeros(len(vertices)))[0].mean(axis=1)
+    vertices, shifts = thinned(vertices, triangles.astype(np.int64), light, voxel_m)
+    behind = KDTree(vertices)  # of what was moved inwards, views see what was in front of it
+    vertices, triangles = _simplified(vertices, triangles.astype(np.int64), max_triangles, voxel_m)
+    _, normals, areas = geometry_of(vertices, triangles)
+    outwards = vertex_normals(len(vertices), triangles, normals, areas)
+    colours, seen_by = looks.at(vertices, outwards, shifts[behind.query(vertices)[1]])
+    layout = layout_of(vertices, triangles, voxel_m / VOXEL_PX)
+    texture, _ = looks.at(layout.places, layout.outwards, shifts[behind.query(layout.places)[1]])
+    sides = [layout.width, layout.height]
+    return SurfaceMesh(
+        vertices,
+        triangles,
+        colours,
+        seen_by,
+        len(cameras),
+        gaussians.shading == "lambert",
+        (layout.corners / sides).astype(np.float32),
+        layout.image(texture),
     )
-    return SurfaceMesh(vertices, triangles, colours, seen_by, len(cameras), gaussians.shading == "lambert")
 
 
 def _evenly_chosen(cameras: Cameras) -> Cameras:
@@ -239,68 +254,106 @@ def _pieces(mask: np.ndarray) -> np.ndarray:
 def _simplified(
     vertices: np.ndarray, triangles: np.ndarray, max_triangles: int, voxel_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a mesh of at most so many triangles, which stays closed.
+    """Return a mesh of at most so many triangles, which stays closed, with flat faces flat.
 
-    The distance by which vertices may move grows until that is reached; the step that reaches it is then made as small
-    as a few bisections find, so that no more triangles are merged than necessary.
+    Edges are collapsed by least quadric error (Garland and Heckbert 1997) before vertices go onto their planes: where
+    all is flat to the last digit, that error is zero for any order, and it leaves holes and needles.
     """
-    mesh = manifold3d.Mesh64(vertices.astype(np.float64), triangles.astype(np.uint64))
-    solid = manifold3d.Manifold(mesh)
-    if solid.status() != manifold3d.Error.NoError:
-        raise ExportError(f"the surface is not closed ({solid.status()}), which should not happen")
-    finer, tolerance_m = solid, FIRST_TOLERANCE_VOXELS * voxel_m
-    while solid.num_tri() > max_triangles:
-        finer, solid = solid, solid.simplify(tolerance_m)
-        tolerance_m *= TOLERANCE_GROWTH
-    enough_m = tolerance_m / TOLERANCE_GROWTH
-    too_fine_m = enough_m / TOLERANCE_GROWTH
-    for _ in range(BISECTIONS if finer is not solid else 0):
-        middle_m = (too_fine_m + enough_m) / 2
-        tried = finer.simplify(middle_m)
-        if tried.num_tri() > max_triangles:
-            finer, too_fine_m = tried, middle_m
-        else:
-            solid, enough_m = tried, middle_m
-    if solid.num_tri() == 0:
+    faces, face = flat_faces(vertices, triangles, voxel_m)
+    simple, among = _collapsed(vertices, triangles, max_triangles, voxel_m)
+    if len(among) == 0:
         raise ExportError(
             f"nothing is left of the surface with at most {max_triangles} triangles; allow more"
         )
-    simple = solid.to_mesh64()
-    return np.array(simple.vert_properties[:, :3]), np.array(simple.tri_verts, dtype=np.int64)
+    of_simple = faces_of_simplified((vertices, triangles, face), (simple, among), faces, voxel_m)
+    return _arrays(_closed(flattened(simple, among, of_simple, faces, voxel_m), among))
 
 
-def _appearance(
-    vertices: Tensor,
-    gaussians: Gaussians,
-    depths: list[Tensor],
-    cameras: Cameras,
-    sun_dir: Tensor | None,
-    voxel_m: float,
+def _collapsed(
+    vertices: np.ndarray, triangles: np.ndarray, count: int, voxel_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return colours [V, C] and the number of views that see each vertex [V]."""
-    shown = gaussians
-    if gaussians.shading == "lambert":  # the albedos alone
-        turn = gaussians.sh.shape[1] > 1
-        shown = dataclasses.replace(gaussians.matt(), shading="sun" if turn else "view")
-    shown = lit_from(shown, sun_dir)
-    total, seen_by = torch.zeros(len(vertices), gaussians.sh.shape[2]), torch.zeros(len(vertices))
-    covered = torch.zeros(len(vertices))  # sum of the alphas of the pixels that they are seen in
-    for c, depth in enumerate(depths):
-        camera = cameras.one(c)
-        z, index, within, _ = _on_image(vertices, camera)
-        seen = within & ((depth.flatten()[index] - z).abs() < SAME_DEPTH_VOXELS * voxel_m)
-        picture = render(shown, camera)
-        alpha = picture.alpha.flatten()[index]
-        light = picture.radiance[0].flatten(0, 1)[index] - camera.background * (1 - alpha)[:, None]
-        total += torch.where(seen[:, None], light, 0)
-        covered += torch.where(seen, alpha, 0)
-        seen_by += seen
-    known = covered > 0
-    colours = total / torch.where(known, covered, 1.0)[:, None]
-    if known.any() and not known.all():
-        _, nearest = KDTree(vertices[known].numpy()).query(vertices[~known].numpy())
-        colours[~known] = colours[known][torch.from_numpy(nearest)]
-    return colours.numpy(), seen_by.long().numpy()
+    """Return a closed mesh of about so many triangles, or of more if fewer would not be closed."""
+    middle = vertices.mean(axis=0)
+    scaled = ((vertices - middle) / voxel_m).astype(np.float32)  # the threshold of the collapse has no unit
+    while count < len(triangles):
+        simple = fast_simplification.simplify(
+            scaled, triangles.astype(np.int32), target_count=count, agg=COLLAPSE_RATE
+        )
+        try:
+            return _arrays(_closed(simple[0].astype(np.float64) * voxel_m + middle, simple[1]))
+        except ExportError:
+            count = 2 * count
+    return _arrays(_closed(vertices, triangles))
+
+
+def _closed(vertices: np.ndarray, triangles: np.ndarray) -> manifold3d.Manifold:
+    solid = manifold3d.Manifold(manifold3d.Mesh64(vertices.astype(np.float64), triangles.astype(np.uint64)))
+    if solid.status() != manifold3d.Error.NoError:
+        raise ExportError(f"the surface is not closed ({solid.status()}), which should not happen")
+    return solid
+
+
+def _arrays(solid: manifold3d.Manifold) -> tuple[np.ndarray, np.ndarray]:
+    mesh = solid.to_mesh64()
+    return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int64)
+
+
+class _Looks:
+    """What the views see of a model: its radiance, or under Lambert's law its albedo, for any places on its surface."""
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        depths: list[Tensor],
+        cameras: Cameras,
+        sun_dir: Tensor | None,
+        voxel_m: float,
+    ):
+        shown = gaussians
+        if gaussians.shading == "lambert":  # the albedos alone
+            turn = gaussians.sh.shape[1] > 1
+            shown = dataclasses.replace(gaussians.matt(), shading="sun" if turn else "view")
+        shown = lit_from(shown, sun_dir)
+        self._depths, self._cameras, self._voxel_m = depths, cameras, voxel_m
+        self._pictures = []
+        for c in range(len(cameras)):
+            picture = render(shown, cameras.one(c))
+            alpha = picture.alpha.flatten()
+            light = picture.radiance[0].flatten(0, 1) - cameras.background * (1 - alpha)[:, None]
+            self._pictures.append((light, alpha))
+
+    def at(
+        self, places: np.ndarray, outwards: np.ndarray, behind_m: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return colours [P, C] and the number of views that see each place [P]; unseen ones are like their nearest.
+
+        Args:
+            places: [P, 3] m; outwards: [P, 3] unit normals; behind_m: [P] by how much what the views see there may lie
+                in front of them.
+        """
+        points, facing = torch.from_numpy(places).float(), torch.from_numpy(outwards).float()
+        behind = torch.from_numpy(behind_m).float()
+        tolerance_m = SAME_DEPTH_VOXELS * self._voxel_m
+        total = torch.zeros(len(points), self._pictures[0][0].shape[1])
+        seen_by, covered = (
+            torch.zeros(len(points)),
+            torch.zeros(len(points)),
+        )  # sum of the alphas they are seen in
+        for c, (light, alpha) in enumerate(self._pictures):
+            z, index, within, _ = _on_image(points, self._cameras.one(c))
+            deeper = z - self._depths[c].flatten()[index]
+            towards = F.normalize(self._cameras.centres[c] - points, dim=1)
+            seen = within & ((towards * facing).sum(dim=1) > SEEN_AT)
+            seen &= (deeper > -tolerance_m) & (deeper < tolerance_m + behind)
+            total += torch.where(seen[:, None], light[index], 0)
+            covered += torch.where(seen, alpha[index], 0)
+            seen_by += seen
+        known = covered > 0
+        colours = total / torch.where(known, covered, 1.0)[:, None]
+        if known.any() and not known.all():
+            _, nearest = KDTree(points[known].numpy()).query(points[~known].numpy())
+            colours[~known] = colours[known][torch.from_numpy(nearest)]
+        return colours.numpy(), seen_by.long().numpy()
 
 
 def _back_projected(depth: Tensor, camera: Cameras) -> Tensor:
