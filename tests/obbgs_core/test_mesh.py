@@ -104,8 +104,8 @@ def test_the_faces_of_a_box_are_planes_and_its_edges_are_sharp(box):
             facing = side * shape.face_normals[:, axis] > np.cos(np.radians(2))
             away, area = side * shape.triangles_center[facing, axis], shape.area_faces[facing]
             plane = np.median(np.repeat(away, np.ceil(area / area.mean()).astype(int)))
-            assert abs(plane - 0.6) < 2.5 * PIXEL_M
-            assert area[np.abs(away - plane) < 0.02 * PIXEL_M].sum() > 0.9 * area.sum()
+            assert abs(plane - 0.6) < 0.5 * PIXEL_M
+            assert area[np.abs(away - plane) < 0.3 * PIXEL_M].sum() > 0.95 * area.sum()
     corners = np.array(np.meshgrid(*[[-0.6, 0.6]] * 3)).reshape(3, -1).T
     gaps, _ = KDTree(shape.vertices).query(corners)
     assert gaps.max() < 2 * PIXEL_M
