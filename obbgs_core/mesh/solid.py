@@ -43,6 +43,9 @@ FEWEST_NODES = 8  # of a piece that is kept
 COLLAPSE_RATE = 7  # of fast_simplification: how fast its threshold grows
 SAME_DEPTH_VOXELS = 2.0  # within which a place counts as seen
 SEEN_AT = 0.05  # cosine between a place's normal and the way to a view that sees it, at least
+SEEN_AT_VERTEX = (
+    -0.3
+)  # the same of a vertex: its normal is the mean of its triangles', of which one may be seen
 
 
 @torch.no_grad()
