@@ -46,6 +46,9 @@ SEEN_AT = 0.05  # cosine between a place's normal and the way to a view that see
 SEEN_AT_VERTEX = (
     -0.3
 )  # the same of a vertex: its normal is the mean of its triangles', of which one may be seen
+SEEN_AT_VERTEX = (
+    -0.3
+)  # the same of a vertex: its normal is the mean of its triangles', of which one may be seen
 
 
 @torch.no_grad()
@@ -103,7 +106,7 @@ def surface_mesh(
     vertices, triangles = _simplified(vertices, triangles.astype(np.int64), max_triangles, voxel_m)
     _, normals, areas = geometry_of(vertices, triangles)
     outwards = vertex_normals(len(vertices), triangles, normals, areas)
-    colours, seen_by = looks.at(vertices, outwards, shifts[behind.query(vertices)[1]])
+    colours, seen_by = looks.at(vertices, outwards, shifts[behind.query(vertices)[1]], SEEN_AT_VERTEX)
     layout = layout_of(vertices, triangles, voxel_m / VOXEL_PX)
     texture, _ = looks.at(layout.places, layout.outwards, shifts[behind.query(layout.places)[1]])
     sides = [layout.width, layout.height]
@@ -326,7 +329,7 @@ class _Looks:
             self._pictures.append((light, alpha))
 
     def at(
-        self, places: np.ndarray, outwards: np.ndarray, behind_m: np.ndarray
+        self, places: np.ndarray, outwards: np.ndarray, behind_m: np.ndarray, seen_at: float = SEEN_AT
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return colours [P, C] and the number of views that see each place [P]; unseen ones are like their nearest.
 
@@ -346,7 +349,7 @@ class _Looks:
             z, index, within, _ = _on_image(points, self._cameras.one(c))
             deeper = z - self._depths[c].flatten()[index]
             towards = F.normalize(self._cameras.centres[c] - points, dim=1)
-            seen = within & ((towards * facing).sum(dim=1) > SEEN_AT)
+            seen = within & ((towards * facing).sum(dim=1) > seen_at)
             seen &= (deeper > -tolerance_m) & (deeper < tolerance_m + behind)
             total += torch.where(seen[:, None], light[index], 0)
             covered += torch.where(seen, alpha[index], 0)
