@@ -179,9 +179,11 @@ def faces_of_simplified(
     """
     middles, normals, _ = geometry_of(*fine[:2])
     there, facing, _ = geometry_of(*simple)
-    _, index = KDTree(middles).query(there, k=min(8, len(middles)))
+    count = min(8, len(middles))
+    index = KDTree(middles).query(there, k=count)[1].reshape(-1, count)
     alike = (normals[index] * facing[:, None]).sum(axis=2) > 0.5
-    face = np.where(alike.any(axis=1), fine[2][index[np.arange(len(there)), alike.argmax(axis=1)]], -1)
+    nearest = np.take_along_axis(index, alike.argmax(axis=1)[:, None], axis=1)[:, 0]
+    face = np.where(alike.any(axis=1), fine[2][nearest], -1)
     chosen = np.flatnonzero(face >= 0)
     corners = simple[0][simple[1][chosen]]
     off = np.max([np.abs(faces.off(corners[:, k], face[chosen])) for k in range(3)], axis=0)
