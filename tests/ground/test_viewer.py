@@ -308,7 +308,9 @@ def test_the_mesh_covers_what_the_splats_cover(session):
     solid_arms = trimesh.util.concatenate(arms)
     grey = np.full((len(solid_arms.vertices), 1), 0.5, np.float32)
     seen = np.ones(len(grey), np.int64)
-    mesh = SurfaceMesh(np.asarray(solid_arms.vertices), np.asarray(solid_arms.faces), grey, seen, 1, False)
+    vertices, triangles = np.asarray(solid_arms.vertices), np.asarray(solid_arms.faces)
+    texture, corners = np.full((2, 2, 1), 0.5, np.float32), np.full((len(triangles), 3, 2), 0.5, np.float32)
+    mesh = SurfaceMesh(vertices, triangles, grey, seen, 1, False, corners, texture)
     path = session / "arms.glb"
     save_mesh(mesh, path, 1.0)
     shown = dataclasses.replace(Source(session).load(), gaussians=model, mesh=path.read_bytes())
