@@ -302,17 +302,20 @@ class PoseCorrections:
         """Return the change of the body that makes the corrections smallest, and that of the shared parameters [S].
 
         The former [7] is a small motion and a logarithm of its size. It adds adjoint · d to each correction, which the
-        shared parameters may take up instead.
+        shared parameters may take up instead. Beside these, the brackets count as one: what the model errs in is alike
+        in all of them, and corrections that suit one size do not suit another, by far less than any picture shows
+        (experiment 103).
         """
         size = self.by_shared.shape[2]
         farther = torch.cat([torch.zeros(len(poses), 3, 1, dtype=poses.dtype), poses[:, :3, 3:]], dim=1)
         columns = [-adjoints(poses), farther, -self.by_shared]
         adjoint = self._bracket_means(torch.cat(columns, dim=2))  # [P, 6, 7 + S]
         free = _null_space((self.whitening.exact @ adjoint).flatten(0, 1))
-        own_rows = (self.whitening.inverse @ adjoint).flatten(0, 1)
+        alike = len(self.value) ** -0.5 if size else 1.0
+        own_rows = alike * (self.whitening.inverse @ adjoint).flatten(0, 1)
         shared_rows = torch.cat([torch.zeros(size, 7, dtype=torch.float64), torch.eye(size).double()], dim=1)
         rows = torch.cat([own_rows, shared_rows]) @ free
-        now = torch.cat([self.value.flatten().double(), (self.shared / self.sigmas)[self.free]])
+        now = torch.cat([alike * self.value.flatten().double(), (self.shared / self.sigmas)[self.free]])
         change = free @ (torch.linalg.pinv(rows) @ -now)
         return change[:7], change[7:]
 

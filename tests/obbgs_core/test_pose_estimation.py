@@ -492,6 +492,51 @@ def test_a_model_of_another_size_is_undone_by_the_similarity_alone(draw):
         assert pose_errors(estimated, true, rigid, 1.0, FOCAL_PX).range_share > 0.005
 
 
+def test_a_size_that_no_picture_shows_is_what_the_shared_errors_say():
+    """Poses that fit a body too small by 3 % are not held there by a pattern of a few thousandths of the path.
+
+    The relative orbit is free motion (Clohessy and Wiltshire) and 0.1 m of something else.
+    """
+    times, rate = np.linspace(0, 5000, 48), 1e-3
+    phase = rate * times
+    in_plane = np.stack([30 * np.cos(phase), -60 * np.sin(phase), 25 * np.cos(phase)], 1)
+    in_plane += 0.1 * np.stack([np.sin(7 * phase), np.cos(5 * phase), np.sin(11 * phase)], 1)
+    places = Rotation.from_rotvec(phase[:, None] * [0, 0, 1.0]).apply(in_plane)
+    cameras = []
+    for place in places:
+        z = -place / np.linalg.norm(place)
+        x = np.cross([0.0, 0.3, 1.0], z)
+        cameras.append(np.stack([x / np.linalg.norm(x), np.cross(z, x / np.linalg.norm(x)), z]))
+    bodies = np.broadcast_to(np.eye(3), (len(times), 3, 3))
+    motion = NominalMotion(times, places, np.array(cameras), bodies, rate)
+    nothing = torch.zeros(SIZE, SIZE, 1)
+    true = [
+        TrainingFrame(nothing, 1e-4, torch.from_numpy(pose).float(), scenes.intrinsics(SIZE, 100.0), i, i)
+        for i, pose in enumerate(motion.world_to_camera)
+    ]
+    errors_of_it = SharedParameters(position_m=[0.5, -0.4, 0.3], boresight_rad=[0.012, -0.008, 0.004])
+    own = torch.diag(torch.tensor([2e-4] * 3 + [3e-3] * 3).double() ** 2)
+    tags = [
+        dataclasses.replace(f, pose_covariance=own)
+        for f in tagged(true, displaced_motion(motion, errors_of_it))
+    ]
+    poses, truth = PoseCorrections(tags), torch.from_numpy(motion.world_to_camera)
+    nearer = truth.clone()
+    nearer[:, :3, 3] *= 0.97
+    unit = torch.tensor([1.0, 1, 1, RANGE_M, RANGE_M, RANGE_M]).double()
+    for _ in range(4):  # the shared parameters that place the cameras most nearly so
+        left = (motion_vectors(nearer @ torch.linalg.inv(poses.moved)) / unit).flatten()
+        columns = (poses.by_shared / unit[:, None]).flatten(0, 1)
+        poses._change_shared(tags, torch.linalg.lstsq(columns, left[:, None])[0][:, 0])
+
+    def size() -> float:
+        return size_of(best_motion(poses.corrected(list(range(len(true)))), truth, 1.0, with_size=True))
+
+    assert size() == pytest.approx(1 / 0.97, abs=3e-3)
+    poses.fix_gauge(MODEL, tags)
+    assert size() == pytest.approx(1.0, abs=0.01)
+
+
 def test_frames_that_join_are_where_silhouettes_say_as_the_model_sees_them(erring):
     """What the first third of a pass says of the shared parameters leads the rest of it astray."""
     true, tags = erring
