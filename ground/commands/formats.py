@@ -71,7 +71,10 @@ def import_command(
     from ground.formats.photographs.exposures import UNKNOWN, estimated, read_table, with_exposures
     from ground.formats.pictures.placement import placed, with_stated_errors
     from ground.formats.pictures.views import EXACT, Values, first_of_each_split, write_session
+    from ground.session.folder import SessionError
 
+    if (session / "session.json").exists():  # before the work of minutes
+        raise SessionError(f"{session} holds a session already; choose a new folder")
     given_sigmas = None if pose_sigma is None else _pose_sigmas(pose_sigma)
     table = None if exposures in (None, UNKNOWN) else read_table(Path(exposures))
     sigmas, exported, registration = EXACT, None, None
@@ -214,10 +217,7 @@ def _photographs(
     """
     from ground.formats.photographs.poses import read_photographs
     from ground.formats.photographs.video import FRAMES, write_frames
-    from ground.session.folder import SessionError
 
-    if (session / "session.json").exists():
-        raise SessionError(f"{session} holds a session already; choose a new folder")
     stop = threading.Event()
     before = {
         number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from ground import cli
 from ground.run.runs import open_run
+from ground.show.page import unbroken
 from ground.show.report.sizes import sizes_section
 from ground.show.sizes import with_deviation
 
@@ -65,7 +66,8 @@ def test_sizes_are_those_of_the_mesh(run):
     assert all(face["area"]["value"] <= mesh.area for face in values["faces"])
     text = sizes_section(open_run(run.parents[1], run.name))
     told = values["largest_dimension"]
-    assert with_deviation(told["value"], told["half_width_90"]) in text
+    assert unbroken(with_deviation(told["value"], told["half_width_90"])) in text
+    assert " ±" not in text and "± " not in text  # no number and its deviation are in two lines, on a phone
 
 
 def test_a_part_of_the_design_that_is_not_there_is_told(run):

@@ -120,10 +120,10 @@ def test_ranges_of_report_and_viewer_are_those_of_the_refined_poses(refined):
 
 
 PHONE_PX = 390
-# words with a digit that are broken between two lines, in tables and on cards
+# words with a digit, and numbers with their deviation, that are broken between two lines, in tables and on cards
 BROKEN_NUMBERS = """() => [...document.querySelectorAll("td.n, .card b")].flatMap(cell => {
   const text = cell.firstChild;
-  return [...text.data.matchAll(/\\S*\\d\\S*/g)].filter(word => {
+  return [...text.data.matchAll(/\\S*\\d\\S*(\\s±\\s\\S+)?/g)].filter(word => {
     const range = document.createRange();
     range.setStart(text, word.index);
     range.setEnd(text, word.index + word[0].length);

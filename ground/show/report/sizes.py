@@ -6,7 +6,7 @@ from ground.run.runs import Run
 from ground.session.folder import SessionError
 from ground.show.inspection import read_model
 from ground.show.measure import measured
-from ground.show.page import section, two_tables
+from ground.show.page import section, two_tables, unbroken
 from ground.show.sizes import with_deviation
 
 
@@ -20,7 +20,12 @@ def sizes_section(run: Run) -> str:
     squared = "m²" if unit == "m" else "the squares of these"
     rows = [("largest dimension", _told(values["largest_dimension"]))]
     for face in values["faces"]:
-        rows.append((f"{face['name']}, length x width", f"{_told(face['length'])} x {_told(face['width'])}"))
+        rows.append(
+            (
+                f"{face['name']}, length x width",
+                f"{_told(face['length'])} {unbroken('x ')}{_told(face['width'])}",
+            )
+        )
         rows.append(("… its area", _told(face["area"])))
     note = (
         f"Lengths are in {unit}, areas in {squared}. Intervals hold the true value with a probability of 90 %: they "
@@ -32,5 +37,5 @@ def sizes_section(run: Run) -> str:
 
 
 def _told(value: dict) -> str:
-    """Return a value and half of the width of its interval, as `measured` gives them."""
-    return with_deviation(value["value"], value["half_width_90"])
+    """Return a value and half of the width of its interval, as `measured` gives them, in one line."""
+    return unbroken(with_deviation(value["value"], value["half_width_90"]))
