@@ -592,7 +592,8 @@ def test_what_cannot_be_one_session_is_refused(tmp_path):
     with pytest.raises(SessionError, match="holds a session already"):
         write_session(views, tmp_path / "s", "lego")
     told = call("ground", "import", "--format", "nerf", "--from", "nowhere", "--session", tmp_path / "s")
-    assert told.returncode == 1 and "holds a session already" in told.stderr  # before anything is read or checked
+    # before anything is read or checked
+    assert told.returncode == 1 and "holds a session already" in told.stderr
     write_png(tmp_path / "lego/val/r_0.png", np.zeros((5, 5, 3), dtype=np.uint8))
     views, _ = read_nerf(tmp_path / "lego")
     with pytest.raises(FormatError, match="have one size"):
