@@ -9,13 +9,14 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
 from compare.charts.charts import COLOURS, VERDICT_COLOURS
 from compare.charts.page import error_of, shown_view
 from compare.charts.results import VERDICTS, Results, pareto
 from compare.grid.rows import Rows
 from ground.show.pictures import heat, tone
+from ground.show.plots import ticks_1_2_5
 from obbgs_base.files import keep_mode
 
 DPI = 110
@@ -107,8 +108,9 @@ def _speed(results: Results, target: str) -> Figure:
 
 
 def _ticks_1_2_5(axis: Axes) -> None:
-    """Label a logarithmic x axis at 1, 2 and 5 times powers of ten only; Matplotlib's own labels overlap."""
-    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    """Label a logarithmic x axis of what is drawn as the page does; Matplotlib's own labels overlap."""
+    drawn = [float(value) for line in axis.lines for value in np.asarray(line.get_xdata())]
+    axis.xaxis.set_major_locator(FixedLocator(ticks_1_2_5(drawn)))
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
 

@@ -71,10 +71,7 @@ def import_command(
     from ground.formats.photographs.exposures import UNKNOWN, estimated, read_table, with_exposures
     from ground.formats.pictures.placement import placed, with_stated_errors
     from ground.formats.pictures.views import EXACT, Values, first_of_each_split, write_session
-    from ground.session.folder import SessionError
 
-    if (session / "session.json").exists():  # before the work of minutes
-        raise SessionError(f"{session} holds a session already; choose a new folder")
     given_sigmas = None if pose_sigma is None else _pose_sigmas(pose_sigma)
     table = None if exposures in (None, UNKNOWN) else read_table(Path(exposures))
     sigmas, exported, registration = EXACT, None, None
@@ -85,7 +82,7 @@ def import_command(
         if format_ is ImportFormat.VIDEO and masks is not None and masks.is_file():
             masks = _masks_of_video(masks, views, session)
     else:
-        views, exported = _read(format_, folder, table)
+        views, exported = _read(format_, folder, table, session)
         views = first_of_each_split(views, frames)
         if exposures != UNKNOWN and format_ not in TIMED:
             views = with_exposures(views, table)
@@ -134,18 +131,23 @@ def _tell(count: int, session: Path, registration: dict) -> None:
 
 
 def _read(
-    format_: ImportFormat, folder: Path, table: "dict[str, Light] | None"
+    format_: ImportFormat, folder: Path, table: "dict[str, Light] | None", session: Path
 ) -> "tuple[list[View], Exported | None]":
-    """Return the pictures of a data set whose cameras are known, and what our own export says of them."""
+    """Return the pictures of a data set whose cameras are known, and what our own export says of them.
+
+    Refused at once where the session that is to be made is there already: to check poses takes minutes.
+    """
     from ground.formats.colmap import read_colmap_and_export
     from ground.formats.llff import read_llff
     from ground.formats.middlebury import read_middlebury
     from ground.formats.ndm import read_ndm
     from ground.formats.nerf import read_nerf
     from ground.formats.nerfstudio import read_nerfstudio
+    from ground.formats.pictures.views import check_is_new
     from ground.formats.shirt import read_shirt
     from ground.formats.spice import read_spice
 
+    check_is_new(session)
     described = {
         ImportFormat.NERF: read_nerf,
         ImportFormat.NERFSTUDIO: read_nerfstudio,
@@ -217,7 +219,9 @@ def _photographs(
     """
     from ground.formats.photographs.poses import read_photographs
     from ground.formats.photographs.video import FRAMES, write_frames
+    from ground.formats.pictures.views import check_is_new
 
+    check_is_new(session)
     stop = threading.Event()
     before = {
         number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)

@@ -12,6 +12,7 @@ from obbgs_core.sensor import Sensor
 POINTS_SHOWN = 15_000  # more make the page larger and the view no clearer
 LEAST_OPACITY = 0.2  # fainter Gaussians would hide the others like fog
 SMOOTHED = 10  # logged steps
+EVEN_TICKS = 6  # at most, over a range that is less than a factor of a few
 BINS = 128
 INK, SPACE, SUN = "#1c2733", "#10161e", "#f0b429"
 KNOWN_COLOUR, BLIND_COLOUR = "#1f6feb", "#d1652a"
@@ -101,9 +102,20 @@ def running_mean(values: Sequence[float], window: int = SMOOTHED) -> list[float]
 
 
 def ticks_1_2_5(values: Iterable[float]) -> list[float]:
-    """Return ticks at 1, 2 and 5 times powers of ten that cover the positive values; Plotly's own omit the power."""
+    """Return ticks at 1, 2 and 5 times powers of ten that cover the positive values; Plotly's own omit the power.
+
+    Where fewer than two of them lie between the values, ticks are evenly apart, by 1, 2 or 5 times a power of ten.
+    """
     positive = [value for value in values if value > 0]
     if not positive:
         return [1.0]
-    first, last = math.floor(math.log10(min(positive))), math.floor(math.log10(max(positive)))
-    return [m * 10.0**power for power in range(first, last + 2) for m in (1, 2, 5)]
+    low, high = min(positive), max(positive)
+    first, last = math.floor(math.log10(low)), math.floor(math.log10(high))
+    ticks = [m * 10.0**power for power in range(first, last + 2) for m in (1, 2, 5)]
+    if low == high or sum(low <= tick <= high for tick in ticks) > 1:
+        return ticks
+    power = 10.0 ** math.floor(math.log10(high - low))
+    step = next(m * power for m in (0.2, 0.5, 1, 2, 5) if (high - low) / (m * power) <= EVEN_TICKS)
+    return [
+        float(f"{n * step:.6g}") for n in range(math.floor(low / step), math.ceil(high / step) + 1) if n > 0
+    ]

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from compare.case import load_case
-from compare.charts.figures import write_figures
+from compare.charts.charts import size_figures
+from compare.charts.figures import _size, write_figures
 from compare.charts.page import write_page
 from compare.charts.results import Results, pareto, with_best
 from compare.charts.severity import breaking, series_of
@@ -19,6 +20,7 @@ from compare.command import _line
 from compare.grid.rows import Rows
 from compare.references import black, noise
 from compare.views import SHOWN, WORST, read_views, write_views
+from ground.show.plots import ticks_1_2_5
 from tests.browser import as_url, chromium, opened
 from tests.commands import call
 from tests.small_sessions import small_session
@@ -362,6 +364,29 @@ def test_figures_of_photographs_are_written_without_a_true_surface(without_truth
     rows.add(row("obbgs", target="B", psnr_clean_db=40.0, chamfer=0.02, seconds=60.0))
     names = {path.name for path in write_figures(without_truth)}
     assert {"speed-A.png", "speed-B.png", "gain-obbgs.png"} <= names and "gain-jiang2025.png" not in names
+
+
+def test_an_axis_says_its_numbers_also_where_all_values_are_nearly_alike():
+    """Two models of 1,354 and 1,575 Gaussians: neither 1, 2 nor 5 times a power of ten lies between."""
+    results = Results(
+        [
+            row("obbgs", target=target, psnr_clean_db=40.0, gaussians=count, bytes=60.0 * count)
+            for target, count in (("A", 1354), ("B", 1575))
+        ]
+    )
+    (page, _), (png, _) = size_figures(results), _size(results).axes
+    for ticks in (page.layout.xaxis.tickvals, png.get_xticks()):
+        inside = [tick for tick in ticks if 1354 <= tick <= 1575]
+        assert 2 <= len(inside) <= 7
+    assert page.layout.xaxis.ticktext[1] == "1,400"
+
+
+@given(st.lists(st.floats(1e-6, 1e9), min_size=2, max_size=5))
+def test_ticks_are_few_rise_and_some_lie_between_the_values(values):
+    ticks, low, high = ticks_1_2_5(values), min(values), max(values)
+    assert ticks == sorted(set(ticks)) and ticks[0] > 0
+    if high > 1.001 * low:
+        assert 2 <= sum(0.999 * low <= tick <= 1.001 * high for tick in ticks) <= 48
 
 
 def test_the_line_of_a_row_without_truth_has_the_psnr_against_the_noisy_frames():

@@ -77,6 +77,16 @@ class Exported:
             raise ValueError(f"encoding must be one of {', '.join(ENCODINGS)}, got {self.encoding!r}")
 
 
+def check_is_new(folder: Path) -> None:
+    """Check that a session can be made in a folder.
+
+    Raises:
+        SessionError: it holds one already.
+    """
+    if (folder / "session.json").exists():
+        raise SessionError(f"{folder} holds a session already; choose a new folder")
+
+
 def write_session(
     views: Sequence[View],
     folder: Path,
@@ -117,8 +127,7 @@ def write_session(
     """
     if not views:
         raise FormatError(f"{source}: no pictures found")
-    if (folder / "session.json").exists():
-        raise SessionError(f"{folder} holds a session already; choose a new folder")
+    check_is_new(folder)
     views = _with_pinholes(views)
     judged = judge(views)
     if transparent_on_white and judged.transparent and white_background is None and exported is None:
