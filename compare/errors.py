@@ -1,6 +1,8 @@
 """The error of a comparison."""
 
 import re
+from collections.abc import Mapping
+from typing import Any
 
 from obbgs_base.errors import ObbgsError
 
@@ -14,3 +16,8 @@ class CompareError(ObbgsError):
 def for_people(error: str) -> str:
     """Return the error of a row without the name of its class."""
     return CLASS_NAME.sub("", error)
+
+
+def cannot_be_made(row: Mapping[str, Any]) -> bool:
+    """Return whether a row says that its condition cannot be made of its session, and nothing of its method."""
+    return str(row.get("error")).startswith(f"{CompareError.__name__}: ")

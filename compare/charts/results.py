@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from compare.errors import for_people
+from compare.errors import cannot_be_made, for_people
 from compare.methods import reference_names
 
 # losses against the frames as taken up to which a method holds, or is only shaken
@@ -151,6 +151,7 @@ class Results:
         self.base = (
             plain[0] if plain else next(iter(self.conditions), "")
         )  # what conditions are compared with
+        self.conditions.sort(key=lambda condition: condition != self.base)
         self.truth = any("psnr_clean_db" in row for row in self.rows)
 
     @property
@@ -177,6 +178,10 @@ class Results:
     def of(self, label: str, target: str, condition: str) -> list[dict[str, Any]]:
         """Return the rows of a cell of the table, one a seed."""
         return self._cells.get((label, target, condition), [])
+
+    def tried(self, label: str, target: str, condition: str) -> list[dict[str, Any]]:
+        """Return the rows of a cell whose condition could be made of its session, so that the method was tried."""
+        return [row for row in self.of(label, target, condition) if not cannot_be_made(row)]
 
     def mean(self, label: str, target: str, condition: str, key: str) -> float | None:
         """Return the mean over seeds; None where nothing was measured."""

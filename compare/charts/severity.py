@@ -106,13 +106,13 @@ def breaking(results: Results, label: str, series: Series) -> Breaking | None:
     and where F of the surface within 0.02 is below one half.
     """
     conditions = {name for _, name in series.conditions if name != results.base}
-    if not any(results.of(label, target, name) for target in results.targets for name in conditions):
+    if not any(results.tried(label, target, name) for target in results.targets for name in conditions):
         return None
     broken, held, why = [], [], []
     for side in series.outwards():
         tried = None
         for value, condition in side:
-            rows = [row for target in results.targets for row in results.of(label, target, condition)]
+            rows = [row for target in results.targets for row in results.tried(label, target, condition)]
             if not rows:
                 continue
             reason = next((r for t in results.targets if (r := _broken(results, label, t, condition))), None)
@@ -129,6 +129,8 @@ def breaking(results: Results, label: str, series: Series) -> Breaking | None:
 
 def _broken(results: Results, label: str, target: str, condition: str) -> str | None:
     """Return in words why a method is broken on a target under a condition; None where it is not, or was not tried."""
+    if not results.tried(label, target, condition):
+        return None
     if (error := results.error(label, target, condition)) is not None:
         return f"{target}: {error}"
     key = results.score_of(target).key

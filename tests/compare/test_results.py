@@ -158,6 +158,12 @@ def test_a_method_breaks_at_the_mildest_condition_at_which_it_is_worse_than_no_m
     assert broken.why == ("A: 25.00 dB, and 26.00 dB without any model",)
     assert held is not None and (held.broken_at, held.held) == ((), (4.0,))
     assert breaking(results, "black", series) is None  # no condition was asked of it
+    impossible = [
+        row("obbgs", "noise x2", error="CompareError: A has no truth") | {"changes": {"noise": 2.0}}
+    ]
+    results = Results([*impossible, of_noise("obbgs", None, 40.0), row("black", psnr_clean_db=24.0)])
+    assert results.conditions == ["as taken", "noise x2"]
+    assert breaking(results, "obbgs", series_of(results)[0]) is None  # that says nothing of the method
 
 
 def test_a_model_of_another_shape_is_broken_however_good_its_pictures_are():
