@@ -1,12 +1,13 @@
 # `make demo` runs the whole loop and ends in a report; `make test` checks everything. Both set up from nothing, as all below do.
 # `make test-portable` repeats the numerical tests as processors with fewer instructions would run them: tests/other_processors.py.
+# `make test-arm` runs the kernels as they are compiled for ARM, emulated: tests/arm.py.
 # `make sanitize` runs the kernels under the address, undefined-behaviour and thread sanitizers: tests/sanitize.py.
 # `make coverage` says which lines the tests reach, `make coverage-flight` fails where the tests of flight reach too few of its branches;
 # `make docs` builds the documentation into build/docs.
 OUT ?= demo
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo test test-portable sanitize coverage coverage-flight docs setup clean
+.PHONY: demo test test-portable test-arm sanitize coverage coverage-flight docs setup clean
 
 demo: setup
 	.venv/bin/hil demo --out "$(OUT)" $(ARGS)
@@ -20,6 +21,9 @@ test: setup
 
 test-portable: setup
 	.venv/bin/python -m tests.other_processors $(ARGS)
+
+test-arm: setup
+	.venv/bin/python -m tests.arm
 
 sanitize: setup
 	.venv/bin/python -m tests.sanitize $(ARGS)
