@@ -20,6 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from obbgs_core.compact import held, whole
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.jpeg import BLOCK_PX, FULL_SCALE
 from obbgs_core.sensor import Sensor, clipped_mean, clipped_moments, dark_reading, noise_excess
@@ -31,6 +32,7 @@ CLEAR_EXCESS = 1.3
 UNSMOOTHED = 1.1  # ratio of the scatter of pixels two apart to that of neighbours; noise has 1.02 to 1.05
 BLOCKS = 28  # along the shorter side of the picture, about
 FEWEST_BLOCKS = 12  # of sky, that a plane can be fitted to
+MOST_BLOCKS = 40_000  # of a frame: of more, every so many rows and columns are looked at
 # The first plane has about this share of all blocks below it. Most pictures are mostly sky, and light of the target is
 # never below it.
 LOW_SHARE = 0.2
@@ -152,8 +154,8 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
     """Return planes [F, C, 3] and their variances, infinite where a frame shows no sky, and a reading's deviation."""
     height, width, channels = frames[0].shape
     px = max(2, round(min(height, width) / BLOCKS))
-    cut = torch.stack([cut_pixels(f.dn, sensor) for f in frames])
-    if cut.any():
+    cut = [held(cut_pixels(f.dn, sensor)) for f in frames]
+    if any(bool(whole(mask).any()) for mask in cut):
         px = min(px, CUT_BLOCK_PX)
     if sensor.jpeg is not None:  # within its blocks readings are not independent
         px = BLOCK_PX * max(1, round(px / BLOCK_PX))
@@ -161,20 +163,23 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
     if rows * columns < FEWEST_BLOCKS:
         nothing = torch.zeros(len(frames), channels, 3).double()
         return nothing, torch.full_like(nothing, math.inf), 1.0
-    pooled = [_block_moments(f.dn, px) for f in frames]
+    step = math.ceil(math.sqrt(rows * columns / MOST_BLOCKS))
+    pooled = [_block_moments(f.dn, px, step) for f in frames]
     mean, variance = (torch.stack(moments) for moments in zip(*pooled, strict=True))  # [F, C, B]
-    known = F.max_pool2d(cut[:, None].float(), px)[:, 0].flatten(1) == 0  # [F, B]
+    known = torch.stack(
+        [_taken(F.max_pool2d(whole(m)[None].float(), px), step)[0] == 0 for m in cut]
+    )  # [F, B]
     shown = known.sum(dim=1) >= FEWEST_BLOCKS
     known |= ~shown[:, None]
-    whole = _basis(height, width)[: rows * px, : columns * px].movedim(-1, 0)[None]
-    basis = F.avg_pool2d(whole, px)[0].flatten(1).T.double()  # [B, 3]
+    places = _basis(height, width)[: rows * px, : columns * px].movedim(-1, 0)
+    basis = _taken(F.avg_pool2d(places, px), step).T.double()  # [B, 3]
     quiet = _quantile(variance.mean(dim=1), known, QUIET_SHARE).median()
     sigma_dn = max(math.sqrt(float(quiet)) / CLIPPED_SIGMA, math.sqrt(1 / 12))
     levels = _levels(mean.mean(dim=1), sigma_dn)
     even = torch.zeros(len(frames), 3).double()
     even[:, 0] = _quantile(levels, known, LOW_SHARE)
     found = [
-        _through_sky(start, basis, mean, variance, known, (px * px, rows), sigma_dn, sensor)
+        _through_sky(start, basis, mean, variance, known, (px * px, -(-rows // step)), sigma_dn, sensor)
         for start in (_low_planes(basis, levels, known, sigma_dn), even)
     ]
     # of the two planes of a frame that with more sky; the noise as most frames show it
@@ -280,11 +285,16 @@ def _before_coding(
     return planes, variance * slope.square()[:, None]
 
 
-def _block_moments(dn: Tensor, px: int) -> tuple[Tensor, Tensor]:
-    """Return mean and variance [C, B] of blocks of px x px readings dn [H, W, C]."""
-    image = dn.movedim(-1, 0)[None].double()
-    mean, square = F.avg_pool2d(image, px), F.avg_pool2d(image.square(), px)
-    return mean[0].flatten(1), ((square - mean.square()) * px**2 / (px**2 - 1))[0].flatten(1).clamp(min=0)
+def _block_moments(dn: Tensor, px: int, step: int = 1) -> tuple[Tensor, Tensor]:
+    """Return mean and variance [C, B] of blocks of px x px readings dn [H, W, C], those of `_taken`."""
+    image = dn.movedim(-1, 0).double()
+    mean, square = (_taken(F.avg_pool2d(values, px), step) for values in (image, image.square()))
+    return mean, ((square - mean.square()) * px**2 / (px**2 - 1)).clamp(min=0)
+
+
+def _taken(blocks: Tensor, step: int) -> Tensor:
+    """Return of blocks [C, rows, columns] every so many rows and columns, [C, B]."""
+    return blocks[:, ::step, ::step].flatten(1)
 
 
 def _levels(mean: Tensor, sigma_dn: float) -> Tensor:

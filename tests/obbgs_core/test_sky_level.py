@@ -10,6 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.stats import norm
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from hil.sky.sensor import converted
 from obbgs_core.frames import TrainingFrame, cameras_of
@@ -108,6 +110,41 @@ def test_what_flight_has_cut_is_no_sky_and_stays_black():
     assert (level.planes_dn[:, 0, 0] - true).abs().max() < 0.25 * sensor.read_noise_dn
     for f in corrected:
         assert (f.dn[:24] == told.black_dn).all() and (f.dn[71:] == told.black_dn).all()
+
+
+class _Largest(TorchDispatchMode):
+    """Remembers how many numbers the largest tensor has that an operation makes."""
+
+    numbers = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        made = func(*args, **(kwargs or {}))
+        sizes = [
+            t.untyped_storage().nbytes() // t.element_size()
+            for t in tree_leaves(made)
+            if isinstance(t, torch.Tensor)
+        ]
+        self.numbers = max([self.numbers, *sizes])
+        return made
+
+
+def test_the_sky_of_large_pictures_is_measured_one_picture_at_a_time():
+    """No tensor holds the pixels of all frames, however many there are."""
+    sensor, rng = dataclasses.replace(SENSOR, read_noise_dn=6.0), np.random.default_rng(3)
+    height, width, level_dn = 1100, 1000, 4.0
+    noise = torch.from_numpy(rng.normal(scale=6.0, size=(height, width, 1)).astype(np.float32))
+    frames = []
+    for number in range(12):
+        dn = (sensor.black_dn + level_dn + noise.roll(number * 7, 0)).round()
+        dn[400:700, 300:600] += 900
+        sent = torch.zeros(height, width, dtype=torch.bool)
+        sent[350:750, 250:650] = True
+        dn[~sent] = sensor.black_dn
+        frames.append(TrainingFrame(dn, 1e-4, torch.eye(4), torch.eye(3), number))
+    with _Largest() as largest:
+        _, _, level = levelled(frames, sensor)
+    assert largest.numbers <= 4 * height * width  # a pixel's place has three numbers
+    assert (level.planes_dn[:, 0, 0] - level_dn).abs().max() < 0.25 * sensor.read_noise_dn
 
 
 def test_what_a_clipped_reading_says_stays_true():
