@@ -24,6 +24,7 @@ from obbgs_core.render import lit_from, render
 from obbgs_core.score.surface import bright, with_thin_parts
 
 MAX_TRIANGLES = 5_000
+FINE_TRIANGLES = 50_000  # are looked at for dark sides and flat faces
 VIEWS = 24  # are compared, evenly chosen of those given
 VOXEL_PX = 1.5  # width of a voxel in pixels, at the median depth
 CHUNK = 30_000  # nodes at a time, such that their distances stay in the processor's cache
@@ -99,13 +100,14 @@ def surface_mesh(
     vertices, triangles, inwards, _ = marching_cubes(volume, 0.0)
     vertices = (vertices + DRAWN_BACK_VOXELS * inwards) * voxel_m + (corner + first * voxel_m).numpy()
     vertices = _where_seen(vertices, -inwards, maps, cameras, voxel_m)
+    vertices, triangles = _collapsed(vertices, triangles.astype(np.int64), FINE_TRIANGLES, voxel_m)
     looks = _Looks(gaussians, [depth for depth, _ in seen], cameras, sun_dir, voxel_m)
-    light = looks.at(vertices, -inwards, np.zeros(len(vertices)))[0].mean(axis=1)
-    vertices, shifts = thinned(vertices, triangles.astype(np.int64), light, voxel_m)
+    outwards = _outwards(vertices, triangles)
+    light = looks.at(vertices, outwards, np.zeros(len(vertices)))[0].mean(axis=1)
+    vertices, shifts = thinned(vertices, triangles, light, voxel_m)
     behind = KDTree(vertices)  # of what was moved inwards, views see what was in front of it
-    vertices, triangles = _simplified(vertices, triangles.astype(np.int64), max_triangles, voxel_m)
-    _, normals, areas = geometry_of(vertices, triangles)
-    outwards = vertex_normals(len(vertices), triangles, normals, areas)
+    vertices, triangles = _simplified(vertices, triangles, max_triangles, voxel_m)
+    outwards = _outwards(vertices, triangles)
     colours, seen_by = looks.at(vertices, outwards, shifts[behind.query(vertices)[1]], SEEN_AT_VERTEX)
     layout = layout_of(vertices, triangles, voxel_m / VOXEL_PX)
     texture, _ = looks.at(layout.places, layout.outwards, shifts[behind.query(layout.places)[1]])
@@ -255,6 +257,11 @@ def _pieces(mask: np.ndarray) -> np.ndarray:
     pieces = np.zeros(mask.shape, dtype=np.int32)
     ndimage.label(mask, output=pieces)
     return pieces
+
+
+def _outwards(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    _, normals, areas = geometry_of(vertices, triangles)
+    return vertex_normals(len(vertices), triangles, normals, areas)
 
 
 def _simplified(
