@@ -19,6 +19,7 @@ SET_BACK_AT, SET_BACK_TO, SET_BACKS = 0.4, 0.16, 1
 FEW, MANY = 12, 48
 # of the harmonics, at most, where frames are fewer than `MANY`: few views leave higher ones open
 FEW_SH_DEGREE = 1
+FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
 
 
 @dataclass(frozen=True)
@@ -218,6 +219,15 @@ class MethodConfig:
         main, _, _ = stages[-1]
         first, scale, frames = next(stage for stage in reversed(stages) if done >= stage[0])
         return Moment(done, done - first + 1, (done - first) / max(1, self.steps - main), scale, frames)
+
+    def work(self, first: int, last: int) -> float:
+        """Return the work of the steps from `first` to before `last`, in that of a frame of full size."""
+        stages = self.stages()
+        ends = [*(start for start, _, _ in stages[1:]), self.steps]
+        return sum(
+            max(0, min(last, until) - max(first, start)) * (FIXED_COST + scale**2) * frames
+            for (start, scale, frames), until in zip(stages, ends, strict=True)
+        )
 
     def steps_until(self, share: float) -> float:
         """Return how many steps are done when a share of the training, coarse stages left out, is."""

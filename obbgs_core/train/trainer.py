@@ -3,8 +3,10 @@
 import dataclasses
 import logging
 import math
+import statistics
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -36,8 +38,10 @@ from obbgs_core.train.state import Identity, TrainingState
 log = logging.getLogger(__name__)
 CHECKPOINT_EVERY_S = 20.0
 LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
-FIXED_COST = 0.25  # time of a step that does not shrink with the image, over the time that does, at full size
 PACE_STEPS = 50  # the time left is estimated from the pace of so many steps
+DECISIONS = (
+    0.4  # by so much a whole training takes longer than its steps at the pace of the first (TDRS and DSCOVR)
+)
 
 
 def train(
@@ -400,19 +404,15 @@ class Trainer:
 
 
 def _seconds_left(state: TrainingState, config: MethodConfig) -> float | None:
-    """Return the time that the remaining steps will take, at the pace since the first of them or the last set-back."""
-    last, done, stages = state.history[: -PACE_STEPS - 1 : -1], state.steps_done, config.stages()
-    counted = [info for back, info in enumerate(last, 1) if info.step == done - back]
+    """Return the time that the remaining steps will take, with their decisions, at the middle pace of the last ones."""
+    last, done = state.history[: -PACE_STEPS - 1 : -1], state.steps_done
+    counted = [info.seconds for back, info in enumerate(last, 1) if info.step == done - back]
     if not counted:
         return None
-
-    def work(first: int, last: int) -> float:
-        ends = [*(start for start, _, _ in stages[1:]), config.steps]
-        return sum(
-            max(0, min(last, until) - max(first, start)) * (FIXED_COST + scale**2) * frames
-            for (start, scale, frames), until in zip(stages, ends, strict=True)
-        )
-
-    again = state.poses.set_backs * work(*(round(config.steps_until(s)) for s in (SET_BACK_TO, SET_BACK_AT)))
-    spent = state.seconds - counted[-1].seconds
-    return spent / work(counted[-1].step, done) * (work(done, config.steps) + again)
+    again = state.poses.set_backs * config.work(
+        *(round(config.steps_until(s)) for s in (SET_BACK_TO, SET_BACK_AT))
+    )
+    times = enumerate(pairwise([state.seconds, *counted]))
+    pace = statistics.median((end - begin) / config.work(done - i - 1, done - i) for i, (end, begin) in times)
+    decisions = DECISIONS * (1 - done / config.steps) if config.learns_misfit else 0.0
+    return (1 + decisions) * pace * (config.work(done, config.steps) + again)

@@ -319,6 +319,15 @@ def test_what_came_before_the_first_step_tells_nothing_of_the_time_left(frames):
     assert second.seconds_left is not None and 0 < second.seconds_left < 1e6
 
 
+def test_a_decision_that_took_long_is_not_taken_for_the_pace_of_steps(frames):
+    trainer = Trainer(frames, SENSOR, preset("obbgs", QUICK))
+    for _ in range(6):
+        trainer.step()
+    trainer.state.seconds += 1e6
+    left_s = trainer.step().seconds_left
+    assert left_s is not None and 0 < left_s < 1e5
+
+
 def test_black_frames_are_left_out_and_counted(frames):
     black = dataclasses.replace(frames[0], dn=torch.full_like(frames[0].dn, SENSOR.black_dn))
     trainer = Trainer([*frames, black, black], SENSOR, preset("obbgs", QUICK))
