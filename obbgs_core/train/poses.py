@@ -28,8 +28,8 @@ ALIGNED_FROM = 0.05  # the same, of poses that were aligned before the start (ex
 # In so many rounds the poses would move during a whole training if they moved as often as before `SET_BACK_AT`, or as
 # after it (experiment 079).
 EARLY_ROUNDS, LATE_ROUNDS = 60, 25
-# Of more, rounds are the rarer the more there are, so that all take no more time; not where navigation's errors are
-# shared: with 105 of the demo, 0.29 px were left of them instead of 0.11.
+# Of more, rounds are the rarer the more there are, of twice as many and more so rare that all take half the time; not
+# where navigation's errors are shared: with 105 of the demo, 0.29 px were left of them instead of 0.11.
 MANY_BRACKETS = 50
 SURFACE_UNTIL = 0.5  # share of the steps until which the Gaussians go along with the surface's cells then
 CELLS = 12  # of the surface along the target's radius
@@ -268,8 +268,8 @@ def is_turn(setup: TrainingSetup, moment: Moment) -> bool:
 def steps_between(setup: TrainingSetup, share: float) -> int:
     """Return the number of steps from one round to the next at a share of the steps."""
     rounds = EARLY_ROUNDS if share < SET_BACK_AT else LATE_ROUNDS
-    alone = setup.frames[0].navigation is None
-    rarer = max(1.0, (1 + max(pose_numbers(setup.frames))) / MANY_BRACKETS) if alone else 1.0
+    many = (1 + max(pose_numbers(setup.frames))) / MANY_BRACKETS
+    rarer = max(1.0, many * min(2.0, many)) if setup.frames[0].navigation is None else 1.0
     return max(1, round(rarer * (setup.config.steps_until(1) - setup.config.steps_until(0)) / rounds))
 
 
