@@ -8,6 +8,7 @@ EXTRAS = {
     "ground": {
         *(
             "cv2",
+            "fast_simplification",
             "gsply",
             "manifold3d",
             "onnx",

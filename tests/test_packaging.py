@@ -127,6 +127,7 @@ def test_every_extra_of_the_package_is_known_to_the_message():
     modules = {
         "opencv-contrib-python-headless": "cv2",
         "scikit-image": "skimage",
+        "fast-simplification": "fast_simplification",
         "pillow": "PIL",
         "bsk": "Basilisk",
     }  # where the package has another name
