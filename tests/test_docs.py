@@ -39,6 +39,24 @@ def test_every_link_of_a_page_leads_to_a_file(page):
         assert [link for link in resolved if not link.is_relative_to(ROOT / "docs")] == []
 
 
+def anchors(page: Path) -> set[str]:
+    """Return the names of a page's headings as the site makes them (Python-Markdown's `slugify`)."""
+    headings = re.findall(r"(?m)^#+ +(.*?)(?: +\{.*\})?$", page.read_text())
+    words = [re.sub(r"\]\([^)]*\)", "", heading) for heading in headings]
+    return {re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", text).strip().lower()) for text in words}
+
+
+def test_every_link_to_a_heading_leads_to_one():
+    pages = sorted((ROOT / "docs").rglob("*.md"))
+    wrong_ones = [
+        (page.name, f"{target}#{name}")
+        for page in pages
+        for target, name in re.findall(r"\]\(([^)#\s:]*)#([^)\s]+)\)", page.read_text())
+        if name not in anchors((page.parent / target) if target else page)
+    ]
+    assert wrong_ones == []
+
+
 def test_the_readme_fits_a_terminal():
     wide = [line for line in (ROOT / "README.md").read_text().splitlines() if len(line) > WIDEST_README]
     assert wide == []
