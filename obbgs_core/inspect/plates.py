@@ -30,7 +30,11 @@ BETTER = 0.6  # of the misfit of where it should be is left by a turn that is be
 MOST_RAD = np.radians(32.0)  # a plate is not looked for beyond
 SYSTEMATIC_PX = 0.35  # by which the ends of a model's plate may lie off, alike over the whole plate
 Z_90 = 1.645
-TURNED_SIGMAS, TURNED_RAD = 4.5, np.radians(2.5)  # of a panel, at least, to be told as turned
+TURNED_RAD = np.radians(2.5)  # of a panel, at least, to be told as turned
+# The same in its standard deviations, where so much of it lies on the surface after its turn, and where less does: a
+# sound dish of TDRS, of which 0.73 to 0.88 do, passes for turned by 12 degrees, 4.2 deviations, while the others stay
+# below 1.9 and panels turned by 11 to 20 degrees have 3 to 8.5.
+LAID, TURNED_SIGMAS, POORLY_LAID_SIGMAS = 0.9, 2.5, 4.5
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,8 @@ class Turn:
 
 def is_turned(turn: Turn) -> bool:
     """Return whether a panel is turned, beyond what chance and the surface's errors make of one that is not."""
-    return bool(turn.significance > TURNED_SIGMAS and turn.tilt_rad > TURNED_RAD)
+    least = TURNED_SIGMAS if turn.found > LAID else POORLY_LAID_SIGMAS
+    return bool(turn.significance > least and turn.tilt_rad > TURNED_RAD)
 
 
 def plates_of(design: Samples, pixel_m: float) -> list[Plate]:

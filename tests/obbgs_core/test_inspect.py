@@ -9,7 +9,7 @@ from obbgs_core.inspect.alignment import Surface, aligned
 from obbgs_core.inspect.cad import CadError, CadMesh, read_cad, sampled
 from obbgs_core.inspect.faces import flat_faces, largest_dimension
 from obbgs_core.inspect.findings import Inspection, inspect
-from obbgs_core.inspect.plates import is_turned, plates_of
+from obbgs_core.inspect.plates import Plate, Turn, is_turned, plates_of
 from obbgs_core.inspect.shown import Views
 
 PIXEL_M = 0.03
@@ -131,3 +131,22 @@ def test_what_is_no_design_is_refused_in_a_line(tmp_path):
         read_cad(tmp_path / "packed.glb")
     with pytest.raises(CadError, match="at least 100"):
         aligned(as_cad(body(), tmp_path), Surface(np.zeros((3, 3)), np.zeros((3, 3)), np.ones(3), PIXEL_M))
+
+
+@pytest.mark.parametrize(
+    ("degrees", "significance", "found", "turned"),
+    [  # as seen on TDRS and ACE
+        (10.9, 2.98, 1.0, True),  # turned by 13.3 degrees
+        (12.0, 6.20, 0.99, True),
+        (3.9, 1.84, 1.0, False),
+        (12.1, 4.21, 0.74, False),  # a dish that the model shows in part
+        (1.5, 8.0, 1.0, False),  # too little to be a fault
+    ],
+)
+def test_panels_that_lie_well_on_the_surface_are_told_as_turned_by_fewer_deviations(
+    degrees, significance, found, turned
+):
+    plate = Plate(0, np.arange(1), np.arange(1), np.zeros(3), np.eye(3), np.ones(3))
+    tilt = np.radians(degrees)
+    told = Turn(plate, np.eye(4), tilt, np.eye(3)[0], (0.0, 2 * tilt), significance, found)
+    assert is_turned(told) == turned
