@@ -9,10 +9,12 @@ DARKER = 0.35  # of the light of the opposite side, at most, of a side that is m
 THICKEST_VOXELS = (
     4.0  # of a plate: dark sides were found 2 to 3.5 voxels behind lit ones where truth has a sheet
 )
-THINNEST_VOXELS = 0.5  # is left of it, so that the mesh encloses a volume
+THINNEST_VOXELS = (
+    1.3  # is left of it: with half as much, sides went through each other when triangles were merged
+)
 BESIDE_VOXELS = 1.0  # from a vertex's normal, at most, of what counts as opposite
 OPPOSITE = -0.7  # cosine between the normals of two sides, at most
-LOOKED_AT = 64  # triangles around each vertex
+LOOKED_AT = 8  # triangles around each of some places behind a vertex
 ROUNDS = 2  # the second moves the rims of what the first has moved
 SMOOTHINGS = 2  # of the shift along edges, so that it ends without a step
 NORMAL_ROUNDS = 3
@@ -59,17 +61,17 @@ def _too_thick(
     voxel_m: float,
 ) -> np.ndarray:
     """Return how far [V] m each vertex is to go inwards: 0 where it has light of its own, or nothing opposite."""
-    count = min(LOOKED_AT, len(middles))
-    away, index = KDTree(middles).query(
-        vertices, k=count, distance_upper_bound=(THICKEST_VOXELS + 0.5) * voxel_m
-    )
-    near = np.isfinite(away)
-    index = np.where(near, index, 0)
+    count, tree = min(LOOKED_AT, len(middles)), KDTree(middles)
+    depths_m = voxel_m * np.arange(0.5, THICKEST_VOXELS, 0.75)
+    found = [tree.query(vertices - d * outwards, k=count)[1].reshape(-1, count) for d in depths_m]
+    index = np.concatenate(found, axis=1)
     to = middles[index] - vertices[:, None]
-    depth = -(to * outwards[:, None]).sum(axis=2)
-    beside = np.linalg.norm(to + depth[..., None] * outwards[:, None], axis=2)
-    facing = (normals[index] * outwards[:, None]).sum(axis=2) < OPPOSITE
-    opposite = near & facing & (depth > 0) & (depth < THICKEST_VOXELS * voxel_m)
+    below = -(to * outwards[:, None]).sum(axis=2)
+    beside = np.linalg.norm(to + below[..., None] * outwards[:, None], axis=2)
+    cosine = (normals[index] * outwards[:, None]).sum(axis=2)
+    # to the plane of the triangle, since its middle lies beside the normal
+    depth = (to * normals[index]).sum(axis=2) / -cosine.clip(max=OPPOSITE)
+    opposite = (cosine < OPPOSITE) & (depth > 0) & (depth < THICKEST_VOXELS * voxel_m)
     opposite &= beside < BESIDE_VOXELS * voxel_m
     rows, chosen = np.arange(len(vertices)), np.where(opposite, beside, np.inf).argmin(axis=1)
     is_dark = light < DARKER * light_there[index[rows, chosen]]
