@@ -229,8 +229,8 @@ def test_a_camera_that_never_comes_back_is_two_lines_a_summary_and_a_failure(tmp
     assert "captured 10 frames, 0 were there, 14 failed" in out
     assert "the camera was lost once and never came back: 14 exposures of 5 brackets were not taken" in out
     assert [line.partition(":")[2].split(",")[0] for line in err.splitlines() if line] == [
-        " the camera is lost",
-        " the camera did not come back: 14 exposures were not taken",
+        " warning: the camera is lost",
+        " error: the camera did not come back: 14 exposures were not taken",
     ]
 
 

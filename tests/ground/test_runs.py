@@ -102,7 +102,7 @@ def test_the_mesh_of_a_finished_run_is_written_in_the_format_asked_for(session, 
         assert f"- Mesh: {facts['mesh_triangles']:,} triangles" in (copy.parent / "model_card.md").read_text()
     assert facts["mesh"] == str(copy) and 0 < facts["mesh_triangles"] <= 50_000
     read = trimesh.load_mesh(copy)
-    read.merge_vertices(merge_norm=True)
+    read.merge_vertices(merge_norm=True, merge_tex=True)
     assert read.is_watertight and len(read.faces) == facts["mesh_triangles"]
     card = model_card("today", json.loads((finished / "runs" / "run" / "metrics.json").read_text()))
     assert f"- Mesh: {facts['mesh_triangles']:,} triangles" in card and "| model.glb |" in card
