@@ -15,7 +15,7 @@ USES = {
     "model.ply": "the model without loss",
     "model.spz": "quantised, for viewers and storage",
     "splats.glb": "splats as glTF (KHR_gaussian_splatting), for viewers",
-    "model.glb": "a closed mesh with colours, for other software",
+    "model.glb": "a closed mesh with a texture, for other software",
     "model.onnx": "the renderer for use on board",
 }
 

@@ -4,11 +4,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from obbgs_core.mesh.triangles import geometry_of, neighbours_of, smoothed
+from obbgs_core.mesh.triangles import geometry_of, neighbours_of, pieces_of, smoothed
 
 OFF_VOXELS = 0.75  # from its plane, at most, of a triangle's middle
 FACING = 0.85  # cosine between the normals of a face and its triangles, at least
@@ -77,9 +75,7 @@ class _Search:
         number = np.full(len(self.face), -1)
         number[chosen] = np.arange(len(chosen))
         pairs = number[self.neighbours]
-        pairs = pairs[(pairs >= 0).all(axis=1)]
-        links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(chosen), len(chosen)))
-        piece = connected_components(links, directed=False)[1]
+        piece = pieces_of(len(chosen), pairs[(pairs >= 0).all(axis=1)])
         return chosen[piece == np.argmax(np.bincount(piece, self.areas[chosen]))]
 
     def fitted(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,12 +6,10 @@ from scipy.spatial import KDTree
 from obbgs_core.mesh.triangles import edges_of, geometry_of, neighbours_of, smoothed, vertex_normals
 
 DARKER = 0.35  # of the light of the opposite side, at most, of a side that is moved
-THICKEST_VOXELS = (
-    4.0  # of a plate: dark sides were found 2 to 3.5 voxels behind lit ones where truth has a sheet
-)
-THINNEST_VOXELS = (
-    1.3  # is left of it: with half as much, sides went through each other when triangles were merged
-)
+# of a plate: dark sides were found 2 to 3.5 voxels behind lit ones where truth has a sheet
+THICKEST_VOXELS = 4.0
+# is left of it: with half as much, sides went through each other when triangles were merged
+THINNEST_VOXELS = 1.3
 BESIDE_VOXELS = 1.0  # from a vertex's normal, at most, of what counts as opposite
 OPPOSITE = -0.7  # cosine between the normals of two sides, at most
 LOOKED_AT = 8  # triangles around each of some places behind a vertex

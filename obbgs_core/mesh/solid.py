@@ -267,7 +267,7 @@ def _outwards(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def _simplified(
     vertices: np.ndarray, triangles: np.ndarray, max_triangles: int, voxel_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a mesh of at most so many triangles, which stays closed, with flat faces flat.
+    """Return a closed mesh of about so many triangles, with flat faces flat.
 
     Edges are collapsed by least quadric error (Garland and Heckbert 1997) before vertices go onto their planes: where
     all is flat to the last digit, that error is zero for any order, and it leaves holes and needles.

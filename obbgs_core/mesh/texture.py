@@ -4,10 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from obbgs_core.mesh.triangles import geometry_of, neighbours_of
+from obbgs_core.mesh.triangles import geometry_of, neighbours_of, pieces_of
 
 IN_ONE_PLANE = 1 - 1e-6  # cosine between the normals of neighbours, at least: 0.08 degrees
 MARGIN = 1  # texels around each chart, so that viewers that interpolate find no colour of another
@@ -42,9 +40,8 @@ def layout_of(vertices: np.ndarray, triangles: np.ndarray, texel_m: float) -> La
     _, normals, areas = geometry_of(vertices, triangles)
     pairs = neighbours_of(triangles)
     pairs = pairs[(normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(axis=1) > IN_ONE_PLANE]
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(triangles),) * 2)
-    count, chart = connected_components(links, directed=False)
-    members = np.split(np.argsort(chart, kind="stable"), np.cumsum(np.bincount(chart, minlength=count))[:-1])
+    chart = pieces_of(len(triangles), pairs)
+    members = np.split(np.argsort(chart, kind="stable"), np.cumsum(np.bincount(chart))[:-1])
     charts = [_Chart(vertices[triangles[m]], normals[m], areas[m]) for m in members]
     while True:
         sizes = np.array([c.size(texel_m) for c in charts])

@@ -1,6 +1,8 @@
 """What meshes of triangles are asked: neighbours, normals, areas."""
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 
 def geometry_of(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -26,6 +28,12 @@ def neighbours_of(triangles: np.ndarray) -> np.ndarray:
     edges, owners = edges_of(triangles)
     same = (edges[1:] == edges[:-1]).all(axis=1)
     return np.stack([owners[:-1][same], owners[1:][same]], axis=1)
+
+
+def pieces_of(count: int, pairs: np.ndarray) -> np.ndarray:
+    """Return the number [count] of the piece that each triangle is in: `pairs` [E, 2] of them hang together."""
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    return connected_components(links, directed=False)[1]
 
 
 def smoothed(normals: np.ndarray, areas: np.ndarray, neighbours: np.ndarray, rounds: int) -> np.ndarray:

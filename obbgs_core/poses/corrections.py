@@ -302,9 +302,9 @@ class PoseCorrections:
         """Return the change of the body that makes the corrections smallest, and that of the shared parameters [S].
 
         The former [7] is a small motion and a logarithm of its size. It adds adjoint · d to each correction, which the
-        shared parameters may take up instead. Beside these, the brackets count as one: what the model errs in is alike
-        in all of them, and corrections that suit one size do not suit another, by far less than any picture shows
-        (experiment 103).
+        shared parameters may take up instead. Beside these, the brackets count as one: the model's errors are alike in
+        all of them, and if each counted by itself, differences far smaller than any picture shows would fix the body's
+        size (experiment 103).
         """
         size = self.by_shared.shape[2]
         farther = torch.cat([torch.zeros(len(poses), 3, 1, dtype=poses.dtype), poses[:, :3, 3:]], dim=1)

@@ -39,9 +39,8 @@ log = logging.getLogger(__name__)
 CHECKPOINT_EVERY_S = 20.0
 LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
 PACE_STEPS = 50  # the time left is estimated from the pace of so many steps
-DECISIONS = (
-    0.4  # by so much a whole training takes longer than its steps at the pace of the first (TDRS and DSCOVR)
-)
+# by so much a whole training takes longer than its steps at the pace of the first (TDRS and DSCOVR)
+DECISIONS = 0.4
 
 
 def train(
