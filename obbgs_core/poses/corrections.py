@@ -273,17 +273,22 @@ class PoseCorrections:
             columns = torch.from_numpy(jacobian(motion, at))
             self.by_shared, self.linear_at = columns[:, :, self.free] * self.sigmas[self.free], shared
 
-    def fix_gauge(self, gaussians: Gaussians, frames: list[TrainingFrame]) -> Gaussians:
+    def fix_gauge(self, gaussians: Gaussians, frames: list[TrainingFrame], as_one: bool = False) -> Gaussians:
         """Return the model moved and scaled to where the corrections, moved with it, are smallest in their deviations.
 
         Moving the model rigidly by d and every pose by its inverse changes no image, nor does a larger model that is
         farther away by as much, so training leaves both open. Changes that would move a direction in which a tag is
         exact are excluded, unless a shared parameter takes them up.
+
+        Args:
+            as_one: all brackets together count as one beside the shared parameters. The model's errors are alike in
+                all of them, and if each counted by itself, differences far smaller than any picture shows would fix
+                the body's size (experiment 103).
         """
         whole, target = torch.eye(4, dtype=torch.float64), self.corrected(list(range(len(frames)))).double()
         log_scale = 0.0
         for _ in range(GAUGE_ROUNDS):
-            motion, shared = self._gauge(target)
+            motion, shared = self._gauge(target, as_one)
             rigid = rigid_motions(motion[None, :6])[0]
             scale = torch.exp(motion[6])
             whole[:3] *= scale
@@ -298,20 +303,18 @@ class PoseCorrections:
                 break
         return _transformed(gaussians, whole, log_scale)
 
-    def _gauge(self, poses: Tensor) -> tuple[Tensor, Tensor]:
+    def _gauge(self, poses: Tensor, as_one: bool) -> tuple[Tensor, Tensor]:
         """Return the change of the body that makes the corrections smallest, and that of the shared parameters [S].
 
         The former [7] is a small motion and a logarithm of its size. It adds adjoint · d to each correction, which the
-        shared parameters may take up instead. Beside these, the brackets count as one: the model's errors are alike in
-        all of them, and if each counted by itself, differences far smaller than any picture shows would fix the body's
-        size (experiment 103).
+        shared parameters may take up instead.
         """
         size = self.by_shared.shape[2]
         farther = torch.cat([torch.zeros(len(poses), 3, 1, dtype=poses.dtype), poses[:, :3, 3:]], dim=1)
         columns = [-adjoints(poses), farther, -self.by_shared]
         adjoint = self._bracket_means(torch.cat(columns, dim=2))  # [P, 6, 7 + S]
         free = _null_space((self.whitening.exact @ adjoint).flatten(0, 1))
-        alike = len(self.value) ** -0.5 if size else 1.0
+        alike = len(self.value) ** -0.5 if as_one and size else 1.0
         own_rows = alike * (self.whitening.inverse @ adjoint).flatten(0, 1)
         shared_rows = torch.cat([torch.zeros(size, 7, dtype=torch.float64), torch.eye(size).double()], dim=1)
         rows = torch.cat([own_rows, shared_rows]) @ free

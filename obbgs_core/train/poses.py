@@ -37,6 +37,9 @@ CELLS = 12  # of the surface along the target's radius
 ANSWER_STEPS = 16
 # share of the steps after which brackets that do not fit are left out: poses have mostly settled
 LEFT_OUT_FROM = 0.6
+# share of the steps from which brackets count as one where the gauge is settled: earlier, a frame with the Earth went
+# 3 px astray (experiment 103)
+AS_ONE_FROM = 0.8
 # of the logarithms of the brackets' residuals: median absolute deviations, scaled to those of a normal distribution,
 # above the median
 FAR_DEVIATIONS = 6.0
@@ -224,7 +227,8 @@ class Poses:
         if shifts is not None and along:
             moved = gaussians.means + shifts.of_points(gaussians.means)
             gaussians = dataclasses.replace(gaussians, means=moved)
-        return Change(poses.fix_gauge(poses.after_motion(gaussians, motion), setup.frames), None)
+        gaussians = poses.after_motion(gaussians, motion)
+        return Change(poses.fix_gauge(gaussians, setup.frames, now.moment.share >= AS_ONE_FROM), None)
 
     @staticmethod
     def _leave_out(now: Now, poses: PoseCorrections, brackets: list[list[int]]) -> None:

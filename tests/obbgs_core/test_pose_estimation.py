@@ -533,7 +533,7 @@ def test_a_size_that_no_picture_shows_is_what_the_shared_errors_say():
         return size_of(best_motion(poses.corrected(list(range(len(true)))), truth, 1.0, with_size=True))
 
     assert size() == pytest.approx(1 / 0.97, abs=3e-3)
-    poses.fix_gauge(MODEL, tags)
+    poses.fix_gauge(MODEL, tags, as_one=True)
     assert size() == pytest.approx(1.0, abs=0.01)
 
 
