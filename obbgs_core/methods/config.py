@@ -164,9 +164,6 @@ class MethodConfig:
     # false: every exposure time is replaced by the geometric mean of all (001, 076)
     exposure_aware: bool = True
     frames_per_step: int = at_least_one(3)  # (043)
-    bracket_steps: bool = (
-        True  # the frames of a step are one of each exposure time (001; within the scatter: 076)
-    )
     steps: int = at_least_one(1000)  # (043, 072)
     # share of the steps from which on the models after each step are averaged; 1: the model is that of the last step
     # (071)

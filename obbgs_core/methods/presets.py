@@ -29,7 +29,6 @@ _3DGS = MethodConfig(
     name="3dgs",
     exposure_aware=False,
     frames_per_step=1,
-    bracket_steps=False,
     steps=30_000,
     averaged_from=1.0,
     chi2_end=0.0,
@@ -70,6 +69,7 @@ _3DGS = MethodConfig(
     published=PublishedSettings(
         length_unit="cameras",
         radiance_unit="full_scale",
+        bracket_steps=False,
         windows=False,
         footprint="kerbl",
         grey_start=True,
@@ -124,9 +124,9 @@ PRESETS: dict[str, MethodConfig] = {
             {
                 "name": "jiang2025",
                 "frames_per_step": 3,
-                "bracket_steps": True,
                 "loss.edge_weight": 0.2,
                 "growth.obb_interval": 50,
+                "published.bracket_steps": True,
                 "published.pixel_weighted": True,
                 "published.outlier_filter": True,
             },

@@ -20,6 +20,8 @@ class PublishedSettings:
     # of the rate of the radiance coefficients. full_scale: what saturates a pixel at the frames' mean exposure time, as
     # where pictures of 0 to 1 are fitted (3DGS); one: radiance as it is
     radiance_unit: Literal["one", "full_scale"] = "one"
+    # the frames of a step are one of each exposure time (001; within the scatter: 076), or any (3DGS)
+    bracket_steps: bool = True
     windows: bool = True  # only the part of each frame that the target lies in is rendered and compared
     footprint: Footprint = "camera"  # what a pixel averages over, see `Gaussians`
     # first radiance: grey, half of full scale and a little at random (3DGS without a point cloud), or as frames show it

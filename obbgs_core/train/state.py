@@ -134,7 +134,7 @@ class TrainingState:
             rng=start.rng,
             gaussians=start.gaussians,
             adam=Adam(start.gaussians, (FIRST_MEMORY, memory)),
-            order=FrameOrder(setup.exposures_s, config.bracket_steps, kept_back),
+            order=FrameOrder(setup.exposures_s, config.published.bracket_steps, kept_back),
             growth=Growth.of(len(start.gaussians)),
             poses=poses,
             harmonics=Harmonics("as configured" if config.published.sh_degree else ""),
