@@ -6,7 +6,6 @@ star or a particle is in one frame only.
 """
 
 import dataclasses
-import logging
 import math
 
 import torch
@@ -16,7 +15,6 @@ from torch import Tensor
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor, dark_reading
 
-log = logging.getLogger(__name__)
 LOOKED_AT = 48  # frames, at most, spread evenly
 FEWEST = 8  # of them that show sky around a pixel
 SKY_SIGMA = 3.0  # the mean of eight neighbours may be so many of its deviations above an empty one
@@ -46,9 +44,7 @@ def without_hot_pixels(frames: list[TrainingFrame], sensor: Sensor) -> tuple[lis
         )
         for f in frames
     ]
-    found = f"{count} hot pixels, {count / hot.numel():.2%}, read the mean of their neighbours"
-    log.warning(found)
-    return frames, f"; {found}"
+    return frames, f"{count} hot pixels, {count / hot.numel():.2%}, read the mean of their neighbours"
 
 
 def hot_pixels(frames: list[TrainingFrame], sensor: Sensor) -> Tensor:

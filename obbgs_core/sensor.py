@@ -14,6 +14,8 @@ HALF_DN = 0.5  # a reading of 0 means a signal below this, since signals are rou
 STRAIGHT = 1e-3  # share of full scale below which a response is a straight line
 # edge of the blocks by which noise is measured, and the share of them that is surely sky
 BLOCK_PX, SKY_BLOCKS = 8, 0.25
+# full scale at the mean exposure may be a radiance between this and its inverse without harm
+USUAL_FULL_SCALE = 10.0
 SKY_SCATTERS = 1.0  # a block whose mean is farther above an empty one, in deviations of a reading, is no sky
 
 
@@ -163,6 +165,16 @@ class Sensor:
         floor = 3 / 8 + (self.read_noise_dn * self.electrons_per_dn) ** 2
         signal_e = signal_e.clamp(min=1e-3 - floor)
         return 2 * signal_e / ((signal_e + floor).clamp(min=1e-3).sqrt() + math.sqrt(floor))
+
+
+def unusual_unit(white: float) -> str:
+    """Return a warning if radiance is measured in a unit in which full scale, `white`, is far from 1; "" otherwise."""
+    if 1 / USUAL_FULL_SCALE <= white <= USUAL_FULL_SCALE:
+        return ""
+    return (
+        f"full scale is a radiance of {white:.2g}, and trainings are tuned to about 1: choose the unit of radiance so, "
+        f"for instance with {white:.2g} times the gain dn_per_radiance_s"
+    )
 
 
 def clipped_mean(mean: Tensor, sigma: Tensor) -> Tensor:

@@ -11,7 +11,6 @@ Stein's estimator, 1975).
 """
 
 import dataclasses
-import logging
 import math
 import statistics
 from dataclasses import dataclass
@@ -25,7 +24,6 @@ from obbgs_core.frames import TrainingFrame
 from obbgs_core.jpeg import BLOCK_PX, FULL_SCALE
 from obbgs_core.sensor import Sensor, clipped_mean, clipped_moments, dark_reading, noise_excess
 
-log = logging.getLogger(__name__)
 NOISE_FRAMES = 12  # about so many, spread evenly, by which the noise is measured
 # of the scatter of empty sky over that of the sensor model, or the reverse; frames that fit it have 0.93 to 0.97
 CLEAR_EXCESS = 1.3
@@ -124,7 +122,6 @@ def levelled(frames: list[TrainingFrame], sensor: Sensor) -> tuple[list[Training
     if not departs:
         return frames, sensor, dataclasses.replace(told, sigma_dn=covariance.sqrt().float())
     level = SkyLevel(ids, planes.float(), covariance.sqrt().float())
-    log.warning("%s", level)
     return *_without(frames, sensor, level.planes_dn), level
 
 
@@ -444,9 +441,7 @@ def with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Sensor
     seen = dataclasses.replace(
         sensor, read_noise_dn=excess * sensor.variance_dn2(torch.tensor(sensor.black_dn)).sqrt().item()
     )
-    changed = (
+    return seen, (
         f"read noise taken as {seen.read_noise_dn:.2f} DN instead of the stated {sensor.read_noise_dn:.2f} DN: "
         f"empty sky scatters {excess:.2g} times as much as that"
     )
-    log.warning(changed)
-    return seen, f"; {changed}"

@@ -103,7 +103,7 @@ def reconstruct(
         found = _attitude(session, training, attitude, part / ATTITUDE_FILE, on_search, should_stop)
         if found is not None:
             session = in_body_axes(session, found)
-            training, held_out = split(session)
+            training, held_out = split(session, _told)
             configs[KNOWN] = _refining(config, "always")
         frames = frames_of(session, training)
 
@@ -111,8 +111,9 @@ def reconstruct(
             def on_step(info: StepInfo) -> None:
                 on_progress(Progress(label, info))
 
-            checkpoint = part / _checkpoint(label)
-            result = train(frames, sensor, config, seed, on_step, time_limit_s, checkpoint, should_stop)
+            limits = (seed, on_step, time_limit_s, part / _checkpoint(label), should_stop)
+            # the second training has the same frames as the first
+            result = train(frames, sensor, config, *limits, log.warning if label == KNOWN else _told)
             log.info("%s: start from %s; %s", label, result.start, result.stop_reason)
             return result
 
@@ -183,6 +184,10 @@ def _attitude(
         found.write(path)
     log.info("attitude of the target from its outlines: %s", found.motion.summary())
     return found
+
+
+def _told(warning: str) -> None:
+    """Take a warning that the log has already."""
 
 
 def _refining(config: MethodConfig, refine: Literal["never", "always"]) -> MethodConfig:

@@ -204,7 +204,7 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
     session = _as_it_was(session, folder, metrics["frames_received"])
     if (found := FoundAttitude.read(folder / attitude.FILE)) is not None:
         session = in_body_axes(session, found)
-    training, held_out = split(session)
+    training, held_out = split(session, on_warning=lambda text: None)  # the run was told
     if not metrics[
         "frames_held_out"
     ]:  # of a few brackets that came one by one, none was kept from the training

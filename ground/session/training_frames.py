@@ -2,7 +2,7 @@
 
 import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -19,13 +19,16 @@ SHOWN_PX = 0.2  # a target that moves by less during an exposure is taken as sta
 TEST_INTERVAL = 8  # every eighth bracket is held out
 
 
-def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
+def split(
+    session: Session, on_warning: Callable[[str], None] = log.warning
+) -> tuple[list[FrameRecord], list[FrameRecord]]:
     """Return the training frames and the held-out test frames of a session.
 
     Where the frames state their splits, those of `test` are held out, or those of `val` where there is no test frame;
     otherwise the frames of `val` are in neither list. Where nothing but `train` is stated, and where no split is, every
     eighth bracket is held out as a whole (`is_held_out`); where that is none, the last one; a single bracket is all for
-    training. Frames that are not `usable` are in neither list, nor are those whose picture is damaged.
+    training. Frames that are not `usable` are in neither list, nor are those whose picture is damaged: `on_warning` is
+    called with what is left out.
 
     Raises:
         SessionError: no frame is left, or none that is for training; or a picture cannot be read.
@@ -38,11 +41,12 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
             "pose"
         )
     if len(frames) < len(session.frames):
-        log.warning(
-            "%d frames are left out: in eclipse, or without a valid pose or the Sun's direction",
-            len(session.frames) - len(frames),
+        count = len(session.frames) - len(frames)
+        on_warning(
+            f"left out: {count} of {len(session.frames)} frames, in eclipse, or without a valid pose or "
+            "the Sun's direction"
         )
-    frames = whole(session, frames)
+    frames = whole(session, frames, on_warning)
     stated = {name: [r for r in frames if r.split == name] for name in SPLITS}
     if any(stated.values()) and not stated["train"]:
         raise SessionError(
@@ -57,7 +61,9 @@ def split(session: Session) -> tuple[list[FrameRecord], list[FrameRecord]]:
     return [r for r in frames if r.bracket not in chosen], [r for r in frames if r.bracket in chosen]
 
 
-def whole(session: Session, records: Sequence[FrameRecord]) -> list[FrameRecord]:
+def whole(
+    session: Session, records: Sequence[FrameRecord], on_warning: Callable[[str], None] = log.warning
+) -> list[FrameRecord]:
     """Return the frames whose pictures are not damaged; a warning names the others.
 
     Raises:
@@ -65,11 +71,9 @@ def whole(session: Session, records: Sequence[FrameRecord]) -> list[FrameRecord]
     """
     damaged = {record.id for record in records if not session.is_whole(record)}
     if damaged:
-        log.warning(
-            "the pictures of %d frames are damaged and left out: %s; `ground uplink resend` asks for what is still on "
-            "board",
-            len(damaged),
-            ", ".join(map(str, sorted(damaged))),
+        on_warning(
+            f"the pictures of {len(damaged)} frames are damaged and left out: {', '.join(map(str, sorted(damaged)))}; "
+            "`ground uplink resend` asks for what is still on board"
         )
     return [record for record in records if record.id not in damaged]
 

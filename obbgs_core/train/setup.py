@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import hashlib
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -29,16 +28,13 @@ from obbgs_core.methods.config import MethodConfig, few_share
 from obbgs_core.methods.presets import limited
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
-from obbgs_core.sensor import Sensor
+from obbgs_core.sensor import Sensor, unusual_unit
 from obbgs_core.sky_level import SkyLevel, levelled, with_noise_seen
 from obbgs_core.start.alignment import settled
 from obbgs_core.start.hull import Silhouette, light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
 from obbgs_core.start.texture import textured_pixels
 
-log = logging.getLogger(__name__)
-# full scale at the mean exposure may be a radiance between this and its inverse without harm
-USUAL_FULL_SCALE = 10.0
 MOST_HIDDEN = 0.01  # share of the first Gaussians that may be nearer to the cameras than what is drawn
 # Albedos under Lambert's law turn with the Sun where no two Suns are further apart: over part of the sphere harmonics
 # describe what light from other parts and coarse shadows do, all round it they do not (experiment 075).
@@ -59,7 +55,8 @@ class TrainingSetup:
     unit_m: float  # the method's unit of length
     radiance_unit: float  # the method's unit of radiance
     sun_span_deg: float  # largest angle between two frames' Suns, body frame
-    start: str  # where the first Gaussians came from
+    start: str  # where the first Gaussians came from, and what was unusual
+    warnings: list[str]  # what is unusual about the frames, and what was done about it
     budget: str  # the largest number of Gaussians, and what limits it
     shown: int  # Gaussians that a picture can show: more than the budget where it follows the pictures
     reference_exposure_s: float | None  # what every exposure was taken for when exposure is ignored
@@ -160,7 +157,8 @@ def prepare(
     rng, seen = torch.Generator().manual_seed(seed), silhouettes(lit, sensor, known)
     outlines, poses, why = settled(lit, seen, config.poses.refine != "never", refined)
     posed = lit if poses is None else poses.frames(lit)
-    noise += _unusual_unit(lit, sensor)
+    white = sensor.full_scale_radiance(mean_exposure_s(lit))
+    warnings = [text for text in (hot, noise, unusual_unit(white)) if text]
     certain = {i: held(outline.certain) for i, outline in outlines.items()}
     lit_pixels = [int(whole(mask).sum()) for mask in certain.values()]
     config, shown, budget = limited(config, lit_pixels, textured_pixels(posed, certain, sensor))
@@ -171,7 +169,6 @@ def prepare(
     span_deg = sun_span_deg(lit)
     sky, solid = _masks(outlines, config, span_deg, lit)
     parts = windows(posed, gaussians.means.detach(), certain) if published.windows else None
-    white = sensor.full_scale_radiance(mean_exposure_s(lit))
     setup = TrainingSetup(
         frames=lit,
         sensor=sensor,
@@ -183,7 +180,8 @@ def prepare(
         unit_m=camera_extent_m(lit) if published.length_unit == "cameras" else radius_m,
         radiance_unit=white if published.radiance_unit == "full_scale" else 1.0,
         sun_span_deg=span_deg,
-        start=start + hot + noise,
+        start="; ".join([start, *warnings]),
+        warnings=warnings if sky_level.fits else [str(sky_level), *warnings],
         budget=budget,
         shown=shown,
         reference_exposure_s=reference_exposure_s,
@@ -243,16 +241,3 @@ def _check_nearness(points: Tensor, frames: list[TrainingFrame]) -> None:
             f"{hidden:.0%} of the target is nearer to the cameras than {near_m} m and is not drawn: are the poses "
             "in metres? Scale their positions up, by a thousand if they are in kilometres"
         )
-
-
-def _unusual_unit(frames: list[TrainingFrame], sensor: Sensor) -> str:
-    """Return a warning, also logged, if radiance is measured in a unit in which full scale is far from 1."""
-    white = sensor.full_scale_radiance(mean_exposure_s(frames))
-    if 1 / USUAL_FULL_SCALE <= white <= USUAL_FULL_SCALE:
-        return ""
-    unusual = (
-        f"full scale is a radiance of {white:.2g}, and trainings are tuned to about 1: choose the unit of radiance so, "
-        f"for instance with {white:.2g} times the gain dn_per_radiance_s"
-    )
-    log.warning(unusual)
-    return f"; {unusual}"

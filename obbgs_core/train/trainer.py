@@ -52,6 +52,7 @@ def train(
     time_limit_s: float = math.inf,
     checkpoint: Path | None = None,
     should_stop: Callable[[], bool] = lambda: False,
+    on_warning: Callable[[str], None] = log.warning,
 ) -> TrainResult:
     """Fit Gaussians to frames.
 
@@ -62,6 +63,7 @@ def train(
 
     Args:
         should_stop: called after each step; when it returns true, the training is saved and ends in `Interrupted`.
+        on_warning: called with each thing that is unusual about the frames.
 
     Raises:
         TooFewFrames: fewer than three frames.
@@ -69,7 +71,7 @@ def train(
         Diverged: the loss, or all of the Gaussians, stopped being finite.
         Interrupted: should_stop returned true.
     """
-    trainer = Trainer(frames, sensor, config, seed)
+    trainer = Trainer(frames, sensor, config, seed, on_warning)
     if checkpoint is not None and trainer.resume(checkpoint):
         log.info("resumed at step %d of %d", trainer.state.steps_done, config.steps)
     saved = time.monotonic()
@@ -107,10 +109,19 @@ class Trainer:
     """
 
     @torch_on_one_thread()
-    def __init__(self, frames: list[TrainingFrame], sensor: Sensor, config: MethodConfig, seed: int = 0):
+    def __init__(
+        self,
+        frames: list[TrainingFrame],
+        sensor: Sensor,
+        config: MethodConfig,
+        seed: int = 0,
+        on_warning: Callable[[str], None] = log.warning,
+    ):
         began, self._backend = time.monotonic(), backend_for(config.device)
         self._given, self._stated = frames, sensor
         self.setup, start = prepare(frames, sensor, config, seed)
+        for warning in self.setup.warnings:
+            on_warning(warning)
         self.state = TrainingState.first(self.setup, start)
         self.state.seconds = time.monotonic() - began
 

@@ -1,6 +1,7 @@
 """A pass whose empty sky is above the stated black level, from session to report."""
 
 import json
+import logging
 
 import pytest
 
@@ -43,3 +44,18 @@ def test_a_pedestal_is_measured_reported_and_costs_no_score(tmp_path):
     assert "Level of empty sky" not in write_report(tmp_path / "plain", "run").read_text()
     kept = json.loads((tmp_path / "raised/runs/run/metrics.json").read_text())
     assert len(kept["sky_level_dn"]) == kept["frames_trained"]
+
+
+def test_what_is_unusual_about_frames_is_told_once_from_session_to_report(tmp_path, caplog):
+    """Two trainings, the scores and the report all read the same frames, and measure their sky."""
+    session = small_session(tmp_path / "raised", pedestal_dn=PEDESTAL_DN)
+    lines = [json.loads(line) for line in (session / "frames.jsonl").read_text().splitlines()]
+    lines[3]["in_eclipse"] = True
+    (session / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    reconstruct(session, "run", "obbgs", QUICK | {"steps": 20, "blind_reference": True})
+    evaluate(session, "run")
+    write_report(session, "run")
+    warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    for begins in ("empty sky reads", "left out: 1 of 24 frames, in eclipse"):
+        assert len([text for text in warnings if text.startswith(begins)]) == 1, warnings
+    assert len(warnings) == len(set(warnings))

@@ -48,7 +48,7 @@ def test_hot_pixels_are_found_and_no_others(seed, number, channels):
     frames = read(light + more_dn[..., None], rng)
     assert torch.equal(hot_pixels(frames, SENSOR), torch.from_numpy(hot))
     cleaned, said = without_hot_pixels(frames, SENSOR)
-    assert said.startswith("; 6 hot pixels")
+    assert said.startswith("6 hot pixels")
     for before, after in zip(frames, cleaned, strict=True):
         assert torch.equal(before.dn[~hot], after.dn[~hot])
         row, column = np.argwhere(hot)[0]
