@@ -15,12 +15,12 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from flightsw.downlink import DownlinkProgress
-from flightsw.fsck import fsck
+from flightsw.capture.sequencer import plan
+from flightsw.downlink.loop import DownlinkProgress
 from flightsw.icd.config import ConfigError, keys_below, require
 from flightsw.icd.mission import BracketSection, Mission, load_mission
 from flightsw.run import RunResult, run_pass
-from flightsw.sequencer import plan
+from flightsw.storage.fsck import fsck
 from obbgs_base.command_line import (
     BRACKET_HELP,
     CAMERA_HELP,
@@ -139,7 +139,7 @@ def triage(
 
     Example: flightsw triage --model model.onnx --store store
     """
-    from flightsw.triage import rank_frames  # only this command needs onnxruntime
+    from flightsw.triage.scores import rank_frames  # only this command needs onnxruntime
 
     K = np.array(load_mission(mission).camera.K)
     ranked, unreadable = rank_frames(model, store, K)
@@ -168,7 +168,7 @@ def plan_command(mission: MissionFile = Path("mission.yaml"), json_: AsJson = Fa
 
     Example: flightsw plan --mission mission.yaml
     """
-    from flightsw.planning import pass_plan
+    from flightsw.capture.planning import pass_plan
 
     loaded = load_mission(mission)
     planned = pass_plan(loaded)

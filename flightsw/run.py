@@ -10,20 +10,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flightsw.boot_counter import count_boot
 from flightsw.cameras import open_camera
 from flightsw.cameras.reconnecting import PATIENCE_S, RETRY_S, ReconnectingCamera
+from flightsw.capture.sequencer import CaptureCounts, capture
 from flightsw.clock import utc_ns
-from flightsw.commands import KeyRing
-from flightsw.downlink import DownlinkProgress, run_downlink
+from flightsw.downlink.commands import KeyRing
+from flightsw.downlink.housekeeping import EventLog
+from flightsw.downlink.loop import DownlinkProgress, run_downlink
 from flightsw.errors import CameraLost, CaptureError, StoreError
-from flightsw.housekeeping import EventLog
 from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.icd.mission import Mission
 from flightsw.ports import Link, open_link
-from flightsw.sequencer import CaptureCounts, capture
-from flightsw.settings import load_settings
-from flightsw.store import FrameStore, open_store
+from flightsw.storage.boot_counter import count_boot
+from flightsw.storage.settings import load_settings
+from flightsw.storage.store import FrameStore, open_store
 from flightsw.watchdog import Watchdog, notify
 
 log = logging.getLogger(__name__)

@@ -12,10 +12,10 @@ from typing import Literal
 import numpy as np
 
 import ground.session.truth
+from flightsw.capture.sequencer import Shot, plan
 from flightsw.icd.config import ConfigError, assignment, build, in_file, parse_yaml
 from flightsw.icd.frame import Frame, encode_frame
 from flightsw.icd.mission import Mission
-from flightsw.sequencer import Shot, plan
 from ground.formats.nerf import export_nerf
 from ground.session.folder import open_session
 from ground.session.telemetry import FlightCounts

@@ -9,7 +9,7 @@ import trimesh
 
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission
-from flightsw.pose import pose_tag
+from flightsw.navigation.pose import pose_tag
 from ground.session import truth
 from ground.session.folder import Session, open_session
 from hil.sky.render_farm import RenderFarm

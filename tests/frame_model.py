@@ -22,16 +22,16 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from flightsw.commands import KeyRing
-from flightsw.downlink import _Downlink
+from flightsw.downlink.commands import KeyRing
+from flightsw.downlink.housekeeping import EventLog
+from flightsw.downlink.loop import _Downlink
 from flightsw.errors import StoreFull
-from flightsw.housekeeping import EventLog
 from flightsw.icd.auth import Key
 from flightsw.icd.frame import Frame, PoseTag
 from flightsw.icd.mission import load_mission
-from flightsw.settings import Settings, save_settings
-from flightsw.store import FrameStore, lock_store
-from flightsw.transfer_numbers import TransferNumbers
+from flightsw.storage.settings import Settings, save_settings
+from flightsw.storage.store import FrameStore, lock_store
+from flightsw.storage.transfer_numbers import TransferNumbers
 from ground.link.ingest import _Ingest
 from ground.link.uplink import make_key, outcome, parse_command, submit
 from ground.session.writer import SessionWriter

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from flightsw.icd.mission import load_mission
 from flightsw.icd.quaternion import quat_to_matrix
-from flightsw.pose import pose_tag, target_attitude
+from flightsw.navigation.pose import pose_tag, target_attitude
 from ground import cli
 from ground.session.folder import Session, open_session
 

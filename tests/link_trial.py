@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from flightsw.icd.frame import Frame, PoseTag, decode_frame, encode_frame
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
 from ground.session.folder import open_session
 from hil.links.faults import Faults
 from hil.links.virtual_can import VirtualCan
@@ -38,7 +38,7 @@ import sys, time
 from pathlib import Path
 from flightsw.errors import StoreError
 from flightsw.icd.frame import decode_frame
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
 for path in sorted(Path(sys.argv[2]).iterdir()):
     frame = decode_frame(path.read_bytes())
     while True:

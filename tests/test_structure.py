@@ -43,8 +43,16 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     "flightsw.errors": {"obbgs_base"},
     "flightsw.clock": set(),
     "flightsw.cameras": {"obbgs_base", "flightsw.icd", "flightsw.errors", "flightsw.clock"},
-    "flightsw": CONTRACT
-    | {"flightsw.icd.ndm", "flightsw.ports", "flightsw.errors", "flightsw.clock", "flightsw.cameras"},
+    "flightsw.storage": CONTRACT | {"flightsw.errors"},
+    "flightsw.navigation": {"obbgs_base", "flightsw.icd", "flightsw.icd.ndm", "flightsw.errors"},
+    "flightsw.capture": {"obbgs_base", "flightsw.icd", "flightsw.errors", "flightsw.cameras"}
+    | {"flightsw.navigation", "flightsw.storage"},
+    "flightsw.triage": {"obbgs_base", "flightsw.icd", "flightsw.errors", "flightsw.storage"},
+    "flightsw.downlink": CONTRACT
+    | {"flightsw.ports", "flightsw.errors", "flightsw.clock", "flightsw.storage", "flightsw.triage"},
+    "flightsw": {"obbgs_base", "flightsw.icd"}
+    | {"flightsw.icd.ndm", "flightsw.ports", "flightsw.errors", "flightsw.clock", "flightsw.cameras"}
+    | {f"flightsw.{room}" for room in ("storage", "navigation", "capture", "triage", "downlink")},
     "ground.session": {"obbgs_base", "flightsw.icd", "obbgs_core", "obbgs_core.model", "obbgs_core.render"},
     "ground.link": CONTRACT | {"flightsw.ports", "ground.session"},
     "ground.formats": {"obbgs_base", "flightsw.icd", "flightsw.icd.ndm", "ground.session"},
@@ -80,17 +88,25 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     "compare.command": {"obbgs_base", "ground.commands", "compare", "compare.grid", "compare.charts"},
     "hil.watched": {"obbgs_base"},
     "hil.sky": {"obbgs_base", "flightsw.icd"},
-    "hil.world": {"obbgs_base", "flightsw.icd", "flightsw", "flightsw.cameras"},
+    "hil.world": {
+        "obbgs_base",
+        "flightsw.icd",
+        "flightsw.navigation",
+        "flightsw.capture",
+        "flightsw.cameras",
+    },
     "hil.links": {"obbgs_base", "flightsw.icd", "hil.watched"},
     "hil.cameras": {
-        *("obbgs_base", "flightsw.icd", "flightsw", "flightsw.cameras", "flightsw.errors"),
+        *("obbgs_base", "flightsw.icd", "flightsw.cameras", "flightsw.errors"),
+        "flightsw.navigation",
         *("hil.sky", "hil.world", "hil.watched"),
     },
     "hil": {
         *(
             "obbgs_base",
             "flightsw.icd",
-            "flightsw",
+            "flightsw.navigation",
+            "flightsw.capture",
             "ground.session",
             "ground.formats",
             "ground.show",

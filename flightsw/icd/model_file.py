@@ -6,7 +6,7 @@ onnxruntime alone would not do: it runs its own com.microsoft operators, declare
 tensor names, and turns in a Loop for as long as the file says. Only the operators that our renderers are made of are
 taken. Of those with a body it is Scan alone, not within another: it turns once for each element of a tensor. They can
 still multiply their tensors beyond any memory, so the spacecraft also tries a model under limits
-(`flightsw/model_process.py`).
+(`flightsw/triage/model_process.py`).
 """
 
 from collections.abc import Iterator

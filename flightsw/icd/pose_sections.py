@@ -67,9 +67,9 @@ class PoseSection:
 
 @dataclass(frozen=True)
 class NavigationSection:
-    """Where the pose comes from: the two-line elements, states as JSON lines (flightsw/navigation.py), or messages.
+    """Where the pose comes from: two-line elements, states as JSON lines (flightsw/navigation/stream.py), or messages.
 
-    ndm:///folder holds CCSDS messages of both satellites (flightsw/message_navigation.py), which say themselves how
+    ndm:///folder holds CCSDS messages of both satellites (flightsw/navigation/messages.py), which say themselves how
     they are interpolated.
     """
 

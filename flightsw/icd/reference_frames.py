@@ -91,7 +91,7 @@ def low_precision_sun(utc_ns: int) -> np.ndarray:
     """Return the unit vector [3] from the Earth to the Sun, GCRS, within 0.01 degrees from 1950 to 2050.
 
     Source: Astronomical Almanac, low-precision formulas, with the longitude counted from the equinox of J2000. Flight
-    has the Sun from DE421 (flightsw/orbit.py).
+    has the Sun from DE421 (flightsw/navigation/orbit.py).
     """
     jd, fr = julian_date(utc_ns)
     days = (jd - 2_451_545.0) + fr

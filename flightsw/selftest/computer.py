@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from sgp4.api import Satrec
 
-from flightsw.commands import ReplayCounter
+from flightsw.downlink.commands import ReplayCounter
 from flightsw.icd.config import ConfigError
 from flightsw.icd.frame import Frame, PoseTag, encode_frame
 from flightsw.icd.mission import Mission

@@ -5,12 +5,12 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from flightsw.capture.planning import field_of_view
 from flightsw.errors import NavigationError, OrbitError
 from flightsw.icd.mission import Mission
-from flightsw.message_navigation import MessageNavigation
-from flightsw.orbit import propagate, sun_position_gcrs
-from flightsw.planning import field_of_view
-from flightsw.pose import open_navigation
+from flightsw.navigation.messages import MessageNavigation
+from flightsw.navigation.orbit import propagate, sun_position_gcrs
+from flightsw.navigation.pose import open_navigation
 from flightsw.selftest.finding import Finding
 
 NS = 1_000_000_000

@@ -20,7 +20,7 @@ import numpy as np
 from flightsw.cameras.aravis import PIXEL_FORMATS, aravis
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import CameraSection, Mission
-from flightsw.pose import pose_tag
+from flightsw.navigation.pose import pose_tag
 from hil.sky.sensor import expose
 from hil.watched import WatchedThread
 from hil.world.clock import SimulatedClock

@@ -21,7 +21,7 @@ import numpy as np
 from flightsw.errors import FlightError
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission
-from flightsw.pose import pose_tag
+from flightsw.navigation.pose import pose_tag
 from hil.sky.blender import BlenderError
 from hil.sky.sensor import expose
 from hil.watched import WatchedThread

@@ -9,8 +9,8 @@ from scipy.integrate import OdeSolution, solve_ivp
 
 from flightsw.icd.mission import ConfigError
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
-from flightsw.orbit import propagate, sun_direction_gcrs
-from flightsw.pose import look_along
+from flightsw.navigation.orbit import propagate, sun_direction_gcrs
+from flightsw.navigation.pose import look_along
 
 Attitude = Callable[[int], np.ndarray]  # UTC ns to gcrs_to_body [3, 3]
 

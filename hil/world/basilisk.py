@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from flightsw.icd.config import require, require_counts
 from flightsw.icd.mission import OrbitSection
 from flightsw.icd.reference_frames import teme_to_gcrs
-from flightsw.orbit import OrbitState, propagate, sun_position_gcrs
+from flightsw.navigation.orbit import OrbitState, propagate, sun_position_gcrs
 from hil.world.attitude import AttitudeSection, motion_at_start
 
 # GGM03S (Tapley et al., 2007): the Earth, and its zonal harmonics of degree 0 to 6, normalised

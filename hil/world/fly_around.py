@@ -1,6 +1,6 @@
 """Relative orbits about a target: designed by the linear solution, and turned into a TLE for the chaser.
 
-TEME, kilometres and SGP4's mean elements occur in this file and in flightsw/orbit.py only.
+TEME, kilometres and SGP4's mean elements occur in this file and in flightsw/navigation/orbit.py only.
 """
 
 import math

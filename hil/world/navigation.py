@@ -14,8 +14,8 @@ from flightsw.icd.config import MAX_YAML_BYTES, ConfigError, parse_yaml
 from flightsw.icd.mission import Mission, NavigationSection
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.icd.tle import orbit_axes
-from flightsw.orbit import OrbitState
-from flightsw.pose import look_along
+from flightsw.navigation.orbit import OrbitState
+from flightsw.navigation.pose import look_along
 from hil.world.navigation_errors import NOISE_DEG, NavigationErrors, draw, stated_sigmas, turned
 from hil.world.world import World
 from obbgs_base.files import read_bounded, write_whole
@@ -86,7 +86,7 @@ def _rate_deg_s(world: World, utc_ns: int) -> np.ndarray:
 def _states(
     world: World, section: NavigationSection, errors: NavigationErrors | None, seed: int | None
 ) -> Iterator[dict]:
-    """Yield the navigation states of a pass, in the format that flightsw/navigation.py reads.
+    """Yield the navigation states of a pass, in the format that flightsw/navigation/stream.py reads.
 
     The camera really points at the target; what errs is where navigation believes the chaser, the camera's axes and the
     target's to be, and at what time.

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from flightsw.capture.sequencer import plan
 from flightsw.icd.config import MAX_YAML_BYTES, ConfigError, build, in_file, keys_below, parse_yaml
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import BracketSection, Mission, OrbitSection, PoseSection
 from flightsw.icd.quaternion import matrix_to_quat
-from flightsw.orbit import OrbitState, propagate, sun_direction_gcrs, sunlit_fraction
-from flightsw.pose import look_along, pose_tag
-from flightsw.sequencer import plan
+from flightsw.navigation.orbit import OrbitState, propagate, sun_direction_gcrs, sunlit_fraction
+from flightsw.navigation.pose import look_along, pose_tag
 from hil.world.attitude import Attitude, AttitudeSection, attitude
 from hil.world.basilisk import BasiliskSection, Flown, flown
 from hil.world.fly_around import Design, FlyAround, RelativeElements, design

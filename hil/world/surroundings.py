@@ -16,7 +16,7 @@ from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import CameraSection, Mission
 from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.icd.reference_frames import julian_date
-from flightsw.orbit import OrbitState, sunlit_fraction
+from flightsw.navigation.orbit import OrbitState, sunlit_fraction
 from hil.world.scenario import sgp4_orbits
 from obbgs_base.earth import camera_rays, earth_radiance, sees_earth, stray_light
 from obbgs_base.stars import star_radiance

@@ -10,8 +10,8 @@ import numpy as np
 from flightsw.icd.frame import Attitude as Knowledge
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, PoseSection, TargetAttitudeSection
-from flightsw.orbit import OrbitState
-from flightsw.pose import pose_tag, target_attitude
+from flightsw.navigation.orbit import OrbitState
+from flightsw.navigation.pose import pose_tag, target_attitude
 from hil.world.attitude import Attitude
 from hil.world.scenario import Scenario, Scene, load_scenario, sgp4_orbits
 

@@ -155,12 +155,12 @@ def a_day(hours: float, folder: Path, show: Callable[[dict[str, Any]], None]) ->
         import numpy as np
 
         import ground.link.ingest
-        from flightsw.commands import KeyRing
-        from flightsw.downlink import run_downlink
+        from flightsw.downlink.commands import KeyRing
+        from flightsw.downlink.loop import run_downlink
         from flightsw.icd.command import Command
         from flightsw.icd.frame import Frame, PoseTag
         from flightsw.icd.mission import load_mission
-        from flightsw.store import open_store
+        from flightsw.storage.store import open_store
         from ground.link.uplink import make_key, outcome, submit
         from ground.session.folder import open_session
 

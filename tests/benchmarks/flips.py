@@ -27,18 +27,18 @@ from typing import Any
 
 import numpy as np
 
-from flightsw.boot_counter import count_boot
-from flightsw.downlink import run_downlink
+from flightsw.downlink.housekeeping import EventLog
+from flightsw.downlink.loop import run_downlink
 from flightsw.errors import FlightError
-from flightsw.housekeeping import EventLog
 from flightsw.icd.frame import Frame, PoseTag
 from flightsw.icd.framing import PacketStream
 from flightsw.icd.mission import Mission, load_mission
 from flightsw.icd.packet import APID_EVENTS, APID_FILES, TELECOMMAND
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import Receiver, timer_s
-from flightsw.settings import Settings, load_settings, save_settings
-from flightsw.store import FrameStore
+from flightsw.storage.boot_counter import count_boot
+from flightsw.storage.settings import Settings, load_settings, save_settings
+from flightsw.storage.store import FrameStore
 from tests.benchmarks import ground_flips
 from tests.benchmarks.rows import shown
 

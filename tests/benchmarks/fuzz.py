@@ -41,7 +41,7 @@ import zlib
 
 import isotp
 
-from flightsw.commands import Commander, KeyRing
+from flightsw.downlink.commands import Commander, KeyRing
 from flightsw.icd.auth import Key, seal, seal_file, unseal, unseal_file
 from flightsw.icd.can import FLIGHT_IDS, GROUND_IDS, MAX_MESSAGE_BYTES, IsoTpChannels
 from flightsw.icd.command import Command, Report
@@ -64,7 +64,7 @@ from flightsw.icd.packet import (
 from flightsw.icd.slcan import FD_SIZES, SlcanText, format_slcan
 from flightsw.icd.telemetry import DICTIONARY, NUMBERS, Item
 from flightsw.icd.transfer import Receiver, Sender, parse_pdu
-from flightsw.store import open_store
+from flightsw.storage.store import open_store
 from ground.link.uplink import Uplinker, parse_command
 from ground.session.telemetry import TelemetryLog
 

@@ -27,7 +27,7 @@ import torch
 
 from flightsw.icd.frame import Frame
 from flightsw.icd.mission import load_mission
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
 from ground.run.estimated_poses import FILE as POSES
 from ground.run.estimated_poses import Alignment, read_estimate
 from ground.session.cameras import exposed, predicted_image, sensor_of

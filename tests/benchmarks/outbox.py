@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from flightsw.commands import KeyRing
-from flightsw.downlink import DownlinkProgress, run_downlink
+from flightsw.downlink.commands import KeyRing
+from flightsw.downlink.loop import DownlinkProgress, run_downlink
 from flightsw.icd.frame import Frame, PoseTag
 from flightsw.icd.mission import Mission, load_mission
-from flightsw.settings import Settings, save_settings
-from flightsw.store import FrameStore
+from flightsw.storage.settings import Settings, save_settings
+from flightsw.storage.store import FrameStore
 from ground.link.ingest import _Ingest
 from ground.link.uplink import make_key, outcome, parse_command, submit
 from ground.session.writer import SessionWriter

@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from flightsw.pose import look_along
+from flightsw.navigation.pose import look_along
 from hil.sky import SHIPPED, SHIPPED_FOIL
 from hil.sky.blender import Worker
 from hil.world.scenario import Scene, load_scenario

@@ -24,9 +24,9 @@ import numpy as np
 import torch
 
 from flightsw.icd.frame import HEADER, Frame, PoseTag
-from flightsw.store import FrameStore
-from flightsw.triage import Ranked, sending_order, sent_view
-from flightsw.triage_worker import ModelVerified, TriageWorker
+from flightsw.storage.store import FrameStore
+from flightsw.triage.scores import Ranked, sending_order, sent_view
+from flightsw.triage.worker import ModelVerified, TriageWorker
 from ground.run.model_files import SURFACE_POINTS
 from ground.session.cameras import camera_of, exposed, sensor_of
 from ground.session.folder import FrameRecord, Session, open_session

@@ -2,7 +2,7 @@
 
 import logging
 
-from flightsw.boot_counter import LOST, count_boot
+from flightsw.storage.boot_counter import LOST, count_boot
 from obbgs_base.checked import copy_of
 
 
@@ -31,12 +31,12 @@ def test_on_a_disk_that_takes_nothing_starts_differ_all_the_same(tmp_path, monke
     def read_only(path, content):
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr("flightsw.store.write_whole", read_only)
+    monkeypatch.setattr("flightsw.storage.store.write_whole", read_only)
     first, second = count_boot(tmp_path), count_boot(tmp_path)
     assert first != second and min(first, second) >= LOST
 
 
 def test_after_the_last_number_comes_zero(tmp_path, monkeypatch):
-    monkeypatch.setattr("flightsw.boot_counter.secrets.randbits", lambda bits: LOST - 1)
+    monkeypatch.setattr("flightsw.storage.boot_counter.secrets.randbits", lambda bits: LOST - 1)
     (tmp_path / "boots.json").write_bytes(b"?")
     assert [count_boot(tmp_path) for _ in range(2)] == [0xFFFF_FFFF, 0]

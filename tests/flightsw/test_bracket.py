@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flightsw.bracket import (
+from flightsw.capture.bracket import (
     HEADROOM,
     SHADOW_SHARE,
     SHADOW_SNR,
@@ -21,9 +21,9 @@ from flightsw.bracket import (
     highlight_signal_dn,
     measured_light,
 )
+from flightsw.capture.region import target_pixels
 from flightsw.icd.mission import BracketSection, CameraSection, load_mission
-from flightsw.pose import pose_tag
-from flightsw.region import target_pixels
+from flightsw.navigation.pose import pose_tag
 from hil.sky.sensor import expose
 
 GOLDEN = Path(__file__).parents[1] / "golden"

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flightsw.fsck import fsck
 from flightsw.icd.frame import decode_frame
 from flightsw.icd.mission import load_mission
-from flightsw.store import FrameStore
+from flightsw.storage.fsck import fsck
+from flightsw.storage.store import FrameStore
 from hil.cameras.virtual import CameraServer
 
 COUNT = 40
@@ -129,7 +129,7 @@ def test_automatic_brackets_find_a_target_darker_than_expected(tmp_path, small_m
 
 
 def test_poses_from_a_navigation_file_go_into_the_frames_and_gaps_are_counted(tmp_path, small_mission):
-    from flightsw.pose import pose_tag
+    from flightsw.navigation.pose import pose_tag
 
     start_ns = small_mission.orbit.start_utc_ns
     lines = []
@@ -162,7 +162,7 @@ def test_poses_from_a_navigation_file_go_into_the_frames_and_gaps_are_counted(tm
 def test_frames_outside_the_ephemeris_are_kept_without_a_pose(tmp_path, small_mission):
     """DE421 ends in 2053; the camera does not mind."""
     from flightsw.cameras.camera import Exposure
-    from flightsw.sequencer import capture
+    from flightsw.capture.sequencer import capture
 
     class Clock:
         has_own_clock = True

@@ -13,8 +13,8 @@ from flightsw import run
 from flightsw.cameras.camera import Exposure
 from flightsw.cameras.reconnecting import ReconnectingCamera
 from flightsw.clock import CONFIRM_NS, STEP_NS, SteadyClock
+from flightsw.downlink.housekeeping import EventLog
 from flightsw.errors import CaptureError
-from flightsw.housekeeping import EventLog
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.watchdog import Watchdog
 
@@ -124,7 +124,7 @@ def test_a_computer_that_starts_in_the_past_loses_what_is_due_while_its_clock_is
 
 @pytest.fixture
 def store(tmp_path):
-    from flightsw.store import FrameStore
+    from flightsw.storage.store import FrameStore
 
     return FrameStore(tmp_path / "store")
 

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flightsw.commands import ANSWER_S, DELETE_S, RESERVE_BYTES, Commander, KeyRing, ReplayCounter
+from flightsw.downlink.commands import ANSWER_S, DELETE_S, RESERVE_BYTES, Commander, KeyRing, ReplayCounter
 from flightsw.icd.auth import MAX_COUNTER, Key, digest, seal, seal_file
 from flightsw.icd.command import Command
 from flightsw.icd.config import ConfigError
 from flightsw.icd.telemetry import DICTIONARY
-from flightsw.settings import load_settings
-from flightsw.store import FrameStore
+from flightsw.storage.settings import load_settings
+from flightsw.storage.store import FrameStore
 from ground.link.uplink import make_key
 from obbgs_base.files import write_whole
 from tests.small_disk import fill_disk, small_disk
@@ -206,7 +206,7 @@ def test_the_counter_is_kept_in_the_reserve_of_a_full_disk_which_is_made_again(
             raise OSError(error, os.strerror(error))
         write_whole(path, content)
 
-    monkeypatch.setattr("flightsw.store.write_whole", full_disk)
+    monkeypatch.setattr("flightsw.storage.store.write_whole", full_disk)
     assert spacecraft.send("ping")[-1] == ("completed", "alive")
     assert not reserve.exists()
     is_full = False

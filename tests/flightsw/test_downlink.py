@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 from spacepackets.cfdp.pdu import FileDataPdu, MetadataPdu
 
-from flightsw.commands import KeyRing
-from flightsw.downlink import LAST_TELEMETRY_S, RESTARTS, WAIT_S, run_downlink
+from flightsw.downlink.commands import KeyRing
+from flightsw.downlink.housekeeping import MAX_EVENTS, EventLog, ProcessMeter
+from flightsw.downlink.loop import LAST_TELEMETRY_S, RESTARTS, WAIT_S, run_downlink
 from flightsw.errors import DownlinkError
-from flightsw.housekeeping import MAX_EVENTS, EventLog, ProcessMeter
 from flightsw.icd.auth import Key, seal, seal_file
 from flightsw.icd.command import Command, model_file_name
 from flightsw.icd.frame import HEADER, read_header
@@ -35,9 +35,9 @@ from flightsw.icd.packet import (
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import UPLINK, Receiver, Sender, Verdict, answer_key, parse_pdu
 from flightsw.icd.transfer.checksum import TYPES
-from flightsw.settings import Settings, save_settings
-from flightsw.store import FrameStore
-from flightsw.triage_worker import ModelProcess
+from flightsw.storage.settings import Settings, save_settings
+from flightsw.storage.store import FrameStore
+from flightsw.triage.worker import ModelProcess
 from ground.link.uplink import make_key
 
 
@@ -186,7 +186,7 @@ def test_warnings_of_any_part_become_events_and_the_end_is_told(store, small_mis
 
     def warn(_progress) -> None:
         if link.now_s < 0.001:
-            logging.getLogger("flightsw.sequencer").warning("bracket %d lost\x1b[2J", 7)
+            logging.getLogger("flightsw.capture.sequencer").warning("bracket %d lost\x1b[2J", 7)
 
     fly(link, store, small_mission, 0.5, on_progress=warn)
     events = link.unpacked(APID_EVENTS, "events")
@@ -428,7 +428,7 @@ class FailingLink(ListLink):
 
 @pytest.fixture
 def no_pause(monkeypatch):
-    monkeypatch.setattr("flightsw.downlink.RESTART_S", 0.0)
+    monkeypatch.setattr("flightsw.downlink.loop.RESTART_S", 0.0)
 
 
 def test_a_failure_that_nobody_foresaw_is_told_and_the_downlink_goes_on(store, small_mission, no_pause):
@@ -461,7 +461,7 @@ def test_a_downlink_that_fails_at_every_start_ends_with_an_error(store, small_mi
 
 
 def test_rare_failures_never_end_the_downlink(store, small_mission, no_pause, monkeypatch):
-    monkeypatch.setattr("flightsw.downlink.SOUND_S", 1.0)
+    monkeypatch.setattr("flightsw.downlink.loop.SOUND_S", 1.0)
     link = FailingLink(*(1.5 * number for number in range(1, RESTARTS + 3)))
     assert fly(link, store, small_mission, 1.5 * (RESTARTS + 3)).restarts == RESTARTS + 2
 
@@ -547,10 +547,10 @@ def test_fsck_by_command_repairs_the_store_while_flight_goes_on(store, small_mis
 def test_a_dead_downlink_is_no_success_of_the_program(tmp_path, small_mission):
     """`flightsw downlink` as a process whose port driver has a defect."""
     code = """
-import sys, flightsw.downlink, flightsw.ports
+import sys, flightsw.downlink.loop, flightsw.ports
 def exchange(self, timeout_s): raise ZeroDivisionError("a defect")
 flightsw.ports.SerialLink.exchange = exchange
-flightsw.downlink.RESTART_S = 0.0
+flightsw.downlink.loop.RESTART_S = 0.0
 from flightsw.cli import main
 main()
 """

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from flightsw.orbit import EPHEMERIS
+from flightsw.navigation.orbit import EPHEMERIS
 from tests.wheels import flight_wheel
 
 ROOT = Path(__file__).parents[2]

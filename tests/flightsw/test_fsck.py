@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 
 from flightsw.cli import app
 from flightsw.errors import StoreError
-from flightsw.fsck import fsck
 from flightsw.icd.frame import decode_frame, encode_frame
-from flightsw.settings import Settings, save_settings
-from flightsw.store import FrameStore
+from flightsw.storage.fsck import fsck
+from flightsw.storage.settings import Settings, save_settings
+from flightsw.storage.store import FrameStore
 
 COUNT = 5
 

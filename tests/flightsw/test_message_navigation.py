@@ -10,9 +10,9 @@ from flightsw.errors import NavigationError
 from flightsw.icd.mission import Mission, NavigationSection, load_mission
 from flightsw.icd.ndm.write import Object, write_aem, write_oem
 from flightsw.icd.quaternion import matrix_to_quat
-from flightsw.message_navigation import MessageNavigation
-from flightsw.orbit import propagate
-from flightsw.pose import PoseTagger, pose_tag, target_attitude
+from flightsw.navigation.messages import MessageNavigation
+from flightsw.navigation.orbit import propagate
+from flightsw.navigation.pose import PoseTagger, pose_tag, target_attitude
 from flightsw.selftest import planned_pass
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")

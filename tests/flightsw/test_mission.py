@@ -13,7 +13,7 @@ from sgp4.io import compute_checksum
 from flightsw.icd.config import ConfigError, build
 from flightsw.icd.mission import Mission, load_mission
 from flightsw.icd.tle import orbit_axes, tle_checksum
-from flightsw.orbit import propagate
+from flightsw.navigation.orbit import propagate
 
 TEXT = (Path(__file__).parents[2] / "mission.yaml").read_text()
 TREE = yaml.safe_load(TEXT)

@@ -17,9 +17,15 @@ from scipy.spatial.transform import Rotation, Slerp
 from flightsw.errors import NavigationError
 from flightsw.icd.mission import Mission, NavigationSection, load_mission
 from flightsw.icd.quaternion import quat_to_matrix
-from flightsw.navigation import NavigationStream, RelativePose, SatelliteStates, interpolate, parse_state
-from flightsw.orbit import propagate
-from flightsw.pose import PoseTagger, navigation_tag, pose_tag, target_attitude
+from flightsw.navigation.orbit import propagate
+from flightsw.navigation.pose import PoseTagger, navigation_tag, pose_tag, target_attitude
+from flightsw.navigation.stream import (
+    NavigationStream,
+    RelativePose,
+    SatelliteStates,
+    interpolate,
+    parse_state,
+)
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")
 START_NS = MISSION.orbit.start_utc_ns
@@ -337,8 +343,8 @@ def test_a_clock_that_is_wrong_for_some_states_costs_the_poses_of_that_time_only
 
 
 def test_a_file_that_holds_the_whole_pass_keeps_what_later_exposures_need(tmp_path, monkeypatch):
-    monkeypatch.setattr("flightsw.navigation.MAX_STATES", 6)
-    monkeypatch.setattr("flightsw.navigation.READ_AHEAD", 3)
+    monkeypatch.setattr("flightsw.navigation.stream.MAX_STATES", 6)
+    monkeypatch.setattr("flightsw.navigation.stream.READ_AHEAD", 3)
     path = tmp_path / "states.jsonl"
     path.write_bytes(b"".join(LINES[:1] + LINES[4:]))  # a gap of 4 s at the beginning
     stream = NavigationStream(NavigationSection(f"file://{path}", wait_s=0.0))
@@ -352,7 +358,7 @@ def test_a_file_that_holds_the_whole_pass_keeps_what_later_exposures_need(tmp_pa
 
 def test_a_filter_that_starts_again_with_the_right_time_is_followed(monkeypatch):
     """Its time was a year ahead for longer than the stream reads on: flight hangs up, and the filter is there anew."""
-    monkeypatch.setattr("flightsw.navigation.READ_AHEAD", 5)
+    monkeypatch.setattr("flightsw.navigation.stream.READ_AHEAD", 5)
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def filter_process() -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from flightsw.capture.planning import pass_plan
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import load_mission
 from flightsw.new_mission import EXAMPLE, write_mission
-from flightsw.planning import pass_plan
 from flightsw.selftest.planned_pass import check_orbit, check_view
 from flightsw.service import unit
 from tests.commands import call

@@ -14,7 +14,7 @@ from skyfield.sgp4lib import TEME
 
 from flightsw.errors import OrbitError
 from flightsw.icd.mission import load_mission
-from flightsw.orbit import EPHEMERIS, in_eclipse, propagate, sun_position_gcrs, teme_to_gcrs
+from flightsw.navigation.orbit import EPHEMERIS, in_eclipse, propagate, sun_position_gcrs, teme_to_gcrs
 
 ROOT = Path(__file__).parents[2]
 ARCSEC_RAD = np.pi / 648_000

@@ -9,10 +9,10 @@ import pytest
 from skyfield.almanac import find_discrete
 from skyfield.api import EarthSatellite
 
+from flightsw.capture.planning import pass_plan
 from flightsw.icd.mission import load_mission
-from flightsw.orbit import shadow_crossings
-from flightsw.planning import pass_plan
-from flightsw.pose import pose_tag
+from flightsw.navigation.orbit import shadow_crossings
+from flightsw.navigation.pose import pose_tag
 from hil.sky.sensor import clean_dn
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")

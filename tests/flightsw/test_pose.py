@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from flightsw.errors import NavigationError
 from flightsw.icd.mission import Mission, load_mission
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
-from flightsw.navigation import RelativePose, SatelliteStates
-from flightsw.orbit import propagate, sun_direction_gcrs
-from flightsw.pose import look_along, navigation_tag, pose_tag, target_attitude
+from flightsw.navigation.orbit import propagate, sun_direction_gcrs
+from flightsw.navigation.pose import look_along, navigation_tag, pose_tag, target_attitude
+from flightsw.navigation.stream import RelativePose, SatelliteStates
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")
 START_NS = MISSION.orbit.start_utc_ns

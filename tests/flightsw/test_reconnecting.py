@@ -18,10 +18,10 @@ from flightsw import run
 from flightsw.cameras import open_camera
 from flightsw.cameras.camera import Exposure
 from flightsw.cameras.reconnecting import PATIENCE_S, RETRY_S, ReconnectingCamera
+from flightsw.capture.sequencer import capture
 from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.mission import load_mission
-from flightsw.sequencer import capture
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
 from flightsw.watchdog import Watchdog
 from hil.links.virtual_serial import VirtualSerial
 

@@ -12,19 +12,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flightsw.capture.sequencer import CaptureCounts
 from flightsw.errors import OrbitError, StoreError
 from flightsw.icd.codestream import decode_pixels
 from flightsw.icd.config import ConfigError, build
 from flightsw.icd.mission import load_mission
 from flightsw.icd.model_file import MAX_MODEL_BYTES, ModelUnfit, check_for_triage, check_model
 from flightsw.icd.packet import PacketError
-from flightsw.orbit import EARTH_RADIUS_M, SUN_RADIUS_M, propagate, sun_position_gcrs, sunlit_fraction
+from flightsw.navigation.orbit import (
+    EARTH_RADIUS_M,
+    SUN_RADIUS_M,
+    propagate,
+    sun_position_gcrs,
+    sunlit_fraction,
+)
 from flightsw.run import RunResult
 from flightsw.selftest import computer
-from flightsw.sequencer import CaptureCounts
 from flightsw.service import unit
-from flightsw.store import RESERVE, FrameStore
-from flightsw.store_index import entries_of
+from flightsw.storage.index import entries_of
+from flightsw.storage.store import RESERVE, FrameStore
 from flightsw.watchdog import notify
 from tests.commands import call
 
@@ -172,7 +178,7 @@ def test_on_a_disk_without_room_a_frame_is_deleted_for_good_all_the_same(
     tmp_path, make_frame, monkeypatch, gives_room
 ):
     """No line fits until the reserve, or the frame itself, has made room."""
-    from flightsw import store as module
+    from flightsw.storage import store as module
 
     store = FrameStore(tmp_path)
     fill(store, make_frame, 3)

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flightsw.cameras.camera import Exposure
+from flightsw.capture.sequencer import NS, capture, plan, region_of_interest
 from flightsw.errors import CaptureError
 from flightsw.icd.frame import decode_frame
 from flightsw.icd.mission import load_mission
-from flightsw.sequencer import NS, capture, plan, region_of_interest
-from flightsw.settings import Settings
-from flightsw.store import FrameStore
+from flightsw.storage.settings import Settings
+from flightsw.storage.store import FrameStore
 
 MISSION = load_mission(Path(__file__).parents[1] / "golden" / "mission.yaml")
 

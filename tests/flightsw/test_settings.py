@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from flightsw.errors import StoreError
-from flightsw.settings import Settings, load_settings, save_settings
+from flightsw.storage.settings import Settings, load_settings, save_settings
 
 COMMANDED = Settings("triage", exposure_times_ms=(100.0, 200.0, 400.0), max_error_dn=2, safe_mode=True)
 

@@ -10,10 +10,10 @@ import sys
 import pytest
 
 from flightsw.errors import StoreError, StoreFull
-from flightsw.fsck import fsck
 from flightsw.icd.frame import decode_frame, encode_frame
-from flightsw.settings import Settings, load_settings, save_settings
-from flightsw.store import RESERVE_BYTES, FrameStore
+from flightsw.storage.fsck import fsck
+from flightsw.storage.settings import Settings, load_settings, save_settings
+from flightsw.storage.store import RESERVE_BYTES, FrameStore
 from obbgs_base.files import write_whole
 from tests.small_disk import fill_disk, read_only, small_disk
 
@@ -195,7 +195,7 @@ def test_a_full_disk_leaves_no_half_line(tmp_path, make_frame, monkeypatch):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("flightsw.store.os.fsync", no_space)
+        patch.setattr("flightsw.storage.store.os.fsync", no_space)
         with pytest.raises(StoreError, match="No space left"):
             store.put(make_frame(1))
     assert (tmp_path / "index.jsonl").read_bytes() == before
@@ -315,7 +315,7 @@ CAPTURE_UNTIL_KILLED = """
 import sys
 from pathlib import Path
 from flightsw.icd.frame import decode_frame
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
 import dataclasses
 store, frame = FrameStore(Path(sys.argv[1])), decode_frame(Path(sys.argv[2]).read_bytes())
 while True:
@@ -418,7 +418,7 @@ def test_a_full_disk_is_met_by_the_policy_and_heals(tmp_path, make_frame, monkey
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         real_write_whole(path, content)
 
-    monkeypatch.setattr("flightsw.store.write_whole", small_disk)
+    monkeypatch.setattr("flightsw.storage.store.write_whole", small_disk)
     fill(store, make_frame, 2)
     if policy == "refuse":
         with pytest.raises(StoreFull, match="No space left"):

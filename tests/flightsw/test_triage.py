@@ -13,18 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flightsw.cli import app
-from flightsw.downlink import run_downlink
+from flightsw.downlink.loop import run_downlink
 from flightsw.errors import TriageError
 from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.icd.frame import HEADER, Frame, PoseTag, encode_frame
 from flightsw.icd.mission import load_mission
 from flightsw.icd.model_file import MAX_MODEL_BYTES
 from flightsw.icd.quaternion import quat_to_matrix
+from flightsw.navigation.pose import unknown_pose
 from flightsw.ports import open_link
-from flightsw.pose import unknown_pose
-from flightsw.settings import Settings, save_settings
-from flightsw.store import FrameStore
-from flightsw.triage import (
+from flightsw.storage.settings import Settings, save_settings
+from flightsw.storage.store import FrameStore
+from flightsw.triage.scores import (
     TILE_COLUMNS,
     TILE_ROWS,
     Ranked,

@@ -17,12 +17,12 @@ from onnx import TensorProto, helper, numpy_helper
 
 from flightsw.icd.frame import encode_frame
 from flightsw.icd.model_file import OPERATORS, ModelUnfit, check_model
-from flightsw.model_process import Limits, tried
-from flightsw.ranking import RANKING_S, Ranking
-from flightsw.settings import Settings, save_settings
-from flightsw.store import FrameStore
-from flightsw.triage import Ranked, rank_frames
-from flightsw.triage_worker import ModelFailed, ModelVerified, Result, TriageWorker
+from flightsw.storage.settings import Settings, save_settings
+from flightsw.storage.store import FrameStore
+from flightsw.triage.model_process import Limits, tried
+from flightsw.triage.ranking import RANKING_S, Ranking
+from flightsw.triage.scores import Ranked, rank_frames
+from flightsw.triage.worker import ModelFailed, ModelVerified, Result, TriageWorker
 from ground.link.ingest import listen
 from hil.links.virtual_serial import VirtualSerial
 from obbgs_core.io.onnx import export_onnx
@@ -267,7 +267,7 @@ def asked(model: Path, small_mission, *containers: Path, without: str = "") -> s
     }
     lines = "".join(json.dumps(each) + "\n" for each in (task, *map(str, containers)))
     hide = f"import sys; sys.modules[{without!r}] = None; " if without else ""
-    child = [sys.executable, "-c", f"{hide}from flightsw.model_process import main; main()"]
+    child = [sys.executable, "-c", f"{hide}from flightsw.triage.model_process import main; main()"]
     return subprocess.run(child, input=lines, capture_output=True, text=True, timeout=PATIENT_S)
 
 
@@ -338,7 +338,7 @@ def ranking(tmp_path, small_mission, make_frame, monkeypatch):
         workers.append(ScriptedWorker())
         return workers[-1]
 
-    monkeypatch.setattr("flightsw.ranking.TriageWorker", worker)
+    monkeypatch.setattr("flightsw.triage.ranking.TriageWorker", worker)
     store, clock = FrameStore(tmp_path / "store"), [0.0]
     for number in range(4):
         store.put(make_frame(number))
@@ -420,9 +420,9 @@ def test_a_disk_that_refuses_keeps_no_model_from_ranking(ranking, monkeypatch, c
 
 FLIGHT = """
 import functools, sys
-import flightsw.ranking as ranking
+import flightsw.triage.ranking as ranking
 from flightsw.cli import main
-from flightsw.model_process import Limits
+from flightsw.triage.model_process import Limits
 limits = Limits(time_s=float(sys.argv.pop(1)))
 ranking.RANKING_S, ranking.TriageWorker = 1.0, functools.partial(ranking.TriageWorker, limits=limits)
 main()

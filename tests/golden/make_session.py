@@ -8,10 +8,10 @@ import tempfile
 from pathlib import Path
 
 from flightsw.cameras import open_camera
+from flightsw.capture.sequencer import capture
 from flightsw.icd.frame import decode_frame
 from flightsw.icd.mission import load_mission
-from flightsw.sequencer import capture
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
 from ground.session.writer import SessionWriter
 from hil.cameras.virtual import CameraServer
 from hil.sky import SHIPPED

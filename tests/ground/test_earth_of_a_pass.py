@@ -13,7 +13,7 @@ from flightsw.icd.frame import Frame, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.icd.tle import position_gcrs_m
-from flightsw.pose import pose_tag
+from flightsw.navigation.pose import pose_tag
 from ground.run.evaluate import evaluate
 from ground.run.reconstruct import reconstruct
 from ground.run.runs import Run

@@ -15,12 +15,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flightsw.downlink import run_downlink
+from flightsw.downlink.loop import run_downlink
 from flightsw.icd.frame import HEADER, encode_frame
 from flightsw.icd.framing import frame_packet
 from flightsw.icd.packet import APID_FRAME_HEADERS
 from flightsw.ports import SerialLink
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
 from ground.formats.pictures.views import Intrinsics, View, write_session
 from ground.link.ingest import listen
 from ground.run.evaluate import evaluate

@@ -14,7 +14,7 @@ from flightsw.errors import TriageError
 from flightsw.icd.frame import Frame, PoseTag, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.icd.quaternion import matrix_to_quat
-from flightsw.triage import Renderer, rank_frames
+from flightsw.triage.scores import Renderer, rank_frames
 from ground.run.card import model_card
 from ground.run.evaluate import evaluate
 from ground.run.reconstruct import reconstruct

@@ -11,8 +11,8 @@ from flightsw.icd.ndm.formation import Formation
 from flightsw.icd.ndm.write import Object, write_aem, write_oem
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.icd.tle import orbit_axes
-from flightsw.orbit import propagate, sun_direction_gcrs
-from flightsw.pose import target_attitude
+from flightsw.navigation.orbit import propagate, sun_direction_gcrs
+from flightsw.navigation.pose import target_attitude
 from ground import predicted_image
 from ground.formats.pictures.files import read_header
 from ground.run.estimated_poses import write_estimate

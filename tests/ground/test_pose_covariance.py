@@ -16,8 +16,8 @@ from flightsw.errors import NavigationError
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import load_mission
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
-from flightsw.navigation import RelativePose, SatelliteStates, interpolate, parse_state
-from flightsw.pose import navigation_tag
+from flightsw.navigation.pose import navigation_tag
+from flightsw.navigation.stream import RelativePose, SatelliteStates, interpolate, parse_state
 from ground.session.folder import open_session
 from ground.session.training_frames import frames_of, motion_covariance, tag_covariance, training_frame
 from obbgs_core.model.pose_covariance import flaw

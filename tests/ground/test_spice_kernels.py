@@ -9,8 +9,8 @@ import tifffile
 from scipy.spatial.transform import Rotation
 
 from flightsw.icd.quaternion import quat_to_matrix
-from flightsw.orbit import propagate, sun_direction_gcrs
-from flightsw.pose import target_attitude
+from flightsw.navigation.orbit import propagate, sun_direction_gcrs
+from flightsw.navigation.pose import target_attitude
 from ground.formats.photographs.exposures import read_table
 from ground.formats.spice import read_spice
 from ground.run.runs import open_run

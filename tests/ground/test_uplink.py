@@ -14,13 +14,13 @@ import onnx
 import pytest
 from typer.testing import CliRunner
 
-from flightsw.commands import Commander, KeyRing
+from flightsw.downlink.commands import Commander, KeyRing
 from flightsw.icd.auth import Key, digest, unseal, unseal_file
 from flightsw.icd.command import Command, Report
 from flightsw.icd.mission import ConfigError
 from flightsw.icd.model_file import SENSOR_METADATA
 from flightsw.icd.model_file import check_model as check_model_bytes
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
 from ground import cli
 from ground.link.ingest import listen
 from ground.link.uplink import (

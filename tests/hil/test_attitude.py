@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from flightsw.icd.mission import ConfigError, TargetAttitudeSection, load_mission
 from flightsw.icd.quaternion import quat_to_matrix
-from flightsw.orbit import propagate
-from flightsw.pose import target_attitude
+from flightsw.navigation.orbit import propagate
+from flightsw.navigation.pose import target_attitude
 from hil.world.attitude import AttitudeSection, attitude, tumble
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")

@@ -8,11 +8,11 @@ import pytest
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
+from flightsw.capture.sequencer import plan
 from flightsw.icd.mission import load_mission
 from flightsw.icd.quaternion import quat_to_matrix
-from flightsw.orbit import OrbitState, propagate, sun_position_gcrs, sunlit_fraction
-from flightsw.pose import PoseTagger
-from flightsw.sequencer import plan
+from flightsw.navigation.orbit import OrbitState, propagate, sun_position_gcrs, sunlit_fraction
+from flightsw.navigation.pose import PoseTagger
 from hil.world.attitude import AttitudeSection, attitude
 from hil.world.basilisk import EARTH_MU_M3_S2, BasiliskSection, Craft, flown
 from hil.world.navigation import write_flight_inputs

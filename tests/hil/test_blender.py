@@ -13,7 +13,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, map_coordinates
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, load_mission
 from flightsw.icd.quaternion import matrix_to_quat
-from flightsw.pose import look_along
+from flightsw.navigation.pose import look_along
 from hil.sky import SHIPPED
 from hil.sky.blender import MeshError, Worker
 from hil.sky.motion import image_velocity

@@ -18,16 +18,16 @@ import imagecodecs
 import numpy as np
 import pytest
 
-from flightsw.commands import KeyRing
-from flightsw.downlink import DownlinkProgress, run_downlink
+from flightsw.downlink.commands import KeyRing
+from flightsw.downlink.loop import DownlinkProgress, run_downlink
 from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.icd.command import Command
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission, load_mission
 from flightsw.icd.model_file import SENSOR_METADATA
 from flightsw.ports import open_link
-from flightsw.store import FrameStore
-from flightsw.triage import Renderer
+from flightsw.storage.store import FrameStore
+from flightsw.triage.scores import Renderer
 from ground.link.ingest import ListenSummary, listen
 from ground.link.uplink import make_key, outcome, submit
 from ground.session.folder import open_session

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from flightsw.downlink import DownlinkProgress, run_downlink
+from flightsw.downlink.loop import DownlinkProgress, run_downlink
 from flightsw.icd.framing import PacketStream
 from flightsw.icd.mission import Mission, load_mission
 from flightsw.icd.packet import APID_FILES, TELEMETRY
 from flightsw.icd.transfer import Sender
 from flightsw.ports import SerialLink
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
 from ground.link.ingest import ListenSummary, listen
 from ground.session.folder import open_session
 from hil.links.faults import Faults
@@ -153,10 +153,10 @@ def test_nothing_leaves_the_outbox_while_nobody_listens(tmp_path, small_mission,
 DOWNLINK = """
 import sys
 from pathlib import Path
-from flightsw.downlink import run_downlink
+from flightsw.downlink.loop import run_downlink
 from flightsw.icd.mission import load_mission
 from flightsw.ports import SerialLink
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
 with SerialLink(sys.argv[1]) as link:
     run_downlink(FrameStore(Path(sys.argv[2])), link, load_mission(sys.argv[3]), exit_when_empty=True)
 """

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from flightsw.icd.mission import ConfigError, OrbitSection, load_mission
-from flightsw.orbit import propagate
+from flightsw.navigation.orbit import propagate
 from hil.world.fly_around import FlyAround, RelativeElements, design, linear_motion
 
 MISSION = load_mission(Path(__file__).parents[2] / "mission.yaml")

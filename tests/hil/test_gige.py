@@ -18,11 +18,11 @@ import pytest
 from flightsw.cameras import open_camera
 from flightsw.cameras.aravis import aravis
 from flightsw.cameras.gige import GigeCamera, demosaic
+from flightsw.capture.sequencer import capture
 from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.frame import decode_frame
 from flightsw.icd.mission import CameraSection, Mission, load_mission
-from flightsw.sequencer import capture
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
 from hil.cameras.gige import DESCRIPTION, GigeCameraServer
 from hil.sky.sensor import demosaic as simulator_demosaic
 

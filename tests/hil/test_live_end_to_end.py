@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
 from ground.run.live.status import read_status
 from ground.session.folder import open_session
 from hil.links.virtual_serial import VirtualSerial

@@ -7,7 +7,7 @@ import pytest
 from skyfield.api import EarthSatellite
 
 from flightsw.icd.mission import ConfigError, Mission, TargetAttitudeSection
-from flightsw.pose import pose_tag
+from flightsw.navigation.pose import pose_tag
 from hil.world.scenario import SCENARIOS, Scenario, Scene, describe, load_scenario
 
 NAMES = ["approach", "eclipse", "fly-around", "slow-tumble", "sparse", "tumbling", "v-bar"]

@@ -9,7 +9,7 @@ import pytest
 from skyfield.api import EarthSatellite, wgs84
 
 from flightsw.icd.mission import Mission, load_mission
-from flightsw.pose import pose_tag
+from flightsw.navigation.pose import pose_tag
 from hil.cameras.virtual import CameraServer
 from hil.world.surroundings import PEDESTAL, SWING, Surroundings, gcrs_to_ground
 from obbgs_base.earth import THICK_CLOUD

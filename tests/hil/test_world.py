@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from flightsw.cameras import open_camera
+from flightsw.capture.sequencer import plan
 from flightsw.icd.mission import ConfigError, Mission, load_mission
 from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.icd.tle import orbit_axes
-from flightsw.orbit import propagate
-from flightsw.pose import PoseTagger
-from flightsw.sequencer import plan
+from flightsw.navigation.orbit import propagate
+from flightsw.navigation.pose import PoseTagger
 from hil.cameras.virtual import CameraServer
 from hil.world.clock import LONGEST_WAIT_S, SimulatedClock
 from hil.world.navigation import write_flight_inputs

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from flightsw.downlink import run_downlink
+from flightsw.downlink.loop import run_downlink
 from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.ports import open_link
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
 from hil.links.virtual_serial import VirtualSerial
 
 BIN = Path(sys.executable).parent

@@ -31,7 +31,7 @@ from flightsw.icd.ndm.times import NS, parse_epoch, utc_ns
 from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.icd.reference_frames import teme_to_gcrs
 from flightsw.icd.tle import check_tle
-from flightsw.orbit import propagate
+from flightsw.navigation.orbit import propagate
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "ndm"  # made by make_messages.py there
 READ = json.loads((GOLDEN / "read.json").read_text())

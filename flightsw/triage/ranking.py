@@ -10,9 +10,9 @@ import numpy as np
 
 from flightsw.icd.mission import CameraSection
 from flightsw.icd.packet import PacketError
-from flightsw.store import FrameStore
-from flightsw.triage import Ranked, sending_order, sent_view
-from flightsw.triage_worker import ModelFailed, ModelVerified, TriageWorker
+from flightsw.storage.store import FrameStore
+from flightsw.triage.scores import Ranked, sending_order, sent_view
+from flightsw.triage.worker import ModelFailed, ModelVerified, TriageWorker
 from obbgs_base.errors import in_words
 from obbgs_base.files import sync_folder
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from flightsw.clock import utc_ns
-from flightsw.commands import Commander, KeyRing, Upload
+from flightsw.downlink.commands import Commander, KeyRing, Upload
+from flightsw.downlink.frame_sender import FrameSender, SendingCounts
+from flightsw.downlink.housekeeping import EventLog, ProcessMeter, disk_values
 from flightsw.errors import DownlinkError, FlightError, StoreError
-from flightsw.frame_sender import FrameSender, SendingCounts
-from flightsw.housekeeping import EventLog, ProcessMeter, disk_values
 from flightsw.icd.frame import HEADER, header_of, read_header
 from flightsw.icd.framing import PacketStream
 from flightsw.icd.mission import Mission
@@ -30,10 +30,10 @@ from flightsw.icd.packet import (
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.icd.transfer import UPLINK, Receiver, answer_key, timer_s
 from flightsw.ports import Link
-from flightsw.ranking import Ranking
-from flightsw.settings import Settings, load_settings
-from flightsw.store import FrameStore
-from flightsw.triage_worker import ModelVerified
+from flightsw.storage.settings import Settings, load_settings
+from flightsw.storage.store import FrameStore
+from flightsw.triage.ranking import Ranking
+from flightsw.triage.worker import ModelVerified
 from obbgs_base.errors import in_words
 
 log = logging.getLogger(__name__)

@@ -1,7 +1,7 @@
 """The process in which a model from the ground is loaded and run, under limits of memory and time.
 
 A model can ask for any memory and any time with operators that are all in order. So it never runs in the process that
-has the link: it runs here, and here only. `flightsw/triage_worker.py` starts this process, writes it one line of JSON
+has the link: it runs here, and here only. `flightsw/triage/worker.py` starts this process, writes it one line of JSON
 for each thing to do, reads one line for each answer, and kills it when an answer does not come in time. Where the
 worker's own process is gone, the end of the input or the limit of processor time ends this one.
 """
@@ -22,7 +22,7 @@ import numpy as np
 from flightsw.errors import TriageError, TriageMissing
 from flightsw.icd.frame import decode_frame
 from flightsw.icd.packet import PacketError
-from flightsw.triage import Renderer, rank_frame
+from flightsw.triage.scores import Renderer, rank_frame
 from obbgs_base.errors import reason
 
 NICENESS = 10  # the link and capture have priority

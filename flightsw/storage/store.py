@@ -20,7 +20,7 @@ from flightsw.icd.frame import Frame, encode_frame
 from flightsw.icd.mission import Mission
 from flightsw.icd.packet import PacketError
 from flightsw.icd.transfer import STORE_BYTES
-from flightsw.store_index import (
+from flightsw.storage.index import (
     DELETED_FOR_GOOD,
     DroppedFrame,
     Entry,
@@ -30,7 +30,7 @@ from flightsw.store_index import (
     index_entry,
     parse_entry,
 )
-from flightsw.transfer_numbers import TransferNumbers, random_number, store_identity
+from flightsw.storage.transfer_numbers import TransferNumbers, random_number, store_identity
 from obbgs_base.checked import checked_line, read_twice, write_twice
 from obbgs_base.errors import in_words
 from obbgs_base.files import append_line, sync_folder, write_whole

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from flightsw.model_process import Limits, Task
-from flightsw.triage import Ranked
+from flightsw.triage.model_process import Limits, Task
+from flightsw.triage.scores import Ranked
 
 log = logging.getLogger(__name__)
 BEGIN_S = 120.0  # for Python and onnxruntime to be loaded from a slow disk, before the model's time begins
@@ -63,7 +63,7 @@ class ModelProcess:
         self._task, self._text = task, b""
         one_thread = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         self._process = subprocess.Popen(  # a session of its own: Ctrl-C on the terminal is for flight
-            [sys.executable, "-m", "flightsw.model_process"],
+            [sys.executable, "-m", "flightsw.triage.model_process"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,

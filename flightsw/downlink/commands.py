@@ -21,15 +21,15 @@ from typing import Any
 
 from flightsw.clock import utc_ns
 from flightsw.errors import FlightError, StoreError
-from flightsw.fsck import RunningCheck
 from flightsw.icd.auth import MAX_COUNTER, TAG_BYTES, AuthError, Key, claimed, digest, unseal, unseal_file
 from flightsw.icd.command import ENDED, Command, Report, model_file_name
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import Mission
 from flightsw.icd.packet import PacketError
 from flightsw.icd.telemetry import DICTIONARY
-from flightsw.settings import Settings, load_settings, save_settings
-from flightsw.store import RESERVE, FrameStore, keep_reserve, write_with_reserve
+from flightsw.storage.fsck import RunningCheck
+from flightsw.storage.settings import Settings, load_settings, save_settings
+from flightsw.storage.store import RESERVE, FrameStore, keep_reserve, write_with_reserve
 from obbgs_base.checked import copy_of, each_copy, read_twice, write_twice
 from obbgs_base.errors import in_words, reason
 from obbgs_base.files import set_aside, write_whole

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from flightsw.errors import StoreError
 from flightsw.icd.packet import PacketError
-from flightsw.store import lock_store, quarantine
-from flightsw.store_index import (
+from flightsw.storage.index import (
     DELETED_FOR_GOOD,
     DroppedFrame,
     Entry,
@@ -16,7 +15,8 @@ from flightsw.store_index import (
     entries_of,
     index_entry,
 )
-from flightsw.transfer_numbers import FILE, numbers_line, parse_numbers, random_number
+from flightsw.storage.store import lock_store, quarantine
+from flightsw.storage.transfer_numbers import FILE, numbers_line, parse_numbers, random_number
 from obbgs_base.checked import checked_line, copy_of, parse_checked_line, read_twice
 from obbgs_base.errors import in_words, reason
 from obbgs_base.files import sync_folder, write_whole

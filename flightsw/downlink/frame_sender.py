@@ -13,8 +13,8 @@ from flightsw.icd.frame import decode_frame, encode_thumbnail, header_of
 from flightsw.icd.mission import LinkSection
 from flightsw.icd.packet import PacketError
 from flightsw.icd.transfer import Outcome, Sender
-from flightsw.ranking import Ranking
-from flightsw.store import FrameStore
+from flightsw.storage.store import FrameStore
+from flightsw.triage.ranking import Ranking
 
 log = logging.getLogger(__name__)
 RETRY_S = 5.0  # before a frame that cannot be read, or that the ground cannot store, is tried again

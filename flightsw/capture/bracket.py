@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flightsw.capture.region import ROUNDING_DN, target_pixels
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import BracketSection, CameraSection
-from flightsw.region import ROUNDING_DN, target_pixels
 
 SATURATED_SHARE = 1e-3  # of the target's pixels that the shortest frame may lose
 SHADOW_SHARE = 0.1  # the shadows are the darkest tenth of the target's pixels

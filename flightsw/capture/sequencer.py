@@ -5,15 +5,15 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from flightsw.bracket import AutoBracket, Geometry
 from flightsw.cameras.camera import Camera
+from flightsw.capture.bracket import AutoBracket, Geometry
+from flightsw.capture.region import region_of_interest
 from flightsw.errors import CameraLost, CaptureError, FlightError, OrbitError, StoreFull
 from flightsw.icd.frame import Frame, PoseTag, decode_frame
 from flightsw.icd.mission import Mission
-from flightsw.pose import PoseTagger, pose_tag
-from flightsw.region import region_of_interest
-from flightsw.settings import Settings
-from flightsw.store import FrameStore
+from flightsw.navigation.pose import PoseTagger, pose_tag
+from flightsw.storage.settings import Settings
+from flightsw.storage.store import FrameStore
 
 log = logging.getLogger(__name__)
 NS = 1_000_000_000

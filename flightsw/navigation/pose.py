@@ -9,9 +9,9 @@ from flightsw.errors import NavigationError, OrbitError
 from flightsw.icd.frame import PoseTag
 from flightsw.icd.mission import Mission
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
-from flightsw.message_navigation import SCHEME, MessageNavigation
-from flightsw.navigation import NavigationStream, RelativePose, SatelliteStates
-from flightsw.orbit import in_eclipse, propagate, sun_direction_gcrs
+from flightsw.navigation.messages import SCHEME, MessageNavigation
+from flightsw.navigation.orbit import in_eclipse, propagate, sun_direction_gcrs
+from flightsw.navigation.stream import NavigationStream, RelativePose, SatelliteStates
 
 log = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ import logging
 import secrets
 from pathlib import Path
 
-from flightsw.store import RESERVE, write_with_reserve
+from flightsw.storage.store import RESERVE, write_with_reserve
 from obbgs_base.checked import read_twice, write_twice
 from obbgs_base.errors import in_words
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flightsw.bracket import Geometry, bracket_times_s, expected_light
+from flightsw.capture.bracket import Geometry, bracket_times_s, expected_light
+from flightsw.capture.sequencer import NS, plan
 from flightsw.icd.mission import Mission
-from flightsw.orbit import shadow_crossings
-from flightsw.pose import pose_tag
-from flightsw.sequencer import NS, plan
+from flightsw.navigation.orbit import shadow_crossings
+from flightsw.navigation.pose import pose_tag
 
 WIDEST_DEG = 120.0  # a pinhole camera; lenses that see more are no pinholes
 FEWEST_PX = 8  # across the target, for a picture of it

@@ -10,8 +10,8 @@ from flightsw.icd.config import ConfigError
 from flightsw.icd.ndm.formation import Formation, role_of
 from flightsw.icd.ndm.orbit import NoState
 from flightsw.icd.ndm.text import MAX_NDM_BYTES
-from flightsw.navigation import SatelliteStates
-from flightsw.orbit import propagate
+from flightsw.navigation.orbit import propagate
+from flightsw.navigation.stream import SatelliteStates
 from obbgs_base.errors import reason
 from obbgs_base.files import read_bounded
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from flightsw.errors import StoreError
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import BracketSection, Mission
-from flightsw.store import RESERVE, write_with_reserve
+from flightsw.storage.store import RESERVE, write_with_reserve
 from obbgs_base.checked import copy_of, read_twice, write_twice
 from obbgs_base.errors import in_words, reason
 from obbgs_base.files import set_aside

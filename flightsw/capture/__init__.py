@@ -1,0 +1,1 @@
+"""Which frames are taken and when: brackets, exposure times, the region to read, the plan of a pass."""

@@ -1,0 +1,1 @@
+"""The loop that sends frames and telemetry and takes commands."""

@@ -1,0 +1,1 @@
+"""Which frames are sent first, by the model that the ground has sent."""
