@@ -15,7 +15,7 @@ demo: setup
 test: setup
 	.venv/bin/ruff format --check .
 	.venv/bin/ruff check .
-	.venv/bin/clang-format --dry-run --Werror obbgs_core/render/kernels/*.cpp obbgs_core/render/kernels/*.h
+	.venv/bin/clang-format --dry-run --Werror $$(git ls-files "obbgs_core/render/kernels/*.cpp" "obbgs_core/render/kernels/*.h")
 	.venv/bin/pyright
 	.venv/bin/pytest -n 3 --dist loadfile $(ARGS)
 

@@ -22,7 +22,7 @@ from compare.sky_behind import behind
 from flightsw.icd.config import MAX_YAML_BYTES, ConfigError, build, in_file, parse_yaml, require
 from ground.run.settings import checked_settings
 from obbgs_base.files import read_bounded
-from obbgs_base.stars import star_irradiance
+from obbgs_base.physics.stars import star_irradiance
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.jpeg import JpegCoding
 from obbgs_core.model.motions import rigid_motions

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from obbgs_base.earth import RADIUS_M, camera_rays, earth_radiance
-from obbgs_base.stars import star_radiance
+from obbgs_base.physics.earth import RADIUS_M, camera_rays, earth_radiance
+from obbgs_base.physics.stars import star_radiance
 from obbgs_core.frames import TrainingFrame
 
 HEIGHT_M = 500_000.0  # of the circular orbit, over the Earth's day side

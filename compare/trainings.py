@@ -12,7 +12,6 @@ from torch import Tensor
 from compare.follow import MARKS
 from compare.opponents.reconstruction import EstimatedPoses, Reconstruction, Work
 from compare.validation import BEST, Best, imaging, withheld
-from ground.run.intervals import interval_scores, stated_error_scores
 from ground.run.model_files import SURFACE_POINTS
 from obbgs_base.errors import Interrupted
 from obbgs_core.frames import TrainingFrame, cameras_of
@@ -21,6 +20,7 @@ from obbgs_core.methods.config import MethodConfig
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import with_estimate
 from obbgs_core.poses.estimate import PoseEstimate
+from obbgs_core.score.intervals import interval_scores, stated_error_scores
 from obbgs_core.score.poses import settled_poses
 from obbgs_core.score.surface import surface_positions
 from obbgs_core.sensor import Sensor

@@ -15,9 +15,9 @@ from ground.session.cameras import sensor_of
 from ground.session.folder import open_session
 from ground.session.training_frames import split, training_frame
 from ground.show.pictures import tone
-from obbgs_core import obb
 from obbgs_core.losses import likelihood_loss
 from obbgs_core.methods.presets import preset
+from obbgs_core.model import obb
 from obbgs_core.render import render
 from obbgs_core.train.trainer import Trainer
 

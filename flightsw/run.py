@@ -18,7 +18,7 @@ from flightsw.downlink.commands import KeyRing
 from flightsw.downlink.housekeeping import EventLog
 from flightsw.downlink.loop import DownlinkProgress, run_downlink
 from flightsw.errors import CameraLost, CaptureError, StoreError
-from flightsw.icd.can import FLIGHT_SIDE
+from flightsw.icd.link.can import FLIGHT_SIDE
 from flightsw.icd.mission import Mission
 from flightsw.ports import Link, open_link
 from flightsw.storage.boot_counter import count_boot

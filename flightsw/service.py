@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from flightsw.icd.config import ConfigError
-from flightsw.icd.link_url import parse_link_url
+from flightsw.icd.link.link_url import parse_link_url
 
 TEMPLATE = Path(__file__).with_name("obbgs-flight.service")
 STATE = Path("/var/lib/obbgs")

@@ -3,7 +3,7 @@
 The names in `__all__` can be imported from `ground`; their modules are imported when they are first used.
 """
 
-from obbgs_base.lazy import lazily
+from obbgs_base.imports import lazily
 
 _MODULES = {  # public name: the module that defines it
     "frames_of": "session.training_frames",

@@ -28,10 +28,10 @@ from hil.sky.motion import image_velocity, smear
 from hil.sky.render_farm import RenderFarm
 from hil.sky.sensor import PRESETS, SensorModel, read_out
 from hil.world.scenario import Scene, SceneState, load_scenario, ready_made
-from obbgs_base import stars
 from obbgs_base.errors import ObbgsError
 from obbgs_base.files import write_whole
-from obbgs_base.stars import star_radiance
+from obbgs_base.physics import stars
+from obbgs_base.physics.stars import star_radiance
 
 DATASETS = Path(__file__).parent / "datasets"
 MARKER = "dataset.json"

@@ -1,9 +1,11 @@
-"""Imports of large libraries, made quick."""
+"""Imports of large libraries, made quick, and public names whose modules are imported when they are first used."""
 
 import contextlib
 import gc
+import importlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 MANY = 100  # modules
 
@@ -26,3 +28,19 @@ def quick_imports() -> Iterator[None]:
             gc.freeze()
         if was_on:
             gc.enable()
+
+
+def lazily(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
+    """Return the `__getattr__` of a package, which finds each public name in its module.
+
+    Args:
+        package: the package's own name.
+        modules: public name to the module below the package that defines it.
+    """
+
+    def find(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{package}.{modules[name]}"), name)
+
+    return find

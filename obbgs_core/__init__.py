@@ -20,7 +20,7 @@ The names in `__all__` can be imported from `obbgs_core`; the function `render` 
 seconds to load.
 """
 
-from obbgs_base.lazy import lazily
+from obbgs_base.imports import lazily
 
 _MODULES = {  # public name: the module that defines it
     "Cameras": "model.cameras",

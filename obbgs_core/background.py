@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_base.earth import THICK_CLOUD, camera_rays, sees_earth
+from obbgs_base.physics.earth import THICK_CLOUD, camera_rays, sees_earth
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
 

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_base.navigation_errors import SharedParameters
+from obbgs_base.physics.navigation_errors import SharedParameters
 from obbgs_core.compact import Compact, hold_compact, part
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.model.cameras import Cameras, stacked_suns
@@ -27,7 +27,7 @@ READING_TOLERANCE = 1e-6
 class Navigation:
     """What the pose tags of one pass share: how far its common parameters may err, and the motion that they assume.
 
-    The fields but the first are those of `obbgs_base.navigation_errors.NominalMotion`.
+    The fields but the first are those of `obbgs_base.physics.navigation_errors.NominalMotion`.
     """
 
     sigmas: SharedParameters  # deviations; 0: exact

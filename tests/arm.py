@@ -19,8 +19,8 @@ ROOT = Path(__file__).parents[1]
 KERNELS = ROOT / "obbgs_core" / "render" / "kernels"
 BUILD = ROOT / "build" / "arm"
 SITE, SYSTEM, MODULE = BUILD / "site", BUILD / "root", BUILD / "_rasterizer.so"
-OF_EACH_SET = ("project", "project_backward", "bins", "composite", "composite_backward", "rows")
-OF_ALL = ("binding", "threads", "likelihood", "training")
+OF_EACH_SET = ("project", "project_backward", "bins", "composite", "composite_backward", "rows/rows")
+OF_ALL = ("binding", "machine/threads", "likelihood", "training")
 PACKAGES = (
     *(
         "python3.11-minimal",

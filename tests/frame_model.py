@@ -26,8 +26,8 @@ from flightsw.downlink.commands import KeyRing
 from flightsw.downlink.housekeeping import EventLog
 from flightsw.downlink.loop import _Downlink
 from flightsw.errors import StoreFull
-from flightsw.icd.auth import Key
 from flightsw.icd.frame import Frame, PoseTag
+from flightsw.icd.link.auth import Key
 from flightsw.icd.mission import load_mission
 from flightsw.storage.settings import Settings, save_settings
 from flightsw.storage.store import FrameStore, lock_store

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from flightsw.icd.quaternion import matrix_to_quat
-from obbgs_base.navigation_errors import SharedParameters
+from obbgs_base.physics.navigation_errors import SharedParameters
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render

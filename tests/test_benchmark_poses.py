@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from hil.sky import SHIPPED
 from hil.world.scenario import load_scenario
-from obbgs_base.navigation_errors import SharedParameters
+from obbgs_base.physics.navigation_errors import SharedParameters
 from obbgs_core.frames import sun_span_deg
 from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.poses.gauge import best_motion

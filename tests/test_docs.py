@@ -11,7 +11,7 @@ import pytest
 
 import ground
 import obbgs_core
-from flightsw.icd.link_url import parse_link_url
+from flightsw.icd.link.link_url import parse_link_url
 from tests.benchmarks.figures import PAGES as PAGES_WITH_FIGURES
 from tests.benchmarks.figures import blocks, wrong
 

@@ -1,6 +1,7 @@
 """The house rules: which room may import which, no cycles, no long files, no long functions; read from the source."""
 
 import ast
+import collections
 import graphlib
 from functools import cache
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PARTS = ("obbgs_base", "obbgs_core", "flightsw", "ground", "compare", "hil")
 LONGEST_FILE, LONGEST_FUNCTION = 800, 80  # lines
+FULLEST_FOLDER = 15  # files
 CORE = {"obbgs_base", "obbgs_core.model", "obbgs_core"}  # what every room of the library may use
 LIBRARY = {
     f"obbgs_core.{room}" for room in ("model", "render", "poses", "methods", "train", "io", "score")
@@ -37,9 +39,10 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     "obbgs_core.score": CORE | {"obbgs_core.render", "obbgs_core.poses"},
     "obbgs_core.mesh": CORE | {"obbgs_core.render", "obbgs_core.score"},
     "flightsw.icd": {"obbgs_base"},
-    "flightsw.icd.transfer": {"obbgs_base", "flightsw.icd"},
+    "flightsw.icd.link": {"obbgs_base", "flightsw.icd"},
+    "flightsw.icd.transfer": {"obbgs_base", "flightsw.icd", "flightsw.icd.link"},
     "flightsw.icd.ndm": {"obbgs_base", "flightsw.icd"},
-    "flightsw.ports": {"obbgs_base", "flightsw.icd"},
+    "flightsw.ports": {"obbgs_base", "flightsw.icd.link"},
     "flightsw.errors": {"obbgs_base"},
     "flightsw.clock": set(),
     "flightsw.cameras": {"obbgs_base", "flightsw.icd", "flightsw.errors", "flightsw.clock"},
@@ -49,20 +52,30 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     | {"flightsw.navigation", "flightsw.storage"},
     "flightsw.triage": {"obbgs_base", "flightsw.icd", "flightsw.errors", "flightsw.storage"},
     "flightsw.downlink": CONTRACT
-    | {"flightsw.ports", "flightsw.errors", "flightsw.clock", "flightsw.storage", "flightsw.triage"},
+    | {"flightsw.icd.link", "flightsw.ports", "flightsw.errors", "flightsw.clock"}
+    | {"flightsw.storage", "flightsw.triage"},
     "flightsw": {"obbgs_base", "flightsw.icd"}
-    | {"flightsw.icd.ndm", "flightsw.ports", "flightsw.errors", "flightsw.clock", "flightsw.cameras"}
+    | {
+        "flightsw.icd.ndm",
+        "flightsw.icd.link",
+        "flightsw.ports",
+        "flightsw.errors",
+        "flightsw.clock",
+        "flightsw.cameras",
+    }
     | {f"flightsw.{room}" for room in ("storage", "navigation", "capture", "triage", "downlink")},
     "ground.session": {"obbgs_base", "flightsw.icd", "obbgs_core", "obbgs_core.model", "obbgs_core.render"},
-    "ground.link": CONTRACT | {"flightsw.ports", "ground.session"},
+    "ground.link": CONTRACT | {"flightsw.icd.link", "flightsw.ports", "ground.session"},
     "ground.formats": {"obbgs_base", "flightsw.icd", "flightsw.icd.ndm", "ground.session"},
     "ground.run": {
         "obbgs_base",
         "flightsw.icd",
         "flightsw.icd.ndm",
+        "flightsw.icd.link",
         "ground.session",
         "ground.link",
         "obbgs_core.attitude",
+        "obbgs_core.start",
         "obbgs_core.mesh",
     }
     | LIBRARY,
@@ -76,7 +89,15 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
     }
     | LIBRARY - {"obbgs_core.train"}
     | {"obbgs_core.attitude"},
-    "ground.commands": {"obbgs_base", "flightsw.icd", *GROUND, "ground.link", "ground.run", "ground.show"}
+    "ground.commands": {
+        "obbgs_base",
+        "flightsw.icd",
+        "flightsw.icd.link",
+        *GROUND,
+        "ground.link",
+        "ground.run",
+        "ground.show",
+    }
     | {"obbgs_core", "obbgs_core.train"},
     "ground": {"obbgs_base", "flightsw.icd", "ground.link", "ground.commands"},
     "compare.opponents": CORE
@@ -95,7 +116,7 @@ ARROWS = {  # room: the rooms that its modules may import besides their own; a m
         "flightsw.capture",
         "flightsw.cameras",
     },
-    "hil.links": {"obbgs_base", "flightsw.icd", "hil.watched"},
+    "hil.links": {"obbgs_base", "flightsw.icd.link", "hil.watched"},
     "hil.cameras": {
         *("obbgs_base", "flightsw.icd", "flightsw.cameras", "flightsw.errors"),
         "flightsw.navigation",
@@ -173,6 +194,18 @@ def sources() -> list[Path]:
 def test_no_file_is_longer_than_a_reader_can_hold():
     lengths = {str(p.relative_to(ROOT)): len(p.read_text().splitlines()) for p in sources()}
     assert {name: n for name, n in lengths.items() if n > LONGEST_FILE} == {}
+
+
+def test_no_folder_holds_more_files_than_a_reader_can_hold():
+    files = [p for p in sources() if p.name != "__init__.py"]
+    files += [
+        p
+        for part in PARTS
+        for suffix in ("md", "yaml", "html", "js", "css")
+        for p in (ROOT / part).rglob(f"*.{suffix}")
+    ]
+    counts = collections.Counter(str(p.parent.relative_to(ROOT)) for p in files)
+    assert {folder: n for folder, n in counts.items() if n > FULLEST_FOLDER} == {}
 
 
 def test_no_function_is_longer_than_a_screen_and_a_half():

@@ -36,8 +36,8 @@ class Reconstruction:
     seconds: of the method's own work, without scoring, over all interrupted parts.
     figures: further columns of its row, such as the number of registered frames.
     stated_errors: from held-out frames, their true radiance (or none) and the frames that calibrate to how well the
-        intervals and errors hold that method and sensor state (`ground.run.intervals`); None where pictures are not
-        made by exposing a radiance.
+        intervals and errors hold that method and sensor state (`obbgs_core.score.intervals`); None where pictures are
+        not made by exposing a radiance.
     poses: None where the method takes the poses as they are given.
     """
 

@@ -21,9 +21,18 @@ from typing import Any
 
 from flightsw.clock import utc_ns
 from flightsw.errors import FlightError, StoreError
-from flightsw.icd.auth import MAX_COUNTER, TAG_BYTES, AuthError, Key, claimed, digest, unseal, unseal_file
 from flightsw.icd.command import ENDED, Command, Report, model_file_name
 from flightsw.icd.config import ConfigError
+from flightsw.icd.link.auth import (
+    MAX_COUNTER,
+    TAG_BYTES,
+    AuthError,
+    Key,
+    claimed,
+    digest,
+    unseal,
+    unseal_file,
+)
 from flightsw.icd.mission import Mission
 from flightsw.icd.packet import PacketError
 from flightsw.icd.telemetry import DICTIONARY

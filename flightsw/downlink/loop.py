@@ -14,7 +14,7 @@ from flightsw.downlink.frame_sender import FrameSender, SendingCounts
 from flightsw.downlink.housekeeping import EventLog, ProcessMeter, disk_values
 from flightsw.errors import DownlinkError, FlightError, StoreError
 from flightsw.icd.frame import HEADER, header_of, read_header
-from flightsw.icd.framing import PacketStream
+from flightsw.icd.link.framing import PacketStream
 from flightsw.icd.mission import Mission
 from flightsw.icd.packet import (
     APID_COMMANDS,

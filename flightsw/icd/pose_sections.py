@@ -9,7 +9,7 @@ import numpy as np
 
 from flightsw.icd.config import require, require_counts, require_unit_quaternion
 from flightsw.icd.frame import Attitude
-from obbgs_base.navigation_errors import LENGTHS, SharedParameters
+from obbgs_base.physics.navigation_errors import LENGTHS, SharedParameters
 
 
 @dataclass(frozen=True)

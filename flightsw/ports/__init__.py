@@ -3,8 +3,8 @@
 It knows the interface contract (`flightsw.icd`) and nothing else of either side.
 """
 
-from flightsw.icd.can import CanSide
-from flightsw.icd.link_url import parse_link_url
+from flightsw.icd.link.can import CanSide
+from flightsw.icd.link.link_url import parse_link_url
 from flightsw.ports.port import Link, LinkError
 from flightsw.ports.serial_port import SerialLink
 from flightsw.ports.slcan import SlcanLink

@@ -11,8 +11,8 @@ from typing import Protocol, Self
 
 import can
 
-from flightsw.icd.can import IsoTpChannels
-from flightsw.icd.link_url import parse_link_url
+from flightsw.icd.link.can import IsoTpChannels
+from flightsw.icd.link.link_url import parse_link_url
 from obbgs_base.errors import ObbgsError, reason
 
 log = logging.getLogger(__name__)

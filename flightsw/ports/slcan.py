@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 from isotp import CanMessage
 
-from flightsw.icd.can import CanSide, IsoTpChannels
-from flightsw.icd.link_url import parse_link_url
-from flightsw.icd.slcan import SlcanText, close_slcan, format_slcan, open_slcan
+from flightsw.icd.link.can import CanSide, IsoTpChannels
+from flightsw.icd.link.link_url import parse_link_url
+from flightsw.icd.link.slcan import SlcanText, close_slcan, format_slcan, open_slcan
 from flightsw.ports.port import IsoTpPort
 from flightsw.ports.serial_port import SerialLink
 

@@ -9,8 +9,8 @@ from collections.abc import Callable
 import can
 from isotp import CanMessage
 
-from flightsw.icd.can import CanSide, IsoTpChannels
-from flightsw.icd.link_url import parse_link_url
+from flightsw.icd.link.can import CanSide, IsoTpChannels
+from flightsw.icd.link.link_url import parse_link_url
 from flightsw.ports.port import IsoTpPort
 
 

@@ -7,9 +7,9 @@ import numpy as np
 from flightsw.cameras import open_camera
 from flightsw.cameras.camera import Camera, Exposure
 from flightsw.errors import CaptureError
-from flightsw.icd.can import FLIGHT_SIDE, GROUND_SIDE
-from flightsw.icd.framing import Deframer, frame_packet
-from flightsw.icd.link_url import parse_link_url
+from flightsw.icd.link.can import FLIGHT_SIDE, GROUND_SIDE
+from flightsw.icd.link.framing import Deframer, frame_packet
+from flightsw.icd.link.link_url import parse_link_url
 from flightsw.icd.mission import CameraSection, Mission
 from flightsw.icd.packet import TELEMETRY, pack_packet
 from flightsw.ports import Link, LinkError, open_link

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from flightsw.icd.auth import Key
+from flightsw.icd.link.auth import Key
 from flightsw.icd.mission import ConfigError, ReconstructSection, load_mission
 from ground.commands.options import (
     Overwrite,

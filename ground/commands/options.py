@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from flightsw.icd.auth import Key
+from flightsw.icd.link.auth import Key
 from flightsw.icd.mission import METHODS, VARIANTS, ConfigError
 from obbgs_base.command_line import KEY_HELP, MISSION_HELP, SEED_HELP, SET_HELP
 from obbgs_base.errors import reason

@@ -12,10 +12,10 @@ from typing import Any
 
 import imagecodecs
 
-from flightsw.icd.auth import Key
-from flightsw.icd.can import GROUND_SIDE
 from flightsw.icd.frame import Frame, decode_frame
-from flightsw.icd.framing import PacketStream
+from flightsw.icd.link.auth import Key
+from flightsw.icd.link.can import GROUND_SIDE
+from flightsw.icd.link.framing import PacketStream
 from flightsw.icd.mission import Mission
 from flightsw.icd.packet import (
     APID_COMMANDS,

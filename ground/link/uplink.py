@@ -22,8 +22,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from flightsw.icd.auth import MAX_COUNTER, Key, digest, seal, seal_file
 from flightsw.icd.command import ENDED, Command, Report, model_file_name
+from flightsw.icd.link.auth import MAX_COUNTER, Key, digest, seal, seal_file
 from flightsw.icd.mission import Checksum, ConfigError
 from flightsw.icd.model_file import MAX_MODEL_BYTES, ModelUnfit, check_for_triage
 from flightsw.icd.transfer import UPLINK, Sender

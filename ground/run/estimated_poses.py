@@ -17,7 +17,7 @@ from ground.session.training_frames import frames_of, tag_covariance, training_f
 from ground.session.truth import Truth
 from obbgs_base.errors import reason
 from obbgs_base.files import write_whole
-from obbgs_base.navigation_errors import SharedParameters, jacobian
+from obbgs_base.physics.navigation_errors import SharedParameters, jacobian
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import motion_of, with_estimate

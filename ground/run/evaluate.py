@@ -9,7 +9,6 @@ import torch
 
 from ground.run.card import model_card
 from ground.run.estimated_poses import Alignment, estimated_records, read_estimate, scored_records
-from ground.run.intervals import interval_scores, stated_error_scores
 from ground.run.mesh_files import read_mesh_points
 from ground.run.model_files import SURFACE_POINTS
 from ground.run.runs import Run, open_run, written_to
@@ -27,6 +26,7 @@ from ground.session.truth import Truth, read_points
 from obbgs_base.files import write_whole
 from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.render import render
+from obbgs_core.score.intervals import interval_scores, stated_error_scores
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.score.shown import shown_points
 

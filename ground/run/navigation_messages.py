@@ -21,8 +21,8 @@ from ground.run.runs import Run
 from ground.session.folder import FrameRecord, Session, SessionError
 from ground.session.training_frames import frames_of, motion_covariance, usable
 from obbgs_base.files import write_whole
-from obbgs_base.free_rotation import free_rotation, turning_of
-from obbgs_base.navigation_errors import (
+from obbgs_base.physics.free_rotation import free_rotation, turning_of
+from obbgs_base.physics.navigation_errors import (
     DIFFERENCES,
     LENGTHS,
     NominalMotion,

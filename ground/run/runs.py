@@ -37,7 +37,7 @@ from obbgs_core.frames import TrainingFrame
 from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.sensor import Sensor
-from obbgs_core.sky_level import field, levelled
+from obbgs_core.start.sky_level import field, levelled
 from obbgs_core.train.backdrops import without_earth
 
 LOG = "log"

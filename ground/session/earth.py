@@ -6,7 +6,7 @@ from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.icd.reference_frames import low_precision_sun
 from flightsw.icd.tle import position_gcrs_m
 from ground.session.folder import FrameRecord, Session
-from obbgs_base.earth import OCEAN, THICK_CLOUD, camera_rays, earth_radiance
+from obbgs_base.physics.earth import OCEAN, THICK_CLOUD, camera_rays, earth_radiance
 
 RAYS = 24  # along a side of the picture, at which light is expected
 BLOCK_PX = 4

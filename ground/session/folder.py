@@ -43,7 +43,7 @@ from ground.session.telemetry import FlightCounts
 from obbgs_base.checked import Lines, copy_of, names_checksum, read_lines, read_lines_twice, read_twice
 from obbgs_base.errors import ObbgsError, reason
 from obbgs_base.files import read_bounded
-from obbgs_base.navigation_errors import SharedParameters
+from obbgs_base.physics.navigation_errors import SharedParameters
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from flightsw.icd.quaternion import quat_to_matrix
 from ground.session.folder import FrameRecord, Session
 from ground.session.spread import evenly_spread
 from ground.session.training_frames import training_frame
-from obbgs_base.navigation_errors import SharedParameters, jacobian
+from obbgs_base.physics.navigation_errors import SharedParameters, jacobian
 from obbgs_core.poses.corrections import motion_of
 from obbgs_core.poses.estimate import PoseEstimate
 

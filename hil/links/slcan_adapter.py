@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from isotp import CanMessage
 
-from flightsw.icd.link_url import SLCAN_BITRATES
-from flightsw.icd.slcan import SlcanText, format_slcan, parse_slcan
+from flightsw.icd.link.link_url import SLCAN_BITRATES
+from flightsw.icd.link.slcan import SlcanText, format_slcan, parse_slcan
 from hil.links.faults import flip_a_bit
 from hil.links.virtual_link import VirtualLink
 

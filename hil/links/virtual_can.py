@@ -16,7 +16,7 @@ import random
 import select
 import time
 
-from flightsw.icd.link_url import SLCAN_BITRATES
+from flightsw.icd.link.link_url import SLCAN_BITRATES
 from hil.links.can_timing import frame_s
 from hil.links.faults import Faults
 from hil.links.slcan_adapter import BusLaneStatistics, SlcanAdapter

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from dataclasses import dataclass
 
-from flightsw.icd.framing import DELIMITER
+from flightsw.icd.link.framing import DELIMITER
 from hil.links.faults import Faults, flip_a_bit
 from hil.links.virtual_link import VirtualLink
 

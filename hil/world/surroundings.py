@@ -1,7 +1,7 @@
 """What a camera in orbit sees beside its target: the Earth, stars and the Sun's stray light; how its dark level drifts.
 
 Everything follows from the orbit and the time, in proportion to the target by published albedos and magnitudes
-(`obbgs_base.earth`, `obbgs_base.stars`).
+(`obbgs_base.physics.earth`, `obbgs_base.physics.stars`).
 """
 
 import dataclasses
@@ -18,8 +18,8 @@ from flightsw.icd.quaternion import quat_to_matrix
 from flightsw.icd.reference_frames import julian_date
 from flightsw.navigation.orbit import OrbitState, sunlit_fraction
 from hil.world.scenario import sgp4_orbits
-from obbgs_base.earth import camera_rays, earth_radiance, sees_earth, stray_light
-from obbgs_base.stars import star_radiance
+from obbgs_base.physics.earth import camera_rays, earth_radiance, sees_earth, stray_light
+from obbgs_base.physics.stars import star_radiance
 
 # The dark level above the calibrated one, as a share of full scale: a mean, and how it swings with the temperature
 PEDESTAL, SWING = 0.0005, 0.0005

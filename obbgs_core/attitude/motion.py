@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obbgs_base.free_rotation import free_rotation, rotations
+from obbgs_base.physics.free_rotation import free_rotation, rotations
 
 SPIN, TUMBLE = 3, 8  # numbers of parameters
 # an orthonormal basis [5, 3, 3] of the symmetric matrices without trace

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obbgs_base.free_rotation import rotations
-from obbgs_base.navigation_errors import SIZE, SharedParameters
+from obbgs_base.physics.free_rotation import rotations
+from obbgs_base.physics.navigation_errors import SIZE, SharedParameters
 from obbgs_core.attitude.motion import (
     SPIN,
     TUMBLE,

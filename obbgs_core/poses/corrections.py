@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from obbgs_base.navigation_errors import SIZE, NominalMotion, SharedParameters, displaced, jacobian
+from obbgs_base.physics.navigation_errors import SIZE, NominalMotion, SharedParameters, displaced, jacobian
 from obbgs_core.frames import TrainingFrame, pose_numbers
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
@@ -31,11 +31,11 @@ SETTLED = 0.01  # deviations: no further round follows one that moves no correct
 class PoseCorrections:
     """The poses of all frames with their corrections: shared parameters `shared` [19], then `value` [P, 6] a bracket.
 
-    The shared parameters (`obbgs_base.navigation_errors`) move the tagged poses, each bracket's own correction follows.
-    The own corrections have unit variance: times the root of the tags' covariance they are rigid motions in front of
-    world_to_camera, a rotation about the camera's axes (rad), then a shift along them (m). Directions in which the tags
-    are exact, and shared parameters whose prior deviation is 0, are not corrected. The focal length is not estimated:
-    from a distance it shows as the range does.
+    The shared parameters (`obbgs_base.physics.navigation_errors`) move the tagged poses, each bracket's own correction
+    follows. The own corrections have unit variance: times the root of the tags' covariance they are rigid motions in
+    front of world_to_camera, a rotation about the camera's axes (rad), then a shift along them (m). Directions in which
+    the tags are exact, and shared parameters whose prior deviation is 0, are not corrected. The focal length is not
+    estimated: from a distance it shows as the range does.
 
     Frames of one bracket share their motion: the error of a navigation solution hardly changes within seconds. A
     frame that says so (`own_pose`) counts as a bracket by itself. The covariance of a bracket's motion is the mean of

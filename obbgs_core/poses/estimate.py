@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obbgs_base.navigation_errors import LENGTHS, SharedParameters
+from obbgs_base.physics.navigation_errors import LENGTHS, SharedParameters
 
 # a parameter whose posterior deviation is a larger share of the prior's is called unobservable
 DETERMINED = 0.5

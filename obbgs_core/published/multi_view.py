@@ -5,7 +5,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from obbgs_core import obb
+from obbgs_core.model import obb
 from obbgs_core.model.cameras import Cameras
 
 PARALLEL = 1e-6  # sine of the angle below which two rays do not cross

@@ -9,11 +9,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_core import obb
 from obbgs_core.batches import Batches
 from obbgs_core.evidence.budget import as_many_again, fewer, log_errors
 from obbgs_core.evidence.poses import validation_brackets
 from obbgs_core.methods.config import GrowthSettings, MethodConfig, Moment
+from obbgs_core.model import obb
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.published import mcmc

@@ -10,7 +10,7 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.published.compensation import mapped, nearest
 from obbgs_core.sensor import Sensor
-from obbgs_core.sky_level import SkyLevel
+from obbgs_core.start.sky_level import SkyLevel
 
 
 @dataclass(frozen=True)

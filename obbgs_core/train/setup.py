@@ -23,16 +23,16 @@ from obbgs_core.frames import (
     sun_span_deg,
     usable,
 )
-from obbgs_core.hot_pixels import without_hot_pixels
 from obbgs_core.methods.config import MethodConfig, few_share
 from obbgs_core.methods.presets import limited
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.sensor import Sensor, unusual_unit
-from obbgs_core.sky_level import SkyLevel, levelled, with_noise_seen
 from obbgs_core.start.alignment import settled
+from obbgs_core.start.hot_pixels import without_hot_pixels
 from obbgs_core.start.hull import Silhouette, light, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
+from obbgs_core.start.sky_level import SkyLevel, levelled, with_noise_seen
 from obbgs_core.start.texture import textured_pixels
 
 MOST_HIDDEN = 0.01  # share of the first Gaussians that may be nearer to the cameras than what is drawn

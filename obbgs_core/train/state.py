@@ -21,8 +21,8 @@ from obbgs_core.evidence.response import Response
 from obbgs_core.methods.config import MethodConfig, Moment
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.model.obb import Obb
 from obbgs_core.model.pose_covariance import Whitening
-from obbgs_core.obb import Obb
 from obbgs_core.poses.answers import SAVED as ROUND_SAVED
 from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.published.compensation import Compensation

@@ -10,9 +10,9 @@ from collections import deque
 
 from isotp import CanMessage
 
-from flightsw.icd.can import FLIGHT_IDS, GROUND_IDS, IsoTpChannels
-from flightsw.icd.framing import PacketStream
-from flightsw.icd.link_url import parse_link_url
+from flightsw.icd.link.can import FLIGHT_IDS, GROUND_IDS, IsoTpChannels
+from flightsw.icd.link.framing import PacketStream
+from flightsw.icd.link.link_url import parse_link_url
 from flightsw.icd.packet import APID_FILES, TELECOMMAND, TELEMETRY
 from flightsw.icd.transfer import Receiver, Sender, timer_s
 from hil.links.can_timing import frame_s

@@ -31,7 +31,7 @@ from flightsw.downlink.housekeeping import EventLog
 from flightsw.downlink.loop import run_downlink
 from flightsw.errors import FlightError
 from flightsw.icd.frame import Frame, PoseTag
-from flightsw.icd.framing import PacketStream
+from flightsw.icd.link.framing import PacketStream
 from flightsw.icd.mission import Mission, load_mission
 from flightsw.icd.packet import APID_EVENTS, APID_FILES, TELECOMMAND
 from flightsw.icd.telemetry import DICTIONARY

@@ -42,13 +42,14 @@ import zlib
 import isotp
 
 from flightsw.downlink.commands import Commander, KeyRing
-from flightsw.icd.auth import Key, seal, seal_file, unseal, unseal_file
-from flightsw.icd.can import FLIGHT_IDS, GROUND_IDS, MAX_MESSAGE_BYTES, IsoTpChannels
 from flightsw.icd.command import Command, Report
 from flightsw.icd.config import ConfigError
 from flightsw.icd.frame import CRC, HEADER, MAX_PIXELS, decode_frame
-from flightsw.icd.framing import Deframer, PacketStream, frame_packet, max_frame_bytes
-from flightsw.icd.link_url import parse_link_url
+from flightsw.icd.link.auth import Key, seal, seal_file, unseal, unseal_file
+from flightsw.icd.link.can import FLIGHT_IDS, GROUND_IDS, MAX_MESSAGE_BYTES, IsoTpChannels
+from flightsw.icd.link.framing import Deframer, PacketStream, frame_packet, max_frame_bytes
+from flightsw.icd.link.link_url import parse_link_url
+from flightsw.icd.link.slcan import FD_SIZES, SlcanText, format_slcan
 from flightsw.icd.mission import load_mission
 from flightsw.icd.packet import (
     APID_EVENTS,
@@ -61,7 +62,6 @@ from flightsw.icd.packet import (
     PacketError,
     unpack_packet,
 )
-from flightsw.icd.slcan import FD_SIZES, SlcanText, format_slcan
 from flightsw.icd.telemetry import DICTIONARY, NUMBERS, Item
 from flightsw.icd.transfer import Receiver, Sender, parse_pdu
 from flightsw.storage.store import open_store

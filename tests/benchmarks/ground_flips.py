@@ -16,9 +16,9 @@ from typing import Any
 import imagecodecs
 import numpy as np
 
-from flightsw.icd.auth import AuthError, Key, digest, unseal
 from flightsw.icd.command import Command, Report
 from flightsw.icd.frame import Frame, PoseTag, encode_frame
+from flightsw.icd.link.auth import AuthError, Key, digest, unseal
 from flightsw.icd.mission import ConfigError, Mission
 from flightsw.icd.packet import APID_EVENTS, APID_HOUSEKEEPING, APID_REPORTS
 from flightsw.icd.telemetry import DICTIONARY, Item

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from flightsw.icd.quaternion import quat_to_matrix
 from hil.sky.sensor import converted
 from hil.world.scenario import Scenario, Scene
-from obbgs_base.navigation_errors import NominalMotion
+from obbgs_base.physics.navigation_errors import NominalMotion
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
 from tests.benchmarks.mesh_pictures import pictures

@@ -21,7 +21,7 @@ import torch
 from ground.run.scores import ScoredView, clean_scores, cloud_scores
 from ground.session.cameras import exposed
 from hil.world.scenario import load_scenario
-from obbgs_base.navigation_errors import (
+from obbgs_base.physics.navigation_errors import (
     NominalMotion,
     SharedParameters,
     displaced,

@@ -33,7 +33,7 @@ from ground.session.folder import SCHEMA_VERSION
 from ground.session.truth import TrueFrame, write_truth
 from ground.session.writer import frame_line
 from hil.sky.sensor import PRESETS, RENDERED_PSF_SIGMA_PX, SensorModel, converted, read_out, through_lens
-from obbgs_base.stars import star_radiance
+from obbgs_base.physics.stars import star_radiance
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
 

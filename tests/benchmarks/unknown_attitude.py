@@ -13,8 +13,8 @@ import torch
 
 from hil.world.attitude import AttitudeSection
 from hil.world.scenario import Scenario, load_scenario
-from obbgs_base.free_rotation import free_rotation
-from obbgs_base.navigation_errors import NominalMotion
+from obbgs_base.physics.free_rotation import free_rotation
+from obbgs_base.physics.navigation_errors import NominalMotion
 from obbgs_core.attitude.estimate import AttitudeUndetermined, estimate_motion
 from obbgs_core.attitude.target_motion import TargetMotion
 from obbgs_core.frames import Navigation, TrainingFrame

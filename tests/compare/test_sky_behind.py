@@ -6,7 +6,7 @@ import torch
 
 from compare.case import Case, load_case
 from compare.conditions import Condition, given
-from obbgs_base.earth import camera_rays, sees_earth
+from obbgs_base.physics.earth import camera_rays, sees_earth
 from tests.small_sessions import small_session
 
 

@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flightsw.downlink.commands import ANSWER_S, DELETE_S, RESERVE_BYTES, Commander, KeyRing, ReplayCounter
-from flightsw.icd.auth import MAX_COUNTER, Key, digest, seal, seal_file
 from flightsw.icd.command import Command
 from flightsw.icd.config import ConfigError
+from flightsw.icd.link.auth import MAX_COUNTER, Key, digest, seal, seal_file
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.storage.settings import load_settings
 from flightsw.storage.store import FrameStore

@@ -18,10 +18,10 @@ from flightsw.downlink.commands import KeyRing
 from flightsw.downlink.housekeeping import MAX_EVENTS, EventLog, ProcessMeter
 from flightsw.downlink.loop import LAST_TELEMETRY_S, RESTARTS, WAIT_S, run_downlink
 from flightsw.errors import DownlinkError
-from flightsw.icd.auth import Key, seal, seal_file
 from flightsw.icd.command import Command, model_file_name
 from flightsw.icd.frame import HEADER, read_header
-from flightsw.icd.framing import PacketStream
+from flightsw.icd.link.auth import Key, seal, seal_file
+from flightsw.icd.link.framing import PacketStream
 from flightsw.icd.packet import (
     APID_COMMANDS,
     APID_EVENTS,

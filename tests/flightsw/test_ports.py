@@ -14,11 +14,11 @@ import can
 import pytest
 from isotp import CanMessage
 
-from flightsw.icd.can import FLIGHT_SIDE, GROUND_SIDE
 from flightsw.icd.config import ConfigError
-from flightsw.icd.framing import frame_packet
-from flightsw.icd.link_url import LinkUrl, parse_link_url
-from flightsw.icd.slcan import format_slcan
+from flightsw.icd.link.can import FLIGHT_SIDE, GROUND_SIDE
+from flightsw.icd.link.framing import frame_packet
+from flightsw.icd.link.link_url import LinkUrl, parse_link_url
+from flightsw.icd.link.slcan import format_slcan
 from flightsw.ports import LinkError, SlcanLink, SocketCanLink, open_link
 from flightsw.ports.slcan import SILENT_S
 

@@ -295,8 +295,8 @@ def test_a_clock_that_is_set_during_a_wait_costs_no_exposure(tmp_path, monkeypat
 
 def test_the_ground_is_told_that_the_camera_is_lost(tmp_path, small_mission):
     """In the housekeeping packets of `flightsw capture --link`, while it is tried again and after it was given up."""
-    from flightsw.icd.can import GROUND_SIDE
-    from flightsw.icd.framing import PacketStream
+    from flightsw.icd.link.can import GROUND_SIDE
+    from flightsw.icd.link.framing import PacketStream
     from flightsw.icd.packet import APID_EVENTS, APID_HOUSEKEEPING, TELECOMMAND
     from flightsw.icd.telemetry import DICTIONARY
     from flightsw.ports import open_link

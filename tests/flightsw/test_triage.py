@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from flightsw.cli import app
 from flightsw.downlink.loop import run_downlink
 from flightsw.errors import TriageError
-from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.icd.frame import HEADER, Frame, PoseTag, encode_frame
+from flightsw.icd.link.can import FLIGHT_SIDE
 from flightsw.icd.mission import load_mission
 from flightsw.icd.model_file import MAX_MODEL_BYTES
 from flightsw.icd.quaternion import quat_to_matrix

@@ -25,7 +25,7 @@ from ground.session.truth import Truth
 from ground.show.report.attitude import attitude_section
 from ground.show.sizes import with_deviation
 from obbgs_base.errors import Interrupted
-from obbgs_base.navigation_errors import SharedParameters, displaced
+from obbgs_base.physics.navigation_errors import SharedParameters, displaced
 from obbgs_core.attitude.estimate import AttitudeUndetermined
 from obbgs_core.attitude.motion import at_epoch, attitudes, principal
 from obbgs_core.attitude.search import mirrored

@@ -22,8 +22,8 @@ from ground.session.folder import open_session
 from ground.session.training_frames import frames_of, training_frame
 from ground.session.writer import SessionWriter
 from ground.show.report.poses import pose_history
-from obbgs_base.earth import camera_rays, earth_radiance
-from obbgs_base.navigation_errors import SIZE, SharedParameters
+from obbgs_base.physics.earth import camera_rays, earth_radiance
+from obbgs_base.physics.navigation_errors import SIZE, SharedParameters
 from obbgs_core.background import earth_pixels
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.poses.estimate import PoseEstimate

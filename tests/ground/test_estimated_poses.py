@@ -16,7 +16,7 @@ from ground.run.estimated_poses import FILE, Alignment, estimated_records, read_
 from ground.session.folder import SessionError, open_session
 from ground.session.truth import Truth
 from ground.show.viewer.source import Source
-from obbgs_base.navigation_errors import SharedParameters
+from obbgs_base.physics.navigation_errors import SharedParameters
 from obbgs_core.frames import cameras_of
 from obbgs_core.io.ply import save_ply
 from obbgs_core.model.motions import rigid_motions

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from flightsw.downlink.loop import run_downlink
 from flightsw.icd.frame import HEADER, encode_frame
-from flightsw.icd.framing import frame_packet
+from flightsw.icd.link.framing import frame_packet
 from flightsw.icd.packet import APID_FRAME_HEADERS
 from flightsw.ports import SerialLink
 from flightsw.storage.store import FrameStore

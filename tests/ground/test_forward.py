@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flightsw.icd.config import ConfigError
-from flightsw.icd.framing import frame_packet
+from flightsw.icd.link.framing import frame_packet
 from flightsw.icd.packet import APID_EVENTS, TELECOMMAND, pack_packet
 from flightsw.ports import LinkError
 from ground.link.forward import Forwarder, parse_target

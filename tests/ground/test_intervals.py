@@ -8,11 +8,11 @@ import torch
 
 from compare.case import load_case
 from compare.errors import CompareError
-from ground.run.intervals import interval_scores, stated_error_scores
 from obbgs_core.frames import cameras_of
 from obbgs_core.losses import fit_figures
 from obbgs_core.misfit import model_error
 from obbgs_core.render import render
+from obbgs_core.score.intervals import interval_scores, stated_error_scores
 from obbgs_core.score.uncertainty import parameter_deviations
 from tests import scenes
 from tests.small_sessions import small_session

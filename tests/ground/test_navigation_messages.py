@@ -20,7 +20,7 @@ from ground.run.navigation_messages import export_ndm
 from ground.run.runs import open_run
 from ground.session.folder import open_session
 from ground.session.training_frames import training_frame
-from obbgs_base.navigation_errors import SharedParameters, displaced_motion
+from obbgs_base.physics.navigation_errors import SharedParameters, displaced_motion
 from obbgs_core.poses.corrections import motion_of
 from obbgs_core.poses.estimate import PoseEstimate
 from tests.golden_pass import (

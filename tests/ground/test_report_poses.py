@@ -14,7 +14,7 @@ from ground.session.folder import Navigation, open_session, pass_name
 from ground.session.training_frames import split
 from ground.show.report.poses import pose_history, poses_section
 from ground.show.sizes import with_deviation
-from obbgs_base.navigation_errors import SIZE, SharedParameters
+from obbgs_base.physics.navigation_errors import SIZE, SharedParameters
 from obbgs_core.poses.estimate import PoseEstimate
 from tests import scenes
 from tests.small_sessions import small_session

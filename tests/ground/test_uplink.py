@@ -15,8 +15,8 @@ import pytest
 from typer.testing import CliRunner
 
 from flightsw.downlink.commands import Commander, KeyRing
-from flightsw.icd.auth import Key, digest, unseal, unseal_file
 from flightsw.icd.command import Command, Report
+from flightsw.icd.link.auth import Key, digest, unseal, unseal_file
 from flightsw.icd.mission import ConfigError
 from flightsw.icd.model_file import SENSOR_METADATA
 from flightsw.icd.model_file import check_model as check_model_bytes

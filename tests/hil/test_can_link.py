@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from flightsw.icd.can import FLIGHT_SIDE, GROUND_SIDE
-from flightsw.icd.framing import frame_packet
+from flightsw.icd.link.can import FLIGHT_SIDE, GROUND_SIDE
+from flightsw.icd.link.framing import frame_packet
 from flightsw.ports import Link, open_link
 from hil.links.virtual_can import VirtualCan
 

@@ -20,9 +20,9 @@ import pytest
 
 from flightsw.downlink.commands import KeyRing
 from flightsw.downlink.loop import DownlinkProgress, run_downlink
-from flightsw.icd.can import FLIGHT_SIDE
 from flightsw.icd.command import Command
 from flightsw.icd.frame import PoseTag
+from flightsw.icd.link.can import FLIGHT_SIDE
 from flightsw.icd.mission import Mission, load_mission
 from flightsw.icd.model_file import SENSOR_METADATA
 from flightsw.ports import open_link

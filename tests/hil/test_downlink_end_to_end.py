@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from flightsw.downlink.loop import DownlinkProgress, run_downlink
-from flightsw.icd.framing import PacketStream
+from flightsw.icd.link.framing import PacketStream
 from flightsw.icd.mission import Mission, load_mission
 from flightsw.icd.packet import APID_FILES, TELEMETRY
 from flightsw.icd.transfer import Sender

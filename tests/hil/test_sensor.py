@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from flightsw.icd.mission import load_mission
 from hil.sky.motion import image_velocity, smear
 from hil.sky.sensor import PRESETS, SensorModel, bloom, clean_dn, demosaic, expose, ideal, read_out
-from obbgs_base.stars import catalogue, star_radiance
+from obbgs_base.physics.stars import catalogue, star_radiance
 
 MISSION = load_mission(Path(__file__).parents[1] / "golden" / "mission.yaml")
 

@@ -12,7 +12,7 @@ from flightsw.icd.mission import Mission, load_mission
 from flightsw.navigation.pose import pose_tag
 from hil.cameras.virtual import CameraServer
 from hil.world.surroundings import PEDESTAL, SWING, Surroundings, gcrs_to_ground
-from obbgs_base.earth import THICK_CLOUD
+from obbgs_base.physics.earth import THICK_CLOUD
 
 SIZE_PX = 32
 OVER_EARTH_S, OVER_SKY_S = 200, 800  # after the mission's start the Earth is behind the target, and is not

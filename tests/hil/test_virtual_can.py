@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from isotp import CanMessage
 
-from flightsw.icd.link_url import parse_link_url
-from flightsw.icd.slcan import FD_SIZES, SlcanText, format_slcan, open_slcan
+from flightsw.icd.link.link_url import parse_link_url
+from flightsw.icd.link.slcan import FD_SIZES, SlcanText, format_slcan, open_slcan
 from hil.links.can_timing import frame_bits, frame_s
 from hil.links.faults import Faults
 from hil.links.virtual_can import VirtualCan

@@ -12,7 +12,7 @@ from subprocess import PIPE
 import pytest
 import serial
 
-from flightsw.icd.framing import Deframer, frame_packet
+from flightsw.icd.link.framing import Deframer, frame_packet
 from hil.links.faults import Faults
 from hil.links.virtual_link import VirtualLink, control, run_link
 from hil.links.virtual_serial import VirtualSerial

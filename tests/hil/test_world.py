@@ -26,7 +26,7 @@ from hil.world.navigation import write_flight_inputs
 from hil.world.navigation_errors import draw, stated_sigmas
 from hil.world.scenario import SCENARIOS, load_scenario
 from hil.world.world import World, load_world, told
-from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displaced
+from obbgs_base.physics.navigation_errors import NominalMotion, SharedParameters, displaced
 from tests.hil.test_scenario import BY_BASILISK
 
 NS = 1_000_000_000

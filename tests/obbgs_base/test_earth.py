@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from obbgs_base.earth import (
+from obbgs_base.physics.earth import (
     RADIUS_M,
     camera_rays,
     clouded_albedo,

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from obbgs_base.free_rotation import free_rotation
+from obbgs_base.physics.free_rotation import free_rotation
 
 moments = st.floats(0.4, 2.0)
 speeds = st.floats(-0.05, 0.05)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from obbgs_base.navigation_errors import (
+from obbgs_base.physics.navigation_errors import (
     NominalMotion,
     SharedParameters,
     displaced,

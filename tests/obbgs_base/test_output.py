@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from flightsw.downlink.loop import run_downlink
-from flightsw.icd.can import FLIGHT_SIDE
+from flightsw.icd.link.can import FLIGHT_SIDE
 from flightsw.ports import open_link
 from flightsw.storage.store import FrameStore
 from hil.links.virtual_serial import VirtualSerial

@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from hil.world.attitude import tumble
-from obbgs_base.navigation_errors import SharedParameters
+from obbgs_base.physics.navigation_errors import SharedParameters
 from obbgs_core.attitude import search
 from obbgs_core.attitude.coherence import FILL, coherences, grid_points
 from obbgs_core.attitude.estimate import AttitudeUndetermined, estimate_motion

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from obbgs_base.earth import RADIUS_M
+from obbgs_base.physics.earth import RADIUS_M
 from obbgs_core.background import OUTLINE, backdrop, doubt, earth_pixels, filled, weighed
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame

@@ -11,8 +11,7 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import Rotation
 
-from obbgs_core import obb
-from obbgs_core.model import sh
+from obbgs_core.model import obb, sh
 from obbgs_core.model.rotations import multiply, quats_to_matrices
 from obbgs_core.published.growth import grow, outliers
 from obbgs_core.score.metrics import cloud_distances, even, surface_scores

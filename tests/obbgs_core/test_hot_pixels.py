@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.hot_pixels import hot_pixels, without_hot_pixels
 from obbgs_core.sensor import Sensor
+from obbgs_core.start.hot_pixels import hot_pixels, without_hot_pixels
 
 SENSOR = Sensor(0.0, 255.0, 2.5e6, 1e9, 6.0)
 SIZE_PX = 64

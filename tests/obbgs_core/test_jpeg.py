@@ -13,7 +13,7 @@ from obbgs_core.frames import TrainingFrame
 from obbgs_core.jpeg import JpegCoding
 from obbgs_core.losses import likelihood_loss
 from obbgs_core.sensor import Sensor
-from obbgs_core.sky_level import levelled
+from obbgs_core.start.sky_level import levelled
 
 SENSOR = Sensor(0.0, 255.0, 1.0, 1e9, 6.0)  # black is 0: half of the noise on empty sky is clipped
 HEIGHT, WIDTH = 52, 72  # no multiple of a block

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from obbgs_core import obb
 from obbgs_core.frames import cameras_of
 from obbgs_core.methods.presets import PRESETS, preset
+from obbgs_core.model import obb
 from obbgs_core.model.cameras import Cameras
 from obbgs_core.published.multi_view import corner_rays, crossing_boxes, inside, threshold_factor
 from obbgs_core.render import render

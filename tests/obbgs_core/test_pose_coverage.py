@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from obbgs_base.navigation_errors import NominalMotion, SharedParameters
+from obbgs_base.physics.navigation_errors import NominalMotion, SharedParameters
 from obbgs_core.frames import Navigation, TrainingFrame
 from obbgs_core.poses.corrections import DOUBT, PoseCorrections
 from obbgs_core.poses.registration import PoseInformation, _cell_information

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from skimage import transform
 
-from obbgs_base.navigation_errors import NominalMotion, SharedParameters, displaced_motion
+from obbgs_base.physics.navigation_errors import NominalMotion, SharedParameters, displaced_motion
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.evidence.gains import justified
 from obbgs_core.frames import Navigation, TrainingFrame, cameras_of, usable

@@ -12,7 +12,7 @@ from scipy.ndimage import uniform_filter
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.methods.presets import preset
 from obbgs_core.sensor import Sensor, clipped_mean, dark_reading, noise_excess
-from obbgs_core.sky_level import UNSMOOTHED
+from obbgs_core.start.sky_level import UNSMOOTHED
 from obbgs_core.train.setup import prepare
 from obbgs_core.train.trainer import Trainer
 from tests import scenes

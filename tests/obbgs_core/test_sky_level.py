@@ -19,7 +19,7 @@ from obbgs_core.methods.presets import preset
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.sensor import Sensor
-from obbgs_core.sky_level import field, levelled
+from obbgs_core.start.sky_level import field, levelled
 from obbgs_core.train import train
 from tests.scenes import QUICK, SENSOR, ball, photographed, target
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from obbgs_base.navigation_errors import SIZE, NominalMotion, SharedParameters, displaced_motion
+from obbgs_base.physics.navigation_errors import SIZE, NominalMotion, SharedParameters, displaced_motion
 from obbgs_core.attitude.motion import attitudes, of_principal, principal
 from obbgs_core.attitude.target_motion import LEAST_LEFT, TargetMotion
 from obbgs_core.poses.estimate import PoseEstimate

@@ -22,7 +22,7 @@ from spacepackets.cfdp.tlv import (
     TlvType,
 )
 
-from flightsw.icd.auth import Key
+from flightsw.icd.link.auth import Key
 
 STORE_BYTES = 8
 PREFIX = b"store"  # of the message to user

@@ -1,6 +1,6 @@
 """The part of the XTCE document that describes commands: their arguments, their bytes, and how they are verified.
 
-The bytes are those of the command itself. On the link it travels sealed (flightsw/icd/auth.py), with a key that no
+The bytes are those of the command itself. On the link it travels sealed (flightsw/icd/link/auth.py), with a key that no
 other system has: commands are sent by `ground uplink` only. A report carries the counter of its command, which exists
 once the command is sealed; XTCE cannot compare it, so the verifiers take the next report, of whatever command.
 """

@@ -5,8 +5,8 @@ import math
 import time
 from pathlib import Path
 
-from flightsw.icd.auth import Key
 from flightsw.icd.command import Command
+from flightsw.icd.link.auth import Key
 from flightsw.icd.mission import ConfigError
 from ground.link.uplink import outcome, submit
 from ground.run.live.model import ShownModel

@@ -8,7 +8,7 @@ from ground.run.estimated_poses import read_estimate
 from ground.run.runs import Run
 from ground.show.page import legend, plot, section, two_tables
 from ground.show.sizes import with_deviation
-from obbgs_base.free_rotation import free_rotation
+from obbgs_base.physics.free_rotation import free_rotation
 from obbgs_core.attitude.target_motion import TargetMotion
 from obbgs_core.model.gaussians import Gaussians
 

@@ -14,7 +14,7 @@ from ground.run.runs import Run
 from ground.session.spread import evenly_spread
 from ground.show.page import legend, plot, section, two_tables, unbroken
 from ground.show.sizes import with_deviation
-from obbgs_base.navigation_errors import LENGTHS
+from obbgs_base.physics.navigation_errors import LENGTHS
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.losses import fit_figures
 from obbgs_core.model.motions import motion_vectors

@@ -12,8 +12,8 @@
 #include <string>
 #include <vector>
 
-#include "rows.h"
-#include "threads.h"
+#include "machine/threads.h"
+#include "rows/rows.h"
 
 namespace nb = nanobind;
 using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;

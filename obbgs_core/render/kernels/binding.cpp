@@ -11,7 +11,7 @@
 #include <string>
 
 #include "rasterizer.h"
-#include "rows.h"
+#include "rows/rows.h"
 
 namespace nb = nanobind;
 using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;

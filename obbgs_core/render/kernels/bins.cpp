@@ -4,7 +4,7 @@
 #include <utility>
 #include <vector>
 
-#include "threads.h"
+#include "machine/threads.h"
 #include "tiles.h"
 
 namespace obbgs {

@@ -1,7 +1,7 @@
 // What compositing and its gradient share: tiles, and what one splat does to one block of pixels.
 // Included once for each instruction set, by composite.cpp and composite_backward.cpp.
 #pragma once
-#include "threads.h"
+#include "machine/threads.h"
 #include "tiles.h"
 
 namespace obbgs {

@@ -1,9 +1,9 @@
 // Gaussians to splats: projection, opacity and radiance of a vector of Gaussians at a time.
 #include <vector>
 
+#include "machine/threads.h"
 #include "projection.h"
 #include "shading.h"
-#include "threads.h"
 
 namespace obbgs {
 namespace KERNEL {

@@ -2,9 +2,9 @@
 // a vector of Gaussians at a time. d_x stands for the derivative of the loss by x.
 #include <vector>
 
+#include "machine/threads.h"
 #include "projection.h"
 #include "shading.h"
-#include "threads.h"
 
 namespace obbgs {
 namespace KERNEL {

@@ -4,8 +4,8 @@
 #include <algorithm>
 #include <cfloat>
 
+#include "machine/simd.h"
 #include "rasterizer.h"
-#include "simd.h"
 
 namespace obbgs {
 namespace KERNEL {

@@ -1,8 +1,8 @@
 // Blocks of pixels, one vector each, and tiles of 8x8 blocks, one 64-bit mask each.
 // Included once for each instruction set, whose vectors decide how high a block is.
 #pragma once
+#include "machine/simd.h"
 #include "rasterizer.h"
-#include "simd.h"
 
 namespace obbgs {
 namespace KERNEL {

@@ -5,8 +5,17 @@ from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flightsw.icd.auth import SECURITY_HEADER, TAG_BYTES, AuthError, Key, seal, seal_file, unseal, unseal_file
 from flightsw.icd.config import ConfigError
+from flightsw.icd.link.auth import (
+    SECURITY_HEADER,
+    TAG_BYTES,
+    AuthError,
+    Key,
+    seal,
+    seal_file,
+    unseal,
+    unseal_file,
+)
 
 KEY = Key(1, bytes(range(32)))
 contents = st.binary(max_size=300)

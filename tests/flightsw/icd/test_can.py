@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flightsw.icd.can import FLIGHT_IDS, GROUND_IDS, MAX_MESSAGE_BYTES, OFFERS, IsoTpChannels
-from flightsw.icd.framing import frame_packet
-from flightsw.icd.link_url import parse_link_url
-from flightsw.icd.slcan import FD_SIZES, format_slcan
+from flightsw.icd.link.can import FLIGHT_IDS, GROUND_IDS, MAX_MESSAGE_BYTES, OFFERS, IsoTpChannels
+from flightsw.icd.link.framing import frame_packet
+from flightsw.icd.link.link_url import parse_link_url
+from flightsw.icd.link.slcan import FD_SIZES, format_slcan
 
 CLASSIC, FD = (parse_link_url(f"slcan:///dev/null?fd={fd}") for fd in (0, 1))
 BOTH = pytest.mark.parametrize("url", [CLASSIC, FD], ids=["classic", "fd"])

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flightsw.icd.framing import CRC_BYTES, Deframer, PacketStream, frame_packet, max_frame_bytes
+from flightsw.icd.link.framing import CRC_BYTES, Deframer, PacketStream, frame_packet, max_frame_bytes
 from flightsw.icd.packet import APID_EVENTS, APID_FILES, APIDS, TELECOMMAND, TELEMETRY, pack_packet
 
 MAX_PACKET_BYTES = 300

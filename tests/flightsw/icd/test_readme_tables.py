@@ -10,8 +10,8 @@ import pytest
 
 import flightsw.icd
 from flightsw.icd import packet
-from flightsw.icd.auth import SECURITY_HEADER, TAG_BYTES, Key, seal
 from flightsw.icd.frame import ATTITUDES, CODEC_JPEG_LS, CRC, HEADER, SOURCES, encode_frame
+from flightsw.icd.link.auth import SECURITY_HEADER, TAG_BYTES, Key, seal
 from flightsw.icd.packet import PacketHeader
 
 README = (Path(flightsw.icd.__path__[0]) / "README.md").read_text()

@@ -13,9 +13,9 @@ from spacepackets.cfdp.pdu.file_data import FileDataParams
 from spacepackets.cfdp.pdu.finished import DeliveryCode, FileStatus, FinishedParams
 from spacepackets.util import ByteFieldU8, ByteFieldU32
 
-from flightsw.icd.auth import Key
 from flightsw.icd.codestream import encode_pixels
 from flightsw.icd.frame import HEADER
+from flightsw.icd.link.auth import Key
 from flightsw.icd.mission import CameraSection
 from flightsw.icd.transfer import Outcome, Receiver, Sender, Verdict, answer_key, parse_pdu
 from flightsw.icd.transfer.cfdp_fixes import Gaps

@@ -6,8 +6,8 @@ from can.interfaces.slcan import slcanBus
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flightsw.icd.link_url import parse_link_url
-from flightsw.icd.slcan import FD_SIZES, SlcanText, format_slcan, open_slcan, parse_slcan
+from flightsw.icd.link.link_url import parse_link_url
+from flightsw.icd.link.slcan import FD_SIZES, SlcanText, format_slcan, open_slcan, parse_slcan
 
 
 @st.composite

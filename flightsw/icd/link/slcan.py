@@ -8,8 +8,8 @@ import re
 
 import isotp
 
-from flightsw.icd.framing import DelimitedBytes
-from flightsw.icd.link_url import SLCAN_BITRATES, LinkUrl
+from flightsw.icd.link.framing import DelimitedBytes
+from flightsw.icd.link.link_url import SLCAN_BITRATES, LinkUrl
 
 FD_SIZES = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)  # bytes by length code, ISO 11898-1
 

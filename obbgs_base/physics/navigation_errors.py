@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from obbgs_base.free_rotation import free_rotation, rotations, turning_of
+from obbgs_base.physics.free_rotation import free_rotation, rotations, turning_of
 
 # steps of central differences: m, m/s, rad, rad/s, ratio, rad, s, ratio; of an error of third order in them
 DIFFERENCES = {

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import isotp
 
-from flightsw.icd.framing import DELIMITER
-from flightsw.icd.link_url import LinkUrl
+from flightsw.icd.link.framing import DELIMITER
+from flightsw.icd.link.link_url import LinkUrl
 
 # The ground's identifiers are the lower ones and win the bus: flow control and commands pass first.
 GROUND_IDS, FLIGHT_IDS = tuple(range(0x0C0, 0x0D0)), tuple(range(0x0D0, 0x0E0))
