@@ -8,13 +8,16 @@ portable.
 import contextlib
 import functools
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+Item = TypeVar("Item")
 Result = TypeVar("Result")
 try:
     from obbgs_core import _rasterizer
@@ -55,11 +58,15 @@ def kernels() -> tuple[str, ...]:
 
 
 _threads = 0  # of the compiled module; 0: as many as PyTorch's
+_beside = threading.local()  # has `one` in threads that work beside others: each of them is one
 
 
 def threads() -> int:
-    """Return on how many threads the compiled module runs: as many as PyTorch, but for `torch_on_one_thread`."""
-    return _threads or torch.get_num_threads()
+    """Return on how many threads the compiled module runs: as many as PyTorch, but for `torch_on_one_thread`.
+
+    One in a thread that works beside others, see `each`.
+    """
+    return 1 if hasattr(_beside, "one") else _threads or torch.get_num_threads()
 
 
 @contextlib.contextmanager
@@ -80,6 +87,44 @@ def torch_on_one_thread() -> Iterator[None]:
     finally:
         torch.set_num_threads(torch_threads)
         _threads = outer
+
+
+def each(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """Yield work(item) of each item in their order, made on as many threads as the compiled module has.
+
+    Each item is worked on by one thread, so that results do not depend on their number. Items are drawn in the caller's
+    thread, and only about as many are under way or wait to be taken as there are threads: that bounds the memory.
+    Errors are raised where their results would come.
+    """
+    count, gradients = threads(), torch.is_grad_enabled()
+    if count == 1:
+        yield from map(work, items)
+        return
+
+    def made(item: Item) -> Result:
+        with torch.set_grad_enabled(gradients):  # each thread has its own
+            return work(item)
+
+    pool, waiting = _workers(count), deque[Future[Result]]()
+    try:
+        for item in items:
+            waiting.append(pool.submit(made, item))
+            if len(waiting) > count:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        wait([future for future in waiting if not future.cancel()])
+
+
+@functools.cache
+def _workers(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, "each", _start_beside)
+
+
+def _start_beside() -> None:
+    _start_on_one_thread()
+    _beside.one = True
 
 
 class Background:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from obbgs_base.physics.navigation_errors import SharedParameters
 from obbgs_core.compact import Compact, hold_compact, part
+from obbgs_core.compiled import each
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.model.cameras import Cameras, stacked_suns
 from obbgs_core.model.motions import point_flow
@@ -233,27 +234,36 @@ def usable(
         raise ReconstructionError(
             f"all frames must state the same navigation, that of one pass, got {len(stated)}"
         )
-    for f in frames:
-        finite = torch.isfinite(f.dn).all() and torch.isfinite(f.world_to_camera).all()
-        if f.sun_dir is not None and not abs(float(f.sun_dir.norm()) - 1) < 1e-3:
-            raise ReconstructionError(
-                f"frame {f.id} has {f.sun_dir.tolist()} for the Sun's direction, expected a unit vector; leave it out"
-            )
-        if not (finite and torch.isfinite(f.K).all() and 0 < f.exposure_time_s < math.inf):
-            raise ReconstructionError(
-                f"frame {f.id} holds a value or a pose that is not finite, or no exposure time; leave it out"
-            )
-        if fault := _pinhole_fault(f, white_dn):
-            raise ReconstructionError(f"frame {f.id}: {fault}")
-        if f.pose_covariance is not None and (fault := flaw(f.pose_covariance)):
-            raise ReconstructionError(
-                f"frame {f.id} has a pose covariance that {fault}, expected a symmetric [6, 6] without negative "
-                "eigenvalues; leave the frame out, or send zeros if its pose is exact"
-            )
+    for _ in each(lambda f: _check_values(f, white_dn), frames):
+        pass
     if exposure_aware:
         return frames, None
     reference_s = mean_exposure_s(frames)
     return [dataclasses.replace(f, exposure_time_s=reference_s) for f in frames], reference_s
+
+
+def _check_values(f: TrainingFrame, white_dn: float) -> None:
+    """Refuse a frame with values that none can have.
+
+    Raises:
+        ReconstructionError: see `usable`.
+    """
+    finite = torch.isfinite(f.dn).all() and torch.isfinite(f.world_to_camera).all()
+    if f.sun_dir is not None and not abs(float(f.sun_dir.norm()) - 1) < 1e-3:
+        raise ReconstructionError(
+            f"frame {f.id} has {f.sun_dir.tolist()} for the Sun's direction, expected a unit vector; leave it out"
+        )
+    if not (finite and torch.isfinite(f.K).all() and 0 < f.exposure_time_s < math.inf):
+        raise ReconstructionError(
+            f"frame {f.id} holds a value or a pose that is not finite, or no exposure time; leave it out"
+        )
+    if fault := _pinhole_fault(f, white_dn):
+        raise ReconstructionError(f"frame {f.id}: {fault}")
+    if f.pose_covariance is not None and (fault := flaw(f.pose_covariance)):
+        raise ReconstructionError(
+            f"frame {f.id} has a pose covariance that {fault}, expected a symmetric [6, 6] without negative "
+            "eigenvalues; leave the frame out, or send zeros if its pose is exact"
+        )
 
 
 def _pinhole_fault(frame: TrainingFrame, white_dn: float) -> str | None:

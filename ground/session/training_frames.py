@@ -12,6 +12,7 @@ from ground.session.cameras import sun_direction
 from ground.session.earth import earth_m
 from ground.session.folder import SPLITS, FrameRecord, Session, SessionError
 from ground.session.motion import rates
+from obbgs_core.compiled import each
 from obbgs_core.frames import Navigation, TrainingFrame
 
 log = logging.getLogger(__name__)
@@ -105,7 +106,7 @@ def frames_of(session: Session, records: Sequence[FrameRecord] | None = None) ->
         MissingFrames, SessionCorrupt: a picture cannot be read.
     """
     records = usable(session.frames) if records is None else records
-    return [training_frame(session, record) for record in records]
+    return list(each(lambda record: training_frame(session, record), records))
 
 
 def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:

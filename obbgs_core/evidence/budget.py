@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from obbgs_core.batches import Batches
+from obbgs_core.compiled import each
 from obbgs_core.evidence import Evidence
 from obbgs_core.evidence.gains import ROBUST, bic_penalty, shown_frames
 from obbgs_core.misfit import relative_misfit, sampled
@@ -26,15 +27,19 @@ def as_many_again(gaussians: Gaussians, batches: Batches, sensor: Sensor) -> Evi
     """
     gain, values, chosen = 0.0, 0, shown_frames(batches)
     times = len(batches.frames) / len(chosen)
-    for index in chosen:
+
+    def unexplained(index: int) -> tuple[float, int]:
         batch = batches.batch([index])
         radiance = render(gaussians, batch.cameras).radiance
         prediction = sensor.predicted(radiance, batch.exposure_time_s)
         empty_dn = sensor.expected_dn(batch.cameras.behind, batch.exposure_time_s)
         lit = (prediction.expected_dn - empty_dn).abs() > prediction.sigma_dn
         residual = sensor.normalised_residual(radiance, batch.exposure_time_s, batch.dn)[lit]
-        gain += 0.5 * float((residual.clamp(-ROBUST, ROBUST).square() - 1).sum()) * times
-        values += int(lit.sum())
+        return 0.5 * float((residual.clamp(-ROBUST, ROBUST).square() - 1).sum()), int(lit.sum())
+
+    for more, lit in each(unexplained, chosen):
+        gain += more * times
+        values += lit
     penalty = len(gaussians) * bic_penalty(gaussians, round(values * times))
     return Evidence(torch.tensor(gain, dtype=torch.float64), penalty)
 

@@ -5,19 +5,22 @@ A parameter is justified if its likelihood gain exceeds its BIC penalty. The equ
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from obbgs_core.batches import Batch, Batches
+from obbgs_core.compiled import each
 from obbgs_core.evidence import Evidence
 from obbgs_core.frames import sampling_rates
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render, weighted_gradient
 from obbgs_core.sensor import Sensor
 
+Answer = TypeVar("Answer")
 ROBUST = 3.0  # deviations that a residual counts as at most
 VIEWS = 36  # training frames that are rendered at most, spread evenly; gains are scaled to all frames
 # An opaque Gaussian that no picture shows on as much as a strip, one pixel wide and so many of the target's radii long,
@@ -75,15 +78,19 @@ def likelihood_gains(
     """
     model = gaussians.detach()
     model.opacity_logits.requires_grad_()
-    gains, shown_px, values, times = torch.zeros(len(model)), torch.zeros(len(model)), 0, 0.0
-    for view in _views(model, batches, sensor, rng):
+    gains, shown_px, values = torch.zeros(len(model)), torch.zeros(len(model)), 0
+    times = len(batches.frames) / len(shown_frames(batches))
+
+    def shown(view: _View) -> tuple[Tensor, Tensor]:
         (weights,) = torch.autograd.grad(view.radiance[..., 0].sum(), view.added, retain_graph=True)
-        shown_px = torch.maximum(shown_px, weights[0, :, 0])
         slope = weighted_gradient(view.radiance, view.weight * view.signs, model.opacity_logits)
         # o·d/do, from the derivative by the logit
-        change = slope / (1 - model.opacities.detach()).clamp(min=1e-6)
+        return weights[0, :, 0], slope / (1 - model.opacities.detach()).clamp(min=1e-6)
+
+    for lit, (weights, change) in _asked(shown, model, batches, sensor, rng):
+        shown_px = torch.maximum(shown_px, weights)
         gains += 0.5 * change**2
-        values, times = values + view.values, view.times
+        values += lit
     return Evidence(gains * times, bic_penalty(gaussians, round(values * times))), shown_px
 
 
@@ -100,15 +107,18 @@ def next_degree_gain(
     model = padded(gaussians.detach(), math.isqrt(old))
     model.sh.requires_grad_()
     slope, curvature, shared = (torch.zeros_like(model.sh) for _ in range(3))
-    values, times = 0, 0.0
-    for view in _views(model, batches, sensor, rng):
+    values, times = 0, len(batches.frames) / len(shown_frames(batches))
+
+    def told(view: _View) -> tuple[Tensor, Tensor]:
         residual = view.residual(sensor).clamp(-ROBUST, ROBUST)  # as the loss is
         g = weighted_gradient(view.radiance, view.weight * residual, model.sh, keep_graph=True)
-        probe = weighted_gradient(view.radiance, view.weight * view.signs, model.sh)
+        return g, weighted_gradient(view.radiance, view.weight * view.signs, model.sh)
+
+    for lit, (g, probe) in _asked(told, model, batches, sensor, rng):
         slope += g
         curvature += probe**2
         shared += probe * probe[:, :1]
-        values, times = values + view.values, view.times
+        values += lit
     new_slope, new_curvature = slope[:, old:], curvature[:, old:]
     if model.shading == "sun":
         by_constant = shared[:, old:] / curvature[:, :1].clamp(min=1e-6)
@@ -129,8 +139,6 @@ class _View:
     # of the radiance, in deviations of the reading; 0 where saturated, because the reading does not depend on it there
     weight: Tensor
     signs: Tensor
-    values: int  # sensor values that show the target above the noise
-    times: float  # training frames for each frame that is rendered
 
     def residual(self, sensor: Sensor) -> Tensor:
         """Return (read - expected) / deviation of the reading: mean 0 where the model is true."""
@@ -139,21 +147,30 @@ class _View:
         return -residual * math.sqrt(batch.averaged_pixels)
 
 
-def _views(model: Gaussians, batches: Batches, sensor: Sensor, rng: torch.Generator) -> Iterator[_View]:
-    """Render some of the training frames, spread evenly."""
-    chosen = shown_frames(batches)
-    for index in chosen:
-        batch = batches.batch([index])
+def _asked(
+    question: Callable[[_View], Answer],
+    model: Gaussians,
+    batches: Batches,
+    sensor: Sensor,
+    rng: torch.Generator,
+) -> Iterator[tuple[int, Answer]]:
+    """Ask some of the training frames, spread evenly; yield the values of each that show the target, and its answer."""
+
+    def answered(given: tuple[Batch, Tensor]) -> tuple[int, Answer]:
+        batch, signs = given
         added = torch.zeros(1, len(model), model.sh.shape[2], requires_grad=True)
         radiance = render(model, batch.cameras, added=added).radiance
         prediction = sensor.predicted(radiance.detach(), batch.exposure_time_s)
         sigma_dn = prediction.sigma_dn / math.sqrt(batch.averaged_pixels)
         dn_per_radiance = sensor.dn_per_radiance_s * batch.exposure_time_s
         weight = torch.where(batch.dn < sensor.white_dn, dn_per_radiance / sigma_dn, 0.0)
-        signs = torch.randint(0, 2, radiance.shape, generator=rng) * 2.0 - 1
         empty_dn = sensor.expected_dn(batch.cameras.behind, batch.exposure_time_s)
         values = int(((prediction.expected_dn - empty_dn).abs() > sigma_dn).sum()) * batch.averaged_pixels
-        yield _View(batch, radiance, added, weight, signs, values, len(batches.frames) / len(chosen))
+        return values, question(_View(batch, radiance, added, weight, signs))
+
+    taken = (batches.batch([index]) for index in shown_frames(batches))
+    signs = ((b, torch.randint(0, 2, b.dn.shape, generator=rng) * 2.0 - 1) for b in taken)
+    yield from each(answered, signs)
 
 
 def shown_frames(batches: Batches, most: int = VIEWS) -> range:

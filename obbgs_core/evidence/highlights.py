@@ -13,7 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_core.batches import Batches
+from obbgs_core.batches import Batch, Batches
+from obbgs_core.compiled import each
 from obbgs_core.evidence import Evidence
 from obbgs_core.evidence.gains import shown_frames
 from obbgs_core.frames import TrainingFrame, bracket_numbers, cameras_of
@@ -228,11 +229,10 @@ def _seen(
     step: int,
 ) -> _Seen:
     """Return what some of the training frames say of the Gaussians, in both errors, the model's and the noise."""
-    found = [[], [], [], []]
     static_sun = _static_sun(batches.frames) if model.shading == "view" else None
-    for index in shown_frames(batches, VIEWS):
-        batch = batches.batch([index])
-        sunlit = shadows.sunlit(model, batch.cameras, step)
+
+    def said(given: tuple[Batch, Tensor | None]) -> tuple[Tensor, ...]:
+        batch, sunlit = given
         added = torch.zeros(1, len(model), model.sh.shape[2], requires_grad=True)
         rendered = render(model, batch.cameras, sunlit=sunlit, added=added)
         prediction = sensor.predicted(rendered.radiance.detach(), batch.exposure_time_s)
@@ -251,9 +251,10 @@ def _seen(
         lit = torch.ones(len(model)) if sunlit is None else sunlit[0].to(slope)
         directions = F.normalize(model.means - batch.cameras.centres[0], dim=1)
         sun = static_sun if model.shading == "view" else batch.cameras.known_suns()[0]
-        axes = brightest_axes(directions, sun)
-        for values, more in zip(found, (slope[0], information[0], axes, lit), strict=True):
-            values.append(more)
+        return slope[0], information[0], brightest_axes(directions, sun), lit
+
+    taken = (batches.batch([index]) for index in shown_frames(batches, VIEWS))
+    found = zip(*each(said, ((b, shadows.sunlit(model, b.cameras, step)) for b in taken)), strict=True)
     slope, information, axes, sunlit = (torch.stack(values, dim=1) for values in found)
     known = model.shading != "view" or static_sun is not None
     return _Seen(

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from obbgs_core.batches import Batch, Batches
+from obbgs_core.compiled import each
 from obbgs_core.frames import TrainingFrame, bracket_numbers
 from obbgs_core.misfit import sampled
 from obbgs_core.model.gaussians import Gaussians
@@ -54,10 +55,9 @@ class Response:
         """Take the exponent that the frames tell beside the model as it stands; return whether it is another one."""
         in_brackets = _in_brackets(batches.frames)
         pairs = in_brackets or _in_turns(batches.frames)
-        told = {
-            i: _told(model, batches.batch([i]), sensor)
-            for i in sorted({i for pair in pairs for i in (*pair.one, *pair.other)})
-        }
+        indices = sorted({i for pair in pairs for i in (*pair.one, *pair.other)})
+        found = each(lambda i: _told(model, batches.batch([i]), sensor), indices)
+        told = dict(zip(indices, found, strict=True))
         if not in_brackets and _chosen(told.values()):
             return False
         found = [(pair.part, compared) for pair in pairs if (compared := _compared(pair, told))]

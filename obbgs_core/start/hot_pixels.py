@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from obbgs_core.compiled import each
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor, dark_reading
 
@@ -53,11 +54,15 @@ def hot_pixels(frames: list[TrainingFrame], sensor: Sensor) -> Tensor:
     sigma_dn /= math.sqrt(frames[0].shape[2])
     apart_dn = sigma_dn * math.sqrt(1 + 1 / 8)
     total, count = torch.zeros(2, *frames[0].shape[:2])
-    for frame in frames[:: math.ceil(len(frames) / LOOKED_AT)]:
+
+    def beside(frame: TrainingFrame) -> tuple[Tensor, Tensor]:
         grey = frame.dn.mean(dim=2)
         around = _around(grey) / _around(torch.ones_like(grey))
         sky = around < dark_dn + SKY_SIGMA * sigma_dn / math.sqrt(8)
-        total += sky * (grey - around).clamp(-MOST_SIGMA * apart_dn, MOST_SIGMA * apart_dn)
+        return sky, sky * (grey - around).clamp(-MOST_SIGMA * apart_dn, MOST_SIGMA * apart_dn)
+
+    for sky, brighter in each(beside, frames[:: math.ceil(len(frames) / LOOKED_AT)]):
+        total += brighter
         count += sky
     mean = total / count.clamp(min=1)
     certain = mean > CERTAIN * apart_dn / count.clamp(min=1).sqrt()

@@ -9,6 +9,8 @@ import dataclasses
 import logging
 import math
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +18,8 @@ from scipy.ndimage import uniform_filter
 from torch import Tensor
 
 from obbgs_core.compact import hold_compact
+from obbgs_core.compiled import each
+from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor, dark_reading
 
 log = logging.getLogger(__name__)
@@ -42,6 +46,7 @@ SUBDIVISIONS = 2  # of the first grid, at most; each halves the voxels
 VIEWS_AT_ONCE = 4  # between two looks for points that are out of the hull already
 FINEST_PX = 0.7  # smallest width of a voxel in the image
 VOXELS_AT_ONCE = 1_000_000  # bounds the memory
+POINTS_AT_ONCE = 1 << 17  # of one thread; with fewer, threads of Python wait for each other
 
 
 @dataclass(frozen=True)
@@ -130,9 +135,10 @@ def _dilated(mask: Tensor, reach_px: int) -> Tensor:
     return _mean(mask.float(), 2 * reach_px + 1) > 0  # sums of zeros and ones are exact
 
 
-def shows_light(dn: Tensor, sensor: Sensor) -> bool:
-    """Return whether anything in dn [H, W, C] certainly rises above the noise; in eclipse nothing does."""
+def shows_light(frame: TrainingFrame, sensor: Sensor) -> bool:
+    """Return whether anything in a frame certainly rises above the noise; in eclipse nothing does."""
     sky_dn, sigma_dn = dark_reading(sensor)
+    dn = light(frame.dn, sensor, frame.background, frame.exposure_time_s)
     signal = F.avg_pool2d((dn.mean(dim=-1) - sky_dn)[None], 3, 1)
     bright = signal > CERTAIN_SIGMA * sigma_dn / math.sqrt(dn.shape[2]) / 3
     return int(bright.sum()) >= FEWEST_BRIGHT_PX
@@ -252,25 +258,50 @@ def agreement(silhouettes: list[Silhouette], points: Tensor, reach_m: float, lea
     Args:
         least: points whose share is below this may have a share of 0 instead, which takes less time.
     """
-    shares, left = torch.zeros(len(points)), torch.arange(len(points))
-    votes, seen = torch.zeros(len(points)), torch.zeros(len(points))
-    for number, s in enumerate(silhouettes, 1):
+    pieces = [
+        _Voted(some, at, *torch.zeros(2, len(at)))
+        for some, at in zip(
+            *(of.split(POINTS_AT_ONCE) for of in (points, torch.arange(len(points)))), strict=True
+        )
+    ]
+    shares, most_against = torch.zeros(len(points)), (1 - least) * len(silhouettes)
+    for first in range(0, len(silhouettes), VIEWS_AT_ONCE):
+        views = silhouettes[first : first + VIEWS_AT_ONCE]
+        masks = list(each(partial(_reaching, reach_m), views))
+        pieces = list(each(partial(_voted, views, masks, most_against), pieces))
+    for _, at, votes, seen in pieces:
+        enough = seen >= max(1, len(silhouettes) // 3)
+        shares[at[enough]] = (votes / seen.clamp(min=1))[enough]
+    return shares
+
+
+class _Voted(NamedTuple):
+    """Points [M, 3] that may be in the hull yet, which of all they are, and the views that see light there, and any."""
+
+    points: Tensor
+    at: Tensor
+    votes: Tensor
+    seen: Tensor
+
+
+def _reaching(reach_m: float, s: Silhouette) -> Tensor:
+    """Return where a view sees likely light within `reach_m` at the target's distance, [H, W]."""
+    if reach_m <= 0:
+        return s.likely
+    pixels = math.ceil(float(s.K[0, 0]) * reach_m / max(float(s.world_to_camera[2, 3]), 1e-6))
+    return _dilated(s.likely[None, None], min(pixels, min(s.likely.shape) // 4))[0, 0]
+
+
+def _voted(views: list[Silhouette], masks: list[Tensor], most_against: float, before: _Voted) -> _Voted:
+    """Return points after more views, by their masks, without those that too many speak against."""
+    points, at, votes, seen = before
+    for s, mask in zip(views, masks, strict=True):
         p = torch.addmm(s.world_to_camera[:3, 3], points, s.world_to_camera[:3, :3].T)
         z = p[:, 2].clamp(min=1e-6)
         u, v = s.K[0, 0] * p[:, 0] / z + s.K[0, 2], s.K[1, 1] * p[:, 1] / z + s.K[1, 2]
-        height, width = s.likely.shape
+        height, width = mask.shape
         inside = (p[:, 2] > 1e-6) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        mask = s.likely
-        if reach_m > 0:
-            pixels = math.ceil(float(s.K[0, 0]) * reach_m / max(float(s.world_to_camera[2, 3]), 1e-6))
-            pixels = min(pixels, min(height, width) // 4)
-            mask = _dilated(mask[None, None], pixels)[0, 0]
         lit = mask[v.long().clamp(0, height - 1), u.long().clamp(0, width - 1)]
-        votes += lit & inside
-        seen += inside
-        if number % VIEWS_AT_ONCE == 0:
-            possible = seen - votes <= (1 - least) * len(silhouettes)
-            points, left, votes, seen = points[possible], left[possible], votes[possible], seen[possible]
-    enough = seen >= max(1, len(silhouettes) // 3)
-    shares[left[enough]] = (votes / seen.clamp(min=1))[enough]
-    return shares
+        votes, seen = votes + (lit & inside), seen + inside
+    possible = seen - votes <= most_against
+    return _Voted(points[possible], at[possible], votes[possible], seen[possible])

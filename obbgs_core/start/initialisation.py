@@ -12,6 +12,7 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from obbgs_core.compiled import each
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame, mean_exposure_s
 from obbgs_core.model import sh
@@ -61,19 +62,20 @@ def silhouettes(
     for exposure_s in sorted({f.exposure_time_s for f in frames}, reverse=True):
         if len(chosen) < FEWEST_VIEWS:
             chosen |= {i: f for i, f in black.items() if f.exposure_time_s == exposure_s}
-    outlines = {}
-    for i, f in (chosen | earth).items():
+
+    def outline(i: int) -> hull.Silhouette:
         if i in known:
-            outlines[i] = known[i]
-            continue
+            return known[i]
         if i in earth:
-            outlines[i] = earth_silhouette(f, sensor)
-            continue
+            return earth_silhouette(earth[i], sensor)
+        f = chosen[i]
         light = hull.light(f.dn, sensor, f.background, f.exposure_time_s)
-        outline = hull.silhouette(light, sensor, f.world_to_camera, f.K)
+        found = hull.silhouette(light, sensor, f.world_to_camera, f.K)
         spread_px = math.ceil(f.moved_px / 2)
-        outlines[i] = dataclasses.replace(outline, grown_px=spread_px) if spread_px else outline
-    return outlines
+        return dataclasses.replace(found, grown_px=spread_px) if spread_px else found
+
+    indices = list(chosen | earth)
+    return dict(zip(indices, each(outline, indices), strict=True))
 
 
 def first_gaussians(

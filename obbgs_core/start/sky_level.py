@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from obbgs_core.compact import held, whole
+from obbgs_core.compiled import each
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.jpeg import BLOCK_PX, FULL_SCALE
 from obbgs_core.sensor import Sensor, clipped_mean, clipped_moments, dark_reading, noise_excess
@@ -151,7 +152,7 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
     """Return planes [F, C, 3] and their variances, infinite where a frame shows no sky, and a reading's deviation."""
     height, width, channels = frames[0].shape
     px = max(2, round(min(height, width) / BLOCKS))
-    cut = [held(cut_pixels(f.dn, sensor)) for f in frames]
+    cut = list(each(lambda f: held(cut_pixels(f.dn, sensor)), frames))
     if any(bool(whole(mask).any()) for mask in cut):
         px = min(px, CUT_BLOCK_PX)
     if sensor.jpeg is not None:  # within its blocks readings are not independent
@@ -161,7 +162,7 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
         nothing = torch.zeros(len(frames), channels, 3).double()
         return nothing, torch.full_like(nothing, math.inf), 1.0
     step = math.ceil(math.sqrt(rows * columns / MOST_BLOCKS))
-    pooled = [_block_moments(f.dn, px, step) for f in frames]
+    pooled = each(lambda f: _block_moments(f.dn, px, step), frames)
     mean, variance = (torch.stack(moments) for moments in zip(*pooled, strict=True))  # [F, C, B]
     known = torch.stack(
         [_taken(F.max_pool2d(whole(m)[None].float(), px), step)[0] == 0 for m in cut]
@@ -175,18 +176,17 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
     levels = _levels(mean.mean(dim=1), sigma_dn)
     even = torch.zeros(len(frames), 3).double()
     even[:, 0] = _quantile(levels, known, LOW_SHARE)
-    found = [
-        _through_sky(start, basis, mean, variance, known, (px * px, -(-rows // step)), sigma_dn, sensor)
-        for start in (_low_planes(basis, levels, known, sigma_dn), even)
-    ]
+    size, starts = (px * px, -(-rows // step)), (_low_planes(basis, levels, known, sigma_dn), even)
+    given = (basis, mean, variance, known, size, sigma_dn, sensor)
+    found = list(each(lambda start: _through_sky(start, *given), starts))
     # of the two planes of a frame that with more sky; the noise as most frames show it
     first = found[0].count >= found[1].count
     plane = torch.where(first[:, None], found[0].plane, found[1].plane)
     sky = torch.where(first[:, None], found[0].sky, found[1].sky)
     usable = shown & (found[0].count.maximum(found[1].count) > 0)
     sigma_dn = max(found, key=lambda f: int(f.count.sum())).sigma_dn
-    planes, variances = [], []
-    for channel in range(channels):
+
+    def of_channel(channel: int) -> tuple[Tensor, Tensor]:
         own, of_reading = plane, torch.empty(0)
         for _ in range(SWEEPS):
             own, of_reading = _fitted(own, basis, mean[:, channel], sky, sigma_dn, sensor)
@@ -194,8 +194,9 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
         if sensor.jpeg is not None:
             of_mean = of_mean * (1 + _of_coding(sensor, px * px) * px * px / sigma_dn**2)
             own, of_mean = _before_coding(own, of_mean, sigma_dn, sensor)
-        planes.append(own)
-        variances.append(of_mean)
+        return own, of_mean
+
+    planes, variances = zip(*each(of_channel, range(channels)), strict=True)
     errors = torch.where(usable[:, None, None], torch.stack(variances, dim=1), math.inf)
     return torch.stack(planes, dim=1), errors, sigma_dn
 
@@ -409,14 +410,17 @@ def _without(
     highest = max(0.0, float((planes_dn[..., 0] + corner).max()))
     black_dn = max(0.0, sensor.black_dn + lowest)
     white_dn = sensor.white_dn - (highest - (black_dn - sensor.black_dn))
-    corrected = []
-    for frame, plane in zip(frames, planes_dn, strict=True):
+
+    def corrected(given: tuple[TrainingFrame, Tensor]) -> TrainingFrame:
+        frame, plane = given
         off = field(plane, height, width) - (black_dn - sensor.black_dn)
         dn = (frame.dn - off).clamp(0, white_dn)
         dn[frame.dn <= 0], dn[frame.dn >= sensor.white_dn] = 0.0, white_dn
         dn[cut_pixels(frame.dn, sensor)] = black_dn
-        corrected.append(dataclasses.replace(frame, dn=dn))
-    return corrected, dataclasses.replace(sensor, black_dn=black_dn, white_dn=white_dn)
+        return dataclasses.replace(frame, dn=dn)
+
+    changed = dataclasses.replace(sensor, black_dn=black_dn, white_dn=white_dn)
+    return list(each(corrected, zip(frames, planes_dn, strict=True))), changed
 
 
 def with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Sensor, str]:
@@ -432,8 +436,8 @@ def with_noise_seen(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Sensor
         max(dark_dn, sensor.expected_dn(torch.tensor(frame.background), frame.exposure_time_s).item())
         for frame in shown
     ]
-    pairs = zip(shown, empty_dn, strict=True)
-    ratios, farther = zip(*(noise_excess(frame.dn, sensor, level) for frame, level in pairs), strict=True)
+    found = each(lambda of: noise_excess(of[0].dn, sensor, of[1]), zip(shown, empty_dn, strict=True))
+    ratios, farther = zip(*found, strict=True)
     excess = statistics.median(ratios)
     too_much = sensor.jpeg is None and excess < 1 / CLEAR_EXCESS and statistics.median(farther) < UNSMOOTHED
     if not (excess > CLEAR_EXCESS or too_much):

@@ -6,6 +6,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from obbgs_core.compact import Compact, whole
+from obbgs_core.compiled import each
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.sensor import Sensor
 from obbgs_core.start.hull import light
@@ -26,8 +27,8 @@ def textured_pixels(
         certain: [H, W], where silhouettes of some of the frames show light for certain, by the index of the frame.
     """
     indices = list(certain)[:: -(-len(certain) // PICTURES)]
-    textured, within = 0, 0
-    for i in indices:
+
+    def counted(i: int) -> tuple[int, int]:
         frame, mask = frames[i], whole(certain[i])
         inside = -F.max_pool2d(-mask.float()[None], 3, 1, 1)[0] > 0
         dn = light(frame.dn, sensor, frame.background, frame.exposure_time_s)
@@ -37,6 +38,7 @@ def textured_pixels(
         beside = F.pad(dn[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
         mean = (beside[:-2, 1:-1] + beside[2:, 1:-1] + beside[1:-1, :-2] + beside[1:-1, 2:]) / 4
         least = ((TEXTURE * dn) ** 2 + NOISE**2 * 1.25 * variance_dn2).sqrt()
-        textured += int((((dn - mean).abs() > least) & inside).sum())
-        within += int(inside.sum())
+        return int((((dn - mean).abs() > least) & inside).sum()), int(inside.sum())
+
+    textured, within = map(sum, zip(*each(counted, indices), strict=True))
     return textured // len(indices) if textured > ALL_OVER * within else 0

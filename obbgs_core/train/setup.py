@@ -13,6 +13,7 @@ from torch import Tensor
 
 from obbgs_core.batches import Batches, windows
 from obbgs_core.compact import Compact, held, whole
+from obbgs_core.compiled import each
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import (
     FEWEST_FRAMES,
@@ -30,7 +31,7 @@ from obbgs_core.poses.corrections import PoseCorrections
 from obbgs_core.sensor import Sensor, unusual_unit
 from obbgs_core.start.alignment import settled
 from obbgs_core.start.hot_pixels import without_hot_pixels
-from obbgs_core.start.hull import Silhouette, light, shows_light
+from obbgs_core.start.hull import Silhouette, shows_light
 from obbgs_core.start.initialisation import first_gaussians, silhouettes
 from obbgs_core.start.sky_level import SkyLevel, levelled, with_noise_seen
 from obbgs_core.start.texture import textured_pixels
@@ -150,7 +151,7 @@ def prepare(
     checked, sensor, sky_level = levelled(checked, sensor)
     checked, hot = without_hot_pixels(checked, sensor)
     sensor, noise = with_noise_seen(checked, sensor)
-    lighted = [shows_light(light(f.dn, sensor, f.background, f.exposure_time_s), sensor) for f in checked]
+    lighted = list(each(lambda f: shows_light(f, sensor), checked))
     lit = _lit(checked, lighted)
     config = asked.for_frames(len(lit))
     published = config.published

@@ -56,7 +56,7 @@ def train(
 ) -> TrainResult:
     """Fit Gaussians to frames.
 
-    The same seed, thread count and machine give the same result bit for bit, also when the training was killed and
+    The same seed and machine give the same result bit for bit, on any number of threads, also when it was killed and
     called again with the same checkpoint file; a checkpoint of another training is not used. The time limit counts
     the time spent before a kill too. The checkpoint of a finished training stays, so that the model is not lost where
     what is done with it afterwards fails.

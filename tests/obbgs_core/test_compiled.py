@@ -1,6 +1,7 @@
 """Which kernels run: the best by default, another by name, all with the same result; and what the module holds."""
 
 import ast
+import itertools
 import math
 import re
 import threading
@@ -9,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from obbgs_core import compiled
 from obbgs_core.losses import fit_figures, likelihood_loss, published_loss
@@ -147,3 +150,41 @@ def test_work_beside_the_caller_runs_on_one_thread_of_pytorch_and_at_once_where_
     use_threads(4)  # before the thread's first operation
     assert beside.submit(torch.get_num_threads).result() == 1
     beside.close()
+
+
+def test_each_item_is_worked_on_by_one_thread_and_results_come_in_order(use_threads):
+    use_threads(3)
+    met = threading.Barrier(3, timeout=30)  # three are under way at once, or this breaks
+
+    def worked(item: int) -> tuple:
+        met.wait()
+        grown = torch.zeros(1, requires_grad=True) + item
+        return item, threading.get_ident(), compiled.threads(), torch.get_num_threads(), grown.requires_grad
+
+    with torch.no_grad():
+        items, idents, *threads, graph = zip(*compiled.each(worked, range(6)), strict=True)
+    assert items == tuple(range(6)) and threading.get_ident() not in idents
+    assert threads == [(1,) * 6] * 2 and not any(graph)
+    assert compiled.threads() == 3
+    assert all(graph for *_, graph in compiled.each(worked, range(3)))
+
+
+@given(st.integers(1, 4), st.integers(0, 12), st.integers(0, 11))
+def test_items_are_drawn_as_results_are_taken_and_an_error_comes_in_its_place(count, items, wrong):
+    drawn, before = [], torch.get_num_threads()
+
+    def work(item: int) -> int:
+        if item == wrong:
+            raise KeyError(item)
+        return item**2
+
+    torch.set_num_threads(count)
+    try:
+        found = compiled.each(work, (drawn.append(i) or i for i in range(items)))
+        for taken, value in enumerate(itertools.islice(found, wrong)):
+            assert value == taken**2 and len(drawn) <= taken + 1 + count
+        if wrong < items:
+            with pytest.raises(KeyError, match=str(wrong)):
+                next(found)
+    finally:
+        torch.set_num_threads(before)

@@ -68,6 +68,18 @@ def test_a_step_wakes_threads_for_the_compiled_module_alone(frames, monkeypatch,
     assert set(seen) == {(1, 3)} and (torch.get_num_threads(), compiled.threads()) == (3, 3)
 
 
+def test_start_decisions_and_steps_do_not_depend_on_the_number_of_threads(frames, use_threads, monkeypatch):
+    monkeypatch.setattr("obbgs_core.start.hull.POINTS_AT_ONCE", 1 << 16)  # several threads carve
+    config = preset("obbgs", QUICK | {"parsimony.prune_at": (0.5,)})
+    found = []
+    for threads in (1, 3):
+        use_threads(threads)
+        result = train(frames, SENSOR, config, seed=3)
+        found.append((result.gaussians.tensors(), result.history[-1].loss, str(result.response)))
+    (one, *told), (three, *told_again) = found
+    assert told == told_again and all(torch.equal(tensor, three[name]) for name, tensor in one.items())
+
+
 def test_the_result_is_the_mean_of_the_models_of_the_last_steps(frames):
     config = preset("obbgs", QUICK | {"averaged_from": 0.8, "parsimony.prune_at": ()})
     trainer, models = Trainer(frames, SENSOR, config, seed=3), []

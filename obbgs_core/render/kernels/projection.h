@@ -13,7 +13,7 @@ namespace {
 
 // Gaussians in a unit of parallel work: a constant, so that sums are added in the same order with any number of threads
 constexpr int kChunk = 256;
-constexpr size_t kSplatsPerThread = 8192;  // with fewer, another thread takes longer to wake than it saves
+constexpr size_t kSplatsPerThread = 1024;  // with fewer, another thread takes longer to wake than it saves
 constexpr float kMinNorm = 1e-12f;
 
 inline mask finite(vf x) { return absolute(x) <= vf(FLT_MAX); }
