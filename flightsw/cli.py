@@ -401,7 +401,7 @@ def _run(
     else:
         _print_result(result, store_dir)
     captured = result.captured
-    not_all_stored = captured is not None and (captured.failed or captured.refused)
+    not_all_stored = captured is not None and (captured.failed or captured.refused or captured.dropped)
     if not_all_stored or (exit_when_empty and link_url is not None and result.outbox):
         raise typer.Exit(1)
 
@@ -409,15 +409,22 @@ def _run(
 def _print_result(result: RunResult, store_dir: Path) -> None:
     if (captured := result.captured) is not None:
         print(
-            f"captured {captured.stored} frames, {captured.already_stored} were there, {captured.failed} failed, "
-            f"{captured.refused} refused, {captured.pose_invalid} without a valid pose"
+            f"captured {captured.stored} frames, {captured.already_stored} were taken before, "
+            f"{captured.failed} failed, {captured.refused} refused, {captured.pose_invalid} without a valid pose"
         )
+        if captured.dropped:
+            print(f"{captured.dropped} frames were deleted undelivered to make room (store.when_full)")
+        if captured.skipped:
+            print(f"{captured.skipped} exposures were not taken: safe mode")
         if result.camera_losses:
             times = "once" if result.camera_losses == 1 else f"{result.camera_losses} times"
+            lost = (
+                f"{captured.lost_with_camera} exposures of {captured.brackets_short} brackets were not taken"
+                if captured.lost_with_camera
+                else "no exposure was lost with it"
+            )
             print(
-                f"the camera was lost {times}"
-                f"{' and never came back' if result.camera_is_lost else ''}: {captured.lost_with_camera} exposures "
-                f"of {captured.brackets_short} brackets were not taken"
+                f"the camera was lost {times}{' and never came back' if result.camera_is_lost else ''}: {lost}"
             )
     if result.sent is not None:
         print(f"delivered {result.sent.delivered} frames, {result.sent.segments_resent} segments resent")

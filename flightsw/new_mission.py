@@ -104,7 +104,8 @@ def _elements(path: Path) -> list[str]:
     elements = lines[-2:]
     if len(lines) not in (2, 3) or any('"' in line or "\\" in line for line in elements):
         raise ConfigError(
-            str(path), f"expected two lines of elements, with or without a name before, got {len(lines)}"
+            str(path),
+            f"expected two lines of elements, with or without a name before, got {len(lines)} lines",
         )
     return elements
 

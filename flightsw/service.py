@@ -4,6 +4,7 @@ import re
 import sys
 from pathlib import Path
 
+from flightsw.cameras import driver_of
 from flightsw.icd.config import ConfigError
 from flightsw.icd.link.link_url import parse_link_url
 
@@ -24,14 +25,16 @@ def unit(
     Raises:
         ConfigError: a path is not absolute or hidden from services, the link's URL or the user's name cannot be used,
             or this Python has no command `flightsw`.
+        ValueError: there is no driver for the camera's URL.
     """
+    driver_of(camera_url)
     parse_link_url(link_url)
     if not re.fullmatch(r"[a-z_][a-z0-9_-]{0,31}", user):
         raise ConfigError("--user", f"expected the name of a user, such as obbgs, got {user!r}")
     program = Path(sys.prefix) / "bin" / "flightsw"
     if not program.is_file():
         raise ConfigError(
-            "flightsw service", f"there is no {program}: install the package into this environment"
+            "the environment", f"there is no {program}: install the package into this environment"
         )
     key = STATE / "mission.key" if key is None else key
     for option, path in (("--mission", mission), ("--key", key), ("the environment", program)):
@@ -65,6 +68,6 @@ def unit(
 def _quoted(word: str) -> str:
     """Return a word of a command line as systemd reads it (systemd.service(5), "Command lines")."""
     if "\n" in word:
-        raise ConfigError("flightsw service", f"expected one line, got {word!r}")
+        raise ConfigError(repr(word), "expected one line")
     word = word.replace("\\", "\\\\").replace("%", "%%").replace("$", "$$").replace('"', '\\"')
     return f'"{word}"' if re.search(r"[\s'\"\\;]", word) else word

@@ -5,6 +5,7 @@ called with the URL and the mission's section `camera` and returns a `Camera`. s
 contract.py tests it.
 """
 
+from collections.abc import Callable
 from importlib.metadata import entry_points
 
 from flightsw.cameras.camera import Camera
@@ -20,22 +21,30 @@ def open_camera(url: str, section: CameraSection) -> Camera:
         CaptureError: the camera does not answer, or cannot be what the mission expects.
         ValueError: no driver for this URL, or one that cannot be loaded.
     """
-    scheme = url.partition("://")[0]
-    if scheme == "hil":
+    return driver_of(url)(url, section)
+
+
+def driver_of(url: str) -> Callable[[str, CameraSection], Camera]:
+    """Return what opens the camera that a URL names.
+
+    Raises:
+        ValueError: no driver for this URL, or one that cannot be loaded.
+    """
+    scheme, separator, _ = url.partition("://")
+    if scheme == "hil" and separator:
         from flightsw.cameras.networked import NetworkedCamera
 
-        return NetworkedCamera(url)
-    if scheme == "gige":
+        return lambda url, section: NetworkedCamera(url)
+    if scheme == "gige" and separator:
         from flightsw.cameras.gige import GigeCamera
 
-        return GigeCamera(url, section)
+        return GigeCamera
     installed = entry_points(group=GROUP)
     for found in installed.select(name=scheme):
         try:
-            driver = found.load()
+            return found.load()
         except Exception as error:  # of whatever the driver imports
             raise ValueError(f"the camera driver {found.value} cannot be loaded: {error}") from error
-        return driver(url, section)
     others = "".join(f", {name}://" for name in sorted(installed.names))
     raise ValueError(
         f"no camera driver for {url!r}; expected hil:///path/to/socket, hil://host:port, gige://<device id or IP>"

@@ -136,7 +136,9 @@ class Aravis:
         if error:
             message = error.contents.message.decode(errors="replace")
             self._glib.g_clear_error(ctypes.byref(error))
-            raise AravisError(f"{name.removeprefix('arv_camera_')}: {message}")
+            raise AravisError(
+                f"{name.removeprefix('arv_camera_').replace('_', ' ')}: {message}".removeprefix("new: ")
+            )
         return result
 
     def unref(self, thing: int | None) -> None:

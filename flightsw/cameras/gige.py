@@ -43,13 +43,17 @@ class GigeCamera:
     Raises:
         CameraLost: the camera does not answer, or cannot be what the mission expects, or leaves something
             automatic on.
-        ValueError: the URL names an unknown pixel format.
+        ValueError: the URL names no camera, an unknown pixel format or another option.
     """
 
     def __init__(self, url: str, section: CameraSection):
         device, _, query = url.removeprefix("gige://").partition("?")
-        formats = parse_qs(query, strict_parsing=bool(query)).pop("pixel_format", [])
-        self._format = formats[0] if formats else _format_for(section)
+        options = parse_qs(query, keep_blank_values=True)
+        if not device or set(options) - {"pixel_format"}:
+            raise ValueError(
+                f"expected gige://ID, its IP address for the ID, and no option but ?pixel_format=Mono12, got {url!r}"
+            )
+        self._format = options["pixel_format"][0] if options else _format_for(section)
         if self._format not in PIXEL_FORMATS:
             raise ValueError(
                 f"pixel format {self._format!r} of {url!r}; expected one of {', '.join(PIXEL_FORMATS)}"
@@ -59,7 +63,7 @@ class GigeCamera:
                 f"{self._format} has {PIXEL_FORMATS[self._format][1]} bits, the mission's camera "
                 f"{section.bit_depth}: name another pixel_format in {url!r}"
             )
-        self._url, self._device, self._section = url, device.encode() or None, section
+        self._url, self._device, self._section = url, device.encode(), section
         self._aravis = aravis()
         self._camera = self._stream = None
         self._packets_before = (0, 0)

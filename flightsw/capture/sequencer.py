@@ -46,6 +46,7 @@ class CaptureCounts:
     lost_with_camera: int = 0  # of the failed ones: the camera did not answer
     brackets_short: int = 0  # brackets that lack such exposures
     refused: int = 0  # taken, but the store is full
+    dropped: int = 0  # stored frames that were deleted undelivered for newer ones
     skipped: int = 0  # not taken: safe mode
     in_eclipse: int = 0
     pose_invalid: int = 0  # of the stored ones; the next three say why
@@ -96,6 +97,7 @@ def capture(
     """
     counts = CaptureCounts()
     store.hold_pass(mission.orbit.start_utc_ns)
+    dropped_before = store.dropped_undelivered
     tagger = PoseTagger(mission)
     times = _BracketTimes(mission, store, wait_until, settings)
     failures = _Repeats("%d more exposures lost for the same reason: %s")
@@ -143,6 +145,7 @@ def capture(
                 else:
                     take(shot, commanded.max_error_dn if commanded else 0)
             counts.planned += 1
+            counts.dropped = store.dropped_undelivered - dropped_before
             counts.stale_elements = tagger.stale_elements
             counts.outside_ephemeris = tagger.outside_ephemeris
             counts.navigation_gaps = tagger.navigation_gaps

@@ -437,7 +437,8 @@ class Commander:
         if command.name == "bracket":
             dataclasses.replace(self.settings, **values).bracket(self._mission)
         elif command.name in ("delete", "resend") and values["first_frame"] > values["last_frame"]:
-            raise ValueError(f"frames {values['first_frame']} to {values['last_frame']} are none")
+            first, last = values["first_frame"], values["last_frame"]
+            raise ValueError(f"expected the first number before the last, got {first} and {last}")
         elif command.name == "retire":
             if values["key"] == received.spi:
                 raise ValueError(f"key {received.spi} would retire itself: seal this with the key that stays")

@@ -165,7 +165,10 @@ def _pointing(states: SatelliteStates) -> np.ndarray:
     try:
         return look_along(line_of_sight, down=-orbit_normal)
     except ValueError as error:
-        raise OrbitError(f"the camera cannot point at the target {line_of_sight} m away: {error}") from error
+        raise OrbitError(
+            f"the camera cannot point at the target {np.linalg.norm(line_of_sight):.3g} m away: {error}; are these the "
+            "elements of two spacecraft?"
+        ) from error
 
 
 def target_attitude(mission: Mission, utc_ns: int) -> np.ndarray:
@@ -198,7 +201,10 @@ def look_along(direction: np.ndarray, down: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: the two are parallel or zero, so that y is not defined.
     """
-    z = direction / max(float(np.linalg.norm(direction)), 1e-300)
+    distance = float(np.linalg.norm(direction))
+    if not distance:
+        raise ValueError("the direction has no length")
+    z = direction / distance
     y = down - (down @ z) * z
     length = np.linalg.norm(y)
     if not length > 1e-9 * np.linalg.norm(down):

@@ -1,6 +1,7 @@
 """Checks of the flight computer: clock, disk, speed and memory, and the key's files."""
 
 import ctypes
+import errno
 import os
 import shutil
 import time
@@ -80,8 +81,16 @@ def check_disk(mission: Mission, store: Path) -> list[Finding]:
     if not folder.is_dir():
         advice = "name another --store, or move the file away"
         return [Finding.failed("disk", f"{folder} cannot be written: it is no folder", advice)]
+    frame_bytes = _frame_bytes(mission)
+    bracket = mission.bracket
+    per_bracket = frame_bytes * len(bracket.exposure_times_ms)
+    free_bytes = shutil.disk_usage(folder).free
+    if mission.store.quota_bytes is not None:
+        free_bytes = min(free_bytes, mission.store.quota_bytes)
+    room = f"{folder}: room for {free_bytes / 1e6:.3g} MB, the pass takes {per_bracket * bracket.count / 1e6:.3g}"
+    more_room = "free space, raise the quota, or take fewer brackets"
     probe = folder / f".selftest-{os.getpid()}"
-    content = os.urandom(1 << 20)
+    content = os.urandom(min(1 << 20, max(free_bytes // 4, 1)))  # it stands there twice for a moment
     try:
         started_s = time.monotonic()
         write_whole(probe, content)
@@ -92,22 +101,16 @@ def check_disk(mission: Mission, store: Path) -> list[Finding]:
     except OSError as error:
         probe.unlink(missing_ok=True)
         advice = "mount the disk for writing, give this user the folder (chown), or name another --store"
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            advice = more_room
         return [Finding.failed("disk", f"{folder} cannot be written: {reason(error)}", advice)]
     if not came_back:
         advice = "replace the disk: it does not keep what is written"
         return [Finding.failed("disk", f"{folder} returned other bytes than were written", advice)]
-    frame_bytes = _frame_bytes(mission)
-    bracket = mission.bracket
-    per_bracket = frame_bytes * len(bracket.exposure_times_ms)
-    free_bytes = shutil.disk_usage(folder).free
-    if mission.store.quota_bytes is not None:
-        free_bytes = min(free_bytes, mission.store.quota_bytes)
-    room = f"{folder}: room for {free_bytes / 1e6:.0f} MB, the pass takes {per_bracket * bracket.count / 1e6:.0f}"
-    advice = "free space, raise the quota, or take fewer brackets"
     if free_bytes < per_bracket:
-        return [Finding.failed("disk", f"{room} MB: not even one bracket fits", advice)]
+        return [Finding.failed("disk", f"{room} MB: not even one bracket fits", more_room)]
     if free_bytes < per_bracket * bracket.count:
-        return [Finding.warning("disk", f"{room} MB uncompressed", advice)]
+        return [Finding.warning("disk", f"{room} MB uncompressed", more_room)]
     return [
         Finding.ok("disk", f"{room} MB at most; wrote {2e-6 * len(content) / elapsed_s:.0f} MB/s, atomically")
     ]

@@ -36,7 +36,11 @@ def check_orbit(mission: Mission) -> list[Finding]:
         ranges_m[name] = float(np.linalg.norm(states[0].position_m - states[1].position_m))
     findings = []
     by_elements = mission.navigation.source == "sgp4"
-    if not by_elements and ages_days["the last trigger"] > orbit.max_element_age_days:
+    if not all(ranges_m.values()):
+        state = Finding.failed if by_elements else Finding.warning
+        found = "target and chaser are at the same place: are these the elements of two spacecraft?"
+        findings.append(state("orbit", found, "correct orbit.target_tle or orbit.chaser_tle"))
+    elif not by_elements and ages_days["the last trigger"] > orbit.max_element_age_days:
         found = (
             f"elements are {ages_days['the last trigger']:.1f} days old at the last trigger, "
             f"{orbit.max_element_age_days:g} are allowed: poses come from navigation, but the plan of the pass and the "
@@ -75,7 +79,7 @@ def check_orbit(mission: Mission) -> list[Finding]:
 def check_view(mission: Mission) -> list[Finding]:
     """Check that the camera's figures fit to the target: field of view, share of the picture, line of sight.
 
-    Says nothing where the orbits cannot be computed, which `check_orbit` tells.
+    Says nothing where the orbits cannot be computed or are one, which `check_orbit` tells.
     """
     orbit, bracket = mission.orbit, mission.bracket
     ranges_m = []
@@ -86,6 +90,8 @@ def check_view(mission: Mission) -> list[Finding]:
         except OrbitError:
             return []
         ranges_m.append(float(np.linalg.norm(states[0].position_m - states[1].position_m)))
+    if not all(ranges_m):
+        return []
     view, problems = field_of_view(mission, ranges_m)
     advice = "correct mission.camera and bracket.target_extent_m, and look at `flightsw plan`"
     return [Finding.warning("view", problem, advice) for problem in problems] or [Finding.ok("view", view)]

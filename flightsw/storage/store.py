@@ -145,14 +145,14 @@ class FrameStore:
             if used_limit < 0:
                 self._refuse(frame.frame_id, f"its {len(container)} bytes exceed the quota")
             while self.used_bytes > used_limit:
-                self._make_room(frame.frame_id, f"the quota of {self.quota_bytes} bytes")
+                self._make_room(frame.frame_id, f"the quota of {self.quota_bytes} bytes is full")
             while True:
                 try:
                     return self._write(frame, container)
                 except OSError as error:
                     if error.errno not in DISK_FULL:
                         raise
-                    self._make_room(frame.frame_id, f"the disk ({os.strerror(error.errno or 0)})")
+                    self._make_room(frame.frame_id, f"the disk is full ({os.strerror(error.errno or 0)})")
 
     def drop(self, frame_id: int, reason: str = "command") -> None:
         """Delete a frame and its place in the outbox; its number and its exposure are not used again.
@@ -359,25 +359,23 @@ class FrameStore:
             marker.unlink(missing_ok=True)
             raise
 
-    def _make_room(self, for_frame: int, what_is_full: str) -> None:
+    def _make_room(self, for_frame: int, why: str) -> None:
         """Delete one frame: the oldest confirmed one, or if there is none what the policy says."""
         waiting = set(self._markers())
         confirmed = sorted(frame_id for frame_id in self._stored if frame_id not in waiting)
         if confirmed:
-            log.info("frame %d deleted, the ground has it: %s is full", confirmed[0], what_is_full)
+            log.info("frame %d deleted, the ground has it: %s", confirmed[0], why)
             self._drop(confirmed[0], "delivered")
         elif self.when_full == "drop-oldest" and (free := self._not_in_flight()):
             oldest = min(free)  # frames in flight may be on the ground already
             if (self._outbox / f"{oldest:08d}").stat().st_size:  # delivered once; in the outbox by command
-                log.info("frame %d deleted, the ground had it: %s is full", oldest, what_is_full)
+                log.info("frame %d deleted, the ground had it: %s", oldest, why)
                 self._drop(oldest, "delivered")
                 return
-            log.warning(
-                "frame %d deleted undelivered for frame %d: %s is full", oldest, for_frame, what_is_full
-            )
+            log.warning("frame %d deleted undelivered for frame %d: %s", oldest, for_frame, why)
             self._drop(oldest, "oldest")
         else:
-            self._refuse(for_frame, f"{what_is_full} is full")
+            self._refuse(for_frame, why)
 
     def _not_in_flight(self) -> set[int]:
         """Return the stored frames that cannot have arrived yet; none where it cannot be read which are in flight."""
@@ -386,7 +384,7 @@ class FrameStore:
 
     def _refuse(self, frame_id: int, reason: str) -> None:
         self.refused += 1
-        raise StoreFull(f"frame {frame_id} refused: {reason}, policy {self.when_full}")
+        raise StoreFull(f"frame {frame_id} refused: {reason}, and store.when_full is {self.when_full}")
 
     def _drop(self, frame_id: int, reason: str) -> None:
         """Delete a frame; its line is on the disk first, so that the reason is never lost."""

@@ -45,7 +45,7 @@ EXAMPLES = {  # of the commands that take arguments
     "near": "near 2",
     "priority": "priority oldest",
     "model": "model pass-12/runs/first/model.onnx",
-    "arm": "arm delete",
+    "arm": "arm delete` or `arm resume` or `arm retire",
     "delete": "delete 0 39",
     "resend": "resend 0 39` or `resend all",
     "retire": "retire 1",
@@ -144,6 +144,8 @@ def _parsed(name: str, arguments: list[str]) -> tuple[Command, Path | None]:
             return Command(name, {"first_frame": 0, "last_frame": LAST_FRAME}), None
         case "delete" | "resend", [first, last]:
             frames = {"first_frame": _number(first, int), "last_frame": _number(last, int)}
+            if frames["first_frame"] > frames["last_frame"]:
+                raise ValueError("expected the number of the first frame before that of the last")
             return Command(name, frames), None
         case "retire", [key]:
             return Command(name, {"key": _number(key, int)}), None

@@ -107,8 +107,10 @@ def test_a_full_store_never_ends_the_pass(tmp_path, small_mission, policy, refus
         result, err = finish(process)
     counts = result["capture"]
     assert counts["planned"] == 30 == counts["stored"] + counts["refused"]
-    assert bool(counts["refused"]) == refused == bool(process.returncode)
+    assert bool(counts["refused"]) == refused
+    assert process.returncode == 1  # frames are lost by either policy
     store = FrameStore(tmp_path / "store")
+    assert counts["dropped"] == counts["stored"] - len(store.frames) and bool(counts["dropped"]) != refused
     assert 0 < store.used_bytes <= 20_000
     newest = max(stored.bracket_id for stored in store.frames)
     assert (newest == 9) != refused

@@ -180,6 +180,9 @@ def test_the_unit_names_its_user_and_its_environment(installed, tmp_path):
         ({"mission": Path("mission.yaml")}, "--mission: expected an absolute path"),
         ({"key": Path("/home/me/mission.key")}, "--key: a service cannot read /home/me/mission.key"),
         ({"link_url": "carrier://pigeon"}, "carrier://pigeon"),
+        ({"link_url": ""}, "the link's URL is empty: expected serial://"),
+        ({"camera_url": "v4l2://0"}, "no camera driver for 'v4l2://0'"),
+        ({"camera_url": "gige"}, "no camera driver for 'gige'"),
     ],
 )
 def test_a_unit_that_could_not_start_is_not_made(installed, change, message):
@@ -190,7 +193,7 @@ def test_a_unit_that_could_not_start_is_not_made(installed, change, message):
         "key": None,
         "user": "obbgs",
     }
-    with pytest.raises(ConfigError, match=re.escape(message)):
+    with pytest.raises(ValueError, match=re.escape(message)):
         unit(**(given | change))
 
 

@@ -226,7 +226,7 @@ def test_a_camera_that_never_comes_back_is_two_lines_a_summary_and_a_failure(tmp
         process = start_capture(tmp_path, patience_s=0.2)
         out, err = process.communicate(timeout=120)
     assert process.returncode == 1
-    assert "captured 10 frames, 0 were there, 14 failed" in out
+    assert "captured 10 frames, 0 were taken before, 14 failed" in out
     assert "the camera was lost once and never came back: 14 exposures of 5 brackets were not taken" in out
     assert [line.partition(":")[2].split(",")[0] for line in err.splitlines() if line] == [
         " warning: the camera is lost",
@@ -245,7 +245,7 @@ def test_a_camera_that_answers_only_after_flight_has_started_takes_the_pass(tmp_
                 time.sleep(0.05)
             process.terminate()
             out, err = process.communicate(timeout=60)
-    assert "captured 24 frames, 0 were there, 0 failed" in out, err
+    assert "captured 24 frames, 0 were taken before, 0 failed" in out, err
 
 
 def test_a_camera_that_never_answers_is_given_up_and_the_link_goes_on(tmp_path, small_mission):

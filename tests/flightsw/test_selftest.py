@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import errno
 import json
 import os
 import random
@@ -19,8 +20,10 @@ import pytest
 from typer.testing import CliRunner
 
 from flightsw.cli import app
+from flightsw.errors import OrbitError
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import NavigationSection, StoreSection
+from flightsw.planning import pass_plan
 from flightsw.selftest import computer, devices, planned_pass, self_test
 
 ROOT = Path(__file__).parents[2]
@@ -254,6 +257,36 @@ def test_a_disk_that_cannot_be_written_or_is_too_small(small_mission, tmp_path):
         mission = dataclasses.replace(small_mission, store=StoreSection(quota_mb=quota_mb))
         (finding,) = computer.check_disk(mission, tmp_path)
         assert finding.state == state, finding  # a bracket takes 13.8 kB, the pass 0.55 MB
+
+
+def test_on_a_disk_with_little_room_that_is_what_is_told(small_mission, tmp_path, monkeypatch):
+    """The probe takes no more than there is, so a small disk is not called one that cannot be written."""
+    free, written = 200_000, []
+
+    def write(path: Path, content: bytes) -> None:
+        written.append(len(content))
+        if 2 * len(content) > free:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        path.write_bytes(content)
+
+    monkeypatch.setattr(computer, "write_whole", write)
+    monkeypatch.setattr(computer.shutil, "disk_usage", lambda folder: types.SimpleNamespace(free=free))
+    (finding,) = computer.check_disk(small_mission, tmp_path)
+    assert finding.state == "warning" and "room for 0.2 MB, the pass takes 0.553 MB" in finding.found
+    free = 5_000
+    (finding,) = computer.check_disk(small_mission, tmp_path)
+    assert finding.state == "failed" and "not even one bracket fits" in finding.found
+    assert max(written) <= 100_000 and not list(tmp_path.glob(".selftest*"))
+
+
+def test_the_same_elements_for_both_spacecraft_are_told(small_mission, in_the_pass):
+    orbit = dataclasses.replace(small_mission.orbit, chaser_tle=small_mission.orbit.target_tle)
+    mission = dataclasses.replace(small_mission, orbit=orbit)
+    (finding,) = planned_pass.check_orbit(mission)
+    assert finding.state == "failed" and "at the same place" in finding.found
+    assert planned_pass.check_view(mission) == []
+    with pytest.raises(OrbitError, match="cannot point at the target 0 m away"):
+        pass_plan(mission)
 
 
 def test_elements_too_old_or_beyond_use_and_a_pass_that_is_over(small_mission, in_the_pass, monkeypatch):

@@ -76,7 +76,10 @@ def test_a_full_store_is_one_line_and_one_with_the_count(tmp_path, caplog):
     counts = capture(MISSION, Sky(), FrameStore(tmp_path / "small", quota_bytes))
     assert counts.refused == 48 - counts.stored > 40
     first, rest = (record.getMessage() for record in caplog.records)
-    assert first == f"frame {counts.stored} refused: the quota of {quota_bytes} bytes is full, policy refuse"
+    assert (
+        first
+        == f"frame {counts.stored} refused: the quota of {quota_bytes} bytes is full, and store.when_full is refuse"
+    )
     assert rest == f"{counts.refused - 1} more frames refused: the store is full"
 
 

@@ -95,6 +95,8 @@ def test_a_command_line_becomes_a_command(words, expected):
         ("near x", "`near x`: expected a whole number, got 'x'"),
         ("near 99", "`near 99`: near: expected 0 to 16 DN, got 99"),
         ("delete 3", "`delete 3`: expected `delete 0 39`"),
+        ("arm", "`arm`: expected `arm delete` or `arm resume` or `arm retire`"),
+        ("resend 3 0", "`resend 3 0`: expected the number of the first frame before that of the last"),
         ("resend x", "`resend x`: expected `resend 0 39` or `resend all`"),
         ("priority newest", "`priority newest`: order: expected one of oldest, triage, thumbnail-first"),
         ("retire 99999", "`retire 99999`: key: expected 1 to 65534, got 99999"),

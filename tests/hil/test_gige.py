@@ -244,7 +244,15 @@ def test_impossible_requests_are_refused_with_the_reason():
         open_camera("gige://127.0.0.1?pixel_format=Mono13", section(12))
     with pytest.raises(ValueError, match="Mono8 has 8 bits, the mission's camera 12"):
         open_camera("gige://127.0.0.1?pixel_format=Mono8", section(12))
-    with pytest.raises(CaptureError, match="no camera at gige://nobody"):
+    for url in (
+        "gige://",
+        "gige://?pixel_format=Mono12",
+        "gige://127.0.0.1?pixelformat=Mono12",
+        "gige://1?x",
+    ):
+        with pytest.raises(ValueError, match="expected gige://ID, .* got '" + re.escape(url)):
+            GigeCamera(url, section(12))
+    with pytest.raises(CaptureError, match="no camera at gige://nobody: Device 'nobody' not found"):
         open_camera("gige://nobody", section(12))
     with fake_camera():
         camera = open_camera("gige://127.0.0.1?pixel_format=Mono8", section(8))

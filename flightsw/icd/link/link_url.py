@@ -46,14 +46,14 @@ def parse_link_url(url: str) -> LinkUrl:
         raise ConfigError(url, f"is not a URL: {error}") from error
     device, other = (parts.netloc, parts.path) if parts.scheme == "can" else (parts.path, parts.netloc)
     if parts.scheme not in OPTIONS or not device or other:
-        raise ConfigError(url, EXPECTED)
+        raise ConfigError(url or "the link's URL is empty", EXPECTED)
     options = {name: values[-1] for name, values in parse_qs(parts.query, keep_blank_values=True).items()}
     if unknown := set(options) - OPTIONS[parts.scheme]:
         expected = ", ".join(sorted(OPTIONS[parts.scheme]))
         raise ConfigError(url, f"unknown option {', '.join(sorted(unknown))}; expected {expected}")
     default_baud = DEFAULT_BAUD_RATE if parts.scheme == "serial" else 3_000_000
     baud_text = options.get("baud", str(default_baud))
-    if not baud_text.isdigit() or not 1200 <= int(baud_text) <= 12_000_000:
+    if not baud_text.isdecimal() or not 1200 <= int(baud_text) <= 12_000_000:
         raise ConfigError(url, f"expected a baud rate of 1200 to 12000000, got {baud_text!r}")
     if parts.scheme == "serial":
         return LinkUrl("serial", device, int(baud_text))
