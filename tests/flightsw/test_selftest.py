@@ -19,11 +19,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from flightsw.capture.planning import pass_plan
 from flightsw.cli import app
 from flightsw.errors import OrbitError
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import NavigationSection, StoreSection
-from flightsw.planning import pass_plan
 from flightsw.selftest import computer, devices, planned_pass, self_test
 
 ROOT = Path(__file__).parents[2]
