@@ -97,8 +97,7 @@ def capture(
     """
     counts = CaptureCounts()
     store.hold_pass(mission.orbit.start_utc_ns)
-    dropped_before = store.dropped_undelivered
-    tagger = PoseTagger(mission)
+    dropped_before, tagger = store.dropped_undelivered, PoseTagger(mission)
     times = _BracketTimes(mission, store, wait_until, settings)
     failures = _Repeats("%d more exposures lost for the same reason: %s")
     refusals = _Repeats("%d more frames refused: %s")
@@ -107,8 +106,7 @@ def capture(
     def take(shot: Shot, max_error_dn: int) -> None:
         try:
             frame = expose(mission, camera, shot, store.next_frame_id, tagger)
-            roi_mask = region_of_interest(frame.dn, mission)
-            store.put(frame, max_error_dn=max_error_dn, roi_mask=roi_mask)
+            store.put(frame, max_error_dn=max_error_dn, roi_mask=region_of_interest(frame.dn, mission))
         except StoreFull as error:
             counts.refused += 1
             refusals.log("the store is full", str(error))
@@ -119,8 +117,7 @@ def capture(
             counts.brackets_short = len(short)
         except (CaptureError, ValueError) as error:
             counts.failed += 1
-            place = f"bracket {shot.bracket_id} frame {shot.bracket_index}"
-            failures.log(str(error), f"{place} lost: {error}")
+            failures.log(str(error), f"bracket {shot.bracket_id} frame {shot.bracket_index} lost: {error}")
         else:
             failures.end()
             refusals.end()
