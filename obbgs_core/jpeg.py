@@ -9,6 +9,7 @@ has to know of it.
 Source: ITU-T T.81, 1992; T.871, 2011 (colours).
 """
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -67,6 +68,62 @@ class JpegCoding:
                 The first may have a gradient.
         """
         height, width, channels = mean.shape[1:]
+        planes = self._planes(mean, variance)
+        luma = self._rounded(*planes[0], self.luma)
+        back, error = luma[0] + MIDDLE, luma[1]
+        if channels == 3:
+            chroma = self._rounded(*planes[1], self.chroma or self.luma)
+            # linear between the middles of what was averaged, as libjpeg does
+            whole = [F.interpolate(i, back.shape[2:], mode="bilinear", align_corners=False) for i in chroma]
+            back, error = torch.cat([back, whole[0]], dim=1), torch.cat([error, whole[1]], dim=1)
+            turn = torch.tensor(TO_RGB).to(mean)
+            back = torch.einsum("ck,bkhw->bchw", turn, back)
+            error = torch.einsum("ck,bkhw->bchw", turn.square(), error)
+        back, error = (image[:, :, :height, :width].movedim(1, -1) for image in (back, error))
+        return back, error
+
+    def deviance_residuals(self, mean: Tensor, variance: Tensor, stored: Tensor) -> list[Tensor]:
+        """Return the root of twice the negative log-likelihood of each stored coefficient, less the least it can be.
+
+        A coefficient says that the value lay within half a step of it. Returned are those of luma [B, 1, rows, columns,
+        64] and of chromas [B, 2, rows, columns, 64], by blocks; they have a gradient by the mean if that has one.
+
+        What came back does not tell the coefficients exactly where it was clipped.
+
+        Args:
+            mean, variance: as for `moments`.
+            stored: [B, H, W, C], what came back.
+        """
+        coded = self._planes(mean, variance)
+        read = [values for values, _ in self._planes(stored, torch.zeros_like(stored))]
+        if len(read) > 1:
+            height, width = (
+                _before_interpolation(n, few) for n, few in zip(read[1].shape[2:], self.averaged, strict=True)
+            )
+            read[1] = height.to(stored) @ read[1] @ width.to(stored).T
+        tables = (self.luma, self.chroma or self.luma)
+        return [
+            _deviance_residual(*self._coefficients(*plane, steps), self._coefficients(values, None, steps)[0])
+            for plane, values, steps in zip(coded, read, tables, strict=False)
+        ]
+
+    def in_pixels(self, residuals: list[Tensor], height: int, width: int) -> Tensor:
+        """Return the root mean square [B, H, W, 1] of the residuals of the blocks that each pixel lies in."""
+        sums = [
+            F.interpolate(
+                of.square().sum(dim=(1, 4))[:, None], scale_factor=[float(BLOCK_PX * n) for n in averaged]
+            )
+            for of, averaged in zip(residuals, ((1, 1), self.averaged), strict=False)
+        ]
+        total = sums[0] + sums[1] / math.prod(self.averaged) if len(sums) > 1 else sums[0]
+        return (total / BLOCK_PX**2).sqrt()[:, 0, :height, :width, None]
+
+    def _planes(self, mean: Tensor, variance: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return mean and variance of luma [B, 1, H, W], less the middle, and of the averaged chromas [B, 2, h, w].
+
+        Height and width are whole numbers of blocks.
+        """
+        height, width, channels = mean.shape[1:]
         values, spread = mean.movedim(-1, 1), variance.movedim(-1, 1)
         if channels == 3:
             turn = torch.tensor(TO_YCC).to(mean)
@@ -75,34 +132,37 @@ class JpegCoding:
         size = [BLOCK_PX * n for n in (self.averaged if channels == 3 else (1, 1))]
         missing = (0, -width % size[1], 0, -height % size[0])
         values, spread = (F.pad(image, missing, mode="replicate") for image in (values, spread))
-        luma = self._rounded(values[:, :1] - MIDDLE, spread[:, :1], self.luma)
-        back, error = luma[0] + MIDDLE, luma[1]
+        planes = [(values[:, :1] - MIDDLE, spread[:, :1])]
         if channels == 3:
             few = [F.avg_pool2d(image[:, 1:], self.averaged) for image in (values, spread)]
-            chroma = self._rounded(few[0], few[1] / math.prod(self.averaged), self.chroma or self.luma)
-            # linear between the middles of what was averaged, as libjpeg does
-            whole = [F.interpolate(i, values.shape[2:], mode="bilinear", align_corners=False) for i in chroma]
-            back, error = torch.cat([back, whole[0]], dim=1), torch.cat([error, whole[1]], dim=1)
-            turn = torch.tensor(TO_RGB).to(mean)
-            back = torch.einsum("ck,bkhw->bchw", turn, back)
-            error = torch.einsum("ck,bkhw->bchw", turn.square(), error)
-        back, error = (image[:, :, :height, :width].movedim(1, -1) for image in (back, error))
-        return back, error
+            planes.append((few[0], few[1] / math.prod(self.averaged)))
+        return planes
+
+    @staticmethod
+    def _coefficients(
+        values: Tensor, variance: Tensor | None, steps: tuple[int, ...]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the coefficients [B, K, rows, columns, 64] of images [B, K, H, W] and their deviation, in steps."""
+        rows, columns = (n // BLOCK_PX for n in values.shape[2:])
+        step = torch.tensor(steps, dtype=values.dtype, device=values.device)
+        shape = (*values.shape[:2], rows, BLOCK_PX, columns, BLOCK_PX)
+        coefficient = values.reshape(shape).transpose(3, 4).flatten(4) @ (_transform().to(values).T / step)
+        if variance is None:
+            return coefficient, coefficient
+        # the noise of pixels is independent, and nearly the same all over a block
+        sigma = F.avg_pool2d(variance, BLOCK_PX).sqrt()[..., None] / step
+        return coefficient, sigma.clamp(min=LEAST_SIGMA)
 
     @staticmethod
     def _rounded(values: Tensor, variance: Tensor, steps: tuple[int, ...]) -> tuple[Tensor, Tensor]:
         """Return mean and variance of images [B, K, H, W] whose coefficients were rounded to multiples of steps."""
-        transform, rows, columns = (
+        coefficient, sigma = JpegCoding._coefficients(values, variance, steps)
+        transform, step = (
             _transform().to(values),
-            values.shape[2] // BLOCK_PX,
-            values.shape[3] // BLOCK_PX,
+            torch.tensor(steps, dtype=values.dtype, device=values.device),
         )
-        step = torch.tensor(steps, dtype=values.dtype, device=values.device)
-        shape = (*values.shape[:2], rows, BLOCK_PX, columns, BLOCK_PX)
-        coefficient = values.reshape(shape).transpose(3, 4).flatten(4) @ (transform.T / step)
-        # the noise of pixels is independent, and nearly the same all over a block
-        sigma = F.avg_pool2d(variance, BLOCK_PX).sqrt()[..., None] / step
-        mean, spread = _rounding(coefficient, sigma.clamp(min=LEAST_SIGMA))
+        rows, columns = coefficient.shape[2:4]
+        mean, spread = _rounding(coefficient, sigma)
         back, error = (mean * step) @ transform, (spread * step.square()) @ transform.square()
         parts = (*values.shape[:2], rows, columns, BLOCK_PX, BLOCK_PX)
         back, error = (blocks.view(parts).transpose(3, 4).reshape(values.shape) for blocks in (back, error))
@@ -127,6 +187,28 @@ def _rounding(value: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(wide, value, nearest + mean), variance
 
 
+def _deviance_residual(value: Tensor, sigma: Tensor, stored: Tensor) -> Tensor:
+    """Return the root of -2 ln of the likelihood, over its maximum, that x lies within half of what was stored.
+
+    x is normal with mean `value` and deviation `sigma`.
+    """
+    away = (value - stored).abs()
+    near, far = (torch.special.log_ndtr((edge - away) / sigma) for edge in (0.5, -0.5))
+    most = torch.erf(0.5 / math.sqrt(2) / sigma).log()
+    deviance = 2 * (most - near - torch.log1p(-(far - near).exp())).clamp(min=0)
+    return (deviance + 1e-15).sqrt()  # the root has no derivative at 0
+
+
+@functools.cache
+def _before_interpolation(n: int, averaged: int) -> Tensor:
+    """Return the matrix [n, n] that turns means over so many pixels of interpolated values into the values."""
+    if averaged == 1:
+        return torch.eye(n)
+    whole = F.interpolate(torch.eye(n)[None], averaged * n, mode="linear", align_corners=False)
+    return torch.linalg.inv(F.avg_pool1d(whole, averaged)[0].T)
+
+
+@functools.cache
 def _transform() -> Tensor:
     """Return the orthonormal discrete cosine transform of a block [64, 64]: frequencies by places."""
     n = torch.arange(BLOCK_PX, dtype=torch.float64)

@@ -4,6 +4,7 @@
 value and gradient in one sweep. The readable PyTorch beside them is the reference in tests, and runs everywhere else.
 """
 
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from obbgs_core import compiled
+from obbgs_core.jpeg import FULL_SCALE, JpegCoding
 from obbgs_core.misfit import OWN, error_of, misfit_of, model_error, sampling_stride
 from obbgs_core.sensor import Sensor
 
@@ -87,17 +89,15 @@ def likelihood_loss_reference(
     misfit: float | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return what `likelihood_loss` does, in readable PyTorch."""
+    if sensor.jpeg is not None and averaged_pixels == 1:
+        return _coded_likelihood(radiance, exposure_time_s, dn, sensor, sensor.jpeg, misfit)
     prediction = sensor.predicted(radiance, exposure_time_s, averaged_pixels)
     residual = sensor.residual_of(prediction, dn, averaged_pixels)
     if misfit is None:
         loss = charbonnier(residual)
     else:
         with torch.no_grad():
-            own = (
-                model_error(radiance, exposure_time_s, sensor, averaged_pixels, misfit)
-                if sensor.jpeg is None
-                else error_of(prediction, sensor, averaged_pixels, misfit)
-            )
+            own = model_error(radiance, exposure_time_s, sensor, averaged_pixels, misfit)
             excess = own.variance_dn2(prediction, sensor) / prediction.variance_dn2
         residual = residual / (1 + excess).sqrt()
         loss = own.weight * cauchy(residual)
@@ -105,6 +105,33 @@ def likelihood_loss_reference(
         visible = prediction.expected_dn.clamp(max=sensor.white_dn)
         loss = loss + edge_weight * sobel_edge_loss(sensor.stabilised(visible), sensor.stabilised(dn))
     return loss, residual.detach()
+
+
+def _coded_likelihood(
+    radiance: Tensor,
+    exposure_time_s: Tensor,
+    dn: Tensor,
+    sensor: Sensor,
+    coding: JpegCoding,
+    misfit: float | None,
+) -> tuple[Tensor, Tensor]:
+    """Return the loss of readings that were stored as JPEG, and the residual of its blocks in each pixel.
+
+    Coefficients are compared, each within its step, since what their rounding leaves in pixels is alike in all pixels
+    of a block. Edges are not: rounding moves them.
+    """
+    prediction = dataclasses.replace(sensor, jpeg=None).predicted(radiance, exposure_time_s)
+    read, variance = prediction.clipped_moments(sensor.white_dn)
+    variance, weight = variance.detach(), 1.0
+    if misfit is not None:
+        with torch.no_grad():
+            own = error_of(prediction, sensor, 1, misfit)
+            variance, weight = variance + own.variance_dn2(prediction, sensor), own.weight
+    scale_dn = sensor.white_dn / FULL_SCALE
+    residuals = coding.deviance_residuals(read / scale_dn, variance / scale_dn**2, dn / scale_dn)
+    penalty = charbonnier if misfit is None else cauchy
+    loss = weight * sum(penalty(of) * (of.numel() / dn.numel()) for of in residuals)
+    return loss, coding.in_pixels([of.detach() for of in residuals], *dn.shape[1:3]).expand_as(dn)
 
 
 def published_loss(

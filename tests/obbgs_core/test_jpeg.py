@@ -8,9 +8,10 @@ import pytest
 import torch
 from PIL import Image
 from scipy.optimize import root_scalar
+from scipy.stats import norm
 
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.jpeg import JpegCoding
+from obbgs_core.jpeg import TO_RGB, JpegCoding, _deviance_residual
 from obbgs_core.losses import likelihood_loss
 from obbgs_core.sensor import Sensor
 from obbgs_core.start.sky_level import levelled
@@ -46,6 +47,7 @@ def scene(channels: int) -> np.ndarray:
 @pytest.mark.parametrize("how", [{"subsampling": 0}, {"subsampling": 1}, {"subsampling": 2}, {"grey": True}])
 @pytest.mark.parametrize("quality", [60, 85, 95])
 def test_mean_and_scatter_of_what_comes_back_are_those_of_libjpeg(quality, how):
+    how = dict(how)
     rng, truth = np.random.default_rng(quality), scene(1 if how.pop("grey", False) else 3)
     drawn = [stored(readings(truth, rng), quality=quality, **how) for _ in range(100)]
     values, coding = np.stack([v for v, _ in drawn]), drawn[0][1]
@@ -59,6 +61,38 @@ def test_mean_and_scatter_of_what_comes_back_are_those_of_libjpeg(quality, how):
     assert changed > 1.2 * (by_chance + 0.3) or quality == 95 or truth.shape[2] == 1
     # errors of neighbouring chromas are alike, which is left out
     assert 0.8 < values.std(axis=0).mean() / spread.sqrt().mean().item() < 1.2
+
+
+@pytest.mark.parametrize("how", [{"subsampling": 0}, {"subsampling": 1}, {"subsampling": 2}, {"grey": True}])
+@pytest.mark.parametrize("quality", [60, 85, 95])
+def test_what_was_coded_lies_within_half_a_step_of_every_coefficient_that_libjpeg_stored(quality, how):
+    """Without noise and clipping, but for a DN of integer arithmetic; one brighter, or bluer, by two steps does not."""
+    how = dict(how)
+    truth = scene(1 if how.pop("grey", False) else 3)[:48, :64]  # whole blocks
+    values, coding = stored(np.rint(truth).astype(np.uint8), quality=quality, **how)
+    dn, mean = (torch.from_numpy(image)[None] for image in (values, np.rint(truth)))
+
+    def shares_outside(picture: torch.Tensor) -> list[float]:
+        residuals = coding.deviance_residuals(picture, torch.ones_like(picture), dn)
+        return [(of > 2).double().mean().item() for of in residuals]
+
+    assert max(shares_outside(mean)) < 0.02
+    brighter = mean + 2 * coding.luma[0] / 8
+    assert shares_outside(brighter)[0] > 1 / 70  # the mean of each block is wrong
+    if coding.chroma:
+        bluer = mean + 2 * coding.chroma[0] / 8 * torch.tensor([0, TO_RGB[1][1], TO_RGB[2][1]])
+        assert shares_outside(bluer)[1] > 1 / 140 and shares_outside(bluer)[0] < 0.02
+
+
+def test_a_coefficient_is_as_likely_as_its_rounding():
+    value, stored_at = torch.linspace(-6, 6, 49).double(), torch.tensor(1.0).double()
+    for sigma in (0.05, 0.3, 1.0, 4.0):
+        x = value.numpy()
+        likelihood = norm.cdf((1.5 - x) / sigma) - norm.cdf((0.5 - x) / sigma)
+        expected = -2 * np.log(likelihood.clip(1e-300) / (2 * norm.cdf(0.5 / sigma) - 1))
+        found = _deviance_residual(value, torch.tensor(sigma).double(), stored_at).square().numpy()
+        told = likelihood > 1e-12
+        np.testing.assert_allclose(found[told], expected[told], rtol=1e-3, atol=1e-9)
 
 
 @pytest.mark.parametrize("level_dn", [0.0, 3.0, 8.0, 60.0])
