@@ -130,7 +130,8 @@ def _coded_likelihood(
     scale_dn = sensor.white_dn / FULL_SCALE
     residuals = coding.deviance_residuals(read / scale_dn, variance / scale_dn**2, dn / scale_dn)
     penalty = charbonnier if misfit is None else cauchy
-    loss = weight * sum(penalty(of) * (of.numel() / dn.numel()) for of in residuals)
+    shares = [penalty(of) * (of.numel() / dn.numel()) for of in residuals]
+    loss = weight * torch.stack(shares).sum()
     return loss, coding.in_pixels([of.detach() for of in residuals], *dn.shape[1:3]).expand_as(dn)
 
 
