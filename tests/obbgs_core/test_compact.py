@@ -1,7 +1,9 @@
 """Pictures in little memory: what is read is what was given, bit for bit, and trainings are the same."""
 
 import dataclasses
+import resource
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -53,13 +55,27 @@ def test_large_pictures_are_held_in_the_memory_of_what_they_show():
     others = [dataclasses.replace(frame, id=number) for number in range(20)]
     taken, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert taken < 1e6  # 16 bits of 400x400 pixels, once; NumPy tells tracemalloc, PyTorch does not
+    (kept,) = {id(other.__dict__["_dn"]): other.__dict__["_dn"] for other in others}.values()
+    assert taken < 1e5 and kept.inside.nbytes == 2 * 400 * 400  # 16 bits, once
     assert all(torch.equal(other.dn, dn) for other in others[:2])
     assert others[0].shape == dn.shape
     changed = others[1].dn
     changed[0, 0] = 7.0  # of a copy
     assert torch.equal(others[1].dn, dn)
     assert torch.equal(dataclasses.replace(frame, dn=changed).dn, changed)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="Linux tells what a process takes")
+def test_what_is_no_longer_held_goes_back_to_the_system_whatever_lies_beside_it():
+    def taken() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+    np.ones(31_000_000, dtype=np.uint8)  # once it is freed the C library keeps what is smaller
+    every = [held(torch.randint(0, 4096, (1000, 2000)).float()) for _ in range(20)]
+    before = taken()
+    every = every[::2]  # 10 times 4 MB
+    assert before - taken() > 36e6
+    assert all(isinstance(one, Compact) for one in every)
 
 
 def test_what_is_small_stays_as_it_is():
