@@ -26,13 +26,17 @@ from obbgs_base.errors import ObbgsError, reason
 log = logging.getLogger(__name__)
 POLICY_VIOLATION = 1008  # RFC 6455, section 7.4.1
 LABEL = "obbgs"  # of the panel
-# viser has no setting for it: its panel covers most of a narrow screen until its title is touched
+# viser has no setting for it: its panel covers most of a narrow screen until its title is touched. A touch that comes
+# first decides: folded after it, a panel that was just opened would close.
 FOLD_ON_A_PHONE = b"""<script>
 if (innerWidth < 600) {
+  let isTouched = false;
+  addEventListener("pointerdown", () => { isTouched = true; }, { capture: true, once: true });
   const look = setInterval(() => {
     const isTitle = (e) => e.children.length === 0 && e.textContent.trim() === "obbgs";
     const title = [...document.querySelectorAll("body *")].find(isTitle);
-    if (title) { clearInterval(look); title.click(); }
+    if (title || isTouched) clearInterval(look);
+    if (title && !isTouched) title.click();
   }, 300);
 }
 </script>"""

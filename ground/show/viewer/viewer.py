@@ -108,6 +108,7 @@ class Viewer:
         self.server, self.placed = server, placed
         self.lock = threading.RLock()  # viser calls from threads of its own
         self.frames = _in_time(placed[0])
+        server.gui.main_panel.dock_right()  # beside the scene: above it, it would hide the target on narrow screens
         self._controls()
         self._start_camera()
         server.on_client_connect(self._frame)
@@ -309,15 +310,33 @@ class Viewer:
         camera.near, camera.far = RADIUS / 10, 100 * RADIUS
 
     def _frame(self, client: viser.ClientHandle) -> None:
-        """Let a client begin with the whole model in view, from further away where its window is narrow."""
+        """Let a client begin with the whole model in view, from further away where its window is narrow.
+
+        Until it is moved its camera follows the window's shape, which changes when the panel is put beside the scene.
+        """
         self._limit_zoom(client)
-        if client.camera.aspect < 1:
-            self._place(client)
+        begun = [
+            self._begin(client.camera.aspect),
+            self._begin(1.0),
+        ]  # where it may have been put, last one last
+
+        def follow(camera: viser.CameraHandle) -> None:
+            unmoved = any(np.allclose(camera.position, each, rtol=1e-3, atol=1e-3) for each in begun)
+            if unmoved and not np.allclose(begun[-1], begin := self._begin(camera.aspect)):
+                begun.append(begin)
+                self._place(client)
+
+        client.camera.on_update(follow)
+        follow(client.camera)
+
+    def _begin(self, aspect: float) -> np.ndarray:
+        """Return where a camera stands at first whose picture is so many times as wide as high."""
+        position, look_at = self.start
+        return look_at + (position - look_at) / min(1.0, aspect)
 
     def _place(self, client: viser.ClientHandle) -> None:
-        position, look_at = self.start
-        client.camera.position = look_at + (position - look_at) / min(1.0, client.camera.aspect)
-        client.camera.look_at = look_at
+        client.camera.position = self._begin(client.camera.aspect)
+        client.camera.look_at = self.start[1]
 
     def _limit_zoom(self, client: viser.ClientHandle) -> None:
         client.camera.max_orbit_distance = FARTHEST * RADIUS

@@ -47,6 +47,7 @@ class Waiting:
         self._server, self._sources = server, sources
         self._frames = self._bytes_seen = 0  # in the session, and in its frames.jsonl
         self._drawn: set[int] = set()  # frames whose cameras stand in the scene
+        server.gui.main_panel.dock_right()
         self.plots = PassPlots(server, sources[0].session_path)
         self.status = server.gui.add_markdown("")
         self.newest = server.gui.add_image(
