@@ -16,7 +16,8 @@ supported "$python" || {
 # name of the Debian package = what proves that it is there
 missing=()
 needs() { eval "$2" >/dev/null 2>&1 || missing+=("$1"); }
-library() { needs "$1" "{ ldconfig -p || /sbin/ldconfig -p; } 2>/dev/null | grep -q '$2'"; }
+libraries=$({ ldconfig -p || /sbin/ldconfig -p; } 2>/dev/null) || true
+library() { needs "$1" "[[ \$libraries == *'$2'* ]]"; }
 needs g++ "command -v g++"
 needs python3-venv "'$python' -c 'import ensurepip'"
 needs python3-dev "test -f \"\$('$python' -c 'import sysconfig; print(sysconfig.get_path(\"include\"))')/Python.h\""

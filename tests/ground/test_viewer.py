@@ -273,7 +273,8 @@ def test_the_page_draws_the_splats_and_its_controls_work(session):
             placed.show("name", False)  # these do too
         with (
             chromium() as browser,
-            page_of(browser, f"http://127.0.0.1:{server.get_port()}", 700, 700, known=VISERS) as page,
+            # beside the panel 700 x 700 pixels are left, a square as the frame
+            page_of(browser, f"http://127.0.0.1:{server.get_port()}", 1024, 700, known=VISERS) as page,
         ):
             page.wait_for_selector("text=Timeline of the pass")
             client = waited_for(lambda: next(iter(server.get_clients().values()), None))
@@ -621,6 +622,14 @@ def test_the_panel_stands_beside_the_scene_and_the_whole_model_is_seen_beside_it
             return client.camera.aspect < 0.8 and np.linalg.norm(client.camera.position) * half > scene.RADIUS
 
         waited_for(is_fully_seen)
+        page.wait_for_timeout(3000)  # the splats fade in
+        with page.expect_download() as saved:
+            page.get_by_text("Save picture").click()
+        is_ball = np.asarray(imagecodecs.png_decode(saved.value.path().read_bytes())).max(axis=-1) > 20
+        across, high = (int(np.ptp(np.flatnonzero(is_ball.any(axis=axis)))) for axis in (0, 1))
+        assert across > 100 and across == pytest.approx(
+            high, rel=0.1
+        )  # round: 1.5 times as wide in 1200 x 800
         client.camera.position = moved = np.array([0.0, 30.0, 0.0])  # by the user
         waited_for(lambda: np.allclose(client.camera.position, moved))
         page.set_viewport_size({"width": 800, "height": 1000})

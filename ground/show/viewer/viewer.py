@@ -47,7 +47,6 @@ NEAREST, FARTHEST = (
 # the exposure slider reaches from a quarter of the shortest exposure to so many times the longest
 REACH = 4.0
 DIGITS = 2  # that the exposure slider shows behind the first one of its shortest time
-PICTURE_PX = (1200, 800)
 TURNTABLE_PX = (480, 320)
 CHI2_WORDS = "chi²: mean squared residual over the variance of the noise; 1 is noise alone"
 DEVIATION_WORDS = "standard deviation of the radiance, as a share of full scale at the middle exposure"
@@ -375,8 +374,12 @@ class Viewer:
 
     def _save_picture(self, client: viser.ClientHandle | None) -> None:
         if client is not None:
-            width, height = PICTURE_PX
-            image = client.get_render(height, width, transport_format="png", timeout=60)
+            camera = (
+                client.camera
+            )  # viser draws splats squeezed in a picture of another shape than the window's
+            image = client.get_render(
+                camera.image_height, camera.image_width, transport_format="png", timeout=60
+            )
             png = imagecodecs.png_encode(np.ascontiguousarray(on_black(image)))
             client.send_file_download(self.file_name("view"), bytes(png), save_immediately=True)
 
