@@ -23,9 +23,9 @@ from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import motion_of, with_estimate
 from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.poses.gauge import best_motion, size_of
+from obbgs_core.render.backdrops import without_earth
 from obbgs_core.score.poses import PoseErrors, pose_errors, settled_poses
 from obbgs_core.sensor import Sensor
-from obbgs_core.train.backdrops import without_earth
 
 FILE = "poses_estimated.json"
 

@@ -36,9 +36,9 @@ from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
+from obbgs_core.render.backdrops import without_earth
 from obbgs_core.sensor import Sensor
 from obbgs_core.start.sky_level import field, levelled
-from obbgs_core.train.backdrops import without_earth
 
 LOG = "log"
 LOCK = "lock"  # in the folder of an unfinished run; holds the name of the process that works on it

@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 from obbgs_base.errors import Interrupted, reason
+from obbgs_core.background import backdrop
 from obbgs_core.batches import Batch, Batches
 from obbgs_core.compiled import torch_on_one_thread
 from obbgs_core.errors import Diverged
@@ -25,9 +26,9 @@ from obbgs_core.poses.estimate import PoseEstimate
 from obbgs_core.published import mcmc
 from obbgs_core.published.growth import outliers
 from obbgs_core.render import Rendered, backend_for, pictures_at, render
+from obbgs_core.render.backdrops import covered, doubted
 from obbgs_core.sensor import Sensor
 from obbgs_core.train.adam import FIRST_MEMORY, SECOND_MEMORY, learning_rates
-from obbgs_core.train.backdrops import doubted, renew
 from obbgs_core.train.joining import begun_again, check_joinable, join, release, withhold
 from obbgs_core.train.objective import DROPPED_UNTIL, dropped, image_loss, priors
 from obbgs_core.train.parts import Seen
@@ -37,6 +38,7 @@ from obbgs_core.train.state import Identity, TrainingState
 
 log = logging.getLogger(__name__)
 CHECKPOINT_EVERY_S = 20.0
+BACKDROPS_EVERY = 100  # steps
 LEAST_PSF_SIGMA_PX = 0.05  # a learnt point spread stays above: at 0 its square has no slope
 PACE_STEPS = 50  # the time left is estimated from the pace of so many steps
 # by so much a whole training takes longer than its steps at the pace of the first (TDRS and DSCOVR)
@@ -135,7 +137,7 @@ class Trainer:
         began = time.monotonic()
         setup, state, config = self.setup, self.state, self.setup.config
         moment = config.moment(state.steps_done)
-        renew(setup, state)
+        self._renew_backdrops()
         drawn = state.order.draw(min(moment.frames, len(setup.frames)), state.rng)
         batch = setup.batches.batch(drawn, moment.image_scale, pictures_at(self._backend))
         if state.poses.corrections is not None:
@@ -145,7 +147,7 @@ class Trainer:
         model, drops = state.model, setup.dropout > 0 and moment.share < DROPPED_UNTIL
         drawn_model = dropped(model, setup.dropout, state.rng) if drops else model
         rendered = self._compensated(render(drawn_model, batch.cameras, self._backend, sunlit), batch)
-        batch = doubted(setup, batch, rendered)
+        batch = doubted(batch, rendered, setup.sensor, setup.frames)
         loss, residual = image_loss(rendered, batch, setup.sensor, config, state.fit.misfit)
         if not torch.isfinite(loss):
             raise Diverged(state.steps_done, loss.item())
@@ -171,6 +173,23 @@ class Trainer:
         state.steps_done = state.poses.set_back(setup, state.steps_done)
         self._prolong_growth()
         return info
+
+    def _renew_backdrops(self) -> None:
+        """Find where the model is in the frames that have the Earth, when due, and what stands behind it there."""
+        setup, state = self.setup, self.state
+        indices = [i for i, frame in enumerate(setup.frames) if frame.earth_m is not None]
+        if not indices or setup.config.published.loss != "likelihood":
+            return
+        # a round of poses asks about one and the same
+        due = state.steps_done % BACKDROPS_EVERY == 0 and state.poses.round is None
+        if due or set(state.near_target) != set(indices):
+            batches, model = self._batches, state.model
+            state.near_target = {i: covered(model, batches.cameras([i]))[0] for i in indices}
+        elif setup.batches.has_backdrops:
+            return
+        near = state.near_target
+        seen = {i: backdrop(setup.frames[i], setup.sensor, near[i]) for i in indices}
+        setup.batches.stand(seen, {i: ~near[i] for i in indices if setup.config.loss.sky_weight})
 
     def _decide(self, moment: Moment, seen: Seen) -> None:
         """Take the decisions that are due, one part after the other."""

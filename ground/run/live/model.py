@@ -20,8 +20,8 @@ from obbgs_core.frames import TrainingFrame
 from obbgs_core.io.ply import save_ply
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.estimate import PoseEstimate
+from obbgs_core.render.backdrops import without_earth
 from obbgs_core.score.metrics import psnr_db
-from obbgs_core.train.backdrops import without_earth
 
 log = logging.getLogger(__name__)
 SCORED = 16  # held-out frames at most, spread evenly over those that have come
