@@ -35,12 +35,20 @@ class Follower:
     Args:
         folder: of the work's own files.
         stop: a file; when it appears, the work should save itself and end.
-        marks: shares of the work at which it is measured.
+        marks: shares of the work at which it is measured; surface_marks: those at which its surface is, too.
     """
 
-    def __init__(self, case: Case, folder: Path, stop: Path, marks: tuple[float, ...] = MARKS):
+    def __init__(
+        self,
+        case: Case,
+        folder: Path,
+        stop: Path,
+        marks: tuple[float, ...] = MARKS,
+        surface_marks: tuple[float, ...] = SURFACE_MARKS,
+    ):
         self.points: list[dict[str, float]] = []  # share, seconds, PSNR, Chamfer distance, and F of surfaces
-        self._folder, self._stop, self._marks = folder, stop, marks
+        self._folder, self._stop = folder, stop
+        self._marks, self._surface_marks = marks, surface_marks
         self._psnr = "psnr_clean_db" if case.radiance else "psnr_noisy_db"
         count = len(case.held_out)
         self._case = case.of_views(
@@ -68,7 +76,7 @@ class Follower:
         self._share = share
         measured = self.points[-1]["share"] if self.points else 0.0
         if share < 1 and any(measured < mark <= share for mark in self._marks):
-            with_surface = any(measured < mark <= share for mark in SURFACE_MARKS)
+            with_surface = any(measured < mark <= share for mark in self._surface_marks)
             self._add(share, seconds, snapshot(with_surface))
         now_s = time.monotonic()
         if now_s - self._told_s > TELL_EVERY_S:

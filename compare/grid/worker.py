@@ -8,7 +8,7 @@ from typing import Any
 from compare.case import Case, content_digest, load_case
 from compare.conditions import given
 from compare.errors import CompareError
-from compare.follow import FEW_MARKS, MARKS, Follower, image_of
+from compare.follow import FEW_MARKS, MARKS, SURFACE_MARKS, Follower, image_of
 from compare.grid.cells import Cell
 from compare.grid.origin import commit, with_origin
 from compare.grid.rows import locked
@@ -76,7 +76,9 @@ def _made(cell: Cell, out: Path, folder: Path, stop: Path, command: str) -> dict
     try:
         case = load_case(cell.session.path, cell.condition.held_out_sector_deg)
         wanted = method(cell.method, cell.weights)
-        follower = Follower(case, folder, stop, MARKS if wanted.settable else FEW_MARKS)
+        marks = MARKS if wanted.settable else FEW_MARKS
+        # the time that a surface takes is asked of frames as they were taken
+        follower = Follower(case, folder, stop, marks, () if cell.condition.stated() else SURFACE_MARKS)
         frames, sensor = given(case, cell.condition)
         task = Task(
             case,

@@ -327,7 +327,10 @@ def test_a_sector_that_leaves_no_frame_gives_a_row_that_says_so(session, tmp_pat
 def test_the_share_of_the_steps_is_of_those_that_a_condition_sets(session, tmp_path):
     few = {"few": Condition(set={"steps": 40})}
     (cell,) = cells_of([session_facts(session)], ["obbgs"], 1, [Budget(0.1)], few)
-    assert run_cell(cell, tmp_path / "out", tmp_path / "stop", "compare")["steps"] == 4
+    row = run_cell(cell, tmp_path / "out", tmp_path / "stop", "compare")
+    assert row["steps"] == 4
+    # and its curve has images alone on the way
+    assert len(row["curve"]) > 2 and not [point for point in row["curve"][:-1] if "f_02_surface" in point]
 
 
 def test_a_figure_that_is_no_number_is_left_out_of_a_row():
