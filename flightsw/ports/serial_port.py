@@ -54,7 +54,7 @@ class SerialLink(Port):
                 return b""
             data = os.read(descriptor, READ_BYTES)
             if not data:
-                raise OSError("the port hung up")
+                raise OSError("the device went away")
         except self.OPEN_ERRORS as error:
             self._hang_up(error)
             return b""

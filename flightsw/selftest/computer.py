@@ -87,7 +87,7 @@ def check_disk(mission: Mission, store: Path) -> list[Finding]:
     free_bytes = shutil.disk_usage(folder).free
     if mission.store.quota_bytes is not None:
         free_bytes = min(free_bytes, mission.store.quota_bytes)
-    room = f"{folder}: room for {free_bytes / 1e6:.3g} MB, the pass takes {per_bracket * bracket.count / 1e6:.3g}"
+    room = f"{folder}: room for {_mb(free_bytes)} MB, the pass takes {_mb(per_bracket * bracket.count)}"
     more_room = "free space, raise the quota, or take fewer brackets"
     probe = folder / f".selftest-{os.getpid()}"
     content = os.urandom(min(1 << 20, max(free_bytes // 4, 1)))  # it stands there twice for a moment
@@ -155,6 +155,10 @@ def check_key(key_file: Path) -> list[Finding]:
 def _epoch_ns(tle: tuple[str, ...]) -> int:
     satellite = Satrec.twoline2rv(*tle)
     return round((satellite.jdsatepoch - UNIX_EPOCH_JD + satellite.jdsatepochF) * DAY_NS)
+
+
+def _mb(size_bytes: float) -> str:
+    return f"{size_bytes / 1e6:.0f}" if size_bytes >= 1e7 else f"{size_bytes / 1e6:.2g}"
 
 
 def _frame_bytes(mission: Mission) -> int:

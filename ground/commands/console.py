@@ -222,14 +222,16 @@ class ConsoleView:
             f"{link_state(status)[0]}, frames {s.frames_in_session} received / {captured(status)} captured, {speed}"
             f"{s.crc_errors} CRC errors, {s.packets_missing} missing, {s.segments_resent} resent, "
             f"outbox {status.housekeeping.get('outbox_frames', '?')}"
-            + ("" if status.model is None else f"; model: {_model(status)}")
+            + ("" if status.model is None else f"; model: {_model(status, in_short=True)}")
         )
 
 
-def _model(status: Status) -> str:
-    """Return how the training beside the listener stands."""
+def _model(status: Status, in_short: bool = False) -> str:
+    """Return how the training beside the listener stands; in short without why it failed, which was told then."""
     if status.model is None:
         return "none is made meanwhile"
+    if in_short and status.model.get("state") == "failed":
+        return "failed"
     return model_line(status.model) if status.model else "the training starts"
 
 

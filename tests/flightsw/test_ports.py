@@ -415,3 +415,15 @@ def test_an_interface_that_is_down_is_one_outage_however_long(monkeypatch, caplo
                 link.write(frame_packet(bytes(7)))
         assert link.bytes_written
     link._drop()
+
+
+def test_a_serial_line_that_goes_away_is_told_once_in_words(caplog):
+    ours, theirs = os.openpty()
+    url = f"serial://{os.ttyname(theirs)}"
+    os.close(theirs)
+    with open_link(url, FLIGHT_SIDE) as link:
+        os.close(ours)
+        for _ in range(3):
+            link.exchange(0.0)
+    (why,) = (record.getMessage().partition(" hung up: ")[2] for record in caplog.records)
+    assert why in ("the device went away", "Input/output error")  # by the kernel's mood: end of file, or EIO

@@ -272,7 +272,7 @@ def test_on_a_disk_with_little_room_that_is_what_is_told(small_mission, tmp_path
     monkeypatch.setattr(computer, "write_whole", write)
     monkeypatch.setattr(computer.shutil, "disk_usage", lambda folder: types.SimpleNamespace(free=free))
     (finding,) = computer.check_disk(small_mission, tmp_path)
-    assert finding.state == "warning" and "room for 0.2 MB, the pass takes 0.553 MB" in finding.found
+    assert finding.state == "warning" and "room for 0.2 MB, the pass takes 0.55 MB" in finding.found
     free = 5_000
     (finding,) = computer.check_disk(small_mission, tmp_path)
     assert finding.state == "failed" and "not even one bracket fits" in finding.found

@@ -87,7 +87,7 @@ class LiveProcess:
             lines = self._log.read_text(errors="replace").strip().splitlines()
         except OSError as error:
             return f"it ended, and its log cannot be read: {in_words(error)}"
-        return lines[-1] if lines else "it ended without a word"
+        return lines[-1].removeprefix("ground: ") if lines else "it ended without a word"
 
     def status(self) -> dict[str, Any]:
         """Return how the training stands, as `read_status`; {} while it has said nothing and has not failed."""
