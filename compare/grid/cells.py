@@ -11,10 +11,12 @@ from compare.case import content_digest
 from compare.conditions import Condition
 from compare.errors import CompareError
 from compare.methods import Method, method
-from ground.run.cluster import needed_mb
+from ground.run.cluster import frames_mb, needed_mb
 from ground.session.folder import open_session, pass_name
+from ground.session.training_frames import TEST_INTERVAL
 
-VALUE_BYTES = 16  # of a frame: readings, prepared batches at several scales, silhouettes, truth
+VALUE_BYTES = 16  # of a frame, of a method that holds them whole in single precision, with truth and pictures
+TRUTH_BYTES = 8  # of a held-out frame, which is every eighth: its truth and a method's picture of it
 FORMAT = 2  # of a cell's digest; raise it when what is scored changes its meaning
 
 
@@ -61,6 +63,7 @@ class SessionFacts:
     size_px: int  # the longer side
     frames: int
     pixels: int  # of a frame, times its channels
+    frames_mb: float  # memory that they are estimated to take in a training
 
 
 def session_facts(folder: Path) -> SessionFacts:
@@ -79,6 +82,7 @@ def session_facts(folder: Path) -> SessionFacts:
         max(camera.width, camera.height),
         len(session.frames),
         camera.width * camera.height * camera.channels,
+        frames_mb(session),
     )
 
 
@@ -169,5 +173,9 @@ def _cell(
     }
     digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
     gaussians = wanted.gaussians if largest is None else largest
-    memory_mb = needed_mb(facts.frames * facts.pixels, VALUE_BYTES, gaussians) + wanted.working_mb
+    values_mb = 1e-6 * facts.frames * facts.pixels
+    held_mb = (
+        facts.frames_mb + TRUTH_BYTES / TEST_INTERVAL * values_mb if gaussians else VALUE_BYTES * values_mb
+    )
+    memory_mb = needed_mb(held_mb, gaussians) + wanted.working_mb
     return Cell(facts, wanted.name, seed, Budget(share, largest), name, condition, digest, memory_mb)

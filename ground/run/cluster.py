@@ -8,19 +8,25 @@ from pathlib import Path
 from typing import Any
 
 import dask.config
+import numpy as np
 import psutil
+import torch
 from distributed import Client, LocalCluster
 from distributed.security import Security
 
-from ground.session.folder import open_session
+from ground.session.folder import FrameRecord, Session, open_session
 from obbgs_base.errors import ObbgsError, reason
+from obbgs_core.compact import Compact, held
 from obbgs_core.methods.presets import preset
 
 log = logging.getLogger(__name__)
 BASE_MB = 600.0  # a process with PyTorch before any work
 # of a Gaussian's 59 numbers: parameters, gradient and two moments, and what growth and checkpoints copy of them
 GAUSSIAN_MB = 4e-6 * 59 * 8
-VALUE_BYTES = 6  # of a frame: readings of 16 bits, averaged images, silhouettes
+VALUE_BYTES = 6  # of a frame whose picture is held as it is: readings, averaged images, silhouettes
+COMPACT_SHARE = 1.1  # of what a large frame is held in: with its silhouettes
+WORKING_BYTES = 100  # of a pixel of the one frame that the start is looking at
+LOOKED_AT = 8  # frames of a session, spread evenly, of which one tells what it is held in
 USED_MEMORY = 0.9  # of what is available: the rest is for everybody else
 CONFIG = {
     "distributed.scheduler.worker-ttl": "1 hour",  # a busy worker of low priority may be silent for minutes
@@ -38,9 +44,30 @@ class ClusterError(ObbgsError):
     """There are no processes, or not enough memory; the message says why and what to do."""
 
 
-def needed_mb(values: int, bytes_of_each: float, gaussians: int) -> float:
-    """Return the memory that a training's process is estimated to need, of so many values of all frames together."""
-    return BASE_MB + 1e-6 * bytes_of_each * values + GAUSSIAN_MB * gaussians
+def needed_mb(frames_mb: float, gaussians: int) -> float:
+    """Return the memory that a training's process is estimated to need, beside frames that take so much."""
+    return BASE_MB + frames_mb + GAUSSIAN_MB * gaussians
+
+
+def frames_mb(session: Session) -> float:
+    """Return the memory that a session's frames are estimated to take in a training.
+
+    Large ones take what shows in them (`obbgs_core.compact`): some are read.
+
+    Raises:
+        SessionError: a picture cannot be read.
+    """
+    pixels = session.camera.width * session.camera.height
+
+    def kept(record: FrameRecord) -> float:
+        picture = held(torch.from_numpy(session.dn(record).astype(np.float32)))
+        if isinstance(picture, Compact):
+            return COMPACT_SHARE * picture.inside.nbytes
+        return VALUE_BYTES * pixels * session.camera.channels
+
+    some = session.frames[:: max(1, len(session.frames) // LOOKED_AT)]
+    of_each = sum(map(kept, some)) / max(1, len(some))
+    return 1e-6 * (WORKING_BYTES * pixels + of_each * len(session.frames))
 
 
 def training_mb(session_dir: Path, method: str, changes: dict[str, Any]) -> float:
@@ -50,8 +77,7 @@ def training_mb(session_dir: Path, method: str, changes: dict[str, Any]) -> floa
         SessionError, ValueError: as in `open_session` and `preset`.
     """
     session, config = open_session(session_dir), preset(method, changes)
-    values = len(session.frames) * session.camera.width * session.camera.height * session.camera.channels
-    return needed_mb(values, VALUE_BYTES, config.growth.max_gaussians)
+    return needed_mb(frames_mb(session), config.growth.max_gaussians)
 
 
 @contextlib.contextmanager
