@@ -1,7 +1,8 @@
-// Gaussians to splats: projection, opacity and radiance of a vector of Gaussians at a time.
+// Gaussians to splats: projection, opacity, radiance and the tiles that they touch.
 #include <vector>
 
 #include "machine/threads.h"
+#include "pairs.h"
 #include "projection.h"
 #include "shading.h"
 
@@ -74,6 +75,7 @@ void project(const Scene& s, Frame& frame, float* means2d, float* radii, int thr
   const size_t n = s.gaussians, count = n * s.cameras;
   frame.splats.resize(count);
   frame.visible.resize(count);
+  frame.found.assign(chunks, {});
   std::vector<uint32_t> visible(size_t(s.cameras) * chunks, 0);  // keys of each camera and chunk
   std::vector<Camera> cameras;
   cameras.reserve(s.cameras);
@@ -94,6 +96,16 @@ void project(const Scene& s, Frame& frame, float* means2d, float* radii, int thr
                              frame.visible.data() + base + size_t(chunk) * kChunk + keys);
       }
     }
+    std::vector<Found>& found = frame.found[chunk];
+    found.reserve(2 * kChunk * s.cameras);
+    for (int c = 0; c < s.cameras; ++c)  // while the splats are in this core's cache
+      for (uint32_t k = 0; k < visible[size_t(c) * chunks + chunk]; ++k) {
+        const uint32_t index = frame.visible[c * n + size_t(chunk) * kChunk + k].splat;
+        Splat& splat = frame.splats[index];
+        splat.first_record = uint32_t(found.size());
+        find_tiles(s, splat, index, found);
+        splat.records = uint32_t(found.size()) - splat.first_record;
+      }
   });
   frame.visible_count = 0;
   for (int c = 0; c < s.cameras; ++c)

@@ -20,7 +20,7 @@ struct SplatSums {
 
   SplatSums(const Scene& s, const Group& group, const Splat* splats, const float* records, bool given_means2d,
             float* pixels) {
-    for (int l = kLanes; l < 2 * kLanes && group.first + l < s.gaussians; ++l)  // the next group's records lie anywhere
+    for (int l = kLanes; l < 2 * kLanes && group.first + l < s.gaussians && (group.first + l) % kChunk; ++l)  // the next group's records lie anywhere
       if (splats[l].records) __builtin_prefetch(records + size_t(splats[l].first_record) * kRecord);
     for (int l = 0; l < group.size; ++l) {
       for (uint32_t r = 0; r < splats[l].records; ++r) {
@@ -262,6 +262,7 @@ void project_backward(const Scene& s, const Frame& frame, const float* records, 
   parallel_for(chunks, worthwhile(threads, n * s.cameras, kSplatsPerThread), [&](int chunk) {
     std::vector<vf> d_cameras(size_t(s.cameras) * kCamera, vf(0.0f));
     vf d_ambient = 0.0f;
+    const float* of_chunk = records + size_t(frame.first_record[chunk]) * kRecord;
     for (int first = chunk * kChunk; first < std::min(s.gaussians, (chunk + 1) * kChunk); first += kLanes) {
       const Group group(s, first);
       const Model m(s, group);
@@ -270,7 +271,7 @@ void project_backward(const Scene& s, const Frame& frame, const float* records, 
         const size_t base = c * n;
         float* means2d = out.means2d + 2 * base;
         float* added = out.added ? out.added + base * s.channels : nullptr;
-        const SplatSums sums(s, group, &frame.splats[base + first], records, out.means2d_in != nullptr,
+        const SplatSums sums(s, group, &frame.splats[base + first], of_chunk, out.means2d_in != nullptr,
                              out.pixels + base + first);
         if (sums.none) {
           std::fill_n(means2d + 2 * first, 2 * group.size, 0.0f);

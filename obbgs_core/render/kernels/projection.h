@@ -11,8 +11,6 @@ namespace obbgs {
 namespace KERNEL {
 namespace {
 
-// Gaussians in a unit of parallel work: a constant, so that sums are added in the same order with any number of threads
-constexpr int kChunk = 256;
 constexpr size_t kSplatsPerThread = 1024;  // with fewer, another thread takes longer to wake than it saves
 constexpr float kMinNorm = 1e-12f;
 

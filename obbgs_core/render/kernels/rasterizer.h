@@ -5,6 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <vector>
 
 namespace obbgs {
 
@@ -42,7 +43,8 @@ struct Scene {
 struct alignas(64) Splat {
   float x, y, k1, k2, k3, level, cutoff, reach;
   float feature[kMaxFeatures];
-  uint32_t first_record, records;  // its gradient records, one for each tile it touches; none if it is not drawn
+  // its gradient records, one for each tile it touches, from the first of its chunk on; none if it is not drawn
+  uint32_t first_record, records;
 };
 
 // One splat in one tile.
@@ -69,15 +71,26 @@ class Buffer {  // a resizable array; resizing leaves it uninitialised
   size_t size_ = 0;
 };
 
+// A tile that a splat touches, and which blocks of it.
+struct Found {
+  uint64_t blocks;
+  uint32_t tile;
+};
+
 struct DepthKey {
   uint32_t depth_bits, splat;
 };
+
+// Gaussians in a unit of parallel work: a constant, so that sums are added in the same order with any number of threads
+constexpr int kChunk = 256;
 
 // What the forward pass leaves for the backward pass.
 struct Frame {
   Buffer<Splat> splats;      // [cameras * gaussians]
   Buffer<DepthKey> visible;  // splats on an image, nearest first once binned
   size_t visible_count = 0;
+  std::vector<std::vector<Found>> found;  // of each chunk of Gaussians, splat by splat; empty once binned
+  std::vector<uint32_t> first_record;     // of each chunk
   Buffer<uint32_t> tile_begin;  // [tiles + 1] into pairs
   Buffer<Pair> pairs;           // by tile, then by depth
   Buffer<float> transmittance;  // [cameras, height, width]
