@@ -28,7 +28,9 @@ from obbgs_core.jpeg import JpegCoding
 from obbgs_core.model.motions import rigid_motions
 from obbgs_core.sensor import Sensor
 
-NOISE, SHUTTER, DARK, POSE, LOSS, STRAY, HOT, MOTION = range(8)  # streams of random numbers, one a purpose
+NOISE, SHUTTER, DARK, POSE, LOSS, STRAY, HOT, MOTION, SETTING = range(
+    9
+)  # streams of random numbers, one a purpose
 BLUR_STEP_PX = 0.25  # between the shifted copies that are averaged
 MOST_ELECTRONS = 1e15  # NumPy's Poisson refuses about 9e18
 UNCERTAIN_SHIFT_M = 1e-6  # of a pose error that turns only: a covariance must not be singular
@@ -43,6 +45,8 @@ class Condition:
     - exposure_ratios: the session's exposure times, shortest first, become its shortest times these.
     - noise: factor on the standard deviation of the noise.
     - exposure_error: standard deviation of ln(true / tagged exposure time), frame by frame.
+    - setting_error: the same of each exposure time of the session, less the median of all, which is the unit of light.
+    - exposure_drift: ln(true / tagged exposure time) grows by so much from the first frame to the last, around 0.
     - response_gamma: the readings follow signal ** gamma (full scale 1), while the method takes them for linear.
     - pedestal: share of full scale that is added to every reading before it is clipped, while no method is told of it.
     - earth: share of the frames that have the Earth or its limb behind the target, by day and from a height of 500 km,
@@ -72,6 +76,8 @@ class Condition:
     exposure_ratios: tuple[float, ...] = ()
     noise: float = 1.0
     exposure_error: float = 0.0
+    setting_error: float = 0.0
+    exposure_drift: float = 0.0
     response_gamma: float = 1.0
     pedestal: float = 0.0
     stray_gradient: float = 0.0
@@ -94,13 +100,21 @@ class Condition:
     def __post_init__(self):
         for name in ("noise", "response_gamma", "believed_noise", "believed_gain"):
             require(getattr(self, name) > 0, name, f"expected more than 0, got {getattr(self, name):g}")
-        for name in ("exposure_error", "stars", "blur_px", "frames", "missing_exposure", "pose_error_deg"):
-            require(getattr(self, name) >= 0, name, f"expected 0 or more, got {getattr(self, name):g}")
-        require(
-            self.exposure_error <= MOST_EXPOSURE_ERROR,
+        for name in (
             "exposure_error",
-            f"expected at most {MOST_EXPOSURE_ERROR:g}, got {self.exposure_error:g}",
-        )
+            "setting_error",
+            "stars",
+            "blur_px",
+            "frames",
+            "missing_exposure",
+            "pose_error_deg",
+        ):
+            require(getattr(self, name) >= 0, name, f"expected 0 or more, got {getattr(self, name):g}")
+        for name in ("exposure_error", "setting_error", "exposure_drift"):
+            error = abs(getattr(self, name))
+            require(
+                error <= MOST_EXPOSURE_ERROR, name, f"expected at most {MOST_EXPOSURE_ERROR:g}, got {error:g}"
+            )
         for name in ("pedestal", "stray_gradient"):
             share = getattr(self, name)
             require(
@@ -138,7 +152,7 @@ class Condition:
     def exposes_anew(self) -> bool:
         """Whether frames are made from the truth."""
         changed = (self.exposure_ratios, self.exposure_error, self.pedestal, self.stray_gradient)
-        changed += (self.earth, self.stars, self.blur_px)
+        changed += (self.setting_error, self.exposure_drift, self.earth, self.stars, self.blur_px)
         return any(changed) or (self.noise, self.response_gamma) != (1, 1)
 
     def stated(self) -> dict[str, Any]:
@@ -241,9 +255,16 @@ def _exposed_anew(case: Case, condition: Condition) -> list[TrainingFrame]:
     )
     view, frames = case.true_views(), []
     star_gain = _star_gain(case.sensor, condition, max(times_s))
-    for frame in case.training:
+    drawn = np.random.default_rng(SETTING).standard_normal(len(times_s))
+    of_setting = dict(zip(times_s, condition.setting_error * (drawn - np.median(drawn)), strict=True))
+    along = np.linspace(-0.5, 0.5, len(case.training))
+    for number, frame in enumerate(case.training):
         exposure_s = tagged_s.get(frame.exposure_time_s, frame.exposure_time_s)
-        longer = math.exp(_random(SHUTTER, frame).normal(0, condition.exposure_error))
+        longer = math.exp(
+            _random(SHUTTER, frame).normal(0, condition.exposure_error)
+            + of_setting[frame.exposure_time_s]
+            + condition.exposure_drift * along[number]
+        )
         light, coverage = view(frame)
         scene = behind(frame, condition.earth, star_gain)
         light = light.astype(float) + (1 - coverage[..., None]) * scene.radiance

@@ -54,6 +54,7 @@ class Batches:
         solid: Mapping[int, Tensor | Compact] | None = None,
     ):
         self.frames, self.white_dn = frames, white_dn
+        self._gains: list[float] | None = None
         self._masks = {"sky": dict(sky or {}), "solid": dict(solid or {})}
         self._backdrops: dict[int, Backdrop] = {}
         self._windows = windows
@@ -71,6 +72,12 @@ class Batches:
         """Return the same images with the poses of other frames, such as refined ones."""
         other = copy.copy(self)
         other.frames = frames
+        return other
+
+    def exposed(self, gains: list[float] | None) -> "Batches":
+        """Return the same images with exposure times so many times as long as stated; None: as stated."""
+        other = copy.copy(self)
+        other._gains = gains
         return other
 
     @property
@@ -109,7 +116,8 @@ class Batches:
         if any(i in self._backdrops for i in indices):
             cameras = dataclasses.replace(cameras, backdrop=stacked("radiance"))
             doubt = stacked("sigma")
-        exposures_s = torch.tensor([self.frames[i].exposure_time_s for i in indices])
+        gains = self._gains or [1.0] * len(self.frames)
+        exposures_s = torch.tensor([self.frames[i].exposure_time_s * gains[i] for i in indices])
         return Batch(
             indices,
             cameras,

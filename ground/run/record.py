@@ -56,9 +56,8 @@ def training_metrics(
         "dark_frames": result.dark_frames,
         "sky_level": None if result.sky_level.fits else str(result.sky_level),  # null: the stated black level
         "sky_level_dn": None if result.sky_level.fits else result.sky_level.by_frame(),
-        "response": None
-        if result.response.exponent == 1
-        else str(result.response),  # null: linear, as stated
+        # null: linear, and exposure times right, as stated
+        "response": None if result.response.is_as_stated else str(result.response),
         "response_exponent": result.response.exponent,
         "misfit_frames": result.misfit_frames,
         "chi2": None if math.isnan(chi2) else chi2,

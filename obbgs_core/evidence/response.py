@@ -1,4 +1,4 @@
-"""The response of a camera whose readings are no straight line in light: its exponent, learnt beside the model.
+"""What a camera does otherwise than stated, learnt beside the model: its response's exponent, its exposure times.
 
 The model is one for all exposure times. If the readings of long exposures are too bright for it and those of short
 ones too dark, by a ratio that is a power of the exposure time, then readings are that power of light. Compared are
@@ -7,13 +7,17 @@ pass, which see the target from all of its sides alike. An exposure time that an
 says what it saw, and tells nothing. Readings count in the radiance that both can read, so that a model which is too
 dark where it is bright is no evidence either.
 
+Ratios that follow no power are those of exposure times which are not as stated, each by a factor; the median is taken
+as stated, since what all share is the unit of light. A ratio that grows along the pass, alike in the frames of every
+exposure time, is a drift.
+
 Source: Mitsunaga and Nayar, Radiometric self calibration, 1999, who fit a polynomial to exposures of one view.
 """
 
 import itertools
 import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -32,52 +36,151 @@ log = logging.getLogger(__name__)
 DECIDED_AT = (0.3, 0.5, 0.7)  # shares of the steps
 LEAST_STEP = 0.1  # of the logarithms of exposure times that are compared
 FEWEST_READINGS = 30
-MOST = 120  # frames, or pairs of neighbours in a bracket, that are rendered
+MOST = 60  # frames, or pairs of neighbours in a bracket, that are rendered
 FEWEST = 24  # pairs of neighbours in brackets; of each setting, where views have one exposure, one a part
 LEFT_OUT = 10  # parts of the pass, each left out once (jackknife)
 # of ln of exposure times and ln of the light that the model shows in the frames: more, and the camera chose them by it
 MOST_CHOSEN = 0.5
-# an exponent is used that is by so much other than 1, and by so many of its errors
+# what is by so much other than stated is used, and by so many of its errors
 LEAST, CERTAIN = 0.02, 3.0
 LIT_SIGMA, BELOW_FULL_SCALE = 4.0, 0.9  # readings that count: between so much noise and so much of full scale
+MOST_WRONG = 0.5  # of ln(true / stated exposure time)
 RANGE = (0.3, 3.0)  # of exponents: others are none of a camera's
 
 
 @dataclass
 class Response:
-    """What is known of the exponent."""
+    """What is known of the exponent, and of exposure times that are not as stated."""
 
     exponent: float = 1.0  # that is used
     error: float = math.nan  # its standard error; nan: not measured
+    settings: dict[float, float] | None = None  # ln(true / stated) of stated exposure times; None: as stated
+    drift: float = 0.0  # of ln(true / stated) from the first frame to the last
+
+    @property
+    def is_as_stated(self) -> bool:
+        """Whether readings are linear in light and exposure times right, as far as it is known."""
+        return self.exponent == 1 and self.settings is None and self.drift == 0
 
     @torch.no_grad()
     def decide(self, model: Gaussians, batches: Batches, sensor: Sensor) -> bool:
-        """Take the exponent that the frames tell beside the model as it stands; return whether it is another one."""
+        """Take what the frames tell beside the model as it stands; return whether it is something else."""
         in_brackets = _in_brackets(batches.frames)
         pairs = in_brackets or _in_turns(batches.frames)
         indices = sorted({i for pair in pairs for i in (*pair.one, *pair.other)})
-        found = each(lambda i: _told(model, batches.batch([i]), sensor), indices)
+        frames = batches.frames
+        found = each(lambda i: _told(model, batches.batch([i]), sensor, frames[i].exposure_time_s), indices)
         told = dict(zip(indices, found, strict=True))
         if not in_brackets and _chosen(told.values()):
             return False
-        found = [(pair.part, compared) for pair in pairs if (compared := _compared(pair, told))]
-        parts = np.array([part for part, _ in found])
-        steps = np.array([compared for _, compared in found]).reshape(-1, 2)
-        if len(set(parts.tolist())) < LEFT_OUT:
+        contrasts = _Contrasts.of([c for pair in pairs if (c := _compared(pair, told)) is not None])
+        if len(set(contrasts.parts.tolist())) < LEFT_OUT:
             return False
-        without = np.array([_slope(steps[parts != part]) for part in range(LEFT_OUT)])
-        self.error = math.sqrt((LEFT_OUT - 1) * without.var())
-        now, before = self.exponent + _slope(steps), self.exponent
-        is_bent = abs(now - 1) > max(LEAST, CERTAIN * self.error) and RANGE[0] <= now <= RANGE[1]
-        self.exponent = now if is_bent else 1.0
-        if self.exponent != 1:
-            log.info("%s", self)
-        return self.exponent != before
+        before = self.exponent, self.settings, self.drift
+        stated = {
+            s: (self.exponent - 1) * math.log(s) + (self.settings or {}).get(s, 0.0)
+            for s in contrasts.times_s
+        }
+        contrasts.values += contrasts.design @ np.array(list(stated.values()))
+        bend, self.error = _jackknifed(contrasts.slope, contrasts.parts)
+        uneven, errors = _jackknifed(contrasts.uneven, contrasts.parts)
+        each_s = contrasts.settings(np.full(len(contrasts.parts), True))
+        if (np.abs(uneven) > np.maximum(LEAST, CERTAIN * errors)).any() and np.abs(
+            each_s
+        ).max() <= MOST_WRONG:
+            self.exponent, self.settings = 1.0, dict(zip(contrasts.times_s, each_s.tolist(), strict=True))
+        else:
+            is_bent = abs(bend) > max(LEAST, CERTAIN * self.error) and RANGE[0] <= 1 + bend <= RANGE[1]
+            self.exponent, self.settings = 1 + float(bend) if is_bent else 1.0, None
+        self.drift = self._drift(told, len(batches.frames))
+        if (self.exponent, self.settings, self.drift) == before:
+            return False
+        log.info("%s", self)
+        return True
+
+    def _drift(self, told: dict[int, "_Told"], count: int) -> float:
+        """Return the drift that the frames tell."""
+        groups: dict[tuple[int, float], list[_Told]] = {}
+        for i, t in told.items():
+            groups.setdefault((i * LEFT_OUT // count, t.exposure_time_s), []).append(t)
+        levels = {key: _together(group).log_ratio(0.0, math.inf) for key, group in groups.items()}
+        known = [(part, s, level) for (part, s), level in levels.items() if level is not None]
+        parts, times_s, level = np.array(known).reshape(-1, 3).T
+        for s in set(times_s.tolist()):  # what a setting does to all of its frames is no drift
+            level[times_s == s] -= level[times_s == s].mean()
+        if len(set(parts.tolist())) < LEFT_OUT:
+            return 0.0
+        slope, error = _jackknifed(lambda kept: np.polyfit(parts[kept], level[kept], 1)[0] * LEFT_OUT, parts)
+        now = self.drift + float(slope)
+        return now if max(LEAST, CERTAIN * error) < abs(now) <= MOST_WRONG else 0.0
+
+    def gains(self, frames: list[TrainingFrame]) -> list[float] | None:
+        """Return the true exposure time of each frame over the stated one; None where all are as stated."""
+        if self.settings is None and self.drift == 0:
+            return None
+        middle, settings = (len(frames) - 1) / 2, self.settings or {}
+        drifts = [self.drift * (i - middle) / max(2 * middle, 1) for i in range(len(frames))]
+        return [
+            math.exp(d + settings.get(f.exposure_time_s, 0.0)) for f, d in zip(frames, drifts, strict=True)
+        ]
 
     def __str__(self) -> str:
-        if self.exponent == 1:
-            return "readings are linear in light, as stated"
-        return f"readings follow light to the power of {self.exponent:.3f} ± {self.error:.3f}"
+        said = []
+        if self.exponent != 1:
+            said.append(f"readings follow light to the power of {self.exponent:.3f} ± {self.error:.3f}")
+        if self.settings:
+            each = ", ".join(
+                f"{1e3 * s:g} ms is {1e3 * s * math.exp(g):.4g} ms" for s, g in self.settings.items()
+            )
+            said.append(f"exposure times are not as stated: {each}")
+        if self.drift:
+            said.append(
+                f"exposure times drift by {math.expm1(self.drift):+.1%} from the first frame to the last"
+            )
+        return "; ".join(said) or "readings are linear in light and exposure times right, as stated"
+
+
+@dataclass
+class _Contrasts:
+    """By how much ln of read over expected light differs between frames of two exposure times, N times."""
+
+    times_s: list[float]  # S exposure times
+    design: np.ndarray  # [N, S] -1 at the one, 1 at the other
+    values: np.ndarray  # [N]
+    parts: np.ndarray  # [N] of the pass
+
+    @staticmethod
+    def of(found: list[tuple[int, float, float, float]]) -> "_Contrasts":
+        """Return the contrasts of parts, exposure times of the one and of the other, and values."""
+        times_s = sorted({s for _, one_s, other_s, _ in found for s in (one_s, other_s)})
+        design = np.array(
+            [[float(s == other) - float(s == one) for s in times_s] for _, one, other, _ in found]
+        ).reshape(len(found), len(times_s))
+        return _Contrasts(times_s, design, np.array([f[3] for f in found]), np.array([f[0] for f in found]))
+
+    def slope(self, kept: np.ndarray) -> np.ndarray:
+        """Return the slope over ln of exposure times that fits some contrasts best."""
+        steps = (self.design @ np.log(self.times_s))[kept]
+        return np.array(steps @ self.values[kept] / (steps @ steps))
+
+    def settings(self, kept: np.ndarray) -> np.ndarray:
+        """Return one value for each exposure time [S] that fits some contrasts best, with a median of 0."""
+        values = np.linalg.lstsq(self.design[kept], self.values[kept], rcond=None)[0]
+        return values - np.median(values)
+
+    def uneven(self, kept: np.ndarray) -> np.ndarray:
+        """Return what of `settings` no slope explains."""
+        logs = np.log(self.times_s)
+        values = self.settings(kept) - self.slope(kept) * logs
+        return values - np.median(values)
+
+
+def _jackknifed(
+    estimate: Callable[[np.ndarray], np.ndarray], parts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return an estimate of all, given which are taken, and its standard error by leaving out each part once."""
+    without = np.array([estimate(parts != part) for part in range(LEFT_OUT)])
+    return estimate(parts >= 0), np.sqrt((LEFT_OUT - 1) * without.var(axis=0))
 
 
 class _Pair(NamedTuple):
@@ -148,14 +251,14 @@ class _Told:
         return math.log(ratio) if ratio > 0 else None
 
 
-def _told(model: Gaussians, batch: Batch, sensor: Sensor) -> _Told:
+def _told(model: Gaussians, batch: Batch, sensor: Sensor, exposure_time_s: float) -> _Told:
     radiance, dn = sampled(sensor, render(model, batch.cameras).radiance, batch.dn)
     prediction = sensor.predicted(radiance, batch.exposure_time_s)
     light, variance = prediction.expected_dn - sensor.black_dn, prediction.variance_dn2
     counts = light > LIT_SIGMA * variance.sqrt()
     counts &= light < BELOW_FULL_SCALE * (sensor.white_dn - sensor.black_dn)
     values = radiance[counts], light[counts], dn[counts] - sensor.black_dn
-    return _Told(batch.exposure_time_s.item(), radiance.mean().item(), *values)
+    return _Told(exposure_time_s, radiance.mean().item(), *values)
 
 
 def _together(told: list[_Told]) -> _Told:
@@ -164,8 +267,8 @@ def _together(told: list[_Told]) -> _Told:
     return _Told(told[0].exposure_time_s, sum(t.brightness for t in told) / len(told), *values)
 
 
-def _compared(pair: _Pair, told: dict[int, _Told]) -> tuple[float, float] | None:
-    """Return by how much ln of the exposure time, and of read over expected light, differ between frames.
+def _compared(pair: _Pair, told: dict[int, _Told]) -> tuple[int, float, float, float] | None:
+    """Return the part of a pair, its two exposure times, and by how much ln of read over expected light differs.
 
     None where too few readings of either lie in the radiance that both can read.
     """
@@ -177,9 +280,4 @@ def _compared(pair: _Pair, told: dict[int, _Told]) -> tuple[float, float] | None
     before, after = one.log_ratio(least, most), other.log_ratio(least, most)
     if before is None or after is None:
         return None
-    return math.log(other.exposure_time_s / one.exposure_time_s), after - before
-
-
-def _slope(pairs: np.ndarray) -> float:
-    """Return the slope of the line through the origin that fits pairs [N, 2] best."""
-    return float(pairs[:, 0] @ pairs[:, 1] / (pairs[:, 0] @ pairs[:, 0]))
+    return pair.part, one.exposure_time_s, other.exposure_time_s, after - before

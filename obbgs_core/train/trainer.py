@@ -265,7 +265,8 @@ class Trainer:
         if found.extension.errors is not None:
             growth = dataclasses.replace(config.growth, max_gaussians=max(most, setup.shown))
             config = dataclasses.replace(config, growth=growth)
-        self.setup = dataclasses.replace(setup, sensor=sensor, config=config)
+        batches = setup.batches.exposed(found.response.gains(setup.frames))
+        self.setup = dataclasses.replace(setup, sensor=sensor, config=config, batches=batches)
 
     def _recorded(self, loss: float) -> StepInfo:
         """Return how the training stands, and keep it in the history."""

@@ -165,6 +165,25 @@ def test_frames_exposed_anew_have_the_ratios_and_the_noise_of_their_condition(ca
     assert dark.mean() == pytest.approx(case.sensor.black_dn, abs=2)
 
 
+def test_exposure_times_are_wrong_by_setting_and_drift_while_tags_stay(case):
+    def longer(**condition: float) -> np.ndarray:
+        """Return ln of the light of each frame over that with the exposure time of its tag."""
+        sums = []
+        for changes in ({}, condition):
+            frames = frames_under(case, exposure_ratios=(1.0, 1.5, 2.0), noise=1e-6, **changes)
+            assert len({f.exposure_time_s for f in frames}) == 3
+            sums.append([float((f.dn - case.sensor.black_dn).sum()) for f in frames])
+        return np.log(np.divide(sums[1], sums[0]))
+
+    exposures_s = [f.exposure_time_s for f in case.training]
+    drifted, by_setting = longer(exposure_drift=-0.4), longer(setting_error=0.1)
+    np.testing.assert_allclose(drifted, np.linspace(0.2, -0.2, len(drifted)), atol=0.02)
+    of = [by_setting[np.array(exposures_s) == s] for s in sorted(set(exposures_s))]
+    assert max(np.ptp(values) for values in of) < 0.02
+    means = np.array([values.mean() for values in of])
+    assert abs(np.median(means)) < 0.01 and np.abs(means).max() > 0.02
+
+
 @generated(st.floats(0.1, 3.0), st.floats(0.5, 2.0))
 def test_the_response_bends_the_signal_and_not_its_ends(noise, gamma):
     sensor = Sensor(64, 4095, 1.0, 1e9, 1e-6)
@@ -344,6 +363,7 @@ def test_a_figure_that_is_no_number_is_left_out_of_a_row():
         ("a: {nois: 2}", "conditions.a.nois: unknown key"),
         ("a: {noise: 0}", "conditions.a.noise: expected more than 0"),
         ("a: {exposure_error: 1000}", "conditions.a.exposure_error: expected at most 3"),
+        ("a: {exposure_drift: -4}", "conditions.a.exposure_drift: expected at most 3, got 4"),
         ("a: {noise: loud}", "conditions.a.noise: expected a number"),
         ("a: {eclipse: [0.7, 0.4]}", "conditions.a.eclipse: expected two shares"),
         ("a: {synthetic_bracket: [1, 0]}", "conditions.a.synthetic_bracket: expected numbers above 0"),

@@ -14,7 +14,7 @@ from obbgs_core.losses import likelihood_loss
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.sh import from_radiance, radiance
 from obbgs_core.sensor import Sensor
-from tests.scenes import SENSOR, photographed, target
+from tests.scenes import EXPOSURES_S, SENSOR, photographed, target
 
 FULL_SCALE_DN = SENSOR.white_dn - SENSOR.black_dn
 
@@ -60,6 +60,32 @@ def test_a_model_that_is_wrong_is_no_evidence_against_a_linear_camera(contrast, 
     """A training in its first steps has one: too soft, dark faces too bright or bright ones too dark."""
     frames, model = in_brackets(photographed(target(), count=54), bracket), wrong(target(), contrast, size)
     assert not Response().decide(model, Batches(frames, SENSOR.white_dn), SENSOR)
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.15])
+@pytest.mark.parametrize("wrong_by", [(1.0, 1.0, 1.0), (1.12, 1.0, 1.15), (1.0, 1.2, 0.9)])
+@pytest.mark.parametrize("size", [3, None])
+def test_exposure_times_that_are_wrong_by_setting_or_drift_are_found(size, wrong_by, drift):
+    model, count = target(), 60
+    along = np.linspace(-0.5, 0.5, count)
+    tagged_s = np.resize(EXPOSURES_S, count)
+    true = np.resize(wrong_by, count) / np.median(wrong_by) * np.exp(drift * along)
+    frames = [
+        dataclasses.replace(f, exposure_time_s=float(tagged))
+        for f, tagged in zip(
+            photographed(model, count, exposures_s=(tagged_s * true).tolist()), tagged_s, strict=True
+        )
+    ]
+    frames, response = in_brackets(frames, size), Response()
+    batches = Batches(frames, SENSOR.white_dn)
+    for _ in range(2):
+        response.decide(model, batches.exposed(response.gains(frames)), SENSOR)
+    assert response.exponent == 1
+    gains = response.gains(frames)
+    assert (gains is None) == (drift == 0 and len(set(wrong_by)) == 1)
+    np.testing.assert_allclose(gains or np.ones(count), true, rtol=0.01)
+    exposed = batches.exposed(gains).batch([7]).exposure_time_s.item()
+    assert exposed == pytest.approx(tagged_s[7] * true[7], rel=0.01)
 
 
 def test_frames_of_one_exposure_time_tell_nothing():
