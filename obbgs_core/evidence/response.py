@@ -82,16 +82,17 @@ class Response:
             for s in contrasts.times_s
         }
         contrasts.values += contrasts.design @ np.array(list(stated.values()))
-        bend, self.error = _jackknifed(contrasts.slope, contrasts.parts)
+        bend, error = map(float, _jackknifed(contrasts.slope, contrasts.parts))
         uneven, errors = _jackknifed(contrasts.uneven, contrasts.parts)
         each_s = contrasts.settings(np.full(len(contrasts.parts), True))
+        self.error = error
         if (np.abs(uneven) > np.maximum(LEAST, CERTAIN * errors)).any() and np.abs(
             each_s
         ).max() <= MOST_WRONG:
             self.exponent, self.settings = 1.0, dict(zip(contrasts.times_s, each_s.tolist(), strict=True))
         else:
-            is_bent = abs(bend) > max(LEAST, CERTAIN * self.error) and RANGE[0] <= 1 + bend <= RANGE[1]
-            self.exponent, self.settings = 1 + float(bend) if is_bent else 1.0, None
+            is_bent = abs(bend) > max(LEAST, CERTAIN * error) and RANGE[0] <= 1 + bend <= RANGE[1]
+            self.exponent, self.settings = 1 + bend if is_bent else 1.0, None
         self.drift = self._drift(told, len(batches.frames))
         if (self.exponent, self.settings, self.drift) == before:
             return False
