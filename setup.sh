@@ -3,6 +3,11 @@
 # Idempotent: what is up to date is left alone. PYTHON names another interpreter (3.11 to 3.14), PIP_ARGS adds arguments to pip.
 set -euo pipefail
 cd "$(dirname "$0")"
+[ "$(uname -s)" = Linux ] || {
+  echo "setup: this sets up Linux, and $(uname -s) was never tried; \`pip install -c constraints.txt -e '.[dev]'\` may do for" \
+    "all but the simulator, which needs a \`blender\` on the PATH" >&2
+  exit 2
+}
 
 supported() { "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' 2>/dev/null; }
 python=${PYTHON:-}
@@ -36,7 +41,7 @@ if [ ${#missing[@]} -gt 0 ]; then
     echo "setup: $install"
     apt-get update -qq && $install >/dev/null
   else
-    echo "setup: system packages are missing; run: sudo $install" >&2
+    echo "setup: system packages are missing; on Debian or Ubuntu run: sudo $install" >&2
     exit 2
   fi
 fi
@@ -49,17 +54,22 @@ environment() { # directory, its Python, files that shape it, command that fills
   echo "setup: $dir (downloads on the first run)"
   # an environment of another Python is made anew
   "$dir/bin/python" -m pip --version >/dev/null 2>&1 && [ "$("$dir/bin/python" -V)" = "$("$own" -V)" ] || "$own" -m venv --clear "$dir"
-  eval "$fill"
+  eval "$fill" || {
+    echo "setup: $dir is not complete: pip says above what it could not install for $("$own" -V) on $machine. Python 3.11 to" \
+      "3.13 on x86_64 have every package; PYTHON=/path/to/python3 takes another" >&2
+    exit 2
+  }
   echo "$digest" >"$dir/.ready"
 }
 
+machine=$(uname -m)
 pip_args="-q --disable-pip-version-check ${PIP_ARGS:-}"
 environment .venv "$python" "pyproject.toml constraints.txt CMakeLists.txt $(find obbgs_core/render/kernels -type f -not -name '*.pyc' | sort | tr '\n' ' ')" \
   ".venv/bin/pip install $pip_args -c constraints.txt -e '.[dev]'"
 
-# Blender comes as the package bpy, which exists for some Pythons only; else it is a `blender` that is there; else bpy in a
-# Python 3.11 of uv's. hil/sky/blender.py looks for it in this order, too.
-has_bpy() { "$1" -c 'import sys, ensurepip; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 13)))' >/dev/null 2>&1; }
+# Blender comes as the package bpy, which exists for some Pythons on x86_64 only; else it is a `blender` that is there; else
+# bpy in a Python 3.11 of uv's. hil/sky/blender.py looks for it in this order, too.
+has_bpy() { [ "$machine" = x86_64 ] && "$1" -c 'import sys, ensurepip; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 13)))' >/dev/null 2>&1; }
 blender_python=
 for name in "$python" python3.11 python3.13; do
   if [ -z "$blender_python" ] && has_bpy "$name"; then blender_python=$(command -v "$name"); fi
@@ -67,16 +77,18 @@ done
 blender_version() { blender --version 2>/dev/null | sed -n 's/^Blender \([0-9]*\)\.\([0-9]*\).*/\1 \2/p' | head -1; }
 read -r major minor < <(blender_version) || true
 if [ -z "$blender_python" ] && [ "$((${major:-0} * 100 + ${minor:-0}))" -ge 401 ]; then
-  echo "setup: Blender is $(command -v blender), $major.$minor; there is no bpy for $("$python" -V)"
+  echo "setup: Blender is $(command -v blender), $major.$minor; there is no bpy for $("$python" -V) on $machine"
   exit 0
 fi
-if [ -z "$blender_python" ] && command -v uv >/dev/null && uv python install -q 3.11; then
+if [ -z "$blender_python" ] && [ "$machine" = x86_64 ] && command -v uv >/dev/null && uv python install -q 3.11; then
   blender_python=$(uv python find 3.11)
 fi
 if [ -z "$blender_python" ]; then
-  echo "setup: everything but Blender is ready: there is no bpy for $("$python" -V), no python3.11 or python3.13 with venv, no" \
-    "\`blender\` of 4.1 or newer on the PATH, and no uv that can install Python 3.11. Provide one of them, such as" \
-    "\`apt-get install blender python3-numpy\` on Debian 13; without it the simulator cannot render" >&2
+  others=", no python3.11 or python3.13 with venv, and no uv that can install Python 3.11"
+  [ "$machine" = x86_64 ] || others=""
+  echo "setup: everything but Blender is ready: no \`blender\` of 4.1 or newer is on the PATH, there is no bpy for" \
+    "$("$python" -V) on $machine$others. Provide one of them, such as \`apt-get install blender python3-numpy\` on Debian" \
+    "13; without it the simulator cannot render" >&2
   exit 2
 fi
 environment .venv-blender "$blender_python" "hil/blender-requirements.txt" \
