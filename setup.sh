@@ -64,8 +64,9 @@ environment() { # directory, its Python, files that shape it, command that fills
 
 machine=$(uname -m)
 pip_args="-q --disable-pip-version-check ${PIP_ARGS:-}"
+modules=$(find flightsw obbgs_base obbgs_core ground compare hil -name '*.py' | sort | sha256sum | cut -c1-16)
 environment .venv "$python" "pyproject.toml constraints.txt CMakeLists.txt $(find obbgs_core/render/kernels -type f -not -name '*.pyc' | sort | tr '\n' ' ')" \
-  ".venv/bin/pip install $pip_args -c constraints.txt -e '.[dev]'"
+  ".venv/bin/pip install $pip_args -c constraints.txt -e '.[dev]' # modules $modules, which an editable installation lists"
 
 # Blender comes as the package bpy, which exists for some Pythons on x86_64 only; else it is a `blender` that is there; else
 # bpy in a Python 3.11 of uv's. hil/sky/blender.py looks for it in this order, too.

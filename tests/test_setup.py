@@ -20,7 +20,7 @@ def script(path: Path, text: str) -> None:
 @pytest.fixture
 def machine(tmp_path) -> Path:
     """The programs of a machine of a user who is not root, with all libraries but without a compiler."""
-    for name in ("bash", "env", "cat", "dirname", "sed", "head", "find", "sort", "tr", "sha256sum", "rm"):
+    for name in ("bash", "env", "cat", "dirname", "sed", "head", "find", "sort", "tr", "sha256sum", "cut"):
         (tmp_path / name).symlink_to(shutil.which(name) or "")
     script(tmp_path / "id", "echo 1000")
     system(tmp_path, "Linux", "x86_64")
@@ -76,7 +76,8 @@ def installed(machine) -> Path:
     """A copy of setup.sh whose environment is made of a Python 3.12 that installs what it is told."""
     root = machine / "root"
     (root / ".venv" / "bin").mkdir(parents=True)
-    (root / "obbgs_core" / "render" / "kernels").mkdir(parents=True)
+    for part in ("flightsw", "obbgs_base", "obbgs_core/render/kernels", "ground", "compare", "hil"):
+        (root / part).mkdir(parents=True)
     for name in ("setup.sh", "pyproject.toml", "constraints.txt", "CMakeLists.txt"):
         shutil.copy(ROOT / name, root)
     include = machine / "Python.h"
@@ -119,3 +120,17 @@ def test_packages_that_pip_cannot_install_are_told(machine, installed):
     said = told(machine, str(machine / "python3.12"), installed)
     assert ".venv is not complete" in said and "Python 3.12.1 on x86_64" in said
     assert not (installed / ".venv" / ".ready").exists()
+
+
+def test_a_module_that_moves_is_installed_anew(machine, installed):
+    """An editable installation lists the files of modules: one that became a folder was not found any more."""
+    script(installed / ".venv" / "bin" / "pip", f"echo installed >> {machine}/log")
+    script(machine / "blender", "echo Blender 4.3.2")
+    environment = {"PATH": str(machine), "PYTHON": str(machine / "python3.12")}
+    (installed / "flightsw" / "pose").mkdir()
+    (installed / "flightsw" / "pose.py").touch()
+    for times, after in ((1, "pose.py"), (1, "pose.py"), (2, "pose/__init__.py")):
+        if times == 2:
+            (installed / "flightsw" / "pose.py").rename(installed / "flightsw" / after)
+        subprocess.run([installed / "setup.sh"], env=environment, check=True, capture_output=True, timeout=60)
+        assert (machine / "log").read_text().count("installed") == times
