@@ -6,7 +6,7 @@ tensor of the values that were given.
 """
 
 import mmap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,6 +66,42 @@ class Compact:
         whole = self.part(slice(None), slice(None))
         whole.of_compact = (self, whole._version)  # type: ignore[attr-defined]
         return whole
+
+
+def seen(look: Callable[[Tensor], Tensor], picture: Tensor | Compact, reach: int) -> Tensor:
+    """Return what `look` says of each pixel of a picture [H, W, ...], [..., H, W].
+
+    It depends on the readings within `reach` rows and columns of a pixel: where the picture is even it is the same
+    everywhere, and of a large one only what is not even is looked at.
+    """
+    if not isinstance(picture, Compact):
+        return look(picture)
+    (height, width), margin = picture.shape[:2], 2 * (reach + 1)
+    top, bottom = picture.top, picture.top + len(picture.inside)
+    left, right = picture.left, picture.left + picture.width
+    rows = slice(max(0, top - margin), min(height, bottom + margin))
+    columns = slice(max(0, left - margin), min(width, right + margin))
+    row, column = (rows.start + rows.stop) // 2, (columns.start + columns.stop) // 2
+    if bottom + margin <= height:
+        row = bottom + reach
+    elif top >= margin:
+        row = top - reach - 1
+    elif right + margin <= width:
+        column = right + reach
+    elif left >= margin:
+        column = left - reach - 1
+    else:
+        return look(picture.tensor())
+    found = look(picture.part(rows, columns))
+    even = found[..., row - rows.start, column - columns.start]
+    of_all = even[..., None, None].expand(*even.shape, height, width).contiguous()
+    known = (slice(max(0, top - reach), bottom + reach), slice(max(0, left - reach), right + reach))
+    at = tuple(
+        slice(k.start - p.start, min(k.stop, p.stop) - p.start)
+        for k, p in zip(known, (rows, columns), strict=True)
+    )
+    of_all[(..., *known)] = found[(..., *at)]
+    return of_all
 
 
 def _smallest(values: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from obbgs_base.physics.navigation_errors import SharedParameters
-from obbgs_core.compact import Compact, hold_compact, part
+from obbgs_core.compact import Compact, hold_compact, part, seen
 from obbgs_core.compiled import each
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.model.cameras import Cameras, stacked_suns
@@ -120,6 +121,10 @@ class TrainingFrame:
     def part(self, rows: slice, columns: slice) -> Tensor:
         """Return some rows and columns of dn [h, w, C]."""
         return part(self.__dict__["_dn"], rows, columns)
+
+    def seen(self, look: Callable[[Tensor], Tensor], reach_px: int) -> Tensor:
+        """Return what `look` says of each pixel of dn by those within `reach_px` of it, see `compact.seen`."""
+        return seen(look, self.__dict__["_dn"], reach_px)
 
 
 # 360 pictures of 12 megapixels take 18 GB in single precision

@@ -105,6 +105,18 @@ def silhouette(dn: Tensor, sensor: Sensor, world_to_camera: Tensor, K: Tensor) -
     return Silhouette(certain[0, 0], likely[0, 0], (sky & ~likely)[0, 0], world_to_camera, K)
 
 
+def silhouette_of(frame: TrainingFrame, sensor: Sensor) -> Silhouette:
+    """Return the silhouette of a frame in front of black sky, or of another even background."""
+
+    def look(dn: Tensor) -> Tensor:
+        lit = light(dn, sensor, frame.background, frame.exposure_time_s)
+        found = silhouette(lit, sensor, frame.world_to_camera, frame.K)
+        return torch.stack([found.certain, found.likely, found.sky])
+
+    certain, likely, sky = frame.seen(look, max(SKY_WINDOWS_PX) // 2 + 1)
+    return Silhouette(certain, likely, sky, frame.world_to_camera, frame.K)
+
+
 def light(dn: Tensor, sensor: Sensor, background: float, exposure_time_s: float) -> Tensor:
     """Return readings [H, W, C] as if on black sky: the black level plus how far each is from that of the background.
 

@@ -69,8 +69,7 @@ def silhouettes(
         if i in earth:
             return earth_silhouette(earth[i], sensor)
         f = chosen[i]
-        light = hull.light(f.dn, sensor, f.background, f.exposure_time_s)
-        found = hull.silhouette(light, sensor, f.world_to_camera, f.K)
+        found = hull.silhouette_of(f, sensor)
         spread_px = math.ceil(f.moved_px / 2)
         return dataclasses.replace(found, grown_px=spread_px) if spread_px else found
 

@@ -14,6 +14,7 @@ import dataclasses
 import math
 import statistics
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -131,7 +132,7 @@ def field(plane_dn: Tensor, height: int, width: int) -> Tensor:
     return torch.einsum("hwk,ck->hwc", _basis(height, width).to(plane_dn), plane_dn)
 
 
-def cut_pixels(dn: Tensor, sensor: Sensor) -> Tensor:
+def cut_pixels(sensor: Sensor, dn: Tensor) -> Tensor:
     """Return which pixels [H, W] of readings dn [H, W, C] flight has not sent: they read the black level all over."""
     # with less noise, or a black level below it, many readings of the sky are exactly that
     if not CLEAR_NOISE_DN < _noise_dn(sensor) < sensor.black_dn:
@@ -152,7 +153,7 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
     """Return planes [F, C, 3] and their variances, infinite where a frame shows no sky, and a reading's deviation."""
     height, width, channels = frames[0].shape
     px = max(2, round(min(height, width) / BLOCKS))
-    cut = list(each(lambda f: held(cut_pixels(f.dn, sensor)), frames))
+    cut = list(each(lambda f: held(f.seen(partial(cut_pixels, sensor), 2 * CUT_PX)), frames))
     if any(bool(whole(mask).any()) for mask in cut):
         px = min(px, CUT_BLOCK_PX)
     if sensor.jpeg is not None:  # within its blocks readings are not independent
@@ -416,7 +417,7 @@ def _without(
         off = field(plane, height, width) - (black_dn - sensor.black_dn)
         dn = (frame.dn - off).clamp(0, white_dn)
         dn[frame.dn <= 0], dn[frame.dn >= sensor.white_dn] = 0.0, white_dn
-        dn[cut_pixels(frame.dn, sensor)] = black_dn
+        dn[cut_pixels(sensor, frame.dn)] = black_dn
         return dataclasses.replace(frame, dn=dn)
 
     changed = dataclasses.replace(sensor, black_dn=black_dn, white_dn=white_dn)

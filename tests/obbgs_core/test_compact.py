@@ -3,6 +3,7 @@
 import dataclasses
 import resource
 import tracemalloc
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import uniform_filter
 
 from obbgs_core import compact, preset
-from obbgs_core.compact import Compact, held, part, whole
+from obbgs_core.compact import Compact, held, part, seen, whole
+from obbgs_core.start.hull import silhouette_of
+from obbgs_core.start.sky_level import cut_pixels
 from obbgs_core.train.trainer import Trainer
 from tests import scenes
 
@@ -76,6 +80,35 @@ def test_what_is_no_longer_held_goes_back_to_the_system_whatever_lies_beside_it(
     every = every[::2]  # 10 times 4 MB
     assert before - taken() > 36e6
     assert all(isinstance(one, Compact) for one in every)
+
+
+@given(st.integers(0, 99), st.integers(1, 4), st.lists(st.integers(0, 40), min_size=4, max_size=4))
+def test_what_depends_on_near_pixels_is_found_around_what_is_not_even(seed, reach, edges):
+    rows, columns = (slice(*sorted(pair)) for pair in (edges[:2], edges[2:]))
+    picture = torch.full((40, 40, 1), 3.0)
+    part = picture[rows, columns]
+    part[...] = torch.from_numpy(np.random.default_rng(seed).integers(0, 9, part.shape)).float()
+
+    def look(dn: torch.Tensor) -> torch.Tensor:
+        means = uniform_filter(dn[..., 0].double().numpy(), 2 * reach + 1, mode="nearest")
+        return torch.from_numpy(np.stack([means.round(6), (dn[..., 0] > 3).numpy()]))
+
+    assert torch.equal(seen(look, Compact.of(picture), reach), look(picture))
+
+
+def test_silhouettes_and_cut_pixels_of_large_frames_are_those_of_the_whole_picture(monkeypatch):
+    frame = scenes.photographed(scenes.target(), 1)[0]
+    dn = torch.full((200, 260, frame.shape[2]), float(scenes.SENSOR.black_dn))
+    dn[70 : 70 + frame.shape[0], 90 : 90 + frame.shape[1]] = frame.dn
+    plain = dataclasses.replace(frame, dn=dn)
+    monkeypatch.setattr(compact, "FEWEST_PX", 1)
+    large = dataclasses.replace(frame, dn=dn)
+    assert large.is_compact and not plain.is_compact
+    for name in ("certain", "likely", "sky"):
+        one, other = (getattr(silhouette_of(f, scenes.SENSOR), name) for f in (plain, large))
+        assert torch.equal(one[13:-13, 13:-13], other[13:-13, 13:-13]), name
+    cut = partial(cut_pixels, scenes.SENSOR)
+    assert cut(dn).any() and torch.equal(large.seen(cut, 10), cut(dn))
 
 
 def test_what_is_small_stays_as_it_is():
