@@ -39,6 +39,7 @@ FEWEST_READINGS = 30
 MOST = 60  # frames, or pairs of neighbours in a bracket, that are rendered
 FEWEST = 24  # pairs of neighbours in brackets; of each setting, where views have one exposure, one a part
 LEFT_OUT = 10  # parts of the pass, each left out once (jackknife)
+FEWEST_PARTS = 7  # that tell something
 # of ln of exposure times and ln of the light that the model shows in the frames: more, and the camera chose them by it
 MOST_CHOSEN = 0.5
 # what is by so much other than stated is used, and by so many of its errors
@@ -74,7 +75,7 @@ class Response:
         if not in_brackets and _chosen(told.values()):
             return False
         contrasts = _Contrasts.of([c for pair in pairs if (c := _compared(pair, told)) is not None])
-        if len(set(contrasts.parts.tolist())) < LEFT_OUT:
+        if len(set(contrasts.parts.tolist())) < FEWEST_PARTS:
             return False
         before = self.exponent, self.settings, self.drift
         stated = {
@@ -109,7 +110,7 @@ class Response:
         parts, times_s, level = np.array(known).reshape(-1, 3).T
         for s in set(times_s.tolist()):  # what a setting does to all of its frames is no drift
             level[times_s == s] -= level[times_s == s].mean()
-        if len(set(parts.tolist())) < LEFT_OUT:
+        if len(set(parts.tolist())) < FEWEST_PARTS:
             return 0.0
         slope, error = _jackknifed(lambda kept: np.polyfit(parts[kept], level[kept], 1)[0] * LEFT_OUT, parts)
         now = self.drift + float(slope)
@@ -180,8 +181,8 @@ def _jackknifed(
     estimate: Callable[[np.ndarray], np.ndarray], parts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return an estimate of all, given which are taken, and its standard error by leaving out each part once."""
-    without = np.array([estimate(parts != part) for part in range(LEFT_OUT)])
-    return estimate(parts >= 0), np.sqrt((LEFT_OUT - 1) * without.var(axis=0))
+    without = np.array([estimate(parts != part) for part in np.unique(parts)])
+    return estimate(parts >= 0), np.sqrt((len(without) - 1) * without.var(axis=0))
 
 
 class _Pair(NamedTuple):

@@ -88,6 +88,19 @@ def test_exposure_times_that_are_wrong_by_setting_or_drift_are_found(size, wrong
     assert exposed == pytest.approx(tagged_s[7] * true[7], rel=0.01)
 
 
+def test_a_tenth_of_the_pass_that_compares_nothing_does_not_hide_what_the_others_tell():
+    model = target()
+    exposures_s = np.resize(EXPOSURES_S, 60)
+    exposures_s[:6] = EXPOSURES_S[1]  # of a part that has no other exposure time to compare with
+    frames = [
+        dataclasses.replace(f, dn=bent(f.dn, 0.85))
+        for f in photographed(model, 60, exposures_s=exposures_s.tolist())
+    ]
+    response = Response()
+    assert response.decide(model, Batches(in_brackets(frames, None), SENSOR.white_dn), SENSOR)
+    assert response.exponent == pytest.approx(0.85, abs=LEAST)
+
+
 def test_frames_of_one_exposure_time_tell_nothing():
     model = target()
     frames = photographed(model, count=36, exposures_s=(1e-4,))
