@@ -353,7 +353,10 @@ def with_bracket(
             ) from error
     if count is not None:
         changes["count"] = count
-    with keys_below("--count", "mission.bracket.count"):
+    with (
+        keys_below("--count", "mission.bracket.count"),
+        keys_below("--bracket", "mission.bracket.exposure_times_ms"),
+    ):
         section: BracketSection = dataclasses.replace(mission.bracket, **changes)
     orbit = mission.orbit
     if start is not None:

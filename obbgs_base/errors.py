@@ -5,6 +5,7 @@ import re
 from typing import ClassVar
 
 NUMBER = re.compile(r"\s*\[(Errno|Error Code) -?\d+\]:?")
+TERMIOS = re.compile(r"\(\d+, '([^']*)'\)")  # how an error of a serial line is told, alone or by pyserial
 
 
 class ObbgsError(Exception):
@@ -27,6 +28,7 @@ def reason(error: BaseException) -> str:
         said = str(error.strerror)
         if error.errno and NUMBER.search(said):  # pyserial repeats the error that it met, with its file
             said = os.strerror(error.errno)
+    said = TERMIOS.sub(r"\1", said)
     words = NUMBER.sub("", " ".join(said.split())).strip()
     return words or type(error).__name__  # a TimeoutError may say nothing
 

@@ -25,12 +25,17 @@ class NetworkedCamera:
 
     Raises:
         CameraLost: there is no server.
+        ValueError: the URL names neither a socket nor a host and its port.
     """
 
     has_own_clock = True
     packets_lost = 0  # the socket loses none
 
     def __init__(self, url: str):
+        host, _, port = url.removeprefix("hil://").rpartition(":")
+        is_socket = url.startswith("hil:///") and len(url) > len("hil:///")
+        if not is_socket and not (host and port.isdecimal() and 0 < int(port) < 65_536):
+            raise ValueError(f"expected hil:///path/to/socket or hil://host:port, got {url!r}")
         self._url = url
         self._stream: BufferedRWPair | None = None
         self.open()
@@ -56,7 +61,7 @@ class NetworkedCamera:
             else:
                 host, _, port = address.rpartition(":")
                 connection = socket.create_connection((host, int(port)), timeout=CONNECT_S)
-        except (OSError, ValueError) as error:
+        except OSError as error:
             raise CameraLost(
                 f"no camera at {self._url}: {reason(error)}; start the camera's server"
             ) from error

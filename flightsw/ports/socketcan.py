@@ -95,7 +95,12 @@ class SocketCanLink(IsoTpPort):
             self._unsent.popleft()
 
     def _open(self) -> None:
-        self._bus = can.Bus(self.url.device, interface="socketcan", fd=self.url.fd)
+        try:
+            self._bus = can.Bus(self.url.device, interface="socketcan", fd=self.url.fd)
+        except OSError as error:
+            if error.errno == errno.EAFNOSUPPORT:
+                raise OSError("this kernel has no CAN (modprobe can_raw loads it)") from error
+            raise
         self._channels.abandon()
         self._unsent.clear()
 

@@ -94,7 +94,7 @@ class Renderer:
             self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's errors share no base class; the file is from the link
             raise TriageError(
-                f"{path} is not a model that onnxruntime accepts: {str(error)[:200]}"
+                f"{path} is not a model that onnxruntime accepts: {str(error).rpartition(' : ')[2][:200]}"
             ) from error
         metadata = self._session.get_modelmeta().custom_metadata_map
         try:

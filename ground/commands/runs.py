@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from flightsw.icd.config import require
 from flightsw.icd.mission import ReconstructSection, load_mission
 from ground.commands.options import (
     AttitudeChoice,
@@ -68,6 +69,7 @@ def reconstruct_command(
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: spinning threads slow each other down
     section = load_mission(mission).reconstruct if mission else ReconstructSection()
+    require(time_limit > 0, "--time-limit", f"the time limit must be longer than 0 s, got {time_limit:g}")
     chosen, seed = method or section.method, section.seed if seed is None else seed
     asked = _Asked(
         name, chosen, section, quality, budget, settings or [], seed, time_limit, attitude, overwrite
@@ -112,6 +114,7 @@ def _one(session: Path, asked: _Asked, as_json: bool) -> None:
             with quick_imports():
                 from ground.run.evaluate import evaluate
                 from ground.run.reconstruct import Progress, reconstruct
+                from ground.run.runs import run_folder
                 from ground.session.folder import read_header
                 from ground.show.report.document import write_report
                 from obbgs_core.process import prepare_process
@@ -125,6 +128,7 @@ def _one(session: Path, asked: _Asked, as_json: bool) -> None:
                 show(progress.label, progress.info)
 
             read_header(session)  # what is no session is told before anything else
+            run_folder(session, asked.name)  # and so is a wrong name
             say(stderr, f"reading the frames of {session}")
             folder = reconstruct(
                 session,

@@ -78,10 +78,10 @@ def reconstruct(
         on_search: called with what is being done to find the attitude, and the share of it that is done.
 
     Raises:
-        SessionError: the session cannot be used; the name is not a plain folder name, or is that of a finished run or
-            of one that another process is making; or the folder of runs cannot be written.
+        SessionError: the session cannot be used; the name is that of a finished run or of one that another process is
+            making; or the folder of runs cannot be written.
         ReconstructionError: the frames allow no model (too few, all black), or leave the attitude open.
-        ValueError: unknown method or setting, or a time limit that is not positive.
+        ValueError: unknown method or setting, a name that is no folder's, or a time limit that is not positive.
         Interrupted: should_stop returned True.
     """
     if not time_limit_s > 0:

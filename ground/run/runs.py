@@ -117,10 +117,10 @@ def run_folder(session_dir: Path, name: str, out: Path | None = None) -> Path:
     """Return where a run is or will be: in `out` if given, otherwise in runs/ of the session.
 
     Raises:
-        SessionError: the name is not a plain folder name.
+        ValueError: the name is not a plain folder name.
     """
     if not name or Path(name).name != name or name.startswith("."):
-        raise SessionError(f"a run's name must be a plain folder name, got {name!r}")
+        raise ValueError(f"a run's name must be a plain folder name, got {name!r}")
     return (session_dir / "runs" if out is None else out) / name
 
 

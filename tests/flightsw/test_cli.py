@@ -44,6 +44,22 @@ def test_every_command_has_help_with_an_example(tool, command):
         ),
         (["capture", "--camera", "ftp://x", "--store", "{tmp}"], 2, "no camera driver for 'ftp://x'"),
         (
+            ["capture", "--camera", "hil://", "--store", "{tmp}"],
+            2,
+            "expected hil:///path/to/socket or hil://host:port",
+        ),
+        (["capture", "--camera", "hil://h:99999", "--store", "{tmp}"], 2, "host:port, got 'hil://h:99999'"),
+        (
+            ["capture", "--camera", "hil:///x", "--bracket", "inf"],
+            2,
+            "--bracket[0]: expected 0.001 to 60000 ms",
+        ),
+        (
+            ["downlink", "--link", "serial:///dev/null", "--store", "{tmp}", "--exit-when-empty"],
+            1,
+            "cannot open /dev/null: Could not configure port: Inappropriate ioctl for device",
+        ),
+        (
             ["capture", "--camera", "hil:///x", "--bracket", "0.05,two", "--store", "{tmp}"],
             2,
             "--bracket: expected",
@@ -51,7 +67,7 @@ def test_every_command_has_help_with_an_example(tool, command):
         (
             ["capture", "--camera", "hil:///x", "--bracket", "-1", "--store", "{tmp}"],
             2,
-            "exposure_times_ms[0]",
+            "--bracket[0]: expected 0.001 to 60000 ms, got -1.0",
         ),
         (
             ["capture", "--camera", "hil:///x", "--count", "0", "--store", "{tmp}"],

@@ -427,3 +427,14 @@ def test_a_serial_line_that_goes_away_is_told_once_in_words(caplog):
             link.exchange(0.0)
     (why,) = (record.getMessage().partition(" hung up: ")[2] for record in caplog.records)
     assert why in ("the device went away", "Input/output error")  # by the kernel's mood: end of file, or EIO
+
+
+def test_a_kernel_without_can_is_told_so(monkeypatch):
+    def refuse(*_, **__) -> None:
+        raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
+
+    monkeypatch.setattr("can.Bus", refuse)
+    with pytest.raises(
+        LinkError, match=r"^cannot open can0: this kernel has no CAN \(modprobe can_raw loads it\)$"
+    ):
+        open_link("can://can0", FLIGHT_SIDE)

@@ -285,7 +285,18 @@ def test_a_session_without_frames_is_refused(tmp_path):
     ("change", "arguments", "code", "message"),
     [
         (lambda s: None, ["--method", "nerf"], 2, "no method 'nerf'; expected one of 3dgs"),
-        (lambda s: None, ["--name", "../x"], 1, "plain folder name"),
+        (
+            lambda s: None,
+            ["--name", "../x"],
+            2,
+            "ground: a run's name must be a plain folder name, got '../x'",
+        ),
+        (
+            lambda s: None,
+            ["--time-limit", "nan"],
+            2,
+            "ground: --time-limit: the time limit must be longer than 0 s",
+        ),
         (lambda s: shutil.rmtree(s), [], 1, "is not a session"),
         (lambda s: (s / "session.json").write_text('{"schema_version": 99}'), [], 1, "schema version 99"),
         (lambda s: (s / "frames" / "000003.png").unlink(), [], 1, "pictures are missing: 3"),
@@ -302,6 +313,8 @@ def test_the_command_says_what_is_wrong_in_one_line(
     assert exit_info.value.code == code
     said = " ".join(capsys.readouterr().err.replace("│", " ").split())  # wrong usage is told in a frame
     assert message in said
+    if message.startswith("ground: "):
+        assert said.startswith(message)  # with nothing before it, such as what would have been done
 
 
 def test_the_commands_print_json(trained):
