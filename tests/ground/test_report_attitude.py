@@ -57,3 +57,4 @@ def test_the_rows_tell_both_estimates():
     assert rows["moment of inertia about x over that about z"].startswith("0.4000 ±")
     assert rows["rate from outlines alone"].startswith("1.1459 ±")
     assert "rate from outlines alone" not in dict(rotation_rows(SPIN, None))
+    assert dict(rotation_rows(SPIN, None))["one turn"] == "314.2 ± 1.6 s"  # 2 pi / 0.02, half a per cent

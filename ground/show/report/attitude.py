@@ -57,7 +57,7 @@ def rotation_rows(motion: TargetMotion, before: TargetMotion | None) -> list[tup
         ("motion", "torque-free tumble" if motion.tumbles else "steady spin"),
         ("axis, inertial", _axis(facts)),
         ("rate", _rate(facts)),
-        ("one turn", f"{facts['period_s']:.2f} s"),
+        ("one turn", _turn(facts)),
     ]
     for name, value, sigma in zip("xy", facts["inertia_ratios"], facts["inertia_ratios_sigma"], strict=False):
         rows.append((f"moment of inertia about {name} over that about z", with_deviation(value, sigma)))
@@ -69,6 +69,12 @@ def rotation_rows(motion: TargetMotion, before: TargetMotion | None) -> list[tup
         ]
     rows.append(("outlines compared", str(facts["outlines_compared"])))
     return rows
+
+
+def _turn(facts: dict) -> str:
+    """Return the time of one turn with its deviation, which is relatively that of the rate."""
+    sigma_s = facts["period_s"] * facts["rate_sigma_deg_s"] / facts["rate_deg_s"]
+    return f"{with_deviation(facts['period_s'], sigma_s)} s"
 
 
 def _axis(facts: dict) -> str:
