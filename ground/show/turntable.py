@@ -22,10 +22,13 @@ LEAST_OPACITY, INLIERS = 0.5, 0.98  # fainter Gaussians and the farthest 2 % do 
 
 
 def extent(gaussians: Gaussians) -> tuple[torch.Tensor, float]:
-    """Return centre [3] m and radius, m, of a ball around the visible model, body frame, without its outliers."""
-    means = gaussians.means[
-        (gaussians.opacities > LEAST_OPACITY) & gaussians.means.isfinite().all(dim=1)
-    ].double()
+    """Return centre [3] m and radius, m, of a ball around the visible model, body frame, without its outliers.
+
+    Where all is faint, as in a start that no step has trained, all of it counts.
+    """
+    places = gaussians.means.isfinite().all(dim=1)
+    visible = places & (gaussians.opacities > LEAST_OPACITY)
+    means = gaussians.means[visible if visible.any() else places].double()
     if len(means) == 0:
         return torch.zeros(3), 1.0
     ends = torch.quantile(means, torch.tensor([1 - INLIERS, INLIERS], dtype=torch.float64), dim=0)

@@ -308,3 +308,11 @@ def test_imported_pictures_are_not_told_what_only_a_pass_has(session, tmp_path):
     for absent in ("1000 ms", "the Sun", "on board", "Losses on the link", "Exposure histogram", " 0 m"):
         assert absent not in body.partition("Configuration and versions")[0], absent
     assert "pictures imported" in body and "Brightness" in body
+
+
+def test_an_untrained_start_is_seen_whole():
+    """The Gaussians of a start have an opacity of one half, which counted as invisible: the page stood within it."""
+    solid = dataclasses.replace(random_gaussians(200, seed=3), opacity_logits=torch.full((200,), 3.0))
+    start = dataclasses.replace(solid, opacity_logits=torch.zeros(200))
+    assert turntable.extent(start)[1] == turntable.extent(solid)[1] != 1.0
+    assert torch.equal(turntable.extent(start)[0], turntable.extent(solid)[0])
