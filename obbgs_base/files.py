@@ -27,8 +27,10 @@ def write_whole(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path)
-    except OSError:
+    except OSError as error:
         part.unlink(missing_ok=True)
+        if path.is_dir():  # the error names the part, which nobody asked for
+            raise IsADirectoryError(error.errno, error.strerror, str(path)) from error
         raise
     sync_folder(path.parent)
 

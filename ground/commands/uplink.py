@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import load_mission
 from ground.commands.options import UplinkCommand, listening_key
 from obbgs_base.command_line import KEY_HELP, LINK_HELP, MISSION_HELP, AsJson
@@ -96,8 +97,10 @@ def _text_of(script: Path | None) -> str:
     assert script is not None
     try:
         return script.read_text()
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise SessionError(f"the script {script} cannot be read: {reason(error)}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(str(script), "is no text; a script has a command on each line") from error
 
 
 def _sent(

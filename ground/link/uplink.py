@@ -62,9 +62,9 @@ def make_key(path: Path, spi: int = 1) -> Key:
     """Write a new key and the counters of both sides beside it: PATH, PATH.sent and PATH.received.
 
     Raises:
-        ConfigError: one of the files exists already, or the folder cannot be written.
+        ConfigError: one of the files exists already, or the folder cannot be written; nothing is left behind.
     """
-    key = Key(spi, secrets.token_bytes(32))
+    key, made = Key(spi, secrets.token_bytes(32)), list[Path]()
     try:
         for suffix, text in (
             (".sent", key.counter_text(0)),
@@ -73,11 +73,14 @@ def make_key(path: Path, spi: int = 1) -> Key:
         ):
             part = path.with_name(path.name + suffix)
             with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+                made.append(part)
                 file.write(text)
-    except FileExistsError as error:
-        raise ConfigError(str(error.filename), "exists already; a key is never overwritten") from error
     except OSError as error:
-        raise ConfigError(str(path), f"cannot write the key: {reason(error)}") from error
+        for part in made:
+            part.unlink(missing_ok=True)
+        if not isinstance(error, FileExistsError):
+            raise ConfigError(str(path), f"cannot write the key: {reason(error)}") from error
+        raise ConfigError(str(error.filename), "exists already; a key is never overwritten") from error
     return key
 
 

@@ -581,3 +581,17 @@ def test_a_file_that_is_no_model_of_a_run_does_not_go_up(tmp_path):
         assert done.exception.exit_code == 2 and not (tmp_path / "session").exists()
     model.write_bytes(foreign_model(**dict.fromkeys(names, "1")))
     check_model(model)
+
+
+def test_a_file_in_the_place_of_a_key_stays_and_no_counters_are_left_beside_it(tmp_path):
+    (tmp_path / "key").write_bytes(b"not a key")
+    with pytest.raises(ConfigError, match="exists already"):
+        make_key(tmp_path / "key")
+    assert [path.name for path in tmp_path.iterdir()] == ["key"]
+
+
+def test_a_script_that_is_no_text_is_wrong_usage(tmp_path):
+    (tmp_path / "script").write_bytes(b"\xff\xfe\x00")
+    words = ["uplink", "--script", str(tmp_path / "script"), "--session", str(tmp_path)]
+    error = CliRunner().invoke(cli.app, words).exception
+    assert isinstance(error, ConfigError) and "is no text; a script has a command on each line" in str(error)

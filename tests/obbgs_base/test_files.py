@@ -39,3 +39,10 @@ def test_a_file_that_is_written_anew_keeps_its_mode_and_leaves_none_of_a_killed_
     path.chmod(0o664)
     write_whole(path, b"newer")
     assert stat.S_IMODE(path.stat().st_mode) == 0o664
+
+
+def test_a_folder_in_the_place_of_a_file_is_named_and_no_part_is_left(tmp_path):
+    (tmp_path / "out").mkdir()
+    with pytest.raises(IsADirectoryError) as caught:
+        write_whole(tmp_path / "out", b"{}")
+    assert caught.value.filename == str(tmp_path / "out") and [p.name for p in tmp_path.iterdir()] == ["out"]
