@@ -31,7 +31,10 @@ def speed_figures(results: Results, target: str) -> list[go.Figure]:
     """
     score = results.score_of(target)
     figures = []
-    for key, title, sign in ((score.key, score.title, 1.0), ("chamfer", "Chamfer distance", -1.0)):
+    for key, title, sign in (
+        (score.key, score.title, 1.0),
+        ("chamfer", "Chamfer distance of the centres", -1.0),
+    ):
         figure = _speed(results, target, key, sign)
         if figure.data:
             figure.update_layout(title={"text": title, "font": {"size": 14}})
@@ -39,7 +42,8 @@ def speed_figures(results: Results, target: str) -> list[go.Figure]:
             if key == score.key:
                 _draw_references(figure, results, target, key)
             else:
-                figure.update_yaxes(type="log")
+                ticks = ticks_1_2_5(_drawn(figure, "y"))
+                figure.update_yaxes(type="log", tickvals=ticks, ticktext=[f"{t:g}" for t in ticks])
     return figures
 
 

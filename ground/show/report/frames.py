@@ -15,6 +15,7 @@ from ground.session.spread import evenly_spread
 from ground.session.truth import Truth
 from ground.show.page import grid, label, picture, section, unbroken
 from ground.show.pictures import ERROR_FULL_SCALE, bounding_box, heat, tone
+from ground.show.sizes import states_scale
 from obbgs_core.score.metrics import psnr_db
 
 LABEL_WIDTH = "minmax(44px, 60px)"
@@ -42,9 +43,7 @@ def frames_section(run: Run) -> str:
             if record is None:
                 cells.append(label("missing"))
                 continue
-            caption = unbroken(f"frame {record.id}") + (
-                "" if nominal else f", {unbroken(range_in_words(record))}"
-            )
+            caption = unbroken(f"frame {record.id}") + _range(run, record)
             if not is_same:
                 caption += f", {_exposure(run, record)}"
             if record.saturated:
@@ -57,22 +56,22 @@ def frames_section(run: Run) -> str:
         f"{len(picked)} of the {len(run.session.frames):,} imported pictures, {brightness(run)}."
         if nominal
         else "Frames as received: each column is a bracket, each row one of its exposures; below each frame stand its "
-        "number, the range to the target and, where they differ in a row, the exposure time. "
-        f"Brightness is {brightness(run)}.",
+        f"number{', the range to the target' if states_scale(run.session) else ''} and, where they differ in a row, "
+        f"the exposure time. Brightness is {brightness(run)}.",
         grid(f"{LABEL_WIDTH} repeat({len(picked)}, {PICTURE_WIDTH})", cells),
     )
 
 
 def scored_section(run: Run, truth: Truth | None) -> str:
     estimate = read_estimate(run.folder)
-    range_of = {r.id: range_in_words(r) for r in as_estimated(run.session, estimate).frames}
+    range_of = {r.id: _range(run, r) for r in as_estimated(run.session, estimate).frames}
     nominal, brackets = run.session.nominal_exposures, sorted({r.bracket for r in run.scored})
     shown = evenly_spread(brackets, VIEWS_SHOWN)
     records = scored_records(run, truth, [r for r in run.scored if r.bracket in shown])
     body = []
     for bracket in shown:
         of_view = sorted((r for r in records if r.bracket == bracket), key=lambda r: r.exposure_time_s)
-        named = f"Picture {of_view[0].id}" if nominal else f"Bracket {bracket}, {range_of[of_view[0].id]}"
+        named = f"Picture {of_view[0].id}" if nominal else f"Bracket {bracket}{range_of[of_view[0].id]}"
         body.append(f"<h3>{named}</h3>")
         body.append(_compared(run, truth, of_view))
     training = run.metrics["scored_frames"] == "training"
@@ -92,6 +91,11 @@ def scored_section(run: Run, truth: Truth | None) -> str:
         note += " Blind: the same training from the same poses, every exposure time replaced by their mean."
     title = "Training views (nothing was held out)" if training else "Held-out views"
     return section(f"{title}: {'truth' if truth else 'frame'}, render, error", note, "".join(body))
+
+
+def _range(run: Run, record: FrameRecord) -> str:
+    """Return ", 4.5 m"; nothing where nobody stated that the poses are in metres."""
+    return f", {unbroken(range_in_words(record))}" if states_scale(run.session) else ""
 
 
 def _mean(run: Run, truth: Truth | None) -> str:
