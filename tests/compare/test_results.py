@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from compare.case import load_case
-from compare.charts.charts import size_figures
+from compare.charts.charts import size_figures, speed_figures
 from compare.charts.figures import _size, write_figures
 from compare.charts.page import write_page
 from compare.charts.results import Results, pareto, with_best
@@ -385,6 +385,13 @@ def test_an_axis_says_its_numbers_also_where_all_values_are_nearly_alike():
         inside = [tick for tick in ticks if 1354 <= tick <= 1575]
         assert 2 <= len(inside) <= 7
     assert page.layout.xaxis.ticktext[1] == "1,400"
+
+
+def test_distances_on_a_logarithmic_axis_are_written_out():
+    """Digits alone, as plotly writes them between powers of ten, do not say which power they are of."""
+    axis = speed_figures(Results(ROWS), "A")[1].layout.yaxis
+    assert axis.type == "log" and len(axis.ticktext) >= 2 and "0.1" in axis.ticktext
+    assert [float(text) for text in axis.ticktext] == pytest.approx(axis.tickvals)
 
 
 @given(st.lists(st.floats(1e-6, 1e9), min_size=2, max_size=5))
