@@ -109,7 +109,14 @@ def test_the_reports_held_out_views_are_those_of_the_headline(refined, tmp_path,
         )  # trained without exposure times, seen from the same poses
 
 
-def test_ranges_of_report_and_viewer_are_those_of_the_refined_poses(refined):
+def test_ranges_of_report_and_viewer_are_those_of_the_refined_poses(refined, tmp_path):
+    shutil.copytree(
+        refined, tmp_path / "linked"
+    )  # as if the frames came over a link: their ranges are in metres
+    refined = tmp_path / "linked"
+    header = json.loads((refined / "session.json").read_text())
+    del header["imported_from"]
+    (refined / "session.json").write_text(json.dumps(header))
     page = write_report(refined, "run").read_text().replace("\N{NO-BREAK SPACE}", " ")
     frames = Source(refined / "runs" / "run").load().session.frames
     told = re.findall(r"frame (\d+), ([\d.,]+ m)", page)
