@@ -20,7 +20,8 @@ struct SplatSums {
 
   SplatSums(const Scene& s, const Group& group, const Splat* splats, const float* records, bool given_means2d,
             float* pixels) {
-    for (int l = kLanes; l < 2 * kLanes && group.first + l < s.gaussians && (group.first + l) % kChunk; ++l)  // the next group's records lie anywhere
+    // the next group's records lie anywhere
+    for (int l = kLanes; l < 2 * kLanes && group.first + l < s.gaussians && (group.first + l) % kChunk; ++l)
       if (splats[l].records) __builtin_prefetch(records + size_t(splats[l].first_record) * kRecord);
     for (int l = 0; l < group.size; ++l) {
       for (uint32_t r = 0; r < splats[l].records; ++r) {

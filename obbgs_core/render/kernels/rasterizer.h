@@ -91,9 +91,9 @@ struct Frame {
   size_t visible_count = 0;
   std::vector<std::vector<Found>> found;  // of each chunk of Gaussians, splat by splat; empty once binned
   std::vector<uint32_t> first_record;     // of each chunk
-  Buffer<uint32_t> tile_begin;  // [tiles + 1] into pairs
-  Buffer<Pair> pairs;           // by tile, then by depth
-  Buffer<float> transmittance;  // [cameras, height, width]
+  Buffer<uint32_t> tile_begin;            // [tiles + 1] into pairs
+  Buffer<Pair> pairs;                     // by tile, then by depth
+  Buffer<float> transmittance;            // [cameras, height, width]
 };
 
 struct Images {  // [cameras, height, width] and, for radiance, channels
