@@ -34,7 +34,7 @@ def test_a_warning_begins_with_the_command_and_names_no_module_of_ours(capsys, m
     @app.command()
     def warn() -> None:
         logging.getLogger("ground.formats.somewhere").warning("nothing states %s", "the times")
-        logging.getLogger("distributed.nanny").error("restarted")
+        logging.getLogger("a_library.nanny").error("restarted")  # one that no other test configures
 
     @app.command()
     def other() -> None:
@@ -46,5 +46,5 @@ def test_a_warning_begins_with_the_command_and_names_no_module_of_ours(capsys, m
         run(app, "ground")
     assert capsys.readouterr().err.splitlines() == [
         "ground: warning: nothing states the times",
-        "ground: error of distributed.nanny: restarted",
+        "ground: error of a_library.nanny: restarted",
     ]
