@@ -71,6 +71,7 @@ FILES = {
     "sector": "sector-200x200",
     "sky": "sky-100x100",
     "bars": "sky-bars-100x100",
+    "camera": "camera-100x100",
     "best100": "best-100x100",
     "size": "size-200x200",
     "mesh": "mesh-400x400",
