@@ -52,10 +52,10 @@ def needed_mb(frames_mb: float, gaussians: int) -> float:
 def frames_mb(session: Session) -> float:
     """Return the memory that a session's frames are estimated to take in a training.
 
-    Large ones take what shows in them (`obbgs_core.compact`): some are read.
+    Large ones take what shows in them (`obbgs_core.compact`): some are read, of those that are not damaged.
 
     Raises:
-        SessionError: a picture cannot be read.
+        MissingFrames, SessionCorrupt: a picture is not there, or none of the camera's.
     """
     pixels = session.camera.width * session.camera.height
 
@@ -65,7 +65,8 @@ def frames_mb(session: Session) -> float:
             return COMPACT_SHARE * picture.inside.nbytes
         return VALUE_BYTES * pixels * session.camera.channels
 
-    some = session.frames[:: max(1, len(session.frames) // LOOKED_AT)]
+    evenly = session.frames[:: max(1, len(session.frames) // LOOKED_AT)]
+    some = [record for record in evenly if session.is_whole(record)]
     of_each = sum(map(kept, some)) / max(1, len(some))
     return 1e-6 * (WORKING_BYTES * pixels + of_each * len(session.frames))
 
