@@ -28,9 +28,8 @@ from obbgs_core.jpeg import JpegCoding
 from obbgs_core.model.motions import rigid_motions
 from obbgs_core.sensor import Sensor
 
-NOISE, SHUTTER, DARK, POSE, LOSS, STRAY, HOT, MOTION, SETTING = range(
-    9
-)  # streams of random numbers, one a purpose
+# streams of random numbers, one a purpose
+NOISE, SHUTTER, DARK, POSE, LOSS, STRAY, HOT, MOTION, SETTING = range(9)
 BLUR_STEP_PX = 0.25  # between the shifted copies that are averaged
 MOST_ELECTRONS = 1e15  # NumPy's Poisson refuses about 9e18
 UNCERTAIN_SHIFT_M = 1e-6  # of a pose error that turns only: a covariance must not be singular

@@ -54,7 +54,7 @@ class Batches:
         solid: Mapping[int, Tensor | Compact] | None = None,
     ):
         self.frames, self.white_dn = frames, white_dn
-        self._gains: list[float] | None = None
+        self._gains = [1.0] * len(frames)  # true over stated exposure times
         self._masks = {"sky": dict(sky or {}), "solid": dict(solid or {})}
         self._backdrops: dict[int, Backdrop] = {}
         self._windows = windows
@@ -77,7 +77,7 @@ class Batches:
     def exposed(self, gains: list[float] | None) -> "Batches":
         """Return the same images with exposure times so many times as long as stated; None: as stated."""
         other = copy.copy(self)
-        other._gains = gains
+        other._gains = gains or [1.0] * len(self.frames)
         return other
 
     @property
@@ -116,8 +116,7 @@ class Batches:
         if any(i in self._backdrops for i in indices):
             cameras = dataclasses.replace(cameras, backdrop=stacked("radiance"))
             doubt = stacked("sigma")
-        gains = self._gains or [1.0] * len(self.frames)
-        exposures_s = torch.tensor([self.frames[i].exposure_time_s * gains[i] for i in indices])
+        exposures_s = torch.tensor([self.frames[i].exposure_time_s * self._gains[i] for i in indices])
         return Batch(
             indices,
             cameras,

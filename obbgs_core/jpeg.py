@@ -68,11 +68,11 @@ class JpegCoding:
                 The first may have a gradient.
         """
         height, width, channels = mean.shape[1:]
-        planes = self._planes(mean, variance)
-        luma = self._rounded(*planes[0], self.luma)
+        means, variances = self._planes(mean), self._variances(variance)
+        luma = _rounded(means[0], variances[0], self.luma)
         back, error = luma[0] + MIDDLE, luma[1]
         if channels == 3:
-            chroma = self._rounded(*planes[1], self.chroma or self.luma)
+            chroma = _rounded(means[1], variances[1], self.chroma or self.luma)
             # linear between the middles of what was averaged, as libjpeg does
             whole = [F.interpolate(i, back.shape[2:], mode="bilinear", align_corners=False) for i in chroma]
             back, error = torch.cat([back, whole[0]], dim=1), torch.cat([error, whole[1]], dim=1)
@@ -94,8 +94,7 @@ class JpegCoding:
             mean, variance: as for `moments`.
             stored: [B, H, W, C], what came back.
         """
-        coded = self._planes(mean, variance)
-        read = [values for values, _ in self._planes(stored, torch.zeros_like(stored))]
+        means, variances, read = self._planes(mean), self._variances(variance), self._planes(stored)
         if len(read) > 1:
             height, width = (
                 _before_interpolation(n, few) for n, few in zip(read[1].shape[2:], self.averaged, strict=True)
@@ -103,8 +102,8 @@ class JpegCoding:
             read[1] = height.to(stored) @ read[1] @ width.to(stored).T
         tables = (self.luma, self.chroma or self.luma)
         return [
-            _deviance_residual(*self._coefficients(*plane, steps), self._coefficients(values, None, steps)[0])
-            for plane, values, steps in zip(coded, read, tables, strict=False)
+            _deviance_residual(_in_steps(value, steps), _deviation(spread, steps), _in_steps(values, steps))
+            for value, spread, values, steps in zip(means, variances, read, tables, strict=False)
         ]
 
     def in_pixels(self, residuals: list[Tensor], height: int, width: int) -> Tensor:
@@ -118,55 +117,55 @@ class JpegCoding:
         total = sums[0] + sums[1] / math.prod(self.averaged) if len(sums) > 1 else sums[0]
         return (total / BLOCK_PX**2).sqrt()[:, 0, :height, :width, None]
 
-    def _planes(self, mean: Tensor, variance: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return mean and variance of luma [B, 1, H, W], less the middle, and of the averaged chromas [B, 2, h, w].
+    def _planes(self, image: Tensor) -> list[Tensor]:
+        """Return luma [B, 1, H, W], less the middle, and the averaged chromas [B, 2, h, w], in whole blocks."""
+        luma, *few = self._averaged(image, torch.tensor(TO_YCC))
+        return [luma - MIDDLE, *few]
 
-        Height and width are whole numbers of blocks.
-        """
-        height, width, channels = mean.shape[1:]
-        values, spread = mean.movedim(-1, 1), variance.movedim(-1, 1)
+    def _variances(self, variance: Tensor) -> list[Tensor]:
+        """Return the variances of `_planes`, where those of pixels are independent."""
+        luma, *few = self._averaged(variance, torch.tensor(TO_YCC).square())
+        return [luma, *(of / math.prod(self.averaged) for of in few)]
+
+    def _averaged(self, image: Tensor, turn: Tensor) -> list[Tensor]:
+        """Return an image [B, H, W, C] of whole blocks in other colours; all but the first are averaged."""
+        height, width, channels = image.shape[1:]
+        image = image.movedim(-1, 1)
         if channels == 3:
-            turn = torch.tensor(TO_YCC).to(mean)
-            values = torch.einsum("kc,bchw->bkhw", turn, values)
-            spread = torch.einsum("kc,bchw->bkhw", turn.square(), spread)
+            image = torch.einsum("kc,bchw->bkhw", turn.to(image), image)
         size = [BLOCK_PX * n for n in (self.averaged if channels == 3 else (1, 1))]
-        missing = (0, -width % size[1], 0, -height % size[0])
-        values, spread = (F.pad(image, missing, mode="replicate") for image in (values, spread))
-        planes = [(values[:, :1] - MIDDLE, spread[:, :1])]
-        if channels == 3:
-            few = [F.avg_pool2d(image[:, 1:], self.averaged) for image in (values, spread)]
-            planes.append((few[0], few[1] / math.prod(self.averaged)))
-        return planes
+        image = F.pad(image, (0, -width % size[1], 0, -height % size[0]), mode="replicate")
+        return [image[:, :1], *([F.avg_pool2d(image[:, 1:], self.averaged)] if channels == 3 else [])]
 
-    @staticmethod
-    def _coefficients(
-        values: Tensor, variance: Tensor | None, steps: tuple[int, ...]
-    ) -> tuple[Tensor, Tensor]:
-        """Return the coefficients [B, K, rows, columns, 64] of images [B, K, H, W] and their deviation, in steps."""
-        rows, columns = (n // BLOCK_PX for n in values.shape[2:])
-        step = torch.tensor(steps, dtype=values.dtype, device=values.device)
-        shape = (*values.shape[:2], rows, BLOCK_PX, columns, BLOCK_PX)
-        coefficient = values.reshape(shape).transpose(3, 4).flatten(4) @ (_transform().to(values).T / step)
-        if variance is None:
-            return coefficient, coefficient
-        # the noise of pixels is independent, and nearly the same all over a block
-        sigma = F.avg_pool2d(variance, BLOCK_PX).sqrt()[..., None] / step
-        return coefficient, sigma.clamp(min=LEAST_SIGMA)
 
-    @staticmethod
-    def _rounded(values: Tensor, variance: Tensor, steps: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-        """Return mean and variance of images [B, K, H, W] whose coefficients were rounded to multiples of steps."""
-        coefficient, sigma = JpegCoding._coefficients(values, variance, steps)
-        transform, step = (
-            _transform().to(values),
-            torch.tensor(steps, dtype=values.dtype, device=values.device),
-        )
-        rows, columns = coefficient.shape[2:4]
-        mean, spread = _rounding(coefficient, sigma)
-        back, error = (mean * step) @ transform, (spread * step.square()) @ transform.square()
-        parts = (*values.shape[:2], rows, columns, BLOCK_PX, BLOCK_PX)
-        back, error = (blocks.view(parts).transpose(3, 4).reshape(values.shape) for blocks in (back, error))
-        return back, error
+def _in_steps(image: Tensor, steps: tuple[int, ...]) -> Tensor:
+    """Return the coefficients [B, K, rows, columns, 64] of images [B, K, H, W], in quantisation steps."""
+    rows, columns = (n // BLOCK_PX for n in image.shape[2:])
+    shape = (*image.shape[:2], rows, BLOCK_PX, columns, BLOCK_PX)
+    return image.reshape(shape).transpose(3, 4).flatten(4) @ (
+        _transform().to(image).T / _tensor(steps, image)
+    )
+
+
+def _deviation(variance: Tensor, steps: tuple[int, ...]) -> Tensor:
+    """Return the deviation [B, K, rows, columns, 64] of coefficients, in steps, by that of pixels [B, K, H, W]."""
+    # the noise of pixels is independent, and nearly the same all over a block
+    sigma = F.avg_pool2d(variance, BLOCK_PX).sqrt()[..., None] / _tensor(steps, variance)
+    return sigma.clamp(min=LEAST_SIGMA)
+
+
+def _rounded(image: Tensor, variance: Tensor, steps: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """Return mean and variance of images [B, K, H, W] whose coefficients were rounded to multiples of steps."""
+    mean, spread = _rounding(_in_steps(image, steps), _deviation(variance, steps))
+    transform, step = _transform().to(image), _tensor(steps, image)
+    back, error = (mean * step) @ transform, (spread * step.square()) @ transform.square()
+    parts = (*mean.shape[:4], BLOCK_PX, BLOCK_PX)
+    back, error = (blocks.view(parts).transpose(3, 4).reshape(image.shape) for blocks in (back, error))
+    return back, error
+
+
+def _tensor(steps: tuple[int, ...], like: Tensor) -> Tensor:
+    return torch.tensor(steps, dtype=like.dtype, device=like.device)
 
 
 def _rounding(value: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:

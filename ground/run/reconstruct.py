@@ -24,7 +24,7 @@ from ground.run.runs import (
 )
 from ground.session.cameras import sensor_of
 from ground.session.folder import FrameRecord, Session, open_session
-from ground.session.training_frames import frames_of, split
+from ground.session.training_frames import frames_of, split, told_before
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.methods.config import MethodConfig
@@ -103,7 +103,7 @@ def reconstruct(
         found = _attitude(session, training, attitude, part / ATTITUDE_FILE, on_search, should_stop)
         if found is not None:
             session = in_body_axes(session, found)
-            training, held_out = split(session, _told)
+            training, held_out = split(session, told_before)
             configs[KNOWN] = _refining(config, "always")
         frames = frames_of(session, training)
 
@@ -111,9 +111,9 @@ def reconstruct(
             def on_step(info: StepInfo) -> None:
                 on_progress(Progress(label, info))
 
-            limits = (seed, on_step, time_limit_s, part / _checkpoint(label), should_stop)
-            # the second training has the same frames as the first
-            result = train(frames, sensor, config, *limits, log.warning if label == KNOWN else _told)
+            limits = time_limit_s, part / _checkpoint(label), should_stop
+            on_warning = log.warning if label == KNOWN else told_before  # both have the same frames
+            result = train(frames, sensor, config, seed, on_step, *limits, on_warning)
             log.info("%s: start from %s; %s", label, result.start, result.stop_reason)
             return result
 
@@ -184,10 +184,6 @@ def _attitude(
         found.write(path)
     log.info("attitude of the target from its outlines: %s", found.motion.summary())
     return found
-
-
-def _told(warning: str) -> None:
-    """Take a warning that the log has already."""
 
 
 def _refining(config: MethodConfig, refine: Literal["never", "always"]) -> MethodConfig:

@@ -29,7 +29,7 @@ from ground.session.folder import (
     read_frame_lines,
     read_records,
 )
-from ground.session.training_frames import split, training_frame
+from ground.session.training_frames import split, told_before, training_frame
 from obbgs_base.errors import reason
 from obbgs_base.files import UNUSED, read_bounded
 from obbgs_core.errors import ReconstructionError
@@ -204,7 +204,7 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
     session = _as_it_was(session, folder, metrics["frames_received"])
     if (found := FoundAttitude.read(folder / attitude.FILE)) is not None:
         session = in_body_axes(session, found)
-    training, held_out = split(session, on_warning=lambda text: None)  # the run was told
+    training, held_out = split(session, on_warning=told_before)
     if not metrics[
         "frames_held_out"
     ]:  # of a few brackets that came one by one, none was kept from the training

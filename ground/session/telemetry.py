@@ -22,9 +22,8 @@ from obbgs_base.checked import checked_line
 
 EVENTS_KEPT = 200  # in memory; the file has all
 EARLIER_COUNTS = ("run_utc_ns", "run_uptime_s")
-DRAWN_BOOTS = (
-    1 << 31
-)  # from here on the number of a start is drawn at random (flightsw/storage/boot_counter.py)
+# from here on the number of a start is drawn at random (flightsw/storage/boot_counter.py)
+DRAWN_BOOTS = 1 << 31
 
 
 @dataclass(frozen=True)

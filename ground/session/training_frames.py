@@ -20,6 +20,10 @@ SHOWN_PX = 0.2  # a target that moves by less during an exposure is taken as sta
 TEST_INTERVAL = 8  # every eighth bracket is held out
 
 
+def told_before(warning: str) -> None:
+    """Take a warning that somebody was told already; for `on_warning`."""
+
+
 def split(
     session: Session, on_warning: Callable[[str], None] = log.warning
 ) -> tuple[list[FrameRecord], list[FrameRecord]]:

@@ -85,12 +85,12 @@ class Response:
         contrasts.values += contrasts.design @ np.array(list(stated.values()))
         bend, error = map(float, _jackknifed(contrasts.slope, contrasts.parts))
         uneven, errors = _jackknifed(contrasts.uneven, contrasts.parts)
-        each_s = contrasts.settings(np.full(len(contrasts.parts), True))
+        of_settings = contrasts.settings(np.full(len(contrasts.parts), True))
         self.error = error
-        if (np.abs(uneven) > np.maximum(LEAST, CERTAIN * errors)).any() and np.abs(
-            each_s
-        ).max() <= MOST_WRONG:
-            self.exponent, self.settings = 1.0, dict(zip(contrasts.times_s, each_s.tolist(), strict=True))
+        is_uneven = (np.abs(uneven) > np.maximum(LEAST, CERTAIN * errors)).any()
+        if is_uneven and np.abs(of_settings).max() <= MOST_WRONG:
+            self.exponent = 1.0
+            self.settings = dict(zip(contrasts.times_s, of_settings.tolist(), strict=True))
         else:
             is_bent = abs(bend) > max(LEAST, CERTAIN * error) and RANGE[0] <= 1 + bend <= RANGE[1]
             self.exponent, self.settings = 1 + bend if is_bent else 1.0, None

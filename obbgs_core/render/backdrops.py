@@ -8,7 +8,6 @@ from torch import Tensor
 from obbgs_core.background import backdrop, black_share, doubt, grown, weighed
 from obbgs_core.batches import Batch
 from obbgs_core.frames import TrainingFrame, cameras_of
-from obbgs_core.model.cameras import Cameras
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import Rendered, render
 from obbgs_core.sensor import Sensor
@@ -17,11 +16,9 @@ NEAR_ALPHA = 0.3  # a pixel with more of the model's alpha shows the target; les
 REACH_PX = 2  # and so may its neighbours
 
 
-@torch.no_grad()
-def covered(model: Gaussians, cameras: Cameras) -> Tensor:
-    """Return which pixels [B, H, W] of some cameras show a model, or lie next to it, as bool."""
-    shown = render(model, cameras).alpha > NEAR_ALPHA
-    return torch.stack([grown(one, REACH_PX) for one in shown])
+def covered(alpha: Tensor) -> Tensor:
+    """Return which pixels [H, W] show a model of which they have this alpha [H, W], or lie next to it, as bool."""
+    return grown(alpha > NEAR_ALPHA, REACH_PX)
 
 
 @torch.no_grad()
@@ -43,7 +40,7 @@ def without_earth(model: Gaussians, frame: TrainingFrame, sensor: Sensor) -> Tra
     if frame.earth_m is None:
         return frame
     alpha = render(model, cameras_of([frame])).alpha[0]
-    found = backdrop(frame, sensor, grown(alpha > NEAR_ALPHA, REACH_PX))
+    found = backdrop(frame, sensor, covered(alpha))
     behind_dn = sensor.dn_per_radiance_s * frame.exposure_time_s * (1 - alpha)[..., None] * found.radiance
     dn = torch.where(found.dn < sensor.white_dn, (found.dn - behind_dn).clamp(min=0), found.dn)
     return dataclasses.replace(frame, dn=dn, earth_m=None)

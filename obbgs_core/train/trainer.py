@@ -184,7 +184,9 @@ class Trainer:
         due = state.steps_done % BACKDROPS_EVERY == 0 and state.poses.round is None
         if due or set(state.near_target) != set(indices):
             batches, model = self._batches, state.model
-            state.near_target = {i: covered(model, batches.cameras([i]))[0] for i in indices}
+            with torch.no_grad():
+                alphas = {i: render(model, batches.cameras([i])).alpha[0] for i in indices}
+            state.near_target = {i: covered(alpha) for i, alpha in alphas.items()}
         elif setup.batches.has_backdrops:
             return
         near = state.near_target

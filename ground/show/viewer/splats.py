@@ -15,7 +15,7 @@ from torch import Tensor
 from ground.session.cameras import cameras_of, exposed, sun_direction
 from ground.session.folder import FrameRecord, Session
 from ground.session.spread import evenly_spread
-from ground.session.training_frames import split, training_frame
+from ground.session.training_frames import split, told_before, training_frame
 from ground.show.pictures import tone
 from ground.show.turntable import metres_per_pixel
 from ground.show.viewer.source import Shown
@@ -154,7 +154,7 @@ def legend(limits: tuple[float, float], unit: str) -> str:
 
 
 def _frames(session: Session) -> list:
-    training, _ = split(session, on_warning=lambda text: None)  # the run was told
+    training, _ = split(session, on_warning=told_before)
     return [training_frame(session, record) for record in evenly_spread(training, FRAMES)]
 
 

@@ -314,10 +314,8 @@ class Viewer:
         Until it is moved its camera follows the window's shape, which changes when the panel is put beside the scene.
         """
         self._limit_zoom(client)
-        begun = [
-            self._begin(client.camera.aspect),
-            self._begin(1.0),
-        ]  # where it may have been put, last one last
+        # where it may have been put, the last one last
+        begun = [self._begin(client.camera.aspect), self._begin(1.0)]
 
         def follow(camera: viser.CameraHandle) -> None:
             unmoved = any(np.allclose(camera.position, each, rtol=1e-3, atol=1e-3) for each in begun)
@@ -374,12 +372,9 @@ class Viewer:
 
     def _save_picture(self, client: viser.ClientHandle | None) -> None:
         if client is not None:
-            camera = (
-                client.camera
-            )  # viser draws splats squeezed in a picture of another shape than the window's
-            image = client.get_render(
-                camera.image_height, camera.image_width, transport_format="png", timeout=60
-            )
+            # viser draws splats squeezed in a picture of another shape than the window's
+            shape = client.camera.image_height, client.camera.image_width
+            image = client.get_render(*shape, transport_format="png", timeout=60)
             png = imagecodecs.png_encode(np.ascontiguousarray(on_black(image)))
             client.send_file_download(self.file_name("view"), bytes(png), save_immediately=True)
 
