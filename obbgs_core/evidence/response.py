@@ -44,6 +44,9 @@ FEWEST_PARTS = 7  # that tell something
 MOST_CHOSEN = 0.5
 # what is by so much other than stated is used, and by so many of its errors
 LEAST, CERTAIN = 0.02, 3.0
+LEAST_DRIFT = (
+    0.05  # a model itself errs along a pass by up to half of it (the demo: 0.027 with an error of 0.008)
+)
 LIT_SIGMA, BELOW_FULL_SCALE = 4.0, 0.9  # readings that count: between so much noise and so much of full scale
 MOST_WRONG = 0.5  # of ln(true / stated exposure time)
 RANGE = (0.3, 3.0)  # of exponents: others are none of a camera's
@@ -114,7 +117,7 @@ class Response:
             return 0.0
         slope, error = _jackknifed(lambda kept: np.polyfit(parts[kept], level[kept], 1)[0] * LEFT_OUT, parts)
         now = self.drift + float(slope)
-        return now if max(LEAST, CERTAIN * error) < abs(now) <= MOST_WRONG else 0.0
+        return now if max(LEAST_DRIFT, CERTAIN * error) < abs(now) <= MOST_WRONG else 0.0
 
     def gains(self, frames: list[TrainingFrame]) -> list[float] | None:
         """Return the true exposure time of each frame over the stated one; None where all are as stated."""

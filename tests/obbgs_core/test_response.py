@@ -8,7 +8,7 @@ import torch
 
 from obbgs_core.batches import Batches
 from obbgs_core.evidence import response as evidence
-from obbgs_core.evidence.response import LEAST, Response
+from obbgs_core.evidence.response import LEAST, LEAST_DRIFT, Response
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.losses import likelihood_loss
 from obbgs_core.model.gaussians import Gaussians
@@ -86,6 +86,19 @@ def test_exposure_times_that_are_wrong_by_setting_or_drift_are_found(size, wrong
     np.testing.assert_allclose(gains or np.ones(count), true, rtol=0.01)
     exposed = batches.exposed(gains).batch([7]).exposure_time_s.item()
     assert exposed == pytest.approx(tagged_s[7] * true[7], rel=0.01)
+
+
+def test_a_drift_as_small_as_a_model_errs_along_a_pass_is_not_taken():
+    model, along = target(), np.linspace(-0.5, 0.5, 60)
+    tagged_s = np.resize(EXPOSURES_S, 60)
+    true_s = tagged_s * np.exp(LEAST_DRIFT / 2 * along)
+    frames = [
+        dataclasses.replace(f, exposure_time_s=float(tagged))
+        for f, tagged in zip(photographed(model, 60, exposures_s=true_s.tolist()), tagged_s, strict=True)
+    ]
+    response = Response()
+    assert not response.decide(model, Batches(in_brackets(frames, None), SENSOR.white_dn), SENSOR)
+    assert response.is_as_stated
 
 
 def test_a_tenth_of_the_pass_that_compares_nothing_does_not_hide_what_the_others_tell():
