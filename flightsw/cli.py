@@ -178,6 +178,10 @@ def plan_command(mission: MissionFile = Path("mission.yaml"), json_: AsJson = Fa
     print(f"camera: {planned.view}")
     bracket = loaded.bracket
     print(f"exposures: {bracket.spacing_s():g} s apart, a bracket every {bracket.interval_s:g} s")
+    if loaded.navigation.source != "sgp4":
+        print(
+            f"orbits: by the two-line elements; during the pass states come from {loaded.navigation.source}"
+        )
     for problem in planned.problems:
         print(f"warning: {problem}")
     print(

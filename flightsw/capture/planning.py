@@ -95,11 +95,14 @@ def field_of_view(mission: Mission, ranges_m: list[float]) -> tuple[str, list[st
     ]
     side_px = min(camera.width, camera.height)
     most_px, least_px = (camera.fx_px * extent_m / range_m for range_m in (least_m, greatest_m))
+    covers = {
+        f"{px:.0f} px at {range_m:.0f} m": f"{px / side_px:.0%}"
+        for px, range_m in ((most_px, least_m), (least_px, greatest_m))
+    }
     view = (
         f"{camera.width} x {camera.height} px see {degrees[0]:.3g} x {degrees[1]:.3g} degrees; "
-        f"a target of {extent_m:g} m is {most_px:.0f} px at {least_m:.0f} m "
-        f"and {least_px:.0f} px at {greatest_m:.0f} m, "
-        f"{most_px / side_px:.0%} and {least_px / side_px:.0%} of the picture's smaller side"
+        f"a target of {extent_m:g} m is {' and '.join(covers)}, {' and '.join(covers.values())} "
+        "of the picture's smaller side"
     )
     problems = []
     for name, centre, size in (("cx_px", camera.cx_px, camera.width), ("cy_px", camera.cy_px, camera.height)):

@@ -81,7 +81,7 @@ class Design:
     error_rms_m: float  # of the TLE's motion against the linear solution, over the whole span
     error_max_m: float
     unrounded_error_max_m: float  # without the rounding to a TLE's digits: the error of the linear solution
-    drift_m_per_orbit: float  # of the mean along-track offset; 0 for a bounded orbit
+    drift_error_m_per_orbit: float  # of the mean along-track offset, against the intended drift
 
 
 def linear_motion(

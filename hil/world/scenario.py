@@ -237,7 +237,7 @@ def describe(scenario: Scenario) -> dict:
         "duration_s": scenario.duration_s,
         "range_m": [round(min(ranges), 1), round(max(ranges), 1)],
         "phase_angle_deg": [round(min(phases), 1), round(max(phases), 1)],
-        "in_eclipse": sum(state.pose.in_eclipse for state in states),
+        "brackets_in_eclipse": sum(state.pose.in_eclipse for state in states),
         "sun_moves_deg": round(float(np.degrees(np.arccos(np.clip(suns @ suns[0], -1, 1)).max())), 2),
         "chaser_tle": list(scene.orbit.chaser_tle),
     }
@@ -245,7 +245,7 @@ def describe(scenario: Scenario) -> dict:
     if made is not None:
         facts |= {
             name: round(getattr(made, name), 3)
-            for name in ("error_rms_m", "error_max_m", "unrounded_error_max_m", "drift_m_per_orbit")
+            for name in ("error_rms_m", "error_max_m", "unrounded_error_max_m", "drift_error_m_per_orbit")
         }
     return facts
 

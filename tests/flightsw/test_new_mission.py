@@ -131,6 +131,18 @@ def test_a_plan_says_that_its_poses_will_be_stale(tmp_path):
     assert problem.startswith("the elements are more than 7 days from 40 of 40 brackets")
 
 
+def test_a_plan_says_that_states_will_come_from_elsewhere_and_a_constant_range_once(tmp_path):
+    path = tmp_path / "filtered.yaml"
+    text = (ROOT / "mission.yaml").read_text().replace("  count: 40 ", "  count: 1 ")
+    path.write_text(text + "navigation: {source: 'file:///states.jsonl'}\n")
+    planned = call("flightsw", "plan", "--mission", str(path)).stdout
+    assert (
+        "orbits: by the two-line elements; during the pass states come from file:///states.jsonl" in planned
+    )
+    assert re.search(r"a target of 6 m is \d+ px at \d+ m, \d+% of the picture's smaller side", planned)
+    assert "orbits:" not in call("flightsw", "plan", "--mission", str(ROOT / "mission.yaml")).stdout
+
+
 def test_a_line_of_sight_far_from_the_picture_is_refused(tmp_path):
     path = tmp_path / "odd.yaml"
     path.write_text((ROOT / "mission.yaml").read_text().replace("cx_px: 128.0", "cx_px: 100000"))

@@ -67,7 +67,7 @@ def test_a_fly_around_is_two_to_one_bounded_and_as_wide_as_asked():
     first, last = along[:40].mean(), along[-40:].mean()
     assert abs(last - first) < 4  # m in two orbits: the last digit of mean motion alone is 0.03 m an orbit
     assert made.error_max_m < ROUNDING_M + 3
-    assert abs(made.drift_m_per_orbit) < 2
+    assert abs(made.drift_error_m_per_orbit) < 2
 
 
 def test_the_default_width_keeps_the_range_constant():
@@ -128,7 +128,7 @@ def test_the_command_prints_numbers_with_units_and_the_tle_as_it_is(tmp_path):
     assert all(len(number) <= 8 for line in rest for number in re.findall(r"[\d.]+", line))
     table = {line[:24].strip(): line[24:].strip() for line in rest}
     assert table["half width"] == "346.41 m" and table["dlambda"] == "0 m"
-    for name, unit in (("period", "s"), ("error rms", "m"), ("dex", "m"), ("drift", "m per orbit")):
+    for name, unit in (("period", "s"), ("error rms", "m"), ("dex", "m"), ("drift error", "m per orbit")):
         number, _, shown = table[name].partition(" ")
         assert float(number) != 0 and shown == unit
     described = subprocess.run([*command[:2], "v-bar"], cwd=root, capture_output=True, text=True, check=True)
