@@ -30,6 +30,7 @@ table { border-collapse: collapse; width: 100%; font-size: 14px; }
 td, th { text-align: left; padding: 5px 10px; border-bottom: 1px solid var(--line); vertical-align: top; }
 th.n { text-align: right; }
 td.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
+td.long { white-space: normal; }
 .grid { display: grid; gap: 6px; }
 .grid img { width: 100%; display: block; background: #000; border-radius: 3px; image-rendering: pixelated; }
 .grid .label, .grid figcaption { overflow-wrap: anywhere; }
@@ -73,6 +74,8 @@ pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px;
 }
 """
 
+LONG = 24  # characters of a table's value that stay on one line
+
 # while the page is read, a figure takes the room of those that will stand beside it
 FITTED = (
     '<script>document.querySelectorAll(".js-plotly-plot").forEach(plot => Plotly.Plots.resize(plot))</script>'
@@ -110,8 +113,10 @@ def two_tables(rows: list[tuple[str, str]]) -> str:
 
 
 def _table(rows: Iterable[tuple[str, str]]) -> str:
+    """Return a table; values longer than a number with its error may take several lines, so that it fits its half."""
     cells = "".join(
-        f'<tr><td>{html.escape(label)}</td><td class="n">{value}</td></tr>' for label, value in rows
+        f'<tr><td>{html.escape(label)}</td><td class="n{" long" if len(value) > LONG else ""}">{value}</td></tr>'
+        for label, value in rows
     )
     return f"<table>{cells}</table>"
 

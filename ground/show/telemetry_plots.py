@@ -65,6 +65,7 @@ def telemetry_figures(series: list[Series]) -> list[go.Figure]:
             marker={"size": 4, "color": [LIMIT_COLOURS[limit] for limit in each.limits]},
             hovertemplate="%{y:,} after %{x:.0f} s<extra></extra>",
             showlegend=False,
+            cliponaxis=False,  # a value on the axis is seen whole
         )
         for limit, bounds in (("yellow", each.item.yellow), ("red", each.item.red)):
             for bound in bounds:
@@ -73,7 +74,7 @@ def telemetry_figures(series: list[Series]) -> list[go.Figure]:
                     figure.add_hline(y=bound / factor, line=line)
         if each.values.min() == each.values.max():  # a scale of thousandths around a constant says nothing
             value = each.values[0] / factor
-            figure.update_yaxes(range=[value - max(1.0, abs(value)), value + max(1.0, abs(value))])
+            figure.update_yaxes(range=[0.0, 2 * value or 1.0])  # nothing that is shown can be negative
         figure.update_xaxes(ticksuffix=" s")
         figure.update_yaxes(tickformat=",")
         title = {"text": f"{named(each.item)}{unit_of(each.item)}", "font": {"size": 12}}

@@ -5,10 +5,11 @@ import json
 import numpy as np
 import pytest
 
+from ground.show.page import page, section, two_tables
 from ground.show.telemetry_plots import LIMIT_COLOURS, housekeeping_series, telemetry_figures
 from ground.show.viewer.door import opened
 from ground.show.viewer.pass_plots import PassPlots, drawn_lines, pass_events, plotted, up_to
-from tests.browser import chromium
+from tests.browser import as_url, chromium
 from tests.browser import opened as page_of
 from tests.ground.test_telemetry_plots import packet, written
 
@@ -159,3 +160,15 @@ def test_the_page_draws_a_plot_for_each_item_and_a_session_without_telemetry_has
         page.get_by_text("command near 9 refused: forged").wait_for()
         texts = page.locator(".uplot").first.inner_text()  # its title; the axes are drawn on the canvas
         assert texts.startswith("frames stored")
+
+
+def test_a_table_with_a_long_value_stays_within_its_half_of_the_page(tmp_path):
+    elements = "da -0.04, dlambda -2.40, dex -0.34, dey -0.27, dix 0.14, diy 0.27"
+    tables = two_tables([("brackets", "24"), ("navigation: orbit error, m", elements)])
+    (tmp_path / "page.html").write_text(page("Wide", "", [section("World", "", tables)], plots=False))
+    with chromium() as browser, page_of(browser, as_url(tmp_path / "page.html"), 1440, 700) as shown:
+        cells, edge = shown.evaluate(
+            "() => ['td', 'section'].map(name => Math.max("
+            "...[...document.querySelectorAll(name)].map(element => element.getBoundingClientRect().right)))"
+        )
+        assert cells < edge

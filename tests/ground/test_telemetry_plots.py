@@ -58,6 +58,12 @@ def test_limits_are_those_of_the_dictionary_and_stand_in_the_figure(tmp_path):
     assert heights[300.0] == LIMIT_COLOURS["yellow"]  # of the memory, in MB
 
 
+def test_counts_that_stay_at_zero_have_no_axis_below_it(tmp_path):
+    series = housekeeping_series(written(tmp_path, packet(0), packet(1)))
+    axes = [figure.layout.yaxis.range for figure in telemetry_figures(series)]
+    assert any(axes) and all(axis[0] == 0 for axis in axes if axis)
+
+
 def test_a_session_without_telemetry_has_no_series(tmp_path):
     assert housekeeping_series(tmp_path) == []
     assert housekeeping_series(written(tmp_path)) == []

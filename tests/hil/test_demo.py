@@ -68,7 +68,12 @@ def test_demo_ends_in_a_report_with_every_frame_across(mission, tmp_path):
     run = out / "session" / "runs" / "demo"
     assert all((run / name).exists() for name in ("model.ply", "model.onnx", "metrics.json", "report.html"))
     page = (run / "report.html").read_text()
-    for words in ("The simulated world", "camera: late frames", "link: kind", "navigation: position error m"):
+    for words in (
+        "The simulated world",
+        "camera: late frames",
+        "link: kind",
+        "navigation: position error, m",
+    ):
         assert words in page
     metrics = json.loads((run / "metrics.json").read_text())
     for key in (

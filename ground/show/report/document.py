@@ -301,7 +301,7 @@ def _simulation(truth: Truth | None) -> str:
     if truth is None or not truth.simulation:
         return ""
     rows = [
-        (f"{part}: {_spelled(name)}", f"{value:,}" if isinstance(value, int) else html.escape(f"{value}"))
+        (f"{part}: {_with_unit(name)}", f"{value:,}" if isinstance(value, int) else html.escape(f"{value}"))
         for part, facts in truth.simulation.items()
         for name, value in facts.items()
     ]
@@ -310,6 +310,13 @@ def _simulation(truth: Truth | None) -> str:
         "directions."
     )
     return section("The simulated world", note, two_tables(rows))
+
+
+def _with_unit(key: str) -> str:
+    """Return a key in words, with a comma before its unit."""
+    name, _, unit = key.rpartition("_")
+    units = {"s": "s", "m": "m", "deg": "deg", "percent": "%"}
+    return f"{_spelled(name)}, {units[unit]}" if name and unit in units else _spelled(key)
 
 
 def _spelled(key: str) -> str:
