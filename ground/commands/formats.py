@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 TIMED = (ImportFormat.NDM, ImportFormat.SPICE)  # formats whose readers need the table for the poses
 VIDEO_FRAMES = "video-frames"  # in a session that is being made of a video
-MOST_NAMED = 30  # pictures in one line; --json names all
+MOST_NAMED = 5  # pictures in one line; --json names all
 
 stderr = Console(stderr=True)
 
@@ -191,7 +191,8 @@ def _checked_poses(
         "unchecked": ("they are taken as stated",) * 2,
     }
     for kind, pictures in names.items():
-        named = ", ".join(pictures[:MOST_NAMED]) + ", ..." * (len(pictures) > MOST_NAMED)
+        more = f" and {len(pictures) - MOST_NAMED} more" * (len(pictures) > MOST_NAMED)
+        named = ", ".join(pictures[:MOST_NAMED]) + more
         where = "" if len(pictures) == len(views) else f": {named}"
         what = f"{len(pictures)} of {len(views)} cameras {said[kind]}{where}; {done[kind][not mend]}"
         stderr.print(what, soft_wrap=True, highlight=False)

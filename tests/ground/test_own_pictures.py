@@ -317,6 +317,12 @@ def test_bright_borders_are_told_unless_the_background_is_white_or_a_mask_says_w
     session_of(views, tmp_path / "white", white_background=True)
     session = session_of([dataclasses.replace(v, mask=mask) for v in views], tmp_path / "masked")
     assert "bright" not in caplog.text and session.dn(session.frames[0])[0, 0].tolist() == [0, 0, 0]
+    lit_at_the_border = np.dstack([picture, np.full((16, 16), 255, np.uint8)])
+    lit_at_the_border[4:12, 4:12, 3] = 0
+    session_of(
+        [view(png(tmp_path / f"clear{i}.png", lit_at_the_border)) for i in range(3)], tmp_path / "clear"
+    )
+    assert "bright" not in caplog.text
 
 
 def test_masks_of_a_folder_have_the_names_of_the_pictures(tmp_path):

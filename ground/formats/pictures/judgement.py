@@ -27,8 +27,8 @@ class Judgement:
     bit_depth: of the readings.
     full_scale: the value of full scale of each type of numbers: at it a pixel is saturated.
     transparent: whether any pixel is.
-    bright_borders: how many pictures have a border that space does not have.
-    border: the median over the pictures of their borders' medians, 0 to 1.
+    bright_borders: how many opaque pictures without a mask have a border that space does not have.
+    border: the median over those pictures of their borders' medians, 0 to 1.
     """
 
     channels: int
@@ -69,23 +69,21 @@ def judge(views: Sequence[View], on_view: Callable[[], None] = lambda: None) -> 
         if image.dtype.kind == "u":
             kind.histogram += np.bincount(values.reshape(-1), minlength=1 << 16)
             kind.at_top[(top, view.exposure_time_s)] += int((values == top).sum())
-        opaque = np.ones(image.shape[:2], bool)
+        masked = view.mask is not None
         if image.shape[2] > count:
-            opaque = image[..., -1] > 0
-            transparent |= bool((image[..., -1] < FULL_SCALE[image.dtype.name]).any())
-        if view.mask is None:  # a mask says what the target is, also at the border
-            borders.append(_border(values, opaque))
+            clear = bool((image[..., -1] < FULL_SCALE[image.dtype.name]).any())
+            transparent |= clear
+            masked |= clear
+        if not masked:  # a mask or transparency says what the target is, also at the border
+            borders.append(_border(values))
         on_view()
     return _judged(seen, colours, transparent, borders)
 
 
-def _border(values: np.ndarray, opaque: np.ndarray) -> tuple[str, float] | None:
-    """Return the type of a picture and the median of its border's brightest colour; None if nothing of it is opaque."""
-    rim = np.zeros(opaque.shape, bool)
+def _border(values: np.ndarray) -> tuple[str, float]:
+    """Return the type of a picture and the median of its border's brightest colour."""
+    rim = np.zeros(values.shape[:2], bool)
     rim[[0, -1]] = rim[:, [0, -1]] = True
-    rim &= opaque
-    if not rim.any():
-        return None
     return values.dtype.name, float(np.median(values[rim].max(axis=1)))
 
 
@@ -93,7 +91,7 @@ def _judged(
     seen: dict[str, _Seen],
     colours: list[tuple[int, str]],
     transparent: bool,
-    borders: list[tuple[str, float] | None],
+    borders: list[tuple[str, float]],
 ) -> Judgement:
     common, number = Counter(colours).most_common(1)[0]
     if number < len(colours):
@@ -103,7 +101,7 @@ def _judged(
     for name, kind in seen.items():
         full_scale[name], bits = _full_scale(name, kind)
         depth = max(depth, bits)
-    bright = [value / full_scale[name] for name, value in filter(None, borders)]
+    bright = [value / full_scale[name] for name, value in borders]
     return Judgement(
         channels=max(count for count, _ in colours),
         display=common == (3, "uint8"),
