@@ -9,7 +9,7 @@ dark where it is bright is no evidence either.
 
 Ratios that follow no power are those of exposure times which are not as stated, each by a factor; the median is taken
 as stated, since what all share is the unit of light. A ratio that grows along the pass, alike in the frames of every
-exposure time, is a drift.
+exposure time, is a drift. Where each frame has an error of its own (`frame_errors`), that takes the place of all these.
 
 Source: Mitsunaga and Nayar, Radiometric self calibration, 1999, who fit a polynomial to exposures of one view.
 """
@@ -26,6 +26,7 @@ import torch
 
 from obbgs_core.batches import Batch, Batches
 from obbgs_core.compiled import each
+from obbgs_core.evidence.exposures import frame_errors
 from obbgs_core.frames import TrainingFrame, bracket_numbers
 from obbgs_core.misfit import sampled
 from obbgs_core.model.gaussians import Gaussians
@@ -34,6 +35,10 @@ from obbgs_core.sensor import Sensor
 
 log = logging.getLogger(__name__)
 DECIDED_AT = (0.3, 0.5, 0.7)  # shares of the steps
+FRAMES_FROM = (
+    0.5  # errors of single frames are told from then on: before, the model itself errs from frame to frame
+)
+FOLLOWED_AT = (0.6, 0.8, 0.9)  # and where they are used
 LEAST_STEP = 0.1  # of the logarithms of exposure times that are compared
 FEWEST_READINGS = 30
 MOST = 60  # frames, or pairs of neighbours in a bracket, that are rendered
@@ -60,15 +65,39 @@ class Response:
     error: float = math.nan  # its standard error; nan: not measured
     settings: dict[float, float] | None = None  # ln(true / stated) of stated exposure times; None: as stated
     drift: float = 0.0  # of ln(true / stated) from the first frame to the last
+    frames: dict[int, float] | None = (
+        None  # ln(true / stated), by id; None: frames have no errors of their own
+    )
 
     @property
     def is_as_stated(self) -> bool:
         """Whether readings are linear in light and exposure times right, as far as it is known."""
-        return self.exponent == 1 and self.settings is None and self.drift == 0
+        return self.exponent == 1 and self.settings is None and self.drift == 0 and self.frames is None
+
+    @property
+    def decided_at(self) -> tuple[float, ...]:
+        """The shares of the steps after which it is decided."""
+        return DECIDED_AT if self.frames is None else DECIDED_AT + FOLLOWED_AT
 
     @torch.no_grad()
-    def decide(self, model: Gaussians, batches: Batches, sensor: Sensor) -> bool:
-        """Take what the frames tell beside the model as it stands; return whether it is something else."""
+    def decide(self, model: Gaussians, batches: Batches, sensor: Sensor, share: float = 1.0) -> bool:
+        """Take what the frames tell beside the model as it stands; return whether it is something else.
+
+        Args:
+            share: of the steps that are done.
+        """
+        used = np.log(self.gains(batches.frames) or np.ones(len(batches.frames)))
+        errors = frame_errors(model, batches, sensor, used) if share >= FRAMES_FROM else None
+        if errors is not None:
+            self.exponent, self.settings, self.drift = 1.0, None, 0.0
+            self.frames = {f.id: own for f, own in zip(batches.frames, errors.tolist(), strict=True)}
+            log.info("%s", self)
+            return True
+        if (
+            self.frames is not None
+        ):  # what else there may be is decided beside a model that was trained without them
+            self.frames = None
+            return True
         in_brackets = _in_brackets(batches.frames)
         pairs = in_brackets or _in_turns(batches.frames)
         indices = sorted({i for pair in pairs for i in (*pair.one, *pair.other)})
@@ -121,6 +150,8 @@ class Response:
 
     def gains(self, frames: list[TrainingFrame]) -> list[float] | None:
         """Return the true exposure time of each frame over the stated one; None where all are as stated."""
+        if self.frames is not None:  # frames that joined since are as stated
+            return [math.exp(self.frames.get(frame.id, 0.0)) for frame in frames]
         if self.settings is None and self.drift == 0:
             return None
         middle, settings = (len(frames) - 1) / 2, self.settings or {}
@@ -141,6 +172,10 @@ class Response:
         if self.drift:
             said.append(
                 f"exposure times drift by {math.expm1(self.drift):+.1%} from the first frame to the last"
+            )
+        if self.frames:
+            said.append(
+                f"exposure times err by {np.std(list(self.frames.values())):.1%} from frame to frame; each is estimated"
             )
         return "; ".join(said) or "readings are linear in light and exposure times right, as stated"
 

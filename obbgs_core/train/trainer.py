@@ -17,7 +17,6 @@ from obbgs_core.batches import Batch, Batches
 from obbgs_core.compiled import torch_on_one_thread
 from obbgs_core.errors import Diverged
 from obbgs_core.evidence.radiance import described
-from obbgs_core.evidence.response import DECIDED_AT
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.methods.config import SET_BACK_AT, SET_BACK_TO, MethodConfig, Moment
 from obbgs_core.model.gaussians import Gaussians
@@ -237,10 +236,10 @@ class Trainer:
     def _learn_response(self) -> None:
         """Take another exponent of the camera's response when that is due and the frames tell it."""
         state, setup, config = self.state, self.setup, self.setup.config
-        due = state.steps_done in {round(config.steps_until(share)) for share in DECIDED_AT}
-        if not due or state.fit.misfit is None or setup.sun_moves:
+        due = {round(config.steps_until(share)): share for share in state.response.decided_at}
+        if state.steps_done not in due or state.fit.misfit is None or setup.sun_moves:
             return
-        if state.response.decide(state.model, self._batches, setup.sensor):
+        if state.response.decide(state.model, self._batches, setup.sensor, due[state.steps_done]):
             self._use_found()
 
     def _prolong_growth(self) -> None:
