@@ -35,3 +35,13 @@ def prepare_process(threads: int | None = None) -> None:
     if mallopt is not None:
         mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT_BYTES)
         mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)
+
+
+def give_back() -> None:
+    """Hand memory that was freed back to the system, also what lies between what is held, where the C library can.
+
+    Between stages of work that take much memory: what one has freed is in pieces that the next does not fit into.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)

@@ -158,19 +158,22 @@ def shows_light(frame: TrainingFrame, sensor: Sensor) -> bool:
 
 def radius_m(silhouettes: list[Silhouette]) -> float:
     """Return the target's radius, m: how far from the origin, across the line of sight, light is; 0 if all is dark."""
+    ahead = [s for s in silhouettes if s.world_to_camera[2, 3] > 0]
+    count = sum(int(s.certain.sum()) for s in ahead)
+    outside = (
+        count - max(1, int(INSIDE * count)) + 1
+    )  # pixels that are no nearer: of each view no more are kept
     reaches = []
-    for s in silhouettes:
+    for s in ahead:
         rows, columns = torch.nonzero(s.certain, as_tuple=True)
         origin = s.world_to_camera[:3, 3]
-        if len(rows) == 0 or origin[2] <= 0:
-            continue
         x = (columns + 0.5 - s.K[0, 2]) / s.K[0, 0] - origin[0] / origin[2]
         y = (rows + 0.5 - s.K[1, 2]) / s.K[1, 1] - origin[1] / origin[2]
-        reaches.append(torch.hypot(x, y) * origin[2])
-    if not reaches:
+        reach = torch.hypot(x, y) * origin[2]
+        reaches.append(reach.topk(min(len(reach), outside)).values)
+    if not count:
         return 0.0
-    reach = torch.cat(reaches)
-    return 1.05 * float(reach.kthvalue(max(1, int(INSIDE * len(reach)))).values)
+    return 1.05 * float(torch.cat(reaches).topk(outside).values[-1])
 
 
 def origin_apart(silhouettes: list[Silhouette]) -> float:

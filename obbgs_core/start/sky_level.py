@@ -13,6 +13,7 @@ Stein's estimator, 1975).
 import dataclasses
 import math
 import statistics
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -50,6 +51,9 @@ CUT_PX, CLEAR_NOISE_DN = 5, 1.0
 CUT_BELOW = 2.0  # deviations of a reading: where flight has cut, the sky is lower than that above black
 CUT_BLOCK_PX = 4  # blocks are as small in passes that were cut, since what is left of the sky is a rim
 FIRST_SWEEPS, SWEEPS = 30, 6  # of the first plane, and of the plane through sky
+# So many blocks, about, are computed with at once, which bounds the memory. Their frames are a multiple of 16, which
+# libraries of matrices take together: results do not depend on how many there are.
+BLOCKS_AT_ONCE, FRAMES_TOGETHER = 1 << 19, 16
 # Of a reading's deviation: a level that departs by less from the stated black, in the mean of squares over frames and
 # pixels, is no reason to doubt it. Windows of 25 pixels tell sky from a face of 0.2 (`start.hull.FAINTEST_SIGMA`).
 NEGLIGIBLE = 0.03
@@ -163,8 +167,10 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
         nothing = torch.zeros(len(frames), channels, 3).double()
         return nothing, torch.full_like(nothing, math.inf), 1.0
     step = math.ceil(math.sqrt(rows * columns / MOST_BLOCKS))
-    pooled = each(lambda f: _block_moments(f.dn, px, step), frames)
-    mean, variance = (torch.stack(moments) for moments in zip(*pooled, strict=True))  # [F, C, B]
+    kept = -(-rows // step) * -(-columns // step)
+    mean, variance = torch.empty(2, len(frames), channels, kept).double()  # [F, C, B]
+    for i, moments in enumerate(each(lambda f: _block_moments(f.dn, px, step), frames)):
+        mean[i], variance[i] = moments
     known = torch.stack(
         [_taken(F.max_pool2d(whole(m)[None].float(), px), step)[0] == 0 for m in cut]
     )  # [F, B]
@@ -172,12 +178,19 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
     known |= ~shown[:, None]
     places = _basis(height, width)[: rows * px, : columns * px].movedim(-1, 0)
     basis = _taken(F.avg_pool2d(places, px), step).T.double()  # [B, 3]
-    quiet = _quantile(variance.mean(dim=1), known, QUIET_SHARE).median()
+    parts = _parts(len(frames), kept)
+
+    def of_parts(work: Callable[[slice], Tensor]) -> Tensor:
+        return torch.cat(list(map(work, parts)))
+
+    quiet = of_parts(lambda at: _quantile(variance[at].mean(dim=1), known[at], QUIET_SHARE)).median()
     sigma_dn = max(math.sqrt(float(quiet)) / CLIPPED_SIGMA, math.sqrt(1 / 12))
-    levels = _levels(mean.mean(dim=1), sigma_dn)
-    even = torch.zeros(len(frames), 3).double()
-    even[:, 0] = _quantile(levels, known, LOW_SHARE)
-    size, starts = (px * px, -(-rows // step)), (_low_planes(basis, levels, known, sigma_dn), even)
+    low, even = torch.zeros(2, len(frames), 3).double()
+    for at in parts:
+        levels = _levels(mean[at].mean(dim=1), sigma_dn)
+        even[at, 0] = _quantile(levels, known[at], LOW_SHARE)
+        low[at] = _low_planes(basis, levels, known[at], sigma_dn)
+    size, starts = (px * px, -(-rows // step)), (low, even)
     given = (basis, mean, variance, known, size, sigma_dn, sensor)
     found = list(each(lambda start: _through_sky(start, *given), starts))
     # of the two planes of a frame that with more sky; the noise as most frames show it
@@ -188,9 +201,12 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
     sigma_dn = max(found, key=lambda f: int(f.count.sum())).sigma_dn
 
     def of_channel(channel: int) -> tuple[Tensor, Tensor]:
-        own, of_reading = plane, torch.empty(0)
-        for _ in range(SWEEPS):
-            own, of_reading = _fitted(own, basis, mean[:, channel], sky, sigma_dn, sensor)
+        own, of_reading = plane.clone(), torch.empty_like(plane)
+        for at in parts:
+            for _ in range(SWEEPS):
+                own[at], of_reading[at] = _fitted(
+                    own[at], basis, mean[at, channel], sky[at], sigma_dn, sensor
+                )
         of_mean = of_reading / (px * px)
         if sensor.jpeg is not None:
             of_mean = of_mean * (1 + _of_coding(sensor, px * px) * px * px / sigma_dn**2)
@@ -233,23 +249,33 @@ def _through_sky(
         known: [F, B] bool, the blocks that are as the camera read them.
         size: pixels of a block, and rows of blocks.
     """
-    grey, scatter, readings = mean.mean(dim=1), variance.mean(dim=1), size[0] * mean.shape[1]
-    sky = torch.ones_like(grey, dtype=torch.bool)
-    expected, spread = _moments(plane, basis, sigma_dn, sensor)
+    readings, parts = size[0] * mean.shape[1], _parts(len(mean), mean.shape[2])
+    plane, sky, ratio, below = plane.clone(), torch.ones_like(known), *torch.zeros(2, len(mean)).double()
     for _ in range(SWEEPS):
-        of_mean = spread / readings + _of_coding(sensor, readings)
-        sky = _sky_blocks(grey, scatter, known, expected, spread, of_mean, readings, size[1])
-        plane, _ = _fitted(plane, basis, grey, sky, sigma_dn, sensor)
-        _, spread = _moments(plane, basis, sigma_dn, sensor)
-        ratio = (scatter * sky).sum(dim=1) / (spread * sky).sum(dim=1)
+        for at in parts:
+            grey, scatter = mean[at].mean(dim=1), variance[at].mean(dim=1)
+            expected, spread = _moments(plane[at], basis, sigma_dn, sensor)
+            of_mean = spread / readings + _of_coding(sensor, readings)
+            seen = (grey, scatter, known[at], expected, spread, of_mean)
+            sky[at] = _sky_blocks(*seen, readings, size[1])
+            plane[at], _ = _fitted(plane[at], basis, grey, sky[at], sigma_dn, sensor)
+            _, spread = _moments(plane[at], basis, sigma_dn, sensor)
+            ratio[at] = (scatter * sky[at]).sum(dim=1) / (spread * sky[at]).sum(dim=1)
         if ratio.isfinite().any():
             sigma_dn *= math.sqrt(float(ratio.nanmedian()))
-        expected, spread = _moments(plane, basis, sigma_dn, sensor)
-    of_mean = spread / readings + _of_coding(sensor, readings)
-    far = torch.where(known, FAR_BELOW * of_mean.sqrt(), CUT_BELOW * spread.sqrt())
-    below = (grey < expected - far).double().mean(dim=1)
+    for at in parts:
+        expected, spread = _moments(plane[at], basis, sigma_dn, sensor)
+        of_mean = spread / readings + _of_coding(sensor, readings)
+        far = torch.where(known[at], FAR_BELOW * of_mean.sqrt(), CUT_BELOW * spread.sqrt())
+        below[at] = (mean[at].mean(dim=1) < expected - far).double().mean(dim=1)
     count = sky.sum(dim=1)
     return _Fit(plane, sky, count * ((count >= FEWEST_BLOCKS) & (below <= MOST_BELOW)), sigma_dn)
+
+
+def _parts(frames: int, blocks: int) -> list[slice]:
+    """Return frames in parts whose blocks are few enough to be computed with at once."""
+    together = FRAMES_TOGETHER * max(1, BLOCKS_AT_ONCE // (FRAMES_TOGETHER * blocks))
+    return [slice(first, min(first + together, frames)) for first in range(0, frames, together)]
 
 
 def _noise_dn(sensor: Sensor) -> float:

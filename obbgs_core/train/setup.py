@@ -28,6 +28,7 @@ from obbgs_core.methods.config import MethodConfig, few_share
 from obbgs_core.methods.presets import limited
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
+from obbgs_core.process import give_back
 from obbgs_core.sensor import Sensor, unusual_unit
 from obbgs_core.start.alignment import settled
 from obbgs_core.start.hot_pixels import without_hot_pixels
@@ -149,6 +150,7 @@ def prepare(
     """
     checked, reference_exposure_s = usable(frames, asked.exposure_aware, sensor.white_dn)
     checked, sensor, sky_level = levelled(checked, sensor)
+    give_back()
     checked, hot = without_hot_pixels(checked, sensor)
     sensor, noise = with_noise_seen(checked, sensor)
     lighted = list(each(lambda f: shows_light(f, sensor), checked))
@@ -162,6 +164,7 @@ def prepare(
     warnings = [text for text in (hot, noise, unusual_unit(white)) if text]
     certain = {i: held(outline.certain) for i, outline in outlines.items()}
     lit_pixels = [int(whole(mask).sum()) for mask in certain.values()]
+    give_back()
     config, shown, budget = limited(config, lit_pixels, textured_pixels(posed, certain, sensor))
     given = (posed, list(outlines.values()), sensor, config.start, published.sh_degree, rng)
     gaussians, radius_m, start = first_gaussians(*given, published.grey_start)
