@@ -9,6 +9,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from hil.sky.sensor import converted
 from obbgs_core.frames import TrainingFrame
@@ -134,3 +136,19 @@ def tagged(frames: list[TrainingFrame], wrong: bool, sigma_rad: float = 0.005) -
         )
         for f, error in zip(frames, errors, strict=True)
     ]
+
+
+class LargestTensor(TorchDispatchMode):
+    """Remembers how many numbers the largest tensor has that an operation makes."""
+
+    numbers = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        made = func(*args, **(kwargs or {}))
+        sizes = [
+            t.untyped_storage().nbytes() // t.element_size()
+            for t in tree_leaves(made)
+            if isinstance(t, Tensor)
+        ]
+        self.numbers = max([self.numbers, *sizes])
+        return made

@@ -172,12 +172,12 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
     for i, moments in enumerate(each(lambda f: _block_moments(f.dn, px, step), frames)):
         mean[i], variance[i] = moments
     known = torch.stack(
-        [_taken(F.max_pool2d(whole(m)[None].float(), px), step)[0] == 0 for m in cut]
+        [F.max_pool2d(_taken(whole(m)[None], px, step).float(), px).flatten() == 0 for m in cut]
     )  # [F, B]
     shown = known.sum(dim=1) >= FEWEST_BLOCKS
     known |= ~shown[:, None]
-    places = _basis(height, width)[: rows * px, : columns * px].movedim(-1, 0)
-    basis = _taken(F.avg_pool2d(places, px), step).T.double()  # [B, 3]
+    places = _taken(_basis(height, width).movedim(-1, 0), px, step)
+    basis = F.avg_pool2d(places, px).flatten(1).T.double()  # [B, 3]
     parts = _parts(len(frames), kept)
 
     def of_parts(work: Callable[[slice], Tensor]) -> Tensor:
@@ -312,14 +312,18 @@ def _before_coding(
 
 def _block_moments(dn: Tensor, px: int, step: int = 1) -> tuple[Tensor, Tensor]:
     """Return mean and variance [C, B] of blocks of px x px readings dn [H, W, C], those of `_taken`."""
-    image = dn.movedim(-1, 0).double()
-    mean, square = (_taken(F.avg_pool2d(values, px), step) for values in (image, image.square()))
+    image = _taken(dn.movedim(-1, 0), px, step).double()
+    mean, square = (F.avg_pool2d(values, px).flatten(1) for values in (image, image.square()))
     return mean, ((square - mean.square()) * px**2 / (px**2 - 1)).clamp(min=0)
 
 
-def _taken(blocks: Tensor, step: int) -> Tensor:
-    """Return of blocks [C, rows, columns] every so many rows and columns, [C, B]."""
-    return blocks[:, ::step, ::step].flatten(1)
+def _taken(image: Tensor, px: int, step: int) -> Tensor:
+    """Return of an image [C, H, W] the blocks of px x px pixels of every so many rows and columns of blocks."""
+    if step == 1:
+        return image
+    rows, columns = (side // px for side in image.shape[1:])
+    blocks = image[:, : rows * px, : columns * px].unflatten(1, (rows, px)).unflatten(3, (columns, px))
+    return blocks[:, ::step, :, ::step].flatten(3).flatten(1, 2)
 
 
 def _levels(mean: Tensor, sigma_dn: float) -> Tensor:

@@ -15,6 +15,7 @@ from scipy.ndimage import uniform_filter
 
 from obbgs_core import compact, preset
 from obbgs_core.compact import Compact, held, part, seen, whole
+from obbgs_core.process import give_back
 from obbgs_core.start.hull import silhouette_of
 from obbgs_core.start.sky_level import cut_pixels
 from obbgs_core.train.trainer import Trainer
@@ -69,17 +70,33 @@ def test_large_pictures_are_held_in_the_memory_of_what_they_show():
     assert torch.equal(dataclasses.replace(frame, dn=changed).dn, changed)
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="Linux tells what a process takes")
-def test_what_is_no_longer_held_goes_back_to_the_system_whatever_lies_beside_it():
-    def taken() -> int:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+def taken_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
+
+ON_LINUX = pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="Linux tells what a process takes"
+)
+
+
+@ON_LINUX
+def test_what_is_no_longer_held_goes_back_to_the_system_whatever_lies_beside_it():
     np.ones(31_000_000, dtype=np.uint8)  # once it is freed the C library keeps what is smaller
     every = [held(torch.randint(0, 4096, (1000, 2000)).float()) for _ in range(20)]
-    before = taken()
+    before = taken_bytes()
     every = every[::2]  # 10 times 4 MB
-    assert before - taken() > 36e6
+    assert before - taken_bytes() > 36e6
     assert all(isinstance(one, Compact) for one in every)
+
+
+@ON_LINUX
+def test_what_was_freed_between_what_is_held_is_given_back():
+    pieces = [np.ones(100_000, dtype=np.uint8) for _ in range(400)]  # too small for pages of their own
+    pieces = pieces[::2]
+    before = taken_bytes()
+    give_back()
+    assert before - taken_bytes() > 10e6  # of 20 MB
+    assert len(pieces) == 200
 
 
 @given(st.integers(0, 99), st.integers(1, 4), st.lists(st.integers(0, 40), min_size=4, max_size=4))

@@ -20,7 +20,7 @@ from obbgs_core.start import hull, initialisation
 from obbgs_core.train.adam import Adam
 from obbgs_core.train.growth import split_long_axis
 from obbgs_core.train.parts import Change
-from tests.scenes import random_gaussians
+from tests.scenes import LargestTensor, random_gaussians
 
 
 @given(st.integers(0, 2**31), st.integers(4, 60))
@@ -55,6 +55,18 @@ def test_gaussians_behind_a_tile_lie_in_its_frustum_and_not_behind_the_surface()
     depth = torch.full((60, 120), 5.0)
     chosen = obb.behind_tile(means, means2d, depth, torch.eye(4), (20, 40))
     assert chosen.tolist() == [True, False, False, False]
+
+
+def test_the_radius_encloses_nearly_all_light_and_never_holds_the_light_of_all_views():
+    K, pose, rng = torch.tensor([[90.0, 0, 50], [0, 90, 50], [0, 0, 1]]), torch.eye(4), torch.Generator()
+    pose[2, 3] = 5.0
+    masks = [torch.rand(100, 100, generator=rng.manual_seed(i)) < 0.5 for i in range(40)]
+    with LargestTensor() as largest:
+        found = hull.radius_m([hull.Silhouette(mask, mask, ~mask, pose, K) for mask in masks])
+    rows, columns = torch.nonzero(torch.stack(masks), as_tuple=True)[1:]
+    reach = torch.hypot((columns + 0.5 - 50) / 90, (rows + 0.5 - 50) / 90) * 5
+    assert found == 1.05 * float(reach.sort().values[int(hull.INSIDE * len(reach)) - 1])
+    assert largest.numbers <= 2 * 100 * 100  # the places of one view's pixels
 
 
 def test_the_hull_of_a_ball_is_its_surface():

@@ -10,8 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.stats import norm
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 from hil.sky.sensor import converted
 from obbgs_core.frames import TrainingFrame, cameras_of
@@ -19,9 +17,10 @@ from obbgs_core.methods.presets import preset
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.sensor import Sensor
+from obbgs_core.start import sky_level
 from obbgs_core.start.sky_level import field, levelled
 from obbgs_core.train import train
-from tests.scenes import QUICK, SENSOR, ball, photographed, target
+from tests.scenes import QUICK, SENSOR, LargestTensor, ball, photographed, target
 
 SIZE_PX = 96
 DARK = Sensor(0.0, 255.0, 2.5e6, 1e9, 6.0)  # black is 0: half of the noise on empty sky is clipped
@@ -112,22 +111,6 @@ def test_what_flight_has_cut_is_no_sky_and_stays_black():
         assert (f.dn[:24] == told.black_dn).all() and (f.dn[71:] == told.black_dn).all()
 
 
-class _Largest(TorchDispatchMode):
-    """Remembers how many numbers the largest tensor has that an operation makes."""
-
-    numbers = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        made = func(*args, **(kwargs or {}))
-        sizes = [
-            t.untyped_storage().nbytes() // t.element_size()
-            for t in tree_leaves(made)
-            if isinstance(t, torch.Tensor)
-        ]
-        self.numbers = max([self.numbers, *sizes])
-        return made
-
-
 def test_the_sky_of_large_pictures_is_measured_one_picture_at_a_time():
     """No tensor holds the pixels of all frames, however many there are."""
     sensor, rng = dataclasses.replace(SENSOR, read_noise_dn=6.0), np.random.default_rng(3)
@@ -141,10 +124,26 @@ def test_the_sky_of_large_pictures_is_measured_one_picture_at_a_time():
         sent[350:750, 250:650] = True
         dn[~sent] = sensor.black_dn
         frames.append(TrainingFrame(dn, 1e-4, torch.eye(4), torch.eye(3), number))
-    with _Largest() as largest:
+    with LargestTensor() as largest:
         _, _, level = levelled(frames, sensor)
     assert largest.numbers <= 4 * height * width  # a pixel's place has three numbers
     assert (level.planes_dn[:, 0, 0] - level_dn).abs().max() < 0.25 * sensor.read_noise_dn
+
+
+@pytest.mark.parametrize("fits", [True, False])
+def test_blocks_of_few_frames_are_computed_with_at_once_and_all_learn_from_each_other(monkeypatch, fits):
+    true = [(2.0 * i * (not fits), 0.5, 0.2) for i in range(40)]
+    frames = seen(SENSOR, planes(true))
+    _, _, together = levelled(frames, SENSOR)
+    monkeypatch.setattr(sky_level, "BLOCKS_AT_ONCE", 1)  # 16 frames
+    with LargestTensor() as largest:
+        _, _, apart = levelled(frames, SENSOR)
+    blocks = (SIZE_PX // 3) ** 2
+    assert (
+        largest.numbers <= 2 * 40 * blocks
+    )  # mean and variance of each; three numbers of each were computed with
+    torch.testing.assert_close(apart.planes_dn, together.planes_dn)
+    torch.testing.assert_close(apart.sigma_dn, together.sigma_dn)
 
 
 def test_what_a_clipped_reading_says_stays_true():
