@@ -5,6 +5,7 @@ from the target as black, so that of such a frame only the target and its surrou
 tensor of the values that were given.
 """
 
+import dataclasses
 import mmap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ class Compact:
     """A picture [H, W, ...] that has one value around a rectangle.
 
     around: [...] that value. inside: [h, w, ...] the rectangle, of bits [h, w / 8 rounded up] if dtype is bool.
+    changed: rows [N] and columns [N] of pixels in the rectangle, and the values [N, ...] that they have instead.
     """
 
     shape: torch.Size
@@ -30,6 +32,7 @@ class Compact:
     left: int
     width: int
     inside: np.ndarray
+    changed: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     @classmethod
     def of(cls, picture: Tensor) -> "Compact":
@@ -59,6 +62,10 @@ class Compact:
                 inside = np.unpackbits(inside, axis=1, count=self.width).view(bool)
             inside = inside[:, begin - self.left : end - self.left]
             whole.numpy()[first - top : last - top, begin - left : end - left] = inside
+        if self.changed is not None:
+            at, to, values = self.changed
+            shown = (at >= top) & (at < bottom) & (to >= left) & (to < right)
+            whole.numpy()[at[shown] - top, to[shown] - left] = values[shown]
         return whole
 
     def tensor(self) -> Tensor:
@@ -138,6 +145,19 @@ def held(picture: Tensor | Compact) -> Tensor | Compact:
     if known is not None and known[1] == picture._version:
         return known[0]
     return Compact.of(picture)
+
+
+def changed(picture: Tensor | Compact, at: Tensor, values: Tensor) -> Tensor | Compact:
+    """Return what is held with other values [N, ...] at the pixels `at` [H, W] bool; what is compact is shared."""
+    if isinstance(picture, Compact) and picture.changed is None:
+        rows, columns, new = *(places.numpy() for places in torch.nonzero(at, as_tuple=True)), values.numpy()
+        bottom, right = picture.top + len(picture.inside), picture.left + picture.width
+        inside = (rows >= picture.top) & (rows < bottom) & (columns >= picture.left) & (columns < right)
+        if (new[~inside] == picture.around).all():
+            return dataclasses.replace(picture, changed=(rows[inside], columns[inside], new[inside]))
+    other = whole(picture).clone()
+    other[at] = values
+    return held(other)
 
 
 def whole(picture: Tensor | Compact) -> Tensor:

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from obbgs_base.physics.navigation_errors import SharedParameters
-from obbgs_core.compact import Compact, hold_compact, part, seen
+from obbgs_core.compact import Compact, changed, hold_compact, part, seen
 from obbgs_core.compiled import each
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.model.cameras import Cameras, stacked_suns
@@ -121,6 +122,10 @@ class TrainingFrame:
     def part(self, rows: slice, columns: slice) -> Tensor:
         """Return some rows and columns of dn [h, w, C]."""
         return part(self.__dict__["_dn"], rows, columns)
+
+    def with_readings(self, at: Tensor, dn: Tensor) -> "TrainingFrame":
+        """Return the frame with other readings dn [N, C] at the pixels `at` [H, W] bool; the others are held once."""
+        return dataclasses.replace(self, dn=cast(Tensor, changed(self.__dict__["_dn"], at, dn)))
 
     def seen(self, look: Callable[[Tensor], Tensor], reach_px: int) -> Tensor:
         """Return what `look` says of each pixel of dn by those within `reach_px` of it, see `compact.seen`."""

@@ -5,7 +5,6 @@ pixels around one show empty sky therefore tell whether it is hot, and the brigh
 star or a particle is in one frame only.
 """
 
-import dataclasses
 import math
 
 import torch
@@ -39,10 +38,7 @@ def without_hot_pixels(frames: list[TrainingFrame], sensor: Sensor) -> tuple[lis
     around = _around(kept)
     filled = hot & (around > 0)
     frames = [
-        dataclasses.replace(
-            f,
-            dn=torch.where(filled[..., None], _around_all(f.dn * kept[..., None]) / around[..., None], f.dn),
-        )
+        f.with_readings(filled, _around_all(f.dn * kept[..., None])[filled] / around[filled][:, None])
         for f in frames
     ]
     return frames, f"{count} hot pixels, {count / hot.numel():.2%}, read the mean of their neighbours"

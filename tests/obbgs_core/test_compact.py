@@ -134,6 +134,29 @@ def test_what_is_small_stays_as_it_is():
     assert torch.equal(part(dn, slice(2, 4), slice(3, 9)), dn[2:4, 3:9])
 
 
+@pytest.mark.parametrize("outside", [None, 64.0, 64.5])
+def test_a_frame_with_a_few_other_readings_shares_the_others_and_reads_as_if_they_had_been_put_in(outside):
+    dn = torch.full((1500, 1000, 1), 64.0)
+    dn[300:700, 200:600] = torch.randint(65, 4096, (400, 400, 1)).float()
+    frame = dataclasses.replace(scenes.photographed(scenes.target(), 1)[0], dn=dn)
+    at = torch.zeros(1500, 1000, dtype=torch.bool)
+    at[310, 210:220], at[305:400, 599], at[5, 7] = True, True, outside is not None
+    other = torch.full((int(at.sum()), 1), 7.25)
+    if outside is not None:
+        other[0] = outside
+    expected = dn.clone()
+    expected[at] = other
+    changed = frame.with_readings(at, other)
+    assert torch.equal(changed.dn, expected) and torch.equal(frame.dn, dn)
+    rows, columns = slice(306, 350), slice(215, 600)
+    assert torch.equal(changed.part(rows, columns), expected[rows, columns])
+    kept, given = (f.__dict__["_dn"] for f in (changed, frame))
+    assert (kept.inside is given.inside) == (outside != 64.5)
+    again = changed.with_readings(at, other + 1)
+    expected[at] = other + 1
+    assert torch.equal(again.dn, expected)
+
+
 @pytest.mark.parametrize("scale", [1.0, 0.25])
 def test_a_training_on_compact_frames_is_the_same_to_the_bit(monkeypatch, scale):
     def trained() -> list[torch.Tensor]:
