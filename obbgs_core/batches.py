@@ -12,6 +12,7 @@ from torch import Tensor
 from obbgs_core.background import Backdrop
 from obbgs_core.compact import Compact, held, part, whole
 from obbgs_core.frames import TrainingFrame, averaged, cameras_of
+from obbgs_core.jpeg import FULL_SCALE, JpegCoding
 from obbgs_core.model.cameras import Cameras
 
 # windows begin at multiples of it, so that the pixels averaged for a coarse image lie in one window
@@ -34,6 +35,9 @@ class Batch:
     sky: Tensor | None = None
     solid: Tensor | None = None
     doubt: Tensor | None = None  # [B, H, W, C] deviation of the cameras' backdrop
+    stored: list[Tensor] | None = (
+        None  # `JpegCoding.coefficients` that dn came from, of each frame; None: not known
+    )
 
 
 class Batches:
@@ -43,6 +47,7 @@ class Batches:
     sky, solid: where silhouettes show empty sky, and what is solid, [H, W] bool by the frame's index; frames without a
         silhouette are not in them.
     windows: the part of each frame [F, 4] that is shown, see `windows.windows`; None: all of it.
+    jpeg: how the frames were stored; their coefficients never change, and are found when a frame is first asked for.
     """
 
     def __init__(
@@ -52,6 +57,7 @@ class Batches:
         sky: Mapping[int, Tensor | Compact] | None = None,
         windows: Tensor | None = None,
         solid: Mapping[int, Tensor | Compact] | None = None,
+        jpeg: JpegCoding | None = None,
     ):
         self.frames, self.white_dn = frames, white_dn
         self._gains = [1.0] * len(frames)  # true over stated exposure times
@@ -63,6 +69,9 @@ class Batches:
         self._reached = None if windows is None else common(windows, width, height)
         # by name, factor, frame and where they are
         self._images: dict[tuple[str, int, int, torch.device], Tensor] = {}
+        # whole blocks lie in every window
+        self._jpeg = jpeg if jpeg and all(GRID_PX % px == 0 for px in jpeg.blocks_px) else None
+        self._stored: dict[int, list[Tensor]] = {}  # by frame
 
     def cameras(self, indices: list[int]) -> Cameras:
         """Return the cameras of whole frames, with nothing behind the target."""
@@ -127,7 +136,29 @@ class Batches:
             sky,
             solid,
             doubt,
+            self._coefficients(indices, shown) if factor == 1 else None,
         )
+
+    def _coefficients(self, indices: list[int], shown: list[tuple[slice, slice]]) -> list[Tensor] | None:
+        """Return the coefficients of what is shown of some frames; None where dn is not what was stored."""
+        if self._jpeg is None or any(i in self._backdrops for i in indices):
+            return None
+        for i in indices:
+            if i not in self._stored:
+                # chromas at the edge follow from beyond it, too
+                reach = self._reach(1, i)
+                wider = [
+                    slice(max(0, (of.start or 0) - GRID_PX), of.stop and of.stop + GRID_PX) for of in reach
+                ]
+                dn = self.frames[i].part(*wider)
+                found = self._jpeg.coefficients(dn / (self.white_dn / FULL_SCALE))
+                inside = [
+                    slice((of.start or 0) - begin, of.stop and of.stop - begin)
+                    for of, begin in ((of, wide.start) for of, wide in zip(reach, wider, strict=True))
+                ]
+                self._stored[i] = self._jpeg.part(found, *inside)
+        parts = [self._jpeg.part(self._stored[i], *at) for i, at in zip(indices, shown, strict=True)]
+        return [torch.stack(planes) for planes in zip(*parts, strict=True)]
 
     def _image(self, name: str, factor: int, index: int, device: torch.device) -> Tensor:
         """Return what `_averaged` does, on a device; whole frames are not kept twice in main memory."""

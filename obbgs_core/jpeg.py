@@ -17,6 +17,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 BLOCK_PX = 8
 # red, green and blue to luma and chromas, T.871
@@ -25,6 +26,7 @@ TO_RGB = ((1.0, 0.0, 1.402), (1.0, -0.344136, -0.714136), (1.0, 1.772, 0.0))
 FULL_SCALE, MIDDLE = 255.0, 128.0  # the largest value; what is taken off luma before it is transformed
 # of a coefficient, in its steps: less would leave rounding without a slope; more, and its mean is what was rounded
 LEAST_SIGMA, WIDE = 0.05, 0.6
+PROJECTIONS = 4  # between what pictures can show and what files can hold, where values were clipped
 THRESHOLDS = 2  # of rounding on each side of a coefficient that are looked at
 
 
@@ -67,43 +69,70 @@ class JpegCoding:
             mean, variance: [B, H, W, C] of the values that are coded, of which FULL_SCALE is the largest; C is 1 or 3.
                 The first may have a gradient.
         """
-        height, width, channels = mean.shape[1:]
+        height, width = mean.shape[1:3]
         means, variances = self._planes(mean), self._variances(variance)
-        luma = _rounded(means[0], variances[0], self.luma)
-        back, error = luma[0] + MIDDLE, luma[1]
-        if channels == 3:
-            chroma = _rounded(means[1], variances[1], self.chroma or self.luma)
-            # linear between the middles of what was averaged, as libjpeg does
-            whole = [F.interpolate(i, back.shape[2:], mode="bilinear", align_corners=False) for i in chroma]
-            back, error = torch.cat([back, whole[0]], dim=1), torch.cat([error, whole[1]], dim=1)
-            turn = torch.tensor(TO_RGB).to(mean)
-            back = torch.einsum("ck,bkhw->bchw", turn, back)
-            error = torch.einsum("ck,bkhw->bchw", turn.square(), error)
-        back, error = (image[:, :, :height, :width].movedim(1, -1) for image in (back, error))
-        return back, error
+        rounded = [_rounded(*of) for of in zip(means, variances, self._tables, strict=False)]
+        back, error = ([planes[k] for planes in rounded] for k in range(2))
+        return (
+            self._in_colours(back, torch.tensor(TO_RGB), height, width, MIDDLE),
+            self._in_colours(error, torch.tensor(TO_RGB).square(), height, width),
+        )
 
-    def deviance_residuals(self, mean: Tensor, variance: Tensor, stored: Tensor) -> list[Tensor]:
+    def coefficients(self, picture: Tensor) -> list[Tensor]:
+        """Return the coefficients that a picture [H, W, C] came from, in quantisation steps, whole numbers as int16.
+
+        They are those of luma [1, rows, columns, 64] and of chromas [2, ...], by blocks. Where values were clipped they
+        follow from what lies beyond the clips, which is found by turns with them: an estimate.
+
+        Args:
+            picture: what came back, of which FULL_SCALE is the largest value.
+        """
+        read, whole = picture[None], self._whole_steps(picture[None])
+        height, width = read.shape[1:3]
+        for _ in range(PROJECTIONS - 1):
+            planes = [_from_steps(of, table) for of, table in zip(whole, self._tables, strict=False)]
+            back = self._in_colours(planes, torch.tensor(TO_RGB), height, width, MIDDLE)
+            beyond = torch.where(read <= 0, back.clamp(max=0), read)
+            beyond = torch.where(read >= FULL_SCALE, back.clamp(min=FULL_SCALE), beyond)
+            whole = self._whole_steps(beyond)
+        return [of[0].to(torch.int16) for of in whole]
+
+    def _whole_steps(self, shown: Tensor) -> list[Tensor]:
+        """Return the coefficients, in whole steps, that come nearest to an image [B, H, W, C] that came back."""
+        planes = zip(self._before_interpolation(shown), self._tables, strict=False)
+        return [_in_steps(of, table).round() for of, table in planes]
+
+    def part(self, planes: list[Tensor], rows: slice, columns: slice) -> list[Tensor]:
+        """Return the coefficients [K, rows, columns, 64] of some pixels, whose first is the first of a block."""
+        parts = []
+        for plane, averaged in zip(planes, ((1, 1), self.averaged), strict=False):
+            at = [slice(None)]
+            for pixels, shared, few in zip((rows, columns), self.averaged, averaged, strict=True):
+                unit, blocks = BLOCK_PX * shared, shared // few  # of pixels that end with blocks of both
+                end = None if pixels.stop is None else -(-pixels.stop // unit) * blocks
+                at.append(slice((pixels.start or 0) // unit * blocks, end))
+            parts.append(plane[tuple(at)])
+        return parts
+
+    def stacked(self, pictures: Tensor) -> list[Tensor]:
+        """Return the `coefficients` of pictures [B, H, W, C], each of a shape [B, ...]."""
+        of_pictures = [self.coefficients(picture) for picture in pictures]
+        return [torch.stack(planes) for planes in zip(*of_pictures, strict=True)]
+
+    def deviance_residuals(self, mean: Tensor, variance: Tensor, stored: list[Tensor]) -> list[Tensor]:
         """Return the root of twice the negative log-likelihood of each stored coefficient, less the least it can be.
 
         A coefficient says that the value lay within half a step of it. Returned are those of luma [B, 1, rows, columns,
         64] and of chromas [B, 2, rows, columns, 64], by blocks; they have a gradient by the mean if that has one.
 
-        What came back does not tell the coefficients exactly where it was clipped.
-
         Args:
             mean, variance: as for `moments`.
-            stored: [B, H, W, C], what came back.
+            stored: as from `coefficients`, of each picture.
         """
-        means, variances, read = self._planes(mean), self._variances(variance), self._planes(stored)
-        if len(read) > 1:
-            height, width = (
-                _before_interpolation(n, few) for n, few in zip(read[1].shape[2:], self.averaged, strict=True)
-            )
-            read[1] = height.to(stored) @ read[1] @ width.to(stored).T
-        tables = (self.luma, self.chroma or self.luma)
+        means, variances = self._planes(mean), self._variances(variance)
         return [
-            _deviance_residual(_in_steps(value, steps), _deviation(spread, steps), _in_steps(values, steps))
-            for value, spread, values, steps in zip(means, variances, read, tables, strict=False)
+            _DevianceResidual.apply(_in_steps(value, steps), _deviation(spread, steps), of.to(value))
+            for value, spread, of, steps in zip(means, variances, stored, self._tables, strict=False)
         ]
 
     def in_pixels(self, residuals: list[Tensor], height: int, width: int) -> Tensor:
@@ -116,6 +145,38 @@ class JpegCoding:
         ]
         total = sums[0] + sums[1] / math.prod(self.averaged) if len(sums) > 1 else sums[0]
         return (total / BLOCK_PX**2).sqrt()[:, 0, :height, :width, None]
+
+    @property
+    def blocks_px(self) -> tuple[int, int]:
+        """Rows and columns of pixels after which a block of each plane ends."""
+        return BLOCK_PX * self.averaged[0], BLOCK_PX * self.averaged[1]
+
+    @property
+    def _tables(self) -> tuple[tuple[int, ...], ...]:
+        """The quantisation steps of luma and of chromas."""
+        return self.luma, self.chroma or self.luma
+
+    def _in_colours(
+        self, planes: list[Tensor], turn: Tensor, height: int, width: int, middle: float = 0.0
+    ) -> Tensor:
+        """Return the image [B, H, W, C] of luma [B, 1, H, W] and averaged chromas [B, 2, h, w], with `turn` [C, 3]."""
+        image = planes[0] + middle
+        if len(planes) > 1:
+            # linear between the middles of what was averaged, as libjpeg does
+            whole = F.interpolate(planes[1], image.shape[2:], mode="bilinear", align_corners=False)
+            image = torch.einsum("ck,bkhw->bchw", turn.to(image), torch.cat([image, whole], dim=1))
+        return image[:, :, :height, :width].movedim(1, -1)
+
+    def _before_interpolation(self, read: Tensor) -> list[Tensor]:
+        """Return the planes, as `_planes` does, from which an image that came back was interpolated."""
+        planes = self._planes(read)
+        if len(planes) > 1:
+            height, width = (
+                _before_interpolation(n, few).to(read)
+                for n, few in zip(planes[1].shape[2:], self.averaged, strict=True)
+            )
+            planes[1] = height @ planes[1] @ width.T
+        return planes
 
     def _planes(self, image: Tensor) -> list[Tensor]:
         """Return luma [B, 1, H, W], less the middle, and the averaged chromas [B, 2, h, w], in whole blocks."""
@@ -157,11 +218,19 @@ def _deviation(variance: Tensor, steps: tuple[int, ...]) -> Tensor:
 def _rounded(image: Tensor, variance: Tensor, steps: tuple[int, ...]) -> tuple[Tensor, Tensor]:
     """Return mean and variance of images [B, K, H, W] whose coefficients were rounded to multiples of steps."""
     mean, spread = _rounding(_in_steps(image, steps), _deviation(variance, steps))
-    transform, step = _transform().to(image), _tensor(steps, image)
-    back, error = (mean * step) @ transform, (spread * step.square()) @ transform.square()
-    parts = (*mean.shape[:4], BLOCK_PX, BLOCK_PX)
-    back, error = (blocks.view(parts).transpose(3, 4).reshape(image.shape) for blocks in (back, error))
-    return back, error
+    error = (spread * _tensor(steps, image).square()) @ _transform().to(image).square()
+    return _from_steps(mean, steps), _in_place(error)
+
+
+def _from_steps(coefficients: Tensor, steps: tuple[int, ...]) -> Tensor:
+    """Return the images [B, K, H, W] of coefficients [B, K, rows, columns, 64], in quantisation steps."""
+    return _in_place((coefficients * _tensor(steps, coefficients)) @ _transform().to(coefficients))
+
+
+def _in_place(blocks: Tensor) -> Tensor:
+    """Return the images [B, K, H, W] of the values of blocks [B, K, rows, columns, 64]."""
+    parts = blocks.unflatten(4, (BLOCK_PX, BLOCK_PX)).transpose(3, 4)
+    return parts.flatten(4, 5).flatten(2, 3)
 
 
 def _tensor(steps: tuple[int, ...], like: Tensor) -> Tensor:
@@ -186,16 +255,33 @@ def _rounding(value: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(wide, value, nearest + mean), variance
 
 
-def _deviance_residual(value: Tensor, sigma: Tensor, stored: Tensor) -> Tensor:
-    """Return the root of -2 ln of the likelihood, over its maximum, that x lies within half of what was stored.
+class _DevianceResidual(torch.autograd.Function):
+    """The root of -2 ln of the likelihood, over its maximum, that x lies within half of what was stored.
 
-    x is normal with mean `value` and deviation `sigma`.
+    x is normal with mean `value` and deviation `sigma`; the slope by the mean is known with it.
     """
-    away = (value - stored).abs()
-    near, far = (torch.special.log_ndtr((edge - away) / sigma) for edge in (0.5, -0.5))
-    most = torch.erf(0.5 / math.sqrt(2) / sigma).log()
-    deviance = 2 * (most - near - torch.log1p(-(far - near).exp())).clamp(min=0)
-    return (deviance + 1e-15).sqrt()  # the root has no derivative at 0
+
+    @staticmethod
+    def forward(ctx, value: Tensor, sigma: Tensor, stored: Tensor) -> Tensor:
+        away = value - stored
+        distance = away.abs()
+        near, far = ((edge - distance) / sigma for edge in (0.5, -0.5))
+        log_near = torch.special.log_ndtr(near)
+        log_inside = log_near + torch.log1p(-(torch.special.log_ndtr(far) - log_near).exp())
+        most = torch.erf(0.5 / math.sqrt(2) / sigma).log()
+        residual = (2 * (most - log_inside).clamp(min=0) + 1e-15).sqrt()  # the root has no slope at 0
+        if ctx.needs_input_grad[0]:
+            densities = torch.exp(-0.5 * near.square() - log_inside) - torch.exp(
+                -0.5 * far.square() - log_inside
+            )
+            ctx.save_for_backward(away.sign() * densities / (math.sqrt(2 * math.pi) * sigma * residual))
+        return residual
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_outputs: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        (slope,) = ctx.saved_tensors
+        return grad_outputs[0] * slope, None, None
 
 
 @functools.cache

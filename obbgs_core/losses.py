@@ -41,6 +41,7 @@ def likelihood_loss(
     misfit: float | None = None,
     drawn: Tensor | None = None,
     factor: float = 1.0,
+    stored: list[Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return the robust negative log likelihood of readings plus weighted edges, and the normalised residual.
 
@@ -59,6 +60,7 @@ def likelihood_loss(
         drawn: [B, H, W]; where it is zero the radiance depends on nothing, and no gradient is needed. Such pixels may
             be left out of the sum, though not of the number that it is divided by; their residual is then zero.
         factor: on the loss; multiplying it afterwards costs a pass over its gradient.
+        stored: `JpegCoding.coefficients` of each picture, if dn was stored so; None: they are found.
 
     Returns:
         loss: scalar; residual: [B, H, W, C], `Sensor.deviance_residual` over its deviation, without gradient.
@@ -70,7 +72,7 @@ def likelihood_loss(
     radiance, sensor = sensor.linear(radiance, exposure_time_s)
     native = None if sensor.jpeg else compiled.module_for(radiance, exposure_time_s, dn)
     if native is None:
-        settings = (averaged_pixels, edge_weight, misfit)
+        settings = (averaged_pixels, edge_weight, misfit, stored)
         loss, residual = likelihood_loss_reference(radiance, exposure_time_s, dn, sensor, *settings)
         return factor * loss, residual
     model, stride = _sensor_model(native, sensor, averaged_pixels), sampling_stride(radiance)
@@ -87,10 +89,12 @@ def likelihood_loss_reference(
     averaged_pixels: int = 1,
     edge_weight: float = 0.0,
     misfit: float | None = None,
+    stored: list[Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return what `likelihood_loss` does, in readable PyTorch."""
     if sensor.jpeg is not None and averaged_pixels == 1:
-        return _coded_likelihood(radiance, exposure_time_s, dn, sensor, sensor.jpeg, misfit)
+        stored = sensor.jpeg.stacked(dn / (sensor.white_dn / FULL_SCALE)) if stored is None else stored
+        return _coded_likelihood(radiance, exposure_time_s, stored, sensor, sensor.jpeg, misfit)
     prediction = sensor.predicted(radiance, exposure_time_s, averaged_pixels)
     residual = sensor.residual_of(prediction, dn, averaged_pixels)
     if misfit is None:
@@ -110,7 +114,7 @@ def likelihood_loss_reference(
 def _coded_likelihood(
     radiance: Tensor,
     exposure_time_s: Tensor,
-    dn: Tensor,
+    stored: list[Tensor],
     sensor: Sensor,
     coding: JpegCoding,
     misfit: float | None,
@@ -122,17 +126,18 @@ def _coded_likelihood(
     """
     prediction = dataclasses.replace(sensor, jpeg=None).predicted(radiance, exposure_time_s)
     read, variance = prediction.clipped_moments(sensor.white_dn)
-    variance, weight = variance.detach(), 1.0
+    weight = 1.0
     if misfit is not None:
         with torch.no_grad():
             own = error_of(prediction, sensor, 1, misfit)
             variance, weight = variance + own.variance_dn2(prediction, sensor), own.weight
     scale_dn = sensor.white_dn / FULL_SCALE
-    residuals = coding.deviance_residuals(read / scale_dn, variance / scale_dn**2, dn / scale_dn)
+    residuals = coding.deviance_residuals(read / scale_dn, variance / scale_dn**2, stored)
     penalty = charbonnier if misfit is None else cauchy
-    shares = [penalty(of) * (of.numel() / dn.numel()) for of in residuals]
+    shares = [penalty(of) * (of.numel() / radiance.numel()) for of in residuals]
     loss = weight * torch.stack(shares).sum()
-    return loss, coding.in_pixels([of.detach() for of in residuals], *dn.shape[1:3]).expand_as(dn)
+    in_pixels = coding.in_pixels([of.detach() for of in residuals], *radiance.shape[1:3])
+    return loss, in_pixels.expand_as(radiance)
 
 
 def published_loss(

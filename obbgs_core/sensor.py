@@ -104,7 +104,6 @@ class Sensor:
         if self.jpeg is not None and averaged_pixels == 1:
             scale_dn = self.white_dn / FULL_SCALE
             read, spread = clipped_moments(expected, variance.sqrt(), self.white_dn)
-            spread = spread.detach()  # it is 0 where all is saturated, and its root has no slope there
             shape = read.shape if read.ndim == 4 else (1, *read.shape)
             stored = self.jpeg.moments((read / scale_dn).view(shape), (spread / scale_dn**2).view(shape))
             expected = (stored[0] * scale_dn).view(read.shape)
@@ -184,15 +183,24 @@ def clipped_mean(mean: Tensor, sigma: Tensor) -> Tensor:
 
 
 def clipped_moments(mean: Tensor, sigma: Tensor, most: float) -> tuple[Tensor, Tensor]:
-    """Return mean and variance of min(max(x, 0), most) for x normal with `mean` and deviation `sigma`."""
-    low, high = -mean / sigma, (most - mean) / sigma  # the clips, in deviations from the mean
-    below, above = torch.special.ndtr(low), torch.special.ndtr(-high)
-    # the means of what each clip cuts off, and the second moment between the clips
-    lifted, lowered = low * below + _density(low), _density(high) - high * above
-    inside = 1 - below - above + low * _density(low) - high * _density(high)
-    shift = lifted - lowered
-    variance = (inside + low**2 * below + high**2 * above - shift**2).clamp(min=0)
-    return (mean + sigma * shift).clamp(0, most), sigma**2 * variance
+    """Return mean and variance of min(max(x, 0), most) for x normal with `mean` and deviation `sigma`.
+
+    Only the first has a gradient, by `mean`.
+    """
+    with torch.no_grad():
+        low, high = -mean / sigma, (most - mean) / sigma  # the clips, in deviations from the mean
+        below, above = torch.special.ndtr(low), torch.special.ndtr(-high)
+        at_low, at_high = _density(low), _density(high)
+        # the means of what each clip cuts off, and the second moment between the clips
+        lifted, lowered = low * below + at_low, at_high - high * above
+        between = 1 - below - above
+        inside = between + low * at_low - high * at_high
+        shift = lifted - lowered
+        variance = (inside + low**2 * below + high**2 * above - shift**2).clamp(min=0)
+        clipped, variance = (mean + sigma * shift).clamp(0, most), sigma**2 * variance
+    if mean.requires_grad:
+        clipped = clipped + between * (mean - mean.detach())
+    return clipped, variance
 
 
 def _density(z: Tensor) -> Tensor:

@@ -31,7 +31,7 @@ def doubted(batch: Batch, rendered: Rendered, sensor: Sensor, frames: list[Train
     gain = sensor.dn_per_radiance_s * batch.exposure_time_s
     behind_dn = gain * doubt(rendered.alpha, behind, batch.doubt, black_share(frames))
     dn = weighed(batch.dn, prediction.expected_dn, prediction.sigma_dn, behind_dn, sensor.white_dn)
-    return dataclasses.replace(batch, dn=dn)
+    return dataclasses.replace(batch, dn=dn, stored=None)
 
 
 @torch.no_grad()

@@ -13,7 +13,7 @@ from obbgs_core.render import Rendered, render
 from obbgs_core.train.parts import Now, Seen
 from obbgs_core.train.setup import TrainingSetup
 
-MEMORY = 0.98  # of the running figures that a step keeps; the rest is the step's own
+MEMORY, CODED_EVERY = 0.98, 4  # what running figures keep in a step; of JPEG one step in so many is taken in
 # share of the steps from which brackets that were kept back are trained on (docs/experiments/093)
 UNSEEN_UNTIL = 0.6
 log = logging.getLogger(__name__)
@@ -34,16 +34,18 @@ class Fit:
     misfit: float | None = None
     unseen_factor: float | None = None
 
-    def observe(self, setup: TrainingSetup, rendered: Rendered, seen: Seen) -> None:
+    def observe(self, setup: TrainingSetup, rendered: Rendered, seen: Seen, step: int) -> None:
         """Take in a step, by sampled pixels; `rendered` is the whole model where the step left Gaussians out."""
-        batch = seen.batch
+        batch, each = seen.batch, 1 if setup.sensor.jpeg is None else CODED_EVERY
+        if step % each:  # what is expected of JPEG takes as long as a step: one in so many stands for all
+            return
         radiance, alpha, dn = sampled(setup.sensor, rendered.radiance, rendered.alpha, batch.dn)
         fit = fit_figures(radiance, alpha, batch.exposure_time_s, dn, setup.sensor, batch.averaged_pixels)
         self.psnr_db = fit.psnr_db
         if not math.isnan(fit.chi2):
-            self.chi2 = fit.chi2 if math.isnan(self.chi2) else _running(self.chi2, fit.chi2)
+            self.chi2 = fit.chi2 if math.isnan(self.chi2) else _running(self.chi2, fit.chi2, each)
         if setup.config.learns_misfit and not math.isnan(fit.misfit):
-            self.misfit = _running(fit.misfit if self.misfit is None else self.misfit, fit.misfit)
+            self.misfit = _running(fit.misfit if self.misfit is None else self.misfit, fit.misfit, each)
 
     def due(self, now: Now) -> bool:
         """Return whether the brackets that are kept back are to tell the model's own error, and be trained on then.
@@ -76,6 +78,6 @@ class Fit:
         return misfit / self.misfit
 
 
-def _running(mean: float, value: float) -> float:
-    """Return a running mean after one more value."""
-    return MEMORY * mean + (1 - MEMORY) * value
+def _running(mean: float, value: float, steps: int) -> float:
+    """Return a running mean after one more value, which stands for so many steps."""
+    return MEMORY**steps * mean + (1 - MEMORY**steps) * value

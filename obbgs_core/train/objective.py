@@ -42,7 +42,7 @@ def image_loss(
         # where colours of frames are learnt each pixel depends on them
         drawn = None if published.compensation else rendered.alpha
         known = (batch.averaged_pixels, edge_weight, misfit, drawn)
-        return likelihood_loss(*images, *known, factor=batch.shown)
+        return likelihood_loss(*images, *known, factor=batch.shown, stored=batch.stored)
     loss, residual = published_loss(*images, published.ssim_weight, edge_weight, published.clamped)
     return loss * (batch.shown * len(batch.cameras)), residual  # a sum over the step's frames, as published
 

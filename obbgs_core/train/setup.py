@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from obbgs_core.batches import Batches, windows
+from obbgs_core.batches import GRID_PX, Batches, windows
 from obbgs_core.compact import Compact, held, whole
 from obbgs_core.compiled import each
 from obbgs_core.errors import ReconstructionError
@@ -172,14 +172,17 @@ def prepare(
     gaussians = dataclasses.replace(gaussians, footprint=published.footprint)
     span_deg = sun_span_deg(lit)
     sky, solid = _masks(outlines, config, span_deg, lit)
-    parts = windows(posed, gaussians.means.detach(), certain) if published.windows else None
+    # a window that begins at a multiple of the grid may end within a block of coefficients
+    cuts = sensor.jpeg is not None and any(side % GRID_PX for side in lit[0].shape[:2])
+    cropped = published.windows and not cuts
+    parts = windows(posed, gaussians.means.detach(), certain) if cropped else None
     setup = TrainingSetup(
         frames=lit,
         sensor=sensor,
         asked=asked,
         config=config,
         seed=seed,
-        batches=Batches(lit, sensor.white_dn, sky, parts, solid),
+        batches=Batches(lit, sensor.white_dn, sky, parts, solid, sensor.jpeg),
         radius_m=radius_m,
         unit_m=camera_extent_m(lit) if published.length_unit == "cameras" else radius_m,
         radiance_unit=white if published.radiance_unit == "full_scale" else 1.0,

@@ -164,7 +164,7 @@ class Trainer:
         self._descend(moment)
         self._decide(moment, seen)
         state.average.observe(state.gaussians, moment.share >= config.averaged_from)
-        state.fit.observe(setup, rendered, seen)
+        state.fit.observe(setup, rendered, seen, state.steps_done)
         state.steps_done += 1
         self._learn_response()
         state.seconds += time.monotonic() - began

@@ -10,10 +10,11 @@ from PIL import Image
 from scipy.optimize import root_scalar
 from scipy.stats import norm
 
+from obbgs_core.batches import Batches
 from obbgs_core.frames import TrainingFrame
-from obbgs_core.jpeg import TO_RGB, JpegCoding, _deviance_residual
+from obbgs_core.jpeg import TO_RGB, JpegCoding, _DevianceResidual, _in_steps
 from obbgs_core.losses import likelihood_loss
-from obbgs_core.sensor import Sensor
+from obbgs_core.sensor import Sensor, clipped_moments
 from obbgs_core.start.sky_level import levelled
 
 SENSOR = Sensor(0.0, 255.0, 1.0, 1e9, 6.0)  # black is 0: half of the noise on empty sky is clipped
@@ -73,7 +74,7 @@ def test_what_was_coded_lies_within_half_a_step_of_every_coefficient_that_libjpe
     dn, mean = (torch.from_numpy(image)[None] for image in (values, np.rint(truth)))
 
     def shares_outside(picture: torch.Tensor) -> list[float]:
-        residuals = coding.deviance_residuals(picture, torch.ones_like(picture), dn)
+        residuals = coding.deviance_residuals(picture, torch.ones_like(picture), coding.stacked(dn))
         return [(of > 2).double().mean().item() for of in residuals]
 
     assert max(shares_outside(mean)) < 0.02
@@ -90,9 +91,53 @@ def test_a_coefficient_is_as_likely_as_its_rounding():
         x = value.numpy()
         likelihood = norm.cdf((1.5 - x) / sigma) - norm.cdf((0.5 - x) / sigma)
         expected = -2 * np.log(likelihood.clip(1e-300) / (2 * norm.cdf(0.5 / sigma) - 1))
-        found = _deviance_residual(value, torch.tensor(sigma).double(), stored_at).square().numpy()
+        found = _DevianceResidual.apply(value, torch.tensor(sigma).double(), stored_at).square().numpy()
         told = likelihood > 1e-12
         np.testing.assert_allclose(found[told], expected[told], rtol=1e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.3, 1.0, 4.0])
+def test_the_slope_of_a_coefficient_s_likelihood_is_that_of_finite_differences(sigma):
+    value = torch.linspace(-5, 5, 40).double().requires_grad_()  # not at the very middle of a step
+    others = torch.tensor(sigma).double().expand(40), torch.tensor(1.0).double().expand(40)
+    assert torch.autograd.gradcheck(lambda v: _DevianceResidual.apply(v, *others), value, eps=1e-7, atol=1e-4)
+
+
+def test_clipped_means_have_the_slope_of_finite_differences():
+    mean = torch.linspace(-30, 290, 41).double().requires_grad_()
+    sigma = torch.tensor(6.0).double()
+    assert torch.autograd.gradcheck(lambda m: clipped_moments(m, sigma, 255.0)[0], mean)
+
+
+def test_coefficients_are_those_of_the_file_also_where_values_were_clipped():
+    """Dark blocks, of whose values many came back below black, were too bright by a step in the mean."""
+    noisy = readings(np.zeros((64, 64, 1)), np.random.default_rng(0))
+    values, coding = stored(noisy, quality=95)
+    before, back = (torch.from_numpy(v).double() for v in (noisy, values))
+    file, unaware = (_in_steps(coding._planes(of[None])[0], coding.luma)[0].round() for of in (before, back))
+    error, unaware = ((of - file)[..., 0].mean() for of in (coding.coefficients(back)[0], unaware))
+    assert unaware > 3 * error.abs()
+
+
+@pytest.mark.parametrize("subsampling", [0, 1, 2])
+def test_a_batch_has_the_coefficients_of_its_window(subsampling):
+    noisy = readings(scene(3)[:48, :64], np.random.default_rng(1))
+    values, coding = stored(noisy, quality=90, subsampling=subsampling)
+    dn, K = torch.from_numpy(values).float(), torch.eye(3)
+    frames = [TrainingFrame(dn, 1.0, torch.eye(4), K, number) for number in range(2)]
+    windows = torch.tensor([[16, 0, 48, 32], [32, 16, 64, 48]])
+    batches = Batches(frames, SENSOR.white_dn, windows=windows, jpeg=coding)
+    stored_of, batch = coding.coefficients(dn), batches.batch([0, 1])
+    assert batch.stored is not None and batch.dn.shape[1:3] == (32, 32)
+    luma, chroma = batch.stored
+    assert luma.dtype == chroma.dtype == torch.int16
+    rows, columns = (2 // n for n in coding.averaged)
+    assert torch.equal(luma[1], stored_of[0][:, 2:, 4:])
+    assert torch.equal(chroma[1], stored_of[1][:, rows:, 2 * columns :])
+    time_s, told = torch.ones(2, 1, 1, 1), dataclasses.replace(SENSOR, jpeg=coding)
+    given, _ = likelihood_loss(batch.dn + 1, time_s, batch.dn, told, stored=batch.stored)
+    found, _ = likelihood_loss(batch.dn + 1, time_s, batch.dn, told)
+    assert abs(given / found - 1) < 0.02  # chromas at the edge of a window are interpolated from beyond it
 
 
 @pytest.mark.parametrize("level_dn", [0.0, 3.0, 8.0, 60.0])

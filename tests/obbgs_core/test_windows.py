@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from obbgs_core.batches import GRID_PX, Batches, common, windows
 from obbgs_core.frames import cameras_of
+from obbgs_core.jpeg import JpegCoding
 from obbgs_core.methods.presets import preset
 from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
@@ -98,3 +99,11 @@ def test_what_is_learnt_in_windows_is_as_good_on_whole_pictures():
         scores_db.append(psnr_db(render(learnt, cameras).radiance / true.max(), true / true.max()))
     assert scores_db[0] > 30
     assert scores_db[1] > scores_db[0] - 1
+
+
+@pytest.mark.parametrize("size_px", [144, 150])
+def test_no_window_cuts_a_block_of_jpeg(size_px):
+    frames = photographed(SMALL, 6, size_px=size_px, focal_px=90.0)
+    told = dataclasses.replace(SENSOR, jpeg=JpegCoding((1,) * 64))
+    shown = Trainer(frames, told, preset("obbgs"), 0).setup.batches.batch([0, 1]).dn.shape[1:3]
+    assert tuple(shown) == (150, 150) if size_px == 150 else shown[0] < 144 and shown[0] % GRID_PX == 0
