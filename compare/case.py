@@ -153,8 +153,10 @@ class Case:
         clouds = {"": points_m.double().numpy(), "_surface": surface_m.double().numpy()}
         return cloud_scores(clouds, self.cloud_m, self.units_per_m, self.shown)
 
-    def true_views(self) -> Callable[[TrainingFrame], tuple[np.ndarray, np.ndarray]]:
+    def true_views(self) -> Callable[[TrainingFrame], tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
         """Return a function from a training frame to its true radiance [H, W, C] and coverage [H, W] in 0..1.
+
+        The third that it returns is the radiance [nH, nW, C] of pixels n times as small, None where it is not known.
 
         Raises:
             CompareError: the session has no truth.
@@ -166,7 +168,7 @@ class Case:
                 "exposures, noise or response, or take a simulated session"
             )
         truth, records = Truth(session), {record.id: record for record in session.frames}
-        return lambda frame: truth.radiance(records[frame.id])
+        return lambda frame: (*truth.radiance(records[frame.id]), truth.finer(records[frame.id]))
 
 
 def load_case(folder: Path, sector_deg: float = 0.0) -> Case:
@@ -272,8 +274,8 @@ def content_digest(folder: Path) -> str:
         digest.update(session.dn(record).tobytes())
         if truth is not None:
             digest.update(repr(truth.posed(record).world_to_camera.tolist()).encode())
-            for array in truth.radiance(record):
-                digest.update(array.tobytes())
+            for array in (*truth.radiance(record), truth.finer(record)):
+                digest.update(b"" if array is None else array.tobytes())
     if truth is not None:
         digest.update(repr(truth.largest_dimension_m).encode() + truth.cloud_m.tobytes())
     return digest.hexdigest()

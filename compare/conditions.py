@@ -264,10 +264,16 @@ def _exposed_anew(case: Case, condition: Condition) -> list[TrainingFrame]:
             + of_setting[frame.exposure_time_s]
             + condition.exposure_drift * along[number]
         )
-        light, coverage = view(frame)
+        light, coverage, finer = view(frame)
         scene = behind(frame, condition.earth, star_gain)
-        light = light.astype(float) + (1 - coverage[..., None]) * scene.radiance
-        light, rates = _blurred(light, frame, exposure_s, condition.blur_px)
+        beside = (1 - coverage[..., None]) * scene.radiance
+        if condition.blur_px:
+            light, beside = (
+                _blurred(of.astype(float), frame, condition.blur_px)
+                for of in (light if finer is None else finer, beside)
+            )
+        light = light.astype(float) + beside
+        rates = _rates(frame, exposure_s, condition.blur_px)
         added_dn = _added_dn(frame, case.sensor, condition)
         dn = read_out(light, exposure_s * longer, case.sensor, condition, _random(NOISE, frame), added_dn)
         dn = torch.from_numpy(dn.astype(np.float32))
@@ -277,19 +283,33 @@ def _exposed_anew(case: Case, condition: Condition) -> list[TrainingFrame]:
     return frames
 
 
-def _blurred(
-    light: np.ndarray, frame: TrainingFrame, exposure_s: float, blur_px: float
-) -> tuple[np.ndarray, torch.Tensor | None]:
-    """Return light [H, W, C] as a camera sees it that turns evenly, and the target's rates as in `TrainingFrame`."""
-    if not blur_px:
-        return light, None
+def _moved_px(frame: TrainingFrame, blur_px: float) -> tuple[float, float]:
+    """Return by how much a picture moves along x and y while the shutter is open, px, in a direction at random."""
     angle = _random(MOTION, frame).uniform(0, 2 * math.pi)
-    x, y = blur_px * math.cos(angle), blur_px * math.sin(angle)
+    return blur_px * math.cos(angle), blur_px * math.sin(angle)
+
+
+def _rates(frame: TrainingFrame, exposure_s: float, blur_px: float) -> torch.Tensor | None:
+    """Return the target's rates as in `TrainingFrame`; None where it stands still."""
+    if not blur_px:
+        return None
+    x, y = _moved_px(frame, blur_px)
+    return torch.tensor([-y / frame.K[1, 1], x / frame.K[0, 0], 0, 0, 0, 0]) / exposure_s
+
+
+def _blurred(light: np.ndarray, frame: TrainingFrame, blur_px: float) -> np.ndarray:
+    """Return light [nH, nW, C] as a camera sees it [H, W, C] that turns evenly.
+
+    Between pixels it is interpolated, which is exact to 50 dB of the peak where n is 1, as a sharp edge in between is
+    not known.
+    """
+    height, width, channels = frame.shape
+    n = light.shape[0] // height
+    x, y = (n * way for way in _moved_px(frame, blur_px))
     copies = math.ceil(blur_px / BLUR_STEP_PX)
     shares = (np.arange(copies) + 0.5) / copies - 0.5
-    moved = [ndimage.shift(light, (share * y, share * x, 0), order=3) for share in shares]
-    turn = torch.tensor([-y / frame.K[1, 1], x / frame.K[0, 0], 0, 0, 0, 0]) / exposure_s
-    return np.mean(moved, axis=0).clip(min=0), turn
+    moved = np.mean([ndimage.shift(light, (share * y, share * x, 0), order=3) for share in shares], axis=0)
+    return moved.reshape(height, n, width, n, channels).mean(axis=(1, 3)).clip(min=0)
 
 
 def _star_gain(sensor: Sensor, condition: Condition, longest_s: float) -> float:

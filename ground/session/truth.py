@@ -40,6 +40,7 @@ class TrueFrame:
     alpha: np.ndarray  # [H, W] uint8, coverage by the target times 255
     depth: np.ndarray | None = None  # [H, W] planar, m, inf where nothing is seen
     normals: np.ndarray | None = None  # [H, W, 3] unit vectors, body axes; given together with the depth
+    finer: np.ndarray | None = None  # [nH, nW, C] the radiance, of pixels n times as small
 
 
 def write_truth(
@@ -93,6 +94,8 @@ def _write_frame(folder: Path, frame: TrueFrame) -> dict[str, Any]:
             "depth": frame.depth.astype(np.float32),
             "normals": frame.normals.astype(np.float16),
         }
+    if frame.finer is not None:
+        content["finer"] = {"radiance": frame.finer.astype(np.float16)}
     entry = {"id": frame.id, "world_to_camera": frame.world_to_camera.tolist()}
     for kind, arrays in content.items():
         entry[kind] = f"{kind}/{frame.id:06d}.npz"
@@ -125,6 +128,7 @@ class Truth:
                     f"{SCHEMA_VERSION}: install a newer one"
                 )
             self._radiance = {entry["id"]: Path(entry["radiance"]) for entry in facts["frames"]}
+            self._finer = {entry["id"]: entry["finer"] for entry in facts["frames"] if "finer" in entry}
             self._poses = {
                 entry["id"]: np.array(entry["world_to_camera"], dtype=float).reshape(4, 4)
                 for entry in facts["frames"]
@@ -181,10 +185,23 @@ class Truth:
             SessionError: the truth has no such frame, or its file is missing or damaged.
         """
         self._require(record)
-        path = self.folder / self._radiance[record.id]
+        arrays = self._arrays(self._radiance[record.id], "radiance", "alpha")
+        return arrays[0].astype(np.float32), arrays[1].astype(np.float32) / 255
+
+    def finer(self, record: FrameRecord) -> np.ndarray | None:
+        """Return a frame's radiance [nH, nW, C], float32, of pixels n times as small; None where it is not known.
+
+        Raises:
+            SessionError: its file is missing or damaged.
+        """
+        file = self._finer.get(record.id)
+        return None if file is None else self._arrays(Path(file), "radiance")[0].astype(np.float32)
+
+    def _arrays(self, file: Path, *names: str) -> list[np.ndarray]:
+        path = self.folder / file
         try:
-            with open(path, "rb") as file, np.load(file) as arrays:
-                return arrays["radiance"].astype(np.float32), arrays["alpha"].astype(np.float32) / 255
+            with open(path, "rb") as opened, np.load(opened) as arrays:
+                return [arrays[name] for name in names]
         # errors of its zip archive, of zlib, or of NumPy's header: whichever the damage meets
         except Exception as error:
             raise SessionError(f"{path} is damaged: {error}; {GO_ON}") from error

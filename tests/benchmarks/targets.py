@@ -53,6 +53,7 @@ class View:
     frame: TrainingFrame
     radiance: Tensor  # [H, W, 3]
     alpha: Tensor  # [H, W] in 0..1
+    finer: Tensor | None = None  # [400, 400, 3] the radiance before averaging, where that was done
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,9 @@ def expose(
     lit = radiance.mean(-1)[alpha >= 230 / 255]
     # full scale per radiance and second
     gain = MID_SIGNAL / (float(np.percentile(lit.numpy(), 97)) * BRACKET_S[1])
+    finer: list[Tensor | None] = [None] * len(radiance)
     if size != radiance.shape[1]:
+        finer = list(radiance)
         factor = radiance.shape[1] // size
         radiance = F.avg_pool2d(radiance.movedim(-1, 1), factor).movedim(1, -1)
         alpha = F.avg_pool2d(alpha[:, None], factor)[:, 0]
@@ -110,7 +113,7 @@ def expose(
         frame = TrainingFrame(
             torch.from_numpy(dn.astype(np.float32)), exposure_s, poses[i], K, i, sun_dir=suns[i]
         )
-        views.append(View(frame, radiance[i], alpha[i]))
+        views.append(View(frame, radiance[i], alpha[i], finer[i]))
     return Target(name, sensor, views, cloud)
 
 
@@ -252,7 +255,8 @@ def _true_frames(target: Target) -> Iterator[TrueFrame]:
     for view in target.views:
         alpha = (255 * view.alpha).round().numpy().astype(np.uint8)
         pose = view.frame.world_to_camera.double().numpy()
-        yield TrueFrame(view.frame.id, pose, view.radiance.numpy(), alpha)
+        finer = None if view.finer is None else view.finer.numpy()
+        yield TrueFrame(view.frame.id, pose, view.radiance.numpy(), alpha, finer=finer)
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from compare.case import Case, content_digest, load_case
-from compare.conditions import AS_TAKEN, Condition, given, load_conditions, read_out
+from compare.conditions import AS_TAKEN, Condition, _blurred, _moved_px, given, load_conditions, read_out
 from compare.errors import CompareError
 from compare.grid.cells import Budget, cells_of, parse_budgets, session_facts
 from compare.grid.rows import Rows, locked
@@ -220,6 +220,26 @@ def test_blurred_frames_are_what_a_moving_target_looks_like_at_the_told_rate(cas
     turns = torch.stack([frame.rates[:3] * frame.exposure_time_s for frame in frames])
     focal_px = torch.stack([frame.K[0, 0] for frame in frames])
     torch.testing.assert_close(turns.norm(dim=1) * focal_px, torch.full((len(frames),), 4.0))
+
+
+@pytest.mark.parametrize(("n", "most"), [(4, 0.015), (1, 0.06)])
+def test_finer_light_tells_how_a_sharp_edge_moves(case, n, most):
+    """Interpolated between pixels, an edge is wrong by some hundredths of its height."""
+    frame, size = case.training[0], case.training[0].shape[0]
+    x, y = _moved_px(frame, 2.0)
+
+    def edge(pixels: int, moved: float) -> np.ndarray:
+        """Return a bright half of the picture, seen in so many pixels, each the mean over 8x8 points."""
+        at = (np.arange(8 * pixels) + 0.5) / (8 * pixels) * size - size / 2
+        bright = (at[None] - moved * x) * 0.8 + (at[:, None] - moved * y) * 0.6 > 0.37
+        return (
+            bright.reshape(pixels, 8, pixels, 8).mean(axis=(1, 3))[..., None].repeat(frame.shape[2], axis=2)
+        )
+
+    exact = np.mean([edge(size, moved) for moved in (np.arange(16) + 0.5) / 16 - 0.5], axis=0)
+    inside = slice(4, -4)
+    error = np.abs(_blurred(edge(n * size, 0.0), frame, 2.0) - exact)[inside, inside].max()
+    assert error < most and (n > 1 or error > 0.015)
 
 
 def test_hot_pixels_are_the_same_in_all_frames(case):

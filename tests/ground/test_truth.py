@@ -62,6 +62,16 @@ def test_what_is_written_is_read_again_and_replaces_what_was_there(session):
     np.testing.assert_array_equal(mesh.faces, CUBE.faces)
 
 
+def test_finer_light_is_kept_where_it_is_given(session):
+    finer = np.random.default_rng(2).random((12, 16, 1)).astype(np.float16)
+    frames = [dataclasses.replace(true_frame(0), finer=finer), true_frame(1)]
+    write_truth(session.path, frames, CUBE.vertices, CUBE.faces, np.zeros((0, 3)))
+    records = {record.id: record for record in session.frames}
+    truth = Truth(session)
+    np.testing.assert_array_equal(truth.finer(records[0]), finer)
+    assert truth.finer(records[1]) is None
+
+
 def test_depth_and_normals_are_kept_where_they_are_given(session):
     frame = true_frame(0, with_geometry=True)
     write_truth(session.path, [frame, true_frame(1)], CUBE.vertices, CUBE.faces, np.zeros((0, 3)))
