@@ -48,7 +48,8 @@ def training_metrics(
         "sun_span_deg": round(result.sun_span_deg, 2),
         "shown_under_sun_dir_body": None if sun_dir is None else [round(x, 6) for x in sun_dir.tolist()],
         "train_seconds": round(result.seconds, 3),
-        "train_steps": len(result.history),
+        "train_steps": len(result.history),  # with those that were done again once poses were refined
+        "schedule_steps": result.history[-1].steps if result.history else 0,
         "stop_reason": result.stop_reason,
         "start": result.start,
         "removed_outliers": result.removed_outliers,

@@ -203,8 +203,8 @@ def _run_entry(folder: Path) -> RunEntry:
 
 
 def _quality(metrics: dict[str, Any]) -> str | None:
-    """Return the quality that a run's steps are those of, such as `draft`; other numbers of steps as they are."""
-    steps = metrics.get("train_steps")
+    """Return the quality whose steps a run's schedule has, such as `draft`; other numbers of steps as they are."""
+    steps = metrics.get("schedule_steps", metrics.get("train_steps"))  # older runs do not tell their schedule
     if steps is None:
         return None
     try:

@@ -126,7 +126,8 @@ def test_a_run_shows_its_quality_what_was_decided_of_poses_and_their_errors_but_
     shutil.copytree(runs / "first", runs / "second")
     steps = round(0.3 * preset("obbgs").steps)
     errors = {"pose_error_px": 0.31, "pose_error_deg": 0.02, "poses": "refined (held-out loss fell by 3 %)"}
-    metrics = json.loads((runs / "first" / "metrics.json").read_text()) | errors | {"train_steps": steps}
+    metrics = json.loads((runs / "first" / "metrics.json").read_text()) | errors
+    metrics |= {"schedule_steps": steps, "train_steps": round(1.24 * steps)}  # poses were refined on the way
     (runs / "second" / "metrics.json").write_text(json.dumps(metrics))
     config = (runs / "second" / "config.yaml").read_text()
     digest = next(line for line in config.splitlines() if "frames_jsonl_sha256" in line)
