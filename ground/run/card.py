@@ -27,6 +27,13 @@ def scored_frames(metrics: dict) -> str:
     return "held-out frames"
 
 
+def frames_received(metrics: dict) -> str:
+    """Return how many frames came down of those that were taken, or how many pictures were imported."""
+    if (imported := metrics.get("frames_imported")) is not None:
+        return f"{imported:,} pictures imported"
+    return f"{metrics['frames_received']:,} received / {frames_captured(metrics)} captured"
+
+
 def frames_captured(metrics: dict) -> str:
     """Return how many frames the spacecraft reported to have taken; "unknown" without its telemetry."""
     captured = metrics.get("frames_captured")
@@ -83,10 +90,17 @@ def _training(metrics: dict) -> list[str]:
     lines = [
         f"- Start: {metrics['start']}. Training ended after {metrics['train_seconds']:.0f} s: "
         f"{metrics['stop_reason']}.",
-        f"- Exposure times of the training frames: {exposures_ms[0]:g} to {exposures_ms[-1]:g} ms. Between them images "
-        "are as good as stated below; outside them the model extrapolates linearly.",
-        f"- Frames received / captured: {metrics['frames_received']:,} / {frames_captured(metrics)}.",
     ]
+    if not metrics.get("nominal_exposures"):
+        lines.append(
+            f"- Exposure times of the training frames: {exposures_ms[0]:g} to {exposures_ms[-1]:g} ms. Between them "
+            "images are as good as stated below; outside them the model extrapolates linearly."
+        )
+    if (imported := metrics.get("frames_imported")) is not None:
+        lines.append(f"- Pictures imported: {imported:,}.")
+    else:
+        counts = f"{metrics['frames_received']:,} / {frames_captured(metrics)}"
+        lines.append(f"- Frames received / captured: {counts}.")
     for key, name in (
         ("budget", "Budget"),
         ("growth", "Growth"),
@@ -108,10 +122,10 @@ def _appearance(metrics: dict) -> list[str]:
     """Return what the radiance depends on; nothing for runs that did not record it."""
     if "appearance" not in metrics:
         return []
-    lines = [
-        f"- Radiance: {metrics['appearance']}. The Sun's direction spans {metrics['sun_span_deg']:.1f} degrees in the "
-        "target's frame."
-    ]
+    radiance = f"- Radiance: {metrics['appearance']}."
+    if metrics.get("shown_under_sun_dir_body", ()) is not None:  # null: no frame tells the Sun
+        radiance += f" The Sun's direction spans {metrics['sun_span_deg']:.1f} degrees in the target's frame."
+    lines = [radiance]
     shading = metrics.get("shading", metrics.get("sh_direction"))  # its name in older runs
     if shading != "view":
         x, y, z = metrics["shown_under_sun_dir_body"]

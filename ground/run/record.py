@@ -23,6 +23,14 @@ LOG_EVERY = 10  # steps
 PACKAGES = ("obbgs", "torch", "numpy", "onnxruntime", "plotly")
 
 
+def budget_told(result: TrainResult) -> str:
+    """Return what limited the number of Gaussians, also where growth went on beyond the budget that it began with."""
+    most = f"{result.config.growth.max_gaussians:,}"
+    if result.budget.startswith(f"at most {most} Gaussians"):
+        return result.budget
+    return f"{result.budget}; raised to {most}, as many as a picture can show, when growth went on"
+
+
 def training_metrics(
     result: TrainResult,
     blind: TrainResult | None,
@@ -37,7 +45,7 @@ def training_metrics(
         "method": result.config.name,
         "gaussians": len(result.gaussians),
         "max_gaussians": result.config.growth.max_gaussians,
-        "budget": result.budget,
+        "budget": budget_told(result),
         "sh_degree": math.isqrt(result.gaussians.sh.shape[1]) - 1,
         "shading": result.gaussians.shading,
         "highlights": _highlights(result.gaussians),
@@ -66,6 +74,8 @@ def training_metrics(
         "misfit_unseen_factor": result.unseen_factor,  # null: it is that of the training frames
         "frames_received": len(session.frames),
         "frames_captured": session.frames_captured,  # null: flight did not say
+        "frames_imported": session.frames_imported,  # null: they came over a link
+        "nominal_exposures": session.nominal_exposures,
         "frames_trained": len(training),
         "frames_held_out": len(held_out),
         "exposures_s": exposure_times_s(training),

@@ -3,7 +3,7 @@
 from rich.table import Table
 from rich.text import Text
 
-from ground.run.card import chi2_explained, frames_captured, scored_frames, size_explained
+from ground.run.card import chi2_explained, frames_received, scored_frames, size_explained
 
 PSNR_LABELS = {
     "psnr_clean_db": "against noiseless exposures",
@@ -69,7 +69,7 @@ def frames_row(metrics: dict) -> tuple[str, str]:
     """Return as a row how many frames came down and what they were used for."""
     counts = ("trained on", metrics["frames_trained"]), ("held out", metrics["frames_held_out"])
     used = ", ".join(f"{count:,} {what}" for what, count in counts)
-    return "frames", f"{metrics['frames_received']:,} received / {frames_captured(metrics)} captured, {used}"
+    return "frames", f"{frames_received(metrics)}, {used}"
 
 
 def runs_table(runs: dict[str, dict | str]) -> Table:

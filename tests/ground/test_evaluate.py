@@ -3,7 +3,9 @@
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import imagecodecs
 import numpy as np
@@ -19,12 +21,15 @@ from ground.run.card import chi2_explained, model_card
 from ground.run.evaluate import evaluate
 from ground.run.mesh_files import read_mesh_points
 from ground.run.reconstruct import reconstruct
+from ground.run.record import budget_told
 from ground.run.scores import ScoredView, clean_scores
 from ground.session.folder import SessionError
 from ground.session.truth import read_points
 from ground.show.report.document import write_report
+from ground.show.summary import frames_row
 from obbgs_core.frames import cameras_of
 from obbgs_core.io.ply import load_ply
+from obbgs_core.methods.presets import preset
 from obbgs_core.score.metrics import foreground_psnr_db, psnr_db
 from obbgs_core.train.result import Exposing
 from tests.commands import call
@@ -128,6 +133,23 @@ def test_the_card_tells_the_models_own_error_where_it_was_learnt(session, misfit
     assert (
         "21 % of the light under Suns that it has not seen, 10 % under those of its frames" in card
     ) == told
+
+
+def test_neither_card_nor_summary_tells_of_imported_pictures_what_only_a_pass_has(session):
+    metrics = json.loads((session / "runs" / "run" / "metrics.json").read_text())
+    metrics |= {"frames_imported": 47, "nominal_exposures": True, "shown_under_sun_dir_body": None}
+    card = model_card("2026-07-21T00:00:00+00:00", metrics)
+    assert "- Pictures imported: 47." in card
+    assert not any(words in card for words in ("captured", "Exposure times", "Sun's direction"))
+    assert frames_row(metrics)[1].startswith("47 pictures imported, ")
+
+
+def test_the_budget_says_that_it_was_raised_when_growth_went_on_beyond_it():
+    grown = replace(preset("obbgs").growth, max_gaussians=325_041)
+    result = SimpleNamespace(budget="at most 10,000 Gaussians", config=SimpleNamespace(growth=grown))
+    assert "at most 10,000 Gaussians; raised to 325,041, as many as a picture can show" in budget_told(result)
+    result.config.growth = replace(grown, max_gaussians=10_000)
+    assert budget_told(result) == result.budget
 
 
 @pytest.mark.parametrize(
