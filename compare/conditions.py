@@ -308,8 +308,17 @@ def _blurred(light: np.ndarray, frame: TrainingFrame, blur_px: float) -> np.ndar
     x, y = (n * way for way in _moved_px(frame, blur_px))
     copies = math.ceil(blur_px / BLUR_STEP_PX)
     shares = (np.arange(copies) + 0.5) / copies - 0.5
-    moved = np.mean([ndimage.shift(light, (share * y, share * x, 0), order=3) for share in shares], axis=0)
+    moved = np.stack(
+        [_mean_of_shifts(light[..., k], shares * y, shares * x) for k in range(channels)], axis=2
+    )
     return moved.reshape(height, n, width, n, channels).mean(axis=(1, 3)).clip(min=0)
+
+
+def _mean_of_shifts(light: np.ndarray, down_px: np.ndarray, right_px: np.ndarray) -> np.ndarray:
+    """Return the mean of copies of light [H, W] that are shifted so, by cubic splines that are found once."""
+    splines = ndimage.spline_filter(light, order=3, mode="mirror")
+    moves = zip(down_px, right_px, strict=True)
+    return np.mean([ndimage.shift(splines, move, order=3, prefilter=False) for move in moves], axis=0)
 
 
 def _star_gain(sensor: Sensor, condition: Condition, longest_s: float) -> float:
