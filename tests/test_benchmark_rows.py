@@ -84,3 +84,36 @@ def test_no_row_stands_twice():
     for file in rows.FOLDER.glob("*.jsonl"):
         lines = file.read_text().splitlines()
         assert len(set(lines)) == len(lines), f"{file.name} has a row twice"
+
+
+def test_the_page_says_where_each_method_breaks_and_why(tmp_path):
+    def row(method: str, condition: str, psnr_db: float, **more) -> dict:
+        figures = {"psnr_clean_db": psnr_db, "f_02_surface": 90.0} | more
+        name = {
+            "method": method,
+            "condition": condition,
+            "target": "T",
+            "seed": 0,
+            "size": 64,
+            "steps_share": 1.0,
+        }
+        return name | {"digest": f"{method} {condition}"} | figures
+
+    conditions = {"as taken": {}, "noise x4": {"noise": 4}, "noise x8": {"noise": 8}}
+    made = []
+    for (condition, changes), ours, theirs in zip(
+        conditions.items(), (40, 35, 30), (38, 33, 22), strict=True
+    ):
+        changed = {"changes": changes} if changes else {}
+        made += [
+            row("black", condition, 24, **changed),
+            row("obbgs", condition, ours, **changed),
+            row("3dgs", condition, theirs, **changed),
+        ]
+    made[7]["f_02_surface"] = 51.0  # enough
+    (tmp_path / "stability.jsonl").write_text("".join(json.dumps(r) + "\n" for r in made))
+    page = rows.page([tmp_path / "stability.jsonl"])
+    assert "| holds at 8 | **8** (T: 22.00 dB, and 24.00 dB without any model) |" in page
+    made[7]["f_02_surface"] = 49.0
+    (tmp_path / "stability.jsonl").write_text("".join(json.dumps(r) + "\n" for r in made))
+    assert "| **8** (T: F within .02 is 49.0 %) |" in rows.page([tmp_path / "stability.jsonl"])

@@ -69,6 +69,7 @@ FILES = {
     "drafts": "drafts-400x400",
     "foil": "foil-400x400",
     "sector": "sector-200x200",
+    "breaks": "stability-100x100",
     "sky": "sky-100x100",
     "bars": "sky-bars-100x100",
     "camera": "camera-100x100",

@@ -129,7 +129,7 @@ def page(files: Iterable[Path]) -> str:
         loads = [row["load"] for row in rows if "load" in row]
         if loads:
             parts.append(f"- Load while they ran: {min(loads):g} to {max(loads):g}")
-        parts += ["", *_table(rows), "", *_below(rows)]
+        parts += ["", *_table(rows), "", *_breaking(rows), *_below(rows)]
     return "\n".join(parts)
 
 
@@ -149,6 +149,40 @@ def _table(rows: list[dict]) -> list[str]:
         ]
         lines.append("| " + " | ".join(cells) + " |")
     return lines
+
+
+def _breaking(rows: list[dict]) -> list[str]:
+    """Return the table of where methods break, of rows of `ground compare` under conditions of different severity."""
+    from compare.charts.results import Results
+    from compare.charts.severity import LEAST_F_PERCENT, breaking, series_of
+
+    if not all("digest" in row for row in rows):  # another benchmark's
+        return []
+    results = Results(rows)
+    if len(results.trained) < 2:
+        return []
+    lines = []
+    for series in series_of(results):
+        cells = []
+        for method in results.trained:
+            point, words = breaking(results, method, series), []
+            if point is not None:
+                broken = zip(point.broken_at, point.why, strict=True)
+                words += [f"**{series.label(value)}** ({why})" for value, why in broken]
+                words += [f"holds at {series.label(value)}" for value in point.held]
+            cells.append(", ".join(words))
+        if any(cells):
+            lines.append(f"| {' | '.join([series.kind.title, *cells])} |")
+    if not lines:
+        return []
+    about = (
+        "Where methods break: the mildest condition, in bold, at which one ends in an error, is below the better one "
+        "of a black image and the mean image, or has an F of the surface within .02 of less than "
+        f"{LEAST_F_PERCENT:g} % on any target, with the first reason; else the most severe one that it was tried at."
+    )
+    titles = ["condition", *results.trained]
+    head = [f"| {' | '.join(titles)} |", f"| {' | '.join(['---'] * len(titles))} |"]
+    return [about, "", *head, *lines, ""]
 
 
 def ending_below(rows: list[dict]) -> list[tuple[dict, list[str]]]:
