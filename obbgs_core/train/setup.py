@@ -174,8 +174,7 @@ def prepare(
     sky, solid = _masks(outlines, config, span_deg, lit)
     # a window that begins at a multiple of the grid may end within a block of coefficients
     cuts = sensor.jpeg is not None and any(side % GRID_PX for side in lit[0].shape[:2])
-    cropped = published.windows and not cuts
-    parts = windows(posed, gaussians.means.detach(), certain) if cropped else None
+    parts = windows(posed, gaussians.means.detach(), certain) if published.windows and not cuts else None
     setup = TrainingSetup(
         frames=lit,
         sensor=sensor,

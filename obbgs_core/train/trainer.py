@@ -235,11 +235,10 @@ class Trainer:
 
     def _learn_response(self) -> None:
         """Take another exponent of the camera's response when that is due and the frames tell it."""
-        state, setup, config = self.state, self.setup, self.setup.config
-        due = {round(config.steps_until(share)): share for share in state.response.decided_at}
-        if state.steps_done not in due or state.fit.misfit is None or setup.sun_moves:
-            return
-        if state.response.decide(state.model, self._batches, setup.sensor, due[state.steps_done]):
+        state, setup, done = self.state, self.setup, self.state.steps_done
+        due = {round(setup.config.steps_until(share)): share for share in state.response.decided_at}
+        can_tell = done in due and state.fit.misfit is not None and not setup.sun_moves
+        if can_tell and state.response.decide(state.model, self._batches, setup.sensor, due[done]):
             self._use_found()
 
     def _prolong_growth(self) -> None:
