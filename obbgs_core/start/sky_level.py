@@ -21,10 +21,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from obbgs_core.compact import held, whole
+from obbgs_core.compact import Compact, held, whole
 from obbgs_core.compiled import each
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.jpeg import BLOCK_PX, FULL_SCALE
+from obbgs_core.process import give_back
 from obbgs_core.sensor import Sensor, clipped_mean, clipped_moments, dark_reading, noise_excess
 
 NOISE_FRAMES = 12  # about so many, spread evenly, by which the noise is measured
@@ -157,7 +158,7 @@ def _measured(frames: list[TrainingFrame], sensor: Sensor) -> tuple[Tensor, Tens
     """Return planes [F, C, 3] and their variances, infinite where a frame shows no sky, and a reading's deviation."""
     height, width, channels = frames[0].shape
     px = max(2, round(min(height, width) / BLOCKS))
-    cut = list(each(lambda f: held(f.seen(partial(cut_pixels, sensor), 2 * CUT_PX)), frames))
+    cut = list(each(partial(_cut, sensor), frames))
     if any(bool(whole(mask).any()) for mask in cut):
         px = min(px, CUT_BLOCK_PX)
     if sensor.jpeg is not None:  # within its blocks readings are not independent
@@ -229,6 +230,14 @@ class _Fit:
     sky: Tensor
     count: Tensor
     sigma_dn: float
+
+
+def _cut(sensor: Sensor, frame: TrainingFrame) -> Tensor | Compact:
+    """Return where flight has cut the sky of a frame, [H, W] bool."""
+    cut = held(frame.seen(partial(cut_pixels, sensor), 2 * CUT_PX))
+    if isinstance(cut, Compact):  # what one large frame frees is in pieces that the next does not fit into
+        give_back()
+    return cut
 
 
 def _through_sky(
