@@ -35,9 +35,8 @@ class Batch:
     sky: Tensor | None = None
     solid: Tensor | None = None
     doubt: Tensor | None = None  # [B, H, W, C] deviation of the cameras' backdrop
-    stored: list[Tensor] | None = (
-        None  # `JpegCoding.coefficients` that dn came from, of each frame; None: not known
-    )
+    # `JpegCoding.coefficients` that dn came from, of each frame; None: not known
+    stored: list[Tensor] | None = None
 
 
 class Batches:

@@ -18,7 +18,7 @@ from compare.charts.charts import (
     speed_figures,
 )
 from compare.charts.results import HOLDS_DB, MARGIN_DB, METRICS, SHAKEN_DB, VERDICTS, Metric, Results
-from compare.charts.severity import LEAST_F_PERCENT, Breaking, F, Series, breaking, series_of
+from compare.charts.severity import LEAST_F_PERCENT, Breaking, F, Series, breaking_points
 from compare.grid.rows import Rows
 from compare.grid.worker import VIEWS
 from compare.methods import reference_names
@@ -226,11 +226,7 @@ def _failures(results: Results, out: Path) -> str:
 
 def _breaking(results: Results) -> str:
     """Return where each method breaks, kind of condition by kind, and the curves of its scores until there."""
-    found = [
-        (series, {label: point for label in results.trained if (point := breaking(results, label, series))})
-        for series in series_of(results)
-    ]
-    found = [(series, points) for series, points in found if points]
+    found = breaking_points(results)
     if not found:
         return ""
     of_surface = f", or F of the surface within .02 is below {LEAST_F_PERCENT:g} %" if results.truth else ""

@@ -99,6 +99,15 @@ def series_of(results: Results) -> list[Series]:
     return found
 
 
+def breaking_points(results: Results) -> list[tuple[Series, dict[str, Breaking]]]:
+    """Return where methods break, by label, under each kind of condition that any was tried under."""
+    found = [
+        (series, {label: point for label in results.trained if (point := breaking(results, label, series))})
+        for series in series_of(results)
+    ]
+    return [(series, points) for series, points in found if points]
+
+
 def breaking(results: Results, label: str, series: Series) -> Breaking | None:
     """Return where a method breaks on any target; None where it was not tried under conditions of this kind.
 

@@ -10,6 +10,7 @@ Source: Matheron, Principles of geostatistics, 1963, for variogram and nugget.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,6 +55,14 @@ def frame_errors(model: Gaussians, batches: Batches, sensor: Sensor, used: np.nd
     errors[scatter.frames] = scatter.shared + scatter.own()
     # what all share is the unit of light; few frames that are far off do not move it
     return errors - _clipped(errors[:, None]).mean()
+
+
+def jackknifed(
+    estimate: Callable[[np.ndarray], np.ndarray], parts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return an estimate of all, given which are taken, and its standard error by leaving out each part once."""
+    without = np.array([estimate(parts != part) for part in np.unique(parts)])
+    return estimate(parts >= 0), np.sqrt((len(without) - 1) * without.var(axis=0))
 
 
 def _directions(frames: list[TrainingFrame]) -> np.ndarray:
@@ -158,13 +167,13 @@ class _Scatter:
         apart = self.left[one] - self.left[other]
         angles, products = self.angles[one, other], apart[:, 0] * apart[:, 1] / 2
 
-        def line(kept: np.ndarray) -> tuple[float, float]:
-            x, y = angles[kept], products[kept]
-            slope = float(np.cov(x, y)[0, 1] / max(x.var(ddof=1), 1e-9))
-            slope = max(0.0, slope)  # frames that are further apart are not more alike
-            return float(y.mean() - slope * x.mean()), slope
+        def line(kept: np.ndarray) -> np.ndarray:
+            both = kept[one] & kept[other]
+            x, y = angles[both], products[both]
+            # frames that are further apart are not more alike
+            slope = max(0.0, float(np.cov(x, y)[0, 1] / max(x.var(ddof=1), 1e-9)))
+            return np.array([y.mean() - slope * x.mean(), slope])
 
-        self.nugget, self.slope = line(np.full(len(one), True))
-        parts = np.arange(len(self.frames)) * PARTS // len(self.frames)
-        without = [line((parts[one] != p) & (parts[other] != p))[0] for p in range(PARTS)]
-        self.error = float(np.sqrt((PARTS - 1) * np.var(without)))
+        (self.nugget, self.slope), (self.error, _) = jackknifed(
+            line, np.arange(len(self.frames)) * PARTS // len(self.frames)
+        )

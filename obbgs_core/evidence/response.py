@@ -17,7 +17,7 @@ Source: Mitsunaga and Nayar, Radiometric self calibration, 1999, who fit a polyn
 import itertools
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ import torch
 
 from obbgs_core.batches import Batch, Batches
 from obbgs_core.compiled import each
-from obbgs_core.evidence.exposures import frame_errors
+from obbgs_core.evidence.exposures import frame_errors, jackknifed
 from obbgs_core.frames import TrainingFrame, bracket_numbers
 from obbgs_core.misfit import sampled
 from obbgs_core.model.gaussians import Gaussians
@@ -35,9 +35,8 @@ from obbgs_core.sensor import Sensor
 
 log = logging.getLogger(__name__)
 DECIDED_AT = (0.3, 0.5, 0.7)  # shares of the steps
-FRAMES_FROM = (
-    0.5  # errors of single frames are told from then on: before, the model itself errs from frame to frame
-)
+# errors of single frames are told from then on: before, the model itself errs from frame to frame
+FRAMES_FROM = 0.5
 FOLLOWED_AT = (0.6, 0.8, 0.9)  # and where they are used
 LEAST_STEP = 0.1  # of the logarithms of exposure times that are compared
 FEWEST_READINGS = 30
@@ -49,9 +48,8 @@ FEWEST_PARTS = 7  # that tell something
 MOST_CHOSEN = 0.5
 # what is by so much other than stated is used, and by so many of its errors
 LEAST, CERTAIN = 0.02, 3.0
-LEAST_DRIFT = (
-    0.05  # a model itself errs along a pass by up to half of it (the demo: 0.027 with an error of 0.008)
-)
+# a model itself errs along a pass by up to half of it (the demo: 0.027 with an error of 0.008)
+LEAST_DRIFT = 0.05
 LIT_SIGMA, BELOW_FULL_SCALE = 4.0, 0.9  # readings that count: between so much noise and so much of full scale
 MOST_WRONG = 0.5  # of ln(true / stated exposure time)
 RANGE = (0.3, 3.0)  # of exponents: others are none of a camera's
@@ -65,9 +63,8 @@ class Response:
     error: float = math.nan  # its standard error; nan: not measured
     settings: dict[float, float] | None = None  # ln(true / stated) of stated exposure times; None: as stated
     drift: float = 0.0  # of ln(true / stated) from the first frame to the last
-    frames: dict[int, float] | None = (
-        None  # ln(true / stated), by id; None: frames have no errors of their own
-    )
+    # ln(true / stated), by id; None: frames have no errors of their own
+    frames: dict[int, float] | None = None
 
     @property
     def is_as_stated(self) -> bool:
@@ -115,8 +112,8 @@ class Response:
             for s in contrasts.times_s
         }
         contrasts.values += contrasts.design @ np.array(list(stated.values()))
-        bend, error = map(float, _jackknifed(contrasts.slope, contrasts.parts))
-        uneven, errors = _jackknifed(contrasts.uneven, contrasts.parts)
+        bend, error = map(float, jackknifed(contrasts.slope, contrasts.parts))
+        uneven, errors = jackknifed(contrasts.uneven, contrasts.parts)
         of_settings = contrasts.settings(np.full(len(contrasts.parts), True))
         self.error = error
         is_uneven = (np.abs(uneven) > np.maximum(LEAST, CERTAIN * errors)).any()
@@ -144,7 +141,7 @@ class Response:
             level[times_s == s] -= level[times_s == s].mean()
         if len(set(parts.tolist())) < FEWEST_PARTS:
             return 0.0
-        slope, error = _jackknifed(lambda kept: np.polyfit(parts[kept], level[kept], 1)[0] * LEFT_OUT, parts)
+        slope, error = jackknifed(lambda kept: np.polyfit(parts[kept], level[kept], 1)[0] * LEFT_OUT, parts)
         now = self.drift + float(slope)
         return now if max(LEAST_DRIFT, CERTAIN * error) < abs(now) <= MOST_WRONG else 0.0
 
@@ -213,14 +210,6 @@ class _Contrasts:
         logs = np.log(self.times_s)
         values = self.settings(kept) - self.slope(kept) * logs
         return values - np.median(values)
-
-
-def _jackknifed(
-    estimate: Callable[[np.ndarray], np.ndarray], parts: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return an estimate of all, given which are taken, and its standard error by leaving out each part once."""
-    without = np.array([estimate(parts != part) for part in np.unique(parts)])
-    return estimate(parts >= 0), np.sqrt((len(without) - 1) * without.var(axis=0))
 
 
 class _Pair(NamedTuple):

@@ -160,9 +160,8 @@ def radius_m(silhouettes: list[Silhouette]) -> float:
     """Return the target's radius, m: how far from the origin, across the line of sight, light is; 0 if all is dark."""
     ahead = [s for s in silhouettes if s.world_to_camera[2, 3] > 0]
     count = sum(int(s.certain.sum()) for s in ahead)
-    outside = (
-        count - max(1, int(INSIDE * count)) + 1
-    )  # pixels that are no nearer: of each view no more are kept
+    # pixels that are no nearer: of each view no more are kept
+    outside = count - max(1, int(INSIDE * count)) + 1
     reaches = []
     for s in ahead:
         rows, columns = torch.nonzero(s.certain, as_tuple=True)

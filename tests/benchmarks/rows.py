@@ -154,18 +154,19 @@ def _table(rows: list[dict]) -> list[str]:
 def _breaking(rows: list[dict]) -> list[str]:
     """Return the table of where methods break, of rows of `ground compare` under conditions of different severity."""
     from compare.charts.results import Results
-    from compare.charts.severity import LEAST_F_PERCENT, breaking, series_of
+    from compare.charts.severity import LEAST_F_PERCENT, breaking_points
 
     if not all("digest" in row for row in rows):  # another benchmark's
         return []
     results = Results(rows)
-    if len(results.trained) < 2:
+    found = breaking_points(results)
+    if len(results.trained) < 2 or not found:
         return []
     lines = []
-    for series in series_of(results):
+    for series, points in found:
         cells = []
         for method in results.trained:
-            point, words = breaking(results, method, series), []
+            point, words = points.get(method), []
             if point is not None:
                 broken = zip(point.broken_at, point.why, strict=True)
                 words += [f"**{series.label(value)}** ({why})" for value, why in broken]
