@@ -24,8 +24,8 @@ BASE_MB = 600.0  # a process with PyTorch before any work
 # of a Gaussian's 59 numbers: parameters, gradient and two moments, and what growth and checkpoints copy of them
 GAUSSIAN_MB = 4e-6 * 59 * 8
 VALUE_BYTES = 6  # of a frame whose picture is held as it is: readings, averaged images, silhouettes
-COMPACT_SHARE = 2.3  # of what a large frame is held in: what the start takes beside it as well
-WORKING_BYTES = 55  # of a pixel of the one frame that the start is looking at
+COMPACT_SHARE = 1.55  # of what a large frame is held in: what the start takes beside it as well
+WORKING_BYTES = 58  # of a pixel of the one frame that the start is looking at
 LOOKED_AT = 8  # frames of a session, spread evenly, of which one tells what it is held in
 USED_MEMORY = 0.9  # of what is available: the rest is for everybody else
 CONFIG = {

@@ -39,7 +39,7 @@ def test_frames_that_are_mostly_black_are_estimated_to_need_less():
     lit = RNG.integers(64, 4095, (1000, 1200)).astype(np.uint16)
     strip = np.where(abs(np.arange(1200) - 600) <= 60, lit, 64).astype(np.uint16)
     of_each_mb = [(estimated_mb(dn, 100) - estimated_mb(dn, 0)) / 100 for dn in (lit, strip)]
-    assert of_each_mb == pytest.approx([2.3 * 2.4, 2.3 * 0.24], rel=0.02)  # 16 bits a pixel, and the start
+    assert of_each_mb == pytest.approx([1.55 * 2.4, 1.55 * 0.24], rel=0.02)  # 16 bits a pixel, and the start
 
 
 def test_a_damaged_picture_is_not_asked_what_frames_need(tmp_path):
