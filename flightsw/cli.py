@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import logging
-import signal
 import threading
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
@@ -34,6 +33,7 @@ from obbgs_base.command_line import (
     run,
 )
 from obbgs_base.output import output_may_fail
+from obbgs_base.stopping import stop_on_signals
 
 log = logging.getLogger(__name__)
 app = new_app("The flight software: takes frames, stores them, sends them down and obeys commands.")
@@ -381,9 +381,7 @@ def _run(
     key_files: Sequence[Path] = (),
 ) -> None:
     """Capture and send, whichever are asked for, with a bar for each; print what became of every frame."""
-    stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    signal.signal(signal.SIGINT, lambda *_: stop.set())
+    stop = stop_on_signals()
     shots = len(list(plan(mission))) if camera_url is not None else None
     with _progress() as progress:
         sent_bar = progress.add_task("sent", total=None, visible=link_url is not None)

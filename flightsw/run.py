@@ -25,6 +25,7 @@ from flightsw.storage.boot_counter import count_boot
 from flightsw.storage.settings import load_settings
 from flightsw.storage.store import FrameStore, open_store
 from flightsw.watchdog import Watchdog, notify
+from obbgs_base.stopping import join
 
 log = logging.getLogger(__name__)
 LINGER_S = 0.5  # after the last delivery
@@ -125,7 +126,7 @@ def run_pass(
         finally:
             if thread is not None:
                 thread.capturing.clear()
-                thread.join()
+                join(thread)
             notify("STOPPING=1")
         if thread is not None and thread.error is not None:
             raise thread.error

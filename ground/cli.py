@@ -4,8 +4,6 @@ import contextlib
 import dataclasses
 import importlib
 import json
-import signal
-import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -24,6 +22,7 @@ from ground.commands.uplink import uplink_command
 from ground.commands.view import view_command
 from obbgs_base.command_line import LINK_HELP, MISSION_HELP, AsJson, new_app, run
 from obbgs_base.output import output_may_fail
+from obbgs_base.stopping import stop_on_signals
 
 app = new_app("The ground station: frames in, a 3D model out.")
 stderr = Console(stderr=True)
@@ -63,9 +62,7 @@ def listen_command(
     from ground.link.forward import Forwarder
     from ground.link.ingest import listen
 
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_on_signals()
     with (
         Forwarder(forward) if forward is not None else contextlib.nullcontext() as forwarder,
         statuses_shown(stderr, json_, link, session) as (on_status, on_event),

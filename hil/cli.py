@@ -21,6 +21,7 @@ from hil.sky import SHIPPED, SHIPPED_FOIL, Materials
 from obbgs_base.command_line import MISSION_HELP, OUT_HELP, SET_HELP, AsJson, new_app, run
 from obbgs_base.locks import one_command_in
 from obbgs_base.output import output_may_fail
+from obbgs_base.stopping import stop_on_signals
 
 app = new_app("The simulated world: sky, target, camera and link, so that a pass runs on a desk.")
 MissionFile = Annotated[Path, typer.Option("--mission", help=f"{MISSION_HELP}.")]
@@ -163,7 +164,7 @@ def camera(
         unwind_on_sigterm()  # while rendering; then a signal ends the service
         where = None if gige else listen
         console = Console(stderr=True)
-        serve_camera(world, mesh, cache, where, real_time, prerender, _stop_event, console, json_)
+        serve_camera(world, mesh, cache, where, real_time, prerender, stop_on_signals, console, json_)
 
 
 @app.command()
@@ -210,7 +211,7 @@ def link(
         print(json.dumps(urls) if json_ else "\n".join(map(" ".join, urls.items())), flush=True)
         threading.Thread(target=read_commands, daemon=True).start()
 
-    stop = _stop_event()
+    stop = stop_on_signals()
     counts = run_link(line, ready, stop.is_set)
     print(json.dumps({direction: vars(lane) for direction, lane in counts.items()}))
 
@@ -371,14 +372,6 @@ def _lines(facts: dict[str, Any]) -> Iterator[str]:
 def _number(value: float) -> str:
     """Return a number to six figures and at most three decimals."""
     return f"{round(value, 3) + 0.0:.6g}"
-
-
-def _stop_event() -> threading.Event:
-    """Return an event that SIGTERM and SIGINT set."""
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
-    return stop
 
 
 def main() -> None:

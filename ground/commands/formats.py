@@ -4,7 +4,6 @@ import json
 import math
 import shutil
 import signal
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,6 +25,7 @@ from ground.commands.options import (
     ValuesGiven,
 )
 from obbgs_base.command_line import FRAMES_HELP, OUT_HELP, AsJson
+from obbgs_base.stopping import StopRequest
 
 if TYPE_CHECKING:
     from ground.formats.photographs.poses import Registered
@@ -223,7 +223,7 @@ def _photographs(
     from ground.formats.pictures.views import check_is_new
 
     check_is_new(session)
-    stop = threading.Event()
+    stop = StopRequest()
     before = {
         number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)
     }

@@ -3,8 +3,6 @@
 import dataclasses
 import json
 import os
-import signal
-import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +24,7 @@ from ground.show.summary import frames_row, model_rows, table
 from obbgs_base.command_line import KEY_HELP, LINK_HELP, MISSION_HELP, AsJson
 from obbgs_base.imports import quick_imports
 from obbgs_base.output import output_may_fail
+from obbgs_base.stopping import stop_on_signals
 
 stderr = Console(stderr=True)
 
@@ -122,9 +121,7 @@ def _receive(
     from ground.commands.console import failures_told, statuses_shown
     from ground.link.ingest import Status, listen
 
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_on_signals()
     show = Lines(stderr)
     with LiveProcess(session, run, options, lambda text: say(stderr, text)) as training:
         with statuses_shown(stderr, as_json, link, session) as (on_status, on_event):

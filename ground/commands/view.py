@@ -1,8 +1,6 @@
 """The command of `ground` that shows models in the browser."""
 
 import json
-import signal
-import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +10,7 @@ from rich.console import Console
 from obbgs_base.command_line import AsJson
 from obbgs_base.imports import quick_imports
 from obbgs_base.output import output_may_fail
+from obbgs_base.stopping import stop_on_signals
 
 stderr = Console(stderr=True)
 
@@ -46,9 +45,7 @@ def view_command(
         from ground.show.viewer.source import Source
         from ground.show.viewer.viewer import view
 
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_on_signals()
     if not is_loopback(host):
         stderr.print(f"serving at {host}: everyone who reaches this port sees the model and the frames")
     sources = [Source(path) for path in runs]
