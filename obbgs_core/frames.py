@@ -194,6 +194,23 @@ def sampling_rates(means: Tensor, frames: list[TrainingFrame]) -> Tensor:
     return rate
 
 
+def alike(frames: list[TrainingFrame]) -> list[TrainingFrame]:
+    """Return the frames of a pass with the target's rotation as the last ones state it.
+
+    It is told by the attitudes of the frames that were there when a frame came.
+    """
+    last = frames[-1].navigation if frames else None
+    if last is None:
+        return frames
+    rotation = {"rate_rad_s": last.rate_rad_s, "inertia": last.inertia}
+    return [
+        dataclasses.replace(f, navigation=dataclasses.replace(f.navigation, **rotation))
+        if f.navigation is not None and f.navigation is not last
+        else f
+        for f in frames
+    ]
+
+
 def usable(
     frames: list[TrainingFrame], exposure_aware: bool, white_dn: float = math.inf
 ) -> tuple[list[TrainingFrame], float | None]:

@@ -39,11 +39,13 @@ import numpy as np
 from flightsw.icd.config import MAX_JSON_BYTES, ConfigError, build, keys_below, parse_json, require
 from flightsw.icd.frame import Attitude
 from flightsw.icd.mission import CameraSection
+from flightsw.icd.quaternion import quat_to_matrix
 from ground.session.telemetry import FlightCounts
 from obbgs_base.checked import Lines, copy_of, names_checksum, read_lines, read_lines_twice, read_twice
 from obbgs_base.errors import ObbgsError, reason
 from obbgs_base.files import read_bounded
 from obbgs_base.physics.navigation_errors import SharedParameters
+from obbgs_base.physics.rotation_fit import fitted_rotation
 
 log = logging.getLogger(__name__)
 
@@ -109,6 +111,8 @@ class FrameRecord:
         )
 
 
+# frames whose attitudes tell how the target turns, and how far they may be from a rotation without torque, rms
+ATTITUDES, FREE_WITHIN_RAD = 48, 2e-3
 ERRS_ALIKE_S = 5.0  # from one exposure to the next; further apart where tags state a longer correlation
 ARRAY_SHAPES = {
     "world_to_camera": (4, 4),
@@ -133,7 +137,7 @@ class Navigation:
     mean_motion_rad_s: of the target's orbit; 0: not known.
     quat_inertial_to_rtn: [4] to radial, transverse and normal axes at the epoch.
     rate_rad_s, inertia: [3] the target's angular velocity at the epoch and its moments of inertia (ratios matter), body
-        axes; a rate of 0: not known, then the frames' attitudes say how it turns.
+        axes; a rate of 0: not stated, then the frames' attitudes say how it turns (`Session.rotation`).
     sigmas: standard deviations of the parameters that all frames share.
     """
 
@@ -226,6 +230,22 @@ class Session:
             if before.bracket == after.bracket and before.bracket_index < after.bracket_index
         ]
         return float(np.median(apart_s)) / 1e9 if apart_s else 0.0
+
+    @functools.cached_property
+    def rotation(self) -> tuple[np.ndarray, np.ndarray]:
+        """The target's rate at the epoch [3], rad/s, and its moments of inertia [3] (ratios matter), body axes.
+
+        Where navigation states none, they are those of the free rotation that the attitudes of the first frames are
+        of: errors of the rate grow as they do in a body that no torque turns. A rate of 0: there is no such rotation.
+        """
+        stated = np.array(self.navigation.rate_rad_s), np.array(self.navigation.inertia)
+        known = {r.mid_exposure_utc_ns: r.quat_inertial_to_body for r in self.frames if r.pose_valid}
+        attitudes = [quat for quat in known.values() if quat is not None]
+        if stated[0].any() or self.navigation.attitude != "known" or len(attitudes) < len(known):
+            return stated
+        times_s = (np.array(list(known)[:ATTITUDES]) - self.navigation.epoch_utc_ns) / 1e9
+        to_body = np.array([quat_to_matrix(quat) for quat in attitudes[:ATTITUDES]])
+        return fitted_rotation(times_s, to_body, FREE_WITHIN_RAD) or stated
 
     def K(self, record: FrameRecord) -> np.ndarray:
         """Return the pinhole matrix [3, 3] of a frame, float32, px."""

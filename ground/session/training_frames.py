@@ -150,8 +150,7 @@ def navigation_of(session: Session) -> Navigation | None:
     if not stated.sigmas.vector().any():
         return None
     to_rtn = quat_to_matrix(np.array(stated.quat_inertial_to_rtn))
-    rotation = (np.array(stated.rate_rad_s), np.array(stated.inertia))
-    return Navigation(stated.sigmas, stated.mean_motion_rad_s, to_rtn, *rotation)
+    return Navigation(stated.sigmas, stated.mean_motion_rad_s, to_rtn, *session.rotation)
 
 
 def motion_covariance(tag_covariance: np.ndarray, body_to_camera: np.ndarray) -> np.ndarray:

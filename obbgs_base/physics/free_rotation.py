@@ -33,7 +33,7 @@ def turning_of(times_s: np.ndarray, inertial_to_body: np.ndarray) -> Turning:
     """
     order = np.argsort(times_s, kind="stable")
     times, to_body = times_s[order], inertial_to_body[order]
-    rates = _neighbour_rates(times, to_body)
+    rates = neighbour_rates(times, to_body)
     # from time 0 to the first frame, then half of each interval by either of its ends
     first = _integrals(rates[:1], -times[:1]) @ to_body[:1]
     half_s = np.diff(times) / 2
@@ -55,7 +55,7 @@ def _integrals(rates: np.ndarray, spans_s: np.ndarray) -> np.ndarray:
     return spans_s[:, None, None] * (np.eye(3) - versine * cross + third * cross @ cross)
 
 
-def _neighbour_rates(times_s: np.ndarray, to_body: np.ndarray) -> np.ndarray:
+def neighbour_rates(times_s: np.ndarray, to_body: np.ndarray) -> np.ndarray:
     """Return the rate [N, 3] rad/s, body axes, between each frame and its nearest neighbour, times in order."""
     spans_s = np.diff(times_s)
     turns = to_body[1:] @ to_body[:-1].swapaxes(-1, -2)

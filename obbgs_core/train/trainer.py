@@ -17,7 +17,7 @@ from obbgs_core.batches import Batch, Batches
 from obbgs_core.compiled import torch_on_one_thread
 from obbgs_core.errors import Diverged
 from obbgs_core.evidence.radiance import described
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import TrainingFrame, alike
 from obbgs_core.methods.config import SET_BACK_AT, SET_BACK_TO, MethodConfig, Moment
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
@@ -309,7 +309,7 @@ class Trainer:
         """
         check_joinable(self.setup.config)
         began = time.monotonic()
-        every = self._given + frames
+        every = alike(self._given + frames)
         joined, fresh = self._prepared(every, self.state.poses.corrections)
         join(self.setup, self.state, joined, fresh)
         self.setup, self._given = joined, every

@@ -18,10 +18,13 @@ from flightsw.icd.mission import load_mission
 from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.navigation.pose import navigation_tag
 from flightsw.navigation.stream import RelativePose, SatelliteStates, interpolate, parse_state
-from ground.session.folder import open_session
+from ground.session.folder import Navigation, open_session
 from ground.session.training_frames import frames_of, motion_covariance, tag_covariance, training_frame
+from obbgs_base.physics.free_rotation import free_rotation
+from obbgs_base.physics.navigation_errors import SharedParameters, displaced
+from obbgs_core.frames import alike, usable
 from obbgs_core.model.pose_covariance import flaw
-from obbgs_core.poses.corrections import PoseCorrections
+from obbgs_core.poses.corrections import PoseCorrections, motion_of
 
 ROOT = Path(__file__).parents[2]
 GOLDEN = ROOT / "tests" / "golden" / "session"
@@ -186,3 +189,31 @@ def test_frames_share_a_correction_where_their_tags_err_alike(tmp_path, apart_s,
         session, frames=session.frames[:1] + session.frames[2:]
     )  # lost on the link
     assert len(PoseCorrections(frames_of(without_one, without_one.frames)).value) == min(corrections, 5)
+
+
+def test_an_error_of_the_rate_turns_a_tumbling_target_as_no_torque_does(tmp_path):
+    """Also where navigation states attitudes only: they tell how the body turns, however few are known at first."""
+    rate, inertia, error = (
+        np.radians([0.8, 0.1, 0.9]),
+        np.array([0.45, 0.82, 1.0]),
+        np.array([3e-5, -1e-5, 2e-5]),
+    )
+    session, times_s = open_session(GOLDEN), 54.0 * np.arange(48)
+    assumed, true = (free_rotation(times_s, w[None], inertia[None])[0][0] for w in (rate, rate + error))
+    records = tuple(
+        dataclasses.replace(r, mid_exposure_utc_ns=round(s * 1e9), quat_inertial_to_body=matrix_to_quat(a))
+        for r, s, a in zip(session.frames, times_s, assumed, strict=True)
+    )
+    navigation = Navigation(sigmas=SharedParameters(rate_rad_s=np.full(3, 3e-5)))
+    session = dataclasses.replace(session, frames=records, navigation=navigation)
+    frames = frames_of(session, session.frames)
+    moved = displaced(motion_of(frames), SharedParameters(rate_rad_s=error))[:, :3, :3]
+    tagged = np.stack([f.world_to_camera.double().numpy() for f in frames])[:, :3, :3]
+    np.testing.assert_allclose(moved, tagged @ assumed @ true.swapaxes(1, 2), atol=1e-3)
+    assert np.abs(moved - tagged).max() > 0.05
+
+    first = dataclasses.replace(session, frames=records[:5])
+    assert not first.rotation[0].any()
+    joined = alike([*frames_of(first, first.frames), *frames[5:]])
+    usable(joined, exposure_aware=True)  # which refuses frames that state several navigations
+    assert all((f.navigation.rate_rad_s == session.rotation[0]).all() for f in joined if f.navigation)

@@ -12,7 +12,7 @@ from ground.session.folder import (
     read_records,
 )
 from ground.session.training_frames import is_held_out, split, training_frame, usable, whole
-from obbgs_core.frames import TrainingFrame
+from obbgs_core.frames import TrainingFrame, alike
 
 log = logging.getLogger(__name__)
 
@@ -92,5 +92,6 @@ class Arrivals:
             self.held_out = [r for r in chosen if is_held_out(r)]
         if [r.id for r in training[: len(self.training)]] != [r.id for r in self.training]:
             raise SessionError(f"{self.folder} was replaced by another session: start again")
-        self.frames += [training_frame(session, record) for record in training[len(self.training) :]]
+        new = [training_frame(session, record) for record in training[len(self.training) :]]
+        self.frames = alike([*self.frames, *new])
         self.training = training
