@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ground.run.card import readings
 from obbgs_base.command_line import AsJson
 
 if TYPE_CHECKING:  # torch takes seconds to import, and --help must not wait for it
@@ -81,29 +82,31 @@ def _sessions_table(sessions: "list[SessionEntry]") -> Table:
         table.add_column(heading, overflow="fold")
     for s in sessions:
         captured = "" if s.frames_captured is None else f" of {s.frames_captured}"
-        lost = _counts(s.frames_lost) or "nothing"
+        lost = _counts(s.frames_lost) or ("" if s.imported_from else "nothing")  # pictures came over no link
         if s.frames_missing:
             least = "at least " if s.frames_captured is None else ""
             lost += f"; {least}{s.frames_missing:,} not received yet"
         link = f"repaired: {_counts(s.link)}" if s.link else s.imported_from or ""
-        frames = f"{s.frames}{captured} in {s.brackets} brackets"
-        cells = [s.folder, _age(s.created_utc), frames, lost, s.size, link]
+        count = f"{s.frames}{captured} in {s.brackets} brackets"
+        if s.imported_from:
+            count = f"{s.frames} pictures" + (f" in {s.brackets} brackets" if s.brackets < s.frames else "")
+        cells = [s.folder, _age(s.created_utc), count, lost, s.size, link]
         if s.problem:
             cells = [s.folder, "", "", "", "", s.problem]
         table.add_row(*map(Text, cells), style="bold")
         for line in s.damage:
             table.add_row(*map(Text, ("  damaged", "", "", "", "", line)))
         for run in s.runs:
-            table.add_row(*map(Text, _run_cells(run)))
+            table.add_row(*map(Text, _run_cells(run, s.imported_from is not None)))
         table.add_section()
     return table
 
 
-def _run_cells(run: "RunEntry") -> list[str]:
+def _run_cells(run: "RunEntry", imported: bool) -> list[str]:
     psnr_db = run.psnr_clean_db if run.psnr_clean_db is not None else run.psnr_noisy_db
     psnr = "" if psnr_db is None else f"{psnr_db:.2f} dB"
     if psnr and run.psnr_clean_db is None:
-        psnr += " (noisy frames)"
+        psnr += f" (against {readings(imported)})"
     gaussians = "" if run.gaussians is None else f"{run.gaussians:,}"
     method = ", ".join(part for part in (run.method, run.quality) if part)
     if run.seconds is not None:

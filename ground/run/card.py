@@ -20,18 +20,35 @@ USES = {
 }
 
 
+def frames(imported: bool) -> str:
+    """Return what a session's frames are called: imported pictures are nobody's frames."""
+    return "pictures" if imported else "frames"
+
+
+def readings(imported: bool) -> str:
+    """Return what a model without truth is compared with; how noisy an imported picture is nobody stated."""
+    return "the pictures as imported" if imported else "their noisy readings"
+
+
+def is_imported(metrics: dict) -> bool:
+    """Return whether a run's pictures were imported, so that none was received or captured."""
+    return metrics.get("frames_imported") is not None
+
+
 def scored_frames(metrics: dict) -> str:
-    """Return in words which frames a run's image quality was measured on."""
+    """Return in words which frames or pictures a run's image quality was measured on."""
+    what = frames(is_imported(metrics))
     if metrics.get("scored_frames") == "training":
-        return "training frames (nothing was held out)"
-    return "held-out frames"
+        return f"training {what} (nothing was held out)"
+    return f"held-out {what}"
 
 
-def frames_received(metrics: dict) -> str:
-    """Return how many frames came down of those that were taken, or how many pictures were imported."""
-    if (imported := metrics.get("frames_imported")) is not None:
-        return f"{imported:,} pictures imported"
-    return f"{metrics['frames_received']:,} received / {frames_captured(metrics)} captured"
+def frames_received(metrics: dict) -> tuple[str, str]:
+    """Return how many frames came down of those that were taken, or pictures were imported, and what was counted."""
+    if is_imported(metrics):
+        return f"{metrics['frames_imported']:,}", "pictures imported"
+    count = f"{metrics['frames_received']:,} / {frames_captured(metrics)}"
+    return count, "frames received / captured on board"
 
 
 def frames_captured(metrics: dict) -> str:
@@ -66,7 +83,8 @@ def model_card(session_created_utc: str, metrics: dict) -> str:
         "# Model card",
         "",
         f"{metrics['gaussians']:,} Gaussians, radiance of spherical-harmonic degree {metrics['sh_degree']}, made by "
-        f"{metrics['method']} from {metrics['frames_trained']} frames of the session of {session_created_utc}.",
+        f"{metrics['method']} from {metrics['frames_trained']} {frames(is_imported(metrics))} of the session of "
+        f"{session_created_utc}.",
         "",
         *_training(metrics),
         *_appearance(metrics),
@@ -87,20 +105,18 @@ def model_card(session_created_utc: str, metrics: dict) -> str:
 def _training(metrics: dict) -> list[str]:
     """Return how the model came about; runs made by older versions did not record all of it."""
     exposures_ms = [1e3 * exposure_s for exposure_s in metrics["exposures_s"]]
+    called = frames(is_imported(metrics))
     lines = [
         f"- Start: {metrics['start']}. Training ended after {metrics['train_seconds']:.0f} s: "
         f"{metrics['stop_reason']}.",
     ]
     if not metrics.get("nominal_exposures"):
         lines.append(
-            f"- Exposure times of the training frames: {exposures_ms[0]:g} to {exposures_ms[-1]:g} ms. Between them "
+            f"- Exposure times of the training {called}: {exposures_ms[0]:g} to {exposures_ms[-1]:g} ms. Between them "
             "images are as good as stated below; outside them the model extrapolates linearly."
         )
-    if (imported := metrics.get("frames_imported")) is not None:
-        lines.append(f"- Pictures imported: {imported:,}.")
-    else:
-        counts = f"{metrics['frames_received']:,} / {frames_captured(metrics)}"
-        lines.append(f"- Frames received / captured: {counts}.")
+    count, what = frames_received(metrics)
+    lines.append(f"- {what.capitalize()}: {count}.")
     for key, name in (
         ("budget", "Budget"),
         ("growth", "Growth"),
@@ -110,7 +126,7 @@ def _training(metrics: dict) -> list[str]:
             lines.append(f"- {name}: {metrics[key]}.")
     if misfits := metrics.get("misfit_frames"):
         listed = ", ".join(map(str, misfits))
-        lines.append(f"- Left out, because they fit no pose that their tags allow: frames {listed}.")
+        lines.append(f"- Left out, because they fit no pose that their tags allow: {called} {listed}.")
     if metrics.get("removed_not_finite"):
         lines.append(
             f"- {metrics['removed_not_finite']:,} Gaussians were removed: a parameter became NaN or infinite."
@@ -150,7 +166,7 @@ def _appearance(metrics: dict) -> list[str]:
 
 
 def _quality(metrics: dict) -> list[str]:
-    lines = []
+    lines, called = [], frames(is_imported(metrics))
     if isinstance(level := metrics.get("sky_level"), str):
         lines.append(f"- Sky: {level}.")
     if isinstance(response := metrics.get("response"), str):
@@ -161,17 +177,17 @@ def _quality(metrics: dict) -> list[str]:
         line = f"- The model's own error, beside the noise: {100 * misfit:.0f} % of the light"
         if factor := metrics.get("misfit_unseen_factor"):
             line += (
-                f" under Suns that it has not seen, {100 * misfit / factor:.0f} % under those of its frames"
+                f" under Suns that it has not seen, {100 * misfit / factor:.0f} % under those of its {called}"
             )
         if both := metrics.get("chi2_held_out_both"):
             line += (
-                f". Held-out frames have a chi² of {metrics['chi2_held_out']:.2f} over the noise and of {both:.2f} "
+                f". Held-out {called} have a chi² of {metrics['chi2_held_out']:.2f} over the noise and of {both:.2f} "
                 "over noise and own error together; 1 means that the errors are as large as stated"
             )
         lines.append(line + ".")
-    scored = scored_frames(metrics)
+    scored, what = scored_frames(metrics), readings(is_imported(metrics))
     for key, text in (
-        ("psnr_noisy_db", f"PSNR of {scored} against their noisy readings: {{:.2f}} dB."),
+        ("psnr_noisy_db", f"PSNR of {scored} against {what}: {{:.2f}} dB."),
         ("psnr_srgb_db", "The same of display values (sRGB): {:.2f} dB."),
         ("psnr_linear_db", "The same of values that are linear in light: {:.2f} dB."),
         ("psnr_clean_db", f"PSNR of {scored} against their noiseless exposures: {{:.2f}} dB."),
@@ -190,7 +206,7 @@ def _quality(metrics: dict) -> list[str]:
         if key in metrics:
             lines.append(
                 f"- Stated uncertainty: intervals that should hold 90 % hold {100 * metrics[key]:.0f} % of the {of} "
-                "on the target in held-out frames."
+                f"on the target in held-out {called}."
             )
     if "mesh_triangles" in metrics:
         unseen = f"{100 * metrics['mesh_unseen_share']:.1f} % of its area"

@@ -186,7 +186,8 @@ class Session:
     def __repr__(self) -> str:
         size = f"{self.camera.width}x{self.camera.height} pixels"
         brackets = len({record.bracket for record in self.frames})
-        return f"<{self.path}: {len(self.frames):,} frames of {size} in {brackets:,} brackets>"
+        grouped = f" in {brackets:,} brackets" if self.is_bracketed else ""
+        return f"<{self.path}: {len(self.frames):,} frames of {size}{grouped}>"
 
     def check_body_axes(self) -> None:
         """Check that poses are in axes of the target.
@@ -209,6 +210,11 @@ class Session:
         if self.flight is None:
             return self.frames_imported
         return self.flight.captured(self.frames[-1].id)
+
+    @property
+    def is_bracketed(self) -> bool:
+        """Whether frames were taken in exposure brackets: always but for imported pictures that each stand alone."""
+        return self.frames_imported is None or len({r.bracket for r in self.frames}) < len(self.frames)
 
     @property
     def nominal_exposures(self) -> bool:

@@ -3,12 +3,19 @@
 from rich.table import Table
 from rich.text import Text
 
-from ground.run.card import chi2_explained, frames_received, scored_frames, size_explained
+from ground.run.card import (
+    chi2_explained,
+    frames_received,
+    is_imported,
+    readings,
+    scored_frames,
+    size_explained,
+)
 
 PSNR_LABELS = {
     "psnr_clean_db": "against noiseless exposures",
     "psnr_clean_foreground_db": "the same, pixels that show the target",
-    "psnr_noisy_db": "against the noisy frames",
+    "psnr_noisy_db": "against {readings}",
     "psnr_srgb_db": "the same of display values (sRGB)",
     "psnr_linear_db": "the same of linear values",
 }
@@ -30,6 +37,7 @@ def model_rows(metrics: dict) -> list[tuple[str, str]]:
         if known(key):
             blind = metrics.get("psnr_clean_blind_db") if key == "psnr_clean_db" else None
             more = "" if blind is None else f" ({blind:.2f} dB blind to exposure)"
+            label = label.format(readings=readings(is_imported(metrics)))
             rows.append((f"PSNR of {scored_frames(metrics)}, {label}", f"{metrics[key]:.2f} dB{more}"))
     if known("chi2"):
         chi2 = metrics["chi2"]
@@ -66,10 +74,11 @@ def model_rows(metrics: dict) -> list[tuple[str, str]]:
 
 
 def frames_row(metrics: dict) -> tuple[str, str]:
-    """Return as a row how many frames came down and what they were used for."""
+    """Return as a row how many frames came down, or pictures were imported, and what they were used for."""
     counts = ("trained on", metrics["frames_trained"]), ("held out", metrics["frames_held_out"])
     used = ", ".join(f"{count:,} {what}" for what, count in counts)
-    return "frames", f"{frames_received(metrics)}, {used}"
+    count, what = frames_received(metrics)
+    return what, f"{count}, {used}"
 
 
 def runs_table(runs: dict[str, dict | str]) -> Table:
@@ -82,7 +91,7 @@ def runs_table(runs: dict[str, dict | str]) -> Table:
             made.add_row(*map(Text, (session, "", "", "", f"not made: {metrics}")))
             continue
         key = next((key for key in PSNR_LABELS if metrics.get(key) is not None), None)
-        noisy = " (noisy frames)" if key == "psnr_noisy_db" else ""
+        noisy = f" (against {readings(is_imported(metrics))})" if key == "psnr_noisy_db" else ""
         psnr = "" if key is None else f"{metrics[key]:.2f} dB{noisy}"
         counts = f"{metrics['frames_trained']:,}", psnr, f"{metrics['gaussians']:,}"
         made.add_row(*map(Text, (session, *counts, f"{metrics['train_seconds']:.0f} s")))

@@ -26,7 +26,7 @@ from ground.run.scores import ScoredView, clean_scores
 from ground.session.folder import SessionError
 from ground.session.truth import read_points
 from ground.show.report.document import write_report
-from ground.show.summary import frames_row
+from ground.show.summary import frames_row, model_rows
 from obbgs_core.frames import cameras_of
 from obbgs_core.io.ply import load_ply
 from obbgs_core.methods.presets import preset
@@ -141,7 +141,12 @@ def test_neither_card_nor_summary_tells_of_imported_pictures_what_only_a_pass_ha
     card = model_card("2026-07-21T00:00:00+00:00", metrics)
     assert "- Pictures imported: 47." in card
     assert not any(words in card for words in ("captured", "Exposure times", "Sun's direction"))
-    assert frames_row(metrics)[1].startswith("47 pictures imported, ")
+    label, used = frames_row(metrics)
+    assert label == "pictures imported" and used.startswith("47, ")
+    told = card + str(model_rows(metrics))
+    assert "against the pictures as imported" in told and "nois" not in told.replace(
+        "variance of the noise", ""
+    )
 
 
 def test_the_budget_says_that_it_was_raised_when_growth_went_on_beyond_it():

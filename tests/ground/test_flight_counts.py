@@ -237,7 +237,7 @@ def test_run_card_and_report_count_the_frames_of_both_ends(tmp_path, flight, cap
     reconstruct(session, "run", "obbgs", QUICK)
     metrics = evaluate(session, "run")
     assert metrics["frames_received"] == 24 and metrics["frames_captured"] == captured
-    assert f"received / captured: {card}." in (session / "runs/run/model_card.md").read_text()
+    assert f"received / captured on board: {card}." in (session / "runs/run/model_card.md").read_text()
     page = write_report(session, "run").read_text()
     assert f"<b>{card}</b><span>frames received / captured" in page
     assert missing in page[page.index("frames missing") :][:80]

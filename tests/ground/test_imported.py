@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 
@@ -288,7 +289,13 @@ def test_a_run_on_white_is_scored_in_display_values_and_in_light(tmp_path, rende
     )
     assert metrics["psnr_noisy_db"] > blank + 5
     assert metrics["onnx_parity_db"] > 50
-    assert "display values (sRGB)" in write_report(tmp_path / "s", "run").read_text()
+    page = write_report(tmp_path / "s", "run").read_text()
+    shown = re.sub(r"<[^>]*>", " ", re.sub(r"<(script|style).*?</\1>", "", page, flags=re.DOTALL))
+    assert "display values (sRGB)" in shown and "11 imported pictures" in shown
+    # nobody received, captured or bracketed these pictures, and what noise they have nobody stated
+    said = shown + call("ground", "list", tmp_path).stdout
+    assert not re.findall(r".{20}\b(?:received|captured|[Bb]rackets?|noisy|nothing)\b.{20}", said)
+    assert "11 pictures" in said
     card = (run.folder / "model_card.md").read_text()
     assert "display values (sRGB)" in card and "a background of radiance 1" in card
 

@@ -6,7 +6,15 @@ import math
 from datetime import datetime
 from pathlib import Path
 
-from ground.run.card import chi2_explained, frames_captured, scored_frames
+from ground.run.card import (
+    chi2_explained,
+    frames,
+    frames_captured,
+    frames_received,
+    is_imported,
+    readings,
+    scored_frames,
+)
 from ground.run.runs import Run, open_run, read_config, written_to
 from ground.session.cameras import median_sun_direction
 from ground.session.folder import SessionError, pass_name
@@ -41,9 +49,10 @@ def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
     """
     run = open_run(session_dir, name, out)
     truth = Truth(run.session) if Truth.exists(run.session) else None
+    count, called = run.metrics["frames_received"], frames(is_imported(run.metrics))
     content = page(
         f"Reconstruction of {pass_name(run.session.path)}, run {name}",
-        f"Method {run.metrics['method']}, {run.metrics['frames_received']} frames received, session of "
+        f"Method {run.metrics['method']}, {count:,} {called}, session of "
         f"{datetime.fromisoformat(run.session.created_utc):%Y-%m-%d %H:%M} UTC.",
         [
             _model(run),
@@ -81,18 +90,17 @@ def _result(run: Run, truth: Truth | None) -> str:
         f"Clean figures compare the model with noiseless exposures of views {seen}, full scale as 1. Distances are in "
         "units where the target's largest dimension is 2."
         if truth
-        else f"No simulator left a truth for this session, so the model is compared with received frames {seen}."
+        else f"No simulator left a truth for this session, so the model is compared with "
+        f"{'imported pictures' if is_imported(m) else 'received frames'} {seen}."
     )
     lines = [*m.get("notes", []), *(f"{k} is missing: {v}" for k, v in m.get("missing_outputs", {}).items())]
     notes = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
     callout = f'<ul class="notes">{notes}</ul>' if notes else ""
     details = f'<div style="margin-top:16px">{two_tables(_details(m))}</div>'
-    return section(
-        "Result", note, callout + cards(_main_figures(m, run.session.frames_imported is not None)) + details
-    )
+    return section("Result", note, callout + cards(_main_figures(m)) + details)
 
 
-def _main_figures(m: dict, imported: bool) -> list[tuple[str, str]]:
+def _main_figures(m: dict) -> list[tuple[str, str]]:
     """Return the most important figures, each with a sentence of what it means, as HTML."""
     scored = scored_frames(m)
     figures: list[tuple[str, str]] = []
@@ -101,7 +109,8 @@ def _main_figures(m: dict, imported: bool) -> list[tuple[str, str]]:
             (f"{m['psnr_clean_db']:.2f} dB", f"clean PSNR of {scored}, trained with exposure known")
         )
     elif "psnr_noisy_db" in m:
-        figures.append((f"{m['psnr_noisy_db']:.2f} dB", f"PSNR of {scored} against their noisy readings"))
+        text = f"PSNR of {scored} against {readings(is_imported(m))}"
+        figures.append((f"{m['psnr_noisy_db']:.2f} dB", text))
     if "psnr_clean_foreground_db" in m:
         text = "clean PSNR of the foreground: only pixels that the target covers, without the easy black sky"
         figures.append((f"{m['psnr_clean_foreground_db']:.2f} dB", text))
@@ -126,12 +135,7 @@ def _main_figures(m: dict, imported: bool) -> list[tuple[str, str]]:
     figures.append(
         (f"{m['train_seconds']:.0f} s", f"of training; it ended with: {html.escape(m['stop_reason'])}")
     )
-    if imported:
-        figures.append((f"{m['frames_received']:,}", "pictures imported"))
-    else:
-        figures.append(
-            (f"{m['frames_received']:,} / {frames_captured(m)}", "frames received / captured on board")
-        )
+    figures.append(frames_received(m))
     if m.get("onnx_bytes") is not None and m.get("onnx_parity_db") is not None:
         text = f"agreement of the on-board ONNX renderer ({m['onnx_bytes'] / 1e6:.2f} MB) with ours, in its worst view"
         figures.append((f"{m['onnx_parity_db']:.0f} dB", text))
@@ -148,14 +152,14 @@ def _details(m: dict) -> list[tuple[str, str]]:
         "size_error_percent": "… the model is too large by, %",
         "similarity_psnr_clean_db": "… with the model's size corrected, dB",
         "psnr_clean_blind_db": "… of the training without exposure times, dB",
-        "psnr_noisy_db": f"PSNR of {scored_frames(m)} against their noisy readings, dB",
+        "psnr_noisy_db": f"PSNR of {scored_frames(m)} against {readings(is_imported(m))}, dB",
         "psnr_srgb_db": "… of display values (sRGB), dB",
         "psnr_linear_db": "… of values that are linear in light, dB",
         "ssim_srgb": "SSIM of display values",
         "lpips_srgb": "LPIPS of display values (AlexNet, 0 is identical)",
         "psnr_radiance_db": "PSNR of scene-linear radiance (brightest pixel = 1), dB",
         "ssim_clean": "SSIM, clean (structural similarity, 1 is identical)",
-        "chi2_held_out": "chi² of held-out frames: squared error over the variance of the noise",
+        "chi2_held_out": f"chi² of {scored_frames(m)}: squared error over the variance of the noise",
         "chi2_held_out_both": "… over that of noise and the model's own error together (1: errors as large as stated)",
         "chamfer": "Chamfer distance of the centres",
         "chamfer_surface": "Chamfer distance of the points in surface.ply",
@@ -187,13 +191,13 @@ def _exposure_ms(key: str) -> str:
 
 
 def _model(run: Run) -> str:
-    m = run.metrics
+    m, called = run.metrics, frames(is_imported(run.metrics))
     note = (
-        f"The target in 3D, made from {m['frames_trained']:,} frames and drawn as the camera would see it at the "
+        f"The target in 3D, made from {m['frames_trained']:,} {called} and drawn as the camera would see it at the "
         "chosen exposure. Drag to turn, wheel or pinch to zoom, shift and drag to move."
     )
     if m["scored_frames"] == "held_out":
-        note += " The next section says how well it matches frames that it was not made from."
+        note += f" The next section says how well it matches {called} that it was not made from."
     decisions = [("made of", f"{len(run.gaussians):,} Gaussians"), ("brightness", brightness(run))]
     if "appearance" in m and median_sun_direction(list(run.session.frames)) is not None:
         decisions.append(("the Sun's direction spans", f"{m['sun_span_deg']:.1f} degrees"))
@@ -233,7 +237,8 @@ def _training(run: Run) -> str:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SessionError(f"{path} is damaged: {error!r}") from error
     note = (
-        "First the loss that training minimises, then the PSNR of each step's noisy frames. Both are running means; "
+        "First the loss that training minimises, then the PSNR of each step's "
+        f"{'pictures' if is_imported(run.metrics) else 'noisy frames'}. Both are running means; "
         "where they have levelled off, more steps would change little."
     )
     return section("Training", note, legend(named) + beside(map(plot, figures)))
@@ -244,9 +249,9 @@ def _histogram(run: Run) -> str:
     nominal = run.session.nominal_exposures
     title, by_time = ("Histogram", "") if nominal else ("Exposure histogram", ", by exposure time")
     note = (
-        f"How many pixels of all frames have which reading{by_time}; both the peak at the black level "
-        f"and a pile at full scale carry little information. {saturated:,} pixels are saturated: training takes such a "
-        "reading as a lower bound of the light."
+        f"How many pixels of all {frames(is_imported(run.metrics))} have which reading{by_time}; both the peak at the "
+        f"black level and a pile at full scale carry little information. {saturated:,} pixels are saturated: training "
+        "takes such a reading as a lower bound of the light."
     )
     figure, named = histogram_figure(run.session, run.sensor, nominal)
     return section(title, note, legend(named) + plot(figure))

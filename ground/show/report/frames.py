@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
+from ground.run.card import frames, is_imported
 from ground.run.estimated_poses import as_estimated, read_estimate, scored_records
 from ground.run.evaluate import clean_image, model_image, noisy_image
 from ground.run.runs import Run
@@ -29,9 +30,9 @@ NOISE_DEVIATIONS = 5.0  # no pixel of a frame rises by so many for noise alone
 
 
 def frames_section(run: Run) -> str:
-    nominal = run.session.nominal_exposures
     posed = as_estimated(run.session, read_estimate(run.folder)).frames
     by_place = {(r.bracket, r.bracket_index): r for r in posed}
+    bracketed, frame = run.session.is_bracketed, frames(is_imported(run.metrics))[:-1]
     picked = evenly_spread(sorted({r.bracket for r in run.session.frames}), COLUMNS)
     cells = []
     for place in sorted({r.bracket_index for r in run.session.frames}):
@@ -43,19 +44,19 @@ def frames_section(run: Run) -> str:
             if record is None:
                 cells.append(label("missing"))
                 continue
-            caption = unbroken(f"frame {record.id}") + _range(run, record)
+            caption = unbroken(f"{frame} {record.id}") + _range(run, record)
             if not is_same:
                 caption += f", {_exposure(run, record)}"
             if record.saturated:
                 caption += f"<br>{unbroken(f'{record.saturated:,} px')} saturated"
             received = run.session.dn(record).astype(np.float32) / run.sensor.white_dn
             image = _tone(run, received.reshape(*received.shape[:2], -1))
-            cells.append(picture(image, f"frame {record.id}", caption))
+            cells.append(picture(image, f"{frame} {record.id}", caption))
     return section(
-        "Pictures" if nominal else "Frames by exposure",
+        f"{frames(is_imported(run.metrics)).capitalize()}{' by exposure' if bracketed else ''}",
         f"{len(picked)} of the {len(run.session.frames):,} imported pictures, {brightness(run)}."
-        if nominal
-        else "Frames as received: each column is a bracket, each row one of its exposures; below each frame stand its "
+        if not bracketed
+        else f"{_as_they_came(run)}: each column is a bracket, each row one of its exposures; below each stand its "
         f"number{', the range to the target' if states_scale(run.session) else ''} and, where they differ in a row, "
         f"the exposure time. Brightness is {brightness(run)}.",
         grid(f"{LABEL_WIDTH} repeat({len(picked)}, {PICTURE_WIDTH})", cells),
@@ -65,32 +66,36 @@ def frames_section(run: Run) -> str:
 def scored_section(run: Run, truth: Truth | None) -> str:
     estimate = read_estimate(run.folder)
     range_of = {r.id: _range(run, r) for r in as_estimated(run.session, estimate).frames}
-    nominal, brackets = run.session.nominal_exposures, sorted({r.bracket for r in run.scored})
+    bracketed, brackets = run.session.is_bracketed, sorted({r.bracket for r in run.scored})
     shown = evenly_spread(brackets, VIEWS_SHOWN)
     records = scored_records(run, truth, [r for r in run.scored if r.bracket in shown])
     body = []
     for bracket in shown:
         of_view = sorted((r for r in records if r.bracket == bracket), key=lambda r: r.exposure_time_s)
-        named = f"Picture {of_view[0].id}" if nominal else f"Bracket {bracket}{range_of[of_view[0].id]}"
+        named = (f"Bracket {bracket}" if bracketed else f"Picture {of_view[0].id}") + range_of[of_view[0].id]
         body.append(f"<h3>{named}</h3>")
         body.append(_compared(run, truth, of_view))
-    training = run.metrics["scored_frames"] == "training"
-    seen = "trained on: the session has too few brackets to hold one out" if training else "never trained on"
+    training, imported = run.metrics["scored_frames"] == "training", is_imported(run.metrics)
+    frame = frames(imported)[:-1]
+    groups = "brackets" if bracketed else "pictures"
+    few = f"trained on: the session has too few {groups} to hold one out"
+    seen = few if training else "never trained on"
+    against = "the noiseless exposure" if truth else "that imported" if imported else "the noisy frame"
     note = (
-        f"{len(shown)} of {len(brackets)} brackets, {seen}; cropped to the target, brightness as above. Error is the "
+        f"{len(shown)} of {len(brackets)} {groups}, {seen}; cropped to the target, brightness as above. Error is the "
         f"absolute difference: 0<span class='ramp'></span>{ERROR_FULL_SCALE:.0%} of full scale or more. PSNR is of the "
-        f"whole frame against the {'noiseless exposure' if truth else 'noisy frame'}{_mean(run, truth)}."
+        f"whole picture against {against}{_mean(run, truth)}."
     )
     if estimate is not None:
         note += (
             " Poses were refined: each frame is seen from its true pose, moved as the model moved with its poses."
             if truth
-            else " Poses were refined: each frame is seen from the pose that settles on its own picture."
+            else f" Poses were refined: each {frame} is seen from the pose that settles on it."
         )
     if run.blind:
         note += " Blind: the same training from the same poses, every exposure time replaced by their mean."
     title = "Training views (nothing was held out)" if training else "Held-out views"
-    return section(f"{title}: {'truth' if truth else 'frame'}, render, error", note, "".join(body))
+    return section(f"{title}: {'truth' if truth else frame}, render, error", note, "".join(body))
 
 
 def _range(run: Run, record: FrameRecord) -> str:
@@ -101,12 +106,14 @@ def _range(run: Run, record: FrameRecord) -> str:
 def _mean(run: Run, truth: Truth | None) -> str:
     """Return in words the mean PSNR of all scored frames; nothing for a run that was not scored."""
     mean_db = run.metrics.get("psnr_clean_db" if truth else "psnr_noisy_db")
-    return "" if mean_db is None else f"; its mean over all {len(run.scored):,} frames is {mean_db:.2f} dB"
+    what = frames(is_imported(run.metrics))
+    return "" if mean_db is None else f"; its mean over all {len(run.scored):,} {what} is {mean_db:.2f} dB"
 
 
 def _compared(run: Run, truth: Truth | None, of_view: list[FrameRecord]) -> str:
     """Return the frames of a bracket, shortest exposure first, beside the renders of each model and their errors."""
-    reference = "truth" if truth else "frame"
+    frame = frames(is_imported(run.metrics))[:-1]
+    reference = "truth" if truth else frame
     names = [reference, "render", "error"] + (["blind render", "blind error"] if run.blind else [])
     expected = [clean_image(run, truth, r) if truth else noisy_image(run, r) for r in of_view]
     background = torch.tensor(run.session.background)
@@ -126,13 +133,17 @@ def _compared(run: Run, truth: Truth | None, of_view: list[FrameRecord]) -> str:
 
     for record, image in zip(of_view, expected, strict=True):
         cells.append(label(_exposure(run, record)))
-        cells.append(picture(_tone(run, image[box].numpy()), reference, f"frame {record.id}"))
+        cells.append(picture(_tone(run, image[box].numpy()), reference, f"{frame} {record.id}"))
         for render in renders(record):
             error = ((render - image).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
             caption = f"{psnr_db(render, image):.1f} dB"
             cells.append(picture(_tone(run, render[box].numpy()), "render", caption))
             cells.append(picture(heat(error[box].numpy()), "error", "&nbsp;"))
     return grid(f"{LABEL_WIDTH} repeat({len(names)}, {PICTURE_WIDTH})", cells)
+
+
+def _as_they_came(run: Run) -> str:
+    return "Pictures as imported" if is_imported(run.metrics) else "Frames as received"
 
 
 def _exposure(run: Run, record: FrameRecord) -> str:

@@ -408,7 +408,9 @@ def _fitting_distance(models: int) -> float:
 
 def _facts(session: Session, record: FrameRecord) -> str:
     """Return what is known of a frame; of imported pictures only what their format states."""
-    facts = [f"frame {record.id} of bracket {record.bracket}"]
+    facts = [
+        f"frame {record.id} of bracket {record.bracket}" if session.is_bracketed else f"picture {record.id}"
+    ]
     if not session.nominal_exposures:
         facts.append(f"{1e3 * record.exposure_time_s:g} ms")
     if states_time(session, record):
