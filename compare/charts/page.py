@@ -56,17 +56,23 @@ def write_page(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyTyp
     results = Results(Rows(out).rows.values(), asked)
     replaced = ""
     if results.replaced:
+        more = "1 more row is" if results.replaced == 1 else f"{results.replaced} more rows are"
         replaced = (
-            f" {results.replaced} more rows are left out: they bear the same names, and their condition, session or "
-            "settings have changed since, or are not those asked for."
+            f" {more} left out: of the same names, but of another condition, session or settings than now, or than "
+            "those asked for."
         )
-    targets, conditions = (
-        f"{len(names)} {word}{'s' if len(names) != 1 else ''}"
-        for names, word in ((results.targets, "target"), (results.conditions, "condition"))
+    rows, methods, targets, conditions = (
+        f"{len(counted):,} {word}{'s' if len(counted) != 1 else ''}"
+        for counted, word in (
+            (results.rows, "row"),
+            (results.labels, "method"),
+            (results.targets, "target"),
+            (results.conditions, "condition"),
+        )
     )
     content = page(
         "Comparison of methods",
-        f"{len(results.rows)} rows: {len(results.labels)} methods, {targets}, {conditions}.{replaced}",
+        f"{rows}: {methods}, {targets}, {conditions}.{replaced}",
         [
             _tables(results),
             _speed(results),

@@ -12,6 +12,7 @@ from flightsw.navigation.orbit import shadow_crossings
 from flightsw.navigation.pose import pose_tag
 
 WIDEST_DEG = 120.0  # a pinhole camera; lenses that see more are no pinholes
+SAME_RANGE = 1.01  # ranges whose ratio is smaller show the target equally large
 FEWEST_PX = 8  # across the target, for a picture of it
 
 
@@ -95,13 +96,14 @@ def field_of_view(mission: Mission, ranges_m: list[float]) -> tuple[str, list[st
     ]
     side_px = min(camera.width, camera.height)
     most_px, least_px = (camera.fx_px * extent_m / range_m for range_m in (least_m, greatest_m))
-    covers = {
-        f"{px:.0f} px at {range_m:.0f} m": f"{px / side_px:.0%}"
-        for px, range_m in ((most_px, least_m), (least_px, greatest_m))
-    }
+    ends = [(most_px, least_m), (least_px, greatest_m)]
+    if greatest_m < SAME_RANGE * least_m:
+        ends = ends[:1]
+    sizes = " and ".join(f"{px:.0f} px at {range_m:.0f} m" for px, range_m in ends)
+    shares = " and ".join(f"{px / side_px:.0%}" for px, _ in ends)
     view = (
         f"{camera.width} x {camera.height} px see {degrees[0]:.3g} x {degrees[1]:.3g} degrees; "
-        f"a target of {extent_m:g} m is {' and '.join(covers)}, {' and '.join(covers.values())} "
+        f"a target of {extent_m:g} m is {sizes}, {shares} "
         "of the picture's smaller side"
     )
     problems = []

@@ -295,6 +295,7 @@ def _next_counter(key_file: Path, folder: Path) -> Iterator[tuple[Key, int]]:
 @contextlib.contextmanager
 def _locked_counter(key_file: Path) -> Iterator[Path]:
     """Give the file of the ground's counter while no other process has it."""
+    key_file.stat()  # without a key nothing is left beside it
     sent = key_file.with_name(key_file.name + ".sent")
     with open(sent.with_name(sent.name + ".lock"), "wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

@@ -376,6 +376,12 @@ def answer(request):
     raise ValueError(f"unknown operation {op!r}")
 
 
+def in_words(error):
+    """Return what went wrong as one line, as Blender says it or we do."""
+    said = " ".join(str(error).split()).removeprefix("Error: ")
+    return f"{type(error).__name__} {said}".strip() if isinstance(error, KeyError) or not said else said
+
+
 def main():
     replies = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what Blender itself prints goes to stderr, so that stdout holds replies only
@@ -385,7 +391,7 @@ def main():
         try:
             reply = {"ok": True, **answer(json.loads(line))}
         except (RuntimeError, ValueError, KeyError, OSError) as error:
-            reply = {"ok": False, "error": f"{type(error).__name__}: {str(error).strip()}"}
+            reply = {"ok": False, "error": in_words(error)}
         print(json.dumps(reply), file=replies, flush=True)
 
 

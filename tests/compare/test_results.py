@@ -357,6 +357,12 @@ def test_a_row_without_a_result_is_not_explained_as_if_it_had_one(without_truth,
     assert "noise needs a session with its truth" in page and "the noisy frame itself" not in page
 
 
+def test_one_of_a_kind_is_told_in_the_singular(tmp_path):
+    rows = Rows(tmp_path)
+    rows.add(row("noise", error="CompareError: noise needs a session with its truth"))
+    assert "1 row: 1 method, 1 target, 1 condition." in write_page(tmp_path).read_text()
+
+
 def test_figures_are_written_as_png(comparison):
     paths = write_figures(comparison)
     assert {path.name for path in paths} == {

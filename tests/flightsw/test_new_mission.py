@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flightsw.capture.planning import pass_plan
+from flightsw.capture.planning import field_of_view, pass_plan
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import load_mission
 from flightsw.new_mission import EXAMPLE, write_mission
@@ -141,6 +141,13 @@ def test_a_plan_says_that_states_will_come_from_elsewhere_and_a_constant_range_o
     )
     assert re.search(r"a target of 6 m is \d+ px at \d+ m, \d+% of the picture's smaller side", planned)
     assert "orbits:" not in call("flightsw", "plan", "--mission", str(ROOT / "mission.yaml")).stdout
+
+
+@pytest.mark.parametrize(("ranges_m", "told"), [([60.4, 60.6], 1), ([60.4, 61.2], 2), ([60.0, 400.0], 2)])
+def test_ranges_that_show_the_target_equally_large_are_told_as_one(ranges_m, told):
+    """By their values: 60.4 and 60.6 m are written differently, and are the same."""
+    view, _ = field_of_view(MISSION, ranges_m)
+    assert view.count(" px at ") == told and view.count("%") == told
 
 
 def test_a_line_of_sight_far_from_the_picture_is_refused(tmp_path):

@@ -144,9 +144,7 @@ def test_neither_card_nor_summary_tells_of_imported_pictures_what_only_a_pass_ha
     label, used = frames_row(metrics)
     assert label == "pictures imported" and used.startswith("47, ")
     told = card + str(model_rows(metrics))
-    assert "against the pictures as imported" in told and "nois" not in told.replace(
-        "variance of the noise", ""
-    )
+    assert "against the pictures as imported" in told and "noisy" not in told
 
 
 def test_the_budget_says_that_it_was_raised_when_growth_went_on_beyond_it():

@@ -590,6 +590,12 @@ def test_a_file_in_the_place_of_a_key_stays_and_no_counters_are_left_beside_it(t
     assert [path.name for path in tmp_path.iterdir()] == ["key"]
 
 
+def test_without_a_key_moving_its_counter_leaves_nothing_behind(tmp_path):
+    with pytest.raises(ConfigError, match="No such file"):
+        move_counter(tmp_path / "nokey", 5)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_script_that_is_no_text_is_wrong_usage(tmp_path):
     (tmp_path / "script").write_bytes(b"\xff\xfe\x00")
     words = ["uplink", "--script", str(tmp_path / "script"), "--session", str(tmp_path)]

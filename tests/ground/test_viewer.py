@@ -24,7 +24,7 @@ from websockets.sync.client import connect
 from ground import cli
 from ground.run.live.reconstruct import reconstruct_live
 from ground.session.cameras import predicted_image
-from ground.session.folder import SessionError
+from ground.session.folder import FrameRecord, Session, SessionError
 from ground.show.pictures import tone
 from ground.show.sizes import size_deviation
 from ground.show.viewer import ruler, scene, splats, viewer
@@ -42,9 +42,9 @@ from tests.browser import chromium
 from tests.browser import opened as page_of
 from tests.small_sessions import small_session
 
-# What viser 1.1.1 prints: for any splats, at times, the empty bounding sphere of a geometry that it has not filled yet;
-# for a picture in the panel, that it asks for its address once more when it has put the panel beside the scene. The
-# picture is shown, at another address.
+# What viser 1.1.1 prints: for any splats, at times, that the quad which it draws for each has no bounding sphere, since
+# its corners have two coordinates (the splats are drawn, whatever their positions); for a picture in the panel, that it
+# asks for its address once more when it has put the panel beside the scene. The picture is shown, at another address.
 VISERS = (
     "computeBoundingSphere(): Computed radius is NaN",
     "Failed to load resource: net::ERR_FILE_NOT_FOUND",
@@ -525,6 +525,22 @@ def test_at_first_the_exposure_is_one_at_which_the_target_is_seen(session):
         sensor = dataclasses.replace(shown.sensor, dn_per_radiance_s=factor * shown.sensor.dn_per_radiance_s)
         seen_s = splats.seen_exposure_s(dataclasses.replace(shown, sensor=sensor))
         assert usual_s / factor / 10 < seen_s < 10 * usual_s / factor
+
+
+def test_at_first_the_frame_is_the_one_in_which_the_target_is_best_seen(session, monkeypatch):
+    """All frames but one are dark, or as bright as they can be: the page begins with that one, wherever it is."""
+    shown = Source(session).load()
+    exposure_s = splats.seen_exposure_s(shown)
+    lit = [record for record in shown.session.frames if record.exposure_time_s == exposure_s][-1]
+    read = Session.dn
+    for others in (shown.sensor.black_dn, shown.sensor.white_dn):
+
+        def dn(session: Session, record: FrameRecord, others: float = others) -> np.ndarray:
+            pixels = read(session, record)
+            return pixels if record.bracket == lit.bracket else np.full_like(pixels, others)
+
+        monkeypatch.setattr(Session, "dn", dn)
+        assert splats.best_seen(shown, exposure_s).id == lit.id
 
 
 def test_imported_pictures_show_no_time_range_or_sun_that_nobody_stated(session):

@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -260,8 +261,11 @@ def test_after_a_crash_blender_is_restarted_and_the_frame_is_rendered(tmp_path):
 def test_a_file_that_is_no_mesh_is_refused_and_named(tmp_path, content, suffix):
     path = tmp_path / f"bad{suffix}"
     path.write_bytes(content)
-    with pytest.raises(MeshError, match=f"bad{suffix}"):
+    with pytest.raises(MeshError, match=f"bad{suffix}") as refused:
         RenderFarm(MISSION, path, tmp_path / "cache")
+    assert not re.search(
+        r"Error:|\n", str(refused.value)
+    )  # a line of words, without the class of what was raised
 
 
 def test_a_missing_mesh_is_named(tmp_path):

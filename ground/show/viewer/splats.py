@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ground.session.cameras import cameras_of, exposed, sun_direction
-from ground.session.folder import FrameRecord, Session
+from ground.session.folder import FrameRecord, Session, SessionError
 from ground.session.spread import evenly_spread
 from ground.session.training_frames import split, told_before, training_frame
 from ground.show.pictures import tone
@@ -35,6 +35,7 @@ TARGET_SHARE, SEEN_FRAMES, NEAR_ENOUGH = (
     5,
     2.5,
 )  # of full scale; frames looked at; factor between brackets
+WELL_SEEN = (0.05, 0.95)  # shares of full scale above black between which a pixel shows the target
 NOT_SEEN = (90, 90, 110)  # colour of Gaussians that no frame shows
 RAMP = np.array(
     [[13, 8, 135], [126, 3, 168], [204, 71, 120], [248, 149, 64], [240, 249, 33]], dtype=float
@@ -137,6 +138,36 @@ def seen_exposure_s(shown: Shown) -> float:
     wanted_s = TARGET_SHARE * sensor.full_scale_radiance(1.0) / bright
     nearest_s = min(exposures_s, key=lambda time_s: abs(np.log(time_s / wanted_s)))
     return nearest_s if 1 / NEAR_ENOUGH < nearest_s / wanted_s < NEAR_ENOUGH else wanted_s
+
+
+def best_seen(shown: Shown, exposure_time_s: float) -> FrameRecord:
+    """Return the frame in which the target is best seen, of those nearest to an exposure time in some brackets.
+
+    Best seen: most pixels of the model are well above black in the frame, and not saturated. Frames that cannot be read
+    show nothing.
+    """
+    session, sensor = shown.session, shown.sensor
+    nearest: dict[int, FrameRecord] = {}
+    for record in session.frames:
+        kept = nearest.setdefault(record.bracket, record)
+        if abs(record.exposure_time_s - exposure_time_s) < abs(kept.exposure_time_s - exposure_time_s):
+            nearest[record.bracket] = record
+
+    def pixels_seen(record: FrameRecord) -> int:
+        try:
+            dn = torch.from_numpy(session.dn(record).astype(np.float32)).reshape(
+                session.camera.height, session.camera.width, -1
+            )
+        except SessionError:
+            return 0
+        with torch.no_grad():
+            alpha = render(shown.gaussians, cameras_of(session, [record])).alpha[0]
+        share = (dn.mean(dim=-1) - sensor.black_dn) / (sensor.white_dn - sensor.black_dn)
+        return int(
+            ((alpha.reshape(share.shape) > 0.5) & (share > WELL_SEEN[0]) & (share < WELL_SEEN[1])).sum()
+        )
+
+    return max(evenly_spread(list(nearest.values()), VIEWS), key=pixels_seen)
 
 
 def legend(limits: tuple[float, float], unit: str) -> str:

@@ -31,7 +31,7 @@ from ground.show.viewer.scene import (
     Placed,
 )
 from ground.show.viewer.source import Source
-from ground.show.viewer.splats import CHI2_SHOWN, DEVIATION_SHOWN, legend, seen_exposure_s
+from ground.show.viewer.splats import CHI2_SHOWN, DEVIATION_SHOWN, best_seen, legend, seen_exposure_s
 from ground.show.viewer.waiting import awaited
 from obbgs_base.errors import reason
 from obbgs_core.errors import ReconstructionError
@@ -152,7 +152,9 @@ class Viewer:
             self.checks[part].on_update(lambda _: self._show())
         self._measuring_controls()
         with gui.add_folder("Timeline of the pass"):
-            self.timeline = gui.add_slider("Frame", min=0, max=1, step=1, initial_value=0)
+            first = self.frames.index(best_seen(self.placed[0].shown, seen_s))
+            last = max(1, len(self.frames) - 1)
+            self.timeline = gui.add_slider("Frame", min=0, max=last, step=1, initial_value=first)
             self.timeline.on_update(lambda _: self.draw_frame())
             self.facts = gui.add_markdown("")
             self.comparison = gui.add_image(
