@@ -554,7 +554,7 @@ def test_imported_pictures_show_no_time_range_or_sun_that_nobody_stated(session)
                                       exposure_time_s=1.0) for r in shown.session.frames)  # fmt: skip
     imported = dataclasses.replace(shown.session, frames_imported=24, frames=plain)
     facts = viewer._facts(imported, plain[3])
-    assert facts == f"frame 3 of bracket {plain[3].bracket}, {plain[3].saturated:,} pixels saturated"
+    assert facts == f"picture 3, {plain[3].saturated:,} pixels saturated"
     server = opened("127.0.0.1", 0)
     try:
         shown = dataclasses.replace(shown, session=imported, tagged=imported)
