@@ -122,8 +122,8 @@ def import_command(
 
 
 def _tell(count: int, session: Path, registration: dict) -> None:
-    """Print how many frames there are, and which photographs structure from motion left out or turned."""
-    print(f"{count} frames in {session}")
+    """Print how many pictures there are, and which photographs structure from motion left out or turned."""
+    print(f"{count} pictures in {session}")
     if registration.get("left_out"):
         print(f"left out, because they could not be registered: {', '.join(registration['left_out'])}")
     if registration.get("turned"):

@@ -239,7 +239,7 @@ def mesh_command(
     if json_:
         print(json.dumps({"mesh": str(path)} | facts))
     else:
-        unseen = f"{100 * facts['mesh_unseen_share']:.1f} % of the area seen by no view"
+        unseen = f"{100 * facts['mesh_unseen_share']:.1f} % of the area in triangles with a corner that no view saw"
         print(f"{facts['mesh_triangles']:,} triangles, {unseen}: {path}")
 
 

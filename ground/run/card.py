@@ -152,8 +152,13 @@ def _appearance(metrics: dict) -> list[str]:
             f"({x:.3f}, {y:.3f}, {z:.3f}), target body frame."
         )
     if highlights := metrics.get("highlights"):
+        light = (
+            "the Sun"
+            if metrics.get("shown_under_sun_dir_body", ()) is not None
+            else "a light that stands still"
+        )
         lines.append(
-            f"- Highlights: each Gaussian mirrors the Sun in one lobe (GGX, alpha {highlights['alpha']:.2f}). "
+            f"- Highlights: each Gaussian mirrors {light} in one lobe (GGX, alpha {highlights['alpha']:.2f}). "
             "model.ply and model.onnx hold them; model.spz, splats.glb, and what other viewers show of model.ply, hold "
             "them as harmonics of degree 3, far wider and fainter; the colours of model.glb do not follow the view."
         )
@@ -209,11 +214,11 @@ def _quality(metrics: dict) -> list[str]:
                 f"on the target in held-out {called}."
             )
     if "mesh_triangles" in metrics:
-        unseen = f"{100 * metrics['mesh_unseen_share']:.1f} % of its area"
+        unseen = f"In {100 * metrics['mesh_unseen_share']:.1f} % of its area"
         lines.append(
-            f"- Mesh: {metrics['mesh_triangles']:,} triangles, closed. {unseen} was seen by none of "
-            f"{metrics['mesh_views']} views: there the surface only bounds what no view saw. The vertex attribute "
-            "_SEEN_BY_VIEWS counts the views that see each vertex."
+            f"- Mesh: {metrics['mesh_triangles']:,} triangles, closed. {unseen}, triangles with a corner "
+            f"that none of {metrics['mesh_views']} views saw, the surface may only bound what no view saw. The vertex "
+            "attribute _SEEN_BY_VIEWS counts the views that see each vertex."
         )
     if metrics.get("onnx_fits_uplink") is False:
         lines.append("- model.onnx is too large for the uplink: train with a smaller --budget.")

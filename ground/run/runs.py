@@ -81,7 +81,7 @@ class Run:
 
     def without_sky_level(self, record: FrameRecord) -> TrainingFrame:
         """Return a frame as if empty sky read the stated black level, where the training found that it does not."""
-        frame = training_frame(self.session, record)
+        frame = training_frame(self.session, record, self._tagged.get(record.id))
         if (planes_dn := self._sky_planes_dn.get(record.id)) is None:
             return frame
         dn = (frame.dn - field(planes_dn, *frame.dn.shape[:2])).clamp(min=0)
@@ -100,6 +100,10 @@ class Run:
         placed = frame if seen_from is None else dataclasses.replace(frame, world_to_camera=seen_from)
         black = without_earth(self.gaussians, placed, self.sensor)
         return dataclasses.replace(black, world_to_camera=frame.world_to_camera)
+
+    @functools.cached_property
+    def _tagged(self) -> dict[int, FrameRecord]:
+        return {record.id: record for record in self.session.frames}
 
     @functools.cached_property
     def _sky_planes_dn(self) -> dict[int, Tensor]:

@@ -113,14 +113,18 @@ def frames_of(session: Session, records: Sequence[FrameRecord] | None = None) ->
     return list(each(lambda record: training_frame(session, record), records))
 
 
-def training_frame(session: Session, record: FrameRecord) -> TrainingFrame:
+def training_frame(session: Session, record: FrameRecord, tagged: FrameRecord | None = None) -> TrainingFrame:
     """Return a frame with its picture, pose and calibration in the library's form.
+
+    Args:
+        tagged: the same as it was tagged, where `record` has another pose. The Earth is where the tag has it, in which
+            the pose and the attitude that it assumes err alike; None: `record`.
 
     Raises:
         MissingFrames, SessionCorrupt: its picture cannot be read.
     """
     dn, assumed = session.dn(record).astype(np.float32), record.quat_inertial_to_body
-    earth = earth_m(session, record, dn)
+    earth = earth_m(session, tagged or record, dn)
     frame = TrainingFrame(
         dn=torch.from_numpy(dn.reshape(*dn.shape[:2], session.camera.channels)),
         exposure_time_s=record.exposure_time_s,

@@ -11,6 +11,8 @@ from obbgs_core.inspect.faces import (
     nearest_on,
 )
 
+WIDTH_KNOWN = 0.25  # half of the 90 % interval of a face's width as a share of it, at most
+
 
 def places_of(text: str) -> np.ndarray:
     """Return two places [2, 3] m that a text such as 0,0,1:0,0,-1 names.
@@ -25,6 +27,11 @@ def places_of(text: str) -> np.ndarray:
     if places.shape != (2, 3) or not np.isfinite(places).all():
         raise ValueError(f"expected two places as X,Y,Z:X,Y,Z in metres, got {text!r}")
     return places
+
+
+def _is_known(width: dict) -> bool:
+    """Return whether a face is so wide that its width says something: the others are crumbs of a curved surface."""
+    return width["half_width_90"] <= WIDTH_KNOWN * width["value"]
 
 
 def measured(model: Model, between: list[np.ndarray] | None = None) -> dict:
@@ -48,7 +55,9 @@ def measured(model: Model, between: list[np.ndarray] | None = None) -> dict:
             "width": length(float(face.extent[1])),
             "area": {"value": face.area_m2, "half_width_90": area_half_width(face, pixel_m, deviation)},
         }
-        for number, face in enumerate(flat_faces(model.surface), 1)
+        for number, face in enumerate(
+            (f for f in flat_faces(model.surface) if _is_known(length(float(f.extent[1])))), 1
+        )
     ]
     distances = []
     for places in between or []:

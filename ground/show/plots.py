@@ -45,7 +45,7 @@ def training_figures(history: Sequence[dict]) -> tuple[list[go.Figure], list[tup
             )
     ticks = ticks_1_2_5(losses)
     figures[0].update_yaxes(type="log", tickvals=ticks, ticktext=[f"{t:g}" for t in ticks], title_text="loss")
-    figures[1].update_yaxes(title_text="PSNR of each step's frames, dB")
+    figures[1].update_yaxes(title_text="PSNR of each step, dB")
     for figure in figures:
         figure.update_xaxes(title_text="training time, s", rangemode="tozero")
         figure.update_layout(height=330, margin={"l": 60, "r": 20, "t": 15, "b": 45}, showlegend=False)

@@ -208,7 +208,7 @@ class Extension:
             if before is not None:
                 gained = fewer(before, self.errors)
                 goes_on &= bool(gained.justifies)
-                why += f"; brackets kept back err {gained.gain:.1%} less, of which {gained.error:.1%} may be chance"
+                why += f"; errors of views kept back changed by {-gained.gain:+.1%}, {gained.error:.1%} may be chance"
             order.keep_back(brackets if goes_on or setup.keeps_unseen else [])
         self.times += goes_on
         self.reason = f"growth {'goes on' if goes_on else 'ends'}: {why}"

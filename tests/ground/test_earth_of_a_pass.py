@@ -121,6 +121,19 @@ def opaque_target():
     )
 
 
+def test_the_earth_stays_where_the_tag_has_it_when_another_pose_was_found(mission, tmp_path):
+    """Once the target's attitude is corrected, the pose no longer goes with the attitude that the tag assumes."""
+    session = flown(mission, tmp_path / "session", [SHOWS_IT_S], True, opaque_target())
+    record, turn = session.frames[0], np.eye(4)
+    turn[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    placed = dataclasses.replace(record, world_to_camera=record.world_to_camera @ turn)
+    run = Run(tmp_path, session, [], [record], sensor_of(session.camera), opaque_target(), None, {})
+    tagged = training_frame(session, record)
+    seen = run.without_sky_level(placed)
+    assert torch.equal(seen.earth_m, tagged.earth_m)
+    assert not torch.equal(seen.world_to_camera, tagged.world_to_camera)
+
+
 def test_the_report_looks_for_a_target_in_front_of_the_earth_where_its_pose_was_found(mission, tmp_path):
     """The model is the truth; tags place it 20 px beside itself."""
     target, count = opaque_target(), 4

@@ -67,7 +67,7 @@ def bracket_numbers_of(records) -> list[int]:
 def test_corrections_undo_the_errors_and_carry_their_deviations(example):
     run, estimate, turns = example
     history = pose_history(run, estimate)
-    assert (np.diff(history.minutes) >= 0).all()
+    assert (np.diff(history.along) >= 0).all()
     place_of = {number: place for place, number in enumerate(estimate.frame_ids)}
     for row, number in enumerate(history.frame_ids):
         np.testing.assert_allclose(history.correction[row, :3], -turns[place_of[number]], atol=1e-6)
@@ -132,6 +132,21 @@ def test_frames_that_were_left_out_are_named_whatever_the_metrics_hold(example):
     run, *_ = example
     for held, told in (([3, 7], "The frames 3, 7 were left out"), (["<b>x"], "The frames &lt;b&gt;x were")):
         assert told in poses_section(dataclasses.replace(run, metrics=run.metrics | {"misfit_frames": held}))
+
+
+def test_imported_pictures_have_no_minutes_metres_or_tags(example):
+    run, estimate, _ = example
+    plain = tuple(dataclasses.replace(r, mid_exposure_utc_ns=r.id * 10**9) for r in run.session.frames)
+    count = len(plain)
+    session = dataclasses.replace(run.session, frames=plain, frames_imported=count)
+    imported = dataclasses.replace(run, session=session, metrics=run.metrics | {"frames_imported": count})
+    history = pose_history(imported, estimate)
+    assert (history.along_name, history.unit) == ("picture", "units")
+    linked = dataclasses.replace(run, session=dataclasses.replace(session, frames_imported=None))
+    received = pose_history(linked, estimate)
+    assert (received.along_name, received.unit) == ("minutes", "m")
+    assert history.along.tolist() == history.frame_ids
+    assert "minutes" not in (page := poses_section(imported)) and "pose tags" not in page
 
 
 def test_a_run_with_poses_as_tagged_has_no_such_section(example, tmp_path):

@@ -560,7 +560,9 @@ def test_imported_pictures_show_no_time_range_or_sun_that_nobody_stated(session)
         shown = dataclasses.replace(shown, session=imported, tagged=imported)
         page = viewer.Viewer(server, [Placed(server, "a", shown, np.zeros(3))])
         assert not page.checks["sun"].visible and page.placed[0].handles["sun"] == []
-        assert "ms" not in page.file_name("view") and page.file_name("view").startswith("A-run-frame000000")
+        assert "ms" not in page.file_name("view") and page.file_name("view").startswith(
+            f"A-run-frame{page.record.id:06d}-"
+        )
         assert "units of the imported poses" in ruler.measured(shown, np.zeros(3), np.ones(3))
     finally:
         server.stop()

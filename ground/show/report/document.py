@@ -17,7 +17,7 @@ from ground.run.card import (
 )
 from ground.run.runs import Run, open_run, read_config, written_to
 from ground.session.cameras import median_sun_direction
-from ground.session.folder import SessionError, pass_name
+from ground.session.folder import SessionError, pass_name, read_header
 from ground.session.truth import Truth
 from ground.show.page import as_yaml, beside, cards, fold, legend, page, plot, section, two_tables
 from ground.show.plots import histogram_figure, training_figures
@@ -93,7 +93,13 @@ def _result(run: Run, truth: Truth | None) -> str:
         else f"No simulator left a truth for this session, so the model is compared with "
         f"{'imported pictures' if is_imported(m) else 'received frames'} {seen}."
     )
-    lines = [*m.get("notes", []), *(f"{k} is missing: {v}" for k, v in m.get("missing_outputs", {}).items())]
+    imported = read_header(run.session.path).get("imported_from")
+    source = [] if imported is None else [f"Imported from {imported}."]
+    lines = [
+        *source,
+        *m.get("notes", []),
+        *(f"{k} is missing: {v}" for k, v in m.get("missing_outputs", {}).items()),
+    ]
     notes = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
     callout = f'<ul class="notes">{notes}</ul>' if notes else ""
     details = f'<div style="margin-top:16px">{two_tables(_details(m))}</div>'
@@ -194,7 +200,8 @@ def _model(run: Run) -> str:
     m, called = run.metrics, frames(is_imported(run.metrics))
     note = (
         f"The target in 3D, made from {m['frames_trained']:,} {called} and drawn as the camera would see it at the "
-        "chosen exposure. Drag to turn, wheel or pinch to zoom, shift and drag to move."
+        f"chosen {'brightness' if run.session.nominal_exposures else 'exposure'}. Drag to turn, wheel or pinch to "
+        "zoom, shift and drag to move."
     )
     if m["scored_frames"] == "held_out":
         note += f" The next section says how well it matches {called} that it was not made from."
@@ -241,7 +248,8 @@ def _training(run: Run) -> str:
         f"{'pictures' if is_imported(run.metrics) else 'noisy frames'}. Both are running means; "
         "where they have levelled off, more steps would change little."
     )
-    return section("Training", note, legend(named) + beside(map(plot, figures)))
+    key = legend(named) if len(named) > 1 else ""
+    return section("Training", note, key + beside(map(plot, figures)))
 
 
 def _histogram(run: Run) -> str:

@@ -80,7 +80,7 @@ def scored_section(run: Run, truth: Truth | None) -> str:
     groups = "brackets" if bracketed else "pictures"
     few = f"trained on: the session has too few {groups} to hold one out"
     seen = few if training else "never trained on"
-    against = "the noiseless exposure" if truth else "that imported" if imported else "the noisy frame"
+    against = "the noiseless exposure" if truth else "the imported one" if imported else "the noisy frame"
     note = (
         f"{len(shown)} of {len(brackets)} {groups}, {seen}; cropped to the target, brightness as above. Error is the "
         f"absolute difference: 0<span class='ramp'></span>{ERROR_FULL_SCALE:.0%} of full scale or more. PSNR is of the "

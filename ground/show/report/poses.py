@@ -9,11 +9,14 @@ import plotly.graph_objects as go
 import torch
 from plotly.subplots import make_subplots
 
+from ground.run.card import frames as frames_called
+from ground.run.card import is_imported
 from ground.run.estimated_poses import doubts_left, read_estimate
 from ground.run.runs import Run
 from ground.session.spread import evenly_spread
 from ground.show.page import legend, plot, section, two_tables, unbroken
-from ground.show.sizes import with_deviation
+from ground.show.plots import ticks_1_2_5
+from ground.show.sizes import states_scale, states_time, with_deviation
 from obbgs_base.physics.navigation_errors import LENGTHS
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.losses import fit_figures
@@ -38,6 +41,7 @@ SHOWN = {  # the parameters that a pass shares: words, unit, axes
     "focal": ("relative focal length", "", ()),
 }
 ELLIPSES_SHOWN = 60
+MOST_TICKS = 9  # of a logarithmic axis of residuals; above, at powers of ten only
 MISFIT_DEVIATIONS = 6.0  # of the median absolute deviation, scaled to that of a normal distribution
 
 
@@ -50,7 +54,10 @@ class PoseHistory:
     """
 
     frame_ids: list[int]  # of the frame that stands for each bracket, its longest exposure
-    minutes: np.ndarray  # [P] since the first
+    along: np.ndarray  # [P] minutes since the first, or the numbers of pictures of which no time is stated
+    along_name: str  # what these are
+    unit: str  # of shifts
+    called: str  # what a frame is called
     correction: np.ndarray  # [P, 6]
     prior: np.ndarray  # [P, 6, 6] covariance that the tags state, shared errors included
     posterior: np.ndarray  # [P, 6, 6] that is left
@@ -86,9 +93,13 @@ def pose_history(run: Run, estimate: PoseEstimate) -> PoseHistory:
         run.on_black_sky(records[number], pose.float()) for number, pose in zip(ids, estimated, strict=True)
     ]
     times_ns = np.array([records[number].mid_exposure_utc_ns for number in ids])
+    timed = all(states_time(run.session, records[number]) for number in ids)
     return PoseHistory(
         ids,
-        (times_ns - times_ns[0]) / 60e9,
+        (times_ns - times_ns[0]) / 60e9 if timed else np.array(ids),
+        "minutes" if timed else "picture",
+        "m" if states_scale(run.session) else "units",
+        frames_called(is_imported(run.metrics))[:-1],
         motion_vectors(estimated @ torch.linalg.inv(tagged)).numpy(),
         PoseCorrections(frames).covariances.numpy(),
         doubts_left(run.session, [records[number] for number in ids], estimate),
@@ -126,28 +137,30 @@ def poses_section(run: Run) -> str:
     history = pose_history(run, estimate)
     misfits = history.misfits
     alone = len(history.frame_ids) == len(estimate.frame_ids)  # each frame has a correction of its own
-    each = "frame" if alone else "bracket"
+    called = history.called
+    each = called if alone else "bracket"
+    tags, state = (
+        ("stated cameras", "come with them") if called == "picture" else ("pose tags", "the tags state")
+    )
     note = (
-        "What the training found the pose tags to err by. Corrections are along the camera's axes (z along the line of "
-        "sight), dotted lines are the standard deviations that the tags state. Ellipses lie across the line of sight: "
-        "pale what the tags allow, dark what is left in doubt, one standard deviation each. The residual is 1 where "
+        f"What the training found the {tags} to err by. Corrections are along the camera's axes (z along the line of "
+        f"sight), dotted lines are the standard deviations that {state}. Ellipses lie across the line of sight: "
+        "pale what these allow, dark what is left in doubt, one standard deviation each. The residual is 1 where "
         "only noise is left; it compares the finished model with "
-        f"{'each frame' if alone else 'the longest exposure of each bracket'}."
+        f"{f'each {called}' if alone else 'the longest exposure of each bracket'}."
     )
     told = (
         f"No {each}'s residual stands out from the others."
         if not misfits
         else (
-            f"The residual of {len(misfits)} of {len(history.frame_ids)} {each}s stands out (frame"
-            f"{'s' * (len(misfits) > 1)} {', '.join(map(str, misfits))}): the poses may err by more than the tags "
+            f"The residual of {len(misfits)} of {len(history.frame_ids)} {each}s stands out ({called}"
+            f"{'s' * (len(misfits) > 1)} {', '.join(map(str, misfits))}): the poses may err by more than the {tags} "
             "say, or something passed before the camera."
         )
     )
     if left_out := run.metrics.get("misfit_frames"):
         names = html.escape(", ".join(map(str, left_out)))
-        told += (
-            f" The frames {names} were left out of the training: they fitted no pose that their tags allow."
-        )
+        told += f" The {called}s {names} were left out of the training: they fitted no pose that their tags allow."
     body = two_tables(shared_rows(estimate)) if estimate.shared_prior.vector().any() else ""
     body += legend([(f"along {axis}", colour) for axis, colour in AXES.items()]) + plot(
         correction_figure(history)
@@ -177,12 +190,14 @@ def shared_rows(estimate: PoseEstimate) -> list[tuple[str, str]]:
 
 
 def correction_figure(history: PoseHistory) -> go.Figure:
-    """Return the corrections against time, rotation above shift, with the deviations that the tags state."""
+    """Return the corrections along the pass, rotation above shift, with the deviations that the tags state."""
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
     deviations = np.sqrt(np.maximum(np.diagonal(history.prior, axis1=1, axis2=2), 0))
-    for row, (first, factor, unit) in enumerate(((0, math.degrees(1), "deg"), (3, 1.0, "m")), start=1):
+    for row, (first, factor, unit) in enumerate(
+        ((0, math.degrees(1), "deg"), (3, 1.0, history.unit)), start=1
+    ):
         for i, (axis, colour) in enumerate(AXES.items()):
-            line = {"x": history.minutes, "legendgroup": axis, "row": row, "col": 1}
+            line = {"x": history.along, "legendgroup": axis, "row": row, "col": 1}
             figure.add_scatter(
                 **line,
                 y=factor * history.correction[:, first + i],
@@ -191,7 +206,7 @@ def correction_figure(history: PoseHistory) -> go.Figure:
                 mode="lines+markers",
                 marker={"size": 4},
                 customdata=history.frame_ids,
-                hovertemplate=f"frame %{{customdata}}: %{{y:.4g}} {unit}<extra></extra>",
+                hovertemplate=f"{history.called} %{{customdata}}: %{{y:.4g}} {unit}<extra></extra>",
             )
             for sign in (-1, 1):
                 figure.add_scatter(
@@ -202,7 +217,7 @@ def correction_figure(history: PoseHistory) -> go.Figure:
                     line={"color": colour, "dash": "dot", "width": 1},
                 )
         figure.update_yaxes(title_text=f"{'rotation' if row == 1 else 'shift'}, {unit}", row=row, col=1)
-    figure.update_xaxes(title_text="minutes", row=2, col=1)
+    figure.update_xaxes(title_text=history.along_name, row=2, col=1)
     figure.update_layout(height=460, margin=MARGINS_PX, showlegend=False)
     return figure
 
@@ -234,15 +249,15 @@ def ellipse_figure(history: PoseHistory) -> go.Figure:
         name="correction",
         line={"color": "#b9c4d0", "width": 1},
         marker={
-            "color": history.minutes,
+            "color": history.along,
             "colorscale": "Viridis",
-            "colorbar": {"title": {"text": "minutes"}},
+            "colorbar": {"title": {"text": history.along_name}},
         },
         customdata=history.frame_ids,
-        hovertemplate="frame %{customdata}: %{x:.3g}, %{y:.3g} m<extra></extra>",
+        hovertemplate=f"{history.called} %{{customdata}}: %{{x:.3g}}, %{{y:.3g}} {history.unit}<extra></extra>",
     )
-    figure.update_yaxes(title_text="shift along camera y, m", scaleanchor="x")
-    figure.update_xaxes(title_text="shift along camera x, m")
+    figure.update_yaxes(title_text=f"shift along camera y, {history.unit}", scaleanchor="x")
+    figure.update_xaxes(title_text=f"shift along camera x, {history.unit}")
     figure.update_layout(height=460, margin=MARGINS_PX, showlegend=False)
     return figure
 
@@ -262,15 +277,21 @@ def residual_figure(history: PoseHistory) -> go.Figure:
         (history.chi2_tagged, history.chi2_estimated), RESIDUALS.items(), strict=True
     ):
         figure.add_scatter(
-            x=history.minutes,
+            x=history.along,
             y=values,
             name=name,
             mode="lines+markers",
             line={"color": colour},
             customdata=history.frame_ids,
-            hovertemplate="frame %{customdata}: %{y:.3g}<extra></extra>",
+            hovertemplate=f"{history.called} %{{customdata}}: %{{y:.3g}}<extra></extra>",
         )
-    figure.update_yaxes(title_text="residual chi²", type="log")
-    figure.update_xaxes(title_text="minutes")
+    both = np.concatenate([history.chi2_tagged, history.chi2_estimated])
+    ticks = ticks_1_2_5(both[np.isfinite(both)])
+    if len(ticks) > MOST_TICKS:
+        ticks = [tick for tick in ticks if math.log10(tick) % 1 == 0]
+    figure.update_yaxes(
+        title_text="residual chi²", type="log", tickvals=ticks, ticktext=[f"{tick:,g}" for tick in ticks]
+    )
+    figure.update_xaxes(title_text=history.along_name)
     figure.update_layout(height=320, margin=MARGINS_PX, showlegend=False)
     return figure

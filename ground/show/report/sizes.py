@@ -30,8 +30,13 @@ def sizes_section(run: Run) -> str:
     note = (
         f"Lengths are in {unit}, areas in {squared}. Intervals hold the true value with a probability of 90 %: they "
         f"count the error of the scale, {values['size_sigma_percent']:.2g} % (one standard deviation), and that of "
-        f"edges in the model, whose pixels are {values['pixel']:.2g} {unit} wide. Faces are the flat ones that the "
-        "frames show, largest first."
+        f"edges in the model, whose pixels are {values['pixel']:.2g} {unit} wide."
+    )
+    note += (
+        " Faces are the flat ones that the frames show, largest first, without those too small for their width "
+        "to be known to a quarter."
+        if values["faces"]
+        else " The frames show no flat face that is large enough to be measured."
     )
     return section("Sizes", note, two_tables(rows))
 
