@@ -1,6 +1,7 @@
 """The documents are true: their links lead somewhere, the page of commands is that of today's command lines."""
 
 import importlib.util
+import json
 import pkgutil
 import re
 import shlex
@@ -12,6 +13,7 @@ import pytest
 import ground
 import obbgs_core
 from flightsw.icd.link.link_url import parse_link_url
+from tests.benchmarks import figures
 from tests.benchmarks.figures import PAGES as PAGES_WITH_FIGURES
 from tests.benchmarks.figures import blocks, wrong
 
@@ -149,6 +151,25 @@ def test_every_page_is_in_the_site():
 def test_every_figure_comes_from_rows(page):
     found = {block: problems for block in blocks(page.read_text()) if (problems := wrong(block))}
     assert found == {}
+
+
+def test_a_time_to_a_quality_says_on_how_many_targets_that_is_reached(tmp_path, monkeypatch):
+    def row(target: str, psnr_db: float) -> str:
+        curve = [
+            {"cpu_seconds": 2.0, "psnr_clean_db": 36.0},
+            {"cpu_seconds": 6.0, "psnr_clean_db": psnr_db},
+            {"cpu_seconds": 8.0, "psnr_clean_db": 35.0},
+        ]
+        what = {"method": "obbgs", "condition": "as taken", "steps_share": 1.0, "target": target}
+        return json.dumps(what | {"psnr_clean_db": 36.0, "curve": curve})
+
+    (tmp_path / "of-two-targets.jsonl").write_text(row("A", 40.0) + "\n" + row("B", 37.0))
+    monkeypatch.setattr(figures, "FOLDER", tmp_path)
+    monkeypatch.setitem(figures.FILES, "two", "of-two-targets")
+    for queries in ("mean(two, psnr); mean(two, to38); reached(two, 38)", "line(two)"):
+        text = f"At 36.0 dB it has 38 dB after 4.0 s (%d of 6). <!-- rows: {queries} given 38 -->"
+        assert wrong(text % 1) == []
+        assert len(wrong(text % 2)) == 2
 
 
 def test_a_changed_digit_is_found():

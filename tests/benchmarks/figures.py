@@ -6,9 +6,9 @@ comment below a table has a line of queries for each of its rows.
 
     On TDRS 44.2 dB. <!-- rows: mean(six400, psnr, target="TDRS-400") -->
 
-A query is an expression in Python of `mean`, `least` and `most`, each with the name of a file of rows, the key of a
-figure and what rows must hold. `psnr` and the like are short for keys, `o200` and the like for files. Rows are those
-`as taken` and of all steps unless the query says otherwise; seeds are averaged first, then targets.
+A query is an expression in Python of `mean`, `least`, `most` and the like, each with the name of a file of rows, the
+key of a figure and what rows must hold. `psnr` and the like are short for keys, `o200` and the like for files. Rows are
+those `as taken` and of all steps unless the query says otherwise; seeds are averaged first, then targets.
 """
 
 import json
@@ -26,7 +26,7 @@ COMMENT = re.compile(r"<!-- rows:(.*?)-->", re.DOTALL)
 BELOW_A_TABLE = re.compile(r"<!-- rows of the table, a line each:\n(.*?)\n-->", re.DOTALL)
 # what is no result: code, links' targets, comments, names of experiments, picture sizes and counts in words beside them
 NO_FIGURE = re.compile(r"`[^`]*`|\]\([^)]*\)|\[\d{3}\]|<!--.*?-->|\d+x\d+|https?://\S+", re.DOTALL)
-UNIT = r"(?:dB|%|s\b|Gaussians|times|degrees|pixels|px)"
+UNIT = r"(?:dB|%|s\b|Gaussians|times|degrees|pixels|px|of 6\b)"
 FIGURE = re.compile(  # decimals, thousands, whole numbers before a unit or a further number with one, those of a table
     rf"(?<![\w.,])(\d[\d,]*\.\d+|\d{{1,3}}(?:,\d{{3}})+|\d+(?=(?:(?: to| and| or|,) \d+)* {UNIT})|(?<=\| )\d+(?= ))"
     r"(?!\w|\.\d)"
@@ -52,11 +52,11 @@ KEYS = {
     "cpu": "cpu_seconds",
     "CHI2": "chi2_held_out_both",
 }
-# the columns of README's table: seconds by the clock, without the number of Gaussians, seconds of the processor
-A, B, C = (
-    f"psnr foreground chamfer surface accuracy {last}"
-    for last in ("gaussians seconds", "cpu", "gaussians cpu")
-)
+# the opponents of README's table at their best
+AT_BEST = {
+    "BEST_3DGS": "3dgs+exposure+hull+mask+l1+fast",
+    "BEST_MIP": "mip-splatting+exposure+hull+mask+l1+fast",
+}
 FILES = {
     "o200": "opponents-200x200",
     "o400": "opponents-400x400",
@@ -74,6 +74,7 @@ FILES = {
     "bars": "sky-bars-100x100",
     "camera": "camera-100x100",
     "best100": "best-100x100",
+    "best200": "best-200x200",
     "size": "size-200x200",
     "mesh": "mesh-400x400",
     "demo": "demo",
@@ -122,6 +123,34 @@ def most(file: str, key: str, method: str | None = "obbgs", **where: Any) -> flo
     return max(by_target(file, key, method, **where))
 
 
+def best_of(file: str, key: str, *methods: str) -> list[float]:
+    """Return a figure of each target, of the method that has most of it there."""
+    return [max(values) for values in zip(*(by_target(file, key, m) for m in methods), strict=True)]
+
+
+def reached(file: str, level_db: float, method: str = "obbgs") -> float:
+    """Return on how many targets the curve of a method comes to a clean PSNR; `to38` is the mean of these alone."""
+    return float(sum(value >= level_db for value in by_target(file, KEYS["best"], method)))
+
+
+def line(file: str, method: str = "obbgs") -> list[float]:
+    """Return a line of README's table: what the rows of a method hold of its columns, older ones less than all.
+
+    Seconds are by the clock where none has processor time. The last is on how many targets 38 dB are reached, where
+    that is not all or where it is not known how soon.
+    """
+    found: dict[str, list[float]] = {}
+    for key in ("psnr", "foreground", "f01", "f02", "gaussians", "to38", "cpu", "seconds", "best"):
+        try:
+            found[key] = by_target(file, KEYS[key], method)
+        except LookupError:
+            continue
+    found.pop("seconds" if "cpu" in found else "cpu", None)
+    trained, soon = "best" in found, len(found.get("to38", ()))
+    columns = [statistics.fmean(values) for key, values in found.items() if key != "best"]
+    return [*columns, reached(file, 38, method)] if trained and soon < len(found["psnr"]) else columns
+
+
 def blocks(page: str) -> Iterator[str]:
     """Yield the paragraphs, list items and lines of tables of a page, each with the comment of its queries."""
     page = re.sub(r"```.*?```", "", page, flags=re.DOTALL)
@@ -143,10 +172,13 @@ def wrong(block: str) -> list[str]:
     conditions = FIGURE.findall(given) + re.findall(r"[\d.,]*\d", given)
     figures = [text for text in FIGURE.findall(NO_FIGURE.sub("", block)) if text not in conditions]
     names: dict[str, Any] = {
-        **{function.__name__: function for function in (by_target, mean, means, least, most)},
+        **{
+            function.__name__: function
+            for function in (by_target, best_of, mean, means, least, most, reached, line)
+        },
         **KEYS,
         **FILES,
-        **{"A": A, "B": B, "C": C},
+        **AT_BEST,
         "__builtins__": {},
     }
     values = {}
