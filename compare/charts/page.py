@@ -17,7 +17,16 @@ from compare.charts.charts import (
     size_figures,
     speed_figures,
 )
-from compare.charts.results import HOLDS_DB, MARGIN_DB, METRICS, SHAKEN_DB, VERDICTS, Metric, Results
+from compare.charts.results import (
+    HOLDS_DB,
+    MARGIN_DB,
+    METRICS,
+    SHAKEN_DB,
+    VERDICTS,
+    Metric,
+    Results,
+    budget_of,
+)
 from compare.charts.severity import LEAST_F_PERCENT, Breaking, F, Series, breaking_points
 from compare.grid.rows import Rows
 from compare.grid.worker import VIEWS
@@ -72,7 +81,7 @@ def write_page(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyTyp
     )
     content = page(
         "Comparison of methods",
-        f"{rows}: {methods}, {targets}, {conditions}.{replaced}",
+        f"{rows}: {methods}, {targets}, {conditions}.{_shortened(results)}{replaced}",
         [
             _tables(results),
             _speed(results),
@@ -87,6 +96,12 @@ def write_page(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyTyp
     path = out / PAGE
     write_whole(path, content.encode())
     return path
+
+
+def _shortened(results: Results) -> str:
+    """Return in a sentence the budgets of trainings that did not have all steps and as many Gaussians as they want."""
+    budgets = {budget_of(row): None for row in results.rows if row["steps_share"] != 1 or "largest" in row}
+    return f" Trainings had {'; '.join(budgets)}." if budgets else ""
 
 
 def _tables(results: Results) -> str:
@@ -116,7 +131,7 @@ def _explained(results: Results) -> str:
         notes.append(
             f"{which}: their methods are compared with held-out frames as received, whose own noise bounds the PSNR."
         )
-    notes.append("Bold: the best of those that reconstruct something.")
+    notes.append("Bold: the best of those that reconstruct something. Wide tables scroll sideways.")
     if "ceiling" in methods:
         notes.append(
             "The ceiling is a perfect model that ignores exposure: true radiance at the geometric mean of the exposure "
@@ -354,10 +369,11 @@ def _origin(results: Results) -> str:
         f"<tr><td>{html.escape(name)}</td><td>{html.escape(json.dumps(change))}</td></tr>"
         for name, change in changes.items()
     ]
-    early = sum(bool(row.get("converged")) for row in results.rows)
+    count = sum(bool(row.get("converged")) for row in results.rows)
+    early = f"{count} training{'s' * (count != 1)}" if count else "No training"
     note = (
-        f"Every row is a line of rows.jsonl with its own commit, machine, load and date. {early} trainings ended early "
-        "because their curve had moved by less than 0.05 dB over its last fifth (converged)."
+        f"Every row is a line of rows.jsonl with its own commit, machine, load and date. {early} ended early "
+        "because its curve had moved by less than 0.05 dB over its last fifth (converged)."
     )
     return section(
         "Where the rows come from", note, f'<div class="scroll"><table>{"".join(lines)}</table></div>'

@@ -124,20 +124,20 @@ class Results:
             target, condition = asked.get(row["digest"], (row["target"], row["condition"]))
             given.append(row | {"target": target, "condition": condition})
         for row in given:
-            key = (row["method"], _budget(row), row["target"], row["condition"], row["seed"])
+            key = (row["method"], budget_of(row), row["target"], row["condition"], row["seed"])
             if key not in named or named[key]["digest"] not in asked:
                 named[key] = row
         self.replaced = len(given) - len(named)
         self.rows = [with_best(row) for row in named.values()]
         budgets: dict[str, set[str]] = {}
         for row in self.rows:
-            budgets.setdefault(row["method"], set()).add(_budget(row))
+            budgets.setdefault(row["method"], set()).add(budget_of(row))
         self._cells: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
         self.labels: list[str] = []
         self.method_of: dict[str, str] = {}
         for row in self.rows:
             method = row["method"]
-            label = f"{method} ({_budget(row)})" if len(budgets[method]) > 1 else method
+            label = f"{method} ({budget_of(row)})" if len(budgets[method]) > 1 else method
             self.method_of[label] = method
             self._cells.setdefault((label, row["target"], row["condition"]), []).append(row)
         order = reference_names()
@@ -293,6 +293,7 @@ def pareto(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
     return front
 
 
-def _budget(row: dict[str, Any]) -> str:
+def budget_of(row: dict[str, Any]) -> str:
+    """Return in words what a training of a row might use."""
     share = f"{row['steps_share']:g} of the steps"
     return share if "largest" not in row else f"{share}, {row['largest']} Gaussians"

@@ -40,6 +40,7 @@ details { margin: 10px 0; } summary { cursor: pointer; color: var(--soft); font-
 h3 { font-size: 15px; margin: 18px 0 8px; }
 .scroll { overflow-x: auto; }
 .scores td, .scores th { white-space: nowrap; overflow-wrap: normal; }
+.scores th.n { white-space: normal; min-width: 64px; vertical-align: bottom; }
 .scores td.words { white-space: normal; min-width: 240px; }
 .scores td:first-child, .scores th:first-child { position: sticky; left: 0; background: var(--card); }
 .beside { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, var(--least)), 1fr)); gap: 0 16px; }

@@ -13,6 +13,7 @@ from obbgs_core.poses.corrections import motion_of
 from obbgs_core.poses.estimate import PoseEstimate
 
 YEAR_2000_NS = 946_684_800 * 10**9
+MOST_DECIMALS = 8
 FRAMES = 60  # at most, over which the size's deviation is worked out
 
 
@@ -26,6 +27,8 @@ def with_deviation(value: float, deviation: float) -> str:
     if not (math.isfinite(value) and math.isfinite(deviation)) or deviation <= 0:
         return f"{value:.4g} ± {deviation:.2g}"
     decimals = max(0, 1 - math.floor(math.log10(float(f"{deviation:.1e}"))))
+    if decimals > MOST_DECIMALS:  # a row of zeros is no number that a person reads, and too wide for a phone
+        return f"{value:.1e} ± {deviation:.1e}"
     return f"{value:.{decimals}f} ± {deviation:.{decimals}f}"
 
 

@@ -58,8 +58,8 @@ class Lobes:
     def __str__(self) -> str:
         errors = self.evidence.gain / self.evidence.error * SURE
         return (
-            f"highlights would gain {self.nats:,.0f} nats on frames that they are not fitted to, with {errors:.1f} "
-            "standard errors"
+            f"highlights along axes of their own would gain {self.nats:,.0f} nats on frames that they are not fitted "
+            f"to, with {errors:.1f} standard errors"
         )
 
 

@@ -95,7 +95,7 @@ class Highlights:
         found = lobed(now.model, now.batches, now.setup.sensor, now.misfit, now.shadows, now.moment.done)
         shiny, along = found.gaussians, ""
         if shiny is None and now.gaussians.shading != "view":
-            shiny, along = along_normals(now.gaussians), "; they lie along the normals"
+            shiny, along = along_normals(now.gaussians), "; so they lie along the normals"
         self.frames, self.reason = len(now.setup.frames), f"step {now.moment.done + 1}, {found}{along}"
         if shiny is None:
             log.info("radiance %s", described(now.gaussians, self.reason))

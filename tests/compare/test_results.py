@@ -363,6 +363,14 @@ def test_one_of_a_kind_is_told_in_the_singular(tmp_path):
     assert "1 row: 1 method, 1 target, 1 condition." in write_page(tmp_path).read_text()
 
 
+def test_a_page_of_shortened_trainings_says_so(tmp_path):
+    rows = Rows(tmp_path)
+    rows.add(
+        row("3dgs", psnr_clean_db=30.0, chamfer=0.1, seconds=2.0, gaussians=300, bytes=700, steps_share=0.1)
+    )
+    assert "1 condition. Trainings had 0.1 of the steps." in write_page(tmp_path).read_text()
+
+
 def test_figures_are_written_as_png(comparison):
     paths = write_figures(comparison)
     assert {path.name for path in paths} == {

@@ -11,7 +11,8 @@ import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obbgs_core.evidence.highlights import first_lobes
+from obbgs_core.evidence import Evidence
+from obbgs_core.evidence.highlights import Lobes, first_lobes
 from obbgs_core.frames import cameras_of
 from obbgs_core.io.onnx import export_onnx
 from obbgs_core.io.ply import display_sh, load_ply, save_ply
@@ -407,3 +408,9 @@ def test_highlights_that_few_frames_do_not_show_are_found_when_more_have_joined(
     trainer.join(shiny_frames[8:])
     trainer.step()
     assert trainer.state.highlights.frames == 90 and trainer.gaussians.has_highlights
+
+
+def test_what_was_tried_is_not_told_as_what_the_model_has():
+    """Lobes along the normals are given in its place, and nobody said what these gain."""
+    told = str(Lobes(None, Evidence(torch.tensor(-0.1), 0.0, 1.0), -279.0))
+    assert told.startswith("highlights along axes of their own would gain -279 nats")
