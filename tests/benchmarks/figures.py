@@ -75,6 +75,7 @@ FILES = {
     "camera": "camera-100x100",
     "best100": "best-100x100",
     "best200": "best-200x200",
+    "cap200": "best-cap-200x200",
     "size": "size-200x200",
     "mesh": "mesh-400x400",
     "demo": "demo",
