@@ -86,7 +86,8 @@ def _sessions_table(sessions: "list[SessionEntry]") -> Table:
         if s.frames_missing:
             least = "at least " if s.frames_captured is None else ""
             lost += f"; {least}{s.frames_missing:,} not received yet"
-        link = f"repaired: {_counts(s.link)}" if s.link else s.imported_from or ""
+        counts = (f"{kind.replace('_', ' ').replace('crc', 'CRC')}: {n:,}" for kind, n in s.link.items())
+        link = "; ".join(("repaired", *counts)) if s.link else s.imported_from or ""
         count = f"{s.frames}{captured} in {s.brackets} brackets"
         if s.imported_from:
             count = f"{s.frames} pictures" + (f" in {s.brackets} brackets" if s.brackets < s.frames else "")

@@ -2,6 +2,7 @@
 
 import dataclasses
 from datetime import UTC, datetime
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,9 @@ from ground.session.folder import open_session
 from ground.session.training_frames import frames_of, training_frame
 from ground.session.writer import SessionWriter
 from ground.show.report.poses import pose_history
+from ground.show.viewer import viewer
+from ground.show.viewer.source import Shown
+from ground.show.viewer.splats import best_seen
 from obbgs_base.physics.earth import camera_rays, earth_radiance
 from obbgs_base.physics.navigation_errors import SIZE, SharedParameters
 from obbgs_core.background import earth_pixels
@@ -132,6 +136,18 @@ def test_the_earth_stays_where_the_tag_has_it_when_another_pose_was_found(missio
     seen = run.without_sky_level(placed)
     assert torch.equal(seen.earth_m, tagged.earth_m)
     assert not torch.equal(seen.world_to_camera, tagged.world_to_camera)
+
+
+def test_the_viewer_counts_no_earth_as_error_and_begins_where_none_is_seen(mission, tmp_path):
+    """The model is the truth, so that without the Earth hardly anything is left of the error."""
+    times_s = [SHOWS_IT_S, SHOWS_IT_S, BESIDE_IT_S, BESIDE_IT_S]
+    session, target = flown(mission, tmp_path / "session", times_s, True, opaque_target()), opaque_target()
+    shown = Shown("A", session, sensor_of(session.camera), target, None, session, None)
+    width = session.camera.width
+    compared = viewer._compared(SimpleNamespace(shown=shown), session.frames[1])  # pyright: ignore[reportArgumentType]
+    frame, error = compared[:, :width], compared[:, 2 * width :]
+    assert frame[0].mean() > 40 and error.mean() < 10
+    assert best_seen(shown, EXPOSURES_S[1]).id == 3
 
 
 def test_the_report_looks_for_a_target_in_front_of_the_earth_where_its_pose_was_found(mission, tmp_path):

@@ -116,7 +116,11 @@ def test_lost_is_what_never_comes_and_not_what_the_link_repaired(tmp_path):
     assert (found["frames_captured"], found["frames_missing"]) == (60, 3)
     assert found["link"] == {"segments_resent": 12, "crc_errors": 7}
     text = called("list", str(tmp_path), columns=500)
-    assert "48 of 60" in text and "repaired" in text and "3 not received yet" in text
+    assert (
+        "48 of 60" in text
+        and "repaired; segments resent: 12; CRC errors: 7" in text
+        and "3 not received yet" in text
+    )
 
 
 def test_a_run_shows_its_quality_what_was_decided_of_poses_and_their_errors_but_no_digest(passes, tmp_path):

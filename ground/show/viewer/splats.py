@@ -143,8 +143,8 @@ def seen_exposure_s(shown: Shown) -> float:
 def best_seen(shown: Shown, exposure_time_s: float) -> FrameRecord:
     """Return the frame in which the target is best seen, of those nearest to an exposure time in some brackets.
 
-    Best seen: most pixels of the model are well above black in the frame, and not saturated. Frames that cannot be read
-    show nothing.
+    Best seen: most pixels of the model are well above black in the frame, and not saturated, and fewest beside it are.
+    Frames that cannot be read show nothing.
     """
     session, sensor = shown.session, shown.sensor
     nearest: dict[int, FrameRecord] = {}
@@ -163,9 +163,9 @@ def best_seen(shown: Shown, exposure_time_s: float) -> FrameRecord:
         with torch.no_grad():
             alpha = render(shown.gaussians, cameras_of(session, [record])).alpha[0]
         share = (dn.mean(dim=-1) - sensor.black_dn) / (sensor.white_dn - sensor.black_dn)
-        return int(
-            ((alpha.reshape(share.shape) > 0.5) & (share > WELL_SEEN[0]) & (share < WELL_SEEN[1])).sum()
-        )
+        target, lit = alpha.reshape(share.shape) > 0.5, share > WELL_SEEN[0]
+        beside = lit & ~(alpha.reshape(share.shape) > 0)  # the Earth behind it
+        return int((target & lit & (share < WELL_SEEN[1])).sum() - beside.sum())
 
     return max(evenly_spread(list(nearest.values()), VIEWS), key=pixels_seen)
 

@@ -16,6 +16,7 @@ import viser
 from ground.session.cameras import predicted_image, range_in_words, sun_direction
 from ground.session.exposures import in_ms, offered_s
 from ground.session.folder import FrameRecord, Session, SessionError
+from ground.session.training_frames import training_frame
 from ground.show.pictures import ERROR_FULL_SCALE, heat, tone
 from ground.show.sizes import states_scale, states_time
 from ground.show.turntable import VIEWS, circle, moving_png, pictures
@@ -35,6 +36,7 @@ from ground.show.viewer.splats import CHI2_SHOWN, DEVIATION_SHOWN, best_seen, le
 from ground.show.viewer.waiting import awaited
 from obbgs_base.errors import reason
 from obbgs_core.errors import ReconstructionError
+from obbgs_core.render.backdrops import without_earth
 
 log = logging.getLogger(__name__)
 POLL_S, TICK_S = 1.0, 0.25  # between looks for a renewed model, and between steps of a replay
@@ -424,7 +426,7 @@ def _facts(session: Session, record: FrameRecord) -> str:
 
 
 def _compared(placed: Placed, record: FrameRecord) -> np.ndarray:
-    """Return a frame, the model's picture and the error side by side, bytes [H, 3 W, 3]."""
+    """Return a frame, the model's picture and the error side by side, bytes [H, 3 W, 3]; the Earth is no error."""
     shown = placed.shown
     try:
         dn = shown.session.dn(record).astype(np.float32)
@@ -434,7 +436,10 @@ def _compared(placed: Placed, record: FrameRecord) -> np.ndarray:
     frame = torch.from_numpy(dn.reshape(*dn.shape[:2], -1) / shown.sensor.white_dn)
     seen_from = shown.compared(record)
     image = predicted_image(shown.gaussians, shown.session, seen_from, shown.sensor, record.exposure_time_s)
-    error = ((image - frame).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
+    tagged = next(r for r in shown.tagged.frames if r.id == record.id)
+    taken = training_frame(shown.tagged, seen_from, tagged)
+    on_black = without_earth(shown.gaussians, taken, shown.sensor).dn / shown.sensor.white_dn
+    error = ((image - on_black).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
     encoding = shown.session.encoding
     toned = [tone(each.numpy(), shown.sensor, encoding) for each in (frame, image)]
     return np.concatenate([*toned, heat(error.numpy())], axis=1)
