@@ -87,6 +87,22 @@ class Answer:
     dispersion: Tensor
     misfit: Tensor
 
+    def standing_out(self, by: float) -> list[int]:
+        """Return the places of the frames that are so far off that something else than the model's error is in them.
+
+        Both residuals have to say so: the smallest error of a pose shows in deviations of the noise where thin
+        structures are seen edge-on, but it moves little of the picture's light there. A frame without the target has
+        residuals of NaN, and does not.
+
+        Args:
+            by: of the logarithm of the dispersion, so many median absolute deviations above the median, scaled to those
+                of a normal distribution; of the misfit, so many times the median.
+        """
+        logs = self.dispersion.log()
+        above = logs - logs.nanmedian()
+        far = above > by * 1.4826 * above.abs().nanmedian()
+        return torch.nonzero(far & (self.misfit > by * self.misfit.nanmedian()))[:, 0].tolist()
+
 
 class PoseRound:
     """A round of the poses under way: frames are asked in a thread of its own, and the training goes on meanwhile.

@@ -3,11 +3,10 @@
 import copy
 import dataclasses
 import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-
-import torch
-from torch import Tensor
+from types import MappingProxyType
 
 from obbgs_core.evidence.poses import correction_evidence
 from obbgs_core.frames import pose_numbers
@@ -21,9 +20,7 @@ from obbgs_core.train.order import FrameOrder
 from obbgs_core.train.parts import Change, Now
 from obbgs_core.train.setup import Start, TrainingSetup
 
-REFINED_FROM = (
-    0.25  # share of the steps before which the model is too coarse to correct poses (experiment 044)
-)
+REFINED_FROM = 0.25  # share of the steps before which the model is too coarse for it (experiment 044)
 ALIGNED_FROM = 0.05  # the same, of poses that were aligned before the start (experiment 079)
 # In so many rounds the poses would move during a whole training if they moved as often as before `SET_BACK_AT`, or as
 # after it (experiment 079).
@@ -40,12 +37,13 @@ LEFT_OUT_FROM = 0.6
 # share of the steps from which brackets count as one where the gauge is settled: earlier, a frame with the Earth went
 # 3 px astray (experiment 103)
 AS_ONE_FROM = 0.8
-# of the logarithms of the brackets' residuals: median absolute deviations, scaled to those of a normal distribution,
-# above the median
-FAR_DEVIATIONS = 6.0
-FAR_FACTOR = 6.0  # and the residual as a share of the picture's light is above the median by this factor
-# shares of the steps until which frames that have the Earth are asked in pictures of these shares of their size
+# by which a picture's residuals stand out (`Answer.standing_out`), where its bracket is left out, and where it is asked
+# in small from then on
+FAR, DOUBTFUL = 6.0, 3.0
+# shares of the steps until which frames that have the Earth are asked in pictures of these shares of their size; the
+# first is also that of frames whose residuals stand out
 COARSE_UNTIL = ((0.15, 0.25), (0.3, 0.5))
+SMALLEST_PX = 24  # along a side, of the pictures of the latter
 log = logging.getLogger(__name__)
 
 
@@ -88,6 +86,7 @@ class Poses:
     placed_by: refined poses that the setup was made with, as they were then; None: it was made with the tags.
     round: under way.
     moved: rounds in which the pose of a frame has moved, mean of the frames.
+    doubtful: frames whose residuals stood out in the last round.
     """
 
     decision: PoseDecision
@@ -98,6 +97,7 @@ class Poses:
     placed_by: PoseCorrections | None = None
     round: PoseRound | None = None
     moved: float = 0.0
+    doubtful: Sequence[int] = ()
 
     @staticmethod
     def first(
@@ -199,12 +199,24 @@ class Poses:
                 now.model,
                 poses,
                 [members[done // steps % len(members)] for members in shown],
-                next((scale for until, scale in COARSE_UNTIL if now.moment.share < until), 1.0),
+                self._coarse(setup, now.moment.share),
             ),
             shown,
             answered_at=now.taken + _delay(steps),
             judges=0 <= since < steps_between(setup, LEFT_OUT_FROM),
         )
+
+    def _coarse(self, setup: TrainingSetup, share: float) -> dict[int, float]:
+        """Return the frames that are asked in smaller pictures, and the share of their size.
+
+        They have the Earth, and so no silhouette to be aligned by, or they stand out: their poses may lie beyond what
+        whole pictures lead back from.
+        """
+        early = next((scale for until, scale in COARSE_UNTIL if share < until), 1.0)
+        of_earth = [i for i, frame in enumerate(setup.frames) if early < 1 and frame.earth_m is not None]
+        small = COARSE_UNTIL[0][1]
+        doubtful = [i for i in self.doubtful if small * min(setup.frames[i].shape[:2]) >= SMALLEST_PX]
+        return dict.fromkeys(of_earth, early) | dict.fromkeys(doubtful, small)
 
     def _move(self, now: Now, asked: PoseRound) -> Change:
         """Move the poses to where one frame of each bracket wants them if the surface goes along; settle the gauge.
@@ -216,9 +228,9 @@ class Poses:
         assert poses is not None
         self.round, self.moved = None, self.moved + 1
         poses.gather(answer.indices, answer.information)
+        self.doubtful = [answer.indices[i] for i in answer.standing_out(DOUBTFUL)]
         if asked.judges:
-            far = torch.nonzero(standing_out(answer.dispersion, answer.misfit))[:, 0]
-            self._leave_out(now, poses, [asked.brackets[i] for i in far.tolist()])
+            self._leave_out(now, poses, [asked.brackets[i] for i in answer.standing_out(FAR)])
         along = self.aligned and now.moment.share < SURFACE_UNTIL
         reach = cell_m(setup) if along else reach_m(setup, now.moment.share)
         motion, shifts = poses.step(setup.frames, poses.body_motions(), reach, together=along)
@@ -293,35 +305,13 @@ def reach_m(setup: TrainingSetup, share: float) -> float:
     return float(rates["means"]) * steps_between(setup, share)
 
 
-def standing_out(dispersion: Tensor, misfit: Tensor) -> Tensor:
-    """Return which of P pictures are so far off that something else than the model's error is in them.
-
-    Both residuals have to say so: the smallest error of a pose shows in deviations of the noise where thin structures
-    are seen edge-on, but it moves little of the picture's light there.
-
-    Args:
-        dispersion: [P] mean squares in deviations of the noise, NaN where the target is not in the picture.
-        misfit: [P] of the picture's light (`relative_misfit`), also NaN there.
-    """
-    logs = dispersion.log()
-    above = logs - logs.nanmedian()
-    far = above > FAR_DEVIATIONS * 1.4826 * above.abs().nanmedian()
-    return far & (misfit > FAR_FACTOR * misfit.nanmedian())
-
-
 def _question(
-    setup: TrainingSetup, model: Gaussians, poses: PoseCorrections, indices: list[int], scale: float = 1.0
+    setup: TrainingSetup,
+    model: Gaussians,
+    poses: PoseCorrections,
+    indices: list[int],
+    coarse: Mapping[int, float] = MappingProxyType({}),
 ) -> Question:
-    """Return what frames are asked about a model and their poses as they stand; training may go on meanwhile.
-
-    scale: of the pictures that have the Earth, and so no silhouette to be aligned by.
-    """
-    given = (
-        setup.batches.posed(setup.frames),
-        indices,
-        poses.corrected(indices),
-        setup.sensor,
-        cell_m(setup),
-    )
-    coarse = {i: scale for i in indices if scale < 1 and setup.frames[i].earth_m is not None}
-    return Question(model.copied(), *given, coarse)
+    """Return what frames are asked about a model and their poses as they stand; training may go on meanwhile."""
+    batches, at = setup.batches.posed(setup.frames), poses.corrected(indices)
+    return Question(model.copied(), batches, indices, at, setup.sensor, cell_m(setup), coarse)
