@@ -68,6 +68,7 @@ def erring_session(folder: Path, seed: int = 0, brackets: int = VIEWS) -> Path:
     header = json.loads((folder / "session.json").read_text())
     sigmas = SharedParameters(boresight_rad=np.full(3, BORESIGHT_RAD))
     header["navigation"] = {"sigmas": sigmas.lists()}
+    del header["imported_from"]  # so that its frames count as a spacecraft's
     (folder / "session.json").write_text(json.dumps(header))
     return folder
 
