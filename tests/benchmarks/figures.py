@@ -51,6 +51,8 @@ KEYS = {
     "seconds": "seconds",
     "cpu": "cpu_seconds",
     "CHI2": "chi2_held_out_both",
+    "tagged_px": "pose_error_tagged_px",
+    "pose_px": "pose_error_px",
 }
 # the opponents of README's table at their best
 AT_BEST = {
@@ -114,6 +116,13 @@ def means(file: str, keys: str, method: str | None = "obbgs", **where: Any) -> l
     return [mean(file, KEYS[key], method, **where) for key in keys.split()]
 
 
+def of_pass(keys: str, scenario: str = "") -> list[float]:
+    """Return figures of a demo in front of the real sky, of one of the scenarios; `black`: of one without a sky."""
+    sky = "realistic navigation errors" + ", real sky" * (scenario != "black")
+    condition = sky if scenario in ("", "black") else f"scenario {scenario}, {sky}"
+    return [mean("demo", KEYS.get(key, key), condition=condition) for key in keys.split()]
+
+
 def least(file: str, key: str, method: str | None = "obbgs", **where: Any) -> float:
     """Return the least of the targets' means over seeds."""
     return min(by_target(file, key, method, **where))
@@ -175,7 +184,7 @@ def wrong(block: str) -> list[str]:
     names: dict[str, Any] = {
         **{
             function.__name__: function
-            for function in (by_target, best_of, mean, means, least, most, reached, line)
+            for function in (by_target, best_of, mean, means, of_pass, least, most, reached, line)
         },
         **KEYS,
         **FILES,
