@@ -214,6 +214,7 @@ def open_run(session_dir: Path, name: str, out: Path | None = None) -> Run:
     ]:  # of a few brackets that came one by one, none was kept from the training
         training, held_out = [*training, *held_out], []
     metrics["scored_frames"] = "held_out" if held_out else "training"
+    metrics["frames_imported"] = session.frames_imported  # runs of earlier versions do not say it
     with_blind = (folder / "blind.ply").exists() and "blind_reference_exposure_s" in metrics
     return Run(
         folder,

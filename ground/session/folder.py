@@ -45,7 +45,6 @@ from obbgs_base.checked import Lines, copy_of, names_checksum, read_lines, read_
 from obbgs_base.errors import ObbgsError, reason
 from obbgs_base.files import read_bounded
 from obbgs_base.physics.navigation_errors import SharedParameters
-from obbgs_base.physics.rotation_fit import fitted_rotation
 
 log = logging.getLogger(__name__)
 
@@ -244,6 +243,10 @@ class Session:
         Where navigation states none, they are those of the free rotation that the attitudes of the first frames are
         of: errors of the rate grow as they do in a body that no torque turns. A rate of 0: there is no such rotation.
         """
+        from obbgs_base.physics.rotation_fit import (
+            fitted_rotation,
+        )  # SciPy, which opening a session does not need
+
         stated = np.array(self.navigation.rate_rad_s), np.array(self.navigation.inertia)
         known = {r.mid_exposure_utc_ns: r.quat_inertial_to_body for r in self.frames if r.pose_valid}
         attitudes = [quat for quat in known.values() if quat is not None]

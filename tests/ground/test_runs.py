@@ -541,7 +541,7 @@ def test_the_result_is_a_table_with_units_and_json_as_ever(finished):
     shown = CliRunner().invoke(cli.app, ["evaluate", run], env={"COLUMNS": "120"}).stdout
     figures = json.loads(CliRunner().invoke(cli.app, ["evaluate", run, "--json"]).stdout)
     assert f"{figures['psnr_clean_db']:.2f} dB" in shown
-    assert "48 received / unknown captured, 42 trained on, 6 held out" in shown
+    assert "48 / unknown, 42 trained on, 6 held out" in shown
     assert f"{figures['train_seconds']:.0f} s; all 8 steps done" in shown and "MB" in shown
     assert "psnr_clean_db" not in shown and "sun_span_deg" not in shown
     for key in ("method", "gaussians", "chi2", "frames_received", "ply_bytes", "onnx_parity_db", "start"):

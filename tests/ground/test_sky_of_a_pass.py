@@ -39,7 +39,7 @@ def test_a_pedestal_is_measured_reported_and_costs_no_score(tmp_path):
     for key in ("psnr_clean_db", "psnr_noisy_db"):  # 9 dB less where it is not taken off
         assert raised[key] > plain[key] - 1.0, key
     page = write_report(tmp_path / "raised", "run").read_text()
-    assert "<h3>Bracket 7</h3>" in page  # no range: nobody stated that these poses are in metres
+    assert "<h3>Picture 7</h3>" in page  # no range: nobody stated that these poses are in metres
     assert "Level of empty sky" in page and "more than the stated black level" in page
     assert "- Sky: empty sky reads" in (tmp_path / "raised/runs/run/model_card.md").read_text()
     assert "Level of empty sky" not in write_report(tmp_path / "plain", "run").read_text()
