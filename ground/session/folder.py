@@ -240,18 +240,17 @@ class Session:
     def rotation(self) -> tuple[np.ndarray, np.ndarray]:
         """The target's rate at the epoch [3], rad/s, and its moments of inertia [3] (ratios matter), body axes.
 
-        Where navigation states none, they are those of the free rotation that the attitudes of the first frames are
-        of: errors of the rate grow as they do in a body that no torque turns. A rate of 0: there is no such rotation.
+        Where navigation states none, they are those of the free rotation that fits the attitudes of the first frames:
+        an error of the rate then grows as it does in a body on which no torque acts. A rate of 0: none fits.
         """
-        from obbgs_base.physics.rotation_fit import (
-            fitted_rotation,
-        )  # SciPy, which opening a session does not need
-
         stated = np.array(self.navigation.rate_rad_s), np.array(self.navigation.inertia)
         known = {r.mid_exposure_utc_ns: r.quat_inertial_to_body for r in self.frames if r.pose_valid}
         attitudes = [quat for quat in known.values() if quat is not None]
         if stated[0].any() or self.navigation.attitude != "known" or len(attitudes) < len(known):
             return stated
+        # it needs SciPy, which opening a session does not
+        from obbgs_base.physics.rotation_fit import fitted_rotation
+
         times_s = (np.array(list(known)[:ATTITUDES]) - self.navigation.epoch_utc_ns) / 1e9
         to_body = np.array([quat_to_matrix(quat) for quat in attitudes[:ATTITUDES]])
         return fitted_rotation(times_s, to_body, FREE_WITHIN_RAD) or stated

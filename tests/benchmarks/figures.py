@@ -35,6 +35,8 @@ KEYS = {
     "psnr": "psnr_clean_db",
     "foreground": "psnr_foreground_db",
     "pooled": "psnr_clean_pooled_db",
+    "settled": "psnr_clean_settled_db",
+    "noisy": "psnr_noisy_db",
     "best": "psnr_best_db",
     "chamfer": "chamfer",
     "hausdorff": "hausdorff",
@@ -120,7 +122,7 @@ def of_pass(keys: str, scenario: str = "") -> list[float]:
     """Return figures of a demo in front of the real sky, of one of the scenarios; `black`: of one without a sky."""
     sky = "realistic navigation errors" + ", real sky" * (scenario != "black")
     condition = sky if scenario in ("", "black") else f"scenario {scenario}, {sky}"
-    return [mean("demo", KEYS.get(key, key), condition=condition) for key in keys.split()]
+    return means("demo", keys, condition=condition)
 
 
 def least(file: str, key: str, method: str | None = "obbgs", **where: Any) -> float:

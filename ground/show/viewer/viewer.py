@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 
 import imagecodecs
 import numpy as np
-import torch
 import viser
 
 from ground.session.cameras import predicted_image, range_in_words, sun_direction
@@ -428,16 +427,15 @@ def _facts(session: Session, record: FrameRecord) -> str:
 def _compared(placed: Placed, record: FrameRecord) -> np.ndarray:
     """Return a frame, the model's picture and the error side by side, bytes [H, 3 W, 3]; the Earth is no error."""
     shown = placed.shown
+    seen_from = shown.compared(record)
+    tagged = next(r for r in shown.tagged.frames if r.id == record.id)
     try:
-        dn = shown.session.dn(record).astype(np.float32)
+        taken = training_frame(shown.tagged, seen_from, tagged)
     except SessionError as error:
         log.warning("%s", error)
         return np.zeros((2, 6, 3), np.uint8)
-    frame = torch.from_numpy(dn.reshape(*dn.shape[:2], -1) / shown.sensor.white_dn)
-    seen_from = shown.compared(record)
+    frame = taken.dn / shown.sensor.white_dn
     image = predicted_image(shown.gaussians, shown.session, seen_from, shown.sensor, record.exposure_time_s)
-    tagged = next(r for r in shown.tagged.frames if r.id == record.id)
-    taken = training_frame(shown.tagged, seen_from, tagged)
     on_black = without_earth(shown.gaussians, taken, shown.sensor).dn / shown.sensor.white_dn
     error = ((image - on_black).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
     encoding = shown.session.encoding
