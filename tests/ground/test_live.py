@@ -150,6 +150,7 @@ def test_frames_that_came_while_a_settled_training_was_away_are_trained_on(tmp_p
     again._on_status = statuses.append
     while again.turn(over):
         pass
+    again.close()
     again.finish(lambda: False)
     assert statuses[-1].state == "finished" and statuses[-1].frames_trained == 42
     metrics = json.loads((writer.folder / "runs" / "live" / "metrics.json").read_text())
@@ -190,11 +191,11 @@ def test_a_damaged_picture_costs_its_frame_alone_and_is_told(tmp_path, caplog):
     live = begun(writer.folder, statuses, {"steps": 20})
     while live.turn(end):
         pass
-    live.finish(lambda: False)
     live.close()
+    live.finish(lambda: False)
     assert statuses[-1].frames_received == 24 and statuses[-1].frames_trained == 19
     assert statuses[-1].frames_unusable == 3 and statuses[-1].frames_held_out == 2
-    (told,) = (message for message in caplog.messages if "damaged" in message)
+    (told,) = (message for message in caplog.messages if "are damaged" in message)
     assert (
         "3 frames" in told
         and "left out: {}, {}, {};".format(*(records[at]["id"] for at in (1, 13, 21))) in told
