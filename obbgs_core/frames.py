@@ -38,13 +38,14 @@ class Navigation:
     inertial_to_rtn: np.ndarray = field(default_factory=lambda: np.eye(3))
     rate_rad_s: np.ndarray = field(default_factory=lambda: np.zeros(3))
     inertia: np.ndarray = field(default_factory=lambda: np.ones(3))
+    rate_steps: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
 
     def tree(self) -> dict:
         """Return everything as numbers and lists."""
-        motion = (self.inertial_to_rtn, self.rate_rad_s, self.inertia)
+        motion = (self.inertial_to_rtn, self.rate_rad_s, self.inertia, self.rate_steps)
         return {
             "sigmas": self.sigmas.lists(),
-            "orbit": [self.mean_motion_rad_s, *(m.tolist() for m in motion)],
+            "orbit": [self.mean_motion_rad_s, *(m.tolist() for m in motion if m.size)],
         }
 
 
@@ -202,7 +203,7 @@ def alike(frames: list[TrainingFrame]) -> list[TrainingFrame]:
     last = frames[-1].navigation if frames else None
     if last is None:
         return frames
-    rotation = {"rate_rad_s": last.rate_rad_s, "inertia": last.inertia}
+    rotation = {name: getattr(last, name) for name in ("rate_rad_s", "inertia", "rate_steps")}
     return [
         dataclasses.replace(f, navigation=dataclasses.replace(f.navigation, **rotation))
         if f.navigation is not None and f.navigation is not last

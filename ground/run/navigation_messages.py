@@ -21,7 +21,7 @@ from ground.run.runs import Run
 from ground.session.folder import FrameRecord, Session, SessionError
 from ground.session.training_frames import frames_of, motion_covariance, usable
 from obbgs_base.files import write_whole
-from obbgs_base.physics.free_rotation import free_rotation, turning_of
+from obbgs_base.physics.free_rotation import stepped_rotation, turning_of
 from obbgs_base.physics.navigation_errors import (
     DIFFERENCES,
     LENGTHS,
@@ -100,7 +100,8 @@ def _attitudes(
         motion = displaced_motion(motion, estimate.shared)
         to_body = motion.inertial_to_body
     if motion is not None and motion.rate_rad_s.any():
-        return to_body, free_rotation(times_s, motion.rate_rad_s[None], motion.inertia[None])[1][0]
+        rate, inertia = motion.rate_rad_s[None], motion.inertia[None]
+        return to_body, stepped_rotation(times_s, rate, inertia, motion.rate_steps)[1][0]
     return to_body, turning_of(times_s, to_body).rates_rad_s
 
 

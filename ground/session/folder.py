@@ -110,8 +110,7 @@ class FrameRecord:
         )
 
 
-# frames whose attitudes tell how the target turns, and how far they may be from a rotation without torque, rms
-ATTITUDES, FREE_WITHIN_RAD = 48, 2e-3
+FREE_WITHIN_RAD = 2e-3  # root mean square that attitudes may be from those of a rotation without torque
 ERRS_ALIKE_S = 5.0  # from one exposure to the next; further apart where tags state a longer correlation
 ARRAY_SHAPES = {
     "world_to_camera": (4, 4),
@@ -237,13 +236,15 @@ class Session:
         return float(np.median(apart_s)) / 1e9 if apart_s else 0.0
 
     @functools.cached_property
-    def rotation(self) -> tuple[np.ndarray, np.ndarray]:
-        """The target's rate at the epoch [3], rad/s, and its moments of inertia [3] (ratios matter), body axes.
+    def rotation(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The target's rate at the epoch [3], rad/s, its moments of inertia [3] (ratios matter), and steps of the rate.
 
-        Where navigation states none, they are those of the free rotation that fits the attitudes of the first frames:
-        an error of the rate then grows as it does in a body on which no torque acts. A rate of 0: none fits.
+        All are in body axes, the steps [K, 4] those of `NominalMotion`. Where navigation states no rate, they are those
+        of the free rotation that fits the frames' attitudes, in pieces where torques act: an error of the rate then
+        grows as it does in a body that turns like this one. A rate of 0: none fits.
         """
-        stated = np.array(self.navigation.rate_rad_s), np.array(self.navigation.inertia)
+        navigation = self.navigation
+        stated = np.array(navigation.rate_rad_s), np.array(navigation.inertia), np.zeros((0, 4))
         known = {r.mid_exposure_utc_ns: r.quat_inertial_to_body for r in self.frames if r.pose_valid}
         attitudes = [quat for quat in known.values() if quat is not None]
         if stated[0].any() or self.navigation.attitude != "known" or len(attitudes) < len(known):
@@ -251,8 +252,8 @@ class Session:
         # it needs SciPy, which opening a session does not
         from obbgs_base.physics.rotation_fit import fitted_rotation
 
-        times_s = (np.array(list(known)[:ATTITUDES]) - self.navigation.epoch_utc_ns) / 1e9
-        to_body = np.array([quat_to_matrix(quat) for quat in attitudes[:ATTITUDES]])
+        times_s = (np.array(list(known)) - self.navigation.epoch_utc_ns) / 1e9
+        to_body = np.array([quat_to_matrix(quat) for quat in attitudes])
         return fitted_rotation(times_s, to_body, FREE_WITHIN_RAD) or stated
 
     def K(self, record: FrameRecord) -> np.ndarray:

@@ -103,6 +103,33 @@ def free_rotation(
     return turned, rates
 
 
+def stepped_rotation(
+    times_s: np.ndarray, rate_rad_s: np.ndarray, inertia: np.ndarray, rate_steps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same as `free_rotation`, of bodies whose rates change at some times by what torques bring about.
+
+    Args:
+        rate_steps: [K, 4] times above 0 in order, s, and the changes of the rates then, rad/s, body axes.
+
+    Raises:
+        ValueError: a moment is not positive.
+    """
+    turned = np.empty((len(rate_rad_s), len(times_s), 3, 3))
+    rates = np.empty(turned.shape[:3])
+    so_far, begun_s = np.eye(3)[None, None], 0.0
+    leg = np.searchsorted(rate_steps[:, 0], times_s, side="right")
+    for k in range(len(rate_steps) + 1):
+        here = np.flatnonzero(leg == k)
+        ends_s = rate_steps[k : k + 1, 0]
+        turns, at = free_rotation(np.append(times_s[here], ends_s) - begun_s, rate_rad_s, inertia)
+        turns = turns @ so_far
+        turned[:, here], rates[:, here] = turns[:, : len(here)], at[:, : len(here)]
+        if len(ends_s):
+            so_far, begun_s = turns[:, -1:], ends_s[0]
+            rate_rad_s = at[:, -1] + rate_steps[k, 1:]
+    return turned, rates
+
+
 def _tumbling(
     times_s: np.ndarray, rate_rad_s: np.ndarray, inertia: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from obbgs_base.physics.free_rotation import free_rotation, rotations, turning_of
+from obbgs_base.physics.free_rotation import rotations, stepped_rotation, turning_of
 
 # steps of central differences: m, m/s, rad, rad/s, ratio, rad, s, ratio; of an error of third order in them
 DIFFERENCES = {
@@ -100,6 +100,8 @@ class NominalMotion:
     inertia: np.ndarray = field(
         default_factory=lambda: np.ones(3)
     )  # [3] moments about the body axes; ratios matter
+    # [K, 4] when torques have changed the rate, s since the epoch, above 0, in order, and by how much, rad/s, body axes
+    rate_steps: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
 
     def __post_init__(self):
         count = len(self.times_s)
@@ -111,6 +113,7 @@ class NominalMotion:
             ("inertial_to_rtn", (3, 3)),
             ("rate_rad_s", (3,)),
             ("inertia", (3,)),
+            ("rate_steps", (len(self.rate_steps), 4)),
         ):
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape != shape or not np.isfinite(value).all():
@@ -146,8 +149,9 @@ def displaced(motion: NominalMotion, parameters: SharedParameters | np.ndarray) 
     """Return the poses world_to_camera [..., N, 4, 4] (m) from body to camera axes with changed parameters.
 
     The camera's path changes by the Clohessy-Wiltshire solution, the target's attitude by torque-free rotation (Euler's
-    equations), both over any time and for changes of any size. A clock that errs moves the chaser along its path, turns
-    the camera with the line of sight, and turns the target; to first order in the error, which is milliseconds.
+    equations) between the steps of its rate, both over any time and for changes of any size. A clock that errs moves
+    the chaser along its path, turns the camera with the line of sight, and turns the target; to first order in the
+    error, which is milliseconds.
 
     Args:
         parameters: the changes, or vectors [..., 19] of them. The focal length changes no pose.
@@ -264,12 +268,13 @@ def _attitudes(
     """Return inertial_to_body [P, N, 3, 3] with changes of P values each, as in `SharedParameters`."""
     times_s, nominal = motion.times_s, motion.inertial_to_body
     if motion.rate_rad_s.any():
+        steps = motion.rate_steps
         inertia = motion.inertia * np.concatenate([1 + ratios, np.ones((len(ratios), 1))], axis=1)
         rows, of_row = np.unique(
             np.concatenate([motion.rate_rad_s + rate, inertia], axis=1), axis=0, return_inverse=True
         )  # most parameters change none of these
-        turned, rates = (part[of_row] for part in free_rotation(times_s, rows[:, :3], rows[:, 3:]))
-        before, _ = free_rotation(times_s, motion.rate_rad_s[None], motion.inertia[None])
+        turned, rates = (part[of_row] for part in stepped_rotation(times_s, rows[:, :3], rows[:, 3:], steps))
+        before, _ = stepped_rotation(times_s, motion.rate_rad_s[None], motion.inertia[None], steps)
         to_body = turned @ rotations(attitude)[:, None] @ before.swapaxes(-1, -2) @ nominal
         return rotations(-rates * clock[:, None]) @ to_body
     turning = turning_of(times_s, nominal)

@@ -1,4 +1,4 @@
-"""Which torque-free rotation known attitudes of a body are those of."""
+"""Which rotation known attitudes of a body are those of: a torque-free one, or pieces of it where torques act."""
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -6,72 +6,145 @@ from scipy.spatial.transform import Rotation
 
 from obbgs_base.physics.free_rotation import free_rotation, neighbour_rates, rotations
 
-FIRST, GROWTH = 6, 3  # frames that are fitted first, and how many times as many in each further round
+FIRST, GROWTH = 6, 3  # attitudes that are fitted first, and how many times as many in each further round
+LAST = 48  # are fitted in the last round; more say no more of a rotation that is free
+CLOSE = 0.25  # of the mean time between attitudes: of those that are closer, one is fitted where torques act
 STEPS = np.array(
     [1e-6] * 3 + [1e-8] * 3 + [1e-5] * 2
 )  # of the differences: rad, rad/s, logarithms of moments
 SCALES = np.array([1e-2] * 3 + [1e-3] * 3 + [1e-1] * 2)  # of the search, in the same units
 SPIN, TUMBLE = 6, 8  # numbers of parameters
+EQUAL = np.ones(3)  # moments of inertia
 WIDEST = 3.0  # logarithm of a moment over another, at most
 
 
 def fitted_rotation(
     times_s: np.ndarray, inertial_to_body: np.ndarray, within_rad: float
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the rate [3] at time 0, rad/s, body axes, and the moments of inertia [3] of a body that turns freely.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Return the rate [3] at time 0, rad/s, body axes, a body's moments of inertia [3], and steps of its rate [K, 4].
 
     The rotation is fitted to attitudes [N, 3, 3] at times [N], s, in any order: a spin about an axis that stands still,
     and where that does not fit, a tumble about principal axes that are the body's. Neighbours in time must be less
-    than half a turn apart near the first frame; elsewhere the motion so far says how many turns a gap holds. None:
-    there are fewer than six attitudes, or their root mean square distance from every such rotation is above
-    `within_rad`: a torque acts, the axes are others, or the attitudes err.
+    than half a turn apart near the first frame; elsewhere the motion so far says how many turns a gap holds. Where a
+    torque acts, rotations by the same moments fit six attitudes each, and the rate changes from one to the next; the
+    steps are those of `stepped_rotation`. None: there are fewer than six attitudes, or their root mean square distance
+    from every such rotation is above `within_rad`: the torque is large, the axes are others, or the attitudes err.
     """
     order = np.argsort(times_s, kind="stable")
     times, to_body = times_s[order], inertial_to_body[order]
     if len(times) < FIRST:
         return None
-    start = np.concatenate([np.zeros(3), neighbour_rates(times, to_body)[0]])
+    return _as_one(times, to_body, within_rad) or _in_pieces(times, to_body, within_rad)
+
+
+def _as_one(
+    times_s: np.ndarray, to_body: np.ndarray, within_rad: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Return rate, moments and no steps of the one rotation that fits all attitudes."""
+    start = np.concatenate([np.zeros(3), neighbour_rates(times_s, to_body)[0]])
+    last = min(len(times_s), LAST)
     for size in (SPIN, TUMBLE):
         found = np.concatenate([start, np.zeros(size - SPIN)])
         count = FIRST
         while True:
-            found, left_rad = _fit(times[:count], to_body[:count], found)
-            if left_rad > within_rad or count == len(times):
+            found, left_rad = _fit(times_s[:count], to_body[:count], found, EQUAL)
+            if left_rad > within_rad or count == last:
                 break
-            count = min(GROWTH * count, len(times))
-        if left_rad <= within_rad:
-            rate, inertia = found[3:6], _inertia(found[None])
-            return free_rotation(-times[:1], rate[None], inertia)[1][0, 0], inertia[0]
+            count = min(GROWTH * count, last)
+        if left_rad <= within_rad and _rms(_distances(times_s, to_body, found[None], EQUAL)) <= within_rad:
+            inertia = _inertia(found[None], EQUAL)[0]
+            return _rates(-times_s[:1], found, EQUAL)[0], inertia, np.zeros((0, 4))
     return None
 
 
-def _fit(times_s: np.ndarray, to_body: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+def _in_pieces(
+    times_s: np.ndarray, to_body: np.ndarray, within_rad: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Return rate, moments and steps of rotations of six attitudes each; the last of one is the first of the next."""
+    apart_s = CLOSE * (times_s[-1] - times_s[0]) / (len(times_s) - 1)
+    kept = [0]
+    for i in range(1, len(times_s)):
+        if times_s[i] - times_s[kept[-1]] > apart_s:
+            kept.append(i)
+    times, attitudes = times_s[kept], to_body[kept]
+    if len(kept) < FIRST or times[0] < 0:
+        return None
+    start = np.concatenate([np.zeros(3), neighbour_rates(times, attitudes)[0]])
+    inertia, legs = EQUAL, _legs(times, attitudes, start, EQUAL, within_rad)
+    if legs is None:
+        free = _legs(times, attitudes, np.append(start, [0.0, 0.0]), EQUAL, within_rad)
+        if free is None:
+            return None
+        inertia = _inertia(np.median(free, axis=0)[None], EQUAL)[0]
+        legs = _legs(times, attitudes, free[0, :SPIN], inertia, within_rad)
+        if legs is None:
+            return None
+    begins_s = times[: len(kept) - FIRST + 1 : FIRST - 1]
+    spans_s = np.diff(begins_s)[:, None]
+    before = [_rates(span_s, leg, inertia)[0] for span_s, leg in zip(spans_s, legs, strict=False)]
+    steps = legs[1:, 3:6] - np.array(before).reshape(-1, 3)
+    return _rates(-times[:1], legs[0], inertia)[0], inertia, np.column_stack([begins_s[1:], steps])
+
+
+def _legs(
+    times_s: np.ndarray, to_body: np.ndarray, start: np.ndarray, moments: np.ndarray, within_rad: float
+) -> np.ndarray | None:
+    """Return the parameters [K, 6 or 8] of the rotations that fit six attitudes each; None where one does not fit."""
+    legs = []
+    for first in range(0, len(times_s) - FIRST + 1, FIRST - 1):
+        here = slice(first, first + FIRST)
+        found, left_rad = _fit(times_s[here], to_body[here], start, moments)
+        if left_rad > within_rad:
+            return None
+        legs.append(found)
+        leg_s = times_s[here][-1:] - times_s[first]
+        start = np.concatenate([np.zeros(3), _rates(leg_s, found, moments)[0], found[SPIN:]])
+    return np.array(legs)
+
+
+def _rates(spans_s: np.ndarray, found: np.ndarray, moments: np.ndarray) -> np.ndarray:
+    """Return the rates [N, 3] of a rotation after so long [N]."""
+    return free_rotation(spans_s, found[None, 3:6], _inertia(found[None], moments))[1][0]
+
+
+def _fit(
+    times_s: np.ndarray, to_body: np.ndarray, start: np.ndarray, moments: np.ndarray
+) -> tuple[np.ndarray, float]:
     """Return the parameters of the rotation from the first frame on that fits best, and what is left, rad."""
     size = len(start)
 
-    def distances(parameters: np.ndarray) -> np.ndarray:
-        """Return the rotation vectors [P, 3 N] from the attitudes of P rotations to those known."""
-        rates, inertia = parameters[:, 3:6], _inertia(parameters)
-        turned, _ = free_rotation(times_s - times_s[0], rates, inertia)
-        at = turned @ (rotations(parameters[:, :3]) @ to_body[0])[:, None]
-        apart = to_body.swapaxes(-1, -2) @ at
-        return Rotation.from_matrix(apart.reshape(-1, 3, 3)).as_rotvec().reshape(len(parameters), -1)
-
     def slopes(parameters: np.ndarray) -> np.ndarray:
         steps = np.diag(STEPS[:size])
-        sides = distances(np.concatenate([parameters + steps, parameters - steps]))
+        sides = _distances(
+            times_s, to_body, np.concatenate([parameters + steps, parameters - steps]), moments
+        )
         return ((sides[:size] - sides[size:]) / (2 * STEPS[:size, None])).T
 
     def left(parameters: np.ndarray) -> np.ndarray:
-        return distances(parameters[None])[0]
+        return _distances(times_s, to_body, parameters[None], moments)[0]
 
     bounds = np.array([np.inf] * SPIN + [WIDEST] * (size - SPIN))
     solution = least_squares(left, start, slopes, bounds=(-bounds, bounds), x_scale=SCALES[:size])  # pyright: ignore
-    return solution.x, float(np.sqrt(3 * np.mean(np.square(solution.fun))))
+    return solution.x, _rms(solution.fun)
 
 
-def _inertia(parameters: np.ndarray) -> np.ndarray:
-    """Return the moments [P, 3] of parameters [P, 6 or 8]."""
-    moments = np.ones((len(parameters), 3))
-    moments[:, : parameters.shape[1] - SPIN] = np.exp(parameters[:, SPIN:])
-    return moments
+def _distances(
+    times_s: np.ndarray, to_body: np.ndarray, parameters: np.ndarray, moments: np.ndarray
+) -> np.ndarray:
+    """Return the rotation vectors [P, 3 N] from the attitudes of P rotations to those known."""
+    turned, _ = free_rotation(times_s - times_s[0], parameters[:, 3:6], _inertia(parameters, moments))
+    at = turned @ (rotations(parameters[:, :3]) @ to_body[0])[:, None]
+    apart = to_body.swapaxes(-1, -2) @ at
+    return Rotation.from_matrix(apart.reshape(-1, 3, 3)).as_rotvec().reshape(len(parameters), -1)
+
+
+def _rms(vectors: np.ndarray) -> float:
+    """Return the root mean square length of vectors whose components follow each other."""
+    return float(np.sqrt(3 * np.mean(np.square(vectors))))
+
+
+def _inertia(parameters: np.ndarray, moments: np.ndarray) -> np.ndarray:
+    """Return the moments [P, 3] of parameters [P, 6 or 8], which change given ones [3]."""
+    changed = np.repeat(moments[None], len(parameters), axis=0)
+    changed[:, : parameters.shape[1] - SPIN] *= np.exp(parameters[:, SPIN:])
+    return changed

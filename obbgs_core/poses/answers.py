@@ -98,10 +98,24 @@ class Answer:
             by: of the logarithm of the dispersion, so many median absolute deviations above the median, scaled to those
                 of a normal distribution; of the misfit, so many times the median.
         """
+        above, times = self._residuals()
+        return torch.nonzero((above > by) & (times > by))[:, 0].tolist()
+
+    def doubtful(self, by: float) -> list[int]:
+        """Return the places of the frames that stand out, or would if exposures had told as much: dim ones hide errors.
+
+        Args:
+            by: as for `standing_out`, but in the mean of both; a frame whose misfit is that high need have a third of
+                it as its dispersion.
+        """
+        above, times = self._residuals()
+        return torch.nonzero((above > by / 3) & (times > by) & (above + times > 2 * by))[:, 0].tolist()
+
+    def _residuals(self) -> tuple[Tensor, Tensor]:
+        """Return the deviations of the dispersions above their median [B], and misfits over theirs [B]."""
         logs = self.dispersion.log()
         above = logs - logs.nanmedian()
-        far = above > by * 1.4826 * above.abs().nanmedian()
-        return torch.nonzero(far & (self.misfit > by * self.misfit.nanmedian()))[:, 0].tolist()
+        return above / (1.4826 * above.abs().nanmedian()), self.misfit / self.misfit.nanmedian()
 
 
 class PoseRound:

@@ -385,6 +385,7 @@ def motion_of(frames: list[TrainingFrame]) -> NominalMotion:
         inertial_to_rtn=navigation.inertial_to_rtn,
         rate_rad_s=navigation.rate_rad_s,
         inertia=navigation.inertia,
+        rate_steps=navigation.rate_steps,
     )
 
 

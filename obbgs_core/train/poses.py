@@ -37,8 +37,8 @@ LEFT_OUT_FROM = 0.6
 # share of the steps from which brackets count as one where the gauge is settled: earlier, a frame with the Earth went
 # 3 px astray (experiment 103)
 AS_ONE_FROM = 0.8
-# by which a picture's residuals stand out (`Answer.standing_out`), where its bracket is left out, and where it is asked
-# in small from then on
+# by which a picture's residuals stand out, where its bracket is left out (`Answer.standing_out`), and where it is asked
+# in small from then on (`Answer.doubtful`)
 FAR, DOUBTFUL = 6.0, 3.0
 # shares of the steps until which frames that have the Earth are asked in pictures of these shares of their size; the
 # first is also that of frames whose residuals stand out
@@ -228,7 +228,7 @@ class Poses:
         assert poses is not None
         self.round, self.moved = None, self.moved + 1
         poses.gather(answer.indices, answer.information)
-        self.doubtful = [answer.indices[i] for i in answer.standing_out(DOUBTFUL)]
+        self.doubtful = [answer.indices[i] for i in answer.doubtful(DOUBTFUL)]
         if asked.judges:
             self._leave_out(now, poses, [asked.brackets[i] for i in answer.standing_out(FAR)])
         along = self.aligned and now.moment.share < SURFACE_UNTIL

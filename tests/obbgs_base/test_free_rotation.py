@@ -6,19 +6,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from obbgs_base.physics.free_rotation import free_rotation, rotations
+from obbgs_base.physics.free_rotation import free_rotation, rotations, stepped_rotation
 from obbgs_base.physics.rotation_fit import fitted_rotation
 
 moments = st.floats(0.4, 2.0)
 speeds = st.floats(-0.05, 0.05)
 
 
-def integrated(times_s: np.ndarray, rate: np.ndarray, inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return attitudes [N, 3, 3] and rates [N, 3] of a body after times of at least 0, by SciPy."""
+def integrated(
+    times_s: np.ndarray, rate: np.ndarray, inertia: np.ndarray, torque: tuple[float, ...] = (0.0, 0.0, 0.0)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return attitudes [N, 3, 3] and rates [N, 3] of a body after times of at least 0, by SciPy.
+
+    Args:
+        torque: [3] body axes, in the unit of the inertia over s².
+    """
 
     def slopes(_: float, state: np.ndarray) -> np.ndarray:
         w, to_body = state[:3], state[3:].reshape(3, 3)
-        faster = np.cross(inertia * w, w) / inertia
+        faster = (np.cross(inertia * w, w) + torque) / inertia
         return np.concatenate([faster, -np.cross(w, to_body, axisb=0, axisc=0).ravel()])
 
     start = np.concatenate([rate, np.eye(3).ravel()])
@@ -100,8 +106,36 @@ def test_attitudes_of_no_free_rotation_and_too_few_tell_nothing():
     rate, inertia = np.radians([0.3, 0.2, 0.9]), np.array([0.5, 0.8, 1.0])
     free = attitudes(rate, inertia)
     assert fitted_rotation(PASS_S[:5], free[:5], 1e-3) is None
-    turned_by_a_torque = rotations(np.array([0.0, 0.0, 1e-7]) * PASS_S[:, None] ** 2) @ free
-    assert fitted_rotation(PASS_S, turned_by_a_torque, 1e-3) is None
+    erring = rotations(np.random.default_rng(4).normal(0, 0.01, (len(PASS_S), 3))) @ free
+    assert fitted_rotation(PASS_S, erring, 1e-3) is None
+    strong = integrated(PASS_S, rate, inertia, (1e-5, 0.0, 0.0))[0]  # 1.1 rad in five frames
+    assert fitted_rotation(PASS_S, strong, 1e-3) is None
     at_rest = np.broadcast_to(ATTITUDE_AT_EPOCH, free.shape)
     found = fitted_rotation(PASS_S, at_rest, 1e-3)
     assert found is not None and np.abs(found[0]).max() < 1e-9
+
+
+@pytest.mark.parametrize("inertia", [(0.385, 0.77, 1.0), (1.0, 1.0, 1.0)])
+@pytest.mark.parametrize("tight", [False, True])
+def test_where_torques_act_an_error_of_the_rate_grows_as_in_a_body_that_turns_like_this_one(inertia, tight):
+    """By SciPy, which integrates the torque; brackets of one time each count as one attitude."""
+    times_s = (
+        32.5 * np.arange(121) if not tight else (32.5 * np.arange(121)[:, None] + [0.0, 0.2, 0.4]).ravel()
+    )
+    rate, error, torque = np.radians([0.05, 1.2, 0.05]), np.array([1e-6, 4e-5, -1e-6]), (0, 2e-7, 8e-8)
+    nominal, rates = integrated(times_s, rate, np.array(inertia), torque)
+    true, _ = integrated(times_s, rate + error, np.array(inertia), torque)
+    found = fitted_rotation(times_s, nominal, 2e-3)
+    assert found is not None and len(found[2]) > 10
+
+    def farthest_deg(steps: np.ndarray) -> float:
+        both = np.stack([found[0] + error, found[0]])
+        turned, _ = stepped_rotation(times_s, both, np.tile(found[1], (2, 1)), steps)
+        predicted = turned[0] @ turned[1].swapaxes(1, 2) @ nominal
+        return float(np.degrees(np.linalg.norm(predicted - true, axis=(1, 2)).max() / np.sqrt(2)))
+
+    assert farthest_deg(found[2]) < 0.3
+    if len(set(inertia)) > 1:
+        assert farthest_deg(found[2][:0]) > 2.0
+    _, followed = stepped_rotation(times_s, found[0][None], found[1][None], found[2])
+    np.testing.assert_allclose(followed[0], rates, atol=3e-4)

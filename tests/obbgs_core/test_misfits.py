@@ -96,3 +96,16 @@ def test_residuals_stand_out_by_scipys_median_absolute_deviation(by):
     assert found == np.flatnonzero((logs > limit) & (shares > by * np.nanmedian(shares))).tolist()
     far, shares = torch.tensor([1.0, 1.0, 1.0, 9.0, 9.0]), torch.tensor([0.0, 0.1, 0.1, 0.55, 0.65])
     assert standing_out(far, shares, 6.0) == [4]
+
+
+def test_dim_frames_are_in_doubt_where_most_of_their_light_is_wrong():
+    """Two frames of a fly-around had 6 times the median misfit and were 6 and 1 px off."""
+    logs, shares = torch.linspace(-1, 1, 41, dtype=torch.float64), torch.full((41,), 0.1)
+    logs[[3, 5, 7, 9]] = (
+        torch.tensor([1.4, 0.5, 1.4, 2.5], dtype=torch.float64) * logs.abs().median() * 1.4826
+    )
+    shares[[3, 5, 7, 9]] = torch.tensor([0.63, 0.63, 0.35, 0.35])
+    answer = Answer(list(range(41)), PoseInformation(torch.zeros(0), torch.zeros(0)), logs.exp(), shares)
+    assert answer.standing_out(3.0) == [] and answer.doubtful(3.0) == [3]
+    shares[9] = 0.4
+    assert answer.doubtful(3.0) == [3, 9]
