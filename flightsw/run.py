@@ -23,13 +23,17 @@ from flightsw.icd.mission import Mission
 from flightsw.ports import Link, open_link
 from flightsw.storage.boot_counter import count_boot
 from flightsw.storage.settings import load_settings
-from flightsw.storage.store import FrameStore, open_store
+from flightsw.storage.store import FrameStore, open_store, remove_unused
 from flightsw.watchdog import Watchdog, notify
 from obbgs_base.stopping import join
 
 log = logging.getLogger(__name__)
 LINGER_S = 0.5  # after the last delivery
 EXPOSURE_WITHIN_S = 120.0  # with all attempts of the camera; later than this, capture hangs
+
+
+class _NeverAnswered(CaptureError):
+    """The camera gave no other answer than at the start, which was logged then."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +73,9 @@ def run_pass(
 
     Key, link and camera are opened before the store, so that wrong ones leave no store behind. Where there is a link,
     stored frames are sent without a camera that answers; it is tried again until the pass is over, and if it never
-    answered its error is raised afterwards. A link that is not there yet is awaited while frames are taken, and a store
-    that cannot be read while commands are answered; with `exit_when_empty` the store must be there.
+    answered an error is raised afterwards, and a store that was made for nothing goes again. A link that is not there
+    yet is awaited while frames are taken, and a store that cannot be read while commands are answered; with
+    `exit_when_empty` the store must be there.
 
     Args:
         stop: when set, capture and downlink end cleanly.
@@ -95,7 +100,7 @@ def run_pass(
                 if link is None:
                     raise
                 no_camera = error  # what is stored is sent all the same
-        is_patient = link is not None and not exit_when_empty
+        is_patient, is_new = link is not None and not exit_when_empty, not store_dir.exists()
         store = open_store(store_dir, mission, open_now=not is_patient)
         if link is not None:
             waiting = (exit_when_empty, stop, on_sent, alive)
@@ -121,12 +126,19 @@ def run_pass(
         except Exception as error:
             if thread is not None:  # it may go on for hours until the outbox is empty: log the error now
                 thread.camera_failed = True
-                log.error("no more exposures: %s", str(error) or repr(error))
+                if isinstance(
+                    error, _NeverAnswered
+                ):  # why was logged at the start: this is for the ground alone
+                    events.add("error", problem=str(error))
+                else:
+                    log.error("no more exposures: %s", str(error) or repr(error))
             raise
         finally:
             if thread is not None:
                 thread.capturing.clear()
                 join(thread)
+            if is_new and no_camera is not None and camera is None:
+                remove_unused(store_dir)
             notify("STOPPING=1")
         if thread is not None and thread.error is not None:
             raise thread.error
@@ -215,6 +227,7 @@ def _awaited_camera(
     Raises:
         CaptureError: it never answered, or it cannot be what the mission expects.
     """
+    told = str(error)
     pass_s = mission.bracket.count * mission.bracket.interval_s
     over_utc_ns, patient_until_s = mission.orbit.start_utc_ns + pass_s * 1e9, time.monotonic() + PATIENCE_S
     log.warning("no camera yet, it is tried again every %g s: %s", RETRY_S, error)
@@ -233,6 +246,8 @@ def _awaited_camera(
                 return camera
     finally:
         watchdog.ended("capture")
+    if str(error) == told:
+        raise _NeverAnswered("no frame was taken: the camera never answered") from error
     raise error
 
 

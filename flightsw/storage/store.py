@@ -8,6 +8,7 @@ import itertools
 import logging
 import os
 import secrets
+import shutil
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -570,6 +571,16 @@ def write_with_reserve(path: Path, data: bytes, reserve: Path) -> None:
 def open_store(folder: Path, mission: Mission, open_now: bool = True) -> FrameStore:
     """Return the store with the mission's quota and policy."""
     return FrameStore(folder, mission.store.quota_bytes, mission.store.when_full, open_now)
+
+
+def remove_unused(folder: Path) -> None:
+    """Remove a store that holds nothing but what is made at a start; one with frames, settings or an index stays."""
+    at_start = {"frames", "outbox", "lock", RESERVE}
+    at_start |= {f"{name}.json{copy}" for name in ("store", "boots") for copy in ("", ".copy")}
+    with contextlib.suppress(OSError):
+        names = {path.name for path in folder.iterdir()}
+        if names <= at_start and not any(path.is_dir() and any(path.iterdir()) for path in folder.iterdir()):
+            shutil.rmtree(folder)
 
 
 def quarantine(store: Path, path: Path) -> Path:

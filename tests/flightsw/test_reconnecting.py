@@ -21,7 +21,8 @@ from flightsw.cameras.reconnecting import PATIENCE_S, RETRY_S, ReconnectingCamer
 from flightsw.capture.sequencer import capture
 from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.mission import load_mission
-from flightsw.storage.store import FrameStore
+from flightsw.storage.boot_counter import count_boot
+from flightsw.storage.store import FrameStore, remove_unused
 from flightsw.watchdog import Watchdog
 from hil.links.virtual_serial import VirtualSerial
 
@@ -253,8 +254,21 @@ def test_a_camera_that_never_answers_is_given_up_and_the_link_goes_on(tmp_path, 
         process = start_capture(tmp_path, "--link", line.flight_url, patience_s=0.2)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 1 and not out
-    first, *_, last = err.splitlines()
-    assert "no camera yet, it is tried again every 0.05 s" in first and "no camera at hil://" in last
+    first, last = err.splitlines()
+    assert "no camera yet, it is tried again every 0.05 s: no camera at hil://" in first
+    assert last == "flightsw: no frame was taken: the camera never answered"
+    assert not (tmp_path / "store").exists()
+
+
+def test_a_store_that_holds_anything_is_no_unused_one(tmp_path, make_frame):
+    for name in ("empty", "full", "commanded"):
+        count_boot(tmp_path / name)
+        FrameStore(tmp_path / name)
+    FrameStore(tmp_path / "full").put(make_frame(0))
+    (tmp_path / "commanded" / "settings.json").write_text("{}")
+    for name in ("empty", "full", "commanded", "none"):
+        remove_unused(tmp_path / name)
+    assert {path.name for path in tmp_path.iterdir()} == {"full", "commanded"}
 
 
 class ComputersClock:
