@@ -64,6 +64,7 @@ class ListenSummary:
     payload_bytes: int = 0  # containers of frames_received
     open_transfers: int = 0
     commands_ended: int = 0
+    joined_bytes: int = 0  # the rest of a packet that was under way when listening began
     skipped_bytes: int = 0  # not part of a good packet
     crc_errors: int = 0  # packets damaged on the wire
     packets_missing: int = 0  # gaps in the sequence counts
@@ -341,6 +342,7 @@ class _Ingest:
             payload_bytes=self._payload_bytes,
             open_transfers=self.open_transfers,
             commands_ended=self._commands_ended,
+            joined_bytes=deframer.joined_bytes,
             skipped_bytes=deframer.skipped_bytes,
             crc_errors=deframer.crc_errors,
             packets_missing=self._stream.packets_missing,

@@ -144,7 +144,11 @@ def framing(containers: list[bytes]) -> Target:
                     pass
         assert deframer.pending_bytes <= max_frame_bytes(MAX_PACKET_BYTES)
         counted = (
-            deframer.packet_bytes + deframer.idle_bytes + deframer.skipped_bytes + deframer.pending_bytes
+            deframer.packet_bytes
+            + deframer.idle_bytes
+            + deframer.joined_bytes
+            + deframer.skipped_bytes
+            + deframer.pending_bytes
         )
         assert counted == len(data), f"{counted} of {len(data)} bytes counted"
 
@@ -231,7 +235,7 @@ def pipeline(containers: list[bytes]) -> Target:
                 receiver.receive(content, number * 0.01)
                 receiver.next_pdu(number * 0.01)
         d = ground.deframer
-        assert d.packet_bytes + d.idle_bytes + d.skipped_bytes + d.pending_bytes == len(data)
+        assert d.packet_bytes + d.idle_bytes + d.joined_bytes + d.skipped_bytes + d.pending_bytes == len(data)
 
     target.check = check
     return target

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from flightsw.downlink.loop import DownlinkProgress, run_downlink
-from flightsw.icd.link.framing import PacketStream
+from flightsw.icd.link.framing import PacketStream, frame_packet
+from flightsw.icd.link.link_url import parse_link_url
 from flightsw.icd.mission import Mission, load_mission
 from flightsw.icd.packet import APID_FILES, TELEMETRY
 from flightsw.icd.transfer import Sender
@@ -306,6 +307,26 @@ def test_noise_on_the_line_is_counted_and_does_not_stop_the_pass(tmp_path, small
         downlink_all(line, store, small_mission)
     assert ground.summary.skipped_bytes == len(noise)
     assert ground.summary.crc_errors == 1
+    assert_same_frames(store, tmp_path / "session", make_frame)
+
+
+def test_a_packet_under_way_when_listening_begins_is_no_error_of_the_link(
+    tmp_path, small_mission, make_frame
+):
+    store = stored(tmp_path / "store", make_frame, 2)
+    rest = frame_packet(bytes(range(200)))[90:]
+    with (
+        VirtualSerial(BAUD_RATE) as line,
+        Listening(line, tmp_path / "session", small_mission, exit_after=2) as ground,
+    ):
+        while not (tmp_path / "session" / "session.json").exists():  # opening a port empties it
+            time.sleep(0.01)
+        terminal = os.open(parse_link_url(line.flight_url).device, os.O_WRONLY | os.O_NOCTTY)
+        os.write(terminal, rest)
+        os.close(terminal)
+        downlink_all(line, store, small_mission)
+    assert ground.summary.joined_bytes == len(rest)
+    assert set(ground.summary.losses.values()) == {0}
     assert_same_frames(store, tmp_path / "session", make_frame)
 
 

@@ -69,14 +69,17 @@ class DelimitedBytes:
 class Deframer(DelimitedBytes):
     """Finds packets in a byte stream that may start, break and lie anywhere.
 
-    At all times `packet_bytes + idle_bytes + skipped_bytes + pending_bytes` is the number of bytes fed.
+    What ends before the first delimiter and is no packet counts as the rest of one that was under way, not as damage.
+    At all times `packet_bytes + idle_bytes + joined_bytes + skipped_bytes + pending_bytes` is the number of bytes fed.
     """
 
     def __init__(self, max_packet_bytes: int):
         super().__init__(DELIMITER, max_frame_bytes(max_packet_bytes))
         self.packet_bytes = 0  # of packets delivered, as framed
         self.idle_bytes = 0  # delimiters with nothing between them
+        self.joined_bytes = 0  # the rest of a packet that was under way when the stream began
         self.crc_errors = 0  # runs of bytes between delimiters that are no packet
+        self._is_first = True  # no delimiter has come yet
 
     def feed(self, data: bytes) -> list[bytes]:
         """Return the packets that `data` completes; memory is bounded by the longest packet."""
@@ -84,12 +87,15 @@ class Deframer(DelimitedBytes):
         return [packet for packet in packets if packet is not None]
 
     def _packet_of(self, frame: bytes | None) -> bytes | None:
+        is_first, self._is_first = self._is_first, False
         if frame == b"":
             self.idle_bytes += 1
             return None
         packet = None if frame is None else _packet_in(frame)
         size_bytes = len(frame or b"") + 1
-        if packet is None:
+        if packet is None and frame is not None and is_first:
+            self.joined_bytes += size_bytes
+        elif packet is None:
             self.skipped_bytes += size_bytes
             self.crc_errors += 1
         else:

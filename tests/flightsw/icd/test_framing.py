@@ -14,7 +14,8 @@ packets = st.lists(st.binary(min_size=1, max_size=MAX_PACKET_BYTES), max_size=8)
 
 
 def total_bytes(deframer: Deframer) -> int:
-    return deframer.packet_bytes + deframer.idle_bytes + deframer.skipped_bytes + deframer.pending_bytes
+    heard = deframer.packet_bytes + deframer.idle_bytes + deframer.joined_bytes
+    return heard + deframer.skipped_bytes + deframer.pending_bytes
 
 
 @given(packets, st.lists(st.integers(1, 400), max_size=20))
@@ -36,10 +37,10 @@ def test_a_flipped_bit_is_never_accepted(packet, data):
     bit = data.draw(st.integers(0, 8 * len(framed) - 1))
     framed[bit // 8] ^= 1 << bit % 8
     deframer = Deframer(MAX_PACKET_BYTES)
-    received = deframer.feed(bytes(framed) + b"\0" + frame_packet(b"next"))
+    received = deframer.feed(b"\0" + bytes(framed) + b"\0" + frame_packet(b"next"))
     assert received == [b"next"]
     assert deframer.crc_errors >= 1
-    assert total_bytes(deframer) == len(framed) + 1 + len(frame_packet(b"next"))
+    assert total_bytes(deframer) == 1 + len(framed) + 1 + len(frame_packet(b"next"))
 
 
 @given(st.lists(st.binary(max_size=2000), max_size=10))
@@ -55,7 +56,10 @@ def test_a_receiver_that_starts_in_the_middle_is_in_step_at_the_next_packet():
     stream = frame_packet(b"first packet") + frame_packet(b"second")
     deframer = Deframer(MAX_PACKET_BYTES)
     assert deframer.feed(stream[5:]) == [b"second"]
-    assert deframer.skipped_bytes == len(frame_packet(b"first packet")) - 5
+    assert deframer.joined_bytes == len(frame_packet(b"first packet")) - 5
+    assert deframer.skipped_bytes == deframer.crc_errors == 0, "nothing was damaged"
+    assert deframer.feed(stream[5:]) == [b"second"]
+    assert deframer.crc_errors == 1, "in the midst of the stream it is damage"
 
 
 def test_a_delimiter_with_its_lowest_bit_flipped_adds_no_byte_to_the_packet():
