@@ -12,7 +12,7 @@ from compare.charts.severity import Series
 from ground.show.plots import ticks_1_2_5
 
 COLOURS = (*qualitative.D3, *qualitative.Set2)
-VERDICT_COLOURS = ("#2a9d8f", "#e9c46a", "#f4a261", "#c0392b", "#8795a5")  # of VERDICTS
+VERDICT_COLOURS = ("#2a9d8f", "#e9c46a", "#f4a261", "#d9dee3", "#c0392b", "#8795a5")  # of VERDICTS
 REFERENCE_COLOUR, FRONT_COLOUR = "#5b6b7b", "#1c2733"
 LABELS_APART = 0.06  # of the values drawn: names of lines that are nearer would cover one another
 EXACT_DB = 119.0  # the score of a picture that is compared with itself, which would squeeze all others

@@ -22,6 +22,7 @@ from compare.charts.results import (
     MARGIN_DB,
     METRICS,
     SHAKEN_DB,
+    UNJUDGED,
     VERDICTS,
     Metric,
     Results,
@@ -220,8 +221,9 @@ def _failures(results: Results, out: Path) -> str:
     note = (
         f"Numbers are mean scores over targets and seeds; the colour is that of the worst target. Holds: at most "
         f"{HOLDS_DB:g} dB below {html.escape(results.base)}; shaken: at most {SHAKEN_DB:g} dB; suffers: more; fails: "
-        f"less than {MARGIN_DB:g} dB above the best image without training (black, mean, untrained); refused: ended in "
-        "an error that says why. Point at a cell for its figures."
+        f"less than {MARGIN_DB:g} dB above the best image without training (black, mean, untrained); not judged: none "
+        f"of these was scored, or the method not {html.escape(results.base)}; refused: ended in an error that says "
+        "why. Point at a cell for its figures."
     )
     worst: dict[tuple[str, str], tuple[str, KeptView]] = {}  # of each method and target
     for row in results.rows:
@@ -254,8 +256,8 @@ def _breaking(results: Results) -> str:
     note = (
         "The mildest condition, in bold, at which a method is broken on any target: it ends in an error, or its score "
         f"is below the better one of a black image and the mean image{of_surface}. Where it never broke, the most "
-        "severe condition that it was tried at. Point at a cell for the reason. The curves are means over targets, "
-        "their bands from the lowest to the highest seed."
+        "severe condition that it was tried at; not judged: neither image was scored. Point at a cell for the reason. "
+        "The curves are means over targets, their bands from the lowest to the highest seed."
     )
     labels = [label for label in results.trained if any(label in points for _, points in found)]
     head = "".join(f"<th>{html.escape(label)}</th>" for label in labels)
@@ -276,6 +278,7 @@ def _breaking_cell(series: Series, point: Breaking | None) -> str:
         return "<td></td>"
     words = [f"<b>{html.escape(series.label(value))}</b>" for value in point.broken_at]
     words += [f"holds at {html.escape(series.label(value))}" for value in point.held]
+    words += [] if point.is_judged else [UNJUDGED]
     return f'<td title="{html.escape("; ".join(point.why))}">{", ".join(words)}</td>'
 
 

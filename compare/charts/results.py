@@ -234,7 +234,11 @@ class Results:
             words += f", {value - floor:+.2f} dB against the best image without training"
         if not math.isfinite(value) or (floor is not None and value < floor + MARGIN_DB):
             return "fails", words
-        loss = 0.0 if usual is None else usual - value
+        if floor is None:
+            return UNJUDGED, f"{words}; no image without training was scored"
+        if usual is None:
+            return UNJUDGED, f"{words}; it was not trained {self.base}"
+        loss = usual - value
         return ("holds" if loss <= HOLDS_DB else "shaken" if loss <= SHAKEN_DB else "suffers"), words
 
     def floor(self, target: str, condition: str) -> float | None:
@@ -281,7 +285,8 @@ class Results:
         return next(iter([*published, *self.trained]), None)
 
 
-VERDICTS = ("holds", "shaken", "suffers", "fails", "refused")  # the worse, the later
+UNJUDGED = "not judged"
+VERDICTS = ("holds", "shaken", "suffers", UNJUDGED, "fails", "refused")  # the worse, the later
 
 
 def pareto(points: list[tuple[float, float]]) -> list[tuple[float, float]]:

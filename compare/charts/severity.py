@@ -74,11 +74,13 @@ class Breaking:
     broken_at: the mildest numbers at which it is broken, below and above the usual one; none where it never is.
     held: the most severe numbers that it was tried at, on each side on which it never breaks.
     why: in words, of each number in broken_at.
+    is_judged: False where no image without a model was scored, so that nothing tells that it holds.
     """
 
     broken_at: tuple[float, ...]
     held: tuple[float, ...]
     why: tuple[str, ...]
+    is_judged: bool = True
 
 
 def series_of(results: Results) -> list[Series]:
@@ -117,9 +119,9 @@ def breaking(results: Results, label: str, series: Series) -> Breaking | None:
     conditions = {name for _, name in series.conditions if name != results.base}
     if not any(results.tried(label, target, name) for target in results.targets for name in conditions):
         return None
-    broken, held, why = [], [], []
+    broken, held, why, is_judged = [], [], [], True
     for side in series.outwards():
-        tried = None
+        tried, unjudged = None, False
         for value, condition in side:
             rows = [row for target in results.targets for row in results.tried(label, target, condition)]
             if not rows:
@@ -129,11 +131,16 @@ def breaking(results: Results, label: str, series: Series) -> Breaking | None:
                 broken.append(value)
                 why.append(reason)
                 break
-            tried = value
+            if all(_is_judged(results, label, target, condition) for target in results.targets):
+                tried = value
+            elif value != series.kind.usual:
+                unjudged = True
         else:
             if tried is not None and tried != series.kind.usual:
                 held.append(tried)
-    return Breaking(tuple(broken), tuple(held), tuple(why))
+            elif unjudged:
+                is_judged = False
+    return Breaking(tuple(broken), tuple(held), tuple(why), is_judged)
 
 
 def _broken(results: Results, label: str, target: str, condition: str) -> str | None:
@@ -150,6 +157,11 @@ def _broken(results: Results, label: str, target: str, condition: str) -> str | 
     if share is not None and share < LEAST_F_PERCENT:
         return f"{target}: F within .02 is {share:.1f} %"
     return None
+
+
+def _is_judged(results: Results, label: str, target: str, condition: str) -> bool:
+    """Tell whether it is known what a target comes to without a model; True where the method was not tried on it."""
+    return not results.tried(label, target, condition) or results.nothing(target, condition) is not None
 
 
 def _number(value: float | list[float]) -> float:

@@ -153,7 +153,7 @@ def _table(rows: list[dict]) -> list[str]:
 
 def _breaking(rows: list[dict]) -> list[str]:
     """Return the table of where methods break, of rows of `ground compare` under conditions of different severity."""
-    from compare.charts.results import Results
+    from compare.charts.results import UNJUDGED, Results
     from compare.charts.severity import LEAST_F_PERCENT, breaking_points
 
     if not all("digest" in row for row in rows):  # another benchmark's
@@ -171,6 +171,7 @@ def _breaking(rows: list[dict]) -> list[str]:
                 broken = zip(point.broken_at, point.why, strict=True)
                 words += [f"**{series.label(value)}** ({why})" for value, why in broken]
                 words += [f"holds at {series.label(value)}" for value in point.held]
+                words += [] if point.is_judged else [UNJUDGED]
             cells.append(", ".join(words))
         if any(cells):
             lines.append(f"| {' | '.join([series.kind.title, *cells])} |")

@@ -14,7 +14,7 @@ from compare.case import load_case
 from compare.charts.charts import size_figures, speed_figures
 from compare.charts.figures import _size, write_figures
 from compare.charts.page import write_page
-from compare.charts.results import Results, pareto, with_best
+from compare.charts.results import UNJUDGED, Results, pareto, with_best
 from compare.charts.severity import breaking, series_of
 from compare.command import _line
 from compare.grid.rows import Rows
@@ -83,6 +83,18 @@ def test_the_worst_target_decides_a_verdict():
     rows = [row("obbgs", target=t, psnr_clean_db=v) for t, v in (("A", 40.0), ("B", 20.0))]
     rows += [row("black", target=t, psnr_clean_db=25.0) for t in "AB"]
     assert Results(rows).verdict("obbgs", "as taken")[0] == "fails"
+
+
+def test_without_an_image_without_training_nothing_is_said_to_hold():
+    rows = [of_noise("obbgs", times, score) for times, score in ((None, 12.0), (2.0, 11.5))]
+    results = Results(rows)
+    for condition in results.conditions:
+        verdict, why = results.verdict("obbgs", condition)
+        assert verdict == UNJUDGED and "no image without training was scored" in why
+    point = breaking(results, "obbgs", series_of(results)[0])
+    assert point is not None and (point.broken_at, point.held, point.is_judged) == ((), (), False)
+    only_noisy = Results([rows[1], row("black", psnr_clean_db=5.0)])
+    assert only_noisy.verdict("obbgs", "noise x2")[0] == UNJUDGED, "nothing to compare with"
 
 
 def test_gains_are_positive_where_a_method_is_better():
