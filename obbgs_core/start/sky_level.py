@@ -81,11 +81,15 @@ class SkyLevel:
         """Whether the stated black level is that of empty sky."""
         return not self.planes_dn.any()
 
-    def by_frame(self) -> dict[int, list[float]]:
-        """Return the level above black in the middle of each frame and its deviation, DN, means of the channels."""
+    def by_frame(self) -> dict[int, list[float | None]]:
+        """Return the level above black in the middle of each frame and its deviation, DN, means of the channels.
+
+        The deviation is None for a frame that shows too little sky of its own: its level is the mean of the others.
+        """
         values = torch.stack([self.planes_dn, self.sigma_dn])[..., 0].mean(dim=2).T.tolist()
         return {
-            number: [round(v, 3) for v in pair] for number, pair in zip(self.frame_ids, values, strict=True)
+            number: [round(v, 3) if math.isfinite(v) else None for v in pair]
+            for number, pair in zip(self.frame_ids, values, strict=True)
         }
 
     def __str__(self) -> str:
@@ -126,9 +130,10 @@ def levelled(frames: list[TrainingFrame], sensor: Sensor) -> tuple[list[Training
     negligible_dn = NEGLIGIBLE * sigma_dn if sensor.jpeg is None else NEGLIGIBLE_CODED * _noise_dn(sensor)
     departs = _departs(planes[measured], covariance[measured], negligible_dn)
     planes, covariance = _shared(planes, covariance, measured)
+    sigma_dn = torch.where(measured[:, None, None], covariance.sqrt(), math.inf).float()
     if not departs:
-        return frames, sensor, dataclasses.replace(told, sigma_dn=covariance.sqrt().float())
-    level = SkyLevel(ids, planes.float(), covariance.sqrt().float())
+        return frames, sensor, dataclasses.replace(told, sigma_dn=sigma_dn)
+    level = SkyLevel(ids, planes.float(), sigma_dn)
     return *_without(frames, sensor, level.planes_dn), level
 
 

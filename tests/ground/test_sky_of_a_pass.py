@@ -42,9 +42,18 @@ def test_a_pedestal_is_measured_reported_and_costs_no_score(tmp_path):
     assert "<h3>Picture 7</h3>" in page  # no range: nobody stated that these poses are in metres
     assert "Level of empty sky" in page and "more than the stated black level" in page
     assert "- Sky: empty sky reads" in (tmp_path / "raised/runs/run/model_card.md").read_text()
+    assert "have the Earth in view" not in page
     assert "Level of empty sky" not in write_report(tmp_path / "plain", "run").read_text()
-    kept = json.loads((tmp_path / "raised/runs/run/metrics.json").read_text())
+    path = tmp_path / "raised/runs/run/metrics.json"
+    kept = json.loads(path.read_text())
     assert len(kept["sky_level_dn"]) == kept["frames_trained"]
+    kept["sky_level_dn"]["3"] = [7.25, None]  # as of a frame that the Earth fills
+    path.write_text(json.dumps(kept))
+    page = write_report(tmp_path / "raised", "run").read_text()
+    assert (
+        "1 of 21 pictures have the Earth in view or too little sky of their own: the mean of the others, 7.25"
+        in page
+    )
 
 
 def test_what_is_unusual_about_frames_is_told_once_from_session_to_report(tmp_path, caplog):

@@ -95,6 +95,14 @@ def test_nothing_is_measured_where_the_target_fills_the_picture_or_in_front_of_a
     assert levelled(white, SENSOR)[2].fits
 
 
+def test_the_level_of_a_frame_that_shows_the_earth_is_that_of_the_others_and_has_no_error_of_its_own():
+    frames = seen(SENSOR, planes([(3.0 + i, 0, 0) for i in range(6)]))
+    frames[5] = dataclasses.replace(frames[5], earth_m=torch.tensor([0.0, 0.0, 7e6]))
+    levels = levelled(frames, SENSOR)[2].by_frame()
+    assert levels[5][1] is None and levels[5][0] == pytest.approx(5.0, abs=0.2)
+    assert all(levels[i][1] is not None for i in range(5))
+
+
 def test_what_flight_has_cut_is_no_sky_and_stays_black():
     """Around the target a rim of the sky is left, and its level is that of the whole picture."""
     sensor = dataclasses.replace(SENSOR, read_noise_dn=6.0)
