@@ -67,11 +67,8 @@ def telemetry_figures(series: list[Series]) -> list[go.Figure]:
             showlegend=False,
             cliponaxis=False,  # a value on the axis is seen whole
         )
-        for limit, bounds in (("yellow", each.item.yellow), ("red", each.item.red)):
-            for bound in bounds:
-                if _is_near(bound, each.values):
-                    line = {"color": LIMIT_COLOURS[limit], "width": 1, "dash": "dot"}
-                    figure.add_hline(y=bound / factor, line=line)
+        for bound, colour in near_limits(each):
+            figure.add_hline(y=bound / factor, line={"color": colour, "width": 1, "dash": "dot"})
         if each.values.min() == each.values.max():  # a scale of thousandths around a constant says nothing
             value = each.values[0] / factor
             figure.update_yaxes(range=[0.0, 2 * value or 1.0])  # nothing that is shown can be negative
@@ -84,12 +81,15 @@ def telemetry_figures(series: list[Series]) -> list[go.Figure]:
 
 
 def near_limits(series: Series) -> list[tuple[float, str]]:
-    """Return the limits that can be drawn without hiding how the values change, each with its colour."""
+    """Return the limits that can be drawn without hiding how the values change, each with its colour.
+
+    A range from 0 to more has one limit: nothing that is shown can be negative.
+    """
     return [
         (bound, LIMIT_COLOURS[limit])
         for limit, bounds in (("yellow", series.item.yellow), ("red", series.item.red))
         for bound in bounds
-        if _is_near(bound, series.values)
+        if (bound > 0 or max(bounds) == 0) and _is_near(bound, series.values)
     ]
 
 

@@ -22,7 +22,7 @@ from ground.session.cameras import sensor_of
 from ground.session.folder import open_session
 from ground.session.training_frames import frames_of, training_frame
 from ground.session.writer import SessionWriter
-from ground.show.report.poses import pose_history
+from ground.show.report.poses import _of_earth, pose_history
 from ground.show.viewer import viewer
 from ground.show.viewer.source import Shown
 from ground.show.viewer.splats import best_seen
@@ -178,6 +178,8 @@ def test_the_report_looks_for_a_target_in_front_of_the_earth_where_its_pose_was_
     history = pose_history(run, estimate)
     assert all(frame.earth_m is not None for frame in frames_of(session))
     assert (history.chi2_estimated < 0.02 * history.chi2_tagged).all()
+    assert "All of these frames have the Earth in view" in _of_earth(run, history.frame_ids[:2], "frame")
+    assert _of_earth(run, [], "frame") == ""
 
 
 def test_a_pass_with_the_earth_makes_a_model_like_that_of_a_black_sky(mission, tmp_path):

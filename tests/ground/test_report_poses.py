@@ -12,7 +12,7 @@ from ground.run.runs import Run
 from ground.session.cameras import sensor_of
 from ground.session.folder import Navigation, open_session, pass_name
 from ground.session.training_frames import split
-from ground.show.report.poses import pose_history, poses_section
+from ground.show.report.poses import pose_history, poses_section, shared_rows
 from ground.show.sizes import with_deviation
 from obbgs_base.physics.navigation_errors import SIZE, SharedParameters
 from obbgs_core.poses.estimate import PoseEstimate
@@ -115,6 +115,13 @@ def test_a_bracket_whose_residual_stands_out_is_named(example):
     moved[place] = turn @ moved[place]
     history = pose_history(run, dataclasses.replace(estimate, estimated=moved))
     assert history.misfits == [estimate.frame_ids[place]]
+
+
+def test_what_is_as_good_as_known_along_an_axis_is_no_row(example):
+    _, estimate, _ = example
+    sigmas = SharedParameters(boresight_rad=np.array([1e-10, BORESIGHT_RAD, BORESIGHT_RAD]))
+    words = [row[0] for row in shared_rows(dataclasses.replace(estimate, shared_prior=sigmas))]
+    assert [text.partition(":")[0] for text in words] == ["boresight, camera y", "boresight, camera z"]
 
 
 def test_values_are_told_to_the_second_digit_of_their_deviation():

@@ -56,6 +56,10 @@ def test_limits_are_those_of_the_dictionary_and_stand_in_the_figure(tmp_path):
     assert colours["frames_refused"] == tuple(LIMIT_COLOURS[limit] for limit in ("green", "red", "green"))
     heights = {shape.y0: shape.line.color for shape in figures["rss_bytes"].layout.shapes}
     assert heights[300.0] == LIMIT_COLOURS["yellow"]  # of the memory, in MB
+    assert 0.0 not in heights, "nobody has less than no memory"
+    assert [shape.y0 for shape in figures["frames_refused"].layout.shapes] == [0.0, 0.0], (
+        "none may be refused"
+    )
 
 
 def test_counts_that_stay_at_zero_have_no_axis_below_it(tmp_path):

@@ -42,6 +42,7 @@ SHOWN = {  # the parameters that a pass shares: words, unit, axes
 }
 ELLIPSES_SHOWN = 60
 MOST_TICKS = 9  # of a logarithmic axis of residuals; above, at powers of ten only
+AS_GOOD_AS_KNOWN = 1e-3  # of the largest deviation that is stated along another axis
 MISFIT_DEVIATIONS = 6.0  # of the median absolute deviation, scaled to that of a normal distribution
 
 
@@ -155,7 +156,7 @@ def poses_section(run: Run) -> str:
         else (
             f"The residual of {len(misfits)} of {len(history.frame_ids)} {each}s stands out ({called}"
             f"{'s' * (len(misfits) > 1)} {', '.join(map(str, misfits))}): the poses may err by more than the {tags} "
-            "say, or something passed before the camera."
+            f"say, or something passed before the camera.{_of_earth(run, misfits, called)}"
         )
     )
     if left_out := run.metrics.get("misfit_frames"):
@@ -170,8 +171,21 @@ def poses_section(run: Run) -> str:
     return section("Poses as estimated", note, f"{body}<p>{told}</p>")
 
 
+def _of_earth(run: Run, misfits: list[int], called: str) -> str:
+    """Return in words how many of the frames that stand out have the Earth in view; nothing where none has."""
+    records = [record for record in run.session.frames if record.id in misfits]
+    count = sum(run.without_sky_level(record).earth_m is not None for record in records)
+    if not count:
+        return ""
+    which = "All" if count == len(misfits) else f"{count}"
+    return f" {which} of these {called}s have the Earth in view, whose light is known less surely than a black sky."
+
+
 def shared_rows(estimate: PoseEstimate) -> list[tuple[str, str]]:
-    """Return a row for each parameter that the whole pass shares: its value with its deviation, and the prior's."""
+    """Return a row for each parameter that the whole pass shares: its value with its deviation, and the prior's.
+
+    Along an axis on which it is stated a thousand times as surely as on another, it is as good as known and left out.
+    """
     rows, doubted = [], set(estimate.unobservable())
     for name in LENGTHS:
         words, unit, axes = SHOWN[name]
@@ -180,7 +194,7 @@ def shared_rows(estimate: PoseEstimate) -> list[tuple[str, str]]:
             factor * getattr(part, name)
             for part in (estimate.shared, estimate.shared_prior, estimate.shared_posterior)
         )
-        for i in np.flatnonzero(priors):
+        for i in np.flatnonzero(priors > AS_GOOD_AS_KNOWN * priors.max()):
             axis = f" {axes[i]}" if axes else ""
             doubt = ": not determined by the frames" if {name, f"{name}[{i}]"} & doubted else ""
             value = unbroken(with_deviation(values[i], left[i])) + " "
