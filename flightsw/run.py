@@ -91,20 +91,13 @@ def run_pass(
     captured, camera, no_camera, thread, alive = CaptureCounts(), None, None, None, Watchdog()
     with contextlib.ExitStack() as opened:
         events = _events(opened)  # from here on, so that the ground hears of all that is found at the start
-        must_be_there = exit_when_empty and camera_url is None
-        link, keys = _open_link(link_url, key_files, must_be_there, opened)
+        link, keys = _open_link(link_url, key_files, exit_when_empty and camera_url is None, opened)
         if camera_url is not None:
-            try:
-                camera = _open_camera(camera_url, mission, stop, opened)
-            except CaptureError as error:
-                if link is None:
-                    raise
-                no_camera = error  # what is stored is sent all the same
+            camera, no_camera = _first_camera(camera_url, mission, stop, opened, is_needed=link is None)
         is_patient, is_new = link is not None and not exit_when_empty, not store_dir.exists()
         store = open_store(store_dir, mission, open_now=not is_patient)
         if link is not None:
-            waiting = (exit_when_empty, stop, on_sent, alive)
-            thread = _DownlinkThread(store, link, mission, keys, *waiting)
+            thread = _DownlinkThread(store, link, mission, keys, exit_when_empty, stop, on_sent, alive)
             thread.camera, thread.boot, thread.events = camera, count_boot(store_dir), events
             if camera_url is not None:
                 thread.capturing.set()
@@ -203,6 +196,26 @@ def _wait_for_stores(store: FrameStore, thread: "_DownlinkThread", stop: threadi
             if stop.wait(RETRY_S):
                 raise
     thread.store_is_made.set()
+
+
+def _tell(error: Exception, events: EventLog) -> None:
+    """Log what ended capture; to the ground alone where it was logged at the start."""
+    if isinstance(error, _NeverAnswered):
+        events.add("error", problem=str(error))
+    else:
+        log.error("no more exposures: %s", str(error) or repr(error))
+
+
+def _first_camera(
+    url: str, mission: Mission, stop: threading.Event, opened: contextlib.ExitStack, is_needed: bool
+) -> tuple[ReconnectingCamera | None, CaptureError | None]:
+    """Return a camera, or why there is none; with `is_needed` that is raised."""
+    try:
+        return _open_camera(url, mission, stop, opened), None
+    except CaptureError as error:
+        if is_needed:
+            raise
+        return None, error
 
 
 def _open_camera(
