@@ -69,17 +69,19 @@ def _bars(console: Console) -> Iterator[Callable[[str, "StepInfo"], None]]:
 
 
 class _Lines:
-    """Prints the state of a training every ten seconds, at its first step and at its last."""
+    """Prints the state of a training every ten seconds, at its first step, at its last and where it is set back."""
 
     def __init__(self, console: Console):
-        self._console, self._label, self._next_s = console, "", 0.0
+        self._console, self._label, self._next_s, self._step = console, "", 0.0, 0
 
     def __call__(self, label: str, info: "StepInfo") -> None:
-        now_s = time.monotonic()
-        if label == self._label and now_s < self._next_s and info.step < info.steps:
+        now_s, last = time.monotonic(), self._step if label == self._label else 0
+        self._step, is_back = info.step, info.step < last
+        if label == self._label and now_s < self._next_s and info.step < info.steps and not is_back:
             return
         self._label, self._next_s = label, now_s + PLAIN_S
-        say(self._console, f"{label}: step {info.step} of {info.steps} {_state(info)}")
+        back = f" (the schedule was set back from step {last})" if is_back else ""
+        say(self._console, f"{label}: step {info.step} of {info.steps}{back} {_state(info)}")
 
 
 class _Events(logging.Handler):

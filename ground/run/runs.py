@@ -38,7 +38,7 @@ from obbgs_core.io.ply import load_ply
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render.backdrops import without_earth
 from obbgs_core.sensor import Sensor
-from obbgs_core.start.sky_level import field, levelled
+from obbgs_core.start.sky_level import levelled, without_plane
 
 LOG = "log"
 LOCK = "lock"  # in the folder of an unfinished run; holds the name of the process that works on it
@@ -84,11 +84,7 @@ class Run:
         frame = training_frame(self.session, record, self._tagged.get(record.id))
         if (planes_dn := self._sky_planes_dn.get(record.id)) is None:
             return frame
-        dn = (frame.dn - field(planes_dn, *frame.dn.shape[:2])).clamp(min=0)
-        dn[frame.dn >= self.sensor.white_dn] = (
-            self.sensor.white_dn
-        )  # still says no more than "at least this much"
-        return dataclasses.replace(frame, dn=dn)
+        return without_plane(frame, planes_dn, self.sensor)
 
     def on_black_sky(self, record: FrameRecord, seen_from: Tensor | None = None) -> TrainingFrame:
         """Return a frame as if the sky was as black as stated, and the Earth not in view, as the model shows it.

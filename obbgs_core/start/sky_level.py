@@ -142,6 +142,13 @@ def field(plane_dn: Tensor, height: int, width: int) -> Tensor:
     return torch.einsum("hwk,ck->hwc", _basis(height, width).to(plane_dn), plane_dn)
 
 
+def without_plane(frame: TrainingFrame, plane_dn: Tensor, sensor: Sensor) -> TrainingFrame:
+    """Return one frame without the departure of its planes [C, 3]; full scale still says "at least this much"."""
+    dn = (frame.dn - field(plane_dn, *frame.dn.shape[:2])).clamp(min=0)
+    dn[frame.dn >= sensor.white_dn] = sensor.white_dn
+    return dataclasses.replace(frame, dn=dn)
+
+
 def cut_pixels(sensor: Sensor, dn: Tensor) -> Tensor:
     """Return which pixels [H, W] of readings dn [H, W, C] flight has not sent: they read the black level all over."""
     # with less noise, or a black level below it, many readings of the sky are exactly that

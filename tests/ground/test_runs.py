@@ -534,6 +534,12 @@ def test_a_training_without_a_terminal_says_every_so_often_how_far_it_is(monkeyp
     lines = text.getvalue().splitlines()
     assert [int(line.split()[3 if "known" in line else 4]) for line in lines] == [1, 21, 41, 51, 71, 91, 100]
     assert lines[0] == ("known exposure: step 1 of 100 PSNR 30.0 dB chi² 1.5 1234 Gaussians 50 s left")
+    with steps_shown(Console(file=(back := io.StringIO()), width=200)) as show:
+        for step in (60, 61, 62, 25, 26):
+            show("known exposure", StepInfo(step, 100, 0.1, 30.0, 1.5, 1234, now_s, 40.0))
+    first, second = back.getvalue().splitlines()
+    assert "step 60 of 100 PSNR" in first
+    assert "step 25 of 100 (the schedule was set back from step 62) PSNR" in second
 
 
 def test_the_result_is_a_table_with_units_and_json_as_ever(finished):

@@ -2,13 +2,18 @@
 
 import json
 import logging
+from types import SimpleNamespace
 
 import pytest
 
 from ground.run.evaluate import evaluate
 from ground.run.reconstruct import reconstruct
+from ground.session.cameras import sensor_of
+from ground.session.folder import open_session
 from ground.show.report.document import write_report
-from tests.scenes import QUICK
+from ground.show.viewer.source import Shown
+from ground.show.viewer.viewer import _compared
+from tests.scenes import QUICK, target
 from tests.small_sessions import small_session
 
 PEDESTAL_DN = 40.0  # a hundredth of full scale
@@ -54,6 +59,15 @@ def test_a_pedestal_is_measured_reported_and_costs_no_score(tmp_path):
         "1 of 21 pictures have the Earth in view or too little sky of their own: the mean of the others, 7.25"
         in page
     )
+
+
+def test_the_viewer_counts_the_level_of_empty_sky_as_no_error(tmp_path):
+    """The model is the truth, so that without the level nothing but noise is left of the error."""
+    session = open_session(small_session(tmp_path / "raised", pedestal_dn=2 * PEDESTAL_DN))
+    shown = Shown("A", session, sensor_of(session.camera), target(seed=0), None, session, None)
+    compared = _compared(SimpleNamespace(shown=shown), session.frames[4])  # pyright: ignore[reportArgumentType]
+    error = compared[:, 2 * session.camera.width :]
+    assert error[..., 0].mean() < 40, "the level itself is 150"
 
 
 def test_what_is_unusual_about_frames_is_told_once_from_session_to_report(tmp_path, caplog):

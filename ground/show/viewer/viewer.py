@@ -36,6 +36,7 @@ from ground.show.viewer.waiting import awaited
 from obbgs_base.errors import reason
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.render.backdrops import without_earth
+from obbgs_core.start.sky_level import levelled, without_plane
 
 log = logging.getLogger(__name__)
 POLL_S, TICK_S = 1.0, 0.25  # between looks for a renewed model, and between steps of a replay
@@ -425,7 +426,10 @@ def _facts(session: Session, record: FrameRecord) -> str:
 
 
 def _compared(placed: Placed, record: FrameRecord) -> np.ndarray:
-    """Return a frame, the model's picture and the error side by side, bytes [H, 3 W, 3]; the Earth is no error."""
+    """Return a frame, the model's picture and the error side by side, bytes [H, 3 W, 3].
+
+    Neither the Earth nor what empty sky reads above the stated black level is an error of the model.
+    """
     shown = placed.shown
     seen_from = shown.compared(record)
     tagged = next(r for r in shown.tagged.frames if r.id == record.id)
@@ -436,7 +440,9 @@ def _compared(placed: Placed, record: FrameRecord) -> np.ndarray:
         return np.zeros((2, 6, 3), np.uint8)
     frame = taken.dn / shown.sensor.white_dn
     image = predicted_image(shown.gaussians, shown.session, seen_from, shown.sensor, record.exposure_time_s)
-    on_black = without_earth(shown.gaussians, taken, shown.sensor).dn / shown.sensor.white_dn
+    plane_dn = levelled([taken], shown.sensor)[2].planes_dn[0]
+    black = without_earth(shown.gaussians, without_plane(taken, plane_dn, shown.sensor), shown.sensor)
+    on_black = black.dn / shown.sensor.white_dn
     error = ((image - on_black).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
     encoding = shown.session.encoding
     toned = [tone(each.numpy(), shown.sensor, encoding) for each in (frame, image)]
