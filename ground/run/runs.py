@@ -113,6 +113,11 @@ class Run:
         return planes_dn
 
 
+def without_own_sky(frame: TrainingFrame, sensor: Sensor) -> TrainingFrame:
+    """Return a frame without what its own empty sky reads above the stated black level, as far as it shows that."""
+    return without_plane(frame, levelled([frame], sensor)[2].planes_dn[0], sensor)
+
+
 def run_folder(session_dir: Path, name: str, out: Path | None = None) -> Path:
     """Return where a run is or will be: in `out` if given, otherwise in runs/ of the session.
 

@@ -12,6 +12,7 @@ import imagecodecs
 import numpy as np
 import viser
 
+from ground.run.runs import without_own_sky
 from ground.session.cameras import predicted_image, range_in_words, sun_direction
 from ground.session.exposures import in_ms, offered_s
 from ground.session.folder import FrameRecord, Session, SessionError
@@ -36,7 +37,6 @@ from ground.show.viewer.waiting import awaited
 from obbgs_base.errors import reason
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.render.backdrops import without_earth
-from obbgs_core.start.sky_level import levelled, without_plane
 
 log = logging.getLogger(__name__)
 POLL_S, TICK_S = 1.0, 0.25  # between looks for a renewed model, and between steps of a replay
@@ -440,8 +440,7 @@ def _compared(placed: Placed, record: FrameRecord) -> np.ndarray:
         return np.zeros((2, 6, 3), np.uint8)
     frame = taken.dn / shown.sensor.white_dn
     image = predicted_image(shown.gaussians, shown.session, seen_from, shown.sensor, record.exposure_time_s)
-    plane_dn = levelled([taken], shown.sensor)[2].planes_dn[0]
-    black = without_earth(shown.gaussians, without_plane(taken, plane_dn, shown.sensor), shown.sensor)
+    black = without_earth(shown.gaussians, without_own_sky(taken, shown.sensor), shown.sensor)
     on_black = black.dn / shown.sensor.white_dn
     error = ((image - on_black).abs().mean(-1, keepdim=True) / ERROR_FULL_SCALE).clamp(0, 1)
     encoding = shown.session.encoding
