@@ -27,7 +27,7 @@ KEY_HELP = "The file of the mission's key"
 SEED_HELP = "The same seed gives the same result"
 PARTS = ("flightsw", "ground", "compare", "hil", "obbgs_core", "obbgs_base")
 OUT_HELP = "What to write, a file or a folder"
-SET_HELP = "A setting, NAME=VALUE; can be repeated, and a wrong name lists them all"
+SET_HELP = "A setting, NAME=VALUE; can be repeated, and a wrong name tells the nearest"
 
 
 class _Group(TyperGroup):

@@ -175,7 +175,7 @@ def _many(sessions: list[Path], asked: _Asked, workers: str | None, as_json: boo
             state = ended.problem or ("was finished" if ended.was_done else "finished")
             say(stderr, f"{session}: {state}")
 
-        say(stderr, f"reconstructing {len(sessions)} sessions")
+        say(stderr, f"reconstructing {len(sessions)} session{'s' * (len(sessions) > 1)}")
         found = many.reconstruct_all(sessions, wanted, *workers_at(workers), on_end, lambda: stop.requested)
     if as_json:
         told = {str(s): e.metrics or {"error": e.problem} for s, e in found.items()}

@@ -1,5 +1,6 @@
 """Renders the target on several Blender workers and keeps every picture in a cache, by the digest of its inputs."""
 
+import contextlib
 import hashlib
 import json
 import queue
@@ -34,11 +35,11 @@ class RenderFarm:
         check_mesh(mesh)
         self.mission, self.mesh, self.cache = mission, mesh, cache
         self.materials: Materials = materials
-        cache.mkdir(parents=True, exist_ok=True)
         self._count = workers
         self._workers: list[Worker] = []
         self._lock = threading.Lock()
         self._first = self._worker(0)  # at once, so that a bad mesh is reported here
+        cache.mkdir(parents=True, exist_ok=True)
         settings = f"{mesh_sha256(mesh)} {SAMPLES} {self._first.version} {materials} ".encode()
         self._identity = hashlib.sha256(settings + b"".join(s.read_bytes() for s in SOURCES)).hexdigest()
 
@@ -48,6 +49,8 @@ class RenderFarm:
     def __exit__(self, *_) -> None:
         for worker in self._workers:
             worker.close()
+        with contextlib.suppress(OSError):  # it holds something
+            self.cache.rmdir()
 
     @property
     def version(self) -> str:

@@ -208,6 +208,9 @@ def test_a_pass_that_ends_with_too_few_frames_says_so(tmp_path):
     writer = Writer(tmp_path / "s")
     with pytest.raises(SessionError, match="no frame came into"):
         reconstruct_live(writer.folder, idle_timeout_s=0.0)
+    with pytest.raises(SessionError, match="no frame came into"):
+        reconstruct_live(tmp_path / "never", idle_timeout_s=0.0)
+    assert not (tmp_path / "never").exists()
     writer.add(2)
     with pytest.raises(TooFewFrames, match=r"no frame for 0 s, .*2 frames received.*3 frames are needed"):
         reconstruct_live(writer.folder, idle_timeout_s=0.0)

@@ -263,6 +263,7 @@ def test_a_file_that_is_no_mesh_is_refused_and_named(tmp_path, content, suffix):
     path.write_bytes(content)
     with pytest.raises(MeshError, match=f"bad{suffix}") as refused:
         RenderFarm(MISSION, path, tmp_path / "cache")
+    assert not (tmp_path / "cache").exists()
     assert not re.search(
         r"Error:|\n", str(refused.value)
     )  # a line of words, without the class of what was raised

@@ -3,11 +3,13 @@
 This process only reads the session's frames, so that the one that receives them never waits for the training.
 """
 
+import contextlib
 import functools
 import logging
 import math
+import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
 
@@ -86,7 +88,8 @@ def reconstruct_live(
     check_replaceable(folder, overwrite)
     uplink = None if key_file is None else LiveUplink(session_dir, key_file)
     kept = [path.name for path in unfinished_folder(folder).glob("*.checkpoint")]
-    with unfinished_run(folder, overwrite, kept) as part:
+    is_new = not session_dir.exists()
+    with _nothing_left_of(session_dir if is_new else None), unfinished_run(folder, overwrite, kept) as part:
         live = LiveReconstruction(session_dir, folder, part, config, seed, uplink, on_status)
         end = PassEnd(session_dir, idle_timeout_s, must_listen)
         try:
@@ -100,6 +103,17 @@ def reconstruct_live(
             live.close()
         live.finish(should_stop)
     return folder
+
+
+@contextlib.contextmanager
+def _nothing_left_of(session_dir: Path | None) -> Iterator[None]:
+    """Remove a folder that was made for a session of which nothing came, where the block ends in an error."""
+    try:
+        yield
+    except SessionError:
+        if session_dir is not None and [path.name for path in session_dir.iterdir()] == ["runs"]:
+            shutil.rmtree(session_dir, ignore_errors=True)
+        raise
 
 
 class PassEnd:
