@@ -228,9 +228,9 @@ def _photographs(
         number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)
     }
     try:
-        with Progress(
-            TextColumn("finding cameras"), BarColumn(), TimeRemainingColumn(), console=stderr
-        ) as progress:
+        columns = TextColumn("finding cameras"), BarColumn(), TimeRemainingColumn()
+        # elsewhere than on a terminal nothing is left of it but a line before an error
+        with Progress(*columns, console=stderr, transient=True, disable=not stderr.is_terminal) as progress:
             task = progress.add_task("register", total=1.0)
             if format_ is ImportFormat.VIDEO:
                 pictures = session / VIDEO_FRAMES / "pictures"

@@ -25,6 +25,7 @@ from obbgs_core.score.surface import surface_points
 from obbgs_core.sensor import Sensor
 
 log = logging.getLogger(__name__)
+PARITY = "onnx_parity_db"  # of the agreement of model.onnx with our renderer, in metrics.json
 T = TypeVar("T")
 PARITY_VIEWS = 5
 SURFACE_POINTS = 100_000
@@ -46,7 +47,7 @@ class Outputs:
         """
         if self._should_stop():
             raise Interrupted(f"interrupted before {name} was made; {self._kept()}")
-        log.info("making %s", name)
+        log.info("%s", "comparing model.onnx with our renderer" if name == PARITY else f"making {name}")
         try:
             return make(self.folder / name)
         # Whatever goes wrong with one file, the model and the other files are worth keeping.
@@ -103,7 +104,7 @@ def write_models(
     mesh = outputs.make(
         "model.glb", lambda path: write_mesh(gaussians, session, training, path, white_radiance)
     )
-    facts: dict = {"onnx_parity_db": None} | (mesh or {})
+    facts: dict = {PARITY: None} | (mesh or {})
     exported = outputs.make(
         "model.onnx",
         lambda path: export_onnx(
@@ -128,9 +129,9 @@ def write_models(
     views = held_out or training
     views = views[:: max(1, len(views) // PARITY_VIEWS)][:PARITY_VIEWS]
     parity_db = outputs.make(
-        "onnx_parity_db", lambda _: onnx_parity_db(exported.path, gaussians, session, views, sensor)
+        PARITY, lambda _: onnx_parity_db(exported.path, gaussians, session, views, sensor)
     )
-    return facts | {"onnx_parity_db": parity_db}
+    return facts | {PARITY: parity_db}
 
 
 def onnx_parity_db(

@@ -16,6 +16,7 @@ from ground.formats.pictures.views import FormatError, PoseSigmas, write_session
 from ground.session.folder import open_session
 from obbgs_base.errors import Interrupted
 from tests import raycast
+from tests.commands import call
 
 BOXES = [dataclasses.replace(raycast.spacecraft(5)[0], half_m=np.array([0.7, 0.6, 0.5]), cells=12)]
 SIZE_PX = 160
@@ -126,6 +127,9 @@ def test_pictures_that_have_nothing_in_common_are_refused_in_one_sentence(photog
         read_photographs(tmp_path, tmp_path / "work")
     with pytest.raises(FormatError, match="nowhere is not a folder"):
         read_photographs(tmp_path / "nowhere", tmp_path / "other")
+    given = ["--format", "images", "--from", str(tmp_path / "work"), "--session", str(tmp_path / "s")]
+    done = call("ground", "import", *given)
+    assert done.stderr == f"ground: {tmp_path / 'work'}: expected at least 3 photographs, found 0\n"
     with pytest.raises(FormatError, match="at least 3 photographs, found 0"):
         read_photographs(tmp_path / "work", tmp_path / "other")
     cv2.imwrite(str(tmp_path / "3.png"), np.zeros((32, 64), np.uint8))

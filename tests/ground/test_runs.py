@@ -126,6 +126,7 @@ def test_the_limit_of_the_uplink_stops_no_model_of_the_ground_but_the_uplink(ses
     metrics = evaluate(session, "run")
     assert metrics["onnx_bytes"] > 1000 and metrics["onnx_fits_uplink"] is False
     assert metrics["missing_outputs"] == {} and metrics["onnx_parity_db"] > 40
+    assert "comparing model.onnx with our renderer" in (folder / "log").read_text()
     assert "too large for the uplink" in (folder / "model_card.md").read_text()
     assert "too large for the uplink" in dict(model_rows(metrics))["model.onnx"]
     with pytest.raises(ConfigError, match=r"accepts 1 to 1,000; .*smaller --budget"):
