@@ -270,6 +270,26 @@ def test_the_page_shows_every_part(comparison):
     assert "<summary>What the columns mean</summary>" in body and "Precision, recall and their mean F" in body
 
 
+def test_the_page_counts_one_as_one_and_tells_what_it_left_out_and_what_ended_early(tmp_path):
+    rows = Rows(tmp_path)
+    rows.add(row("3dgs", psnr_clean_db=30.0) | {"digest": "old"})
+    rows.add(row("3dgs", psnr_clean_db=31.0, converged=True) | {"digest": "new"})
+    text = write_page(tmp_path).read_text()
+    assert "1 row: 1 method, 1 target, 1 condition." in text and "1 more row is left out" in text
+    assert "1 training ended early" in text
+    rows.add(row("3dgs", psnr_clean_db=31.0) | {"digest": "newest"})
+    text = write_page(tmp_path).read_text()
+    assert "2 more rows are left out" in text and "No training ended early" in text
+
+
+def test_the_page_shows_that_nothing_is_judged_without_an_image_without_training(tmp_path):
+    rows = Rows(tmp_path)
+    for made in (of_noise("obbgs", None, 40.0), of_noise("obbgs", 2.0, 39.0)):
+        rows.add(made)
+    text = write_page(tmp_path).read_text()
+    assert '<td title="">not judged</td>' in text and "holds at" not in text
+
+
 def test_pictures_name_their_method_and_a_section_without_content_goes(comparison, tmp_path):
     assert re.search(r"[a-z0-9]+, \d+\.\d dB</", write_page(comparison).read_text())
     rows = Rows(tmp_path)

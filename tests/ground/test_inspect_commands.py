@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from ground import cli
 from ground.run.runs import open_run
+from ground.show.measure import _is_known
 from ground.show.page import unbroken
 from ground.show.report.sizes import sizes_section
 from ground.show.sizes import with_deviation
@@ -95,3 +96,8 @@ def test_a_part_of_the_design_that_is_not_there_is_told(run):
     }
     coloured = trimesh.load_scene(run / "inspection.glb")
     assert {"body", "box"} <= {node.split("_")[0] for node in coloured.geometry}
+
+
+def test_a_face_whose_width_is_known_to_less_than_a_quarter_is_a_crumb():
+    assert _is_known({"value": 1.0, "half_width_90": 0.25})
+    assert not _is_known({"value": 0.19, "half_width_90": 0.05})

@@ -145,3 +145,13 @@ def test_a_run_shows_its_quality_what_was_decided_of_poses_and_their_errors_but_
     assert found["figures"]["quality"] == ["8 steps", "draft"]
     assert found["figures"]["pose_error_px"] == [None, 0.31]
     assert list(found["settings"]) == ["session.frames"]
+
+
+def test_only_what_came_over_a_link_can_be_lost(passes, tmp_path):
+    assert "nothing" in called("list", str(passes / "2026"))
+    shutil.copytree(GOLDEN, tmp_path / "taken")
+    header = json.loads((tmp_path / "taken" / "session.json").read_text())
+    header |= {"imported_from": "nerf: photographs"}
+    (tmp_path / "taken" / "session.json").write_text(json.dumps(header))
+    told = called("list", str(tmp_path))
+    assert "nothing" not in told and "48 pictures" in told and "nerf: photographs" in told
