@@ -187,7 +187,7 @@ def test_a_field_learns_views_that_it_was_not_shown(small, exposure_aware):
     assert reached > psnr(held_out, lambda f: torch.zeros_like(f.dn)) + 4
     assert reached > psnr(held_out, lambda f: mean) + 4
     assert shares == pytest.approx([(i + 1) / 120 for i in range(120)])
-    assert len(made.surface) == 500 and made.size_bytes == 4 * made.figures["parameters"]
+    assert 300 < len(made.surface) <= 500 and made.size_bytes == 4 * made.figures["parameters"]
     assert (
         float(made.surface.norm(dim=1).median()) < 1.5
     )  # the target's own points lie about 0.6 m from the origin
