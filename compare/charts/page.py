@@ -222,8 +222,8 @@ def _failures(results: Results, out: Path) -> str:
         f"Numbers are mean scores over targets and seeds; the colour is that of the worst target. Holds: at most "
         f"{HOLDS_DB:g} dB below {html.escape(results.base)}; shaken: at most {SHAKEN_DB:g} dB; suffers: more; fails: "
         f"less than {MARGIN_DB:g} dB above the best image without training (black, mean, untrained); not judged: none "
-        f"of these was scored, or the method not {html.escape(results.base)}; refused: ended in an error that says "
-        "why. Point at a cell for its figures."
+        f"of these was scored, or the method not trained {html.escape(results.base)}; refused: ended in an error that "
+        "says why. Point at a cell for its figures."
     )
     worst: dict[tuple[str, str], tuple[str, KeptView]] = {}  # of each method and target
     for row in results.rows:
