@@ -9,7 +9,9 @@ dark where it is bright is no evidence either.
 
 Ratios that follow no power are those of exposure times which are not as stated, each by a factor; the median is taken
 as stated, since what all share is the unit of light. A ratio that grows along the pass, alike in the frames of every
-exposure time, is a drift. Where each frame has an error of its own (`frame_errors`), that takes the place of all these.
+exposure time, is a drift, unless the directions of the views say when they were taken: light that grows with the Sun's
+phase does the same on a pass that goes round its target once. Where each frame has an error of its own
+(`frame_errors`), that takes the place of all these.
 
 Source: Mitsunaga and Nayar, Radiometric self calibration, 1999, who fit a polynomial to exposures of one view.
 """
@@ -50,6 +52,9 @@ MOST_CHOSEN = 0.5
 LEAST, CERTAIN = 0.02, 3.0
 # a model itself errs along a pass by up to half of it (the demo: 0.027 with an error of 0.008)
 LEAST_DRIFT = 0.05
+# share of the variance of the frames' places in the pass that their views' directions explain: more, and there is no
+# telling a drift from light that turns with the view (0.7 to 1.0 on passes of the simulator, 0 on views at random)
+MOST_EXPLAINED = 0.5
 LIT_SIGMA, BELOW_FULL_SCALE = 4.0, 0.9  # readings that count: between so much noise and so much of full scale
 MOST_WRONG = 0.5  # of ln(true / stated exposure time)
 RANGE = (0.3, 3.0)  # of exponents: others are none of a camera's
@@ -123,7 +128,7 @@ class Response:
         else:
             is_bent = abs(bend) > max(LEAST, CERTAIN * error) and RANGE[0] <= 1 + bend <= RANGE[1]
             self.exponent, self.settings = 1 + bend if is_bent else 1.0, None
-        self.drift = self._drift(told, len(batches.frames))
+        self.drift = 0.0 if _explained(batches.frames) > MOST_EXPLAINED else self._drift(told, len(frames))
         if (self.exponent, self.settings, self.drift) == before:
             return False
         log.info("%s", self)
@@ -218,6 +223,17 @@ class _Pair(NamedTuple):
     part: int
     one: list[int]
     other: list[int]
+
+
+def _explained(frames: list[TrainingFrame]) -> float:
+    """Return the adjusted R² of frames' places in the pass by the directions from which they see the target."""
+    poses = torch.stack([f.world_to_camera for f in frames]).double().numpy()
+    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    directions = centres / np.linalg.norm(centres, axis=1, keepdims=True)
+    design, along = np.column_stack([directions, np.ones(len(frames))]), np.arange(len(frames))
+    fitted = design @ np.linalg.lstsq(design, along)[0]
+    unexplained = np.sum((along - fitted) ** 2) / np.sum((along - along.mean()) ** 2)
+    return 1 - unexplained * (len(frames) - 1) / max(1, len(frames) - design.shape[1])
 
 
 def _in_brackets(frames: list[TrainingFrame]) -> list[_Pair]:

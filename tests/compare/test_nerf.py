@@ -206,7 +206,7 @@ def test_a_gpu_learns_what_a_cpu_does(small):
         assert made.image is not None
         image = made.image
         reached.append(psnr(frames[34:], lambda f, image=image: image(cameras_of([f]), f.exposure_time_s)))
-        assert len(made.surface) == 500
+        assert 300 < len(made.surface) <= 500
     assert reached[1] == pytest.approx(reached[0], abs=2)
 
 

@@ -88,6 +88,25 @@ def test_exposure_times_that_are_wrong_by_setting_or_drift_are_found(size, wrong
     assert exposed == pytest.approx(tagged_s[7] * true[7], rel=0.01)
 
 
+@pytest.mark.parametrize("rising", [False, True])
+def test_a_drift_is_not_told_from_light_that_turns_with_views_which_rise_along_the_pass(rising):
+    model, count = target(), 60
+    tagged_s = np.resize(EXPOSURES_S, count)
+    true_s = tagged_s * np.exp(0.2 * np.linspace(-0.5, 0.5, count))
+    poses = [f.world_to_camera for f in photographed(model, count)]
+    heights = [float(p[:3, 3] @ p[:3, 2]) for p in poses]
+    order = np.argsort(heights) if rising else np.arange(count)
+    frames = photographed(model, count, exposures_s=true_s[np.argsort(order)].tolist())
+    frames = [
+        dataclasses.replace(frames[i], exposure_time_s=float(tagged))
+        for i, tagged in zip(order, tagged_s, strict=True)
+    ]
+    response = Response()
+    found = response.decide(model, Batches(in_brackets(frames, None), SENSOR.white_dn), SENSOR)
+    assert found != rising and response.is_as_stated == rising
+    assert rising or response.drift == pytest.approx(0.2, abs=0.01)
+
+
 def test_a_drift_as_small_as_a_model_errs_along_a_pass_is_not_taken():
     model, along = target(), np.linspace(-0.5, 0.5, 60)
     tagged_s = np.resize(EXPOSURES_S, 60)
