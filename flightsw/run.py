@@ -119,12 +119,7 @@ def run_pass(
         except Exception as error:
             if thread is not None:  # it may go on for hours until the outbox is empty: log the error now
                 thread.camera_failed = True
-                if isinstance(
-                    error, _NeverAnswered
-                ):  # why was logged at the start: this is for the ground alone
-                    events.add("error", problem=str(error))
-                else:
-                    log.error("no more exposures: %s", str(error) or repr(error))
+                _tell(error, events)
             raise
         finally:
             if thread is not None:

@@ -41,7 +41,7 @@ class Navigation:
     rate_steps: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
 
     def tree(self) -> dict:
-        """Return everything as numbers and lists."""
+        """Return everything as numbers and lists; without steps as before there were any, so that checkpoints go on."""
         motion = (self.inertial_to_rtn, self.rate_rad_s, self.inertia, self.rate_steps)
         return {
             "sigmas": self.sigmas.lists(),

@@ -75,31 +75,35 @@ def _in_pieces(
         free = _legs(times, attitudes, np.append(start, [0.0, 0.0]), EQUAL, within_rad)
         if free is None:
             return None
-        inertia = _inertia(np.median(free, axis=0)[None], EQUAL)[0]
-        legs = _legs(times, attitudes, free[0, :SPIN], inertia, within_rad)
+        found, _ = free
+        inertia = _inertia(np.median(found, axis=0)[None], EQUAL)[0]
+        legs = _legs(times, attitudes, found[0, :SPIN], inertia, within_rad)
         if legs is None:
             return None
+    found, starts = legs
     begins_s = times[: len(kept) - FIRST + 1 : FIRST - 1]
-    spans_s = np.diff(begins_s)[:, None]
-    before = [_rates(span_s, leg, inertia)[0] for span_s, leg in zip(spans_s, legs, strict=False)]
-    steps = legs[1:, 3:6] - np.array(before).reshape(-1, 3)
-    return _rates(-times[:1], legs[0], inertia)[0], inertia, np.column_stack([begins_s[1:], steps])
+    steps = np.column_stack([begins_s, (found - starts)[:, 3:6]])[1:]
+    return _rates(-times[:1], found[0], inertia)[0], inertia, steps
 
 
 def _legs(
     times_s: np.ndarray, to_body: np.ndarray, start: np.ndarray, moments: np.ndarray, within_rad: float
-) -> np.ndarray | None:
-    """Return the parameters [K, 6 or 8] of the rotations that fit six attitudes each; None where one does not fit."""
-    legs = []
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the parameters [K, 6 or 8] of the rotations that fit six attitudes each; None where one does not fit.
+
+    Beside them are those [K, 6 or 8] that the rotation before says, with which each search begins.
+    """
+    legs, starts = [], []
     for first in range(0, len(times_s) - FIRST + 1, FIRST - 1):
         here = slice(first, first + FIRST)
         found, left_rad = _fit(times_s[here], to_body[here], start, moments)
         if left_rad > within_rad:
             return None
         legs.append(found)
+        starts.append(start)
         leg_s = times_s[here][-1:] - times_s[first]
         start = np.concatenate([np.zeros(3), _rates(leg_s, found, moments)[0], found[SPIN:]])
-    return np.array(legs)
+    return np.array(legs), np.array(starts)
 
 
 def _rates(spans_s: np.ndarray, found: np.ndarray, moments: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ import torch
 from obbgs_core.batches import Batch, Batches
 from obbgs_core.compiled import each
 from obbgs_core.evidence.exposures import frame_errors, jackknifed
-from obbgs_core.frames import TrainingFrame, bracket_numbers
+from obbgs_core.frames import TrainingFrame, bracket_numbers, cameras_of
 from obbgs_core.misfit import sampled
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.render import render
@@ -128,7 +128,7 @@ class Response:
         else:
             is_bent = abs(bend) > max(LEAST, CERTAIN * error) and RANGE[0] <= 1 + bend <= RANGE[1]
             self.exponent, self.settings = 1 + bend if is_bent else 1.0, None
-        self.drift = 0.0 if _explained(batches.frames) > MOST_EXPLAINED else self._drift(told, len(frames))
+        self.drift = 0.0 if _explained(frames) > MOST_EXPLAINED else self._drift(told, len(frames))
         if (self.exponent, self.settings, self.drift) == before:
             return False
         log.info("%s", self)
@@ -227,9 +227,7 @@ class _Pair(NamedTuple):
 
 def _explained(frames: list[TrainingFrame]) -> float:
     """Return the adjusted R² of frames' places in the pass by the directions from which they see the target."""
-    poses = torch.stack([f.world_to_camera for f in frames]).double().numpy()
-    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
-    directions = centres / np.linalg.norm(centres, axis=1, keepdims=True)
+    directions = torch.nn.functional.normalize(cameras_of(frames).centres.double(), dim=1).numpy()
     design, along = np.column_stack([directions, np.ones(len(frames))]), np.arange(len(frames))
     fitted = design @ np.linalg.lstsq(design, along)[0]
     unexplained = np.sum((along - fitted) ** 2) / np.sum((along - along.mean()) ** 2)

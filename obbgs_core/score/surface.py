@@ -26,12 +26,11 @@ THIN_COPIES = 2
 NORMAL_NEIGHBOURS = 64  # fewer follow the noise of the depth maps, more round off the edges
 CANDIDATES = 900_000  # pixels of all views together that are compared with every view
 OVERSAMPLING = 4  # points before they are thinned out, at least, for each that is returned
-# of the views on whose images a point lies, that must see it in their planes: of what fewer see, most was .01 off
-# (experiment 106)
+# share of the views on whose images a point lies, in whose planes it must be: of the points of fewer views, most lay
+# more than .01 off (experiment 106)
 PLANAR_VIEWS = 0.1
-LIT_WITHIN_PX = (
-    4.0  # pixels' width before or behind what a lit view sees, within which a dark face is the same
-)
+# pixels' width before or behind what a lit view sees, within which a dark face is taken for the same surface
+LIT_WITHIN_PX = 4.0
 # of the mean light, which a view's planes have as weight where it shows none
 LEAST_LIGHT = 0.003
 FINEST_CELL = 1e-5  # of the surface's extent
