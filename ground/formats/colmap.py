@@ -19,6 +19,7 @@ from ground.formats.pictures.files import FormatError, within
 from ground.formats.pictures.lens import Intrinsics
 from ground.formats.pictures.placement import with_stated_errors
 from ground.formats.pictures.views import Exported, View
+from ground.session.earth import attitude_behind
 from obbgs_base.errors import in_words
 
 log = logging.getLogger(__name__)
@@ -97,10 +98,16 @@ def _completed(view: View, told: View | None) -> View:
     """Return a view with what our export says of its picture, but its own camera."""
     if told is None:
         return view
+    was, now, attitude = told.world_to_camera, view.world_to_camera, told.quat_inertial_to_body
     completed = dataclasses.replace(
-        told, world_to_camera=view.world_to_camera, intrinsics=view.intrinsics, split=view.split
+        told,
+        world_to_camera=now,
+        intrinsics=view.intrinsics,
+        split=view.split,
+        quat_inertial_to_body=None if attitude is None else attitude_behind(attitude, was, now),
+        sun_dir_body=now[:3, :3].T @ was[:3, :3] @ told.sun_dir_body,
     )
-    if np.allclose(view.world_to_camera, told.world_to_camera, rtol=0, atol=ROUNDED):
+    if np.allclose(now, was, rtol=0, atol=ROUNDED):
         return completed
     return with_stated_errors([dataclasses.replace(completed, covariance=None)])[0]
 

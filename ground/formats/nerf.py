@@ -1,7 +1,7 @@
 """NeRF-synthetic folders: transforms_{train,val,test}.json, camera-to-world in OpenGL axes, pictures of 8 bits.
 
-Keys that other readers ignore keep what the format has no place for: the calibration, and the exposure time, time,
-bracket, Sun direction and covariance of the pose of each frame.
+Keys that other readers ignore keep what the format has no place for: the calibration, and of each frame exposure time,
+time, bracket, Sun direction, covariance of the pose, and the target's place and attitude, by which the Earth is known.
 """
 
 import dataclasses
@@ -20,6 +20,7 @@ from ground.formats.axes import opengl_to_world_to_camera, world_to_camera_to_op
 from ground.formats.pictures.files import KINDS, FormatError, image_size, within
 from ground.formats.pictures.lens import Intrinsics
 from ground.formats.pictures.views import Exported, View
+from ground.session.earth import target_place_m
 from ground.session.folder import SPLITS, FrameRecord, Session
 from obbgs_base.errors import reason
 from obbgs_base.files import read_bounded, write_whole
@@ -32,6 +33,7 @@ OTHER_LENSES = (
     *("is_fisheye", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "ftheta_p0", "latlong"),
     *("equirectangular", "rolling_shutter"),
 )
+UNIT_WITHIN = 1e-3
 # Of eleven brackets six are for training, two for validation, three for testing; 121 brackets of three frames give
 # 198, 66 and 99 frames, the published split.
 SPLIT_PATTERN = (0, 1, 0, 2, 0, 2, 0, 1, 0, 2, 0)
@@ -137,6 +139,7 @@ def frame_keys(session: Session, record: FrameRecord) -> dict[str, Any]:
     """Return a frame's pose, its intrinsics where they are its own, and the keys that only we write."""
     start_ns = session.frames[0].mid_exposure_utc_ns
     own = {} if record.K is None else intrinsics_keys(record.K.tolist())
+    place_m, attitude = target_place_m(session, record), record.quat_inertial_to_body
     return {
         **own,
         "transform_matrix": world_to_camera_to_opengl(record.world_to_camera).tolist(),
@@ -149,6 +152,8 @@ def frame_keys(session: Session, record: FrameRecord) -> dict[str, Any]:
         "sun_dir_body": record.sun_dir_body.tolist(),
         "in_eclipse": record.in_eclipse,
         **({"pose_covariance": record.covariance.tolist()} if record.covariance.any() else {}),
+        **({} if attitude is None else {"quat_inertial_to_body": attitude.tolist()}),
+        **({} if place_m is None else {"target_position_m": place_m.tolist()}),
     }
 
 
@@ -209,10 +214,10 @@ def read_frame(frame: dict[str, Any], image: Path, intrinsics: Intrinsics, where
     try:
         time_ns, bracket = frame.get("mid_exposure_utc_ns"), frame.get("bracket")
         sun = np.array(frame.get("sun_dir_body", (0.0, 0.0, 0.0)), dtype=np.float64)
-        told = frame.get("pose_covariance")
-        covariance = None if told is None else np.array(told, dtype=np.float64)
-        if covariance is not None and (covariance.shape != (6, 6) or not np.isfinite(covariance).all()):
-            raise ValueError(f"pose_covariance: expected finite [6, 6], got {covariance.tolist()}")
+        covariance = _array(frame, "pose_covariance", (6, 6))
+        attitude = _array(frame, "quat_inertial_to_body", (4,))
+        if attitude is not None and abs(np.linalg.norm(attitude) - 1) > UNIT_WITHIN:
+            raise ValueError(f"quat_inertial_to_body: expected a unit quaternion, got {attitude.tolist()}")
         exposure_time_s = float(frame.get("exposure_time_s", 1.0))
         mask = frame.get("mask_path")
         if mask is not None and not isinstance(mask, str):
@@ -232,10 +237,23 @@ def read_frame(frame: dict[str, Any], image: Path, intrinsics: Intrinsics, where
             sun_dir_body=sun,
             in_eclipse=bool(frame.get("in_eclipse", False)),
             covariance=covariance,
+            quat_inertial_to_body=attitude,
+            target_position_m=_array(frame, "target_position_m", (3,)),
             readings=_readings_path(frame, where),
         )
     except (ValueError, TypeError, OverflowError) as error:
         raise FormatError(f"{where}: {image.name}: {error}") from error
+
+
+def _array(frame: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Return the numbers that a frame has under a key of ours; None where it has none."""
+    told = frame.get(key)
+    if told is None:
+        return None
+    array = np.array(told, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"{key}: expected {list(shape)} finite numbers, got {told!r}")
+    return array
 
 
 def _readings_path(frame: dict[str, Any], where: Path) -> Path | None:

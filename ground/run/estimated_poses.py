@@ -12,6 +12,7 @@ from torch import Tensor
 
 from flightsw.icd.quaternion import matrix_to_quat
 from ground.run.runs import Run
+from ground.session.earth import attitude_behind
 from ground.session.folder import FrameRecord, Session, SessionError
 from ground.session.training_frames import frames_of, tag_covariance, training_frame
 from ground.session.truth import Truth
@@ -188,8 +189,12 @@ def settled_records(
 
 def _placed(record: FrameRecord, world_to_camera: np.ndarray) -> FrameRecord:
     position_m = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
+    attitude = record.quat_inertial_to_body
+    if attitude is not None:
+        attitude = attitude_behind(attitude, record.world_to_camera, world_to_camera)
     return dataclasses.replace(
         record,
+        quat_inertial_to_body=attitude,
         world_to_camera=world_to_camera,
         quat_body_to_camera=matrix_to_quat(world_to_camera[:3, :3]),
         position_body_m=position_m,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flightsw.icd.quaternion import quat_to_matrix
+from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.icd.reference_frames import low_precision_sun
 from flightsw.icd.tle import position_gcrs_m
 from ground.session.folder import FrameRecord, Session
@@ -14,13 +14,37 @@ LOW_SHARE = 0.2  # of the Earth beside the target, at least, is darker than the 
 FAINT = 0.25  # of the noise of one reading: light that nobody need take for anything
 
 
+def target_place_m(session: Session, record: FrameRecord) -> np.ndarray | None:
+    """Return where the target is at a frame's mid-exposure: [3] m from the Earth's centre, GCRS; None: not known.
+
+    It is the frame's `target_position_m` or, if that is None, follows from the target's two-line elements by SGP4.
+
+    Raises:
+        ConfigError: SGP4 cannot propagate the elements.
+    """
+    if record.target_position_m is None and session.tles.get("target"):
+        return position_gcrs_m(session.tles["target"], record.mid_exposure_utc_ns)
+    return record.target_position_m
+
+
+def attitude_behind(quat_inertial_to_body: np.ndarray, was: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """Return the attitude [4] of the target that a frame's new pose assumes, where its camera's stays what it was.
+
+    Earth, Sun and stars are then where the old pose has them, in which pose and assumed attitude err alike.
+
+    Args:
+        quat_inertial_to_body: [4] the attitude that the old pose assumes.
+        was, now: [4, 4] world_to_camera.
+    """
+    return matrix_to_quat(now[:3, :3].T @ was[:3, :3] @ quat_to_matrix(quat_inertial_to_body))
+
+
 def earth_m(session: Session, record: FrameRecord, dn: np.ndarray) -> np.ndarray | None:
     """Return where the Earth's centre is in a frame that shows it: [3] m from the camera, in the camera's axes.
 
-    The target's place is that of `record.target_position_m` or, if that is None, of the target's two-line elements at
-    mid-exposure by SGP4. None comes back where neither is known, or the attitude that the pose assumes; where the Earth
-    and its air are beside the picture, or at night all over it; and where the readings stay at the black level though
-    the Earth should shine: a simulator left it out, or flight sent it as black.
+    None comes back where the target's place is not known, or the attitude that the pose assumes; where the Earth and
+    its air are beside the picture, or at night all over it; and where the readings stay at the black level though the
+    Earth should shine: a simulator left it out, or flight sent it as black.
 
     Args:
         dn: [H, W] or [H, W, C] the frame's readings.
@@ -28,9 +52,7 @@ def earth_m(session: Session, record: FrameRecord, dn: np.ndarray) -> np.ndarray
     Raises:
         ConfigError: SGP4 cannot propagate the elements.
     """
-    place_m = record.target_position_m
-    if place_m is None and session.tles.get("target"):
-        place_m = position_gcrs_m(session.tles["target"], record.mid_exposure_utc_ns)
+    place_m = target_place_m(session, record)
     if place_m is None or record.quat_inertial_to_body is None:
         return None
     to_body = quat_to_matrix(record.quat_inertial_to_body)

@@ -16,10 +16,11 @@ NEAR = 16  # frames before and after, by number, among which the next ones in ti
 def rates(session: Session, record: FrameRecord) -> torch.Tensor | None:
     """Return the target's rates [6] at a frame, as `TrainingFrame.rates`: rad/s and m/s in the camera's axes.
 
-    None comes back for imported pictures, whose cameras may have stood still for each of them, and where no tag is near
-    enough.
+    None comes back for imported pictures that state no attitude of the target, whose cameras may have stood still for
+    each of them, and where no tag is near enough.
     """
-    if session.frames_imported is not None or not record.pose_valid:
+    imported = session.frames_imported is not None and record.quat_inertial_to_body is None
+    if imported or not record.pose_valid:
         return None
     before, after = (_neighbour(session, record, sign) or record for sign in (-1, 1))
     interval_s = (after.mid_exposure_utc_ns - before.mid_exposure_utc_ns) / 1e9

@@ -1,25 +1,32 @@
 """A real pass with the Earth behind the target: where it is, by skyfield, and that a training knows it."""
 
 import dataclasses
+import json
 from datetime import UTC, datetime
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pycolmap
 import pytest
 import skyfield.api
 import torch
+from scipy.spatial.transform import Rotation
 from skyfield.api import EarthSatellite
+from typer.testing import CliRunner
 
 from flightsw.icd.frame import Frame, encode_frame
 from flightsw.icd.mission import Mission
-from flightsw.icd.quaternion import quat_to_matrix
+from flightsw.icd.quaternion import matrix_to_quat, quat_to_matrix
 from flightsw.icd.tle import position_gcrs_m
 from flightsw.navigation.pose import pose_tag
+from ground import cli
 from ground.run.evaluate import evaluate
 from ground.run.reconstruct import reconstruct
 from ground.run.runs import Run
 from ground.session.cameras import sensor_of
-from ground.session.folder import open_session
+from ground.session.folder import Session, open_session
+from ground.session.motion import rates
 from ground.session.training_frames import frames_of, training_frame
 from ground.session.writer import SessionWriter
 from ground.show.report.poses import _of_earth, pose_history
@@ -36,6 +43,7 @@ from tests import scenes
 
 SHOWS_IT_S, BESIDE_IT_S = 200, 800  # after the mission's start the Earth is behind the target, and is not
 EXPOSURES_S = (2e-5, 5e-5)
+OFF_PX = 6.0
 TIMES = skyfield.api.load.timescale(builtin=True)
 
 
@@ -193,3 +201,86 @@ def test_a_pass_with_the_earth_makes_a_model_like_that_of_a_black_sky(mission, t
         reconstruct(session.path, "run", "obbgs", scenes.QUICK | {"steps": 60})
         psnr_db[name] = evaluate(session.path, "run")["psnr_noisy_db"]
     assert psnr_db["earth"] > psnr_db["black"] - 3, psnr_db
+
+
+@pytest.mark.parametrize("format_", ["nerf", "nerfstudio", "colmap"])
+def test_the_earth_stays_behind_frames_that_are_exported_and_imported(mission, tmp_path, format_):
+    session = flown(mission, tmp_path / "session", [SHOWS_IT_S, SHOWS_IT_S + 27])
+    again = passed_on(session.path, tmp_path, format_)
+    for was, now in zip(frames_of(session), frames_of(again), strict=True):
+        assert was.earth_m is not None and now.earth_m is not None
+        np.testing.assert_allclose(now.earth_m.numpy(), was.earth_m.numpy(), atol=30.0)  # of 6,900 km
+    for was, now in zip(session.frames, again.frames, strict=True):
+        blur = rates(session, was)
+        assert blur is not None and blur.abs().max() > 1e-4
+        np.testing.assert_allclose(rates(again, now), blur, atol=1e-6)
+
+
+def test_the_earth_is_where_it_was_for_a_colmap_model_that_other_software_turned(mission, tmp_path):
+    session = flown(mission, tmp_path / "session", [SHOWS_IT_S, SHOWS_IT_S + 27])
+    called("export", session.path, "--format", "colmap", "--out", tmp_path / "out")
+    model = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse" / "0"))
+    turn = Rotation.from_rotvec([0.3, -1.0, 0.5])
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(turn.as_quat()), np.array([0.1, 0.2, 0.3])))
+    model.write(str(tmp_path / "out" / "sparse" / "0"))
+    called("import", "--format", "colmap", "--from", tmp_path / "out", "--session", tmp_path / "again")
+    for was, now in zip(session.frames, open_session(tmp_path / "again").frames, strict=True):
+        assert not np.allclose(now.world_to_camera, was.world_to_camera, atol=0.1)
+        in_camera = now.world_to_camera[:3, :3] @ now.sun_dir_body
+        np.testing.assert_allclose(in_camera, was.world_to_camera[:3, :3] @ was.sun_dir_body, atol=1e-6)
+        places = [
+            training_frame(open_session(path), r).earth_m
+            for path, r in ((session.path, was), (tmp_path / "again", now))
+        ]
+        np.testing.assert_allclose(places[1], places[0], atol=30.0)
+
+
+def test_a_refined_pass_with_the_earth_is_trained_the_same_after_export_and_import(mission, tmp_path):
+    """Tags are 6 pixels off; the exported poses are those that the training found, with the Earth where it was."""
+    times_s = [44.0 * (n // 2) + n % 2 for n in range(48)]
+    session = flown(mission, tmp_path / "session", times_s, True, opaque_target())
+    turned_aside(session.path, OFF_PX / mission.camera.fx_px)
+    with pytest.MonkeyPatch.context() as patch:
+        scenes.move_poses_in(patch, 2)
+        reconstruct(session.path, "run", "obbgs", scenes.QUICK | {"steps": 60})
+        first = evaluate(session.path, "run")
+        assert first["poses"].startswith("refined")
+        again = passed_on(session.path / "runs" / "run", tmp_path, "colmap")
+        reconstruct(again.path, "run", "obbgs", scenes.QUICK | {"steps": 60})
+    assert sum(frame.earth_m is not None for frame in frames_of(again)) > 8
+    second = evaluate(again.path, "run")
+    assert second["psnr_noisy_db"] > first["psnr_noisy_db"] - 0.3
+
+
+def turned_aside(folder: Path, turn_rad: float) -> None:
+    """Turn the camera of all tags of a session by an angle, and let it state errors of that size."""
+    turn, lines = np.eye(4), [json.loads(line) for line in (folder / "frames.jsonl").read_text().splitlines()]
+    turn[:3, :3] = Rotation.from_rotvec([turn_rad, -turn_rad, 0]).as_matrix()
+    for line in lines:
+        pose = turn @ np.array(line["world_to_camera"])
+        line["world_to_camera"] = pose.tolist()
+        line["quat_body_to_camera"] = matrix_to_quat(pose[:3, :3]).tolist()
+        del line["crc32"]
+    header = json.loads((folder / "session.json").read_text())
+    del header["crc32"]
+    header["navigation"]["sigmas"]["boresight_rad"] = [turn_rad] * 3
+    for name, text in (
+        ("frames.jsonl", "".join(json.dumps(line) + "\n" for line in lines)),
+        ("session.json", json.dumps(header)),
+    ):
+        (folder / f"{name}.copy").unlink()
+        (folder / name).write_text(text)
+
+
+def passed_on(source: Path, folder: Path, format_: str) -> Session:
+    """Return the session that comes of a session's or run's export and its import."""
+    out, again = folder / "out", folder / "again"
+    called("export", source, "--format", format_, "--out", out)
+    called("import", "--format", format_, "--from", out, "--session", again, "--poses", "stated")
+    return open_session(again)
+
+
+def called(*arguments) -> None:
+    """Call a command of `ground`."""
+    done = CliRunner().invoke(cli.app, list(map(str, arguments)), catch_exceptions=False)
+    assert done.exit_code == 0, done.output
