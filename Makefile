@@ -1,5 +1,6 @@
 # `make demo` runs the whole loop and ends in a report; `make test` checks everything. Both set up from nothing, as all below do.
 # `make test-portable` repeats the numerical tests as processors with fewer instructions would run them: tests/other_processors.py.
+# `make test-wheel` builds the compiled wheel and runs every command from it.
 # `make test-arm` runs the kernels as they are compiled for ARM, emulated: tests/arm.py.
 # `make sanitize` runs the kernels under the address, undefined-behaviour and thread sanitizers: tests/sanitize.py.
 # `make coverage` says which lines the tests reach, `make coverage-flight` fails where the tests of flight reach too few of its branches;
@@ -7,7 +8,7 @@
 OUT ?= demo
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo test test-portable test-arm sanitize coverage coverage-flight docs setup clean
+.PHONY: demo test test-portable test-wheel test-arm sanitize coverage coverage-flight docs setup clean
 
 demo: setup
 	.venv/bin/hil demo --out "$(OUT)" $(ARGS)
@@ -27,6 +28,11 @@ test-arm: setup
 
 sanitize: setup
 	.venv/bin/python -m tests.sanitize $(ARGS)
+
+test-wheel: setup
+	rm -rf build/wheel
+	.venv/bin/pip wheel -q --disable-pip-version-check --no-deps -w build/wheel $(PIP_ARGS) .
+	OBBGS_WHEEL=$$(ls build/wheel/*.whl) .venv/bin/pytest -q tests/test_packaging.py -k wheel $(ARGS)
 
 coverage: setup
 	.venv/bin/pytest -n 3 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:build/coverage $(ARGS)

@@ -14,7 +14,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from obbgs_base.extras import EXTRAS
-from tests.wheels import environment, flight_wheel, whole_wheel
+from obbgs_core import _rasterizer
+from tests.wheels import COMPILED, environment, flight_wheel, whole_wheel
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -212,3 +213,12 @@ def test_every_command_of_the_whole_wheel_runs_from_it(whole, tmp_path):
     assert "two" in run_installed(whole, "ground", "list", str(tmp_path))
     hint = run_installed(whole, "ground", "compare", str(session), "--out", str(tmp_path / "c"), code=2)
     assert "pip install 'obbgs[compare]'" in hint
+
+
+@pytest.mark.skipif(not COMPILED, reason="make test-wheel builds the compiled wheel, which takes a minute")
+def test_the_compiled_wheel_brings_the_rasterizer_of_every_instruction_set(whole):
+    assert "obbgs_core/_rasterizer" in run_installed(
+        whole, "python", str(ROOT / "packaging" / "load_rasterizer.py")
+    )
+    asked = "from obbgs_core import _rasterizer; print(*_rasterizer.kernels())"
+    assert run_installed(whole, "python", "-c", asked).split() == _rasterizer.kernels()
