@@ -7,12 +7,11 @@ from typing import Any
 import plotly.graph_objects as go
 from plotly.colors import qualitative
 
-from compare.charts.results import VERDICTS, Metric, Results, pareto
+from compare.charts.results import Metric, Results, pareto
 from compare.charts.severity import Series
 from ground.show.plots import ticks_1_2_5
 
 COLOURS = (*qualitative.D3, *qualitative.Set2)
-VERDICT_COLOURS = ("#2a9d8f", "#e9c46a", "#f4a261", "#d9dee3", "#c0392b", "#8795a5")  # of VERDICTS
 REFERENCE_COLOUR, FRONT_COLOUR = "#5b6b7b", "#1c2733"
 LABELS_APART = 0.06  # of the values drawn: names of lines that are nearer would cover one another
 EXACT_DB = 119.0  # the score of a picture that is compared with itself, which would squeeze all others
@@ -142,40 +141,6 @@ def size_figures(results: Results) -> list[go.Figure]:
             figure.update_yaxes(title_text=results.score.title)
             figures.append(_sized(figure, 360))
     return figures
-
-
-def failure_figure(results: Results) -> go.Figure:
-    """Return the map of conditions and methods, coloured by verdict, with the mean score in each cell."""
-    labels, conditions = results.trained, results.conditions[::-1]
-    found = [[results.verdict(label, condition) for label in labels] for condition in conditions]
-    scores = [
-        [results.over_targets(label, condition, results.score.key)[0] for label in labels]
-        for condition in conditions
-    ]
-    levels = len(VERDICTS)
-    scale = [[(i + side) / levels, colour] for i, colour in enumerate(VERDICT_COLOURS) for side in (0, 1)]
-    figure = go.Figure(
-        go.Heatmap(
-            z=[[VERDICTS.index(verdict) if verdict else None for verdict, _ in row] for row in found],
-            x=labels,
-            y=conditions,
-            text=[
-                ["" if not v else v if s is None else f"{s:.1f}" for (v, _), s in zip(row, of, strict=True)]
-                for row, of in zip(found, scores, strict=True)
-            ],
-            customdata=[[f"{verdict}<br>{words}" for verdict, words in row] for row in found],
-            texttemplate="%{text}",
-            hovertemplate="%{x}, %{y}<br>%{customdata}<extra></extra>",
-            zmin=-0.5,
-            zmax=levels - 0.5,
-            colorscale=scale,
-            xgap=2,
-            ygap=2,
-            showscale=False,
-        )
-    )
-    figure.update_xaxes(side="top")
-    return _sized(figure, 110 + 30 * len(conditions))
 
 
 def severity_figure(results: Results, series: Series, metric: Metric) -> go.Figure | None:

@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
-from compare.charts.charts import COLOURS, VERDICT_COLOURS
+from compare.charts.charts import COLOURS
 from compare.charts.page import error_of, shown_view
 from compare.charts.results import VERDICTS, Results, pareto
+from compare.charts.tables import VERDICT_COLOURS
 from compare.grid.rows import Rows
 from ground.show.pictures import heat, tone
 from ground.show.plots import ticks_1_2_5
@@ -140,7 +141,8 @@ def _size(results: Results) -> Figure:
 
 
 def _failures(results: Results) -> Figure:
-    labels, conditions = results.trained, results.conditions
+    labels = results.trained
+    conditions = [c for c in results.conditions if any(results.was_run(label, c) for label in labels)]
     figure = Figure(figsize=(2.5 + 1.1 * len(labels), 1.6 + 0.35 * len(conditions)), layout="constrained")
     axis = figure.subplots()
     verdicts = [[results.verdict(label, condition)[0] for label in labels] for condition in conditions]
@@ -149,7 +151,8 @@ def _failures(results: Results) -> Figure:
     texts = []
     for row, condition in zip(verdicts, conditions, strict=True):
         means = [results.over_targets(label, condition, results.score.key)[0] for label in labels]
-        texts.append([v if mean is None else f"{mean:.1f}" for v, mean in zip(row, means, strict=True)])
+        words = [v or results.unjudged(label, condition) for v, label in zip(row, labels, strict=True)]
+        texts.append([w if mean is None else f"{mean:.1f}" for w, mean in zip(words, means, strict=True)])
     _tiles(axis, texts, labels, conditions)
     handles = [Patch(color=c, label=v) for v, c in zip(VERDICTS, VERDICT_COLOURS, strict=True)]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(VERDICTS), fontsize=8)

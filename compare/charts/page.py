@@ -2,16 +2,14 @@
 
 import html
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
 from compare.charts.charts import (
-    VERDICT_COLOURS,
     colour_of,
-    failure_figure,
     gain_figure,
     severity_figure,
     size_figures,
@@ -21,25 +19,25 @@ from compare.charts.results import (
     HOLDS_DB,
     MARGIN_DB,
     METRICS,
+    NOT_RUN,
     SHAKEN_DB,
     UNJUDGED,
     VERDICTS,
-    Metric,
     Results,
     budget_of,
 )
 from compare.charts.severity import LEAST_F_PERCENT, Breaking, F, Series, breaking_points
+from compare.charts.tables import VERDICT_COLOURS, failure_table, score_table
 from compare.grid.rows import Rows
 from compare.grid.worker import VIEWS
 from compare.methods import reference_names
 from compare.views import SHOWN, WORST, KeptView, read_views
-from ground.show.page import beside, fold, label, legend, page, picture, plot, section
+from ground.show.page import beside, breakable, fold, label, legend, page, picture, plot, section
 from ground.show.pictures import ERROR_FULL_SCALE, heat, tone
 from obbgs_base.files import write_whole
 
 PAGE = "compare.html"
 WORST_SHOWN = 6
-CELL_PX = 90  # of a method in a map of conditions, at least
 COLUMNS = (
     "Clean figures compare with noiseless exposures of held-out views, full scale as 1; foreground counts only "
     "the pixels that the target covers; pooled is of the mean squared error over all views together, which "
@@ -100,16 +98,22 @@ def write_page(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyTyp
 
 
 def _shortened(results: Results) -> str:
-    """Return in a sentence the budgets of trainings that did not have all steps and as many Gaussians as they want."""
-    budgets = {budget_of(row): None for row in results.rows if row["steps_share"] != 1 or "largest" in row}
-    return f" Trainings had {'; '.join(budgets)}." if budgets else ""
+    """Return in a sentence which trainings had other steps than their method asks for, or fewer Gaussians."""
+    methods: dict[str, dict[str, None]] = {}
+    for row in results.rows:
+        if row["steps_share"] != 1 or "largest" in row:
+            methods.setdefault(budget_of(row), {})[row["method"]] = None
+    limits = [f"{budget} ({', '.join(names)})" for budget, names in methods.items()]
+    return f" Trainings with limits: {'; '.join(limits)}." if limits else ""
 
 
 def _tables(results: Results) -> str:
     """Return the table of means over the targets, and one of each target."""
-    body = _table(results, None) if len(results.targets) > 1 else ""
+    body = ""
+    if len(results.targets) > 1:
+        body = f"<h3>Mean of the targets</h3>{score_table(results, None)}"
     for target in results.targets:
-        body += f"<h3>{html.escape(target)}</h3>{_table(results, target)}"
+        body += f"<h3>{html.escape(target)}</h3>{score_table(results, target)}"
     columns = f'<p class="note">{COLUMNS}</p>'
     folded = fold("What the columns mean", columns) if results.truth else ""
     return section(f"Scores, {html.escape(results.base)}", _explained(results), folded + body)
@@ -143,55 +147,6 @@ def _explained(results: Results) -> str:
     if any(len(results.of(label, t, results.base)) > 1 for label in results.labels for t in results.targets):
         notes.append("± is the deviation over seeds.")
     return " ".join(notes)
-
-
-def _table(results: Results, target: str | None) -> str:
-    """Return the table of one target, or of the means over all."""
-    shown = results.known(target)
-
-    def value(label: str, metric: Metric) -> tuple[float | None, str]:
-        if target is None:
-            mean, count = results.over_targets(label, results.base, metric.key)
-            more = (
-                ""
-                if count in (0, len(results.targets))
-                else f" <small>({count} of {len(results.targets)})</small>"
-            )
-        else:
-            mean = results.mean(label, target, results.base, metric.key)
-            spread = results.spread(label, target, results.base, metric.key)
-            more = "" if spread is None else f" ± {metric.form.format(_scaled(metric, spread))}"
-        return mean, "" if mean is None else metric.form.format(_scaled(metric, mean)) + more
-
-    lines = []
-    best = {m.key: _best(results, m, lambda label, m=m: value(label, m)[0]) for m in shown}
-    for name in results.labels:
-        cells = [f"<td>{html.escape(name)}</td>"]
-        reason = None if target is None else results.error(name, target, results.base)
-        for metric in shown:
-            mean, text = value(name, metric)
-            text = f"<b>{text}</b>" if mean is not None and mean == best[metric.key] else text
-            cells.append(f'<td class="n">{text}</td>')
-        if reason is not None:
-            words = f"No result: {html.escape(reason.rstrip('.'))}."
-            cells = [cells[0], f'<td class="words" colspan="{max(1, len(shown))}"><div>{words}</div></td>']
-        lines.append(f"<tr>{''.join(cells)}</tr>")
-    head = "".join(f'<th class="n">{html.escape(m.title)}</th>' for m in shown)
-    title = "<h3>Mean of the targets</h3>" if target is None else ""
-    rows = f"<tr><th>method</th>{head}</tr>{''.join(lines)}"
-    return f'{title}<div class="scroll"><table class="scores">{rows}</table></div>'
-
-
-def _scaled(metric: Metric, value: float) -> float:
-    return value / 1e3 if metric.key == "bytes" else value
-
-
-def _best(results: Results, metric: Metric, value: Callable[[str], float | None]) -> float | None:
-    """Return the best value of a column among the methods that reconstruct something."""
-    known = [found for name in results.trained if (found := value(name)) is not None]
-    if not known or metric.more_is_better is None:
-        return None
-    return max(known) if metric.more_is_better else min(known)
 
 
 def _methods_legend(results: Results) -> str:
@@ -236,14 +191,12 @@ def _failures(results: Results, out: Path) -> str:
     shown = sorted(worst.values(), key=lambda entry: entry[1].psnr_db)[:WORST_SHOWN]
     cells = [f'<div class="label head">{words}</div>' for words in ("", "expected", "render", "error")]
     for words, view in shown:
-        cells += [label(f"{html.escape(words)}, frame {view.frame}"), *_compared(view)]
+        cells += [label(f"{breakable(words)}, frame {view.frame}"), *_compared(view)]
     title = "<h3>Worst views, one of each method and target</h3>"
     pictures = f'{title}<div class="grid compared">{"".join(cells)}</div>' if shown else ""
-    drawn = ""
-    if results.trained:
-        width_px = CELL_PX * (1 + len(results.trained))
-        drawn = legend(zip(VERDICTS, VERDICT_COLOURS, strict=True))
-        drawn += f'<div class="scroll"><div style="min-width: {width_px}px">{plot(failure_figure(results))}</div></div>'
+    drawn = failure_table(results) if results.trained else ""
+    if drawn:
+        drawn = legend(zip(VERDICTS, VERDICT_COLOURS, strict=True)) + drawn
     return section("Where methods fail", note, drawn + pictures) if drawn or pictures else ""
 
 
@@ -260,7 +213,7 @@ def _breaking(results: Results) -> str:
         "The curves are means over targets, their bands from the lowest to the highest seed."
     )
     labels = [label for label in results.trained if any(label in points for _, points in found)]
-    head = "".join(f"<th>{html.escape(label)}</th>" for label in labels)
+    head = "".join(f"<th>{breakable(label)}</th>" for label in labels)
     lines, curves = [], ""
     metrics = [results.score, next(metric for metric in METRICS if metric.key == F)]
     for series, points in found:
@@ -275,7 +228,7 @@ def _breaking(results: Results) -> str:
 def _breaking_cell(series: Series, point: Breaking | None) -> str:
     """Return a cell of the table of breaking points."""
     if point is None:
-        return "<td></td>"
+        return f'<td class="unrun">{NOT_RUN}</td>'
     words = [f"<b>{html.escape(series.label(value))}</b>" for value in point.broken_at]
     words += [f"holds at {html.escape(series.label(value))}" for value in point.held]
     words += [] if point.is_judged else [UNJUDGED]
@@ -326,7 +279,7 @@ def _side_by_side(results: Results, out: Path) -> str:
         truth = tone(kept[0][1].expected, kept[0][1].sensor)
         cells = [picture(truth, "expected", "expected")]
         for name, view in kept:
-            _, render, error = _compared(view, f"{html.escape(name)}, ")
+            _, render, error = _compared(view, f"{breakable(name)}, ")
             cells.append(f"<div>{render}{error}</div>")
         body.append(f'<div class="grid views">{"".join(cells)}</div>')
     return section("Side by side", note, "".join(body)) if body else ""

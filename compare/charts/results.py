@@ -183,6 +183,22 @@ class Results:
         """Return the rows of a cell whose condition could be made of its session, so that the method was tried."""
         return [row for row in self.of(label, target, condition) if not cannot_be_made(row)]
 
+    def was_run(self, label: str, condition: str) -> bool:
+        """Tell whether a method was run under a condition on any target."""
+        return any(self.of(label, target, condition) for target in self.targets)
+
+    def run_on(self, target: str) -> list[str]:
+        """Return the methods that were run on a target as it was taken."""
+        return [label for label in self.labels if self.of(label, target, self.base)]
+
+    def runs(self, label: str) -> int:
+        """Return the number of targets on which a method was run as they were taken."""
+        return sum(bool(self.of(label, target, self.base)) for target in self.targets)
+
+    def unjudged(self, label: str, condition: str) -> str:
+        """Return in words why a method has no verdict under a condition: it was not run, or made no pictures."""
+        return "no score" if self.was_run(label, condition) else NOT_RUN
+
     def mean(self, label: str, target: str, condition: str, key: str) -> float | None:
         """Return the mean over seeds; None where nothing was measured."""
         values = [row[key] for row in self.of(label, target, condition) if row.get(key) is not None]
@@ -285,7 +301,7 @@ class Results:
         return next(iter([*published, *self.trained]), None)
 
 
-UNJUDGED = "not judged"
+UNJUDGED, NOT_RUN = "not judged", "not run"
 VERDICTS = ("holds", "shaken", "suffers", UNJUDGED, "fails", "refused")  # the worse, the later
 
 
@@ -300,5 +316,8 @@ def pareto(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
 
 def budget_of(row: dict[str, Any]) -> str:
     """Return in words what a training of a row might use."""
-    share = f"{row['steps_share']:g} of the steps"
-    return share if "largest" not in row else f"{share}, {row['largest']} Gaussians"
+    most = f"at most {row['largest']:,} Gaussians" if "largest" in row else ""
+    if row["steps_share"] == 1:
+        return most or "all steps"
+    share = f"{100 * row['steps_share']:g} % of the steps"
+    return f"{share} and {most}" if most else share

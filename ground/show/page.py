@@ -39,8 +39,12 @@ td.long { white-space: normal; }
 details { margin: 10px 0; } summary { cursor: pointer; color: var(--soft); font-size: 13.5px; }
 h3 { font-size: 15px; margin: 18px 0 8px; }
 .scroll { overflow-x: auto; }
-.scores td, .scores th { white-space: nowrap; overflow-wrap: normal; }
-.scores th.n { white-space: normal; min-width: 64px; vertical-align: bottom; }
+.scores td, .scores th { white-space: nowrap; overflow-wrap: normal; padding: 5px 8px; }
+.scores th { white-space: normal; vertical-align: bottom; } .scores th.n { min-width: 64px; }
+.scores small { color: var(--soft); font-weight: normal; } .scores td.unrun { color: var(--soft); }
+.scores td:first-child { white-space: normal; min-width: 130px; }
+.map td:not(:first-child), .map th.n { text-align: center; } .map td small { color: inherit; }
+.map td:not(:first-child) { border: 2px solid var(--card); }
 .scores td.words { white-space: normal; min-width: 240px; }
 .scores td:first-child, .scores th:first-child { position: sticky; left: 0; background: var(--card); }
 .beside { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, var(--least)), 1fr)); gap: 0 16px; }
@@ -69,7 +73,7 @@ pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px;
   .grid .label, .grid figcaption { font-size: 10px; }
   dl { grid-template-columns: minmax(0, 1fr); } dd { margin: 0 0 6px; }
   .compared { grid-template-columns: repeat(3, minmax(0, 1fr)); }
-  .scores td:first-child { white-space: normal; overflow-wrap: anywhere; min-width: 32vw; }
+  .scores td:first-child { overflow-wrap: normal; min-width: 32vw; } .scores td, .scores th { padding: 5px 4px; }
   .scores td.n { white-space: nowrap; } .scores td.words { min-width: 0; } .scores td.words div { width: 52vw; }
   .compared .label { grid-column: 1 / -1; font-size: 12px; margin-top: 8px; } .compared .head { display: none; }
 }
@@ -141,7 +145,7 @@ def fold(title: str, body: str) -> str:
 
 def legend(entries: Iterable[tuple[str, str]]) -> str:
     """Return names, each with its colour before it, in as many lines as they need."""
-    spans = "".join(f'<span style="--of: {colour}">{html.escape(name)}</span>' for name, colour in entries)
+    spans = "".join(f'<span style="--of: {colour}">{breakable(name)}</span>' for name, colour in entries)
     return f'<div class="legend">{spans}</div>'
 
 
@@ -155,6 +159,11 @@ def picture(image: np.ndarray, alt: str, caption: str) -> str:
     png = imagecodecs.png_encode(np.ascontiguousarray(image), level=9)
     source = "data:image/png;base64," + base64.b64encode(bytes(png)).decode()
     return f'<figure><img alt="{alt}" src="{source}"><figcaption>{caption}</figcaption></figure>'
+
+
+def breakable(name: str) -> str:
+    """Return a name as HTML that needs no mid-word break: a new line may begin after each plus sign."""
+    return html.escape(name).replace("+", "+<wbr>")
 
 
 def unbroken(text: str) -> str:

@@ -104,7 +104,8 @@ def running_mean(values: Sequence[float], window: int = SMOOTHED) -> list[float]
 def ticks_1_2_5(values: Iterable[float]) -> list[float]:
     """Return ticks at 1, 2 and 5 times powers of ten that cover the positive values; Plotly's own omit the power.
 
-    Where fewer than two of them lie between the values, ticks are evenly apart, by 1, 2 or 5 times a power of ten.
+    Where fewer than two of them lie between values that differ, ticks are evenly apart, by 1, 2 or 5 times a power of
+    ten.
     """
     positive = [value for value in values if value > 0]
     if not positive:
@@ -112,7 +113,7 @@ def ticks_1_2_5(values: Iterable[float]) -> list[float]:
     low, high = min(positive), max(positive)
     first, last = math.floor(math.log10(low)), math.floor(math.log10(high))
     ticks = [m * 10.0**power for power in range(first, last + 2) for m in (1, 2, 5)]
-    if low == high or sum(low <= tick <= high for tick in ticks) > 1:
+    if high <= 1.0001 * low or sum(low <= tick <= high for tick in ticks) > 1:
         return ticks
     power = 10.0 ** math.floor(math.log10(high - low))
     step = next(m * power for m in (0.2, 0.5, 1, 2, 5) if (high - low) / (m * power) <= EVEN_TICKS)

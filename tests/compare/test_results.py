@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from compare.case import load_case
 from compare.charts.charts import size_figures, speed_figures
 from compare.charts.figures import _size, write_figures
 from compare.charts.page import write_page
-from compare.charts.results import UNJUDGED, Results, pareto, with_best
+from compare.charts.results import METRICS, UNJUDGED, Results, pareto, with_best
 from compare.charts.severity import breaking, series_of
 from compare.command import _line
 from compare.grid.rows import Rows
@@ -207,7 +207,14 @@ def test_trainings_of_several_budgets_are_told_apart():
         row("3dgs", psnr_clean_db=30.0),
         row("3dgs", psnr_clean_db=20.0) | {"steps_share": 0.1, "digest": "x"},
     ]
-    assert Results(rows).labels == ["3dgs (1 of the steps)", "3dgs (0.1 of the steps)"]
+    rows.append(row("3dgs", psnr_clean_db=20.0, largest=4000) | {"digest": "y"})
+    rows.append(row("3dgs", psnr_clean_db=20.0, largest=4000) | {"steps_share": 0.5, "digest": "z"})
+    assert Results(rows).labels == [
+        "3dgs (all steps)",
+        "3dgs (10 % of the steps)",
+        "3dgs (at most 4,000 Gaussians)",
+        "3dgs (50 % of the steps and at most 4,000 Gaussians)",
+    ]
 
 
 @given(st.lists(st.tuples(st.floats(0, 100), st.floats(-100, 100)), max_size=30))
@@ -336,12 +343,13 @@ def test_a_target_without_truth_beside_one_with_it_is_scored_by_its_noisy_frames
 
 
 # a program that returns the letters at which words of an element are broken between two lines
-BROKEN_WORDS = """cell => [...cell.textContent.matchAll(/\\w+/g)].filter(word => {
-  const range = document.createRange();
-  range.setStart(cell.firstChild, word.index);
-  range.setEnd(cell.firstChild, word.index + word[0].length);
-  return new Set([...range.getClientRects()].map(box => Math.round(box.top))).size > 1;
-}).map(word => word[0])"""
+BROKEN_WORDS = """cell => [...cell.childNodes].filter(node => node.nodeType === Node.TEXT_NODE).flatMap(
+  text => [...text.data.matchAll(/\\w+/g)].filter(word => {
+    const range = document.createRange();
+    range.setStart(text, word.index);
+    range.setEnd(text, word.index + word[0].length);
+    return new Set([...range.getClientRects()].map(box => Math.round(box.top))).size > 1;
+  }).map(word => word[0]))"""
 
 
 def test_long_names_of_methods_break_on_a_phone(comparison, tmp_path):
@@ -357,6 +365,65 @@ def test_long_names_of_methods_break_on_a_phone(comparison, tmp_path):
             "Math.max(...[...document.querySelectorAll('.scores td:first-child')].map(e => e.clientWidth))"
         )
         assert page.evaluate(widest) < 195
+        named = "td:first-child, th, figcaption, .label, .legend span"
+        assert page.evaluate(f"[...document.querySelectorAll('{named}')].flatMap({BROKEN_WORDS})") == []
+
+
+LONG_NAMES = ("3dgs+exposure+hull+mask+l1+fast", "3dgs+affine+hull+mask+l1+fast")
+
+
+@pytest.fixture(scope="module")
+def partly_run(tmp_path_factory) -> Path:
+    """A comparison of every figure, in which a method ran on one of two targets, and one made no pictures."""
+    out = tmp_path_factory.mktemp("partly")
+    rows = Rows(out)
+    figures = {metric.key: 20.0 for metric in METRICS if not metric.key.endswith(("srgb", "srgb_db"))}
+    for target in "AB":
+        rows.add(row("obbgs", target=target, **figures))
+        rows.add(row(LONG_NAMES[0], target=target, **figures | {"psnr_clean_db": 30.0}))
+        rows.add(row("black", target=target, psnr_clean_db=10.0))
+    rows.add(row(LONG_NAMES[1], **figures | {"psnr_clean_db": 50.0}))
+    rows.add(row("obbgs", "noise x2", psnr_clean_db=18.0))
+    rows.add(row("mvs", f_02_surface=80.0))
+    rows.add(row("mvs", "noise x2", f_02_surface=80.0))
+    rows.add(row("black", "noise x4", psnr_clean_db=10.0))
+    return out
+
+
+@pytest.mark.parametrize("width", [390, 1000, 1440])
+def test_scores_read_on_every_screen_and_headers_stand_in_one_line(partly_run, width):
+    with chromium() as browser, opened(browser, as_url(write_page(partly_run)), width, 900) as page:
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+        wide = (
+            "[...document.querySelectorAll('.scores')].map(t => t.scrollWidth - t.parentElement.clientWidth)"
+        )
+        assert width == 390 or max(page.evaluate(wide)) <= 0, "no table of a screen scrolls"
+        below = """[...document.querySelectorAll('.scores tr:first-child')].filter(r => r.clientHeight).map(row => {
+            const ends = [...row.cells].map(cell => {
+                const range = document.createRange(); range.selectNodeContents(cell);
+                return Math.round(Math.max(...[...range.getClientRects()].map(box => box.bottom))); });
+            return Math.max(...ends) - Math.min(...ends); })"""
+        assert max(page.evaluate(below)) <= 1
+        page.locator("summary", has_text="figures").first.click()
+        figures = page.locator("details[open] table")
+        assert figures.locator("tr").count() == len(METRICS) - 3 + 1  # without those of sRGB
+        for name in LONG_NAMES:
+            head = page.locator(".map th", has_text=name)
+            assert head.count() == 1 and head.evaluate("e => e.scrollWidth <= e.clientWidth")
+
+
+def test_what_was_not_run_is_said_and_does_not_win(partly_run):
+    body = write_page(partly_run).read_text().replace("<wbr>", "")
+    mean, of_a, of_b = (part.partition("<details>")[0] for part in re.split(r"<h3>", body)[1:4])
+    assert f"{LONG_NAMES[1]} <small>(1 of 2 targets)</small>" in mean
+    assert "<b>30.00</b>" in mean and "<b>50.00</b>" not in mean, (
+        "the mean of fewer targets is another figure"
+    )
+    assert "<b>50.00</b>" in of_a and "Not run" not in of_a
+    assert f"Not run on B: {LONG_NAMES[1]}, mvs." in of_b and of_b.count(LONG_NAMES[1]) == 1
+    where = body[body.index("Where methods fail") :]
+    assert "18.0 <small>(1 of 2)</small>" in where and ">no score<" in where and ">not run<" in where
+    assert "noise x4" not in where[: where.index("</table>")], "nothing was reconstructed under it"
 
 
 @pytest.mark.parametrize("folder", ["comparison", "without_truth"])
@@ -400,7 +467,9 @@ def test_a_page_of_shortened_trainings_says_so(tmp_path):
     rows.add(
         row("3dgs", psnr_clean_db=30.0, chamfer=0.1, seconds=2.0, gaussians=300, bytes=700, steps_share=0.1)
     )
-    assert "1 condition. Trainings had 0.1 of the steps." in write_page(tmp_path).read_text()
+    rows.add(row("2dgs", psnr_clean_db=30.0, largest=4000))
+    limits = "Trainings with limits: 10 % of the steps (3dgs); at most 4,000 Gaussians (2dgs)."
+    assert f"1 condition. {limits}" in write_page(tmp_path).read_text()
 
 
 def test_figures_are_written_as_png(comparison):
@@ -441,6 +510,7 @@ def test_distances_on_a_logarithmic_axis_are_written_out():
 
 
 @given(st.lists(st.floats(1e-6, 1e9), min_size=2, max_size=5))
+@example([1e-6, 1.0000000000000002e-06])
 def test_ticks_are_few_rise_and_some_lie_between_the_values(values):
     ticks, low, high = ticks_1_2_5(values), min(values), max(values)
     assert ticks == sorted(set(ticks)) and ticks[0] > 0
