@@ -63,6 +63,7 @@ class _Channel:
         self._answers_due, self._answers_until_s = 0, 0.0
         self.errors: list[Exception] = []  # since they were last looked at
         self.frames_repeated = 0
+        self._has_begun = False  # whether a message has begun since listening did
         self._incoming: deque[isotp.CanMessage] = deque()
         self._message = b""
         self._last_data = b""
@@ -112,7 +113,7 @@ class _Channel:
 
     def reset(self) -> None:
         self._layer.reset()
-        self._answers_due = 0
+        self._answers_due, self._has_begun = 0, False
 
     def send(self, message: bytes) -> None:
         self._message, self.offers, self._answers_due = message, 0, 0
@@ -155,6 +156,9 @@ class _Channel:
                 if is_repeated and kind == CONSECUTIVE_FRAME:
                     self.frames_repeated += 1
                     continue
+                if kind == CONSECUTIVE_FRAME and not self._has_begun:
+                    continue  # the rest of a message to someone who listened before
+                self._has_begun = True
                 if kind == FIRST_FRAME:
                     if is_repeated and time_s - self._answered_s < ANSWER_S:
                         continue

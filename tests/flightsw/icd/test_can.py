@@ -229,6 +229,22 @@ def test_time_in_which_a_side_does_not_look_at_its_port_ends_no_message(url):
 
 
 @BOTH
+def test_the_rest_of_a_message_to_someone_who_listened_before_is_no_loss(url):
+    before, now = Wire(url), Wire(url)
+    framed = frame_packet(bytes(range(1, 200)) * 3)
+    before.flight.write(framed)
+    first = before.flight.exchange([], 0.0)[1]
+    answers = before.ground.exchange(first, 0.0)[1]
+    rest = before.flight.exchange(answers, 0.0)[1]
+    assert now.ground.exchange(rest, 0.0)[0] == b"" and now.ground.frames_discarded == 0
+    before.ground.abandon()  # as when a port is opened again
+    assert before.ground.exchange(rest, 0.1)[0] == b"" and before.ground.frames_discarded == 0
+    now.flight.write(framed)
+    assert now.run() == framed
+    assert now.ground.exchange(rest, 100.0)[0] == b"" and now.ground.frames_discarded > 0
+
+
+@BOTH
 def test_a_message_whose_rest_never_comes_is_dropped_and_counted(url):
     wire = Wire(url)
     wire.flight.write(frame_packet(bytes(range(1, 200)) * 3))
