@@ -92,7 +92,8 @@ class Port:
             self._open()
         except self.OPEN_ERRORS as error:
             if must_be_there:
-                raise LinkError(f"cannot open {self.url.device}: {reason(error)}") from error
+                what = f"cannot open {self.url.device}: {reason(error)}"
+                raise LinkError(f"{what}{self._remedy(error)}") from error
             self._is_outage = True
             log.warning("%s is awaited: it cannot be opened yet: %s", self.url.device, reason(error))
 
@@ -111,6 +112,10 @@ class Port:
 
     def _open(self) -> None:
         raise NotImplementedError
+
+    def _remedy(self, error: Exception) -> str:
+        """Return what to do about a port that cannot be opened, after a semicolon; nothing where that is not known."""
+        return ""
 
     def _drop(self) -> None:
         """Give up the port and what it has not sent."""

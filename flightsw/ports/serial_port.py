@@ -1,5 +1,6 @@
 """Links over a serial port."""
 
+import errno
 import os
 import select
 import termios
@@ -9,6 +10,13 @@ import serial
 from flightsw.ports.port import Port
 
 READ_BYTES = 65_536
+REMEDIES = {  # of errors when a port is opened
+    errno.ENOENT: "plug the adapter in, or give the name that `ls /dev/tty*` shows with it",
+    errno.EACCES: "let this user use it: `sudo usermod -aG dialout $USER`, then log in again",
+    errno.EBUSY: "end the program that uses it, which `fuser` names",
+    errno.EAGAIN: "end the program that uses it, which `fuser` names",
+    errno.ENOTTY: "give a serial port, such as /dev/ttyUSB0",
+}
 
 
 class SerialLink(Port):
@@ -79,6 +87,10 @@ class SerialLink(Port):
             self.url.device, self.url.baud_rate, timeout=0, write_timeout=0, exclusive=True
         )
         self._unsent = b"\0"  # ends whatever half packet the other side still holds
+
+    def _remedy(self, error: Exception) -> str:
+        met = [each.args[0] for each in (error, error.__context__) if each is not None and each.args]
+        return next((f"; {REMEDIES[number]}" for number in met if number in REMEDIES), "")
 
     def _drop(self) -> None:
         self._unsent = b""

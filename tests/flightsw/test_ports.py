@@ -103,8 +103,13 @@ def test_the_identifiers_that_one_side_sends_with_are_those_that_the_other_recei
 
 
 def test_a_port_that_is_not_there_is_a_link_error(tmp_path):
-    with pytest.raises(LinkError, match=f"cannot open {tmp_path}/none"):
+    with pytest.raises(
+        LinkError, match=rf"cannot open {tmp_path}/none: .*; plug the adapter in, or give the name"
+    ):
         open_link(f"serial://{tmp_path}/none", FLIGHT_SIDE)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LinkError, match="; give a serial port, such as"):
+        open_link(f"serial://{tmp_path}/file", FLIGHT_SIDE)
     with pytest.raises(LinkError, match=f"cannot open {tmp_path}/none"):
         open_link(f"slcan://{tmp_path}/none", FLIGHT_SIDE)
     with pytest.raises(LinkError, match="cannot open nocan0"):
@@ -236,7 +241,11 @@ def test_what_an_slcan_adapter_garbles_is_counted(terminal):
     master, _, name = terminal
     with open_link(f"slcan://{name}", FLIGHT_SIDE) as link:
         os.write(
-            master, b"t0C83x\r\xff\xfe\r\a" + format_slcan(CanMessage(FLIGHT_SIDE.other_ids[0], 2, b"\x22x"))
+            master,
+            b"t0C83x\r\xff\xfe\r\a"
+            + b"".join(
+                format_slcan(CanMessage(FLIGHT_SIDE.other_ids[0], 2, data)) for data in (b"\x01x", b"\x22x")
+            ),
         )
         exchange_until(link, lambda data: link.losses["can_frames_discarded"])
         assert link.losses == {

@@ -45,7 +45,8 @@ def test_other_errors_keep_their_words():
     ("tool", "arguments", "line"),
     [
         ("flightsw", "downlink --link serial:///dev/nowhere --mission {m} --store {tmp}/s --exit-when-empty",
-         "flightsw: cannot open /dev/nowhere: No such file or directory"),
+         "flightsw: cannot open /dev/nowhere: No such file or directory; plug the adapter in, or give the name that "
+         "`ls /dev/tty*` shows with it"),
         ("flightsw", "capture --camera hil:///nowhere.sock --mission {m} --store {tmp}/s",
          "flightsw: no camera at hil:///nowhere.sock: No such file or directory; start the camera's server"),
         ("flightsw", "capture --camera hil:///nowhere.sock --mission {m} --start soon",
@@ -57,7 +58,8 @@ def test_other_errors_keep_their_words():
          "flightsw: {tmp}/torn.yaml: mission: is not valid YAML: while parsing a flow sequence at line 1, column 4: "
          "a: [1 ^ expected ',' or ']', but got '<stream end>' at line 1, column 6: a: [1 ^"),
         ("ground", "listen --link serial:///dev/nowhere --mission {m} --session {tmp}/s",
-         "ground: cannot open /dev/nowhere: No such file or directory"),
+         "ground: cannot open /dev/nowhere: No such file or directory; plug the adapter in, or give the name that "
+         "`ls /dev/tty*` shows with it"),
     ],
 )  # fmt: skip
 def test_what_a_command_says_is_one_line_that_names_each_thing_once(tmp_path, tool, arguments, line, request):
