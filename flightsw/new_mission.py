@@ -1,5 +1,6 @@
 """A mission file from the little that is known at first: orbits, the target's size, the camera's lens and colour."""
 
+import logging
 import math
 import re
 from datetime import UTC, datetime, timedelta
@@ -15,6 +16,8 @@ from obbgs_base.files import read_bounded, write_whole
 EXAMPLE = Path(__file__).with_name(
     "example_mission.yaml"
 )  # a copy of the project's mission.yaml, as tests check
+log = logging.getLogger(__name__)
+
 UNTIL_FIRST_TRIGGER = timedelta(hours=1)
 
 
@@ -57,10 +60,11 @@ def write_mission(
     if start_utc in (None, "now"):
         first = datetime.now(UTC) + (UNTIL_FIRST_TRIGGER if start_utc is None else timedelta(0))
         start_utc = first.strftime("%Y-%m-%dT%H:%M:%SZ")
+    elements = {"target_tle": _elements(target_tle), "chaser_tle": _elements(chaser_tle)}
     text = EXAMPLE.read_text()
     text = re.sub(r"  # TanDEM-X .*\n", "", text)
-    for key, path in (("target_tle", target_tle), ("chaser_tle", chaser_tle)):
-        lines = "".join(f'    - "{line}"\n' for line in _elements(path))
+    for key, two in elements.items():
+        lines = "".join(f'    - "{line}"\n' for line in two)
         text = re.sub(rf"(  {key}:\n)(?:    - .*\n){{2}}", lambda m, lines=lines: m[1] + lines, text)
     lens = f"{focal_length_mm:g} mm / {pixel_pitch_um:g} um; {field_deg:.3g} degrees across {width} pixels"
     for key, value, remark in (
@@ -89,6 +93,17 @@ def write_mission(
         write_whole(out, text.encode())
     except OSError as error:
         raise ConfigError(str(out), f"cannot be written: {reason(error)}") from error
+    if _orbit(elements["target_tle"]) == _orbit(elements["chaser_tle"]):
+        log.warning(
+            "target and chaser have the same elements, so that they meet: give the chaser's own to --chaser-tle, which "
+            "`hil scenario --fly-around METRES --mission %s` designs",
+            out,
+        )
+
+
+def _orbit(elements: list[str]) -> tuple[str, str]:
+    """Return the epoch and the orbit in two lines of elements, without the number of the object."""
+    return elements[0][18:32], elements[1][8:63]
 
 
 def _elements(path: Path) -> list[str]:

@@ -62,6 +62,16 @@ def test_a_new_mission_has_what_was_given_and_passes_its_checks(tmp_path, elemen
     assert again.returncode == 2 and "exists already" in again.stderr
 
 
+def test_the_same_elements_for_target_and_chaser_are_told_in_a_line(tmp_path, elements, caplog):
+    target, chaser = map(Path, elements)
+    write_mission(tmp_path / "two.yaml", target, chaser, 6.0, "1024x1024", 100.0, 5.5)
+    assert not caplog.records
+    out = tmp_path / "one.yaml"
+    write_mission(out, target, target, 6.0, "1024x1024", 100.0, 5.5)
+    (line,) = caplog.messages
+    assert out.exists() and "have the same elements" in line and f"--mission {out}" in line
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
