@@ -28,10 +28,10 @@ def write_whole(path: Path, content: bytes) -> None:
             os.fsync(file.fileno())
         os.replace(part, path)
     except OSError as error:
-        part.unlink(missing_ok=True)
-        if path.is_dir():  # the error names the part, which nobody asked for
-            raise IsADirectoryError(error.errno, error.strerror, str(path)) from error
-        raise
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        # the error names the part, which nobody asked for; Python chooses its class by the number
+        raise OSError(error.errno, error.strerror, str(path)) from error
     sync_folder(path.parent)
 
 

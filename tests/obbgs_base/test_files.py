@@ -41,6 +41,14 @@ def test_a_file_that_is_written_anew_keeps_its_mode_and_leaves_none_of_a_killed_
     assert stat.S_IMODE(path.stat().st_mode) == 0o664
 
 
+@pytest.mark.parametrize("name", ["none/out", "file/out", "/proc/zz"])
+def test_an_error_names_the_file_that_was_asked_for(tmp_path, name):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(OSError) as caught:
+        write_whole(tmp_path / name, b"{}")
+    assert caught.value.filename == str(tmp_path / name)
+
+
 def test_a_folder_in_the_place_of_a_file_is_named_and_no_part_is_left(tmp_path):
     (tmp_path / "out").mkdir()
     with pytest.raises(IsADirectoryError) as caught:
