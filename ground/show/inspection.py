@@ -120,7 +120,7 @@ def inspected(model: Model, cad: CadMesh, against: str) -> tuple[Inspection, dic
     """Return what of a run is not as designed, and the same as values for JSON; lengths in metres, angles in degrees.
 
     Raises:
-        CadError: the run shows too little surface.
+        ReconstructionError: the run shows too little surface.
     """
     found = inspect(cad, model.surface, model.solid, model.views)
     place, pixel_m = found.place, model.surface.pixel_m
@@ -192,7 +192,8 @@ def write_inspection(run: Path, against: Path, out: Path) -> dict:
         out: the folder for the three files; it is made if need be.
 
     Raises:
-        SessionError, CadError: a run or the design cannot be used.
+        SessionError, ReconstructionError: the run cannot be used.
+        CadError: the design cannot.
     """
     model = read_model(run)
     if against.is_dir():

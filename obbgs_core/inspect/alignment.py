@@ -6,7 +6,8 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from obbgs_core.inspect.cad import CadError, CadMesh, Samples, principal_axes, sampled
+from obbgs_core.errors import ReconstructionError
+from obbgs_core.inspect.cad import CadMesh, Samples, principal_axes, sampled
 
 STARTS = 160  # rotations drawn evenly, besides those that bring principal or file axes together
 FIRST_POINTS, COARSE_POINTS, FEW_POINTS, FINE_POINTS = (
@@ -90,10 +91,10 @@ def aligned(cad: CadMesh, surface: Surface, seed: int = 0) -> Similarity:
     plane (Chen and Medioni 1992) with Tukey's weights, so that what is faulty or missing does not pull.
 
     Raises:
-        CadError: fewer than 100 points of surface.
+        ReconstructionError: fewer than 100 points of surface.
     """
     if len(surface.points) < 100:
-        raise CadError(
+        raise ReconstructionError(
             f"the model shows {len(surface.points)} points of a surface, at least 100 are needed: train it with more "
             "or better exposed frames"
         )

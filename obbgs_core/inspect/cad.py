@@ -19,8 +19,10 @@ PLANAR_COS = float(
 DRACO = "KHR_draco_mesh_compression"
 
 
-class CadError(ReconstructionError):
+class CadError(ReconstructionError, ValueError):
     """A mesh of a design that cannot be used; the message says why and what to do."""
+
+    exit_code = 2  # like any other file that was given and is not what is asked for
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def inspect(cad: CadMesh, surface: Surface, solid: Samples, views: Views, seed: 
         views: the frames.
 
     Raises:
-        CadError: too little surface.
+        ReconstructionError: too little surface.
     """
     place = aligned(cad, surface, seed)
     pixel_m = surface.pixel_m

@@ -15,6 +15,7 @@ from ground.show.measure import _is_known
 from ground.show.page import unbroken
 from ground.show.report.sizes import sizes_section
 from ground.show.sizes import with_deviation
+from tests.commands import call
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 UNIT = 25.4  # of the design's file, per metre
@@ -101,3 +102,10 @@ def test_a_part_of_the_design_that_is_not_there_is_told(run):
 def test_a_face_whose_width_is_known_to_less_than_a_quarter_is_a_crumb():
     assert _is_known({"value": 1.0, "half_width_90": 0.25})
     assert not _is_known({"value": 0.19, "half_width_90": 0.05})
+
+
+def test_a_design_that_cannot_be_used_is_wrong_usage_like_any_other_file(run, tmp_path):
+    (tmp_path / "no mesh.glb").write_bytes(b"no mesh")
+    for name, told in (("missing.glb", "is not there"), ("no mesh.glb", "cannot be read as a mesh")):
+        done = call("ground", "inspect", str(run), "--against", str(tmp_path / name))
+        assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from obbgs_core.errors import ReconstructionError
 from obbgs_core.inspect.alignment import Surface, aligned
 from obbgs_core.inspect.cad import CadError, CadMesh, read_cad, sampled
 from obbgs_core.inspect.faces import flat_faces, largest_dimension
@@ -129,7 +130,7 @@ def test_what_is_no_design_is_refused_in_a_line(tmp_path):
     (tmp_path / "packed.glb").write_bytes(b'glTF {"extensionsRequired": ["KHR_draco_mesh_compression"]}')
     with pytest.raises(CadError, match="compressed by Draco"):
         read_cad(tmp_path / "packed.glb")
-    with pytest.raises(CadError, match="at least 100"):
+    with pytest.raises(ReconstructionError, match="at least 100"):
         aligned(as_cad(body(), tmp_path), Surface(np.zeros((3, 3)), np.zeros((3, 3)), np.ones(3), PIXEL_M))
 
 
