@@ -105,23 +105,29 @@ def find_sessions(folders: Sequence[Path], with_pictures: bool = False) -> list[
     for folder in folders:
         if not folder.is_dir():
             raise SessionError(f"{folder} is not a folder")
-        for session in sorted(_sessions_below(folder, DEEPEST)):
+        for session in sorted(_sessions_below(folder, DEEPEST, {})):
             found.setdefault(session.resolve(), _session_entry(session, with_pictures))
     return list(found.values())
 
 
-def _sessions_below(folder: Path, levels: int) -> Iterator[Path]:
+def _sessions_below(folder: Path, levels: int, looked_at: dict[Path, int]) -> Iterator[Path]:
+    """Give the sessions in a folder, behind symbolic links too; `looked_at` has the levels below each real folder.
+
+    A folder that several links lead to is looked at once, so that no circle of links ends this never.
+    """
+    real = folder.resolve()
+    if looked_at.get(real, -1) >= levels:
+        return
+    looked_at[real] = levels
     if (folder / "session.json").is_file():
         yield folder
     elif levels:
-        with os.scandir(folder) as entries:
-            below = [
-                e.name for e in entries if e.is_dir(follow_symlinks=False) and not e.name.startswith(".")
-            ]
-        for name in below:
+        names = [name for name in os.listdir(folder) if not name.startswith(".")]
+        for below in sorted((folder / name for name in names), key=lambda path: (path.is_symlink(), path)):
             try:
-                yield from _sessions_below(folder / name, levels - 1)
-            except PermissionError:  # somebody else's folder is no session of ours
+                if below.is_dir():
+                    yield from _sessions_below(below, levels - 1, looked_at)
+            except OSError:  # somebody else's folder is no session of ours, and a link may lead to itself
                 continue
 
 

@@ -49,6 +49,17 @@ def test_sessions_are_found_below_a_folder_and_damaged_ones_are_shown_with_the_r
     assert damaged["folder"].endswith("damaged") and "session.json" in damaged["problem"]
 
 
+def test_sessions_behind_links_are_found_once_and_circles_of_links_end(passes, tmp_path):
+    (tmp_path / "latest").symlink_to(passes / "2026" / "pass-12")
+    (tmp_path / "again").symlink_to(passes / "2026")
+    (tmp_path / "up").symlink_to(tmp_path)
+    (tmp_path / "self").symlink_to("self")
+    (session,) = json.loads(called("list", str(tmp_path), "--json"))
+    assert session["folder"] == str(tmp_path / "again" / "pass-12") and session["problem"] == ""
+    both = json.loads(called("list", str(tmp_path), str(passes), "--json"))
+    assert len(both) == 2
+
+
 def test_every_run_is_listed_finished_or_not(passes):
     session = json.loads(called("list", str(passes / "2026"), "--json"))[0]
     runs = {run["name"]: run for run in session["runs"]}
