@@ -69,15 +69,26 @@ def telemetry_figures(series: list[Series]) -> list[go.Figure]:
         )
         for bound, colour in near_limits(each):
             figure.add_hline(y=bound / factor, line={"color": colour, "width": 1, "dash": "dot"})
-        if each.values.min() == each.values.max():  # a scale of thousandths around a constant says nothing
-            value = each.values[0] / factor
-            figure.update_yaxes(range=[0.0, 2 * value or 1.0])  # nothing that is shown can be negative
+        if (reach := constant_reach(each)) is not None:
+            figure.update_yaxes(range=[0.0, reach])
         figure.update_xaxes(ticksuffix=" s")
         figure.update_yaxes(tickformat=",")
         title = {"text": f"{named(each.item)}{unit_of(each.item)}", "font": {"size": 12}}
         figure.update_layout(height=HEIGHT_PX, title=title, margin={"l": 45, "r": 15, "t": 30, "b": 25})
         figures.append(figure)
     return figures
+
+
+def constant_reach(series: Series) -> float | None:
+    """Return how far up from 0 the axis of a series goes whose values are all alike, bytes in MB; None of others.
+
+    A scale of thousandths around a constant says nothing, and nothing that is shown can be negative.
+    """
+    if len(series.values) == 0 or series.values.min() != series.values.max():
+        return None
+    factor = BYTES_PER_MB if series.item.unit == "B" else 1.0
+    highest = max([2 * series.values[0], *(1.1 * bound for bound, _ in near_limits(series))])
+    return float(highest) / factor or 1.0
 
 
 def near_limits(series: Series) -> list[tuple[float, str]]:

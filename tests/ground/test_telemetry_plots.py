@@ -11,8 +11,10 @@ from ground.show.telemetry_plots import (
     SHOWN,
     broken_limits,
     housekeeping_series,
+    near_limits,
     telemetry_figures,
 )
+from ground.show.viewer.pass_plots import scales_of
 
 
 def packet(second: int, **changes) -> dict:
@@ -66,6 +68,12 @@ def test_counts_that_stay_at_zero_have_no_axis_below_it(tmp_path):
     series = housekeeping_series(written(tmp_path, packet(0), packet(1)))
     axes = [figure.layout.yaxis.range for figure in telemetry_figures(series)]
     assert any(axes) and all(axis[0] == 0 for axis in axes if axis)
+    for each in series:  # in the viewer, whose own axis would go up to 100
+        low, high = scales_of(each)["y"]["range"]
+        bounds = [bound for bound, _ in near_limits(each)]
+        assert low < 0 and high in (1.0, 1.1 * max(bounds, default=0.0), 10_000.0)
+    changing = housekeeping_series(written(tmp_path, packet(0), packet(1, delivered=3)))
+    assert [each.item.name for each in changing if "y" not in scales_of(each)] == ["delivered"]
 
 
 def test_a_session_without_telemetry_has_no_series(tmp_path):

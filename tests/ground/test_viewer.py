@@ -581,8 +581,9 @@ def test_two_runs_have_names_overlays_a_legend_and_a_picture_is_saved_at_once(se
         url = f"http://127.0.0.1:{server.get_port()}"
         with chromium() as browser, page_of(browser, url, 800, 600, known=VISERS) as page:
             page.get_by_text("Save picture").wait_for()
-            names = [server.scene._handle_from_node_name[f"/{each}/name"].text for each in "ab"]
-            assert names == ["A/run", "A/other"]
+            names = [server.scene._handle_from_node_name[f"/{each}/name"] for each in "ab"]
+            assert [name.text for name in names] == ["A/run", "A/other"]
+            assert names[0].position[2] > 0 > names[1].position[2], "in one line long names would overlap"
             assert page.get_by_text("seen by no frame").count() == 0
             page_viewer.colouring.value = UNCERTAINTY
             page_viewer._colour_anew()

@@ -18,6 +18,7 @@ from ground.show.telemetry_plots import (
     BYTES_PER_MB,
     LIMIT_COLOURS,
     Series,
+    constant_reach,
     housekeeping_series,
     named,
     near_limits,
@@ -139,7 +140,7 @@ class PassPlots:
         return self._server.gui.add_uplot(
             data=plotted(series, series),
             series=drawn_lines(series),
-            scales={"x": uplot.Scale(time=False)},
+            scales=scales_of(series),
             axes=(
                 uplot.Axis(stroke="#9aa5b1", label="s", labelSize=16, labelGap=-4, size=28),
                 uplot.Axis(stroke="#9aa5b1", size=64),
@@ -156,6 +157,7 @@ class PassPlots:
             plot, data = controls.plots[series.item.name], plotted(series, whole)
             if len(data) != len(plot.series):  # a limit has come near, or is far away now
                 plot.series = drawn_lines(whole)
+            plot.scales = scales_of(series)
             plot.data = data
         controls.told.content = _told(known, [event for event in self._events if event.seconds <= seconds])
 
@@ -173,6 +175,17 @@ def drawn_lines(whole: Series) -> tuple[uplot.Series, ...]:
         uplot.Series(label="limit", stroke=colour, dash=(4, 4), width=1) for _, colour in near_limits(whole)
     ]
     return (uplot.Series(label="s"), uplot.Series(label="value", stroke="#6ea8fe", width=2), *lines)
+
+
+def scales_of(known: Series) -> dict[str, uplot.Scale]:
+    """Return the scales of a plot: those of values that are all alike begin just below 0, so that 0 itself is seen.
+
+    The page's own axis of values that are all 0 would go up to 100.
+    """
+    scales = {"x": uplot.Scale(time=False)}
+    if (reach := constant_reach(known)) is not None:
+        scales["y"] = uplot.Scale(range=(-0.05 * reach, reach))
+    return scales
 
 
 def plotted(known: Series, whole: Series) -> tuple[np.ndarray, ...]:

@@ -85,11 +85,14 @@ class Placed:
         low, high = self.box_m
         return np.all((self.shapes.means >= low) & (self.shapes.means <= high), axis=1)
 
-    def draw_name(self) -> None:
-        """Write the model's name above it, as is needed where two stand side by side."""
-        above = self.offset + np.array([0.0, 0.0, 1.45 * RADIUS])
+    def draw_name(self, below: bool) -> None:
+        """Write the model's name above or below it, as is needed where two stand side by side."""
+        place = self.offset + np.array([0.0, 0.0, (-1.45 if below else 1.45) * RADIUS])
         label = self._server.scene.add_label(
-            f"/{self._name}/name", self.shown.name, position=tuple(above), anchor="bottom-center"
+            f"/{self._name}/name",
+            self.shown.name,
+            position=tuple(place),
+            anchor="top-center" if below else "bottom-center",
         )
         self.handles["name"] = [label]
 

@@ -240,10 +240,10 @@ class Viewer:
     def draw_all(self) -> None:
         """Draw everything anew, after a model was put in place."""
         with self.lock:
-            for each in self.placed:
+            for index, each in enumerate(self.placed):
                 each.draw_mesh(self._is_checked("mesh"))
                 if len(self.placed) > 1:
-                    each.draw_name()
+                    each.draw_name(below=index == 1)  # on a phone names in one line would cover one another
             self.placed[0].draw_cameras(self.frames, self._choose, self._is_checked("cameras"))
             self.draw_frame()
             names = " | ".join(
