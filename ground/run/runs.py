@@ -9,6 +9,7 @@ import json
 import logging
 import os
 import platform
+import shlex
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -261,9 +262,19 @@ def _as_it_was(session: Session, folder: Path, count: int) -> Session:
         return then
     differing = [NAMES_OF_FACTS[key] for key, value in now.items() if noted.get(key, value) != value]
     if differing:
+        again = [
+            "ground",
+            "reconstruct",
+            "--session",
+            str(session.path),
+            "--name",
+            folder.name,
+            "--overwrite",
+        ]
         raise SessionError(
             f"{session.path} has changed since {folder.name} was made of it ({', '.join(differing)}), so the run is "
-            f"neither scored nor shown with it; `ground reconstruct --name {folder.name} --overwrite` makes it again"
+            "neither scored nor shown with it; "
+            f"`{shlex.join(again)}` makes it again"
         )
     return then
 
