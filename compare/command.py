@@ -63,10 +63,13 @@ def compare_command(
             from compare.grid.cells import cells_of, parse_budgets, session_facts
             from compare.grid.origin import this_command
             from compare.grid.run import run_grid
+            from compare.methods import method
 
         chosen = load_conditions(conditions) if conditions else {AS_TAKEN: Condition()}
         names = [name.strip() for name in methods.split(",") if name.strip()]
         shares = parse_budgets(budgets)
+        for name in names:
+            method(name, weights)  # what is no method is told before anything is read
         say(stderr, "reading the sessions")
         facts = [session_facts(folder) for folder in sessions]
         cells = cells_of(facts, names, seeds, shares, chosen, weights)

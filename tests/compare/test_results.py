@@ -530,3 +530,11 @@ def test_the_command_says_what_is_wrong_with_its_arguments(tmp_path):
     arguments = ["compare", str(tmp_path / "no"), "--out", str(tmp_path)]
     done = call("ground", *arguments)
     assert done.returncode == 1 and "is not a session" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_wrong_method_is_told_before_anything_is_read(tmp_path):
+    done = call(
+        "ground", "compare", str(tmp_path), "--methods", "obbgs,nonsense", "--out", str(tmp_path / "out")
+    )
+    assert done.returncode == 2 and "nonsense" in done.stderr
+    assert "reading" not in done.stderr and not (tmp_path / "out").exists()
