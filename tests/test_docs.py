@@ -13,6 +13,8 @@ import pytest
 import ground
 import obbgs_core
 from flightsw.icd.link.link_url import parse_link_url
+from obbgs_core.methods.config import MethodConfig
+from obbgs_core.settings import known_names
 from tests.benchmarks import figures
 from tests.benchmarks.figures import PAGES as PAGES_WITH_FIGURES
 from tests.benchmarks.figures import blocks, wrong
@@ -30,6 +32,13 @@ LARGEST_README = 8192  # bytes
 MOST_WORDS = 60_000  # of all pages in docs/
 MOST_OPTIONS = 150  # and arguments, over all commands
 LONGEST_RELEASE = 40  # lines of CHANGELOG.md
+
+
+def test_the_changelog_counts_the_settings_that_a_wrong_name_is_answered_with():
+    names = [name for name in known_names(MethodConfig) if name != "name"]
+    published = sum(name.startswith("published.") for name in names)
+    counts = f"{len(names) - published} settings, and {published} of published methods"
+    assert counts in (ROOT / "CHANGELOG.md").read_text()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
