@@ -68,14 +68,20 @@ def compare_command(
         chosen = load_conditions(conditions) if conditions else {AS_TAKEN: Condition()}
         names = [name.strip() for name in methods.split(",") if name.strip()]
         shares = parse_budgets(budgets)
+        # what is no method and no number of workers is told before anything is read
+        if not names:
+            raise ValueError(
+                "no method is named: give --methods names with commas between, such as obbgs,3dgs"
+            )
         for name in names:
-            method(name, weights)  # what is no method is told before anything is read
+            method(name, weights)
+        scheduler_and_count = workers_at(workers)
         say(stderr, "reading the sessions")
         facts = [session_facts(folder) for folder in sessions]
         cells = cells_of(facts, names, seeds, shares, chosen, weights)
         with _shown(stderr) as on_state:
             command = this_command("ground")
-            summary = run_grid(cells, out, command, *workers_at(workers), on_state, lambda: stop.requested)
+            summary = run_grid(cells, out, command, *scheduler_and_count, on_state, lambda: stop.requested)
         asked = {cell.digest: (cell.session.name, cell.condition_name) for cell in cells}
         page, figures = write_page(out, asked), write_figures(out, asked)
     for label, reason in summary.failed.items():

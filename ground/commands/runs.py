@@ -114,7 +114,7 @@ def _one(session: Path, asked: _Asked, as_json: bool) -> None:
             with quick_imports():
                 from ground.run.evaluate import evaluate
                 from ground.run.reconstruct import Progress, reconstruct
-                from ground.run.runs import run_folder
+                from ground.run.runs import check_replaceable, run_folder
                 from ground.session.folder import read_header
                 from ground.show.report.document import write_report
                 from obbgs_core.process import prepare_process
@@ -128,7 +128,7 @@ def _one(session: Path, asked: _Asked, as_json: bool) -> None:
                 show(progress.label, progress.info)
 
             read_header(session)  # what is no session is told before anything else
-            run_folder(session, asked.name)  # and so is a wrong name
+            check_replaceable(run_folder(session, asked.name), asked.overwrite)  # and so is a wrong name
             say(stderr, f"reading the frames of {session}")
             folder = reconstruct(
                 session,

@@ -37,6 +37,7 @@ from obbgs_core.io.ply import load_ply
 from obbgs_core.methods import presets
 from obbgs_core.methods.presets import PRESETS, QUALITIES
 from obbgs_core.train.result import StepInfo
+from tests.commands import call
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 QUICK = {"steps": 8, "start.count": 600, "growth.max_gaussians": 800, "published.sh_degree": 0}
@@ -277,6 +278,12 @@ def test_two_processes_do_not_make_one_run_at_once(session):
     killed.kill()
     killed.communicate(timeout=60)
     assert reconstruct(session, "run", "obbgs", QUICK).is_dir()
+
+
+def test_a_finished_run_is_refused_before_its_frames_are_read(session):
+    reconstruct(session, "run", "obbgs", QUICK)
+    done = call("ground", "reconstruct", "--session", str(session), "--name", "run")
+    assert done.returncode == 1 and "--overwrite replaces it" in done.stderr and "reading" not in done.stderr
 
 
 def test_a_run_that_another_process_has_just_finished_is_not_replaced(session, monkeypatch):
