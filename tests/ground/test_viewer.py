@@ -181,6 +181,8 @@ def test_a_port_that_is_taken_is_not_replaced_by_another(session):
         port = other.getsockname()[1]
         with pytest.raises(ViewError, match=f"cannot listen on 127.0.0.1 port {port}: .*--port"):
             opened("127.0.0.1", port)
+    with pytest.raises(ViewError, match=r"cannot listen on nowhere\.invalid: .*--host"):
+        opened("nowhere.invalid", 0)
     result = CliRunner().invoke(cli.app, ["view", str(session / "nothing")])
     assert result.exit_code == 1 and "neither a session" in str(result.exception)
 

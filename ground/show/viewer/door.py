@@ -4,6 +4,7 @@ What that page could not have said ends its connection before viser acts on it.
 """
 
 import contextlib
+import errno
 import functools
 import gzip
 import http
@@ -147,6 +148,11 @@ def _check_free(host: str, port: int) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
     except OSError as error:
+        if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+            what = f"cannot listen on {host}: {reason(error)}"
+            raise ViewError(
+                f"{what}; give an address of this machine with --host, 0.0.0.0 for all"
+            ) from error
         raise ViewError(_taken(host, port, reason(error))) from error
 
 
