@@ -68,10 +68,15 @@ def import_command(
 
     Example: ground import --format shirt --from shirtv1/roe1/lightbox --frames 363 --session roe1
     """
+    from flightsw.icd.config import ConfigError
     from ground.formats.photographs.exposures import UNKNOWN, estimated, read_table, with_exposures
     from ground.formats.pictures.placement import placed, with_stated_errors
     from ground.formats.pictures.views import EXACT, Values, first_of_each_split, write_session
 
+    if format_ is not ImportFormat.VIDEO and not folder.is_dir():
+        raise ConfigError("--from", f"expected a folder that is there, got {folder}")
+    if masks is not None and masks.name != "screen" and not masks.exists():
+        raise ConfigError("--masks", f"expected a folder that is there, got {masks}")
     given_sigmas = None if pose_sigma is None else _pose_sigmas(pose_sigma)
     table = None if exposures in (None, UNKNOWN) else read_table(Path(exposures))
     sigmas, exported, registration = EXACT, None, None

@@ -9,7 +9,7 @@ import struct
 from pathlib import Path
 
 from flightsw.icd.quaternion import matrix_to_quat
-from ground.formats.nerf import posed_frames, split_frames
+from ground.formats.nerf import split_frames
 from ground.formats.nerfstudio import export_nerfstudio
 from ground.session.folder import Session
 from obbgs_base.files import write_whole
@@ -26,7 +26,9 @@ def export_colmap(session: Session, out: Path) -> dict[str, int]:
     width, height = session.camera.width, session.camera.height
     camera_of: dict[tuple[float, ...], int] = {}
     split_of, images, held_out = split_frames(session), [], []
-    for record in posed_frames(session):
+    for record in session.frames:
+        if not record.pose_valid:  # as the export above has told
+            continue
         K = session.camera.K if record.K is None else record.K.tolist()
         lens = (float(K[0][0]), float(K[1][1]), float(K[0][2]), float(K[1][2]))
         camera = camera_of.setdefault(lens, len(camera_of) + 1)

@@ -195,6 +195,21 @@ def test_damaged_readings_are_named(tmp_path, session):
         write_session(views, tmp_path / "again", "nerf", exported=exported)
 
 
+def test_what_is_not_exported_is_told_once(tmp_path, session, caplog):
+    records = (dataclasses.replace(session.frames[0], pose_valid=False), *session.frames[1:])
+    export_colmap(dataclasses.replace(session, frames=records), tmp_path / "c")
+    assert caplog.messages == ["1 frames are left out, because their poses are not valid"]
+
+
+@pytest.mark.parametrize("name", ["--from", "--masks"])
+def test_a_folder_that_is_not_there_is_told_first(tmp_path, name):
+    options = {"--from": str(tmp_path), "--masks": str(tmp_path), name: str(tmp_path / "nowhere")}
+    arguments = [word for pair in options.items() for word in pair]
+    done = call("ground", "import", "--format", "images", *arguments, "--session", str(tmp_path / "s"))
+    assert done.returncode == 2 and done.stderr.startswith(f"ground: {name}: expected a folder")
+    assert not (tmp_path / "s").exists()
+
+
 @pytest.mark.parametrize("cameras", [1, 2])
 def test_colmap_reads_what_we_export(tmp_path, session, cameras):
     """pycolmap, COLMAP's own library, finds our poses, lenses and pictures; so do our two readers."""
@@ -591,7 +606,7 @@ def test_what_cannot_be_one_session_is_refused(tmp_path):
     write_session(views, tmp_path / "s", "lego")
     with pytest.raises(SessionError, match="holds a session already"):
         write_session(views, tmp_path / "s", "lego")
-    told = call("ground", "import", "--format", "nerf", "--from", "nowhere", "--session", tmp_path / "s")
+    told = call("ground", "import", "--format", "nerf", "--from", tmp_path, "--session", tmp_path / "s")
     # before anything is read or checked
     assert told.returncode == 1 and "holds a session already" in told.stderr
     write_png(tmp_path / "lego/val/r_0.png", np.zeros((5, 5, 3), dtype=np.uint8))
