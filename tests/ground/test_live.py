@@ -211,6 +211,10 @@ def test_a_pass_that_ends_with_too_few_frames_says_so(tmp_path):
     with pytest.raises(SessionError, match="no frame came into"):
         reconstruct_live(tmp_path / "never", idle_timeout_s=0.0)
     assert not (tmp_path / "never").exists()
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SessionError, match="no frame came into"):
+        reconstruct_live(tmp_path / "empty", idle_timeout_s=0.0)
+    assert list((tmp_path / "empty").iterdir()) == []
     writer.add(2)
     with pytest.raises(TooFewFrames, match=r"no frame for 0 s, .*2 frames received.*3 frames are needed"):
         reconstruct_live(writer.folder, idle_timeout_s=0.0)

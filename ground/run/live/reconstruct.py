@@ -88,8 +88,7 @@ def reconstruct_live(
     check_replaceable(folder, overwrite)
     uplink = None if key_file is None else LiveUplink(session_dir, key_file)
     kept = [path.name for path in unfinished_folder(folder).glob("*.checkpoint")]
-    is_new = not session_dir.exists()
-    with _nothing_left_of(session_dir if is_new else None), unfinished_run(folder, overwrite, kept) as part:
+    with _nothing_left_of(session_dir), unfinished_run(folder, overwrite, kept) as part:
         live = LiveReconstruction(session_dir, folder, part, config, seed, uplink, on_status)
         end = PassEnd(session_dir, idle_timeout_s, must_listen)
         try:
@@ -106,13 +105,14 @@ def reconstruct_live(
 
 
 @contextlib.contextmanager
-def _nothing_left_of(session_dir: Path | None) -> Iterator[None]:
-    """Remove a folder that was made for a session of which nothing came, where the block ends in an error."""
+def _nothing_left_of(session_dir: Path) -> Iterator[None]:
+    """Remove the folders that were made for a session of which nothing came, where the block ends in an error."""
+    is_new, is_empty = not session_dir.exists(), not (session_dir.is_dir() and any(session_dir.iterdir()))
     try:
         yield
     except SessionError:
-        if session_dir is not None and [path.name for path in session_dir.iterdir()] == ["runs"]:
-            shutil.rmtree(session_dir, ignore_errors=True)
+        if is_empty and [path.name for path in session_dir.iterdir()] == ["runs"]:
+            shutil.rmtree(session_dir if is_new else session_dir / "runs", ignore_errors=True)
         raise
 
 
