@@ -295,11 +295,14 @@ def dataset(
     else:
         jobs = [(mesh or (SHIPPED_FOIL if config.materials == "foil" else SHIPPED), out)]
     cache = out.absolute().parent / "renders"
-    with progress_bar(Console(stderr=True), label_width=20) as bars:
+    bars = progress_bar(Console(stderr=True), label_width=20)
+    with contextlib.ExitStack() as shown:
         tasks: dict[str, TaskID] = {}
 
         def show(step: Progress) -> None:
             label = f"{step.target} {step.step}"
+            if not tasks:  # bars without a task would leave an empty line before an error
+                shown.enter_context(bars)
             if label not in tasks:
                 tasks[label] = bars.add_task(label, total=step.total)
             bars.update(tasks[label], completed=step.done)

@@ -1,6 +1,7 @@
 """A folder that one command at a time works in; the lock ends with its process, also when that is killed."""
 
 import contextlib
+import errno
 import fcntl
 import os
 from collections.abc import Iterator
@@ -45,6 +46,8 @@ def one_command_in(folder: Path, tool: str) -> Iterator[None]:
 def _open_locked(folder: Path, tool: str) -> int:
     """Return the descriptor of a folder's lock file, locked by this process; processes that it starts lack it."""
     while True:
+        if folder.exists() and not folder.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, "is a file: give a folder", str(folder))
         folder.mkdir(parents=True, exist_ok=True)
         try:
             descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)

@@ -79,13 +79,16 @@ class CameraServer:
                     log.warning("a client disconnected during a request: %s", in_words(error))
 
         address = _address(listen)
-        if isinstance(address, str):
-            self._server = _UnixServer(address, Handler)
-            self.url = f"hil://{address}"
-        else:
-            self._server = _TcpServer(address, Handler)
-            host, port = self._server.server_address[:2]
-            self.url = f"hil://{host}:{port}"
+        try:
+            if isinstance(address, str):
+                self._server = _UnixServer(address, Handler)
+                self.url = f"hil://{address}"
+            else:
+                self._server = _TcpServer(address, Handler)
+                host, port = self._server.server_address[:2]
+                self.url = f"hil://{host}:{port}"
+        except OSError as error:  # which does not say where
+            raise OSError(error.errno, error.strerror, str(listen)) from error
         self._socket_file = Path(address) if isinstance(address, str) else None
         self._bound = _identity(self._socket_file)
         self._thread = WatchedThread("camera server", lambda: self._server.serve_forever(POLL_S))

@@ -236,3 +236,9 @@ def test_a_set_of_two_targets_is_one_command_and_one_file(tmp_path):
 def test_a_wrong_configuration_is_named(wrong, key):
     with pytest.raises(ConfigError, match=f"dataset.{key}"):
         DatasetConfig(**{"frames": 33, **wrong})
+
+
+def test_a_data_set_that_cannot_be_begun_is_refused_in_one_line(tmp_path):
+    done = call("hil", "dataset", "--mesh", tmp_path / "none.glb", "--out", tmp_path / "out")
+    assert done.returncode == 2 and done.stderr == f"hil: {tmp_path / 'none.glb'}: no such file\n"
+    assert not (tmp_path / "out").exists()

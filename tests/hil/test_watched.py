@@ -103,3 +103,11 @@ def test_a_thread_that_ends_well_is_no_error():
     thread.join(30)
     thread.check()
     assert done.is_set()
+
+
+@pytest.mark.parametrize("place", ["hil://{tmp}/none/camera.sock", "hil://192.0.2.1:9"])
+def test_an_address_that_cannot_be_served_at_is_named(small_mission, tmp_path, place):
+    listen = place.format(tmp=tmp_path)
+    with pytest.raises(OSError) as refused:
+        CameraServer(small_mission, failing_once(), listen)
+    assert refused.value.filename == listen and refused.value.strerror

@@ -46,6 +46,15 @@ def test_a_process_that_the_holder_started_does_not_hold_the_folder(tmp_path):
         child.stdin.close()
 
 
+def test_a_file_in_the_place_of_the_folder_is_told(tmp_path):
+    (tmp_path / "out").write_bytes(b"")
+    with (
+        pytest.raises(NotADirectoryError, match="is a file: give a folder"),
+        one_command_in(tmp_path / "out", "hil"),
+    ):
+        pass
+
+
 def test_a_folder_is_left_as_it_was(tmp_path):
     made, found = tmp_path / "made" / "here", tmp_path / "found"
     found.mkdir()
