@@ -68,15 +68,11 @@ def import_command(
 
     Example: ground import --format shirt --from shirtv1/roe1/lightbox --frames 363 --session roe1
     """
-    from flightsw.icd.config import ConfigError
     from ground.formats.photographs.exposures import UNKNOWN, estimated, read_table, with_exposures
     from ground.formats.pictures.placement import placed, with_stated_errors
     from ground.formats.pictures.views import EXACT, Values, first_of_each_split, write_session
 
-    if format_ is not ImportFormat.VIDEO and not folder.is_dir():
-        raise ConfigError("--from", f"expected a folder that is there, got {folder}")
-    if masks is not None and masks.name != "screen" and not masks.exists():
-        raise ConfigError("--masks", f"expected a folder that is there, got {masks}")
+    _check_there(format_, folder, masks)
     given_sigmas = None if pose_sigma is None else _pose_sigmas(pose_sigma)
     table = None if exposures in (None, UNKNOWN) else read_table(Path(exposures))
     sigmas, exported, registration = EXACT, None, None
@@ -91,8 +87,7 @@ def import_command(
         views = first_of_each_split(views, frames)
         if exposures != UNKNOWN and format_ not in TIMED:
             views = with_exposures(views, table)
-    views, found_poses = _masked(views, masks, session), {}
-    source = f"{format_.value}: {folder}"
+    views, found_poses, source = _masked(views, masks, session), {}, f"{format_.value}: {folder}"
     given = None if values is None else Values(values.value)
     if exposures == UNKNOWN:
         views = estimated(views, given)
@@ -124,6 +119,15 @@ def import_command(
         print(json.dumps({"frames": count, "session": str(session), **(registration or {}), **found_poses}))
     else:
         _tell(count, session, registration or {})
+
+
+def _check_there(format_: ImportFormat, folder: Path, masks: Path | None) -> None:
+    from flightsw.icd.config import ConfigError
+
+    if format_ is not ImportFormat.VIDEO and not folder.is_dir():
+        raise ConfigError("--from", f"expected a folder that is there, got {folder}")
+    if masks is not None and masks.name != "screen" and not masks.exists():
+        raise ConfigError("--masks", f"expected a folder that is there, got {masks}")
 
 
 def _tell(count: int, session: Path, registration: dict) -> None:
