@@ -38,6 +38,7 @@ from obbgs_base.files import write_whole
 
 PAGE = "compare.html"
 WORST_SHOWN = 6
+NAMES_PX, TILE_PX = 170, 62  # of the names beside the tiles of gains, and of a tile at least
 COLUMNS = (
     "Clean figures compare with noiseless exposures of held-out views, full scale as 1; foreground counts only "
     "the pixels that the target covers; pooled is of the mean squared error over all views together, which "
@@ -149,8 +150,10 @@ def _explained(results: Results) -> str:
     return " ".join(notes)
 
 
-def _methods_legend(results: Results) -> str:
-    scored = {row["method"] for row in results.rows if row.get(results.score.key) is not None}
+def _methods_legend(results: Results, *others: str) -> str:
+    """Return the colours of methods that have a score, or one of the other figures that are drawn beside it."""
+    keys = {*(results.score_of(target).key for target in results.targets), *others}
+    scored = {row["method"] for row in results.rows if any(row.get(key) is not None for key in keys)}
     colour = colour_of(results)
     return legend((name, colour(name)) for name in results.trained if results.method_of[name] in scored)
 
@@ -168,7 +171,7 @@ def _speed(results: Results) -> str:
         body += f"<h3>{html.escape(target)}</h3>{drawn}"
     if not results.trained:
         return section("Speed against accuracy", note, "No method was trained.")
-    return section("Speed against accuracy", note, _methods_legend(results) + body)
+    return section("Speed against accuracy", note, _methods_legend(results, "chamfer") + body)
 
 
 def _failures(results: Results, out: Path) -> str:
@@ -222,7 +225,7 @@ def _breaking(results: Results) -> str:
         figures = [severity_figure(results, series, metric) for metric in metrics]
         curves += beside(plot(figure) for figure in figures if figure is not None)
     table = f'<div class="scroll"><table class="scores"><tr><th>condition</th>{head}</tr>{"".join(lines)}</table></div>'
-    return section("Where each method breaks", note, table + _methods_legend(results) + curves)
+    return section("Where each method breaks", note, table + _methods_legend(results, F) + curves)
 
 
 def _breaking_cell(series: Series, point: Breaking | None) -> str:
@@ -255,7 +258,13 @@ def _gains(results: Results) -> str:
         "smaller value is the better one, so that a positive gain is always an improvement."
     )
     figures = [(name, gain_figure(results, name, base)) for name in others if results.gains(name, base)]
-    body = "".join(f"<h3>{html.escape(name)}</h3>{plot(figure)}" for name, figure in figures)
+    width_px = NAMES_PX + TILE_PX * len(
+        results.targets
+    )  # narrower, tiles would have no room for their numbers
+    body = "".join(
+        f'<h3>{breakable(name)}</h3><div class="scroll"><div style="min-width: {width_px}px">{plot(figure)}</div></div>'
+        for name, figure in figures
+    )
     return section(f"Relative gains over {html.escape(base)}", note, body) if body else ""
 
 

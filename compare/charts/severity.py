@@ -102,12 +102,16 @@ def series_of(results: Results) -> list[Series]:
 
 
 def breaking_points(results: Results) -> list[tuple[Series, dict[str, Breaking]]]:
-    """Return where methods break, by label, under each kind of condition that any was tried under."""
+    """Return where methods break, by label, under each kind of condition that any was tried under in earnest."""
     found = [
         (series, {label: point for label in results.trained if (point := breaking(results, label, series))})
         for series in series_of(results)
     ]
-    return [(series, points) for series, points in found if points]
+    return [
+        (series, points)
+        for series, points in found
+        if any(point.broken_at or point.held or not point.is_judged for point in points.values())
+    ]
 
 
 def breaking(results: Results, label: str, series: Series) -> Breaking | None:

@@ -390,6 +390,34 @@ def partly_run(tmp_path_factory) -> Path:
     return out
 
 
+def test_gains_have_room_for_their_numbers_on_a_phone(tmp_path):
+    rows = Rows(tmp_path)
+    for number in range(6):
+        for method, psnr_db in (("obbgs", 40.0), ("3dgs", 33.3)):
+            rows.add(row(method, target=f"DSCOVR-{number}", psnr_clean_db=psnr_db, ssim_clean=0.9))
+    with chromium() as browser, opened(browser, as_url(write_page(tmp_path)), 390, 800) as page:
+        page.wait_for_selector(".heatmap-label text")
+        texts = "[...document.querySelectorAll('.heatmap-label text')]"
+        assert min(page.evaluate(f"{texts}.map(text => parseFloat(getComputedStyle(text).fontSize))")) >= 9
+        assert page.evaluate("document.documentElement.scrollWidth") == 390
+
+
+def test_a_method_with_a_surface_only_is_in_the_legend_of_its_curves_and_what_says_nothing_is_left_out(
+    tmp_path,
+):
+    rows = Rows(tmp_path)
+    for times in (None, 2.0):
+        rows.add(of_noise("obbgs", times, 40.0, f_02_surface=80.0))
+        surface = row("mvs", "as taken" if times is None else f"noise x{times:g}", f_02_surface=70.0)
+        rows.add(surface if times is None else surface | {"changes": {"noise": times}})
+    rows.add(row("obbgs", "believed", psnr_clean_db=40.0) | {"changes": {"believed_noise": 1.0}})
+    text = write_page(tmp_path).read_text()
+    part = text[text.index("Where each method breaks") : text.index("Where the rows come from")]
+    legend = part[part.index('class="legend"') :].partition("</div>")[0]
+    assert ">obbgs<" in legend and ">mvs<" in legend
+    assert "noise, times that of the camera" in part and "noise that is believed" not in part
+
+
 @pytest.mark.parametrize("width", [390, 1000, 1440])
 def test_scores_read_on_every_screen_and_headers_stand_in_one_line(partly_run, width):
     with chromium() as browser, opened(browser, as_url(write_page(partly_run)), width, 900) as page:
