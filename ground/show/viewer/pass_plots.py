@@ -184,7 +184,9 @@ def scales_of(known: Series) -> dict[str, uplot.Scale]:
     """
     scales = {"x": uplot.Scale(time=False)}
     if (reach := constant_reach(known)) is not None:
-        scales["y"] = uplot.Scale(range=(-0.05 * reach, reach))
+        scales["y"] = uplot.Scale(
+            range=(-0.05 * reach, 1.15 * reach)
+        )  # the page cuts what is written at the edge
     return scales
 
 
