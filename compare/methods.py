@@ -1,7 +1,6 @@
 """The registry of compared methods: how each is run, and which axes of a grid change what it does."""
 
 import dataclasses
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from compare import references
 from compare.case import Case
-from compare.opponents.mvsnet import reconstruct_mvsnet
+from compare.opponents.mvsnet import WeightsUnfit, load_network, reconstruct_mvsnet
 from compare.opponents.nerf import AS_PUBLISHED, FOR_A_CPU, Knowing, Size, reconstruct_nerf
 from compare.opponents.plane_sweep import reconstruct_mvs
 from compare.opponents.reconstruction import Reconstruction, Work
@@ -82,12 +81,16 @@ def method(name: str, weights: Path | None = None) -> Method:
         weights: the file of a learned method's weights, which decides its rows by its content.
 
     Raises:
-        ValueError: there is no such method; the message names the known ones. Or it needs weights, and there are none.
+        ValueError: there is no such method; the message names the known ones. Or it needs weights, and there are none
+            that fit.
     """
     if name == MVSNET:
         if weights is None or not weights.is_file():
             raise ValueError(f"{MVSNET} needs the file of its weights: --weights FILE, got {weights}")
-        digest = hashlib.sha256(weights.read_bytes()).hexdigest()
+        try:
+            _, digest, _ = load_network(weights)
+        except WeightsUnfit as error:
+            raise ValueError(f"--weights: {error}") from error
         return Method(name, lambda task: _learned(task, weights), {"weights": digest})
     if name in _REFERENCES:
         return Method(name, lambda task: _reference(task, _REFERENCES[name]))

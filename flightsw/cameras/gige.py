@@ -136,7 +136,9 @@ class GigeCamera:
             call("arv_camera_start_acquisition", self._camera)
         except CaptureError as error:
             self._release()()
-            raise CameraLost(f"no camera at {self._url}: {error}") from error
+            raise CameraLost(
+                f"no camera at {self._url}: {error}; `arv-tool-0.8` of Debian's aravis-tools lists those that answer"
+            ) from error
 
     def _switch_off_automatics(self) -> None:
         """Switch off whatever keeps readings from following the exposure time, and read back whether it is off.

@@ -5,6 +5,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from compare.methods import method
 from compare.opponents import mvsnet
 from compare.opponents.mvsnet import NetworkSettings, WeightsUnfit, load_network, reconstruct_mvsnet
 from compare.opponents.mvsnet_network import MvsNet
@@ -156,3 +157,9 @@ def test_missing_damaged_and_executable_files_are_refused(tmp_path):
     )  # a class of ours: unpickling it would run code
     with pytest.raises(WeightsUnfit, match="cannot be read as one"):
         load_network(tmp_path / "code.pt")
+
+
+def test_weights_that_do_not_fit_are_refused_before_anything_is_read(tmp_path):
+    (tmp_path / "junk.pt").write_bytes(b"no checkpoint")
+    with pytest.raises(ValueError, match=r"--weights: .*junk.pt: expected a PyTorch checkpoint"):
+        method("mvsnet", tmp_path / "junk.pt")

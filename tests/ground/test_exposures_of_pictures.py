@@ -195,6 +195,12 @@ def test_a_table_that_cannot_be_right_is_refused_by_its_line(tmp_path, text, tol
         read_table(tmp_path / "t.csv")
 
 
+def test_a_table_that_is_no_text_is_refused_by_its_first_wrong_byte(tmp_path):
+    (tmp_path / "t.csv").write_bytes(b"name,iso\n\xff\xd8\n")
+    with pytest.raises(FormatError, match=r"t.csv: byte 9 is no text in UTF-8; expected a table"):
+        read_table(tmp_path / "t.csv")
+
+
 @settings(max_examples=100, deadline=None)
 @given(content=st.binary(max_size=80), whole=st.booleans())
 def test_no_bytes_of_a_table_end_in_anything_but_a_named_error(tmp_path_factory, content, whole):

@@ -51,7 +51,11 @@ def read_table(path: Path) -> dict[str, Light]:
         if path.stat().st_size > LARGEST_TABLE:
             raise FormatError(f"{path}: expected a table of at most {LARGEST_TABLE >> 20} MiB")
         rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines(), strict=True))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except UnicodeDecodeError as error:
+        raise FormatError(
+            f"{path}: byte {error.start} is no text in UTF-8; expected a table of comma-separated values"
+        ) from error
+    except (OSError, csv.Error) as error:
         raise FormatError(f"{path}: the table cannot be read: {reason(error)}") from error
     names = [name.strip() for name in rows[0]] if rows else []
     if (
