@@ -77,8 +77,13 @@ def parse_checked_line(line: bytes) -> dict[str, Any]:
     if found is None:
         raise ValueError(f"expected a line of JSON that ends with its checksum, got {line[-40:]!r}")
     if int(found[2], 16) != zlib.crc32(found[1]):
-        raise ValueError(f"the checksum does not fit the line {line[:40]!r}")
+        raise ValueError(f"the checksum does not fit the line, which begins with {_beginning(line)}")
     return json.loads(found[1] + b"}")
+
+
+def _beginning(line: bytes) -> str:
+    """Return the first characters of a line as one that can be shown."""
+    return " ".join(line[:40].decode(errors="replace").split())
 
 
 @dataclass(frozen=True)

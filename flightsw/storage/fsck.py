@@ -104,6 +104,10 @@ class _Check:
         """Check and repair; the files that a running flight software may be writing are left where it runs."""
         if not (self.folder / "frames").is_dir():
             raise StoreError(f"{self.folder} is no frame store: it has no folder frames/")
+        if (self.folder / "session.json").exists():
+            raise StoreError(
+                f"{self.folder} is a session of the ground, no frame store: give flight's store with --store"
+            )
         try:
             for path in self._container_paths():  # without the lock, since it takes long
                 self._look_at(path)

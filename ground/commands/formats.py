@@ -314,6 +314,11 @@ def export_command(
     if (out.exists() and not out.is_dir()) or (out / "session.json").exists():
         kind = "a session" if out.is_dir() else "a file"
         raise SessionError(f"{out} is {kind}: give a folder of its own with --out, new or empty")
+    if format_ is not ExportFormat.NDM and out.is_dir() and any(out.iterdir()):
+        raise SessionError(
+            f"{out} is not empty, and an import would take what is there for part of the export: give another --out, "
+            "or remove it first"
+        )
     opened = open_run(*run_at(source)) if source.is_dir() and not is_session(source) else None
     if format_ is ExportFormat.NDM:
         counts = export_ndm(open_session(source) if opened is None else opened.session, out, opened)

@@ -147,6 +147,14 @@ def test_quarantined_containers_are_kept_and_never_overwritten(folder, make_fram
     assert len(list((folder / "quarantine").iterdir())) == 2
 
 
+def test_a_session_of_the_ground_is_no_frame_store(tmp_path):
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "session.json").write_text("{}")
+    with pytest.raises(StoreError, match="is a session of the ground, no frame store"):
+        fsck(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames", "session.json"]
+
+
 def test_deleted_frames_stay_deleted(folder):
     FrameStore(folder).drop(4)
     break_index_twice(folder)

@@ -658,10 +658,16 @@ def test_the_commands_import_and_export(tmp_path):
     assert json.loads(done.stdout)["frames"] == 6
     done = call("ground", "export", str(tmp_path / "s"), "--out", str(tmp_path / "out"), "--json")
     assert sum(json.loads(done.stdout).values()) == 6
-    for out, told in ((tmp_path / "s", "is a session"), (tmp_path / "s" / "session.json", "is a file")):
+    before = sorted(path for path in (tmp_path / "out").rglob("*"))
+    for out, told in (
+        (tmp_path / "s", "is a session"),
+        (tmp_path / "s" / "session.json", "is a file"),
+        (tmp_path / "out", "is not empty"),  # what an export of other frames left would be imported with it
+    ):
         refused = call("ground", "export", str(tmp_path / "s"), "--out", str(out))
         assert refused.returncode == 1 and told in " ".join(refused.stderr.split())
     assert not (tmp_path / "s" / "train").exists()
+    assert sorted(path for path in (tmp_path / "out").rglob("*")) == before
     wrong = call(
         "ground", "import", "--format", "obj", "--from", str(tmp_path), "--session", str(tmp_path / "t")
     )

@@ -565,6 +565,9 @@ def test_imported_pictures_show_no_time_range_or_sun_that_nobody_stated(session)
         assert "ms" not in page.file_name("view") and page.file_name("view").startswith(
             f"A-run-frame{page.record.id:06d}-"
         )
+        assert all(end == round(end, 2) for crop in page.crops for end in crop.value), (
+            "as the panel shows them"
+        )
         assert "units of the imported poses" in ruler.measured(shown, np.zeros(3), np.ones(3))
     finally:
         server.stop()
@@ -592,7 +595,7 @@ def test_two_runs_have_names_overlays_a_legend_and_a_picture_is_saved_at_once(se
             page.get_by_text("seen by no frame").wait_for()
             with page.expect_download() as saved:
                 page.get_by_text("Save picture").click()
-            assert saved.value.suggested_filename == page_viewer.file_name("view")
+            assert saved.value.suggested_filename == page_viewer.file_name("view-of-uncertainty of radiance")
     finally:
         server.stop()
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import zlib
 
 import pytest
@@ -78,3 +79,11 @@ def test_where_both_are_damaged_nothing_is_made_up(tmp_path):
     copy_of(path).write_bytes(b"\0")
     with pytest.raises(ValueError, match="checksum"):
         read_twice(path, pytest.fail)
+
+
+def test_a_line_whose_checksum_does_not_fit_is_told_by_its_beginning():
+    line = checked_line({"schema_version": 1, "name": "a\nb"}).replace(b"1", b"2", 1)
+    with pytest.raises(
+        ValueError, match=re.escape('the line, which begins with {"schema_version": 2, "name": "a')
+    ):
+        parse_checked_line(line.rstrip(b"\n"))

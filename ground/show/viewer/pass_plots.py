@@ -28,6 +28,7 @@ from ground.show.telemetry_plots import (
 TELEMETRY, EVENTS = "telemetry.jsonl", "events.jsonl"
 EVENTS_SHOWN = 30
 PLOT_PX, PANEL_PX = 120, 330
+TOP_PX = 12  # beside which the topmost number of an axis, and the last one, are whole
 STEPS_A_SECOND = 10  # of the slider; the replay itself goes on between them
 SPEEDS = {"1x": 1.0, "10x": 10.0, "100x": 100.0, "1000x": 1000.0}
 SEVERITY_COLOURS = {"info": "inherit", "warning": LIMIT_COLOURS["yellow"], "error": LIMIT_COLOURS["red"]}
@@ -148,6 +149,7 @@ class PassPlots:
             title=f"{named(series.item)}{unit_of(series.item)}",
             legend=uplot.Legend(show=False),
             height=PLOT_PX,
+            padding=(TOP_PX, TOP_PX, 0, 0),
         )
 
     def _draw(self, controls: Controls, seconds: float) -> None:

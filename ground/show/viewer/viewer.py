@@ -184,8 +184,11 @@ class Viewer:
             reach_m = RADIUS / self.placed[0].per_metre
             unit = "m" if states_scale(self.placed[0].shown.session) else "units"
             for axis, middle in zip("xyz", self.placed[0].centre_m, strict=True):
-                ends = float(middle - 1.5 * reach_m), float(middle + 1.5 * reach_m)
-                crop = gui.add_multi_slider(f"{axis}, {unit}", *ends, step=reach_m / 100, initial_value=ends)
+                # two digits behind the first of the reach, as the slider shows them
+                digits = 2 - math.floor(math.log10(reach_m))
+                low, high = (round(float(middle + side * 1.5 * reach_m), digits) for side in (-1, 1))
+                step = 10.0**-digits
+                crop = gui.add_multi_slider(f"{axis}, {unit}", low, high, step, initial_value=(low, high))
                 crop.on_update(lambda _: self._crop())
                 self.crops.append(crop)
 
@@ -380,7 +383,8 @@ class Viewer:
             shape = client.camera.image_height, client.camera.image_width
             image = client.get_render(*shape, transport_format="png", timeout=60)
             png = imagecodecs.png_encode(np.ascontiguousarray(on_black(image)))
-            client.send_file_download(self.file_name("view"), bytes(png), save_immediately=True)
+            what = "view" if self.colour == SENSOR else f"view-of-{self.colour}"
+            client.send_file_download(self.file_name(what), bytes(png), save_immediately=True)
 
     def _save_turntable(self, client: viser.ClientHandle | None) -> None:
         """Send the first model's turntable, drawn by our own renderer at the chosen exposure."""
