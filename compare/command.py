@@ -60,6 +60,7 @@ def compare_command(
             from compare.charts.figures import write_figures
             from compare.charts.page import write_page
             from compare.conditions import AS_TAKEN, Condition, load_conditions
+            from compare.errors import CompareError
             from compare.grid.cells import cells_of, parse_budgets, session_facts
             from compare.grid.origin import this_command
             from compare.grid.run import run_grid
@@ -70,7 +71,7 @@ def compare_command(
         shares = parse_budgets(budgets)
         # what is no method and no number of workers is told before anything is read
         if not names:
-            raise ValueError(
+            raise CompareError(
                 "no method is named: give --methods names with commas between, such as obbgs,3dgs"
             )
         for name in names:

@@ -124,12 +124,10 @@ def cells_of(
 
     Raises:
         ValueError: no such method, no seed, or no weights where they are needed.
-        CompareError: no method is named, or two sessions have one name or the same content.
+        CompareError: two sessions have one name or the same content.
     """
     if seeds < 1:
         raise ValueError(f"--seeds: expected 1 or more, got {seeds}")
-    if not methods:
-        raise CompareError("no method is named: give --methods names with commas between, such as obbgs,3dgs")
     known: dict[str, Path] = {}
     for facts in sessions:
         for key in (facts.name, facts.digest):

@@ -124,7 +124,7 @@ def import_command(
 def _check_there(format_: ImportFormat, folder: Path, masks: Path | None) -> None:
     from flightsw.icd.config import ConfigError
 
-    if format_ is not ImportFormat.VIDEO and not folder.is_dir():
+    if format_ is ImportFormat.IMAGES and not folder.is_dir():
         raise ConfigError("--from", f"expected a folder that is there, got {folder}")
     if masks is not None and masks.name != "screen" and not masks.exists():
         raise ConfigError("--masks", f"expected a folder that is there, got {masks}")

@@ -199,7 +199,10 @@ def row_of(target: Target, name: str, number: int) -> dict:
     model = target.model
     found = inspect(cad.moved(anywhere), model.surface, model.solid, model.views, seed=number)
     seconds = time.process_time() - began
-    told, others = _told(found, truth, kind, target.pixel_m)
+    # a fault of the design is where the design was found to lie, which of a symmetric one may be turned
+    there = found.place.matrix() @ anywhere if kind in ("panel", "missing") else np.eye(4)
+    place = there[:3, :3] @ truth["place"] + there[:3, 3] if truth else np.full(3, np.inf)
+    told, others = _told(found, truth, kind, target.pixel_m, place)
     # the size that a point of the design gets: the true one is that of the design that is not moved
     scale = found.place.scale * np.cbrt(np.linalg.det(anywhere[:3, :3]))
     return {
@@ -217,12 +220,11 @@ def row_of(target: Target, name: str, number: int) -> dict:
     }
 
 
-def _told(found: Inspection, truth: dict, kind: str, pixel_m: float) -> tuple[dict, list]:
-    """Return what was told of the fault, and the findings that are none of it."""
+def _told(found: Inspection, truth: dict, kind: str, pixel_m: float, place: np.ndarray) -> tuple[dict, list]:
+    """Return what was told of the fault at a place [3] m of the body, and the findings that are none of it."""
     panels = [(turn, np.degrees(turn.tilt_rad), np.degrees(turn.interval).tolist()) for turn in found.turns]
     told: dict = {}
     others: list = []
-    place = np.array(truth.get("place", [np.inf] * 3))
     reach = {
         "panel": 3 * pixel_m,
         "missing": (0.9 * truth.get("size_px", 0) + 2) * pixel_m,

@@ -566,9 +566,9 @@ def test_a_wrong_method_is_told_before_anything_is_read(tmp_path):
     )
     assert done.returncode == 2 and "nonsense" in done.stderr
     assert "reading" not in done.stderr and not (tmp_path / "out").exists()
-    for option, value, told in (
-        ("--methods", "", "no method is named"),
-        ("--workers", "x", "--workers: expected"),
+    for option, value, told, code in (
+        ("--methods", "", "no method is named", 1),
+        ("--workers", "x", "--workers: expected", 2),
     ):
         done = call("ground", "compare", str(tmp_path), option, value, "--out", str(tmp_path / "out"))
-        assert done.returncode == 2 and told in done.stderr and len(done.stderr.splitlines()) == 1
+        assert done.returncode == code and told in done.stderr and len(done.stderr.splitlines()) == 1

@@ -606,7 +606,7 @@ def test_what_cannot_be_one_session_is_refused(tmp_path):
     write_session(views, tmp_path / "s", "lego")
     with pytest.raises(SessionError, match="holds a session already"):
         write_session(views, tmp_path / "s", "lego")
-    told = call("ground", "import", "--format", "nerf", "--from", tmp_path, "--session", tmp_path / "s")
+    told = call("ground", "import", "--format", "nerf", "--from", "nowhere", "--session", tmp_path / "s")
     # before anything is read or checked
     assert told.returncode == 1 and "holds a session already" in told.stderr
     write_png(tmp_path / "lego/val/r_0.png", np.zeros((5, 5, 3), dtype=np.uint8))
