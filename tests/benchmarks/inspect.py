@@ -110,7 +110,7 @@ def _put_on(target: Target, rng: np.random.Generator) -> tuple[CadMesh, dict]:
                 np.concatenate([target.body.part, alone.part]),
                 (*target.body.names, "put on"),
             )
-            return cad, {"size_px": size_px, "place": middle.tolist(), "depth_px": size_px}
+            return cad, {"fault_px": size_px, "place": middle.tolist(), "depth_px": size_px}
     raise NoPlace
 
 
@@ -144,7 +144,7 @@ def _cut_off(target: Target, rng: np.random.Generator) -> tuple[CadMesh, dict]:
         low, high = cut.min(axis=0) - 0.1 * target.pixel_m, cut.max(axis=0) + 0.1 * target.pixel_m
         cad = _without(target.body, part, low, high, axis, float((points @ axis).max() - size))
         depth_px = float(np.quantile(stands_off, 0.95)) / target.pixel_m
-        return cad, {"size_px": size_px, "place": cut.mean(axis=0).tolist(), "depth_px": depth_px}
+        return cad, {"fault_px": size_px, "place": cut.mean(axis=0).tolist(), "depth_px": depth_px}
     raise NoPlace
 
 
@@ -227,8 +227,8 @@ def _told(found: Inspection, truth: dict, kind: str, pixel_m: float, place: np.n
     others: list = []
     reach = {
         "panel": 3 * pixel_m,
-        "missing": (0.9 * truth.get("size_px", 0) + 2) * pixel_m,
-        "added": (0.9 * truth.get("size_px", 0) + 2) * pixel_m,
+        "missing": (0.9 * truth.get("fault_px", 0) + 2) * pixel_m,
+        "added": (0.9 * truth.get("fault_px", 0) + 2) * pixel_m,
         "none": -1.0,
     }[kind]
     for turn, degrees, interval in panels:
@@ -273,12 +273,12 @@ def summary(rows: list[dict]) -> dict:
         "panels of 10 degrees or more found": share([r["found"] for r in panels if r["degrees"] >= 10]),
         "panels of less found": share([r["found"] for r in panels if r["degrees"] < 10]),
         "missing of 5 px or more found": share(
-            [r["found"] for r in parts if r["size_px"] >= 5 and r["kind"] == "missing"]
+            [r["found"] for r in parts if r["fault_px"] >= 5 and r["kind"] == "missing"]
         ),
         "added of 5 px or more found": share(
-            [r["found"] for r in parts if r["size_px"] >= 5 and r["kind"] == "added"]
+            [r["found"] for r in parts if r["fault_px"] >= 5 and r["kind"] == "added"]
         ),
-        "smaller parts found": share([r["found"] for r in parts if r["size_px"] < 5]),
+        "smaller parts found": share([r["found"] for r in parts if r["fault_px"] < 5]),
         "intervals that hold": share(inside),
         "false alarms of parts and panels looked at": f"{sum(len(r['others']) for r in rows)} of {checked}",
         "inspections with a false alarm": share([bool(r["others"]) for r in rows]),
