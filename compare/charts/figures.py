@@ -141,8 +141,7 @@ def _size(results: Results) -> Figure:
 
 
 def _failures(results: Results) -> Figure:
-    labels = results.trained
-    conditions = [c for c in results.conditions if any(results.was_run(label, c) for label in labels)]
+    labels, conditions = results.trained, results.trained_conditions
     figure = Figure(figsize=(2.5 + 1.1 * len(labels), 1.6 + 0.35 * len(conditions)), layout="constrained")
     axis = figure.subplots()
     verdicts = [[results.verdict(label, condition)[0] for label in labels] for condition in conditions]

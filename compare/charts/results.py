@@ -187,6 +187,11 @@ class Results:
         """Tell whether a method was run under a condition on any target."""
         return any(self.of(label, target, condition) for target in self.targets)
 
+    @property
+    def trained_conditions(self) -> list[str]:
+        """The conditions under which any training was run."""
+        return [c for c in self.conditions if any(self.was_run(label, c) for label in self.trained)]
+
     def run_on(self, target: str) -> list[str]:
         """Return the methods that were run on a target as it was taken."""
         return [label for label in self.labels if self.of(label, target, self.base)]

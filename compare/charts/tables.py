@@ -65,10 +65,9 @@ def failure_table(results: Results) -> str:
     """
     labels = results.trained
     lines = []
-    for condition in results.conditions:
-        if any(results.was_run(label, condition) for label in labels):
-            row = "".join(_verdict_cell(results, label, condition) for label in labels)
-            lines.append(f"<tr><td>{html.escape(condition)}</td>{row}</tr>")
+    for condition in results.trained_conditions:
+        row = "".join(_verdict_cell(results, label, condition) for label in labels)
+        lines.append(f"<tr><td>{html.escape(condition)}</td>{row}</tr>")
     return _table("condition", [breakable(label) for label in labels], lines, "scores map") if lines else ""
 
 

@@ -122,6 +122,11 @@ def import_command(
 
 
 def _check_there(format_: ImportFormat, folder: Path, masks: Path | None) -> None:
+    """Check that photographs and masks are there, before minutes are spent on one without the other.
+
+    Raises:
+        ConfigError: a folder is not; readers of the other formats say themselves what they expect of theirs.
+    """
     from flightsw.icd.config import ConfigError
 
     if format_ is ImportFormat.IMAGES and not folder.is_dir():

@@ -262,19 +262,10 @@ def _as_it_was(session: Session, folder: Path, count: int) -> Session:
         return then
     differing = [NAMES_OF_FACTS[key] for key, value in now.items() if noted.get(key, value) != value]
     if differing:
-        again = [
-            "ground",
-            "reconstruct",
-            "--session",
-            str(session.path),
-            "--name",
-            folder.name,
-            "--overwrite",
-        ]
+        given = shlex.join(["--session", str(session.path), "--name", folder.name])
         raise SessionError(
             f"{session.path} has changed since {folder.name} was made of it ({', '.join(differing)}), so the run is "
-            "neither scored nor shown with it; "
-            f"`{shlex.join(again)}` makes it again"
+            f"neither scored nor shown with it; `ground reconstruct {given} --overwrite` makes it again"
         )
     return then
 
