@@ -44,6 +44,10 @@ AGREEMENT = 0.95  # share of views that must see light where a voxel projects
 COARSE_VOXELS = 64  # along each axis of the first grid
 SUBDIVISIONS = 2  # of the first grid, at most; each halves the voxels
 VIEWS_AT_ONCE = 4  # between two looks for points that are out of the hull already
+SAMPLED, WORTH = (
+    64,
+    0.5,
+)  # of so few voxels is judged whether a coarse grid is carved: not where more than half stay
 FINEST_PX = 0.7  # smallest width of a voxel in the image
 VOXELS_AT_ONCE = 1_000_000  # bounds the memory
 POINTS_AT_ONCE = 1 << 17  # of one thread; with fewer, threads of Python wait for each other
@@ -207,8 +211,14 @@ def hull_points(silhouettes: list[Silhouette], radius: float) -> tuple[Tensor, f
             inside, voxel_m = _doubled(inside), voxel_m / 2
         # a coarse voxel survives when light falls anywhere near its projection, a final one when at its centre
         reach_m = 0.87 * voxel_m * (level < subdivisions)
-        points = _centres(inside, voxel_m, radius).split(VOXELS_AT_ONCE)
-        shares = torch.cat([agreement(silhouettes, p, reach_m, AGREEMENT) for p in points])
+        points = _centres(inside, voxel_m, radius)
+        if (
+            reach_m
+            and (agreement(silhouettes, points[::SAMPLED], reach_m) >= AGREEMENT).float().mean() > WORTH
+        ):
+            continue
+        pieces = points.split(VOXELS_AT_ONCE)
+        shares = torch.cat([agreement(silhouettes, p, reach_m, AGREEMENT) for p in pieces])
         inside[inside.clone()] = shares >= AGREEMENT
         if not inside.any():
             break

@@ -1,5 +1,6 @@
 """Boxes, hull, growth, distances and files of the model."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -69,7 +70,7 @@ def test_the_radius_encloses_nearly_all_light_and_never_holds_the_light_of_all_v
     assert largest.numbers <= 2 * 100 * 100  # the places of one view's pixels
 
 
-def test_the_hull_of_a_ball_is_its_surface():
+def test_the_hull_of_a_ball_is_its_surface(monkeypatch):
     silhouettes, K = [], torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
     rows, columns = torch.meshgrid(torch.arange(100) + 0.5, torch.arange(100) + 0.5, indexing="ij")
     radius_px = 100 * 1.0 / math.sqrt(5**2 - 1)  # the outline of a unit ball five metres away
@@ -85,6 +86,15 @@ def test_the_hull_of_a_ball_is_its_surface():
     # 40 outlines bound the ball from outside; a pixel is 5 cm, a voxel 0.8 cm; the vote lets corners stand out
     assert len(points) > 1000 and distance.min() > 0.9 and distance.median() < 1.08
     assert hull.coherence(silhouettes, points, voxel_m) > 0.99
+    # noise in all views keeps most coarse voxels: they are not carved then, and the hull is the same
+    rng = torch.Generator().manual_seed(0)
+    specks = [torch.rand(100, 100, generator=rng) < 0.15 for _ in silhouettes]
+    noisy = [dataclasses.replace(s, likely=s.likely | n) for s, n in zip(silhouettes, specks, strict=True)]
+    found = []
+    for worth in (0.5, 1.0):
+        monkeypatch.setattr(hull, "WORTH", worth)
+        found.append(hull.hull_points(noisy, hull.radius_m(noisy))[0])
+    assert torch.equal(*found)
     lost = points[
         points[:, 0] < 0
     ]  # half a hull covers less of what the views show, but more than half of it

@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import grey_opening
 from scipy.optimize import minimize
 from scipy.stats import norm
 
@@ -18,7 +19,7 @@ from obbgs_core.render import render
 from obbgs_core.score.metrics import psnr_db
 from obbgs_core.sensor import Sensor
 from obbgs_core.start import sky_level
-from obbgs_core.start.sky_level import field, levelled
+from obbgs_core.start.sky_level import cut_pixels, field, levelled
 from obbgs_core.train import train
 from tests.scenes import QUICK, SENSOR, LargestTensor, ball, photographed, target
 
@@ -216,3 +217,11 @@ def test_stars_and_a_noisy_ball_do_not_move_the_level():
         rows, columns = rng.integers(0, f.dn.shape[0], (2, 30))
         f.dn[rows, columns] += 300
     assert levelled(frames, SENSOR)[2].fits
+
+
+@given(st.integers(1, 30), st.integers(1, 30), st.floats(0.7, 1), st.integers(0, 2**31 - 1))
+def test_pixels_that_were_not_sent_are_those_of_squares_of_nothing_but_black(height, width, share, seed):
+    black = np.random.default_rng(seed).random((height, width)) < share
+    dn = torch.from_numpy(np.where(black, SENSOR.black_dn, SENSOR.black_dn + 1)).float()[..., None]
+    opened = grey_opening(black, size=5, mode="nearest")
+    assert torch.equal(cut_pixels(SENSOR, dn), torch.from_numpy(opened))
