@@ -1,6 +1,7 @@
 """The registry of compared methods: how each is run, and which axes of a grid change what it does."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +13,7 @@ from torch import Tensor
 from compare import references
 from compare.case import Case
 from compare.opponents.mvsnet import WeightsUnfit, load_network, reconstruct_mvsnet
+from compare.opponents.mvsnet_network import MvsNet
 from compare.opponents.nerf import AS_PUBLISHED, FOR_A_CPU, Knowing, Size, reconstruct_nerf
 from compare.opponents.plane_sweep import reconstruct_mvs
 from compare.opponents.reconstruction import Reconstruction, Work
@@ -87,11 +89,12 @@ def method(name: str, weights: Path | None = None) -> Method:
     if name == MVSNET:
         if weights is None or not weights.is_file():
             raise ValueError(f"{MVSNET} needs the file of its weights: --weights FILE, got {weights}")
+        status = weights.stat()
         try:
-            _, digest, _ = load_network(weights)
+            loaded = _network(weights.resolve(), status.st_mtime_ns, status.st_size)
         except WeightsUnfit as error:
             raise ValueError(f"--weights: {error}") from error
-        return Method(name, lambda task: _learned(task, weights), {"weights": digest})
+        return Method(name, lambda task: _learned(task, loaded), {"weights": loaded[1]})
     if name in _REFERENCES:
         return Method(name, lambda task: _reference(task, _REFERENCES[name]))
     if name in _BASELINES:
@@ -172,8 +175,14 @@ def _stereo(task: Task, one_exposure: bool) -> Outcome:
     return Outcome(reconstruct_mvs(task.frames, task.sensor, task.work, one_exposure))
 
 
-def _learned(task: Task, weights: Path) -> Outcome:
-    return Outcome(reconstruct_mvsnet(task.frames, task.sensor, weights, task.work))
+@functools.lru_cache(maxsize=1)
+def _network(weights: Path, changed_ns: int, size_bytes: int) -> tuple[MvsNet, str, str]:
+    """Return a file's network, digest and description, read once for as long as the file stays as it is."""
+    return load_network(weights)
+
+
+def _learned(task: Task, loaded: tuple[MvsNet, str, str]) -> Outcome:
+    return Outcome(reconstruct_mvsnet(task.frames, task.sensor, loaded, task.work))
 
 
 def _motion(task: Task, pictures: Pictures) -> Outcome:

@@ -27,6 +27,9 @@ KEY_HELP = "The file of the mission's key"
 SEED_HELP = "The same seed gives the same result"
 PARTS = ("flightsw", "ground", "compare", "hil", "obbgs_core", "obbgs_base")
 OUT_HELP = "What to write, a file or a folder"
+USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[
+    1
+]  # of any wrong option; Typer shows only this one by name
 SET_HELP = "A setting, NAME=VALUE; can be repeated, and a wrong name tells the nearest"
 
 
@@ -96,7 +99,9 @@ def run(app: typer.Typer, tool: str) -> None:
     handler.setLevel(logging.WARNING)
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     try:
-        app()
+        sys.exit(app(standalone_mode=False) or 0)  # which leaves it to us to say what is wrong, without a box
+    except USAGE_ERROR as error:
+        _end(tool, _usage(error), 2)
     except ModuleNotFoundError as error:
         message = how_to_install(error, tool)
         if message is None:
@@ -133,7 +138,15 @@ class _ToStderr(logging.StreamHandler):
         super().emit(record)
 
 
+def _usage(error: Any) -> str:
+    """Return what is wrong with a command's words, in a line; nothing where the command's help was shown instead."""
+    message = " ".join(error.format_message().split()).rstrip(".")
+    where = "" if error.ctx is None else f" See `{error.ctx.command_path} --help`."
+    return message and f"{message}.{where}"
+
+
 def _end(tool: str, message: str, exit_code: int) -> None:
-    with output_may_fail():
-        print(f"{tool}: {message}", file=sys.stderr)
+    if message:
+        with output_may_fail():
+            print(f"{tool}: {message}", file=sys.stderr)
     sys.exit(exit_code)

@@ -39,7 +39,7 @@ class NetworkSettings:
 def reconstruct_mvsnet(
     frames: list[TrainingFrame],
     sensor: Sensor,
-    weights: Path,
+    loaded: tuple[MvsNet, str, str],
     work: Work,
     settings: NetworkSettings | None = None,
 ) -> Reconstruction:
@@ -48,15 +48,14 @@ def reconstruct_mvsnet(
     Frames are brought to one exposure and clipped at full scale, since the network knows pictures from 0 to 1.
 
     Args:
-        weights: a checkpoint of `MvsNet` or of MVSNet_pytorch, of any width.
+        loaded: what `load_network` returns of a checkpoint of `MvsNet` or of MVSNet_pytorch, of any width.
 
     Raises:
-        WeightsUnfit: no such file, or not one of this network.
         TooFewFrames, ReconstructionError: the frames do not fit together, or are black.
         Interrupted: `work.should_stop` returned true; the depth maps that are done are kept in `work.folder`.
     """
     settings = settings or NetworkSettings()
-    network, digest, description = load_network(weights)
+    network, digest, description = loaded
     views = prepare(frames, sensor, one_exposure=True)
     pairs = neighbours(views, settings.sources)
     figures: dict[str, Any] = {"weights": description, "frames_used": len(views.views)}

@@ -203,10 +203,10 @@ def _implausible(camera: CameraSection, asked_s: float, exposure: Exposure) -> F
     expected = (camera.height, camera.width) + ((3,) if camera.channels == 3 else ())
     if dn.shape != expected or dn.dtype != np.uint16:
         found = f"{name} has {dn.shape} {dn.dtype}, the mission's camera {expected} uint16"
-        return Finding.failed("camera", found, "correct mission.camera, or the region set in the camera")
+        return Finding.failed("camera", found, "correct camera, or the region set in the camera")
     if dn.max() > camera.white_dn:
         found = f"{name} reads up to {dn.max()}, {camera.bit_depth} bits end at {camera.white_dn}"
-        return Finding.failed("camera", found, "correct mission.camera.bit_depth, or the pixel format")
+        return Finding.failed("camera", found, "correct camera.bit_depth, or the pixel format")
     if dn.min() == dn.max():
         found = f"{name} reads {dn.min()} everywhere"
         return Finding.failed("camera", found, "look at the sensor: not even noise is in the picture")
@@ -218,7 +218,7 @@ def _implausible(camera: CameraSection, asked_s: float, exposure: Exposure) -> F
         found = (
             f"{name}: the darkest hundredth reads {dark_dn:.0f}, below the black level of {camera.black_dn:g}"
         )
-        return Finding.failed("camera", found, "calibrate mission.camera.black_dn")
+        return Finding.failed("camera", found, "calibrate camera.black_dn")
     return None
 
 

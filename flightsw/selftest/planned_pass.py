@@ -93,7 +93,7 @@ def check_view(mission: Mission) -> list[Finding]:
     if not all(ranges_m):
         return []
     view, problems = field_of_view(mission, ranges_m)
-    advice = "correct mission.camera and bracket.target_extent_m, and look at `flightsw plan`"
+    advice = "correct camera and bracket.target_extent_m, and look at `flightsw plan`"
     return [Finding.warning("view", problem, advice) for problem in problems] or [Finding.ok("view", view)]
 
 

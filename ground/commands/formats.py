@@ -25,6 +25,7 @@ from ground.commands.options import (
     ValuesGiven,
 )
 from obbgs_base.command_line import FRAMES_HELP, OUT_HELP, AsJson
+from obbgs_base.errors import in_words
 from obbgs_base.stopping import StopRequest
 
 if TYPE_CHECKING:
@@ -325,11 +326,16 @@ def export_command(
             "or remove it first"
         )
     opened = open_run(*run_at(source)) if source.is_dir() and not is_session(source) else None
-    if format_ is ExportFormat.NDM:
-        counts = export_ndm(open_session(source) if opened is None else opened.session, out, opened)
-    else:
-        read = open_session(source) if opened is None else refined_session(opened)
-        read.check_body_axes()
-        counts = exporters[format_](read, out)
+    try:
+        if format_ is ExportFormat.NDM:
+            counts = export_ndm(open_session(source) if opened is None else opened.session, out, opened)
+        else:
+            read = open_session(source) if opened is None else refined_session(opened)
+            read.check_body_axes()
+            counts = exporters[format_](read, out)
+    except OSError as error:
+        raise SessionError(
+            f"{in_words(error)}; give --out a folder that can be written and has room"
+        ) from error
     text = ", ".join(f"{count} {split}" for split, count in counts.items())
     print(json.dumps(counts) if json_ else f"{text} in {out}")

@@ -82,7 +82,8 @@ def _sessions_table(sessions: "list[SessionEntry]") -> Table:
         table.add_column(heading, overflow="fold")
     for s in sessions:
         captured = "" if s.frames_captured is None else f" of {s.frames_captured}"
-        lost = _counts(s.frames_lost) or ("" if s.imported_from else "nothing")  # pictures came over no link
+        lost = _counts(s.frames_lost) or ("" if s.imported_from or s.damage else "nothing")
+        # pictures came over no link, and of what is damaged each line says what is lost
         if s.frames_missing:
             least = "at least " if s.frames_captured is None else ""
             lost += f"; {least}{s.frames_missing:,} not received yet"

@@ -5,6 +5,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from compare import methods
 from compare.methods import method
 from compare.opponents import mvsnet
 from compare.opponents.mvsnet import NetworkSettings, WeightsUnfit, load_network, reconstruct_mvsnet
@@ -102,7 +103,7 @@ def test_training_again_gives_the_same_weights(trained):
 def test_a_reconstruction_keeps_its_depth_maps_and_names_its_weights(weights, tmp_path):
     poses = raycast.looking_at_origin(raycast.directions(5, 20), 4.5)
     frames, _ = raycast.photographed(raycast.spacecraft(3), poses, 64, 120.0, samples=1)
-    result = reconstruct_mvsnet(frames, raycast.SENSOR, weights, Work(tmp_path), TINY)
+    result = reconstruct_mvsnet(frames, raycast.SENSOR, load_network(weights), Work(tmp_path), TINY)
     assert result.figures["weights"] == "trained for a test" and result.figures["depth_maps"] == 5
     assert len(list(tmp_path.iterdir())) == 5
     network, _, _ = load_network(weights)
@@ -163,3 +164,18 @@ def test_weights_that_do_not_fit_are_refused_before_anything_is_read(tmp_path):
     (tmp_path / "junk.pt").write_bytes(b"no checkpoint")
     with pytest.raises(ValueError, match=r"--weights: .*junk.pt: expected a PyTorch checkpoint"):
         method("mvsnet", tmp_path / "junk.pt")
+
+
+def test_weights_are_read_once_for_the_digest_and_the_work_until_the_file_changes(tmp_path, monkeypatch):
+    read, path = [], tmp_path / "weights.pt"
+
+    def counted(file):
+        read.append(file)
+        return load_network(file)
+
+    monkeypatch.setattr(methods, "load_network", counted)
+    torch.save(MvsNet(2).state_dict(), path)
+    first = method("mvsnet", path)
+    assert method("mvsnet", path).stated == first.stated and len(read) == 1
+    torch.save(MvsNet(3).state_dict(), path)
+    assert method("mvsnet", path).stated != first.stated and len(read) == 2

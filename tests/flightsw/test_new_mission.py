@@ -101,6 +101,10 @@ def test_a_wrong_figure_is_named_and_nothing_is_written(tmp_path, elements, chan
     with pytest.raises(ConfigError, match=re.escape(message)):
         write_mission(tmp_path / "new.yaml", **(given | change))
     assert not (tmp_path / "new.yaml").exists()
+    with pytest.raises(
+        ConfigError, match=r"cannot be written: .*; give --out a file in a folder that is there"
+    ):
+        write_mission(tmp_path / "nowhere" / "new.yaml", **given)
 
 
 @pytest.mark.parametrize(

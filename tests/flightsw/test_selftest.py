@@ -240,6 +240,7 @@ def test_a_port_that_is_missing_hangs_up_or_takes_nothing_is_told_apart(monkeypa
 def test_a_camera_that_cannot_be_right_is_named(small_mission, show, options, state, found):
     with camera(show, **options) as url:
         (finding,) = devices.check_camera(small_mission, url)
+    assert "mission." not in finding.advice  # a key is named as it stands in the file
     assert finding.state == state and found in finding.found and finding.advice
 
 

@@ -666,12 +666,16 @@ def test_the_commands_import_and_export(tmp_path):
     ):
         refused = call("ground", "export", str(tmp_path / "s"), "--out", str(out))
         assert refused.returncode == 1 and told in " ".join(refused.stderr.split())
+    (tmp_path / "file").write_text("")
+    refused = call("ground", "export", str(tmp_path / "s"), "--out", str(tmp_path / "file" / "x"))
+    assert refused.returncode == 1 and "give --out a folder that can be written" in refused.stderr
+    (tmp_path / "file").unlink()
     assert not (tmp_path / "s" / "train").exists()
     assert sorted(path for path in (tmp_path / "out").rglob("*")) == before
     wrong = call(
         "ground", "import", "--format", "obj", "--from", str(tmp_path), "--session", str(tmp_path / "t")
     )
-    said = " ".join(wrong.stderr.replace("│", " ").split())
+    said = wrong.stderr
     assert wrong.returncode == 2 and "not one of 'nerf', 'nerfstudio', 'colmap', 'shirt'" in said
     empty = call(
         "ground", "import", "--format", "colmap", "--from", str(tmp_path), "--session", str(tmp_path / "t")

@@ -166,3 +166,12 @@ def test_only_what_came_over_a_link_can_be_lost(passes, tmp_path):
     (tmp_path / "taken" / "session.json").write_text(json.dumps(header))
     told = called("list", str(tmp_path))
     assert "nothing" not in told and "48 pictures" in told and "nerf: photographs" in told
+
+
+def test_of_a_session_without_one_of_its_pictures_no_line_says_that_nothing_is_lost(tmp_path):
+    folder = tmp_path / "A"
+    shutil.copytree(GOLDEN, folder)
+    assert "nothing" in called("list", str(folder), "--pictures")
+    next((folder / "frames").rglob("*.png")).unlink()
+    text = called("list", str(folder), "--pictures")
+    assert "damaged" in text and "nothing" not in text

@@ -181,7 +181,7 @@ def test_impossible_options_are_refused_before_anything_is_written(mission, tmp_
         monkeypatch.setattr(sys, "argv", command)
         with pytest.raises(SystemExit) as ended:
             cli.main()
-        told = " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().err).split())  # without the box around it
+        told = capsys.readouterr().err
         assert ended.value.code == 2 and reason in told
     assert not (tmp_path / "d").exists()
 

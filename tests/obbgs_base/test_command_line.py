@@ -1,7 +1,6 @@
 """What every command says of a value that it does not take: what was expected and what came, in our words."""
 
 import logging
-import re
 
 import pytest
 import typer
@@ -23,9 +22,24 @@ from tests.commands import call
 def test_a_wrong_value_is_refused_in_our_words(words, told):
     tool, *arguments = words.split()
     ended = call(tool, *arguments)
-    said = " ".join(re.sub("[│╭╮╰╯─]", " ", ended.stderr).split())  # without the box around it
-    assert ended.returncode == 2 and told in said
+    (said,) = ended.stderr.splitlines()
+    assert ended.returncode == 2 and said.startswith(f"{tool}: ") and told in said
     assert "Value error" not in said and "Input should" not in said
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("ground nope", "ground: No such command 'nope'. See `ground --help`."),
+        ("flightsw plan --nope", "flightsw: No such option: --nope. See `flightsw plan --help`."),
+        ("ground listen", "ground: Missing option '--link'. See `ground listen --help`."),
+        ("ground", None),  # its help is shown
+    ],
+)
+def test_words_that_are_no_command_of_ours_are_told_in_a_line(words, told):
+    tool, *arguments = words.split()
+    ended = call(tool, *arguments)
+    assert ended.returncode == 2 and ended.stderr.splitlines() == ([told] if told else [])
 
 
 def test_a_warning_begins_with_the_command_and_names_no_module_of_ours(capsys, monkeypatch):
