@@ -32,6 +32,7 @@ from obbgs_base.command_line import (
     new_app,
     run,
 )
+from obbgs_base.errors import counted
 from obbgs_base.output import output_may_fail
 from obbgs_base.stopping import stop_on_signals
 
@@ -414,13 +415,13 @@ def _run(
 def _print_result(result: RunResult, store_dir: Path) -> None:
     if (captured := result.captured) is not None:
         print(
-            f"captured {captured.stored} frames, {captured.already_stored} were taken before, "
+            f"captured {counted(captured.stored, 'frame')}, {captured.already_stored} were taken before, "
             f"{captured.failed} failed, {captured.refused} refused, {captured.pose_invalid} without a valid pose"
         )
         if captured.dropped:
-            print(f"{captured.dropped} frames were deleted undelivered to make room (store.when_full)")
+            print(f"deleted {counted(captured.dropped, 'frame')} undelivered to make room (store.when_full)")
         if captured.skipped:
-            print(f"{captured.skipped} exposures were not taken: safe mode")
+            print(f"{counted(captured.skipped, 'exposure')} not taken: safe mode")
         if result.camera_losses:
             times = "once" if result.camera_losses == 1 else f"{result.camera_losses} times"
             lost = (
@@ -432,8 +433,9 @@ def _print_result(result: RunResult, store_dir: Path) -> None:
                 f"the camera was lost {times}{' and never came back' if result.camera_is_lost else ''}: {lost}"
             )
     if result.sent is not None:
-        print(f"delivered {result.sent.delivered} frames, {result.sent.segments_resent} segments resent")
-    print(f"{result.frames_stored} frames in {store_dir}, {result.outbox} still to be delivered")
+        resent = counted(result.sent.segments_resent, "segment")
+        print(f"delivered {counted(result.sent.delivered, 'frame')}, {resent} resent")
+    print(f"{counted(result.frames_stored, 'frame')} in {store_dir}, {result.outbox} still to be delivered")
 
 
 def _progress() -> Progress:

@@ -58,11 +58,11 @@ class SteadyClock:
             )
         if self._step is None or abs(offset_ns - self._step[0]) >= STEP_NS:
             self._step = offset_ns, now_ns
-            return f"the clock stepped by {gain_ns / NS:+.3f} s; followed if it lasts {CONFIRM_NS / NS:g} s"
+            return f"the clock stepped by {gain_ns / NS:+z.3f} s; followed if it lasts {CONFIRM_NS / NS:g} s"
         if now_ns - self._step[1] < CONFIRM_NS:
             return ""
         self._offset_ns, self._step = offset_ns, None
-        return f"the clock's step by {gain_ns / NS:+.3f} s has lasted and is followed"
+        return f"the clock's step by {gain_ns / NS:+z.3f} s has lasted and is followed"
 
 
 utc_ns = SteadyClock().utc_ns  # of this process

@@ -92,10 +92,8 @@ def write_mission(
     try:
         write_whole(out, text.encode())
     except OSError as error:
-        raise ConfigError(
-            str(out),
-            f"cannot be written: {reason(error)}; give --out a file in a folder that is there and can be written",
-        ) from error
+        why = f"cannot be written: {reason(error)}; give --out a file in a folder that is there"
+        raise ConfigError(str(out), why) from error
     if _orbit(elements["target_tle"]) == _orbit(elements["chaser_tle"]):
         log.warning(
             "target and chaser have the same elements, so that they meet: give the chaser's own to --chaser-tle, which "

@@ -21,6 +21,7 @@ from ground.commands.systems import dictionary_command, yamcs_command
 from ground.commands.uplink import uplink_command
 from ground.commands.view import view_command
 from obbgs_base.command_line import LINK_HELP, MISSION_HELP, AsJson, new_app, run
+from obbgs_base.errors import counted
 from obbgs_base.output import output_may_fail
 from obbgs_base.stopping import stop_on_signals
 
@@ -82,7 +83,9 @@ def listen_command(
     if json_:
         print(json.dumps({"type": "summary"} | dataclasses.asdict(summary)))
     else:
-        print(f"{summary.frames_received} frames received, {summary.frames_in_session} in {session}")
+        print(
+            f"{counted(summary.frames_received, 'frame')} received, {summary.frames_in_session} in {session}"
+        )
     if exit_after is not None and summary.frames_in_session < exit_after:
         raise typer.Exit(1)
 

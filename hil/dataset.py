@@ -141,9 +141,6 @@ def make_dataset(
     done = _already_made(out, digest)
     if done is not None:
         return done
-    out.mkdir(parents=True, exist_ok=True)
-    _write_json(out / MARKER, {"complete": False, "digest": digest})
-
     focal_px = config.size_px / 2 / np.tan(np.radians(scenario.fov_deg) / 2)
     model = PRESETS[config.sensor]
     camera = model.camera_section(config.size_px, config.size_px, focal_px)
@@ -152,6 +149,10 @@ def make_dataset(
     shots = list(plan(mission))
     states = [scene.state(shot.mid_exposure_utc_ns) for shot in shots]
     with RenderFarm(mission, mesh, cache, workers, config.materials) as farm:
+        out.mkdir(
+            parents=True, exist_ok=True
+        )  # not before Blender has taken the mesh: a refusal leaves nothing
+        _write_json(out / MARKER, {"complete": False, "digest": digest})
         rendered = iter(range(1, len(states) + 1))  # a counter that the workers' threads share
         farm.prerender(
             [state.pose for state in states],

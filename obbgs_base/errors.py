@@ -33,6 +33,11 @@ def reason(error: BaseException) -> str:
     return words or type(error).__name__  # a TimeoutError may say nothing
 
 
+def counted(count: int, thing: str) -> str:
+    """Return how many there are of something in words: `1 frame`, `1,200 frames`."""
+    return f"{count:,} {thing}{'' if count == 1 else 's'}"
+
+
 def in_words(error: BaseException) -> str:
     """Return what went wrong as one line, with the file of a system's error before it: `FILE: Permission denied`."""
     file = getattr(error, "filename", None) if isinstance(error, OSError) else None

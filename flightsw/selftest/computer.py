@@ -44,7 +44,7 @@ def check_clock(mission: Mission) -> list[Finding]:
     after = time.monotonic(), time.time()
     gain_s = (after[1] - before[1]) - (after[0] - before[0])
     if abs(gain_s) > STEP_S:
-        found = f"stepped by {gain_s:+.3f} s within {STEADY_S} s"
+        found = f"stepped by {gain_s:+z.3f} s within {STEADY_S} s"
         findings.append(
             Finding.failed("clock", found, "wait until its synchronisation has settled, and test again")
         )

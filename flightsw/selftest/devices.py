@@ -192,7 +192,7 @@ def _bracket(mission: Mission, camera: Camera) -> list[tuple[float, Exposure]]:
         exposure = camera.expose(exposure_time_s, due_ns)
         late_s = (exposure.mid_exposure_utc_ns - due_ns) / NS - exposure_time_s / 2
         if abs(late_s) > CLOCK_S:
-            raise CaptureError(f"an exposure is stamped {late_s:+.3f} s beside the time it was asked for")
+            raise CaptureError(f"an exposure is stamped {late_s:+z.3f} s beside the time it was asked for")
         taken.append((exposure_time_s, exposure))
     return taken
 
@@ -215,9 +215,7 @@ def _implausible(camera: CameraSection, asked_s: float, exposure: Exposure) -> F
         return Finding.failed("camera", found, "ask for exposure times that the camera can take")
     dark_dn = float(np.percentile(dn, DARK_PERCENTILE))
     if dark_dn < camera.black_dn - SIGMAS * max(1.0, camera.read_noise_dn):
-        found = (
-            f"{name}: the darkest hundredth reads {dark_dn:.0f}, below the black level of {camera.black_dn:g}"
-        )
+        found = f"{name}: the darkest hundredth reads {dark_dn:z.0f}, below the black level of {camera.black_dn:g}"
         return Finding.failed("camera", found, "calibrate camera.black_dn")
     return None
 

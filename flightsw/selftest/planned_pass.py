@@ -42,33 +42,33 @@ def check_orbit(mission: Mission) -> list[Finding]:
         findings.append(state("orbit", found, "correct orbit.target_tle or orbit.chaser_tle"))
     elif not by_elements and ages_days["the last trigger"] > orbit.max_element_age_days:
         found = (
-            f"elements are {ages_days['the last trigger']:.1f} days old at the last trigger, "
+            f"elements are {ages_days['the last trigger']:z.1f} days old at the last trigger, "
             f"{orbit.max_element_age_days:g} are allowed: poses come from navigation, but the plan of the pass and the "
             "Earth's shadow are less exact"
         )
         findings.append(Finding.warning("orbit", found, NEWER))
     elif ages_days["the first trigger"] > orbit.max_element_age_days:
         found = (
-            f"elements are {ages_days['the first trigger']:.1f} days old at the first trigger, "
+            f"elements are {ages_days['the first trigger']:z.1f} days old at the first trigger, "
             f"{orbit.max_element_age_days:g} are allowed: every pose will be marked invalid"
         )
         findings.append(Finding.failed("orbit", found, NEWER))
     elif ages_days["the last trigger"] > orbit.max_element_age_days:
         found = (
-            f"elements are {ages_days['the last trigger']:.1f} days old at the last trigger, "
+            f"elements are {ages_days['the last trigger']:z.1f} days old at the last trigger, "
             f"{orbit.max_element_age_days:g} are allowed: poses at the end of the pass will be marked invalid"
         )
         findings.append(Finding.warning("orbit", found, NEWER))
     if last_ns < now_ns:
         days = (now_ns - last_ns) / (86_400 * NS)
-        found = f"the pass ended {days:.1f} days ago; elements are {ages_days['now']:.1f} days old now"
+        found = f"the pass ended {days:z.1f} days ago; elements are {ages_days['now']:z.1f} days old now"
         findings.append(
             Finding.warning("orbit", found, "set orbit.start_utc, or give --start now on a bench")
         )
     if not findings:
         found = (
             f"first trigger at {_utc(first_ns)}, range {ranges_m['the first trigger']:.0f} m, elements "
-            f"{ages_days['the first trigger']:.1f} days old then, {ages_days['now']:.1f} now"
+            f"{ages_days['the first trigger']:z.1f} days old then, {ages_days['now']:z.1f} now"
         )
         findings.append(Finding.ok("orbit", found))
     if not by_elements:

@@ -303,10 +303,10 @@ def shown(name: str, value: Any) -> str:
     if isinstance(value, bytes):
         return value.hex() if any(value) else "none"
     if isinstance(value, tuple):
-        return ", ".join(f"{number:g}" for number in value) + f" {item.unit}"
+        return ", ".join(f"{number:zg}" for number in value) + f" {item.unit}"
     if item.unit == "B":
         return size(value)
-    number = f"{value:.1f}" if isinstance(value, float) else f"{value}"
+    number = f"{value:z.1f}" if isinstance(value, float) else f"{value}"
     return f"{number} {item.unit}".rstrip()
 
 

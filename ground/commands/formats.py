@@ -1,11 +1,13 @@
 """Commands of `ground` that turn other formats into sessions and back: import and export."""
 
+import functools
 import json
 import math
 import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -25,7 +27,7 @@ from ground.commands.options import (
     ValuesGiven,
 )
 from obbgs_base.command_line import FRAMES_HELP, OUT_HELP, AsJson
-from obbgs_base.errors import in_words
+from obbgs_base.errors import Interrupted, ObbgsError, counted, in_words
 from obbgs_base.stopping import StopRequest
 
 if TYPE_CHECKING:
@@ -40,6 +42,23 @@ MOST_NAMED = 5  # pictures in one line; --json names all
 stderr = Console(stderr=True)
 
 
+def _leaves_nothing(command: Callable[..., None]) -> Callable[..., None]:
+    """Let a refused import take the session's folder away that it made; an interrupted one goes on there later."""
+
+    @functools.wraps(command)
+    def checked(session: Path, **given: Any) -> None:
+        is_new = not session.exists()
+        try:
+            command(session=session, **given)
+        except (ObbgsError, ValueError) as error:
+            if is_new and not isinstance(error, Interrupted):
+                shutil.rmtree(session, ignore_errors=True)
+            raise
+
+    return checked
+
+
+@_leaves_nothing
 def import_command(
     folder: Annotated[Path, typer.Option("--from", help="The data set's folder.")],
     session: SessionDir,
@@ -138,7 +157,7 @@ def _check_there(format_: ImportFormat, folder: Path, masks: Path | None) -> Non
 
 def _tell(count: int, session: Path, registration: dict) -> None:
     """Print how many pictures there are, and which photographs structure from motion left out or turned."""
-    print(f"{count} pictures in {session}")
+    print(f"{counted(count, 'picture')} in {session}")
     if registration.get("left_out"):
         print(f"left out, because they could not be registered: {', '.join(registration['left_out'])}")
     if registration.get("turned"):

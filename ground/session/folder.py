@@ -42,7 +42,7 @@ from flightsw.icd.mission import CameraSection
 from flightsw.icd.quaternion import quat_to_matrix
 from ground.session.telemetry import FlightCounts
 from obbgs_base.checked import Lines, copy_of, names_checksum, read_lines, read_lines_twice, read_twice
-from obbgs_base.errors import ObbgsError, reason
+from obbgs_base.errors import ObbgsError, counted, reason
 from obbgs_base.files import read_bounded
 from obbgs_base.physics.navigation_errors import SharedParameters
 
@@ -426,7 +426,9 @@ def read_log(path: Path) -> tuple[dict[str, Any], ...]:
 
 def log_damage(lines: Lines) -> str:
     """Return what is wrong with one of the files `LOGS`, to be read after its name; nothing of a whole one."""
-    words = f"has {len(lines.problems)} damaged lines ({lines.problems[0]})" if lines.problems else ""
+    words = (
+        f"has {counted(len(lines.problems), 'damaged line')} ({lines.problems[0]})" if lines.problems else ""
+    )
     if lines.unfinished:
         words += (" and " if words else "") + "ends in an unfinished line"
     return words
@@ -505,11 +507,13 @@ def damage_of(lines: Lines) -> str:
     """Return what is wrong with frames.jsonl, to be read after its name; nothing of a whole one."""
     words = []
     if lines.problems:
-        words.append(f"has {len(lines.problems)} damaged lines ({lines.problems[0]})")
+        words.append(f"has {counted(len(lines.problems), 'damaged line')} ({lines.problems[0]})")
     if lines.restored:
-        words.append(f"{lines.restored} frames stand in its copy only and are taken from there")
+        words.append(f"{counted(lines.restored, 'frame')} found in its copy only and taken from there")
     if lines.lost:
-        words.append(f"{lines.lost} frames are lost: `ground uplink resend` asks for what is still on board")
+        words.append(
+            f"{counted(lines.lost, 'frame')} lost: `ground uplink resend` asks for what is still on board"
+        )
     return ": " + "; ".join(words) if words else ""
 
 

@@ -38,7 +38,9 @@ td.long { white-space: normal; }
 .grid figure { margin: 0; } .grid figcaption { color: var(--soft); font-size: 12px; text-align: center; }
 details { margin: 10px 0; } summary { cursor: pointer; color: var(--soft); font-size: 13.5px; }
 h3 { font-size: 15px; margin: 18px 0 8px; }
-.scroll { overflow-x: auto; }
+.scroll { overflow-x: auto; background:
+  linear-gradient(to left, var(--card) 12px, transparent) right / 28px 100% no-repeat local,
+  linear-gradient(to left, #1c273366, transparent) right / 14px 100% no-repeat scroll; }
 .scores td, .scores th { white-space: nowrap; overflow-wrap: normal; padding: 5px 8px; }
 .scores th { white-space: normal; vertical-align: bottom; } .scores th.n { min-width: 64px; }
 .scores small { color: var(--soft); font-weight: normal; } .scores td.unrun { color: var(--soft); }

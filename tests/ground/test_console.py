@@ -399,3 +399,7 @@ def test_whatever_fails_in_the_display_is_told_once_and_the_reception_does_not_s
     assert [record.message for record in caplog.records].count(
         "receiving goes on, but it cannot be shown: RecursionError('too deep')"
     ) == 1
+
+
+def test_a_rounded_number_is_never_a_negative_zero():
+    assert shown("uptime_s", -0.04) == "0.0 s" and shown("uptime_s", -0.06) == "-0.1 s"

@@ -72,7 +72,7 @@ def test_a_line_that_is_damaged_twice_costs_its_frame_alone_and_is_counted(
         flip(path, 8 * (path.read_bytes().index(b"\n") + 300))  # in the second line, of frame 0
     opened = open_session(session)
     assert [record.id for record in opened.frames] == [1, 2, 3]
-    assert opened.losses["lines_damaged"] == 1 and "1 frames are lost" in caplog.text
+    assert opened.losses["lines_damaged"] == 1 and "1 frame lost" in caplog.text
     damaged = (session / "frames.jsonl").read_bytes()
     writer = SessionWriter(session, small_mission)
     assert (session / "frames.jsonl.unused-1").read_bytes() == damaged
@@ -158,8 +158,8 @@ def test_ground_list_says_what_is_damaged(session, tmp_path):
     flip(session / "frames" / "000003.png", 900)
     header, frames, events = listed()
     assert "session.json or its copy was damaged" in header
-    assert "frames.jsonl: has 1 damaged lines" in frames and "1 frames stand in its copy only" in frames
-    assert events.startswith("events.jsonl has 1 damaged lines (line 1:")
+    assert "frames.jsonl: has 1 damaged line (" in frames and "1 frame found in its copy only" in frames
+    assert events.startswith("events.jsonl has 1 damaged line (line 1:")
     assert listed("--pictures") == [header, frames, events, "frames/000003.png is damaged"]
 
 

@@ -130,6 +130,7 @@ def test_pictures_that_have_nothing_in_common_are_refused_in_one_sentence(photog
     given = ["--format", "images", "--from", str(tmp_path / "work"), "--session", str(tmp_path / "s")]
     done = call("ground", "import", *given)
     assert done.stderr == f"ground: {tmp_path / 'work'}: expected at least 3 photographs, found 0\n"
+    assert not (tmp_path / "s").exists()  # a refusal leaves nothing behind
     with pytest.raises(FormatError, match="at least 3 photographs, found 0"):
         read_photographs(tmp_path / "work", tmp_path / "other")
     cv2.imwrite(str(tmp_path / "3.png"), np.zeros((32, 64), np.uint8))

@@ -122,14 +122,14 @@ def test_the_page_waits_for_the_first_model_of_a_growing_run_and_follows_it(sess
     try:
         with chromium() as browser, page_of(browser, f"http://127.0.0.1:{ports.get()}", known=VISERS) as page:
             page.wait_for_selector("text=Waiting for the first model of pass/live.")
-            page.wait_for_selector("text=0 frames have come.")
+            page.wait_for_selector("text=0 frames received.")
             arrive(3)
-            page.wait_for_selector("text=3 frames have come.")
+            page.wait_for_selector("text=3 frames received.")
             trained.start()
             page.wait_for_selector("text=4 brackets are needed to begin")
             arrive(9)
             page.wait_for_selector("text=Timeline of the pass")
-            assert page.get_by_text("have come").count() == 0
+            assert page.get_by_text("frames received").count() == 0
             gaussians = len(load_ply(folder / "runs" / "live" / "model.ply"))
             page.wait_for_selector(f"text={gaussians:,} Gaussians")
             page.get_by_text("Look through its camera").click()
@@ -551,7 +551,7 @@ def test_imported_pictures_show_no_time_range_or_sun_that_nobody_stated(session)
         shown.session.frames[3], sun_dir_body=np.zeros(3), mid_exposure_utc_ns=3 * 10**9
     )
     linked = dataclasses.replace(shown.session, frames_imported=None)
-    assert " m" in viewer._facts(linked, record) and "00:00:03" in viewer._facts(linked, record)
+    assert " m" in viewer._facts(linked, record) and "00:00:03 UTC" in viewer._facts(linked, record)
     plain = tuple(dataclasses.replace(r, sun_dir_body=np.zeros(3), mid_exposure_utc_ns=r.id * 10**9,
                                       exposure_time_s=1.0) for r in shown.session.frames)  # fmt: skip
     imported = dataclasses.replace(shown.session, frames_imported=24, frames=plain)
@@ -659,3 +659,24 @@ def test_the_panel_stands_beside_the_scene_and_the_whole_model_is_seen_beside_it
         page.set_viewport_size({"width": 800, "height": 1000})
         waited_for(lambda: client.camera.aspect < 0.6)
         np.testing.assert_allclose(client.camera.position, moved, atol=1e-3)
+
+
+def test_two_clicks_give_a_length_and_a_page_that_is_opened_after_the_last_begins_anew(bare):
+    """In the browser: the ruler by the mouse, then the page is closed and opened again."""
+    url, before = f"http://127.0.0.1:{bare.server.get_port()}", bare.exposure.value
+    with chromium() as browser:
+        with page_of(browser, url, known=VISERS) as page:
+            page.get_by_text("Ruler: click on two points").click()
+            page.get_by_text("click on the first point").wait_for()
+            page.wait_for_timeout(3000)
+            page.mouse.click(250, 320)
+            page.get_by_text("click on the second point").wait_for()
+            page.mouse.click(330, 380)
+            page.get_by_text("units of the imported poses").first.wait_for()
+            bare.colouring.value, bare.exposure.value = UNCERTAINTY, bare.exposure.max
+        waited_for(lambda: bare.colour == scene.SENSOR and not bare.measuring.value)
+        assert bare.exposure.value == pytest.approx(before) and not bare.legend.visible
+        assert "/ruler/length" not in bare.server.scene._handle_from_node_name
+        with page_of(browser, url, known=VISERS) as page:
+            page.get_by_text("Timeline of the pass").wait_for()
+            assert page.get_by_text("units of the imported poses").count() == 0

@@ -20,6 +20,7 @@ from hil import cli, dataset, truth
 from hil.dataset import DatasetConfig, DatasetError, load_dataset_config, make_dataset, target_meshes
 from hil.processes import installed
 from hil.sky import SHIPPED
+from hil.sky.blender import MeshError
 from hil.sky.sensor import PRESETS
 from tests.commands import call
 
@@ -242,3 +243,11 @@ def test_a_data_set_that_cannot_be_begun_is_refused_in_one_line(tmp_path):
     done = call("hil", "dataset", "--mesh", tmp_path / "none.glb", "--out", tmp_path / "out")
     assert done.returncode == 2 and done.stderr == f"hil: {tmp_path / 'none.glb'}: no such file\n"
     assert not (tmp_path / "out").exists()
+
+
+def test_a_mesh_that_blender_refuses_leaves_no_folder(tmp_path):
+    (tmp_path / "junk.glb").write_bytes(b"glTF and nothing more")
+    config = load_dataset_config(None, ["frames=3", "size_px=16", "scenario=sparse"])
+    with pytest.raises(MeshError):
+        make_dataset(config, tmp_path / "junk.glb", tmp_path / "out", tmp_path / "renders", workers=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["junk.glb"]

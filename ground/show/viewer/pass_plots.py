@@ -212,7 +212,7 @@ def _told(known: list[Series], events: list[Event]) -> str:
         for s, limit in sorted(broken, key=lambda pair: pair[1] != "red")
     ]
     for event in events[: -EVENTS_SHOWN - 1 : -1]:
-        at = f"{datetime.fromtimestamp(start_s + event.seconds, UTC):%H:%M:%S}"
+        at = f"{datetime.fromtimestamp(start_s + event.seconds, UTC):%H:%M:%S} UTC"
         colour = SEVERITY_COLOURS.get(event.severity, "inherit")
         lines.append(f'<span style="color: {colour}">{at} {html.escape(event.text)}</span>')
     return f'<div style="padding: 4px 12px; font-size: 12px; line-height: 1.5">{"<br>".join(lines)}</div>'

@@ -103,7 +103,7 @@ def view(
 
 
 class Viewer:
-    """The page: all viewers of it share exposure, frame and colours, each has a camera of its own."""
+    """The page: those who watch at once share exposure, frame and colours, each has a camera of its own."""
 
     def __init__(self, server: viser.ViserServer, placed: list[Placed]):
         self.server, self.placed = server, placed
@@ -113,6 +113,7 @@ class Viewer:
         self._controls()
         self._start_camera()
         server.on_client_connect(self._frame)
+        server.on_client_disconnect(self._left)
         for client in server.get_clients().values():  # who waited for the model
             self._reset(client)
         self.draw_all()
@@ -171,6 +172,15 @@ class Viewer:
         turntable = gui.add_button("Save turntable")
         turntable.on_click(lambda event: self._save_turntable(event.client))
         self._fit_controls()
+        chosen = (
+            self.exposure,
+            self.colouring,
+            *self.checks.values(),
+            self.measuring,
+            *self.crops,
+            self.timeline,
+        )
+        self.defaults = [(control, control.value) for control in chosen]
 
     def _measuring_controls(self) -> None:
         """Add the ruler and the box outside which nothing of the models is drawn."""
@@ -333,6 +343,16 @@ class Viewer:
         client.camera.on_update(follow)
         follow(client.camera)
 
+    def _left(self, client: viser.ClientHandle) -> None:
+        """Let the page that is opened after the last one was closed begin as the first one did."""
+        with self.lock:
+            if self.server.get_clients():
+                return
+            for control, value in self.defaults:
+                if control.value != value:
+                    control.value = value
+            self._fit_controls()  # a run that grows may have other limits by now
+
     def _begin(self, aspect: float) -> np.ndarray:
         """Return where a camera stands at first whose picture is so many times as wide as high."""
         position, look_at = self.start
@@ -422,7 +442,7 @@ def _facts(session: Session, record: FrameRecord) -> str:
     if not session.nominal_exposures:
         facts.append(f"{1e3 * record.exposure_time_s:g} ms")
     if states_time(session, record):
-        facts.append(f"{datetime.fromtimestamp(record.mid_exposure_utc_ns / 1e9, UTC):%H:%M:%S}")
+        facts.append(f"{datetime.fromtimestamp(record.mid_exposure_utc_ns / 1e9, UTC):%H:%M:%S} UTC")
     if states_scale(session):
         facts.append(range_in_words(record))
     facts.append(f"{record.saturated:,} pixels saturated")

@@ -11,6 +11,7 @@ from ground.session.folder import MissingFrames, Session, open_session
 from ground.show.viewer.pass_plots import PassPlots
 from ground.show.viewer.scene import RADIUS, add_camera, one_per_bracket, picture
 from ground.show.viewer.source import Source
+from obbgs_base.errors import counted
 
 PICTURE_PX = 320
 START = np.array(
@@ -70,7 +71,7 @@ class Waiting:
             except MissingFrames as error:
                 if error.ids:
                     raise  # without them the first line is being written
-        words = [f"{self._frames} frames have come."]
+        words = [f"{counted(self._frames, 'frame')} received."]
         for source in self._sources:
             if not source.is_ready():
                 words.append(f"**Waiting for the first model of {source.name}.** {_progress(source)}")
