@@ -246,8 +246,8 @@ def _training(run: Run) -> str:
     note = (
         "First the loss that training minimises, then the PSNR of each step's "
         f"{'pictures' if is_imported(run.metrics) else 'noisy frames'}. Both are running means; "
-        "where they have levelled off, more steps would change little. Time counts from the start of the work: the curves "
-        "begin when the model's first guess has been made."
+        "where they have levelled off, more steps would change little. Time counts from the start of the work: "
+        "the curves begin when the model's first guess has been made."
     )
     key = legend(named) if len(named) > 1 else ""
     return section("Training", note, key + beside(map(plot, figures)))

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
+from typing import Any
 
 import imagecodecs
 import numpy as np
@@ -180,7 +181,7 @@ class Viewer:
             *self.crops,
             self.timeline,
         )
-        self.defaults = [(control, control.value) for control in chosen]
+        self.defaults: list[tuple[Any, Any]] = [(control, control.value) for control in chosen]
 
     def _measuring_controls(self) -> None:
         """Add the ruler and the box outside which nothing of the models is drawn."""
