@@ -355,4 +355,4 @@ def test_on_a_terminal_listen_is_a_console_that_shows_the_spacecraft(tmp_path, s
                         os.read(master, 65_536)
             stdout, _ = ground.communicate(timeout=1)
             os.close(master)
-    assert ground.returncode == 0 and stdout.startswith("1 frames received, 1 in ")
+    assert ground.returncode == 0 and stdout.startswith("1 frame received, 1 in ")
