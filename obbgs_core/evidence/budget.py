@@ -15,6 +15,9 @@ from obbgs_core.render import render
 from obbgs_core.sensor import Sensor
 
 SURE = 2.0  # standard errors by which brackets that were kept back must gain
+# Of what a model does not explain, that as many Gaussians again do: 0.4 of photographs, 0.1 of renders, where twice as
+# many gain less than 0.2 dB of views that are kept back.
+EXPLAINED = 0.25
 LEAST_ERROR = 1e-3  # of the light: smaller errors of the model are alike
 
 
@@ -22,8 +25,8 @@ LEAST_ERROR = 1e-3  # of the light: smaller errors of the model are alike
 def as_many_again(gaussians: Gaussians, batches: Batches, sensor: Sensor) -> Evidence:
     """Return what the frames could gain by as many Gaussians again, with the BIC penalty of so many, in nats.
 
-    The log-likelihood can grow by no more than what is not explained: half of how far the squared residuals of the
-    readings that show the target exceed their expectation, which is 1. Residuals are cut off, as the loss does it.
+    It is a share of what is not explained: of half of how far the squared residuals of the readings that show the
+    target exceed their expectation, which is 1. Residuals are cut off, as the loss does it.
     """
     gain, values, chosen = 0.0, 0, shown_frames(batches)
     times = len(batches.frames) / len(chosen)
@@ -41,7 +44,7 @@ def as_many_again(gaussians: Gaussians, batches: Batches, sensor: Sensor) -> Evi
         gain += more * times
         values += lit
     penalty = len(gaussians) * bic_penalty(gaussians, round(values * times))
-    return Evidence(torch.tensor(gain, dtype=torch.float64), penalty)
+    return Evidence(torch.tensor(EXPLAINED * gain, dtype=torch.float64), penalty)
 
 
 @torch.no_grad()
