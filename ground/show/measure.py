@@ -39,6 +39,9 @@ def measured(model: Model, between: list[np.ndarray] | None = None) -> dict:
 
     Args:
         between: pairs of places [2, 3] m, body axes; the points of the surface that are nearest to them count.
+
+    Raises:
+        ValueError: a place is further away from the surface than the body is large.
     """
     pixel_m, deviation = model.surface.pixel_m, model.size_deviation
 
@@ -62,6 +65,13 @@ def measured(model: Model, between: list[np.ndarray] | None = None) -> dict:
     distances = []
     for places in between or []:
         points = nearest_on(model.surface, places)
+        away = np.linalg.norm(points - places, axis=1)
+        if away.max() > largest:
+            x, y, z = places[away.argmax()]
+            raise ValueError(
+                f"{x:g},{y:g},{z:g} is {away.max():.3g} from the surface, and all of the body is {largest:.3g} large: "
+                "give a place near the point that is meant"
+            )
         distances.append(length(float(np.linalg.norm(points[1] - points[0]))) | {"points": points.tolist()})
     return {
         "run": model.name,

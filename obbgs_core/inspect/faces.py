@@ -17,6 +17,7 @@ FACING = 0.9  # cosine between the normals of a face and of its points, at least
 LEAST_AREA_PX = 60.0  # of a face, in squares of a pixel
 MOST_FACES = 16
 LINKED_PX = 1.5
+NARROW = 0.5  # of a face's usual width: a strip of it that is narrower is something that joins it
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def flat_faces(surface: Surface, seed: int = 0) -> list[Face]:
             break
         largest = np.argmax(np.bincount(groups, area[chosen]))
         members = chosen[groups == largest]
-        face = _face(left[members], points[members], normals[members], area[members])
+        face = _face(left[members], points[members], normals[members], area[members], pixel_m)
         if face.area_m2 < LEAST_AREA_PX * pixel_m**2:
             break
         faces.append(face)
@@ -77,7 +78,9 @@ def _best_plane(
     return chosen
 
 
-def _face(members: np.ndarray, points: np.ndarray, normals: np.ndarray, area: np.ndarray) -> Face:
+def _face(
+    members: np.ndarray, points: np.ndarray, normals: np.ndarray, area: np.ndarray, pixel_m: float
+) -> Face:
     """Return a face with its smallest rectangle: one of its sides lies along the hull (Freeman and Shapira 1975)."""
     middle = points.mean(axis=0)
     axes = principal_axes(points)
@@ -90,16 +93,33 @@ def _face(members: np.ndarray, points: np.ndarray, normals: np.ndarray, area: np
     for side in sides:
         frame = np.stack([side, [-side[1], side[0]]])
         along = hull @ frame.T
-        low, high = along.min(axis=0), along.max(axis=0)
-        boxes.append((float((high - low).prod()), frame, low, high))
-    _, frame, low, high = min(boxes, key=lambda box: box[0])
-    if high[0] - low[0] < high[1] - low[1]:
-        frame, low, high = frame[::-1], low[::-1], high[::-1]
+        boxes.append((float(np.ptp(along, axis=0).prod()), frame))
+    _, frame = min(boxes, key=lambda box: box[0])
+    covers = area * np.abs(normals @ normal)
+    ends = np.array([_ends(along, covers, pixel_m) for along in (flat @ frame.T).T])
+    if np.ptp(ends[0]) < np.ptp(ends[1]):
+        frame, ends = frame[::-1], ends[::-1]
     in_space = frame @ axes[:2]
     axes = np.stack([in_space[0], np.cross(normal, in_space[0]), normal])
-    centre = middle + (low + high) / 2 @ in_space
-    covered = float((area * np.abs(normals @ normal)).sum())
-    return Face(members, centre, axes, high - low, covered)
+    centre = middle + ends.mean(axis=1) @ in_space
+    return Face(members, centre, axes, ends[:, 1] - ends[:, 0], float(covers.sum()))
+
+
+def _ends(along: np.ndarray, covers: np.ndarray, pixel_m: float) -> tuple[float, float]:
+    """Return where a face begins and ends along one of its sides, m, without what stands off narrower, as a yoke does.
+
+    Args:
+        along: [N] m, of its points. covers: [N] m², what each of them covers.
+    """
+    low = float(along.min())
+    strips = np.bincount(((along - low) / pixel_m).astype(int), covers)
+    share = np.minimum(1.0, strips / np.median(strips))  # of its usual width
+    wide = np.flatnonzero(share > NARROW)
+    first, last = int(wide[0]), int(wide[-1]) + 1
+    before = share[first - 1] if first else 0.0
+    after = share[last] if last < len(share) else 0.0
+    begin, end = low + (first - before) * pixel_m, low + (last + after) * pixel_m
+    return max(begin, low), min(end, float(along.max()))
 
 
 def faces_as_parts(mesh: CadMesh, pixel_m: float) -> CadMesh:

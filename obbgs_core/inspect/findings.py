@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from obbgs_core.inspect.alignment import CORRELATED_PX, FINE_POINTS, Similarity, Surface, aligned, refine
+from obbgs_core.inspect.alignment import FINE_POINTS, Similarity, Surface, aligned, refine
 from obbgs_core.inspect.cad import CadMesh, Samples, groups_within, principal_axes, sampled
 from obbgs_core.inspect.plates import Z_90, Turn, is_turned, plates_of, turn_of
 from obbgs_core.inspect.shown import Views, views_showing
@@ -17,11 +17,15 @@ OFF_PX = 2.0  # from the surface or the design: nearer is the same place
 OFF_SIGMAS = 4.0  # the same in robust standard deviations of the surface
 LINKED_PX = 1.8  # points nearer to each other are of one finding
 LEAST_AREA_PX = 20.0  # of a finding, in squares of a pixel
+LEAST_WIDTH_PX = (
+    1.5  # its area over its size: frames do not show what is narrower, as a mast, surely enough to miss it
+)
 # that a finding stands off, at least: models of bodies that are as designed err by up to 5.5 px in single places
-LEAST_DEPTH_PX = 6.0
+LEAST_DEPTH_PX = 5.0
 WHOLE = 0.6  # of a part's shown samples that are not there: the part is missing
 STATES = ("as designed", "missing", "not seen", "turned")
 EDGE_PX = 0.5  # standard deviation of where a finding's edge lies
+DEPTH_PX = 1.0  # of how far it stands off: models round edges and ends
 
 
 @dataclass(frozen=True)
@@ -243,12 +247,13 @@ def _region(
         return None
     axes = principal_axes(points)
     size = float(np.ptp(points @ axes.T, axis=0).max())
+    if area.sum() < LEAST_WIDTH_PX * pixel_m * size:
+        return None
     half = Z_90 * np.sqrt(2) * EDGE_PX * pixel_m
     deepest = float(np.quantile(depth, 0.95))
     if deepest < LEAST_DEPTH_PX * pixel_m:
         return None
-    squares = max(1.0, float(area.sum()) / (CORRELATED_PX * pixel_m) ** 2)
-    deep = Z_90 * EDGE_PX * pixel_m / np.sqrt(min(squares, 4.0))
+    deep = Z_90 * DEPTH_PX * pixel_m
     return Region(
         kind,
         part,

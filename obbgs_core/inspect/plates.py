@@ -28,12 +28,16 @@ CUT_PX = 4.0
 FOUND = 0.6  # of a plate's shown samples that lie on the surface, for its turn to be told
 BETTER = 0.6  # of the misfit of where it should be is left by a turn that is believed, at most
 MOST_RAD = np.radians(32.0)  # a plate is not looked for beyond
-SYSTEMATIC_PX = 0.35  # by which the ends of a model's plate may lie off, alike over the whole plate
+SYSTEMATIC_PX = 0.2  # by which the ends of a model's plate may lie off, alike over the whole plate
+SEEN = 0.1  # of a plate's samples, at least, that the frames show, for its turn to be told
+# Of the mean distance of where a panel should be, that its turn leaves at most: 0.2 to 1.28 of panels that are turned,
+# 1.32 to 1.75 of a sound dish that passed for turned by 6 to 8 degrees.
+NEARER = 1.3
 Z_90 = 1.645
 TURNED_RAD = np.radians(2.5)  # of a panel, at least, to be told as turned
 # The same in its standard deviations, where so much of it lies on the surface after its turn, and where less does: a
 # sound dish of TDRS, of which 0.73 to 0.88 do, passes for turned by 12 degrees, 4.2 deviations, while the others stay
-# below 1.9 and panels turned by 11 to 20 degrees have 3 to 8.5.
+# below 2.1 and panels turned by 11 to 20 degrees have 2.3 to 16.
 LAID, TURNED_SIGMAS, POORLY_LAID_SIGMAS = 0.9, 2.5, 4.5
 
 
@@ -58,7 +62,7 @@ class Turn:
 
     motion: [4, 4], from design to as it is, body axes. tilt_rad: of its normal. axis: [3] of that turn. interval: of
     tilt_rad, 90 %. significance: the turn in its standard deviations. found: share of the shown samples that lie on the
-    surface after the motion.
+    surface after the motion. left: their mean distance from it then, over that without the motion.
     """
 
     plate: Plate
@@ -68,12 +72,13 @@ class Turn:
     interval: tuple[float, float]
     significance: float
     found: float
+    left: float
 
 
 def is_turned(turn: Turn) -> bool:
     """Return whether a panel is turned, beyond what chance and the surface's errors make of one that is not."""
     least = TURNED_SIGMAS if turn.found > LAID else POORLY_LAID_SIGMAS
-    return bool(turn.significance > least and turn.tilt_rad > TURNED_RAD)
+    return bool(turn.significance > least and turn.tilt_rad > TURNED_RAD and turn.left < NEARER)
 
 
 def plates_of(design: Samples, pixel_m: float) -> list[Plate]:
@@ -151,7 +156,7 @@ def turn_of(plate: Plate, design: Samples, surface: Surface, shown: np.ndarray) 
     pixel_m = surface.pixel_m
     panel = design.select(plate.members)
     visible = panel.points[shown[plate.members]]
-    if len(visible) < 20:
+    if len(visible) < max(20, SEEN * len(panel.points)):
         return None
     near = _candidates(plate, design, surface)
     if len(near.points) < 20:
@@ -173,10 +178,13 @@ def turn_of(plate: Plate, design: Samples, surface: Surface, shown: np.ndarray) 
     found = float((tree.query(visible @ motion[:3, :3].T + motion[:3, 3])[0] < BESIDE_PX * pixel_m).mean())
     if found < FOUND or not np.isfinite(covariance).all():
         return None
-    return _turn(plate, motion, covariance, found, pixel_m)
+    left = misfit(motion) / max(misfit(np.eye(4)), 1e-9 * pixel_m)
+    return _turn(plate, motion, covariance, found, left, pixel_m)
 
 
-def _turn(plate: Plate, motion: np.ndarray, covariance: np.ndarray, found: float, pixel_m: float) -> Turn:
+def _turn(
+    plate: Plate, motion: np.ndarray, covariance: np.ndarray, found: float, left: float, pixel_m: float
+) -> Turn:
     """Return the turn of a panel's normal, from its motion and the covariance [3, 3] of its rotation vector."""
     normal = plate.axes[2]
     turned = motion[:3, :3] @ normal
@@ -191,7 +199,7 @@ def _turn(plate: Plate, motion: np.ndarray, covariance: np.ndarray, found: float
     significance = float(np.sqrt(vector @ np.linalg.solve(stated, vector)))
     way = in_plane @ axis
     half = Z_90 * float(np.sqrt(way @ stated @ way))
-    return Turn(plate, motion, tilt, axis, (max(0.0, tilt - half), tilt + half), significance, found)
+    return Turn(plate, motion, tilt, axis, (max(0.0, tilt - half), tilt + half), significance, found, left)
 
 
 def _angle(motion: np.ndarray) -> float:

@@ -202,7 +202,10 @@ def row_of(target: Target, name: str, number: int) -> dict:
     # a fault of the design is where the design was found to lie, which of a symmetric one may be turned
     there = found.place.matrix() @ anywhere if kind in ("panel", "missing") else np.eye(4)
     place = there[:3, :3] @ truth["place"] + there[:3, 3] if truth else np.full(3, np.inf)
-    told, others = _told(found, truth, kind, target.pixel_m, place)
+    # what is told of a symmetric body holds as well for the places that it can be turned to, which is told with it
+    turned = (found.place.other_rotations @ (place - found.place.pivot) + found.place.pivot) if truth else []
+    scored = [_told(found, truth, kind, target.pixel_m, p) for p in (place, *turned)]
+    told, others = max(scored, key=lambda one: one[0]["found"])
     # the size that a point of the design gets: the true one is that of the design that is not moved
     scale = found.place.scale * np.cbrt(np.linalg.det(anywhere[:3, :3]))
     return {

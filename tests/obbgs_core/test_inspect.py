@@ -1,5 +1,7 @@
 """Faults that trimesh builds into a body are found, wherever and however large the design lies."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -121,6 +123,16 @@ def test_sizes_are_those_of_the_box_that_trimesh_made():
     assert diagonal == pytest.approx(np.linalg.norm([1.2, 0.8, 0.5]), abs=2 * PIXEL_M)
 
 
+def test_what_joins_a_face_and_is_narrower_does_not_make_it_longer():
+    wing, yoke = trimesh.creation.box([2.0, 1.0, 0.1]), trimesh.creation.box([0.4, 0.2, 0.1])
+    yoke.apply_translation([1.2, 0.1, 0])
+    surface, _ = seen(trimesh.Scene([wing, yoke]), noise_px=0.0)
+    largest = flat_faces(surface)[0]
+    np.testing.assert_allclose(largest.extent, [2.0, 1.0], atol=PIXEL_M)
+    np.testing.assert_allclose(largest.middle[:2], [0, 0], atol=PIXEL_M)
+    np.testing.assert_allclose(np.abs(np.linalg.det(largest.axes)), 1)
+
+
 def test_what_is_no_design_is_refused_in_a_line(tmp_path):
     with pytest.raises(CadError, match="is not there"):
         read_cad(tmp_path / "none.glb")
@@ -149,5 +161,8 @@ def test_panels_that_lie_well_on_the_surface_are_told_as_turned_by_fewer_deviati
 ):
     plate = Plate(0, np.arange(1), np.arange(1), np.zeros(3), np.eye(3), np.ones(3))
     tilt = np.radians(degrees)
-    told = Turn(plate, np.eye(4), tilt, np.eye(3)[0], (0.0, 2 * tilt), significance, found)
+    told = Turn(plate, np.eye(4), tilt, np.eye(3)[0], (0.0, 2 * tilt), significance, found, 0.9)
     assert is_turned(told) == turned
+    assert not is_turned(
+        dataclasses.replace(told, left=1.5)
+    )  # it lay nearer to the surface where it should be

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ground.run.runs import without_own_sky
 from ground.session.cameras import cameras_of, exposed, sun_direction
 from ground.session.folder import FrameRecord, Session, SessionError
 from ground.session.spread import evenly_spread
@@ -23,6 +24,7 @@ from obbgs_core.frames import cameras_of as cameras_of_frames
 from obbgs_core.model.footprint import variance_px2
 from obbgs_core.model.sh import C0
 from obbgs_core.render import project, render, sunlit_shares, weighted_gradient
+from obbgs_core.render.backdrops import without_earth
 from obbgs_core.render.lighting import radiance_along
 from obbgs_core.score.uncertainty import parameter_deviations
 
@@ -82,8 +84,8 @@ def colours(shown: Shown, record: FrameRecord, exposure_time_s: float) -> np.nda
 def error_colours(shown: Shown) -> np.ndarray:
     """Return colours [N, 3], bytes, of the misfit: each Gaussian's mean squared residual over the noise, its chi².
 
-    The mean is over the pixels of the frames, weighted by how much of each the Gaussian is. It is the derivative of the
-    weighted image by the Gaussian's radiance.
+    The mean is over the pixels of the frames, as if their sky was black, weighted by how much of each the Gaussian is.
+    It is the derivative of the weighted image by the Gaussian's radiance.
     """
     probe = dataclasses.replace(
         shown.gaussians.detach().matt(),
@@ -93,9 +95,10 @@ def error_colours(shown: Shown) -> np.ndarray:
         shading="view",
     )
     total, weight = torch.zeros(len(probe)), torch.zeros(len(probe))
-    for frame in _frames(shown.session):
-        cameras = cameras_of_frames([frame])
+    for taken in _frames(shown.session):
+        cameras = cameras_of_frames([taken])
         with torch.no_grad():
+            frame = without_earth(shown.gaussians, without_own_sky(taken, shown.sensor), shown.sensor)
             radiance = render(shown.gaussians, cameras).radiance[0]
             residual = shown.sensor.normalised_residual(radiance, frame.exposure_time_s, frame.dn)
             squared = residual.square().mean(dim=-1, keepdim=True)
