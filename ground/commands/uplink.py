@@ -137,11 +137,13 @@ def _sent(
 
             listen(link, session, load_mission(mission), should_stop=ended, key=listening_key(key_file))
     finally:
+        was_sent = uplinking.was_sent(session, counter)
         uplinking.withdraw(session, counter)
     result = uplinking.outcome(session, counter)
     if result is None:
         words = uplinking.in_words(command, model)
         result = {"counter": counter, "command": command.name, "given": words, "stage": "failed"}
-        result |= {"text": "no process sent it", "reports": []}
+        sent_text = "it was sent, and no answer came before its listener ended: it may have been executed"
+        result |= {"text": sent_text if was_sent else "no process sent it", "reports": []}
         uplinking.note_end(session, result, time.time_ns())
     return result

@@ -340,9 +340,14 @@ def is_waiting(session: Path, counter: int) -> bool:
     return (session / "uplink" / f"{counter:020d}.json").exists()
 
 
+def was_sent(session: Path, counter: int) -> bool:
+    """Return whether a listener has sent a command that has no result and was not withdrawn."""
+    return (session / "uplink" / f"{counter:020d}.sent").exists()
+
+
 def withdraw(session: Path, counter: int) -> None:
     """Take back a command; one that has been sent already may still be executed."""
-    for suffix in (".json", ".bin"):
+    for suffix in (".json", ".bin", ".sent"):
         (session / "uplink" / f"{counter:020d}{suffix}").unlink(missing_ok=True)
 
 
@@ -444,6 +449,8 @@ class Uplinker:
             if now_s >= job.next_send_s and not (job.file_put and self.is_sending_file):
                 intervals = RESULT_INTERVALS if job.reports else RESEND_INTERVALS
                 job.next_send_s = now_s + intervals * self._interval_s
+                with contextlib.suppress(OSError):  # a full disk keeps no command from being sent
+                    (self._folder / f"{counter:020d}.sent").touch()
                 return job.packet
             if not job.reports:
                 return None  # counters must arrive in order
@@ -523,7 +530,7 @@ class Uplinker:
 
     def _remove(self, counter: int) -> None:
         """Remove a command's files; one that stays, since the folder does not let go of it, is not looked at again."""
-        for suffix in (".json", ".bin"):
+        for suffix in (".json", ".bin", ".sent"):
             try:
                 (self._folder / f"{counter:020d}{suffix}").unlink(missing_ok=True)
             except OSError as error:

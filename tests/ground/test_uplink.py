@@ -601,3 +601,23 @@ def test_a_script_that_is_no_text_is_wrong_usage(tmp_path):
     words = ["uplink", "--script", str(tmp_path / "script"), "--session", str(tmp_path)]
     error = CliRunner().invoke(cli.app, words).exception
     assert isinstance(error, ConfigError) and "is no text; a script has a command on each line" in str(error)
+
+
+def test_a_command_that_was_sent_before_its_listener_ended_is_told_from_one_that_nobody_sent(
+    session, key_file
+):
+    def send_and_end() -> None:
+        uplinker, packet = Uplinker(session, 1000, INTERVAL_S), None
+        while packet is None:
+            packet = uplinker.next_command(time.monotonic())
+            time.sleep(0.02)
+
+    command = ["uplink", "ping", "--session", str(session), "--key", str(key_file), "--timeout", "1"]
+    with listening(session):
+        assert "no process sent it" in CliRunner().invoke(cli.app, command).output
+        sender = threading.Thread(target=send_and_end, daemon=True)
+        sender.start()
+        ended = CliRunner().invoke(cli.app, command)
+    assert ended.exit_code == 1 and "may have been executed" in ended.output
+    assert "may have been executed" in (session / "commands.jsonl").read_text()
+    assert not list((session / "uplink").glob("*.sent"))
