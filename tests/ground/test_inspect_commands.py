@@ -72,6 +72,11 @@ def test_sizes_are_those_of_the_mesh(run):
     assert " ±" not in text and "± " not in text  # no number and its deviation are in two lines, on a phone
 
 
+def test_a_place_that_is_far_from_the_body_is_refused(run):
+    done = call("ground", "measure", str(run), "--between=1000,0,1:0,0,-1")
+    assert done.returncode == 2 and "1000,0,1 is 9" in done.stderr and len(done.stderr.splitlines()) == 1
+
+
 def test_a_part_of_the_design_that_is_not_there_is_told(run):
     """The design is the run's own mesh, moved, in another unit, with a box that stands on it."""
     mesh = seen_mesh(run)
