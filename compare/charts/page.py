@@ -188,9 +188,9 @@ def _failures(results: Results, out: Path) -> str:
         view = read_views(out / VIEWS / f"{row['digest']}.npz").get(WORST)
         if view is None or row["method"] in reference_names():
             continue
-        key = (row["method"], row["target"])
+        key = (results.label_of(row), row["target"])
         if key not in worst or view.psnr_db < worst[key][1].psnr_db:
-            worst[key] = (f"{row['method']}, {row['target']}, {row['condition']}", view)
+            worst[key] = (f"{key[0]}, {row['target']}, {row['condition']}", view)
     shown = sorted(worst.values(), key=lambda entry: entry[1].psnr_db)[:WORST_SHOWN]
     cells = [f'<div class="label head">{words}</div>' for words in ("", "expected", "render", "error")]
     for words, view in shown:
@@ -213,7 +213,8 @@ def _breaking(results: Results) -> str:
         "The mildest condition, in bold, at which a method is broken on any target: it ends in an error, or its score "
         f"is below the better one of a black image and the mean image{of_surface}. Where it never broke, the most "
         "severe condition that it was tried at; not judged: neither image was scored. Point at a cell for the reason. "
-        "The curves are means over targets, their bands from the lowest to the highest seed."
+        "The curves are means over the targets that were run at each point, their bands from the lowest to the highest "
+        "seed: where points have other targets, as the table says, a curve compares these as well."
     )
     labels = [label for label in results.trained if any(label in points for _, points in found)]
     head = "".join(f"<th>{breakable(label)}</th>" for label in labels)

@@ -135,9 +135,9 @@ class Results:
         self._cells: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
         self.labels: list[str] = []
         self.method_of: dict[str, str] = {}
+        self._several = {method for method, of_method in budgets.items() if len(of_method) > 1}
         for row in self.rows:
-            method = row["method"]
-            label = f"{method} ({budget_of(row)})" if len(budgets[method]) > 1 else method
+            method, label = row["method"], self.label_of(row)
             self.method_of[label] = method
             self._cells.setdefault((label, row["target"], row["condition"]), []).append(row)
         order = reference_names()
@@ -153,6 +153,11 @@ class Results:
         )  # what conditions are compared with
         self.conditions.sort(key=lambda condition: condition != self.base)
         self.truth = any("psnr_clean_db" in row for row in self.rows)
+
+    def label_of(self, row: dict[str, Any]) -> str:
+        """Return what a row's method is called: with its budget, where the method was run with several."""
+        method = row["method"]
+        return f"{method} ({budget_of(row)})" if method in self._several else method
 
     @property
     def score(self) -> Metric:

@@ -1,5 +1,6 @@
 """Checks of the flight computer: clock, disk, speed and memory, and the key's files."""
 
+import contextlib
 import ctypes
 import errno
 import os
@@ -99,7 +100,8 @@ def check_disk(mission: Mission, store: Path) -> list[Finding]:
         came_back = probe.read_bytes() == content
         probe.unlink()
     except OSError as error:
-        probe.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            probe.unlink(missing_ok=True)
         advice = "mount the disk for writing, give this user the folder (chown), or name another --store"
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             advice = more_room

@@ -157,7 +157,7 @@ class _Check:
                 found[frame_id] = self._good[frame_id]
                 continue
             self.report.quarantined += 1
-            if self._note(f"frames/{path.name}: {error}; moved to quarantine/"):
+            if self._note(f"frames/{path.name}: {error}; a repair moves it to quarantine/"):
                 quarantine(self.folder, path)
         return found
 

@@ -149,7 +149,9 @@ class FrameStore:
                 self._make_room(frame.frame_id, f"the quota of {self.quota_bytes} bytes is full")
             while True:
                 try:
-                    return self._write(frame, container)
+                    if self._leaves_reserve(len(container)):
+                        return self._write(frame, container)
+                    self._make_room(frame.frame_id, "the disk is full but for what is kept for commands")
                 except OSError as error:
                     if error.errno not in DISK_FULL:
                         raise
@@ -359,6 +361,13 @@ class FrameStore:
             path.unlink(missing_ok=True)
             marker.unlink(missing_ok=True)
             raise
+
+    def _leaves_reserve(self, size_bytes: int) -> bool:
+        """Return whether commands have room beside so much more: the reserve, made again if it fits, or half of it."""
+        with contextlib.suppress(OSError):
+            keep_reserve(self.folder / RESERVE, RESERVE_BYTES)
+            return True
+        return shutil.disk_usage(self.folder).free >= size_bytes + RESERVE_BYTES // 2
 
     def _make_room(self, for_frame: int, why: str) -> None:
         """Delete one frame: the oldest confirmed one, or if there is none what the policy says."""

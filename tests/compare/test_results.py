@@ -209,6 +209,8 @@ def test_trainings_of_several_budgets_are_told_apart():
     ]
     rows.append(row("3dgs", psnr_clean_db=20.0, largest=4000) | {"digest": "y"})
     rows.append(row("3dgs", psnr_clean_db=20.0, largest=4000) | {"steps_share": 0.5, "digest": "z"})
+    assert Results(rows[:1]).label_of(rows[0]) == "3dgs"
+    assert [Results(rows).label_of(each) for each in rows] == Results(rows).labels
     assert Results(rows).labels == [
         "3dgs (all steps)",
         "3dgs (10 % of the steps)",

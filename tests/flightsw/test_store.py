@@ -433,6 +433,22 @@ def test_a_full_disk_is_met_by_the_policy_and_heals(tmp_path, make_frame, monkey
     assert FrameStore(tmp_path).outbox() == store.outbox()
 
 
+def test_frames_do_not_take_the_room_that_is_kept_for_commands(tmp_path, make_frame, small_mission):
+    with small_disk(tmp_path / "disk", "512k") as disk:
+        store = FrameStore(disk / "store")
+        with pytest.raises(StoreFull):
+            for _ in range(400):
+                store.put(make_frame(store.next_frame_id))
+        fill_disk(disk / "foreign")
+        save_settings(store.folder, Settings("triage", safe_mode=True))  # in the room of the reserve
+        with pytest.raises(StoreFull, match="kept for commands"):
+            for _ in range(40):
+                store.put(make_frame(store.next_frame_id))
+        for policy in ("triage", "oldest") * 10:
+            save_settings(store.folder, Settings(policy, safe_mode=True))
+        assert load_settings(store.folder, small_mission) == Settings("oldest", safe_mode=True)
+
+
 def test_on_a_disk_that_is_truly_full_transfers_are_numbered_and_settings_kept(
     tmp_path, make_frame, small_mission
 ):

@@ -292,6 +292,8 @@ def test_the_page_draws_the_splats_and_its_controls_work(session):
                 theirs, ours = through_camera(client, first, page_viewer.record, exposure_s)
                 assert ours.max() > 50
                 assert -10 * np.log10(np.mean((ours - theirs) ** 2) / 255**2) > 30
+            page.get_by_text("Reset view", exact=True).click()
+            waited_for(lambda: (client.camera.near, client.camera.far) == pytest.approx((0.01, 1000.0)))
             page.get_by_text("Cameras", exact=True).click()
             waited_for(lambda: all(handle.visible for handle in first.handles["cameras"]))
             page.get_by_text("Save turntable").click()

@@ -122,7 +122,7 @@ def _main_figures(m: dict) -> list[tuple[str, str]]:
         figures.append((f"{m['psnr_clean_foreground_db']:.2f} dB", text))
     if "psnr_clean_blind_db" in m:
         gain_db = m["psnr_clean_db"] - m["psnr_clean_blind_db"]
-        text = f"the same, trained without exposure times: knowing them brings {gain_db:+.2f} dB"
+        text = f"clean PSNR of {scored} trained without exposure times: knowing them brings {gain_db:+.2f} dB"
         figures.append((f"{m['psnr_clean_blind_db']:.2f} dB", text))
     if "chamfer" in m:
         text = (

@@ -42,6 +42,7 @@ from obbgs_core.render.backdrops import without_earth
 log = logging.getLogger(__name__)
 POLL_S, TICK_S = 1.0, 0.25  # between looks for a renewed model, and between steps of a replay
 APART = 2.4  # radii between the centres of two models side by side
+SHOWN_BETWEEN = 0.01, 1000.0  # distances from the camera, as viser has them at first
 FIELD_RAD = 0.4  # vertical field of view, about that of a telescope's picture of the model
 NEAREST, FARTHEST = (
     1.4,
@@ -372,6 +373,7 @@ class Viewer:
             client.camera.up_direction = (0.0, 0.0, 1.0)
             self._place(client)
             client.camera.fov = FIELD_RAD
+            client.camera.near, client.camera.far = SHOWN_BETWEEN
             self._limit_zoom(client)
 
     def _look_through(self, client: viser.ClientHandle | None) -> None:
