@@ -280,15 +280,16 @@ def _capture(
 
     watchdog.expect("capture", EXPOSURE_WITHIN_S)
     try:
-        counts = capture(
-            mission,
-            camera,
-            store,
-            on_frame=on_frame,
-            should_stop=stop.is_set,
-            wait_until=wait_until,
-            settings=lambda: load_settings(store.folder, mission),
-        )
+        with store.capturing():
+            counts = capture(
+                mission,
+                camera,
+                store,
+                on_frame=on_frame,
+                should_stop=stop.is_set,
+                wait_until=wait_until,
+                settings=lambda: load_settings(store.folder, mission),
+            )
     finally:
         watchdog.ended("capture")
     if camera.lost:

@@ -197,7 +197,7 @@ def _failures(results: Results, out: Path) -> str:
         cells += [label(f"{breakable(words)}, frame {view.frame}"), *_compared(view)]
     title = "<h3>Worst views, one of each method and target</h3>"
     pictures = f'{title}<div class="grid compared">{"".join(cells)}</div>' if shown else ""
-    drawn = failure_table(results) if results.trained else ""
+    drawn = failure_table(results)
     if drawn:
         drawn = legend(zip(VERDICTS, VERDICT_COLOURS, strict=True)) + drawn
     return section("Where methods fail", note, drawn + pictures) if drawn or pictures else ""

@@ -61,11 +61,14 @@ def score_table(results: Results, target: str | None) -> str:
 def failure_table(results: Results) -> str:
     """Return the map of conditions and methods, coloured by verdict, with the mean score in each cell.
 
-    Conditions under which none of them was run are left out.
+    Conditions under which none of them was run are left out. References stand in it where nothing else was run.
     """
-    labels = results.trained
+    labels = results.trained or results.labels
+    refused = any(results.verdict(label, c)[0] == "refused" for label in labels for c in results.conditions)
+    if not (results.trained or refused or len(results.conditions) > 1):
+        return ""
     lines = []
-    for condition in results.trained_conditions:
+    for condition in results.trained_conditions or results.conditions:
         row = "".join(_verdict_cell(results, label, condition) for label in labels)
         lines.append(f"<tr><td>{html.escape(condition)}</td>{row}</tr>")
     return _table("condition", [breakable(label) for label in labels], lines, "scores map") if lines else ""
@@ -80,6 +83,8 @@ def _verdict_cell(results: Results, label: str, condition: str) -> str:
     of = len(results.targets)
     text = verdict if score is None else f"{score:.1f}"
     text += f" <small>({count} of {of})</small>" if 0 < count < of else ""
+    if label not in results.trained and verdict != "refused":
+        return f'<td class="n">{text}</td>'
     ink = "#fff" if verdict in DARK else "inherit"
     colour = VERDICT_COLOURS[VERDICTS.index(verdict)]
     title = html.escape(f"{label}, {condition}: {verdict}; {words}")

@@ -86,7 +86,9 @@ class NavigationSection:
             f"expected sgp4, file:///path, tcp://host:port or ndm:///folder, got {self.source!r}",
         )
         require(
-            0 < self.max_gap_s <= 3600, f"{path}.max_gap_s", f"expected 0 to 3600 s, got {self.max_gap_s}"
+            0 < self.max_gap_s <= 3600,
+            f"{path}.max_gap_s",
+            f"expected more than 0 s, 3600 s at most, got {self.max_gap_s}",
         )
         require(0 <= self.wait_s <= 60, f"{path}.wait_s", f"expected 0 to 60 s, got {self.wait_s}")
 

@@ -322,6 +322,27 @@ class FrameStore:
                 self._is_locked = False
 
     @contextlib.contextmanager
+    def capturing(self) -> Iterator[None]:
+        """Keep other processes from taking frames into the store; one that is killed lets go of it.
+
+        Raises:
+            StoreError: another process takes frames into it, or the disk refuses to be read.
+        """
+        with _disk_errors("hold the store for its frames"):
+            held = os.open(self._frames, os.O_RDONLY)
+        try:
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise StoreError(
+                    f"another process takes frames into {self.folder}: end it, which `fuser {self._frames}` names, "
+                    "or give another --store"
+                ) from None
+            yield
+        finally:
+            os.close(held)
+
+    @contextlib.contextmanager
     def _told(self, action: str) -> Iterator[None]:
         """Go on where the disk refuses to be written to; an event says so once."""
         try:

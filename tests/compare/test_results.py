@@ -304,6 +304,11 @@ def test_pictures_name_their_method_and_a_section_without_content_goes(compariso
     rows = Rows(tmp_path)
     rows.add(row("black", psnr_clean_db=20.0))
     assert "Where methods fail" not in write_page(tmp_path).read_text()
+    rows.add(row("black", "noise x2", error="CompareError: A has no truth"))
+    page = write_page(tmp_path).read_text()
+    assert (
+        "refused; A: A has no truth" in page and '<td class="n">20.0</td>' in page
+    )  # a reference is not judged
 
 
 @pytest.fixture(scope="module")

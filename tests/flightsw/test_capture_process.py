@@ -62,6 +62,19 @@ def wait_for_frames(store: Path, count: int, process: subprocess.Popen) -> None:
         time.sleep(0.005)
 
 
+def test_a_store_takes_the_frames_of_one_process_until_that_ends(tmp_path, small_mission):
+    store = FrameStore(tmp_path / "store")
+    with camera(small_mission) as server:
+        with store.capturing():
+            refused = start(tmp_path, server, "--count", "2")
+            _, error = finish(refused)
+            assert refused.returncode == 1 and len(error.splitlines()) == 1
+            assert "another process takes frames into" in error and "--store" in error
+            assert len(FrameStore(tmp_path / "store").frames) == 0
+        told, _ = finish(start(tmp_path, server, "--count", "2"))
+    assert told["frames_stored"] > 0
+
+
 def test_a_kill_at_any_moment_loses_at_most_the_frame_being_exposed(tmp_path, small_mission):
     rng = random.Random(4)
     kills = 4

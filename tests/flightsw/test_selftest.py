@@ -25,6 +25,7 @@ from flightsw.errors import OrbitError
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import NavigationSection, StoreSection
 from flightsw.selftest import computer, devices, planned_pass, self_test
+from tests.small_disk import read_only
 
 ROOT = Path(__file__).parents[2]
 NS = 1_000_000_000
@@ -247,6 +248,12 @@ def test_a_camera_that_cannot_be_right_is_named(small_mission, show, options, st
 def test_a_camera_that_is_not_there(small_mission, tmp_path):
     (finding,) = devices.check_camera(small_mission, f"hil://{tmp_path}/nobody")
     assert finding.state == "failed" and "no camera at" in finding.found
+
+
+def test_a_disk_that_is_mounted_for_reading_is_a_finding(small_mission, tmp_path):
+    with read_only(tmp_path):
+        (finding,) = computer.check_disk(small_mission, tmp_path)
+    assert finding.state == "failed" and "Read-only" in finding.found and "for writing" in finding.advice
 
 
 def test_a_disk_that_cannot_be_written_or_is_too_small(small_mission, tmp_path):
