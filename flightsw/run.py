@@ -268,6 +268,10 @@ def _capture(
     watchdog: Watchdog,
 ) -> CaptureCounts:
     def wait_until(due_ns: int) -> None:
+        # a camera with a clock of its own waits for this computer: in safe mode its time stands still
+        while camera.has_own_clock and load_settings(store.folder, mission).safe_mode and not stop.is_set():
+            watchdog.expect("capture", RETRY_S + EXPOSURE_WITHIN_S)
+            stop.wait(RETRY_S)
         while not camera.has_own_clock and not stop.is_set() and (left_s := (due_ns - utc_ns()) / 1e9) > 0:
             watchdog.expect("capture", RETRY_S + EXPOSURE_WITHIN_S)
             camera.reconnect()

@@ -1,4 +1,4 @@
-"""A watertight mesh of what the model's depth maps leave solid."""
+"""A closed mesh of what the model's depth maps leave solid."""
 
 import dataclasses
 
@@ -56,7 +56,9 @@ SEEN_AT_VERTEX = (
 def surface_mesh(
     gaussians: Gaussians, cameras: Cameras, sun_dir: Tensor | None = None, max_triangles: int = MAX_TRIANGLES
 ) -> SurfaceMesh:
-    """Return a watertight mesh of all that the views do not see through.
+    """Return a closed mesh of all that the views do not see through.
+
+    Two triangles share an edge, or four where two bodies touch along it.
 
     Each place of a grid gets its distances from the planes that the views see there, positive in front, and far in
     front where a view sees past it. The distance that SEEN_THROUGH of them exceed is 0 on the surface, also of a thin

@@ -17,6 +17,7 @@ import pytest
 from flightsw.icd.frame import decode_frame
 from flightsw.icd.mission import load_mission
 from flightsw.storage.fsck import fsck
+from flightsw.storage.settings import Settings, save_settings
 from flightsw.storage.store import FrameStore
 from hil.cameras.virtual import CameraServer
 
@@ -73,6 +74,18 @@ def test_a_store_takes_the_frames_of_one_process_until_that_ends(tmp_path, small
             assert len(FrameStore(tmp_path / "store").frames) == 0
         told, _ = finish(start(tmp_path, server, "--count", "2"))
     assert told["frames_stored"] > 0
+
+
+def test_the_pass_of_a_simulated_camera_stands_still_in_safe_mode(tmp_path, small_mission):
+    store = FrameStore(tmp_path / "store")
+    save_settings(store.folder, Settings("oldest", safe_mode=True))
+    with camera(small_mission) as server:
+        process = start(tmp_path, server, "--count", "2")
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(timeout=4)
+        save_settings(store.folder, Settings("oldest"))
+        told, _ = finish(process)
+    assert told["frames_stored"] == 2 * len(small_mission.bracket.exposure_times_ms)
 
 
 def test_a_kill_at_any_moment_loses_at_most_the_frame_being_exposed(tmp_path, small_mission):
