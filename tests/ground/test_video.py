@@ -123,7 +123,8 @@ def test_spans_are_of_presentation_times_where_the_frame_rate_changes(tmp_path):
 def test_a_damaged_end_costs_its_own_frames(tmp_path, caplog):
     frames = noise(30, set(range(30)))
     whole = write_video(tmp_path / "a.avi", frames, codec="MJPG")
-    kept = write_frames(whole, tmp_path / "whole", 30)
+    with caplog.at_level(logging.WARNING):
+        kept = write_frames(whole, tmp_path / "whole", 30)
     assert kept == list(range(30)) and not caplog.records
     content = whole.read_bytes()
     (tmp_path / "cut.avi").write_bytes(content[: len(content) * 2 // 3])
