@@ -129,5 +129,13 @@ def filled(image: Tensor, variance: Tensor, known: Tensor) -> tuple[Tensor, Tens
 
 
 def grown(mask: Tensor, reach_px: int) -> Tensor:
-    """Return where a mask [H, W] is set within `reach_px` rows and columns."""
-    return F.max_pool2d(mask[None, None].float(), 2 * reach_px + 1, 1, reach_px)[0, 0] > 0
+    """Return where a mask [H, W] bool is set within `reach_px` rows and columns."""
+    for axis in (0, 1):
+        done, most = 0, min(reach_px, mask.shape[axis] - 1)
+        while done < most:  # what is within `done` of a pixel that is `step` away is within their sum
+            step = min(done + 1, most - done)  # that pixel lies on the way, within the picture
+            near, mask, length = mask, mask.clone(), mask.shape[axis] - step
+            mask.narrow(axis, step, length).logical_or_(near.narrow(axis, 0, length))
+            mask.narrow(axis, 0, length).logical_or_(near.narrow(axis, step, length))
+            done += step
+    return mask

@@ -17,10 +17,8 @@ OFF_PX = 2.0  # from the surface or the design: nearer is the same place
 OFF_SIGMAS = 4.0  # the same in robust standard deviations of the surface
 LINKED_PX = 1.8  # points nearer to each other are of one finding
 LEAST_AREA_PX = 20.0  # of a finding, in squares of a pixel
-LEAST_WIDTH_PX = (
-    1.5  # its area over its size: frames do not show what is narrower, as a mast, surely enough to miss it
-)
-# that a finding stands off, at least: models of bodies that are as designed err by up to 5.5 px in single places
+LEAST_WIDTH_PX = 1.5  # its area over its size: frames may not show what is narrower, such as a mast
+# that a finding stands off, at least: models of bodies that are as designed err by as much in single places
 LEAST_DEPTH_PX = 5.0
 WHOLE = 0.6  # of a part's shown samples that are not there: the part is missing
 STATES = ("as designed", "missing", "not seen", "turned")

@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
+from obbgs_core.background import grown
 from obbgs_core.compact import hold_compact
 from obbgs_core.compiled import each
 from obbgs_core.frames import TrainingFrame
@@ -44,10 +45,8 @@ AGREEMENT = 0.95  # share of views that must see light where a voxel projects
 COARSE_VOXELS = 64  # along each axis of the first grid
 SUBDIVISIONS = 2  # of the first grid, at most; each halves the voxels
 VIEWS_AT_ONCE = 4  # between two looks for points that are out of the hull already
-SAMPLED, WORTH = (
-    64,
-    0.5,
-)  # of so few voxels is judged whether a coarse grid is carved: not where more than half stay
+# A coarse grid is not carved where noise would keep more than WORTH of it, as every SAMPLED-th of its voxels tells.
+SAMPLED, WORTH = 64, 0.5
 FINEST_PX = 0.7  # smallest width of a voxel in the image
 VOXELS_AT_ONCE = 1_000_000  # bounds the memory
 POINTS_AT_ONCE = 1 << 17  # of one thread; with fewer, threads of Python wait for each other
@@ -74,13 +73,13 @@ class Silhouette:
     def solid(self) -> Tensor:
         """The pixels [H, W] inside certain light, away from its rim by RIM_PX and by as much as likely light was grown:
         something opaque is there, however dark, since a spacecraft is not translucent."""
-        return ~_dilated(~self.certain[None, None], RIM_PX + self.grown_px)[0, 0]
+        return ~grown(~self.certain, RIM_PX + self.grown_px)
 
     def dilated(self, reach_px: int) -> "Silhouette":
         """Return the silhouette with its likely light grown, and its sky shrunk, by `reach_px` for pose errors."""
         if reach_px == 0:
             return self
-        likely, lit = (_dilated(mask[None, None], reach_px)[0, 0] for mask in (self.likely, ~self.sky))
+        likely, lit = (grown(mask, reach_px) for mask in (self.likely, ~self.sky))
         return dataclasses.replace(self, likely=likely, sky=~lit, grown_px=self.grown_px + reach_px)
 
 
@@ -146,11 +145,6 @@ def _mean(image: Tensor, window: int) -> Tensor:
     return torch.from_numpy(uniform_filter(image[0, 0].numpy(), window, mode="constant"))[None, None]
 
 
-def _dilated(mask: Tensor, reach_px: int) -> Tensor:
-    """Return where a mask [1, 1, H, W] is set within `reach_px` rows and columns of each pixel."""
-    return _mean(mask.float(), 2 * reach_px + 1) > 0  # sums of zeros and ones are exact
-
-
 def shows_light(frame: TrainingFrame, sensor: Sensor) -> bool:
     """Return whether anything in a frame certainly rises above the noise; in eclipse nothing does."""
     sky_dn, sigma_dn = dark_reading(sensor)
@@ -212,11 +206,10 @@ def hull_points(silhouettes: list[Silhouette], radius: float) -> tuple[Tensor, f
         # a coarse voxel survives when light falls anywhere near its projection, a final one when at its centre
         reach_m = 0.87 * voxel_m * (level < subdivisions)
         points = _centres(inside, voxel_m, radius)
-        if (
-            reach_m
-            and (agreement(silhouettes, points[::SAMPLED], reach_m) >= AGREEMENT).float().mean() > WORTH
-        ):
-            continue
+        if reach_m:
+            staying = agreement(silhouettes, points[::SAMPLED], reach_m) >= AGREEMENT
+            if staying.float().mean() > WORTH:
+                continue
         pieces = points.split(VOXELS_AT_ONCE)
         shares = torch.cat([agreement(silhouettes, p, reach_m, AGREEMENT) for p in pieces])
         inside[inside.clone()] = shares >= AGREEMENT
@@ -246,7 +239,7 @@ def coherence(silhouettes: list[Silhouette], points: Tensor, voxel_m: float) -> 
         image[v[inside].long(), u[inside].long()] = True
         voxel_px = float(s.K[0, 0]) * voxel_m / max(float(s.world_to_camera[2, 3]), 1e-6)
         reach_px = math.ceil(min(max(voxel_px / 2, 1.0), min(height, width) / 4))  # as in `agreement`
-        image = _dilated(image[None, None], reach_px)[0, 0]
+        image = grown(image, reach_px)
         covered += int((s.certain & image).sum())
         total += int(s.certain.sum())
     return covered / max(total, 1)
@@ -313,7 +306,7 @@ def _reaching(reach_m: float, s: Silhouette) -> Tensor:
     if reach_m <= 0:
         return s.likely
     pixels = math.ceil(float(s.K[0, 0]) * reach_m / max(float(s.world_to_camera[2, 3]), 1e-6))
-    return _dilated(s.likely[None, None], min(pixels, min(s.likely.shape) // 4))[0, 0]
+    return grown(s.likely, min(pixels, min(s.likely.shape) // 4))
 
 
 def _voted(views: list[Silhouette], masks: list[Tensor], most_against: float, before: _Voted) -> _Voted:

@@ -21,6 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from obbgs_core.background import grown
 from obbgs_core.compact import Compact, held, whole
 from obbgs_core.compiled import each
 from obbgs_core.frames import TrainingFrame
@@ -154,20 +155,8 @@ def cut_pixels(sensor: Sensor, dn: Tensor) -> Tensor:
     # with less noise, or a black level below it, many readings of the sky are exactly that
     if not CLEAR_NOISE_DN < _noise_dn(sensor) < sensor.black_dn:
         return torch.zeros(dn.shape[:2], dtype=torch.bool)
-    inside = _shrunk((dn == int(sensor.black_dn)).all(dim=2))
-    return ~_shrunk(~inside)
-
-
-def _shrunk(mask: Tensor) -> Tensor:
-    """Return where a mask [H, W] is set all over the square of `CUT_PX` around a pixel, as far as the picture goes."""
-    reach = CUT_PX // 2
-    for axis in (0, 1):
-        around, mask = mask, mask.clone()
-        for shift in range(1, min(reach, mask.shape[axis] - 1) + 1):
-            length = mask.shape[axis] - shift
-            mask.narrow(axis, shift, length).logical_and_(around.narrow(axis, 0, length))
-            mask.narrow(axis, 0, length).logical_and_(around.narrow(axis, shift, length))
-    return mask
+    other = ~(dn == int(sensor.black_dn)).all(dim=2)
+    return grown(~grown(other, CUT_PX // 2), CUT_PX // 2)
 
 
 def _basis(rows: int, columns: int) -> Tensor:
