@@ -44,12 +44,9 @@ FEWEST_NODES = 8  # of a piece that is kept
 COLLAPSE_RATE = 7  # of fast_simplification: how fast its threshold grows
 SAME_DEPTH_VOXELS = 2.0  # within which a place counts as seen
 SEEN_AT = 0.05  # cosine between a place's normal and the way to a view that sees it, at least
-SEEN_AT_VERTEX = (
-    -0.3
-)  # the same of a vertex: its normal is the mean of its triangles', of which one may be seen
-SEEN_AT_VERTEX = (
-    -0.3
-)  # the same of a vertex: its normal is the mean of its triangles', of which one may be seen
+# the same of a vertex: its normal is the mean of its triangles', of which one may be seen
+SEEN_AT_VERTEX = -0.3
+APART_VOXELS = 0.01  # by which vertices at one place are moved into the solid, each on its own side
 
 
 @torch.no_grad()
@@ -58,7 +55,7 @@ def surface_mesh(
 ) -> SurfaceMesh:
     """Return a closed mesh of all that the views do not see through.
 
-    Two triangles share an edge, or four where two bodies touch along it.
+    Two triangles share an edge, also when vertices at equal places are merged.
 
     Each place of a grid gets its distances from the planes that the views see there, positive in front, and far in
     front where a view sees past it. The distance that SEEN_THROUGH of them exceed is 0 on the surface, also of a thin
@@ -109,6 +106,7 @@ def surface_mesh(
     vertices, shifts = thinned(vertices, triangles, light, voxel_m)
     behind = KDTree(vertices)  # of what was moved inwards, views see what was in front of it
     vertices, triangles = _simplified(vertices, triangles, max_triangles, voxel_m)
+    vertices = _apart(vertices, _outwards(vertices, triangles), voxel_m)
     outwards = _outwards(vertices, triangles)
     colours, seen_by = looks.at(vertices, outwards, shifts[behind.query(vertices)[1]], SEEN_AT_VERTEX)
     layout = layout_of(vertices, triangles, voxel_m / VOXEL_PX)
@@ -282,6 +280,17 @@ def _simplified(
         )
     of_simple = faces_of_simplified((vertices, triangles, face), (simple, among), faces, voxel_m)
     return _arrays(_closed(flattened(simple, among, of_simple, faces, voxel_m), among))
+
+
+def _apart(vertices: np.ndarray, outwards: np.ndarray, voxel_m: float) -> np.ndarray:
+    """Return the vertices [V, 3] m, those that share a place moved into the solid a little.
+
+    Where two sheets touch along an edge, each has vertices of its own there; whoever merges vertices by their place
+    would find four triangles at that edge and call the mesh open.
+    """
+    _, place, counts = np.unique(vertices, axis=0, return_inverse=True, return_counts=True)
+    shared = counts[place.ravel()] > 1
+    return np.where(shared[:, None], vertices - APART_VOXELS * voxel_m * outwards, vertices)
 
 
 def _collapsed(

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 from obbgs_core.errors import ExportError
 from obbgs_core.io.mesh import save_mesh
 from obbgs_core.mesh.flat_faces import flat_faces
-from obbgs_core.mesh.solid import _where_seen, surface_mesh
+from obbgs_core.mesh.solid import _apart, _outwards, _where_seen, surface_mesh
 from obbgs_core.mesh.texture import layout_of
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.model.mesh import SurfaceMesh
@@ -110,6 +110,17 @@ def test_the_faces_of_a_box_are_planes_and_its_edges_are_sharp(box):
     corners = np.array(np.meshgrid(*[[-0.6, 0.6]] * 3)).reshape(3, -1).T
     gaps, _ = KDTree(shape.vertices).query(corners)
     assert gaps.max() < 2 * PIXEL_M
+
+
+def test_sheets_that_touch_along_an_edge_stay_closed_when_vertices_are_merged():
+    first, second = trimesh.creation.box(), trimesh.creation.box().apply_translation([1.0, 1.0, 0.0])
+    vertices = np.concatenate([first.vertices, second.vertices])
+    triangles = np.concatenate([first.faces, second.faces + len(first.vertices)])
+    assert not trimesh.Trimesh(vertices, triangles, process=True).is_watertight
+    apart = _apart(vertices, _outwards(vertices, triangles), voxel_m=0.1)
+    merged = trimesh.Trimesh(apart, triangles, process=True)
+    assert merged.is_watertight and len(merged.vertices) == 16
+    assert np.abs(apart - vertices).max() < 0.001  # a hundredth of a voxel
 
 
 def test_the_texture_shows_what_lies_between_the_vertices(box):
