@@ -318,7 +318,8 @@ def export_command(
     """Write a session's frames for other software, whole brackets split into train, val and test (6:2:3).
 
     Pictures have 8 bits. Beside them lie the readings of 16 bits, which `ground import` takes with exposure times and
-    the sensor's figures, of a COLMAP folder with the cameras of its model. The format ndm writes no pictures, but CCSDS
+    the sensor's figures, of a COLMAP folder with the cameras of its model; of a run that has points of the surface. The
+    format ndm writes no pictures, but CCSDS
     messages: the target's attitude and rate, the camera's attitude and its path about the target with covariance.
 
     Example: ground export pass-12/runs/first --format nerfstudio --out pass-12-nerfstudio
@@ -330,12 +331,9 @@ def export_command(
     from ground.run.navigation_messages import export_ndm
     from ground.run.runs import is_session, open_run, run_at
     from ground.session.folder import SessionError, open_session
+    from ground.session.truth import read_points
 
-    exporters = {
-        ExportFormat.NERF: export_nerf,
-        ExportFormat.NERFSTUDIO: export_nerfstudio,
-        ExportFormat.COLMAP: export_colmap,
-    }
+    exporters = {ExportFormat.NERF: export_nerf, ExportFormat.NERFSTUDIO: export_nerfstudio}
     if (out.exists() and not out.is_dir()) or (out / "session.json").exists():
         kind = "a session" if out.is_dir() else "a file"
         raise SessionError(f"{out} is {kind}: give a folder of its own with --out, new or empty")
@@ -351,7 +349,13 @@ def export_command(
         else:
             read = open_session(source) if opened is None else refined_session(opened)
             read.check_body_axes()
-            counts = exporters[format_](read, out)
+            if format_ is ExportFormat.COLMAP:
+                surface = opened and opened.folder / "surface.ply"
+                counts = export_colmap(
+                    read, out, read_points(surface) if surface and surface.exists() else None
+                )
+            else:
+                counts = exporters[format_](read, out)
     except OSError as error:
         raise SessionError(
             f"{in_words(error)}; give --out a folder that can be written and has room"

@@ -8,6 +8,8 @@ Source: colmap.github.io/format.html.
 import struct
 from pathlib import Path
 
+import numpy as np
+
 from flightsw.icd.quaternion import matrix_to_quat
 from ground.formats.nerf import split_frames
 from ground.formats.nerfstudio import export_nerfstudio
@@ -15,12 +17,18 @@ from ground.session.folder import Session
 from obbgs_base.files import write_whole
 
 PINHOLE = 1  # the number of COLMAP's camera model
+POINTS = 10_000  # from which a trainer of Gaussian splats may start
+GREY = (128, 128, 128)
 
 
-def export_colmap(session: Session, out: Path) -> dict[str, int]:
+def export_colmap(session: Session, out: Path, surface: np.ndarray | None = None) -> dict[str, int]:
     """Write a session as a COLMAP folder, frames and pictures as in `export_nerfstudio`; return the frames per split.
 
-    The model has no points. Its test.txt names the pictures that are not for training, as for 3DGS.
+    Its test.txt names the pictures that are not for training, as for 3DGS.
+
+    Args:
+        surface: [P, 3] m, body frame, places on the target, of which at most POINTS become the model's points: grey,
+            without the pictures that they were seen in. Without a surface the model has no points.
     """
     counts = export_nerfstudio(session, out)
     width, height = session.camera.width, session.camera.height
@@ -48,7 +56,11 @@ def export_colmap(session: Session, out: Path) -> dict[str, int]:
     ]
     model = out / "sparse" / "0"
     model.mkdir(parents=True, exist_ok=True)
-    for name, entries in (("cameras", cameras), ("images", images), ("points3D", [])):
+    places = np.empty((0, 3)) if surface is None else surface[:: max(1, -(-len(surface) // POINTS))]
+    points = [
+        struct.pack("<Q3d3BdQ", p + 1, *place, *GREY, 0.0, 0) for p, place in enumerate(places.tolist())
+    ]
+    for name, entries in (("cameras", cameras), ("images", images), ("points3D", points)):
         write_whole(model / f"{name}.bin", struct.pack("<Q", len(entries)) + b"".join(entries))
     write_whole(model / "test.txt", "".join(held_out).encode())
     return counts

@@ -119,6 +119,7 @@ def page(files: Iterable[Path]) -> str:
     parts = [
         "# Results\n",
         "Made from `results/*.jsonl` by `python -m tests.benchmarks.rows`; do not edit.\n",
+        "A command is that of its commit: check that out to repeat it, since later ones rename options and grids.\n",
     ]
     for file in files:
         rows = [with_best(json.loads(line)) for line in file.read_text().splitlines() if line]

@@ -265,6 +265,15 @@ def test_a_colmap_export_comes_back_with_its_exposures_and_readings_and_the_came
     assert again.frames[0].covariance.any()  # of the moved one nobody states it: about a pixel
 
 
+def test_the_points_of_a_colmap_export_lie_on_the_surface_and_colmap_reads_them(tmp_path, session):
+    export_colmap(session, tmp_path / "none")
+    assert len(pycolmap.Reconstruction(str(tmp_path / "none" / "sparse" / "0")).points3D) == 0
+    surface = np.random.default_rng(0).normal(size=(25_000, 3))
+    export_colmap(session, tmp_path / "c", surface)
+    points = pycolmap.Reconstruction(str(tmp_path / "c" / "sparse" / "0")).points3D
+    np.testing.assert_allclose([point.xyz for _, point in sorted(points.items())], surface[::3])
+
+
 def changed_frames(session, change):
     """Return the session with its frames' lines changed."""
     lines = [json.loads(line) for line in (session.path / "frames.jsonl").read_text().splitlines()]
