@@ -18,7 +18,7 @@ from ground.commands.live import live_command
 from ground.commands.options import ListenKey, SessionDir, listening_key
 from ground.commands.runs import evaluate_command, mesh_command, reconstruct_command, report_command
 from ground.commands.systems import dictionary_command, yamcs_command
-from ground.commands.uplink import uplink_command
+from ground.commands.uplink import UplinkWords, uplink_command
 from ground.commands.view import view_command
 from obbgs_base.command_line import LINK_HELP, MISSION_HELP, AsJson, new_app, run
 from obbgs_base.errors import counted
@@ -130,7 +130,7 @@ def key(
         print(f"key {made.spi} ({made.fingerprint}) in {file}; copy it and {file}.received to the spacecraft")
 
 
-app.command("uplink")(uplink_command)
+app.command("uplink", cls=UplinkWords)(uplink_command)
 app.command("live")(live_command)
 app.command("reconstruct")(reconstruct_command)
 app.command("evaluate")(evaluate_command)

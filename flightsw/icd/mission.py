@@ -176,11 +176,11 @@ class BracketSection:
         )
         if self.frame_spacing_s is None:  # as long as the longest exposure, at least
             spacing_s = max(self.exposure_times_s)
-        shortest_s = spacing_s * len(self.exposure_times_ms)
+        shortest_ns = round(spacing_s * len(self.exposure_times_ms) * 1e9)  # as exactly as times are kept
         require(
-            self.interval_s >= shortest_s,
+            round(self.interval_s * 1e9) >= shortest_ns,
             f"{path}.interval_s",
-            f"{self.interval_s} s is shorter than the bracket itself ({shortest_s} s)",
+            f"{self.interval_s} s is shorter than the bracket itself ({shortest_ns / 1e9} s)",
         )
         require(self.interval_s <= 86_400, f"{path}.interval_s", f"{self.interval_s} s is more than a day")
         require(1 <= self.count <= 100_000, f"{path}.count", f"expected 1 to 100000, got {self.count}")
@@ -298,6 +298,15 @@ class Mission:
     link: LinkSection = field(default_factory=LinkSection)
     reconstruct: ReconstructSection = field(default_factory=ReconstructSection)
     sha256: str = ""  # of the file's bytes, so a result can be traced to its mission
+
+    def __post_init__(self):
+        frame_mb = 2e-6 * self.camera.width * self.camera.height * self.camera.channels
+        require(
+            self.store.quota_mb == 0 or self.store.quota_mb >= frame_mb,
+            "mission.store.quota_mb",
+            f"expected room for a frame of this camera, {frame_mb:g} MB uncompressed, or 0 for as much as the disk "
+            f"holds, got {self.store.quota_mb:g}",
+        )
 
 
 def load_mission(path: str | Path) -> Mission:

@@ -11,6 +11,14 @@ from flightsw.icd.config import require, require_counts, require_unit_quaternion
 from flightsw.icd.frame import Attitude
 from obbgs_base.physics.navigation_errors import LENGTHS, SharedParameters
 
+# errors beyond which a value says nothing, in the units of the mission file
+MOST = {
+    "attitude_deg": (180.0, " degrees"),
+    "boresight_deg": (180.0, " degrees"),
+    "inertia_ratios": (1.0, ", a share of the ratios: write 1 % as 0.01"),
+    "focal": (0.5, ", a share of the focal length: write 1 % as 0.01"),
+}
+
 
 @dataclass(frozen=True)
 class TargetAttitudeSection:
@@ -117,6 +125,8 @@ class NavigationErrorsSection:
             values = value if isinstance(value, tuple) else (value,)
             require(len(values) in (1, length), path, f"expected 1 or {length} numbers, got {len(values)}")
             require(min(values) >= 0, path, f"must not be negative, got {min(values):g}")
+            most, unit = MOST.get(name, (math.inf, ""))
+            require(max(values) <= most, path, f"expected 0 to {most:g}{unit}, got {max(values):g}")
 
     @property
     def sigmas(self) -> SharedParameters:

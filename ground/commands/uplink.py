@@ -1,21 +1,48 @@
 """The command of `ground` that sends commands to the spacecraft, one or a script of them."""
 
+import itertools
 import json
+import re
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from flightsw.icd.config import ConfigError
 from flightsw.icd.mission import load_mission
 from ground.commands.options import UplinkCommand, listening_key
-from obbgs_base.command_line import KEY_HELP, LINK_HELP, MISSION_HELP, AsJson
+from obbgs_base.command_line import KEY_HELP, LINK_HELP, MISSION_HELP, USAGE_ERROR, AsJson
 from obbgs_base.errors import reason
 from obbgs_base.output import output_may_fail
 
 if TYPE_CHECKING:
     from flightsw.icd.command import Command
+
+LOOK_S = 0.5  # between looks whether somebody listens
+RESTART_S = 5.0  # that a listener may be gone: it may be starting again
+NEGATIVE = re.compile(r"-[\d.]")  # how a negative number begins
+
+
+class UplinkWords(TyperCommand):
+    """The words after `ground uplink`: a negative number among them is no option, but an argument out of range."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        from ground.link.uplink import parse_command
+
+        given = list(args)  # parsing takes them away
+        try:
+            return super().parse_args(ctx, args)
+        except USAGE_ERROR as error:
+            if not NEGATIVE.match(getattr(error, "option_name", "")):
+                raise
+            names = [each.value for each in UplinkCommand]
+            start = next((place for place, word in enumerate(given) if word in names), len(given))
+            words = list(itertools.takewhile(lambda word: not word.startswith("--"), given[start:]))
+            if words:
+                parse_command(words[0], words[1:])  # says what is expected
+            raise
 
 
 @output_may_fail()
@@ -123,14 +150,15 @@ def _sent(
             return True
         if time.monotonic() <= end_s:
             return False
-        is_tended = model is not None and uplinking.is_waiting(session, counter)
-        if is_tended and link is None:
-            is_tended = uplinking.is_listening(session)
-        return not is_tended
+        return model is None or not uplinking.is_waiting(session, counter)
 
     try:
         if link is None:
-            while not ended():
+            heard_s = looked_s = time.monotonic()
+            while not ended() and looked_s - heard_s <= RESTART_S:
+                if time.monotonic() - looked_s > LOOK_S:
+                    looked_s = time.monotonic()
+                    heard_s = looked_s if uplinking.is_listening(session) else heard_s
                 time.sleep(0.05)
         else:
             from ground.link.ingest import listen
@@ -143,7 +171,12 @@ def _sent(
     if result is None:
         words = uplinking.in_words(command, model)
         result = {"counter": counter, "command": command.name, "given": words, "stage": "failed"}
-        sent_text = "it was sent, and no answer came before its listener ended: it may have been executed"
-        result |= {"text": sent_text if was_sent else "no process sent it", "reports": []}
+        text = (
+            "it was sent, no answer came, and it may have been executed" if was_sent else "no process sent it"
+        )
+        if link is None and not uplinking.is_listening(session):
+            then = "a `ping` before it is repeated" if was_sent else "the command"
+            text = f"`ground listen` of {session} has ended: {text}; start it again, and give {then}"
+        result |= {"text": text, "reports": []}
         uplinking.note_end(session, result, time.time_ns())
     return result

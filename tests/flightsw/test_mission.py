@@ -54,7 +54,7 @@ def test_the_shipped_mission_loads(tmp_path):
         (
             "interval_s: 27.0",
             "interval_s: 0.0003",
-            r"mission\.bracket\.interval_s: 0\.0003 s is shorter",
+            r"mission\.bracket\.interval_s: 0\.0003 s is shorter than the bracket itself \(0\.0006 s\)",
         ),
         ("mode: spin", "mode: wobble", r"mission\.target_attitude\.mode: expected one of inertial, spin"),
         ("axis: sun", "axis: [1.0, 1.0, 0.0]", r"mission\.target_attitude\.axis: expected a unit vector"),
@@ -99,12 +99,29 @@ def test_the_shipped_mission_loads(tmp_path):
             "navigation_errors: {focal: two}\npose:",
             r"navigation_errors\.focal: expected a number, got 'two'",
         ),
+        (
+            "pose:",
+            "navigation_errors: {focal: 2}\npose:",
+            r"navigation_errors\.focal: expected 0 to 0\.5, a share of the focal length: write 1 % as 0\.01, got 2$",
+        ),
+        (
+            "pose:",
+            "store: {quota_mb: 0.0001}\npose:",
+            r"mission\.store\.quota_mb: expected room for a frame .*, 0\.131072 MB uncompressed, or 0 .*, got 0\.0001$",
+        ),
     ],
 )
 def test_a_wrong_value_is_named_by_its_path(tmp_path, old, new, path):
     assert old in TEXT
     with pytest.raises(ConfigError, match=path):
         load(tmp_path, TEXT.replace(old, new))
+
+
+def test_the_shortest_interval_that_a_message_states_is_taken(tmp_path):
+    """The sum of three times of 0.2 ms is 0.6000000000000001 ms."""
+    assert load(tmp_path, TEXT.replace("interval_s: 27.0", "interval_s: 0.0006")).bracket.interval_s == 6e-4
+    with pytest.raises(ConfigError, match="is shorter"):
+        load(tmp_path, TEXT.replace("interval_s: 27.0", "interval_s: 0.000599999"))
 
 
 def test_sigmas_of_shared_errors_are_in_radians_one_an_axis(tmp_path):

@@ -1,6 +1,7 @@
 """Commands on the ground: sealed, each with its own counter, repeated until the result is known, executed once."""
 
 import contextlib
+import itertools
 import json
 import math
 import os
@@ -22,6 +23,8 @@ from flightsw.icd.model_file import SENSOR_METADATA
 from flightsw.icd.model_file import check_model as check_model_bytes
 from flightsw.storage.store import FrameStore
 from ground import cli
+from ground.commands import uplink as uplink_commands
+from ground.link import uplink as uplinking
 from ground.link.ingest import listen
 from ground.link.uplink import (
     COUNTER_MARGIN,
@@ -41,6 +44,7 @@ from ground.link.uplink import (
 )
 from ground.session.folder import SessionError
 from obbgs_base.checked import checked_line, parse_checked_line
+from obbgs_base.command_line import USAGE_ERROR
 
 INTERVAL_S = 0.5
 
@@ -618,6 +622,46 @@ def test_a_command_that_was_sent_before_its_listener_ended_is_told_from_one_that
         sender = threading.Thread(target=send_and_end, daemon=True)
         sender.start()
         ended = CliRunner().invoke(cli.app, command)
+        sender.join()
     assert ended.exit_code == 1 and "may have been executed" in ended.output
     assert "may have been executed" in (session / "commands.jsonl").read_text()
     assert not list((session / "uplink").glob("*.sent"))
+
+
+@pytest.mark.parametrize("is_sent", [False, True])
+@pytest.mark.parametrize("name", ["ping", "model"])
+def test_a_listener_that_is_gone_ends_the_wait_for_a_command(
+    session, key_file, tmp_path, monkeypatch, name, is_sent
+):
+    """With the time-out of a day: without the look at the listener this would wait for ever."""
+    monkeypatch.setattr(uplink_commands, "LOOK_S", 0.0)
+    monkeypatch.setattr(uplink_commands, "RESTART_S", 0.2)
+    monkeypatch.setattr(uplinking, "was_sent", lambda *_: is_sent)
+    looks = itertools.chain([True, True, False, True], itertools.repeat(False))  # it starts again once
+    monkeypatch.setattr(uplinking, "is_listening", lambda _: next(looks))
+    model = tmp_path / "model.onnx"
+    model.write_bytes(foreign_model(**dict.fromkeys(("width", "height", *SENSOR_METADATA), "1")))
+    words = [name] if name == "ping" else [name, str(model)]
+    options = ["--session", str(session), "--key", str(key_file), "--timeout", "86400"]
+    ended = CliRunner().invoke(cli.app, ["uplink", *words, *options])
+    assert ended.exit_code == 1 and len(ended.output.splitlines()) == 1
+    assert f"`ground listen` of {session} has ended: " in ended.output
+    assert ("may have been executed" in ended.output) == is_sent
+    assert [path.name for path in (session / "uplink").iterdir()] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("near -3", "`near -3`: near: expected 0 to 16 DN, got -3"),
+        ("--timeout 5 resend -1 3", "`resend -1 3`: "),
+        ("bracket -0.1,0.2 --json", "`bracket -0.1,0.2`: "),
+        ("ping -3", "`ping -3`: expected no arguments"),
+        ("near 3 --sesion x", "No such option: --sesion"),
+    ],
+)
+def test_a_negative_number_is_an_argument_out_of_range_and_no_unknown_option(words, told):
+    error = CliRunner().invoke(cli.app, ["uplink", *words.split()], standalone_mode=False).exception
+    assert isinstance(error, (ValueError, USAGE_ERROR))
+    said = getattr(error, "format_message", error.__str__)()
+    assert said.startswith(told), said
