@@ -18,7 +18,7 @@ from flightsw.storage.index import (
 from flightsw.storage.store import lock_store, quarantine
 from flightsw.storage.transfer_numbers import FILE, numbers_line, parse_numbers, random_number
 from obbgs_base.checked import checked_line, copy_of, parse_checked_line, read_twice
-from obbgs_base.errors import in_words, reason
+from obbgs_base.errors import counted, in_words, reason
 from obbgs_base.files import sync_folder, write_whole
 
 TWICE = (
@@ -37,14 +37,14 @@ class FsckReport:
     frames: int = 0  # containers whose every checksum fits
     waiting: int = 0  # of them still to be delivered
     quarantined: int = 0  # containers that were moved away
-    missing: int = 0  # frames of the index that are gone from the disk
+    missing: int = 0  # frames of the index that are gone from the disk, those in quarantine not counted
     problems: list[str] = field(default_factory=list)
 
     def sentence(self, done: str = "repaired") -> str:
         """Return the counts in words."""
         return (
-            f"{self.frames} good frames, {self.waiting} to be delivered, {self.quarantined} quarantined, "
-            f"{self.missing} missing, {len(self.problems)} problems {done}"
+            f"{counted(self.frames, 'good frame')}, {self.waiting} to be delivered, {self.quarantined} quarantined, "
+            f"{self.missing} missing, {counted(len(self.problems), 'problem')} {done}"
         )
 
 
@@ -99,6 +99,7 @@ class _Check:
     def __init__(self, folder: Path, repair: bool):
         self.folder, self.repair, self.report = folder, repair, FsckReport()
         self._good: dict[int, StoredFrame] = {}
+        self._damaged: set[int] = set()  # numbers of the containers that are moved away
 
     def run(self, is_running: bool) -> FsckReport:
         """Check and repair; the files that a running flight software may be writing are left where it runs."""
@@ -157,6 +158,8 @@ class _Check:
                 found[frame_id] = self._good[frame_id]
                 continue
             self.report.quarantined += 1
+            if path.stem.isdigit():
+                self._damaged.add(int(path.stem))
             if self._note(f"frames/{path.name}: {error}; a repair moves it to quarantine/"):
                 quarantine(self.folder, path)
         return found
@@ -184,9 +187,12 @@ class _Check:
                 state.add(stored)
         for frame_id, stored in sorted(state.stored.items()):
             if frame_id not in found and frame_id not in state.dropped:
-                self.report.missing += 1
-                self._note(f"frame {frame_id}: in the index, but not on the disk")
-                state.add(DroppedFrame(frame_id, "lost", stored.bracket_id, stored.bracket_index))
+                is_damaged = frame_id in self._damaged
+                self.report.missing += not is_damaged  # a damaged one is counted as quarantined
+                where = "its container is damaged" if is_damaged else "not on the disk"
+                self._note(f"frame {frame_id}: in the index, but {where}")
+                why = "damaged" if is_damaged else "lost"
+                state.add(DroppedFrame(frame_id, why, stored.bracket_id, stored.bracket_index))
         for entry in state.missing_from(gone):
             if len(self.report.problems) == before:
                 self._note(f"frame {entry.frame_id}: deleted.jsonl does not have that it was deleted")

@@ -147,6 +147,13 @@ def test_quarantined_containers_are_kept_and_never_overwritten(folder, make_fram
     assert len(list((folder / "quarantine").iterdir())) == 2
 
 
+@pytest.mark.parametrize(("damage", "counts"), [(break_torn, (1, 0)), (break_missing, (0, 1))])
+def test_a_frame_is_counted_as_quarantined_or_as_missing_and_never_as_both(folder, damage, counts):
+    damage(folder)
+    for report in (fsck(folder, repair=False), fsck(folder)):
+        assert (report.quarantined, report.missing) == counts
+
+
 def test_a_session_of_the_ground_is_no_frame_store(tmp_path):
     (tmp_path / "frames").mkdir()
     (tmp_path / "session.json").write_text("{}")

@@ -140,6 +140,31 @@ def test_the_slider_of_a_replay_shows_tenths_of_seconds_and_loses_no_time(tmp_pa
     assert controls.place.value == controls.place.max
 
 
+def test_a_replay_of_a_simulated_pass_moves_the_timeline_by_the_frames_that_were_announced(tmp_path, server):
+    """Frames have the simulated time, the housekeeping has the wall clock; the ground's clock is 5 s ahead of it."""
+    lines = [packet(t) | {"received_utc_ns": (t + 5) * 10**9} for t in range(0, 101, 10)]
+    taken = [(9000 + 30 * i) * 10**9 for i in range(4)]
+    headers = [
+        {"packet": "frame", "received_utc_ns": (20 * i + 15) * 10**9, "mid_exposure_utc_ns": utc_ns}
+        for i, utc_ns in enumerate(taken)
+    ]  # at 10, 30, 50 and 70 s of the housekeeping's clock
+    written(tmp_path, *lines, *headers)
+    times: list[int] = []
+    plots = PassPlots(server, tmp_path, times.append, lambda: taken)
+    plots.tick(0.25)
+    controls = plots.controls
+    assert controls is not None and "another clock" not in controls.told.content
+    controls.replay.value, controls.speed.value = True, "10x"
+    for _ in range(16):
+        plots.tick(0.5)
+    assert list(dict.fromkeys(times)) == taken and times.count(taken[0]) == 4
+    assert "the one that was announced last" in controls.told.content
+    written(tmp_path, *lines)  # nothing links the clocks
+    times.clear()
+    plots.tick(0.5)
+    assert times == [] and "nothing links the two" in controls.told.content
+
+
 def test_the_page_draws_a_plot_for_each_item_and_a_session_without_telemetry_has_no_panel(
     session, tmp_path, server
 ):

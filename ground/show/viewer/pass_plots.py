@@ -70,6 +70,31 @@ def up_to(series: Series, seconds: float) -> Series:
     return Series(series.item, series.seconds[kept], series.values[kept], series.start_utc_ns)
 
 
+def announced_frames(session: Path) -> list[tuple[int, int]]:
+    """Return when each frame's header came and when the frame was taken, Unix ns by two clocks, in the order of coming.
+
+    The first is by the clock of the housekeeping, which tells when its own packets were sent and came.
+    """
+    lines = read_log(session / TELEMETRY)
+    timed = [line for line in lines if type(line.get("received_utc_ns")) is int]
+    sent = sorted(
+        (line["received_utc_ns"], line["utc_ns"]) for line in timed if type(line.get("utc_ns")) is int
+    )
+    headers = sorted(
+        (line["received_utc_ns"], line["mid_exposure_utc_ns"])
+        for line in timed
+        if type(line.get("mid_exposure_utc_ns")) is int
+    )
+    if not sent or not headers:
+        return []
+    first_ns = sent[0][0]  # large numbers would lose digits
+    came_s = np.array([came - first_ns for came, _ in headers]) / 1e9
+    ahead_s = np.interp(
+        came_s, [(came - first_ns) / 1e9 for came, _ in sent], [(own - came) / 1e9 for came, own in sent]
+    )
+    return [(came + round(1e9 * ahead), taken) for (came, taken), ahead in zip(headers, ahead_s, strict=True)]
+
+
 @dataclass(frozen=True)
 class Controls:
     """The panel's controls, and a plot for each item of the housekeeping that is shown."""
@@ -82,12 +107,23 @@ class Controls:
 
 
 class PassPlots:
-    """A panel with the telemetry of a session; `on_time` is told the time of a replay, Unix ns, as it goes on."""
+    """A panel with the telemetry of a session.
+
+    Args:
+        on_time: told the time of a replay by the clock of the frames, Unix ns, as it goes on.
+        taken_utc_ns: gives the times of the frames that there are.
+    """
 
     def __init__(
-        self, server: viser.ViserServer, session: Path, on_time: Callable[[int], None] = lambda utc_ns: None
+        self,
+        server: viser.ViserServer,
+        session: Path,
+        on_time: Callable[[int], None] = lambda utc_ns: None,
+        taken_utc_ns: Callable[[], list[int]] = list,
     ):
-        self._server, self._session, self._on_time = server, session, on_time
+        self._server, self._session = server, session
+        self._on_time, self._taken_utc_ns = on_time, taken_utc_ns
+        self._announced: list[tuple[int, int]] = []
         self._read: tuple[int, ...] = ()  # sizes of the files as they were read
         self._series: list[Series] = []
         self._events: list[Event] = []
@@ -103,6 +139,7 @@ class PassPlots:
             self._series, self._read = housekeeping_series(self._session), sizes
             if self._series:
                 self._events = pass_events(self._session, self._series[0].start_utc_ns)
+                self._announced = announced_frames(self._session)
         if not self._series:
             return
         if self.controls is None:
@@ -117,10 +154,37 @@ class PassPlots:
             self._replayed_s = min(self._replayed_s, end_s)
             self._shown_s = math.ceil(self._replayed_s * STEPS_A_SECOND) / STEPS_A_SECOND
             controls.place.value = self._shown_s
-            self._on_time(self._series[0].start_utc_ns + round(1e9 * self._replayed_s))
+            if (utc_ns := self._time_of_frames()) is not None:
+                self._on_time(utc_ns)
             self._draw(controls, self._replayed_s)
         elif changed:
             self._draw(controls, np.inf)
+
+    @property
+    def _is_one_clock(self) -> bool:
+        """Whether any frame was taken while housekeeping came; those of a simulated pass have its simulated times."""
+        taken, start_ns = self._taken_utc_ns(), self._series[0].start_utc_ns
+        end_ns = start_ns + 1e9 * float(self._series[0].seconds[-1])
+        return not taken or any(start_ns <= utc_ns <= end_ns for utc_ns in taken)
+
+    def _time_of_frames(self) -> int | None:
+        """Return how far a replay is by the clock of the frames; None where nothing tells, or nothing has come yet.
+
+        Where that is another clock than the housekeeping's, the frame that was announced last tells the time.
+        """
+        now_ns = self._series[0].start_utc_ns + round(1e9 * self._replayed_s)
+        if self._is_one_clock:
+            return now_ns
+        return max((taken for came, taken in self._announced if came <= now_ns), default=None)
+
+    @property
+    def _note(self) -> str:
+        """What a replay shows of the frames where their times are not those of the telemetry; else nothing."""
+        if self._is_one_clock:
+            return ""
+        if self._announced:
+            return "Frames have another clock than the telemetry: the timeline shows the one that was announced last."
+        return "Frames have another clock than the telemetry, and nothing links the two: the timeline stays."
 
     def _built(self) -> Controls:
         gui = self._server.gui
@@ -161,7 +225,8 @@ class PassPlots:
                 plot.series = drawn_lines(whole)
             plot.scales = scales_of(series)
             plot.data = data
-        controls.told.content = _told(known, [event for event in self._events if event.seconds <= seconds])
+        told = [event for event in self._events if event.seconds <= seconds]
+        controls.told.content = _told(known, told, self._note if controls.replay.value else "")
 
     def _begin(self, controls: Controls) -> None:
         """Start a replay from where the slider stands, at its end from the beginning; or show the pass as it is now."""
@@ -203,11 +268,12 @@ def plotted(known: Series, whole: Series) -> tuple[np.ndarray, ...]:
     return (seconds, values, *limits)
 
 
-def _told(known: list[Series], events: list[Event]) -> str:
-    """Return as HTML the limits that are broken now, red before yellow, and the newest events, the newest first."""
+def _told(known: list[Series], events: list[Event], note: str) -> str:
+    """Return as HTML a note, the limits that are broken now, red before yellow, and the newest events, newest first."""
     broken = [(s, s.limits[-1]) for s in known if len(s.values) and s.limits[-1] != "green"]
     start_s = known[0].start_utc_ns / 1e9
-    lines = [
+    lines = [f"<i>{note}</i>"] if note else []
+    lines += [
         f'<b style="color: {LIMIT_COLOURS[limit]}">{named(s.item)} {_in_words(s)}</b>'
         for s, limit in sorted(broken, key=lambda pair: pair[1] != "red")
     ]

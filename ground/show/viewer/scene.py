@@ -21,7 +21,7 @@ RADIUS = 10.0  # of the first model in the scene: large enough for the half-prec
 CAMERAS_AT = 2.0  # radii: true directions, but nearer, or the model could not be seen beside them
 MOST_CAMERAS = 60
 THUMBNAIL_PX = 64
-SENSOR, ERROR, UNCERTAINTY = "as the sensor sees it", "misfit (chi²)", "uncertainty of radiance"
+SENSOR, ERROR, UNCERTAINTY = "as the sensor sees it", "residual chi²", "uncertainty of radiance"
 COLOURS = (SENSOR, ERROR, UNCERTAINTY)
 
 

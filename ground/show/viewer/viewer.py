@@ -35,7 +35,7 @@ from ground.show.viewer.scene import (
 from ground.show.viewer.source import Source
 from ground.show.viewer.splats import CHI2_SHOWN, DEVIATION_SHOWN, best_seen, legend, seen_exposure_s
 from ground.show.viewer.waiting import awaited
-from obbgs_base.errors import reason
+from obbgs_base.errors import counted, reason
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.render.backdrops import without_earth
 
@@ -52,7 +52,7 @@ NEAREST, FARTHEST = (
 REACH = 4.0
 DIGITS = 2  # that the exposure slider shows behind the first one of its shortest time
 TURNTABLE_PX = (480, 320)
-CHI2_WORDS = "chi²: mean squared residual over the variance of the noise; 1 is noise alone"
+CHI2_WORDS = "residual chi²: mean squared residual over the variance of the noise; 1 is noise alone"
 DEVIATION_WORDS = "standard deviation of the radiance, as a share of full scale at the middle exposure"
 PARTS = ("splats", "cameras", "sun", "mesh")
 
@@ -86,7 +86,7 @@ def view(
         for other in shown[1:]:
             placed.append(Placed(server, "b", other, np.array([APART * RADIUS, 0.0, 0.0]), first.per_metre))
         viewer = Viewer(server, placed)
-        plots = PassPlots(server, sources[0].session_path, viewer.show_time)
+        plots = PassPlots(server, sources[0].session_path, viewer.show_time, viewer.taken_utc_ns)
         looked_s = time.monotonic() - POLL_S
         while not should_stop():
             plots.tick(TICK_S)
@@ -262,7 +262,7 @@ class Viewer:
             self.placed[0].draw_cameras(self.frames, self._choose, self._is_checked("cameras"))
             self.draw_frame()
             names = " | ".join(
-                f"{each.shown.name}, {len(each.shown.gaussians):,} Gaussians" for each in self.placed
+                f"{each.shown.name}, {counted(len(each.shown.gaussians), 'Gaussian')}" for each in self.placed
             )
             self.status.content = f"**{names}**, read at {datetime.now(UTC):%H:%M:%SZ}"
 
@@ -282,6 +282,10 @@ class Viewer:
             for each in self.placed:
                 each.draw_sun(record, self._is_checked("sun"))
             self.draw_splats()
+
+    def taken_utc_ns(self) -> list[int]:
+        """Return the times at which the frames of the timeline were taken."""
+        return [record.mid_exposure_utc_ns for record in self.frames]
 
     def show_time(self, utc_ns: int) -> None:
         """Move the timeline to the frame that was taken last before a time of the pass."""
@@ -448,7 +452,7 @@ def _facts(session: Session, record: FrameRecord) -> str:
         facts.append(f"{datetime.fromtimestamp(record.mid_exposure_utc_ns / 1e9, UTC):%H:%M:%S} UTC")
     if states_scale(session):
         facts.append(range_in_words(record))
-    facts.append(f"{record.saturated:,} pixels saturated")
+    facts.append(f"{counted(record.saturated, 'pixel')} saturated")
     return ", ".join(facts)
 
 
