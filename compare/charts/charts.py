@@ -24,7 +24,7 @@ def colour_of(results: Results) -> Callable[[str], str]:
 
 
 def speed_figures(results: Results, target: str) -> list[go.Figure]:
-    """Return score and Chamfer distance of one target against seconds, each where any method has it.
+    """Return score and Chamfer distance of one target against the training's time, each where any method has it.
 
     Curves, final scores and their Pareto front; the score's figure also has the methods without training as lines.
     """
@@ -49,23 +49,24 @@ def speed_figures(results: Results, target: str) -> list[go.Figure]:
 def _speed(results: Results, target: str, key: str, sign: float) -> go.Figure:
     """Return curves, ends and Pareto front of one metric; `sign` is -1 where less is better."""
     figure, colour = go.Figure(), colour_of(results)
+    clock, axis = results.clock(target, (results.score_of(target).key, "chamfer"))
     ends: list[tuple[float, float]] = []
     for label in results.trained:
         for row in results.of(label, target, results.base):
             curve = [point for point in row.get("curve", []) if key in point]
             if curve:
                 figure.add_scatter(
-                    x=[point["seconds"] for point in curve],
+                    x=[point[clock] for point in curve],
                     y=[point[key] for point in curve],
                     mode="lines",
                     line={"color": colour(label), "width": 2},
                     hovertemplate=f"{label}<br>%{{x:.1f}} s: %{{y:.4g}}<extra></extra>",
                 )
-            if row.get(key) is None or not row.get("seconds"):
+            if row.get(key) is None or not row.get(clock):
                 continue
-            ends.append((row["seconds"], sign * row[key]))
+            ends.append((row[clock], sign * row[key]))
             figure.add_scatter(
-                x=[row["seconds"]],
+                x=[row[clock]],
                 y=[row[key]],
                 mode="markers",
                 name=label,
@@ -81,7 +82,7 @@ def _speed(results: Results, target: str, key: str, sign: float) -> go.Figure:
             line={"color": FRONT_COLOUR, "dash": "dot", "shape": "hv", "width": 1.5},
             hoverinfo="skip",
         )
-    _draw_log_axis(figure, "seconds of training")
+    _draw_log_axis(figure, axis)
     return _sized(figure, 380)
 
 
@@ -195,21 +196,24 @@ def _values(rows: list[dict[str, Any]], key: str, seed: int) -> list[float]:
 
 
 def gain_figure(results: Results, label: str, base: str) -> go.Figure:
-    """Return the relative gains of a method over a base method, a tile for each metric and target."""
+    """Return the gains of a method over a base method, a tile for each metric and target.
+
+    Units differ from row to row: a tile's colour compares it with the largest of its own row.
+    """
     gains = results.gains(label, base)
-    values = [of_targets for _, of_targets in gains]
-    largest = max((abs(value) for row in values for value in row if value is not None), default=1.0)
+    texts = [[metric.gain(value) for value in row] for metric, row in gains]
+    values = shares_of_rows([row for _, row in gains])
     figure = go.Figure(
         go.Heatmap(
             z=values,
             x=results.targets,
             y=[metric.title for metric, _ in gains],
-            text=[["" if value is None else f"{value:+.1f} %" for value in row] for row in values],
+            text=texts,
             texttemplate="%{text}",
-            hovertemplate="%{y}, %{x}: %{z:+.1f} %<extra></extra>",
+            hovertemplate="%{y}, %{x}: %{text}<extra></extra>",
             colorscale="Viridis",
             zmin=min(0.0, min((v for row in values for v in row if v is not None), default=0.0)),
-            zmax=largest,
+            zmax=1.0,
             xgap=2,
             ygap=2,
             showscale=False,
@@ -217,6 +221,15 @@ def gain_figure(results: Results, label: str, base: str) -> go.Figure:
     )
     figure.update_yaxes(autorange="reversed")
     return _sized(figure, 110 + 32 * len(gains))
+
+
+def shares_of_rows(rows: list[list[float | None]]) -> list[list[float | None]]:
+    """Return the values of each row as shares of the largest in it, whatever its sign."""
+    found: list[list[float | None]] = []
+    for row in rows:
+        largest = max((abs(value) for value in row if value is not None), default=0.0) or 1.0
+        found.append([None if value is None else value / largest for value in row])
+    return found
 
 
 def _draw_log_axis(figure: go.Figure, title: str) -> None:

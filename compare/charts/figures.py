@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
-from compare.charts.charts import COLOURS
+from compare.charts.charts import COLOURS, shares_of_rows
 from compare.charts.page import error_of, shown_view
 from compare.charts.results import VERDICTS, Results, pareto
 from compare.charts.tables import VERDICT_COLOURS
@@ -76,20 +76,21 @@ def _speed(results: Results, target: str) -> Figure:
     measured = any("chamfer" in row for row in rows)  # imported pictures have no true surface
     figure = Figure(figsize=(11 if measured else 5.8, 4.2), layout="constrained")
     drawn = ((score.key, 1.0), ("chamfer", -1.0)) if measured else ((score.key, 1.0),)
+    clock, words = results.clock(target, (score.key, "chamfer"))
     axes = figure.subplots(1, len(drawn), squeeze=False)[0]
     for axis, (key, sign) in zip(axes, drawn, strict=True):
         ends = []
         for label in results.trained:
             for i, row in enumerate(results.of(label, target, results.base)):
                 curve = [point for point in row.get("curve", []) if key in point]
-                axis.plot([p["seconds"] for p in curve], [p[key] for p in curve], color=colour(label), lw=1.4)
-                if row.get(key) is not None and row.get("seconds"):
-                    ends.append((row["seconds"], sign * row[key]))
+                axis.plot([p[clock] for p in curve], [p[key] for p in curve], color=colour(label), lw=1.4)
+                if row.get(key) is not None and row.get(clock):
+                    ends.append((row[clock], sign * row[key]))
                     name = label if i == 0 else None
-                    axis.plot(row["seconds"], row[key], "D", color=colour(label), label=name)
+                    axis.plot(row[clock], row[key], "D", color=colour(label), label=name)
         front = pareto(ends)
         axis.step([x for x, _ in front], [sign * y for _, y in front], "k:", where="post", lw=1)
-        axis.set(xscale="log", xlabel="seconds of training")
+        axis.set(xscale="log", xlabel=words)
         _ticks_1_2_5(axis)
         axis.grid(alpha=0.3)
     left = axes[0]
@@ -162,14 +163,13 @@ def _gain(results: Results, label: str, base: str) -> Figure:
     figure = Figure(figsize=(2.8 + 1.2 * len(results.targets), 4), layout="constrained")
     axis = figure.subplots()
     gains = results.gains(label, base)
-    values = [of_targets for _, of_targets in gains]
+    values = shares_of_rows([row for _, row in gains])
     shown = np.array([[np.nan if value is None else value for value in row] for row in values], float)
     least = min(0.0, float(np.nanmin(shown))) if np.isfinite(shown).any() else 0.0
-    image = axis.imshow(shown, "viridis", vmin=least, aspect="auto")
-    texts = [["" if value is None else f"{value:+.1f} %" for value in row] for row in values]
+    axis.imshow(shown, "viridis", vmin=least, vmax=1.0, aspect="auto")
+    texts = [[metric.gain(value) for value in row] for metric, row in gains]
     _tiles(axis, texts, results.targets, [metric.title for metric, _ in gains])
-    axis.set_title(f"{label} against {base}, %", fontsize=10)
-    figure.colorbar(image, ax=axis)
+    axis.set_title(f"gains of {label} over {base}", fontsize=10)
     return figure
 
 

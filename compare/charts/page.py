@@ -17,6 +17,7 @@ from compare.charts.charts import (
 )
 from compare.charts.results import (
     HOLDS_DB,
+    LEVELS_DB,
     MARGIN_DB,
     METRICS,
     NOT_RUN,
@@ -34,21 +35,60 @@ from compare.methods import reference_names
 from compare.views import SHOWN, WORST, KeptView, read_views
 from ground.show.page import beside, breakable, fold, label, legend, page, picture, plot, section
 from ground.show.pictures import ERROR_FULL_SCALE, heat, tone
+from obbgs_base.errors import counted
 from obbgs_base.files import write_whole
 
 PAGE = "compare.html"
 WORST_SHOWN = 6
 NAMES_PX, TILE_PX = 170, 62  # of the names beside the tiles of gains, and of a tile at least
-COLUMNS = (
-    "Clean figures compare with noiseless exposures of held-out views, full scale as 1; foreground counts only "
-    "the pixels that the target covers; pooled is of the mean squared error over all views together, which "
-    "single nearly exact views do not lift. Best on the way is the highest clean PSNR of a curve: what a "
-    "method would reach if the truth told it when to stop. Mu-law is of radiance after log(1 + 5000 x). "
-    "Distances are in units where the target's largest dimension is 2. Precision, recall and their mean F, "
-    "within .01 and .02, and Chamfer of the surface compare the surface that the training views see with the "
-    "true one, both thinned to one point in each cell of 0.005; surface complete and accuracy are of 100,000 "
-    "points on it (complete: within 0.01 of a point). Those of centres, of Gaussians that may be out of sight, "
-    "only help to find faults. Seconds to a quality are of the processor, read on the way without measuring."
+COLUMNS = (  # ends of the keys of columns, and what these mean
+    (
+        ("_clean_db", "ssim_clean"),
+        "Clean figures compare with noiseless exposures of held-out views, full scale as 1.",
+    ),
+    (("psnr_noisy_db",), "Noisy PSNR compares with held-out frames as received: their own noise bounds it."),
+    (("_srgb_db", "_srgb"), "Figures of sRGB compare display values with those of held-out pictures."),
+    (("foreground_db",), "Foreground counts only the pixels that the target covers."),
+    (
+        ("pooled_db",),
+        "Pooled is of the mean squared error over all views together, which single nearly exact views do not lift.",
+    ),
+    (
+        ("best_db",),
+        "Best on the way is the highest clean PSNR of a curve: what a method would reach if the truth told it when to "
+        "stop.",
+    ),
+    (("mu_db",), "Mu-law is of radiance after log(1 + 5000 x)."),
+    (("ssim_clean", "ssim_srgb"), "SSIM is the structural similarity, 1 of identical pictures."),
+    (("lpips", "lpips_srgb"), "LPIPS is the difference that a network sees, 0 of identical pictures."),
+    (
+        ("_surface", "chamfer", "_centres"),
+        "Distances are in units where the target's largest dimension is 2.",
+    ),
+    (
+        ("f_01_surface", "f_02_surface", "chamfer_surface"),
+        "Precision, recall and their mean F, within .01 and .02, and Chamfer of the surface compare the surface that "
+        "the training views see with the true one, both thinned to one point in each cell of 0.005.",
+    ),
+    (
+        ("completeness_surface", "accuracy_surface"),
+        "Surface complete and accuracy are of 100,000 points on it (complete: within 0.01 of a point).",
+    ),
+    (
+        ("chamfer", "hausdorff", "_centres"),
+        "Those of centres, of Gaussians that may be out of sight, only help to find faults.",
+    ),
+    (("bytes",), "kB are those of the model that one would keep."),
+    (
+        ("seconds_to_f60", *(f"seconds_to_{level}_db" for level in LEVELS_DB)),
+        "Seconds to a quality are of the processor, read on the way without measuring.",
+    ),
+    (
+        ("cpu_seconds",),
+        "Processor time is that of the training alone, which other work on the machine does not change.",
+    ),
+    (("seconds",), "Seconds are of the training alone, by the clock."),
+    (("energy_j",), "Energy is what the processor packages took, with all that ran beside."),
 )
 
 
@@ -65,16 +105,16 @@ def write_page(out: Path, asked: Mapping[str, tuple[str, str]] = MappingProxyTyp
     results = Results(Rows(out).rows.values(), asked)
     replaced = ""
     if results.replaced:
-        more = "1 more row is" if results.replaced == 1 else f"{results.replaced} more rows are"
+        more = f"{counted(results.replaced, 'more row')} {'is' if results.replaced == 1 else 'are'}"
         replaced = (
             f" {more} left out: of the same names, but of another condition, session or settings than now, or than "
             "those asked for."
         )
     rows, methods, targets, conditions = (
-        f"{len(counted):,} {word}{'s' if len(counted) != 1 else ''}"
-        for counted, word in (
+        counted(len(those), word)
+        for those, word in (
             (results.rows, "row"),
-            (results.labels, "method"),
+            (set(results.method_of.values()), "method"),
             (results.targets, "target"),
             (results.conditions, "condition"),
         )
@@ -115,8 +155,9 @@ def _tables(results: Results) -> str:
         body = f"<h3>Mean of the targets</h3>{score_table(results, None)}"
     for target in results.targets:
         body += f"<h3>{html.escape(target)}</h3>{score_table(results, target)}"
-    columns = f'<p class="note">{COLUMNS}</p>'
-    folded = fold("What the columns mean", columns) if results.truth else ""
+    keys = [metric.key for metric in results.known()]
+    columns = " ".join(words for ends, words in COLUMNS if any(key.endswith(ends) for key in keys))
+    folded = fold("What the columns mean", f'<p class="note">{columns}</p>') if columns else ""
     return section(f"Scores, {html.escape(results.base)}", _explained(results), folded + body)
 
 
@@ -160,7 +201,8 @@ def _methods_legend(results: Results, *others: str) -> str:
 
 def _speed(results: Results) -> str:
     note = (
-        "Curves are measured on the way, on up to 16 of the held-out views; measuring is not counted as time. "
+        "Curves are measured on the way, on up to 16 of the held-out views; measuring is not counted as time, which is "
+        "the processor's where all trainings of a target have it. "
         "Diamonds are final scores over all held-out views, and the dotted line their Pareto front: no other "
         "method is both faster and better than those on it."
     )
@@ -255,8 +297,9 @@ def _gains(results: Results) -> str:
     if base is None or not others:
         return ""
     note = (
-        f"By how many per cent a method is better than {html.escape(base)}, tile by tile; for distances and LPIPS a "
-        "smaller value is the better one, so that a positive gain is always an improvement."
+        f"By how much a method is better than {html.escape(base)}, tile by tile: the difference of scores in their own "
+        "unit, and of distances and LPIPS, which are errors, the per cent that are saved. A positive gain is always an "
+        "improvement; colours compare the tiles of a row."
     )
     figures = [(name, gain_figure(results, name, base)) for name in others if results.gains(name, base)]
     width_px = NAMES_PX + TILE_PX * len(
@@ -266,7 +309,7 @@ def _gains(results: Results) -> str:
         f'<h3>{breakable(name)}</h3><div class="scroll"><div style="min-width: {width_px}px">{plot(figure)}</div></div>'
         for name, figure in figures
     )
-    return section(f"Relative gains over {html.escape(base)}", note, body) if body else ""
+    return section(f"Gains over {html.escape(base)}", note, body) if body else ""
 
 
 def _side_by_side(results: Results, out: Path) -> str:
@@ -336,7 +379,7 @@ def _origin(results: Results) -> str:
         for name, change in changes.items()
     ]
     count = sum(bool(row.get("converged")) for row in results.rows)
-    early = f"{count} training{'s' * (count != 1)}" if count else "No training"
+    early = counted(count, "training") if count else "No training"
     note = (
         f"Every row is a line of rows.jsonl with its own commit, machine, load and date. {early} ended early "
         "because its curve had moved by less than 0.05 dB over its last fifth (converged)."

@@ -27,6 +27,16 @@ class Metric:
     form: str
     more_is_better: bool | None
 
+    def gain(self, value: float | None) -> str:
+        """Return a gain in words: a difference of scores in their own unit, of errors the share that is saved."""
+        if value is None:
+            return ""
+        if self.more_is_better is False:
+            return f"{value:+.1f} %"
+        if self.key.endswith("_db"):
+            return f"{value:+.2f} dB"
+        return f"{value:+.1f} points" if self.title.endswith("%") else f"{value:+.4f}"
+
 
 METRICS = (
     Metric("psnr_clean_db", "clean PSNR, dB", "{:.2f}", True),
@@ -62,7 +72,7 @@ METRICS = (
     Metric("seconds", "seconds", "{:,.1f}", None),
     Metric("energy_j", "energy, J", "{:,.0f}", None),
 )
-# of the paper's figure: relative gains of these, the first three of pictures, the others of geometry; where no truth is
+# of the paper's figure: gains of these, the first three of pictures, the others of geometry; where no truth is
 # known, of noisy PSNR, which all sessions have
 GAINS = ("psnr_clean_db", "ssim_clean", "lpips", "chamfer", "completeness_centres", "hausdorff")
 
@@ -285,13 +295,31 @@ class Results:
                 found.append(self.mean(label, target, self.base, key) if value is None else value)
         return max((value for value in found if value is not None), default=None)
 
+    def clock(self, target: str, keys: Iterable[str]) -> tuple[str, str]:
+        """Return the key of a training's time that is drawn against its scores, and the name of its axis.
+
+        That is the processor's time where all trainings of a target have it, on the way too: other work may have shared
+        the machine. Elsewhere it is the clock's.
+        """
+        keys = set(keys)
+        rows = [row for label in self.trained for row in self.of(label, target, self.base)]
+        timed = [row for row in rows if row.get("seconds") and keys & row.keys()]
+        points = [point for row in rows for point in row.get("curve", []) if keys & point.keys()]
+        if (timed or points) and all("cpu_seconds" in each for each in (*timed, *points)):
+            return "cpu_seconds", "processor time of training, s"
+        return "seconds", "time of training by the clock, s"
+
     def gain(self, label: str, base: str, target: str, key: str) -> float | None:
-        """Return by how many per cent a method is better than a base method on a target, negative where it is worse."""
+        """Return by how much a method is better than a base method on a target, negative where it is worse.
+
+        Of scores it is the difference, since a share of decibels says nothing; of errors the per cent that are saved.
+        """
         ours, theirs = (self.mean(name, target, self.base, key) for name in (label, base))
-        if ours is None or not theirs:
+        if ours is None or theirs is None:
             return None
-        better = next(metric.more_is_better for metric in METRICS if metric.key == key)
-        return 100 * (ours - theirs if better else theirs - ours) / abs(theirs)
+        if next(metric.more_is_better for metric in METRICS if metric.key == key):
+            return ours - theirs
+        return 100 * (theirs - ours) / theirs if theirs else None
 
     def gains(self, label: str, base: str) -> list[tuple[Metric, list[float | None]]]:
         """Return a method's gains over another, target by target, of the metrics of which any is known."""
@@ -306,7 +334,7 @@ class Results:
 
     @property
     def gain_base(self) -> str | None:
-        """The method that others are compared with in relative gains: 3DGS where it is there, else the first."""
+        """The method that others are compared with in gains: 3DGS where it is there, else the first."""
         published = [label for label in self.trained if self.method_of[label] == "3dgs"]
         return next(iter([*published, *self.trained]), None)
 

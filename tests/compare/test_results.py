@@ -11,9 +11,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from compare.case import load_case
-from compare.charts.charts import size_figures, speed_figures
+from compare.charts.charts import gain_figure, size_figures, speed_figures
 from compare.charts.figures import _size, write_figures
-from compare.charts.page import write_page
+from compare.charts.page import COLUMNS, write_page
 from compare.charts.results import METRICS, UNJUDGED, Results, pareto, with_best
 from compare.charts.severity import breaking, series_of
 from compare.command import _line
@@ -100,9 +100,31 @@ def test_without_an_image_without_training_nothing_is_said_to_hold():
 def test_gains_are_positive_where_a_method_is_better():
     results = Results(ROWS)
     assert results.gain_base == "3dgs"
-    assert results.gain("obbgs", "3dgs", "A", "psnr_clean_db") == pytest.approx(35.0)  # 40.5 of 30
+    assert results.gain("obbgs", "3dgs", "A", "psnr_clean_db") == pytest.approx(10.5)  # 40.5 against 30 dB
     assert results.gain("obbgs", "3dgs", "A", "chamfer") == pytest.approx(75.0)  # 0.025 of 0.1
     assert results.gain("obbgs", "3dgs", "A", "lpips") is None
+
+
+def test_gains_are_told_in_the_unit_of_their_score_and_per_cent_are_of_errors_alone(tmp_path):
+    told = {metric.key: metric.gain(1.25) for metric in METRICS}
+    assert (told["psnr_clean_db"], told["lpips"], told["chamfer"]) == ("+1.25 dB", "+1.2 %", "+1.2 %")
+    assert (told["ssim_clean"], told["completeness_centres"]) == ("+1.2500", "+1.2 points")
+    figure = gain_figure(Results(ROWS), "obbgs", "3dgs")
+    assert [row[0] for row in figure.data[0].text] == ["+10.50 dB", "+75.0 %"]
+    assert [row[0] for row in figure.data[0].z] == [1, 1], "rows of other units are not compared by colour"
+
+
+def test_speed_is_in_processor_time_where_all_trainings_have_it():
+    made = {"psnr_clean_db": 40.0, "seconds": 60.0, "cpu_seconds": 50.0}
+    point = {"share": 0.5, "seconds": 30.0, "psnr_clean_db": 38.0}
+    rows = [row("obbgs", **made, curve=[point | {"cpu_seconds": 25.0}]), row("black", psnr_clean_db=20.0)]
+    (figure,) = speed_figures(Results(rows), "A")
+    assert figure.layout.xaxis.title.text == "processor time of training, s"
+    assert [list(trace.x) for trace in figure.data[:2]] == [[25.0], [50.0]]
+    other = row("3dgs", psnr_clean_db=30.0, seconds=90.0)  # of an older version
+    (figure,) = speed_figures(Results([*rows, other]), "A")
+    assert figure.layout.xaxis.title.text == "time of training by the clock, s"
+    assert [list(trace.x) for trace in figure.data[:3]] == [[30.0], [60.0], [90.0]]
 
 
 def test_a_method_that_comes_to_fit_the_noise_is_shown_with_the_best_point_of_its_curve():
@@ -271,12 +293,12 @@ def test_the_page_shows_every_part(comparison):
         "Worst views",
         "Side by side",
     )
-    for words in (*titles, "Relative gains over 3dgs", "40.50", "No result: the loss became nan.", "abc1234"):
+    for words in (*titles, "Gains over 3dgs", "40.50", "No result: the loss became nan.", "abc1234"):
         assert words in body
     assert 'src="http' not in page and "<link" not in page
     note = re.search(r'<h2>Scores.*?<p class="note">(.*?)</p>', body)
     assert note is not None and len(note[1].split()) < 60  # what the columns mean is behind a fold
-    assert "<summary>What the columns mean</summary>" in body and "Precision, recall and their mean F" in body
+    assert "<summary>What the columns mean</summary>" in body and "Those of centres" in body
 
 
 def test_the_page_counts_one_as_one_and_tells_what_it_left_out_and_what_ended_early(tmp_path):
@@ -332,7 +354,7 @@ def test_without_truth_scores_charts_and_gains_are_of_noisy_frames(without_truth
     results = Results(Rows(without_truth).rows.values())
     assert [metric.key for metric in results.known("A")] == ["psnr_noisy_db", "gaussians", "bytes", "seconds"]
     ((metric, values),) = results.gains("obbgs", "3dgs")
-    assert metric.key == "psnr_noisy_db" and values == pytest.approx([100 * (37.5 / 27 - 1)])
+    assert metric.key == "psnr_noisy_db" and values == pytest.approx([37.5 - 27])
     assert results.verdict("3dgs", "noise x2")[0] == "fails" and results.gains("jiang2025", "3dgs") == []
 
 
@@ -476,7 +498,7 @@ def test_the_page_is_one_column_on_a_phone_and_shows_no_empty_chart(folder, requ
         legend = page.locator(".legend").first.inner_text()
         assert "obbgs" in legend and "3dgs" in legend
         body = page.locator("body").inner_text()
-        assert "Relative gains over 3dgs" in body and "CompareError" not in body and "Diverged" not in body
+        assert "Gains over 3dgs" in body and "CompareError" not in body and "Diverged" not in body
         assert ("No truth is known" in body) == ("SSIM" not in body and "Chamfer" not in body)
         assert (
             page.evaluate(f"[...document.querySelectorAll('td:first-child')].flatMap({BROKEN_WORDS})") == []
@@ -495,6 +517,26 @@ def test_one_of_a_kind_is_told_in_the_singular(tmp_path):
     rows = Rows(tmp_path)
     rows.add(row("noise", error="CompareError: noise needs a session with its truth"))
     assert "1 row: 1 method, 1 target, 1 condition." in write_page(tmp_path).read_text()
+
+
+def test_a_method_with_several_budgets_is_counted_once(tmp_path):
+    rows = Rows(tmp_path)
+    for share in (0.1, 0.5, 1.0):
+        rows.add(row("3dgs", psnr_clean_db=30.0) | {"steps_share": share, "digest": f"{share}"})
+    assert "3 rows: 1 method, 1 target, 1 condition." in write_page(tmp_path).read_text()
+
+
+def test_the_columns_that_are_shown_are_explained_without_truth_too(without_truth, partly_run):
+    photographs, whole = (write_page(folder).read_text() for folder in (without_truth, partly_run))
+    explained = [
+        re.search("What the columns mean</summary>(.*?)</details>", text, re.DOTALL)
+        for text in (photographs, whole)
+    ]
+    assert explained[0] is not None and explained[1] is not None
+    assert "Noisy PSNR" in explained[0][1] and "kB are" in explained[0][1]
+    assert "Clean" not in explained[0][1] and "Chamfer" not in explained[0][1]
+    shown = [ends for ends, words in COLUMNS if words in explained[1][1]]
+    assert len(shown) == len(COLUMNS) - 1, "all but sRGB"
 
 
 def test_a_page_of_shortened_trainings_says_so(tmp_path):
