@@ -2,6 +2,8 @@
 
 import math
 
+from obbgs_base.errors import counted
+
 SHOWN_SIZE_ERROR_PERCENT = 0.1  # of refined poses; a smaller one costs no picture anything
 NOISE_LIKE_CHI2 = 1.5  # up to here the model's own error is under 0.7 sigma of the noise
 SIZES = {
@@ -79,12 +81,12 @@ def chi2_explained(chi2: float) -> str:
 
 def model_card(session_created_utc: str, metrics: dict) -> str:
     """Return the card as Markdown; figures that were not measured are left out."""
+    trained_on = counted(metrics["frames_trained"], frames(is_imported(metrics))[:-1])
     lines = [
         "# Model card",
         "",
-        f"{metrics['gaussians']:,} Gaussians, radiance of spherical-harmonic degree {metrics['sh_degree']}, made by "
-        f"{metrics['method']} from {metrics['frames_trained']} {frames(is_imported(metrics))} of the session of "
-        f"{session_created_utc}.",
+        f"{counted(metrics['gaussians'], 'Gaussian')}, radiance of spherical-harmonic degree {metrics['sh_degree']}, "
+        f"made by {metrics['method']} from {trained_on} of the session of {session_created_utc}.",
         "",
         *_training(metrics),
         *_appearance(metrics),

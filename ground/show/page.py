@@ -72,7 +72,7 @@ pre { background: #f3f5f8; border-radius: 6px; padding: 12px; font-size: 12.5px;
   .card b { font-size: 20px; } td { padding: 5px 4px; overflow-wrap: anywhere; }
   td:first-child { overflow-wrap: break-word; }
   td.n { white-space: normal; overflow-wrap: normal; } .grid { gap: 3px; }
-  .grid .label, .grid figcaption { font-size: 10px; }
+  .grid .label { font-size: 10px; } .grid figcaption { font-size: 9.5px; }
   dl { grid-template-columns: minmax(0, 1fr); } dd { margin: 0 0 6px; }
   .compared { grid-template-columns: repeat(3, minmax(0, 1fr)); }
   .scores td:first-child { overflow-wrap: normal; min-width: 32vw; } .scores td, .scores th { padding: 5px 4px; }
@@ -129,9 +129,8 @@ def _table(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def grid(columns: str, cells: list[str]) -> str:
-    """Return cells in rows; `columns` are the widths as CSS has them. On a screen without room for them it scrolls."""
-    inner = f'<div class="grid" style="grid-template-columns: {columns}">{"".join(cells)}</div>'
-    return f'<div class="scroll">{inner}</div>'
+    """Return cells in rows; `columns` are the widths as CSS has them."""
+    return f'<div class="grid" style="grid-template-columns: {columns}">{"".join(cells)}</div>'
 
 
 def beside(parts: Iterable[str], least_px: int = 420) -> str:

@@ -12,7 +12,7 @@ from ground.run.runs import Run
 from ground.session.cameras import sensor_of
 from ground.session.folder import Navigation, open_session, pass_name
 from ground.session.training_frames import split
-from ground.show.report.poses import pose_history, poses_section, shared_rows
+from ground.show.report.poses import PATH, pose_history, poses_section, shared_rows
 from ground.show.sizes import with_deviation
 from obbgs_base.physics.navigation_errors import SIZE, SharedParameters
 from obbgs_core.poses.estimate import PoseEstimate
@@ -106,6 +106,8 @@ def test_the_section_tells_values_with_both_deviations_and_what_the_frames_do_no
     assert "boresight, camera z: not determined by the frames" in page
     assert "relative position" not in page  # exact by the tags
     assert page.count("plotly-graph-div") == 3
+    assert "corrections, " in page and PATH in page  # the line that joins them is named too
+    assert "The residual chi² is 1" in page and "residual is" not in page
 
 
 def test_a_bracket_whose_residual_stands_out_is_named(example):

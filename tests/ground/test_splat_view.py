@@ -211,6 +211,27 @@ def test_the_report_fits_a_telephone(session, browser, tmp_path):
         )
 
 
+@pytest.mark.parametrize("width", [390, 1000, 1440])
+def test_all_columns_of_pictures_are_seen_on_every_screen(session, browser, width):
+    """In the browser: no picture of a grid lies beyond the edge of its section, nor behind a bar to scroll with."""
+    with opened(browser, as_url(write_report(session, "run")), width, 800) as page:
+        page.wait_for_selector(".main-svg")
+        ends = page.evaluate("""() => [...document.querySelectorAll('.grid img')].map(image =>
+            [image.getBoundingClientRect().right, image.closest('section').getBoundingClientRect().right,
+             image.getBoundingClientRect().width])""")
+        assert len(ends) >= 6 and all(right < edge and size >= 40 for right, edge, size in ends)
+        assert page.locator(".scroll .grid").count() == 0
+        words = page.evaluate("""() => [...document.querySelectorAll('.grid figcaption')].flatMap(caption =>
+            [...caption.childNodes].filter(node => node.nodeType === Node.TEXT_NODE).flatMap(text =>
+                [...text.data.matchAll(/[\\w.]+/g)].filter(word => {
+                    const range = document.createRange();
+                    range.setStart(text, word.index);
+                    range.setEnd(text, word.index + word[0].length);
+                    return range.getClientRects().length > 1;
+                }).map(word => word[0])))""")
+        assert words == [], "words that are broken between two lines"
+
+
 def test_without_webgl_a_turntable_is_shown(session, browser):
     without = "HTMLCanvasElement.prototype.getContext = () => null"
     with opened(browser, as_url(write_report(session, "run")), before=without) as page:

@@ -28,6 +28,7 @@ from ground.show.report.sizes import sizes_section
 from ground.show.report.sky import sky_section
 from ground.show.splat_view import splat_view
 from ground.show.telemetry_plots import broken_limits, housekeeping_series, telemetry_figures
+from obbgs_base.errors import counted
 from obbgs_base.files import write_whole
 from obbgs_core.score.metrics import COMPLETENESS_RADIUS
 
@@ -49,10 +50,10 @@ def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
     """
     run = open_run(session_dir, name, out)
     truth = Truth(run.session) if Truth.exists(run.session) else None
-    count, called = run.metrics["frames_received"], frames(is_imported(run.metrics))
+    count, called = run.metrics["frames_received"], frames(is_imported(run.metrics))[:-1]
     content = page(
         f"Reconstruction of {pass_name(run.session.path)}, run {name}",
-        f"Method {run.metrics['method']}, {count:,} {called}, session of "
+        f"Method {run.metrics['method']}, {counted(count, called)}, session of "
         f"{datetime.fromisoformat(run.session.created_utc):%Y-%m-%d %H:%M} UTC.",
         [
             _model(run),
@@ -137,7 +138,8 @@ def _main_figures(m: dict) -> list[tuple[str, str]]:
                 f"{m['surface_shown']:.0f} % of it"
             )
         figures.append((f"{m['completeness_surface']:.1f} %", text))
-    figures.append((f"{m['gaussians']:,}", "Gaussians make up the model"))
+    words = "Gaussian makes up the model" if m["gaussians"] == 1 else "Gaussians make up the model"
+    figures.append((f"{m['gaussians']:,}", words))
     figures.append(
         (f"{m['train_seconds']:.0f} s", f"of training; it ended with: {html.escape(m['stop_reason'])}")
     )
@@ -165,7 +167,7 @@ def _details(m: dict) -> list[tuple[str, str]]:
         "lpips_srgb": "LPIPS of display values (AlexNet, 0 is identical)",
         "psnr_radiance_db": "PSNR of scene-linear radiance (brightest pixel = 1), dB",
         "ssim_clean": "SSIM, clean (structural similarity, 1 is identical)",
-        "chi2_held_out": f"chi² of {scored_frames(m)}: squared error over the variance of the noise",
+        "chi2_held_out": f"residual chi² of {scored_frames(m)}: squared error over the variance of the noise",
         "chi2_held_out_both": "… over that of noise and the model's own error together (1: errors as large as stated)",
         "chamfer": "Chamfer distance of the centres",
         "chamfer_surface": "Chamfer distance of the points in surface.ply",
@@ -199,13 +201,13 @@ def _exposure_ms(key: str) -> str:
 def _model(run: Run) -> str:
     m, called = run.metrics, frames(is_imported(run.metrics))
     note = (
-        f"The target in 3D, made from {m['frames_trained']:,} {called} and drawn as the camera would see it at the "
-        f"chosen {'brightness' if run.session.nominal_exposures else 'exposure'}. Drag to turn, wheel or pinch to "
-        "zoom, shift and drag to move."
+        f"The target in 3D, made from {counted(m['frames_trained'], called[:-1])} and drawn as the camera would see it "
+        f"at the chosen {'brightness' if run.session.nominal_exposures else 'exposure'}. Drag to turn, wheel or "
+        "pinch to zoom, shift and drag to move."
     )
     if m["scored_frames"] == "held_out":
         note += f" The next section says how well it matches {called} that it was not made from."
-    decisions = [("made of", f"{len(run.gaussians):,} Gaussians"), ("brightness", brightness(run))]
+    decisions = [("made of", counted(len(run.gaussians), "Gaussian")), ("brightness", brightness(run))]
     if "appearance" in m and median_sun_direction(list(run.session.frames)) is not None:
         decisions.append(("the Sun's direction spans", f"{m['sun_span_deg']:.1f} degrees"))
     for key, words in DECISIONS.items():
@@ -249,6 +251,8 @@ def _training(run: Run) -> str:
         "where they have levelled off, more steps would change little. Time counts from the start of the work: "
         "the curves begin when the model's first guess has been made."
     )
+    if len(named) > 1:
+        note += " Blind to exposure is the same training with every exposure time replaced by their mean."
     key = legend(named) if len(named) > 1 else ""
     return section("Training", note, key + beside(map(plot, figures)))
 
@@ -259,7 +263,8 @@ def _histogram(run: Run) -> str:
     title, by_time = ("Histogram", "") if nominal else ("Exposure histogram", ", by exposure time")
     note = (
         f"How many pixels of all {frames(is_imported(run.metrics))} have which reading{by_time}; both the peak at the "
-        f"black level and a pile at full scale carry little information. {saturated:,} pixels are saturated: training "
+        f"black level and a pile at full scale carry little information. {counted(saturated, 'pixel')} "
+        f"{'is' if saturated == 1 else 'are'} saturated: training "
         "takes such a reading as a lower bound of the light."
     )
     figure, named = histogram_figure(run.session, run.sensor, nominal)
@@ -303,8 +308,8 @@ def _telemetry(run: Run) -> str:
         return ""
     broken = ", ".join(f"{name.replace('_', ' ')} ({limit})" for name, limit in broken_limits(series))
     note = (
-        f"Housekeeping over {series[0].seconds[-1]:.0f} s, {len(series[0].seconds):,} packets. Values beyond a limit "
-        f"of the telemetry dictionary are yellow or red, dotted lines are the limits. Limits were broken by: "
+        f"Housekeeping over {series[0].seconds[-1]:.0f} s, {counted(len(series[0].seconds), 'packet')}. Values beyond "
+        f"a limit of the telemetry dictionary are yellow or red, dotted lines are the limits. Limits were broken by: "
         f"{broken or 'none'}."
     )
     return section("Telemetry", note, beside(map(plot, telemetry_figures(series)), TELEMETRY_PX))

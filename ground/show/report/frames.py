@@ -17,10 +17,11 @@ from ground.session.truth import Truth
 from ground.show.page import grid, label, picture, section, unbroken
 from ground.show.pictures import ERROR_FULL_SCALE, bounding_box, heat, tone
 from ground.show.sizes import states_scale
+from obbgs_base.errors import counted
 from obbgs_core.score.metrics import psnr_db
 
-LABEL_WIDTH = "minmax(44px, 60px)"
-PICTURE_WIDTH = "minmax(72px, 1fr)"
+LABEL_WIDTH = "fit-content(60px)"
+PICTURE_WIDTH = "minmax(0, 1fr)"  # on a phone pictures are small, but all are seen
 COLUMNS = 6  # brackets shown for each exposure
 VIEWS_SHOWN = 3
 MARGIN_PX = 10
@@ -44,7 +45,7 @@ def frames_section(run: Run) -> str:
             if record is None:
                 cells.append(label("missing"))
                 continue
-            caption = unbroken(f"{frame} {record.id}") + _range(run, record)
+            caption = f"{frame} {record.id}" + _range(run, record)
             if not is_same:
                 caption += f", {_exposure(run, record)}"
             if record.saturated:
@@ -54,7 +55,7 @@ def frames_section(run: Run) -> str:
             cells.append(picture(image, f"{frame} {record.id}", caption))
     return section(
         f"{frames(is_imported(run.metrics)).capitalize()}{' by exposure' if bracketed else ''}",
-        f"{len(picked)} of the {len(run.session.frames):,} imported pictures, {brightness(run)}."
+        f"{len(picked)} of {counted(len(run.session.frames), 'imported picture')}, {brightness(run)}."
         if not bracketed
         else f"{_as_they_came(run)}: each column is a bracket, each row one of its exposures; below each stand its "
         f"number{', the range to the target' if states_scale(run.session) else ''} and, where they differ in a row, "
@@ -77,14 +78,14 @@ def scored_section(run: Run, truth: Truth | None) -> str:
         body.append(_compared(run, truth, of_view))
     training, imported = run.metrics["scored_frames"] == "training", is_imported(run.metrics)
     frame = frames(imported)[:-1]
-    groups = "brackets" if bracketed else "pictures"
-    few = f"trained on: the session has too few {groups} to hold one out"
+    group = "bracket" if bracketed else "picture"
+    few = f"trained on: the session has too few {group}s to hold one out"
     seen = few if training else "never trained on"
     against = "the noiseless exposure" if truth else "the imported one" if imported else "the noisy frame"
     note = (
-        f"{len(shown)} of {len(brackets)} {groups}, {seen}; cropped to the target, brightness as above. Error is the "
-        f"absolute difference: 0<span class='ramp'></span>{ERROR_FULL_SCALE:.0%} of full scale or more. PSNR is of the "
-        f"whole picture against {against}{_mean(run, truth)}."
+        f"{len(shown)} of {counted(len(brackets), group)}, {seen}; cropped to the target, brightness as above. Error "
+        f"is the absolute difference: 0<span class='ramp'></span>{ERROR_FULL_SCALE:.0%} of full scale or more. PSNR is "
+        f"of the whole picture against {against}{_mean(run, truth)}."
     )
     if estimate is not None:
         note += (
@@ -106,8 +107,8 @@ def _range(run: Run, record: FrameRecord) -> str:
 def _mean(run: Run, truth: Truth | None) -> str:
     """Return in words the mean PSNR of all scored frames; nothing for a run that was not scored."""
     mean_db = run.metrics.get("psnr_clean_db" if truth else "psnr_noisy_db")
-    what = frames(is_imported(run.metrics))
-    return "" if mean_db is None else f"; its mean over all {len(run.scored):,} {what} is {mean_db:.2f} dB"
+    what = counted(len(run.scored), frames(is_imported(run.metrics))[:-1])
+    return "" if mean_db is None else f"; its mean over all {what} is {mean_db:.2f} dB"
 
 
 def _compared(run: Run, truth: Truth | None, of_view: list[FrameRecord]) -> str:

@@ -17,6 +17,7 @@ from ground.session.spread import evenly_spread
 from ground.show.page import legend, plot, section, two_tables, unbroken
 from ground.show.plots import ticks_1_2_5
 from ground.show.sizes import states_scale, states_time, with_deviation
+from obbgs_base.errors import counted
 from obbgs_base.physics.navigation_errors import LENGTHS
 from obbgs_core.frames import TrainingFrame, cameras_of
 from obbgs_core.losses import fit_figures
@@ -28,6 +29,7 @@ from obbgs_core.render import render
 MARGINS_PX = {"l": 60, "r": 20, "t": 20, "b": 45}
 AXES = {"x": "#1f6feb", "y": "#2a9d8f", "z": "#d1652a"}
 ELLIPSES = {"as the tags state": "rgba(91,107,123,0.4)", "left in doubt": "#1f6feb"}
+PATH = "#b9c4d0"  # of the corrections from bracket to bracket
 RESIDUALS = {"from the tagged pose": "#d1652a", "from the estimated pose": "#1f6feb"}
 ORBIT, BODY = ("radial", "transverse", "normal"), ("x", "y", "z")
 SHOWN = {  # the parameters that a pass shares: words, unit, axes
@@ -146,15 +148,15 @@ def poses_section(run: Run) -> str:
     note = (
         f"What the training found the {tags} to err by. Corrections are along the camera's axes (z along the line of "
         f"sight), dotted lines are the standard deviations that {state}. Ellipses lie across the line of sight: "
-        "pale what these allow, dark what is left in doubt, one standard deviation each. The residual is 1 where "
+        "pale what these allow, dark what is left in doubt, one standard deviation each. The residual chi² is 1 where "
         "only noise is left; it compares the finished model with "
         f"{f'each {called}' if alone else 'the longest exposure of each bracket'}."
     )
     told = (
-        f"No {each}'s residual stands out from the others."
+        f"No {each}'s residual chi² stands out from the others."
         if not misfits
         else (
-            f"The residual of {len(misfits)} of {len(history.frame_ids)} {each}s stands out ({called}"
+            f"The residual chi² of {len(misfits)} of {counted(len(history.frame_ids), each)} stands out ({called}"
             f"{'s' * (len(misfits) > 1)} {', '.join(map(str, misfits))}): the poses may err by more than the {tags} "
             f"say, or something passed before the camera.{_of_earth(run, misfits, called)}"
         )
@@ -166,7 +168,9 @@ def poses_section(run: Run) -> str:
     body += legend([(f"along {axis}", colour) for axis, colour in AXES.items()]) + plot(
         correction_figure(history)
     )
-    body += legend(ELLIPSES.items()) + plot(ellipse_figure(history))
+    body += legend(
+        [*ELLIPSES.items(), (f"corrections, {each} after {each} in the order of time", PATH)]
+    ) + plot(ellipse_figure(history))
     body += legend(RESIDUALS.items()) + plot(residual_figure(history))
     return section("Poses as estimated", note, f"{body}<p>{told}</p>")
 
@@ -261,7 +265,7 @@ def ellipse_figure(history: PoseHistory) -> go.Figure:
         y=shifts[:, 1],
         mode="lines+markers",
         name="correction",
-        line={"color": "#b9c4d0", "width": 1},
+        line={"color": PATH, "width": 1},
         marker={
             "color": history.along,
             "colorscale": "Viridis",
