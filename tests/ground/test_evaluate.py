@@ -114,7 +114,7 @@ def test_the_first_section_of_the_report_explains_chi2_and_shows_the_foreground(
     assert explained in cards and explained in card
     assert 0 < metrics["chi2_held_out_both"] < metrics["chi2_held_out"]
     assert f"{metrics['chi2_held_out_both']:.2f} over noise and own error together" in card
-    assert "<td>chi² of held-out frames: squared error" in page
+    assert "<td>residual chi² of held-out frames: squared error" in page
 
 
 @pytest.mark.parametrize(

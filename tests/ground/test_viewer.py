@@ -547,6 +547,12 @@ def test_at_first_the_frame_is_the_one_in_which_the_target_is_best_seen(session,
         assert splats.best_seen(shown, exposure_s).id == lit.id
 
 
+def test_one_saturated_pixel_is_told_in_the_singular(session):
+    shown = Source(session).load().session
+    told = [viewer._facts(shown, dataclasses.replace(shown.frames[0], saturated=n)) for n in (1, 1200)]
+    assert told[0].endswith(", 1 pixel saturated") and told[1].endswith(", 1,200 pixels saturated")
+
+
 def test_imported_pictures_show_no_time_range_or_sun_that_nobody_stated(session):
     shown = Source(session).load()
     record = dataclasses.replace(
