@@ -155,7 +155,7 @@ def triage(
             f"({r.tile_row_px}, {r.tile_column_px})"
         )
     if unreadable:
-        stderr.print(f"{unreadable} containers could not be read")
+        stderr.print(f"{counted(unreadable, 'container')} could not be read")
 
 
 @app.command("plan")
@@ -200,8 +200,9 @@ def plan_command(mission: MissionFile = Path("mission.yaml"), json_: AsJson = Fa
         )
     for p in planned.passes:
         print(
-            f"pass: brackets {p.first_bracket} to {p.last_bracket}, {p.start_utc} to {p.end_utc}, {p.frames} frames, "
-            f"range {p.range_m[0]:.0f} to {p.range_m[1]:.0f} m, phase {p.phase_deg[0]:.0f} to {p.phase_deg[1]:.0f} deg"
+            f"pass: brackets {p.first_bracket} to {p.last_bracket}, {p.start_utc} to {p.end_utc}, "
+            f"{counted(p.frames, 'frame')}, range {p.range_m[0]:.0f} to {p.range_m[1]:.0f} m, "
+            f"phase {p.phase_deg[0]:.0f} to {p.phase_deg[1]:.0f} deg"
         )
     for utc, change in planned.shadow:
         print(f"shadow: the target {change} it at {utc}")
@@ -425,7 +426,8 @@ def _print_result(result: RunResult, store_dir: Path) -> None:
         if result.camera_losses:
             times = "once" if result.camera_losses == 1 else f"{result.camera_losses} times"
             lost = (
-                f"{captured.lost_with_camera} exposures of {captured.brackets_short} brackets were not taken"
+                f"{counted(captured.lost_with_camera, 'exposure')} of "
+                f"{counted(captured.brackets_short, 'bracket')} not taken"
                 if captured.lost_with_camera
                 else "no exposure was lost with it"
             )

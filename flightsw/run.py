@@ -25,6 +25,7 @@ from flightsw.storage.boot_counter import count_boot
 from flightsw.storage.settings import load_settings
 from flightsw.storage.store import FrameStore, open_store, remove_unused
 from flightsw.watchdog import Watchdog, notify
+from obbgs_base.errors import counted
 from obbgs_base.stopping import join
 
 log = logging.getLogger(__name__)
@@ -297,7 +298,8 @@ def _capture(
     finally:
         watchdog.ended("capture")
     if camera.lost:
-        log.error("the camera did not come back: %d exposures were not taken", counts.lost_with_camera)
+        lost = counted(counts.lost_with_camera, "exposure")
+        log.error("the camera did not come back: %s not taken", lost)
     return counts
 
 

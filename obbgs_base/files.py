@@ -10,10 +10,11 @@ from pathlib import Path
 UNUSED = ".unused-"  # between the name of a file that was set aside and a number
 
 
-def write_whole(path: Path, content: bytes) -> None:
+def write_whole(path: Path, content: bytes, like: Path | None = None) -> None:
     """Write under a temporary name beside `path`, sync, rename, and sync the folder.
 
-    A file that is written anew keeps its mode, and its owner where this user may give files away.
+    A file that is written anew keeps its mode, and its owner where this user may give files away; where there was none,
+    it has those of the file `like`.
 
     Raises:
         OSError: the disk does not take it; then nothing is left behind, and what `path` held before is still there.
@@ -22,7 +23,9 @@ def write_whole(path: Path, content: bytes) -> None:
     try:
         part.unlink(missing_ok=True)  # of a command that was killed, with whatever mode
         with open(part, "wb") as file:
-            keep_mode(path, part)  # before there is anything to read in it
+            keep_mode(
+                path if like is None or path.exists() else like, part
+            )  # before there is anything to read in it
             file.write(content)
             file.flush()
             os.fsync(file.fileno())

@@ -43,7 +43,7 @@ STEP_S = 0.02
 RESULTS = {
     "ping": "alive",
     "resend": "put into the outbox again",
-    "delete": "frames deleted",
+    "delete": "deleted",
     "arm": "is armed",
 }
 TEXT = (Path(__file__).parents[1] / "mission.yaml").read_text()

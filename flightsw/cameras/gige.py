@@ -21,6 +21,7 @@ from flightsw.cameras.camera import OWN_CLOCK_ANSWER_S, Exposure
 from flightsw.clock import utc_ns
 from flightsw.errors import CameraLost, CaptureError
 from flightsw.icd.mission import CameraSection
+from obbgs_base.errors import counted
 
 log = logging.getLogger(__name__)
 NS = 1_000_000_000
@@ -217,7 +218,7 @@ class GigeCamera:
             if status != BUFFER_SUCCESS:
                 raise CaptureError(
                     f"the picture is incomplete ({BUFFER_STATUS.get(status, 'unknown')}); "
-                    f"{self.packets_lost} packets lost so far"
+                    f"{counted(self.packets_lost, 'packet')} lost so far"
                 )
             stamp_ns = call("arv_buffer_get_timestamp", buffer)
             dn = self._pixels(buffer)

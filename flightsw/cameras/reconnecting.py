@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from flightsw.cameras.camera import Camera, Exposure
 from flightsw.errors import CameraLost, CaptureError
+from obbgs_base.errors import counted
 
 log = logging.getLogger(__name__)
 RETRY_S = 1.0  # between attempts to reach a lost camera
@@ -99,5 +100,6 @@ class ReconnectingCamera:
     def _note_return(self) -> None:
         if self._lost_since_s is not None:
             away_s = self._clock_s() - self._lost_since_s
-            log.warning("the camera is back after %.1f s, %d exposures lost", away_s, self._exposures_lost)
+            lost = counted(self._exposures_lost, "exposure")
+            log.warning("the camera is back after %.1f s, %s lost", away_s, lost)
             self._lost_since_s = None

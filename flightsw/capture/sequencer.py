@@ -14,6 +14,7 @@ from flightsw.icd.mission import Mission
 from flightsw.navigation.pose import PoseTagger, pose_tag
 from flightsw.storage.settings import Settings
 from flightsw.storage.store import FrameStore
+from obbgs_base.errors import counted
 
 log = logging.getLogger(__name__)
 NS = 1_000_000_000
@@ -99,8 +100,8 @@ def capture(
     store.hold_pass(mission.orbit.start_utc_ns)
     dropped_before, tagger = store.dropped_undelivered, PoseTagger(mission)
     times = _BracketTimes(mission, store, wait_until, settings)
-    failures = _Repeats("%d more exposures lost for the same reason: %s")
-    refusals = _Repeats("%d more frames refused: %s")
+    failures = _Repeats("more exposure", "lost for the same reason")
+    refusals = _Repeats("more frame", "refused")
     short = set()
 
     def take(shot: Shot, max_error_dn: int) -> None:
@@ -185,8 +186,8 @@ def expose(
 class _Repeats:
     """Logs the first of several problems in a row that differ in numbers only, and then how many more there were."""
 
-    def __init__(self, summary: str):
-        self._summary = summary  # takes the count and the problem
+    def __init__(self, thing: str, fate: str):
+        self._thing, self._fate = thing, fate
         self._last, self._repeats = "", 0
 
     def log(self, problem: str, line: str) -> None:
@@ -199,7 +200,7 @@ class _Repeats:
 
     def end(self) -> None:
         if self._repeats:
-            log.warning(self._summary, self._repeats, self._last)
+            log.warning("%s %s: %s", counted(self._repeats, self._thing), self._fate, self._last)
         self._last, self._repeats = "", 0
 
 

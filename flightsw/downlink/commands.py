@@ -40,7 +40,7 @@ from flightsw.storage.fsck import RunningCheck
 from flightsw.storage.settings import Settings, load_settings, save_settings
 from flightsw.storage.store import RESERVE, FrameStore, keep_reserve, write_with_reserve
 from obbgs_base.checked import copy_of, each_copy, read_twice, write_twice
-from obbgs_base.errors import in_words, reason
+from obbgs_base.errors import counted, in_words, reason
 from obbgs_base.files import set_aside, write_whole
 
 log = logging.getLogger(__name__)
@@ -65,7 +65,7 @@ class ReplayCounter:
     """
 
     def __init__(self, key_file: Path):
-        self.path = key_file.with_name(key_file.name + ".received")
+        self.path, self._key_file = key_file.with_name(key_file.name + ".received"), key_file
         self._reserve = self.path.with_name(self.path.name + ".reserve")
         try:
             self.key = Key.parse(key_file.read_text(), str(key_file))
@@ -102,7 +102,7 @@ class ReplayCounter:
         for each in (self.path, copy_of(self.path)):
             with contextlib.suppress(OSError):  # one of the two is good
                 if not each.exists() or each.read_bytes() != content:
-                    write_with_reserve(each, content, self._reserve)
+                    self._write(each, content)
         return last
 
     def advance(self, counter: int) -> None:
@@ -114,18 +114,22 @@ class ReplayCounter:
         """
         content = self.key.counter_text(counter).encode()
         try:
-            write_with_reserve(self.path, content, self._reserve)
+            self._write(self.path, content)
         except OSError as error:
             raise StoreError(f"cannot keep the command counter: {in_words(error)}") from error
         self.last = counter
         try:
-            write_with_reserve(copy_of(self.path), content, self._reserve)
+            self._write(copy_of(self.path), content)
         except OSError as error:
             log.warning("the copy of the command counter cannot be written: %s", in_words(error))
         self._keep_reserve()
 
     def close(self) -> None:
         os.close(self._lock)
+
+    def _write(self, path: Path, content: bytes) -> None:
+        """Write one of the two files; a new one can be read by those who can read the key."""
+        write_with_reserve(path, content, self._reserve, like=self._key_file)
 
     def _keep_reserve(self) -> None:
         """Make the reserve if there is none; without space it is tried again at the next command."""
@@ -343,10 +347,12 @@ class Commander:
                         return
             except FlightError as error:
                 self._note(
-                    deletion.command, "failed", f"{count - len(frames)} of {count} frames deleted: {error}"
+                    deletion.command,
+                    "failed",
+                    f"{count - len(frames)} of {counted(count, 'frame')} deleted: {error}",
                 )
             else:
-                self._note(deletion.command, "completed", f"{count} frames deleted")
+                self._note(deletion.command, "completed", f"{counted(count, 'frame')} deleted")
             self._deletions.popleft()
             self._frames_to_delete = None
             with contextlib.suppress(StoreError):  # after a restart it is found to be done
@@ -493,7 +499,7 @@ class Commander:
                 return f"key {retired.key} is retired"
             case "resend":
                 count = self._store.put_back(values["first_frame"], values["last_frame"])
-                return f"{count} frames put into the outbox again"
+                return f"{counted(count, 'frame')} put into the outbox again"
             case "fsck":
                 if self._check_of_store is not None:
                     raise StoreError(f"command {self._check_of_store[0].counter} checks the store already")

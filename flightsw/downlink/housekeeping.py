@@ -12,6 +12,7 @@ from typing import Any
 
 from flightsw.clock import utc_ns
 from flightsw.icd.telemetry import DICTIONARY
+from obbgs_base.errors import counted
 
 MAX_EVENTS = 200  # waiting to be sent, or to be sent again; the oldest are lost, and counted in the next one
 QUIET_S = (
@@ -58,7 +59,9 @@ class EventLog(logging.Handler):
             if now_s - self._heard_s > QUIET_S:
                 again = [packet for _, packet in self._sent]
                 if self._not_kept:
-                    problem = f"{self._not_kept} events of the time without the ground are not sent again"
+                    problem = (
+                        f"not sent again: {counted(self._not_kept, 'event')} of the time without the ground"
+                    )
                     again.insert(0, self._pack("warning", problem=problem))
                 self._packets.extendleft(reversed(again))
                 self._sent.clear()
@@ -82,7 +85,7 @@ class EventLog(logging.Handler):
                 self._sent.popleft()
                 self._not_kept += 1
         if lost:
-            self.add("warning", problem=f"{lost} events were lost: more than {MAX_EVENTS} waited")
+            self.add("warning", problem=f"lost {counted(lost, 'event')}: more than {MAX_EVENTS} waited")
         return packet
 
 

@@ -123,7 +123,8 @@ class NavigationErrorsSection:
         for name, length in zip(self.__dataclass_fields__, LENGTHS.values(), strict=True):
             path, value = f"mission.navigation_errors.{name}", getattr(self, name)
             values = value if isinstance(value, tuple) else (value,)
-            require(len(values) in (1, length), path, f"expected 1 or {length} numbers, got {len(values)}")
+            expected = "expected 1 number" if length == 1 else f"expected 1 or {length} numbers"
+            require(len(values) in (1, length), path, f"{expected}, got {len(values)}")
             require(min(values) >= 0, path, f"must not be negative, got {min(values):g}")
             most, unit = MOST.get(name, (math.inf, ""))
             require(max(values) <= most, path, f"expected 0 to {most:g}{unit}, got {max(values):g}")

@@ -13,7 +13,7 @@ import can
 
 from flightsw.icd.link.can import IsoTpChannels
 from flightsw.icd.link.link_url import parse_link_url
-from obbgs_base.errors import ObbgsError, reason
+from obbgs_base.errors import ObbgsError, counted, reason
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +25,11 @@ ADAPTER_FRAMES = 128  # that an adapter may hold for the bus
 
 
 class LinkError(ObbgsError):
-    """The link's port cannot be opened."""
+    """The link's port cannot be opened: `problem` says why, `remedy` what to do, empty where that is not known."""
+
+    def __init__(self, problem: str, remedy: str = ""):
+        super().__init__(f"{problem}; {remedy}" if remedy else problem)
+        self.problem, self.remedy = problem, remedy
 
 
 class Link(Protocol):
@@ -91,11 +95,11 @@ class Port:
         try:
             self._open()
         except self.OPEN_ERRORS as error:
+            why, remedy = self._why(error)
             if must_be_there:
-                what = f"cannot open {self.url.device}: {reason(error)}"
-                raise LinkError(f"{what}{self._remedy(error)}") from error
+                raise LinkError(f"cannot open {self.url.device}: {why}", remedy) from error
             self._is_outage = True
-            log.warning("%s is awaited: it cannot be opened yet: %s", self.url.device, reason(error))
+            log.warning("%s is awaited: it cannot be opened yet: %s", self.url.device, LinkError(why, remedy))
 
     def __enter__(self) -> Self:
         return self
@@ -113,9 +117,9 @@ class Port:
     def _open(self) -> None:
         raise NotImplementedError
 
-    def _remedy(self, error: Exception) -> str:
-        """Return what to do about a port that cannot be opened, after a semicolon; nothing where that is not known."""
-        return ""
+    def _why(self, error: Exception) -> tuple[str, str]:
+        """Return why a port cannot be opened and what to do, the second empty where that is not known."""
+        return reason(error), ""
 
     def _drop(self) -> None:
         """Give up the port and what it has not sent."""
@@ -181,7 +185,7 @@ class IsoTpPort(Port):
                 break
             self.exchange(CLOSE_STEP_S)
         if count := self._channels.messages_pending:
-            log.warning("%s is closed with %d messages that nobody took", self.url.device, count)
+            log.warning("%s is closed with %s that nobody took", self.url.device, counted(count, "message"))
         self._channels.abandon()
 
     def exchange(self, timeout_s: float) -> bytes:

@@ -8,13 +8,15 @@ import termios
 import serial
 
 from flightsw.ports.port import Port
+from obbgs_base.errors import reason
 
 READ_BYTES = 65_536
+END_OTHER = "end that one, which `fuser` with the port's name tells"
 REMEDIES = {  # of errors when a port is opened
     errno.ENOENT: "plug the adapter in, or give the name that `ls /dev/tty*` shows with it",
     errno.EACCES: "let this user use it: `sudo usermod -aG dialout $USER`, then log in again",
-    errno.EBUSY: "end the program that uses it, which `fuser` names",
-    errno.EAGAIN: "end the program that uses it, which `fuser` names",
+    errno.EBUSY: END_OTHER,
+    errno.EAGAIN: END_OTHER,
     errno.ENOTTY: "give a serial port, such as /dev/ttyUSB0",
 }
 
@@ -88,9 +90,10 @@ class SerialLink(Port):
         )
         self._unsent = b"\0"  # ends whatever half packet the other side still holds
 
-    def _remedy(self, error: Exception) -> str:
+    def _why(self, error: Exception) -> tuple[str, str]:
         met = [each.args[0] for each in (error, error.__context__) if each is not None and each.args]
-        return next((f"; {REMEDIES[number]}" for number in met if number in REMEDIES), "")
+        remedy = next((REMEDIES[number] for number in met if number in REMEDIES), "")
+        return ("another program holds it" if remedy == END_OTHER else reason(error)), remedy
 
     def _drop(self) -> None:
         self._unsent = b""

@@ -14,6 +14,7 @@ from flightsw.icd.mission import CameraSection, Mission
 from flightsw.icd.packet import TELEMETRY, pack_packet
 from flightsw.ports import Link, LinkError, open_link
 from flightsw.selftest.finding import Finding
+from obbgs_base.errors import counted
 
 NS = 1_000_000_000
 IDLE_APID = 0x7FF  # packets that every receiver ignores (CCSDS 133.0-B)
@@ -42,7 +43,7 @@ def check_link(url: str, loopback: bool, max_packet_bytes: int) -> list[Finding]
         link = open_link(url, FLIGHT_SIDE)
     except LinkError as error:
         advice = "look at the device's name (ls -l /dev, ip link) and give this user the group dialout"
-        return [Finding.failed("link", str(error), advice)]
+        return [Finding.failed("link", error.problem, error.remedy or advice)]
     with link:
         if parsed.scheme == "serial":
             return [_looped(link, parsed.device, loopback, max_packet_bytes)]
@@ -142,7 +143,7 @@ def _looped(link: Link, device: str, loopback: bool, max_packet_bytes: int) -> F
             return Finding.failed("link", found, f"connect TX with RX by a loop-back plug; {wiring}")
         found = f"{device}: {len(returned)} of {len(sent)} packets came back whole"
         return Finding.failed("link", found, wiring)
-    answer = f"{link.bytes_read} bytes came" if link.bytes_read else "nothing came"
+    answer = f"{counted(link.bytes_read, 'byte')} came" if link.bytes_read else "nothing came"
     found = f"{device} opens and takes bytes; {answer} from the other side (--loopback tests with a plug)"
     return Finding.ok("link", found)
 
@@ -171,7 +172,7 @@ def check_camera(mission: Mission, url: str) -> list[Finding]:
     findings = _compared(mission.camera, exposures)
     if camera.packets_lost:
         advice = "set jumbo frames (ip link set mtu 9000), and nothing else on the camera's network"
-        findings.append(Finding.warning("camera", f"{camera.packets_lost} packets were lost", advice))
+        findings.append(Finding.warning("camera", f"lost {counted(camera.packets_lost, 'packet')}", advice))
     shortest, longest = (_signal_dn(mission.camera, exposures[i][1]) for i in (0, -1))
     times = ", ".join(f"{1e3 * asked_s:g}" for asked_s, _ in exposures)
     found = f"{times} ms: brightest {shortest:.0f} to {longest:.0f} DN above black"

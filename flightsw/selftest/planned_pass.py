@@ -12,6 +12,7 @@ from flightsw.navigation.messages import MessageNavigation
 from flightsw.navigation.orbit import propagate, sun_position_gcrs
 from flightsw.navigation.pose import open_navigation
 from flightsw.selftest.finding import Finding
+from obbgs_base.errors import counted
 
 NS = 1_000_000_000
 MOST_LOOKED_AT = 400  # brackets, spread over the pass, for the range of the target
@@ -120,7 +121,8 @@ def _navigation(mission: Mission) -> list[Finding]:
     finally:
         stream.close()
     if state is None:
-        found = f"no state came from {section.source} in {section.wait_s:g} s ({stream.bad_lines} unreadable lines)"
+        unreadable = counted(stream.bad_lines, "unreadable line")
+        found = f"no state came from {section.source} in {section.wait_s:g} s ({unreadable})"
         return [Finding.failed("navigation", found, advice)]
     return [Finding.ok("navigation", f"{section.source} sends states, the first of {_utc(state.utc_ns)}")]
 

@@ -33,7 +33,7 @@ from flightsw.storage.index import (
 )
 from flightsw.storage.transfer_numbers import TransferNumbers, random_number, store_identity
 from obbgs_base.checked import checked_line, read_twice, write_twice
-from obbgs_base.errors import in_words
+from obbgs_base.errors import counted, in_words
 from obbgs_base.files import append_line, sync_folder, write_whole
 
 log = logging.getLogger(__name__)
@@ -478,7 +478,7 @@ class FrameStore:
         missing = state.missing_from(gone)
         lacked = sum(entry in listed for entry in missing)
         if gone_problems or lacked:
-            problem = gone_problems[0] if gone_problems else f"it lacked {lacked} frames"
+            problem = gone_problems[0] if gone_problems else f"it lacked {counted(lacked, 'frame')}"
             log.error("%s is made again from the index: %s", self._deleted.name, problem)
         if gone_problems or missing or (deleted and not deleted.endswith(b"\n")):
             self._write_again(self._deleted, deleted if gone_problems else b"", [*gone, *missing])
@@ -583,19 +583,22 @@ def keep_reserve(reserve: Path, size_bytes: int) -> None:
         write_whole(reserve, bytes(size_bytes))
 
 
-def write_with_reserve(path: Path, data: bytes, reserve: Path) -> None:
+def write_with_reserve(path: Path, data: bytes, reserve: Path, like: Path | None = None) -> None:
     """Write a small file whole or not at all; where the disk is full, the file `reserve` is deleted for it.
+
+    Args:
+        like: a file whose mode a new one has.
 
     Raises:
         OSError: the disk refuses.
     """
     try:
-        write_whole(path, data)
+        write_whole(path, data, like)
     except OSError as error:
         if error.errno not in DISK_FULL:
             raise
         reserve.unlink(missing_ok=True)
-        write_whole(path, data)
+        write_whole(path, data, like)
 
 
 def open_store(folder: Path, mission: Mission, open_now: bool = True) -> FrameStore:

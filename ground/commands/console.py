@@ -29,6 +29,7 @@ from ground.commands.terminal_pictures import COLUMNS, LatestPicture
 from ground.link.ingest import Status
 from ground.run.live.status import line as model_line
 from ground.session.telemetry import plain
+from obbgs_base.errors import counted
 
 log = logging.getLogger(__name__)
 PLAIN_S, JSON_S = 10.0, 1.0  # between lines where there is no screen
@@ -256,7 +257,7 @@ def _link(status: Status, down: float, up: float) -> Table:
     rows: list[tuple[str, Text]] = [
         ("state", Text(state, colour)),
         ("rate down / up", Text(f"{size(down)}/s / {size(up)}/s")),
-        ("received", Text(f"{size(s.bytes_received)}, {s.packets_received:,} packets")),
+        ("received", Text(f"{size(s.bytes_received)}, {counted(s.packets_received, 'packet')}")),
         (
             "frames",
             Text(

@@ -115,7 +115,7 @@ def import_command(
     if not unposed and poses is not PoseChoice.STATED and in_body_axes:
         views, found_poses = _checked_poses(views, given_sigmas or sigmas, poses is PoseChoice.MEND)
         if poses is PoseChoice.MEND:
-            source += "".join(f", {len(pictures)} poses {kind}" for kind, pictures in found_poses.items())
+            source += "".join(f", {counted(len(p), 'pose')} {kind}" for kind, p in found_poses.items())
     views, origin_moved = placed(views)
     if given_sigmas is None and exported is None:
         views = with_stated_errors(views)  # what an export of ours does not state is exact

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from ground.run.card import readings
 from obbgs_base.command_line import AsJson
+from obbgs_base.errors import counted
 
 if TYPE_CHECKING:  # torch takes seconds to import, and --help must not wait for it
     from ground.show.listing import RunEntry, SessionEntry
@@ -89,9 +90,10 @@ def _sessions_table(sessions: "list[SessionEntry]") -> Table:
             lost += f"; {least}{s.frames_missing:,} not received yet"
         counts = (f"{kind.replace('_', ' ').replace('crc', 'CRC')}: {n:,}" for kind, n in s.link.items())
         link = "; ".join(("repaired", *counts)) if s.link else s.imported_from or ""
-        count = f"{s.frames}{captured} in {s.brackets} brackets"
+        count = f"{s.frames}{captured} in {counted(s.brackets, 'bracket')}"
         if s.imported_from:
-            count = f"{s.frames} pictures" + (f" in {s.brackets} brackets" if s.brackets < s.frames else "")
+            grouped = f" in {counted(s.brackets, 'bracket')}" if s.brackets < s.frames else ""
+            count = counted(s.frames, "picture") + grouped
         cells = [s.folder, _age(s.created_utc), count, lost, s.size, link]
         if s.problem:
             cells = [s.folder, "", "", "", "", s.problem]

@@ -22,6 +22,7 @@ from ground.run.live.process import LiveProcess
 from ground.run.live.status import LiveStatus, line
 from ground.show.summary import frames_row, model_rows, table
 from obbgs_base.command_line import KEY_HELP, LINK_HELP, MISSION_HELP, AsJson
+from obbgs_base.errors import counted
 from obbgs_base.imports import quick_imports
 from obbgs_base.output import output_may_fail
 from obbgs_base.stopping import stop_on_signals
@@ -144,7 +145,9 @@ def _receive(
         stop.clear()  # the next signal ends the training
         if not as_json:
             say(
-                stderr, f"{summary.frames_received} frames received, {summary.frames_in_session} in {session}"
+                stderr,
+                f"{counted(summary.frames_received, 'frame')} received, "
+                f"{summary.frames_in_session} in {session}",
             )
         training.finish(stop.is_set, lambda facts: None if as_json else show("model", line(facts)))
     metrics = json.loads((run / "metrics.json").read_bytes())

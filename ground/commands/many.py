@@ -15,7 +15,7 @@ from ground.run.evaluate import evaluate
 from ground.run.reconstruct import AttitudeSource, reconstruct
 from ground.run.runs import read_metrics, run_folder
 from ground.show.report.document import write_report
-from obbgs_base.errors import Interrupted, ObbgsError, in_words
+from obbgs_base.errors import Interrupted, ObbgsError, counted, in_words
 from obbgs_core.process import prepare_process
 
 POLL_S = 0.2
@@ -88,7 +88,8 @@ def reconstruct_all(
                 on_end(session, result)
     if len(ended) < len(sessions):
         raise Interrupted(
-            f"interrupted; {len(ended)} of {len(sessions)} sessions are done: the same command goes on from there"
+            f"interrupted; {len(ended)} of {counted(len(sessions), 'session')} done: "
+            f"the same command goes on from there"
         )
     return {session: ended[session] for session in sessions}
 

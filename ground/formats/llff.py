@@ -15,7 +15,7 @@ from ground.formats.axes import rigid_inverse
 from ground.formats.pictures.files import FormatError, pictures_in, read_header, within
 from ground.formats.pictures.lens import Intrinsics
 from ground.formats.pictures.view import View
-from obbgs_base.errors import reason
+from obbgs_base.errors import counted, reason
 
 COLUMNS = 17
 ROTATION_TOLERANCE = 1e-3
@@ -44,7 +44,8 @@ def read_llff(folder: Path) -> list[View]:
     names = pictures_in(folder / "images")
     if len(names) != len(rows):
         raise FormatError(
-            f"{path}: it has {len(rows)} poses, but images/ has {len(names)} pictures; LLFF gives the poses of all "
+            f"{path}: it has {counted(len(rows), 'pose')}, but images/ has "
+            f"{counted(len(names), 'picture')}; LLFF gives the poses of all "
             "pictures in the order of their names: take those out that have none"
         )
     masks = _masks(folder / "masks")

@@ -12,7 +12,7 @@ import numpy as np
 from ground.formats.pictures.files import FormatError, image_size, within
 from ground.formats.pictures.lens import Intrinsics
 from ground.formats.pictures.view import View
-from obbgs_base.errors import reason
+from obbgs_base.errors import counted, reason
 
 NUMBERS = 21  # of a picture: K, R and t
 ROTATION_TOLERANCE = 1e-3
@@ -31,7 +31,9 @@ def read_middlebury(folder: Path) -> list[View]:
         count, *lines = filter(str.strip, stated[0].read_text().splitlines())
         views = [_view(folder, stated[0], line) for line in sorted(lines)]
         if int(count) != len(views):
-            raise ValueError(f"expected {int(count)} pictures, as the first line says, got {len(views)}")
+            raise ValueError(
+                f"expected {counted(int(count), 'picture')}, as the first line says, got {len(views)}"
+            )
     except (OSError, ValueError) as error:
         raise FormatError(f"{stated[0]}: {reason(error)}") from error
     return views

@@ -22,7 +22,7 @@ from ground.formats.pictures.lens import Intrinsics
 from ground.formats.pictures.views import Exported, View
 from ground.session.earth import target_place_m
 from ground.session.folder import SPLITS, FrameRecord, Session
-from obbgs_base.errors import reason
+from obbgs_base.errors import counted, reason
 from obbgs_base.files import read_bounded, write_whole
 
 log = logging.getLogger(__name__)
@@ -101,7 +101,7 @@ def posed_frames(session: Session) -> list[FrameRecord]:
     """Return the frames that are exported, those whose pose is valid; what is left out is logged."""
     posed = [record for record in session.frames if record.pose_valid]
     if left_out := len(session.frames) - len(posed):
-        log.warning("%d frames are left out, because their poses are not valid", left_out)
+        log.warning("left out: %s without a valid pose", counted(left_out, "frame"))
     if session.navigation.sigmas.vector().any():
         log.warning("how far the pass's poses err together is not exported: they are as tagged")
     return posed

@@ -28,6 +28,7 @@ from ground.formats.pictures.files import FormatError
 from ground.formats.pictures.lens import Intrinsics
 from ground.formats.pictures.views import Exported, View
 from ground.session.folder import SPLITS, Session
+from obbgs_base.errors import counted
 from obbgs_base.files import write_whole
 
 log = logging.getLogger(__name__)
@@ -53,7 +54,7 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], Exported | None]:
         view = read_frame(frame, image, _intrinsics({**tree, **frame}, path), path)
         views.append(dataclasses.replace(view, split=split_of.get(image)))
     if left_out := len(tree["frames"]) - len(views):
-        log.warning("%s: %d pictures are in none of its splits and left out", path, left_out)
+        log.warning("%s: %s in none of its splits, left out", path, counted(left_out, "picture"))
     return as_exported(views, read_exported(tree, path))
 
 

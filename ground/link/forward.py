@@ -49,13 +49,13 @@ class Forwarder:
             family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, kind, protocol)
         except (OSError, UnicodeError) as error:
-            raise LinkError(f"cannot forward to {url}: {reason(error)}; check the host's name") from error
+            raise LinkError(f"cannot forward to {url}: {reason(error)}", "check the host's name") from error
         try:
             self._socket.setblocking(False)
             self._socket.connect(address)  # opens no connection, but lets a refusal be noticed
         except OSError as error:
             self._socket.close()
-            raise LinkError(f"cannot forward to {url}: {reason(error)}; check address and route") from error
+            raise LinkError(f"cannot forward to {url}: {reason(error)}", "check address and route") from error
 
     def send(self, packet: bytes) -> None:
         """Send a packet now or drop it."""

@@ -184,8 +184,8 @@ class Session:
     def __repr__(self) -> str:
         size = f"{self.camera.width}x{self.camera.height} pixels"
         brackets = len({record.bracket for record in self.frames})
-        grouped = f" in {brackets:,} brackets" if self.is_bracketed else ""
-        return f"<{self.path}: {len(self.frames):,} frames of {size}{grouped}>"
+        grouped = f" in {counted(brackets, 'bracket')}" if self.is_bracketed else ""
+        return f"<{self.path}: {counted(len(self.frames), 'frame')} of {size}{grouped}>"
 
     def check_body_axes(self) -> None:
         """Check that poses are in axes of the target.
@@ -349,7 +349,7 @@ def open_session(folder: str | Path) -> Session:
     if missing:
         named = ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
         raise MissingFrames(
-            f"{folder}: {len(missing)} of {len(frames)} pictures are missing: {named}", missing
+            f"{folder}: {len(missing)} of {counted(len(frames), 'picture')} missing: {named}", missing
         )
     unstated = [record.id for record in frames if record.split is None]
     if 0 < len(unstated) < len(frames):

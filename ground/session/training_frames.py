@@ -12,6 +12,7 @@ from ground.session.cameras import sun_direction
 from ground.session.earth import earth_m
 from ground.session.folder import SPLITS, FrameRecord, Session, SessionError
 from ground.session.motion import rates
+from obbgs_base.errors import counted
 from obbgs_core.compiled import each
 from obbgs_core.frames import Navigation, TrainingFrame
 
@@ -42,20 +43,21 @@ def split(
     if not frames:
         eclipsed = sum(r.in_eclipse for r in session.frames)
         raise SessionError(
-            f"none of the {len(session.frames)} frames can be used: {eclipsed} in eclipse, the others without a valid "
+            f"none of {counted(len(session.frames), 'frame')} can be used: "
+            f"{eclipsed} in eclipse, the others without a valid "
             "pose"
         )
     if len(frames) < len(session.frames):
         count = len(session.frames) - len(frames)
         on_warning(
-            f"left out: {count} of {len(session.frames)} frames, in eclipse, or without a valid pose or "
+            f"left out: {count} of {counted(len(session.frames), 'frame')}, in eclipse, or without a valid pose or "
             "the Sun's direction"
         )
     frames = whole(session, frames, on_warning)
     stated = {name: [r for r in frames if r.split == name] for name in SPLITS}
     if any(stated.values()) and not stated["train"]:
         raise SessionError(
-            f"none of the {len(frames)} usable frames is in the split train: import the training pictures too"
+            f"none of {counted(len(frames), 'usable frame')} is in the split train: import the training pictures too"
         )
     if held_out := stated["test"] or stated["val"]:
         return stated["train"], held_out
@@ -77,7 +79,8 @@ def whole(
     damaged = {record.id for record in records if not session.is_whole(record)}
     if damaged:
         on_warning(
-            f"the pictures of {len(damaged)} frames are damaged and left out: {', '.join(map(str, sorted(damaged)))}; "
+            f"left out, as the picture is damaged: {counted(len(damaged), 'frame')}, "
+            f"{', '.join(map(str, sorted(damaged)))}; "
             "`ground uplink resend` asks for what is still on board"
         )
     return [record for record in records if record.id not in damaged]

@@ -13,6 +13,7 @@ from ground.run.live.status import line, read_status
 from ground.run.runs import is_live, read_config, read_metrics, unfinished_folder
 from ground.session.check import damage
 from ground.session.folder import SessionError, flight_counts, read_header, read_records
+from obbgs_base.errors import counted
 from obbgs_core.methods.presets import QUALITIES, preset
 
 DEEPEST = 3  # levels of folders below the given ones in which sessions are looked for
@@ -216,9 +217,9 @@ def _quality(metrics: dict[str, Any]) -> str | None:
     try:
         of_method = preset(metrics["method"]).steps
     except ValueError:  # of an older version, or of changed settings
-        return f"{steps:,} steps"
+        return counted(steps, "step")
     named = {round(of_method * factor): quality for quality, factor in QUALITIES.items()}
-    return named.get(steps, f"{steps:,} steps")
+    return named.get(steps, counted(steps, "step"))
 
 
 def compare_runs(first: Path, second: Path) -> dict[str, dict[str, list]]:
@@ -240,7 +241,10 @@ def compare_runs(first: Path, second: Path) -> dict[str, dict[str, list]]:
     }
     if "session.frames_jsonl_sha256" in differing:
         counts = [m["frames_received"] for m in metrics]
-        differing["session.frames"] = [f"{counts[0]:,} frames", f"{counts[1]:,} frames, not the same ones"]
+        differing["session.frames"] = [
+            counted(counts[0], "frame"),
+            f"{counted(counts[1], 'frame')}, not the same ones",
+        ]
     figures = {"quality": [_quality(m) for m in metrics]}
     figures |= {key: [m.get(key) for m in metrics] for key in FIGURES}
     return {

@@ -28,7 +28,7 @@ def test_a_number_that_is_lost_goes_on_at_random(tmp_path, caplog):
 def test_on_a_disk_that_takes_nothing_starts_differ_all_the_same(tmp_path, monkeypatch):
     count_boot(tmp_path)
 
-    def read_only(path, content):
+    def read_only(path, content, like=None):
         raise OSError(30, "Read-only file system")
 
     monkeypatch.setattr("flightsw.storage.store.write_whole", read_only)

@@ -18,7 +18,7 @@ from flightsw.icd.link.auth import MAX_COUNTER, Key, digest, seal, seal_file
 from flightsw.icd.telemetry import DICTIONARY
 from flightsw.storage.settings import load_settings
 from flightsw.storage.store import FrameStore
-from ground.link.uplink import make_key
+from ground.link.uplink import make_key, move_counter
 from obbgs_base.files import write_whole
 from tests.small_disk import fill_disk, small_disk
 
@@ -117,7 +117,7 @@ def test_what_is_commanded_survives_a_restart(spacecraft, name, arguments, expec
             ("refused", "expected the first number before the last, got 2 and 1"),
         ),
         ("delete", {"first_frame": 7, "last_frame": 9}, ("completed", "0 frames deleted")),
-        ("resend", {"first_frame": 1, "last_frame": 9}, ("completed", "1 frames put into the outbox again")),
+        ("resend", {"first_frame": 1, "last_frame": 9}, ("completed", "1 frame put into the outbox again")),
     ],
 )
 def test_a_range_of_frames_is_taken_as_far_as_they_are_there(spacecraft, name, arguments, end):
@@ -125,7 +125,7 @@ def test_a_range_of_frames_is_taken_as_far_as_they_are_there(spacecraft, name, a
     if name == "delete":
         spacecraft.send("arm", command="delete")
     assert spacecraft.send(name, **arguments)[-1] == end
-    assert spacecraft.store.outbox() == ([0, 1, 2] if end[1].startswith("1 frames") else [0, 2])
+    assert spacecraft.store.outbox() == ([0, 1, 2] if end[1].startswith("1 frame ") else [0, 2])
     assert len(spacecraft.store.frames) == 3
 
 
@@ -209,10 +209,10 @@ def test_the_counter_is_kept_in_the_reserve_of_a_full_disk_which_is_made_again(
     assert reserve.stat().st_size == RESERVE_BYTES
     is_full = True
 
-    def full_disk(path: Path, content: bytes) -> None:
+    def full_disk(path: Path, content: bytes, like: Path | None = None) -> None:
         if is_full and (reserve.exists() or len(content) >= RESERVE_BYTES):
             raise OSError(error, os.strerror(error))
-        write_whole(path, content)
+        write_whole(path, content, like)
 
     monkeypatch.setattr("flightsw.storage.store.write_whole", full_disk)
     assert spacecraft.send("ping")[-1] == ("completed", "alive")
@@ -484,7 +484,7 @@ def test_a_new_deletion_does_not_replace_the_one_of_before_the_restart(spacecraf
     spacecraft.commander.receive(spacecraft.seal("delete", first_frame=6, last_frame=6))
     spacecraft.restart()
     spacecraft.commander.poll()
-    assert [end[1] for end in spacecraft.reports()] == ["6 frames deleted", "1 frames deleted"]
+    assert [end[1] for end in spacecraft.reports()] == ["6 frames deleted", "1 frame deleted"]
     assert not spacecraft.store.frames
 
 
@@ -500,6 +500,24 @@ def test_a_note_of_a_deletion_that_is_damaged_twice_is_told_and_nothing_is_delet
         spacecraft.commander.poll()
     assert spacecraft.store.frames == before and spacecraft.reports() == []
     assert caplog.text.count("may be left half done, command it again") == 1
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640])
+def test_what_is_written_of_a_counter_can_be_read_by_those_only_who_can_read_the_key(tmp_path, mode):
+    key_file = tmp_path / "k"
+    make_key(key_file)
+    key_file.chmod(mode)
+    move_counter(key_file, 5)
+    keys = KeyRing([key_file])
+    keys.counters[0].advance(41)
+    keys.close()
+    (tmp_path / "k.received").unlink()  # of which the copy is left
+    ReplayCounter(key_file).close()
+    modes = {
+        name: (tmp_path / f"k.{name}").stat().st_mode & 0o777
+        for name in ("received", "received.copy", "sent.copy")
+    }
+    assert modes == dict.fromkeys(modes, mode)
 
 
 @pytest.mark.parametrize("suffix", ["", ".copy"])

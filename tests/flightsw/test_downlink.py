@@ -337,7 +337,7 @@ def test_waiting_events_are_bounded_and_the_lost_ones_told():
     while (packet := events.take()) is not None:
         texts.append(DICTIONARY.unpack("events", packet)[1]["problem"])
     assert texts[0] == "5" and len(texts) == MAX_EVENTS + 1
-    assert texts[-1] == f"5 events were lost: more than {MAX_EVENTS} waited"
+    assert texts[-1] == f"lost 5 events: more than {MAX_EVENTS} waited"
 
 
 def problems(events: EventLog) -> list[str]:
@@ -383,7 +383,7 @@ def test_no_more_events_are_kept_for_a_silent_ground_than_may_wait_and_the_other
         problems(events)
     events.heard()
     again = problems(events)
-    assert again[0] == f"{2 * MAX_EVENTS} events of the time without the ground are not sent again"
+    assert again[0] == f"not sent again: {2 * MAX_EVENTS} events of the time without the ground"
     assert again[1:] == [f"{number}" for number in range(2 * MAX_EVENTS, 3 * MAX_EVENTS)]
 
 

@@ -105,7 +105,7 @@ def test_a_camera_without_its_own_clock_is_tried_at_each_exposure_and_the_lost_o
     assert (kept.losses, kept.lost, camera.calls) == (2, False, 48)
     assert [r.getMessage().partition(",")[2] for r in caplog.records if "back" in r.getMessage()] == [
         " 2 exposures lost",
-        " 1 exposures lost",
+        " 1 exposure lost",
     ]
 
 
@@ -228,10 +228,10 @@ def test_a_camera_that_never_comes_back_is_two_lines_a_summary_and_a_failure(tmp
         out, err = process.communicate(timeout=120)
     assert process.returncode == 1
     assert "captured 10 frames, 0 were taken before, 14 failed" in out
-    assert "the camera was lost once and never came back: 14 exposures of 5 brackets were not taken" in out
+    assert "the camera was lost once and never came back: 14 exposures of 5 brackets not taken" in out
     assert [line.partition(":")[2].split(",")[0] for line in err.splitlines() if line] == [
         " warning: the camera is lost",
-        " error: the camera did not come back: 14 exposures were not taken",
+        " error: the camera did not come back: 14 exposures not taken",
     ]
 
 

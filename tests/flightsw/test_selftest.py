@@ -23,7 +23,9 @@ from flightsw.capture.planning import pass_plan
 from flightsw.cli import app
 from flightsw.errors import OrbitError
 from flightsw.icd.config import ConfigError
+from flightsw.icd.link.can import FLIGHT_SIDE, GROUND_SIDE
 from flightsw.icd.mission import NavigationSection, StoreSection
+from flightsw.ports import LinkError, open_link
 from flightsw.selftest import computer, devices, planned_pass, self_test
 from tests.small_disk import read_only
 
@@ -200,9 +202,28 @@ def test_an_slcan_adapter_is_asked_whether_it_opens_the_bus(answer, state, found
         assert finding.state == "failed" and "returns nobody" in finding.found
 
 
+@pytest.mark.parametrize("scheme", ["serial", "slcan"])
+def test_a_port_that_another_program_holds_is_told_with_what_to_do(scheme, caplog):
+    """A real terminal, held as flightsw and ground hold a port."""
+    ours, theirs = os.openpty()
+    try:
+        with open_link(f"serial://{os.ttyname(theirs)}", FLIGHT_SIDE):
+            url = f"{scheme}://{os.ttyname(theirs)}"
+            (held,) = devices.check_link(url, False, 1100)
+            assert held.state == "failed" and held.found.endswith(": another program holds it")
+            assert "end that one" in held.advice and "dialout" not in held.advice
+            with pytest.raises(LinkError, match="another program holds it; end that one"):
+                open_link(url, GROUND_SIDE)
+            open_link(url, FLIGHT_SIDE, must_be_there=False).close()
+        assert "is awaited: it cannot be opened yet: another program holds it; end that one" in caplog.text
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
 def test_a_port_that_is_missing_hangs_up_or_takes_nothing_is_told_apart(monkeypatch, tmp_path):
     (missing,) = devices.check_link(f"serial://{tmp_path}/ttyX", False, 1100)
-    assert missing.state == "failed" and "ttyX" in missing.found and "dialout" in missing.advice
+    assert missing.state == "failed" and "ttyX" in missing.found and "plug the adapter in" in missing.advice
     ours, theirs = os.openpty()
     url = f"serial://{os.ttyname(theirs)}?baud=921600"
     os.close(theirs)
@@ -329,7 +350,7 @@ def test_a_navigation_source_without_states(small_mission, in_the_pass, tmp_path
         address = unused.getsockname()
     for source, found in (
         (f"file://{tmp_path}/none.jsonl", "no navigation states"),
-        (f"file://{tmp_path}/states.jsonl", "1 unreadable lines"),
+        (f"file://{tmp_path}/states.jsonl", "1 unreadable line)"),
         (f"tcp://127.0.0.1:{address[1]}", "no state came from"),
     ):
         section = NavigationSection(source=source, wait_s=0.3)

@@ -412,11 +412,11 @@ def test_a_full_disk_is_met_by_the_policy_and_heals(tmp_path, make_frame, monkey
     free = round(2.2 * size)
     real_write_whole = write_whole
 
-    def small_disk(path, content):
+    def small_disk(path, content, like=None):
         used = sum(p.stat().st_size for p in (tmp_path / "frames").iterdir())
         if used + len(content) > free:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        real_write_whole(path, content)
+        real_write_whole(path, content, like)
 
     monkeypatch.setattr("flightsw.storage.store.write_whole", small_disk)
     fill(store, make_frame, 2)

@@ -169,7 +169,7 @@ def test_a_table_gives_what_the_pictures_do_not_say(tmp_path):
     views = [plain(tmp_path / name, time=9.0) for name in ("a.jpg", "b.jpg")]
     seconds = [v.exposure_time_s for v in with_exposures(views, read_table(tmp_path / "t.csv"))]
     assert seconds[1] / seconds[0] == pytest.approx(8)
-    with pytest.raises(FormatError, match=r"lacks 1 pictures: c\.jpg"):
+    with pytest.raises(FormatError, match=r"lacks 1 picture: c\.jpg"):
         with_exposures([*views, plain(tmp_path / "c.jpg")], read_table(tmp_path / "t.csv"))
 
 

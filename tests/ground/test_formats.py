@@ -198,7 +198,7 @@ def test_damaged_readings_are_named(tmp_path, session):
 def test_what_is_not_exported_is_told_once(tmp_path, session, caplog):
     records = (dataclasses.replace(session.frames[0], pose_valid=False), *session.frames[1:])
     export_colmap(dataclasses.replace(session, frames=records), tmp_path / "c")
-    assert caplog.messages == ["1 frames are left out, because their poses are not valid"]
+    assert caplog.messages == ["left out: 1 frame without a valid pose"]
 
 
 @pytest.mark.parametrize("name", ["--from", "--masks"])
@@ -299,7 +299,7 @@ def test_poses_that_are_not_valid_are_not_exported_and_others_keep_how_far_they_
 
     session = changed_frames(session, change)
     assert sum(export(session, tmp_path / "out").values()) == 10
-    assert "2 frames are left out, because their poses are not valid" in caplog.text
+    assert "left out: 2 frames without a valid pose" in caplog.text
     views, exported = read(tmp_path / "out")
     write_session(views, tmp_path / "again", "out", exported=exported)
     kept = [record for record in session.frames if record.pose_valid]

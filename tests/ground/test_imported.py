@@ -144,7 +144,7 @@ def test_nerfstudio_lists_name_the_splits_and_held_out_pictures_are_not_trained_
         ("2.png", "val"),
         ("3.png", "test"),
     ]
-    assert "images/2.png is in train and in val" in caplog.text and "1 pictures are in none" in caplog.text
+    assert "images/2.png is in train and in val" in caplog.text and "1 picture in none" in caplog.text
 
 
 @pytest.mark.parametrize("names", [["images/9.png"], [4], "images/0.png", {"images/0.png": 1}])

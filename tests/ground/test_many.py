@@ -36,7 +36,7 @@ def test_an_interrupted_session_is_saved_and_the_same_call_goes_on(sessions, ask
         return bool(wished)
 
     long = {"steps": 100_000}
-    with pytest.raises(Interrupted, match="0 of 1 sessions are done: the same command goes on"):
+    with pytest.raises(Interrupted, match="0 of 1 session done: the same command goes on"):
         reconstruct_all(
             [session], Asked(**vars(asked) | {"changes": CHANGES | long}), None, 1, should_stop=should_stop
         )

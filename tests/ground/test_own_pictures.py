@@ -330,7 +330,7 @@ def test_masks_of_a_folder_have_the_names_of_the_pictures(tmp_path):
         view(png(tmp_path / f"images/{name}", np.full((8, 8), 200, np.uint8))) for name in ("a.png", "b.png")
     ]
     png(tmp_path / "masks/a.png.png", np.eye(8, dtype=np.uint8))  # 0 and 1, as some tools write
-    with pytest.raises(FormatError, match=r"1 pictures have no mask there: b\.png"):
+    with pytest.raises(FormatError, match=r"no mask is there of 1 picture: b\.png"):
         with_masks(views, tmp_path / "masks")
     png(tmp_path / "masks/b.png", np.zeros((4, 4), np.uint8))
     masked = with_masks(views, tmp_path / "masks")

@@ -299,7 +299,7 @@ def test_a_session_without_frames_is_refused(tmp_path):
         ),
         (lambda s: shutil.rmtree(s), [], 1, "is not a session"),
         (lambda s: (s / "session.json").write_text('{"schema_version": 99}'), [], 1, "schema version 99"),
-        (lambda s: (s / "frames" / "000003.png").unlink(), [], 1, "pictures are missing: 3"),
+        (lambda s: (s / "frames" / "000003.png").unlink(), [], 1, "pictures missing: 3"),
     ],
 )
 def test_the_command_says_what_is_wrong_in_one_line(

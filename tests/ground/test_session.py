@@ -209,7 +209,7 @@ def test_frames_without_the_sun_are_left_out_where_the_first_has_it(tags, first_
 
 def test_missing_pictures_are_named(session):
     (session / "frames" / "000001.png").unlink()
-    with pytest.raises(MissingFrames, match="1 of 3 pictures are missing: 1") as caught:
+    with pytest.raises(MissingFrames, match="1 of 3 pictures missing: 1") as caught:
         open_session(session)
     assert caught.value.ids == (1,)
 

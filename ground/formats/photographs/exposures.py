@@ -23,7 +23,7 @@ from ground.formats.photographs.epipolar import matched_points
 from ground.formats.pictures.files import FormatError, Light, pictures_in, read_header
 from ground.formats.pictures.view import View, colours_of, grey_light, has_display_values, read_image
 from ground.formats.pictures.views import Values, unposed
-from obbgs_base.errors import reason
+from obbgs_base.errors import counted, reason
 
 log = logging.getLogger(__name__)
 COLUMNS = ("name", "exposure_time_s", "iso", "f_number", "gain", "mid_exposure_utc")
@@ -96,13 +96,13 @@ def with_exposures(views: Sequence[View], table: dict[str, Light] | None = None)
     headers = {view.image: read_header(view.image) for view in views}
     if turned := sum(header.orientation != 1 for header in headers.values()):
         log.warning(
-            "%d pictures say that they are to be shown turned; cameras are taken to be of the pixels as stored",
-            turned,
+            "%s, by the file, to be shown turned; cameras are taken to be of the pixels as stored",
+            counted(turned, "picture"),
         )
     if table is not None:
         if missing := [view.image.name for view in views if view.image.name not in table]:
             raise FormatError(
-                f"the table of exposures lacks {len(missing)} pictures: {', '.join(missing[:5])}"
+                f"the table of exposures lacks {counted(len(missing), 'picture')}: {', '.join(missing[:5])}"
             )
         lights = [table[view.image.name] for view in views]
         if all(light == Light(middle_utc_ns=light.middle_utc_ns) for light in lights):
@@ -242,8 +242,8 @@ def estimated(
     connected = {number for first, second, *_ in shared for number in (first, second)}
     if alone := [view.image.name for number, view in enumerate(views) if number not in connected]:
         log.warning(
-            "%d pictures share too little with others to estimate their exposures, and take the mean of all: %s",
-            *(len(alone), ", ".join(alone[:5])),
+            "the mean of all exposures is taken for %s with too little in common with others to estimate: %s",
+            *(counted(len(alone), "picture"), ", ".join(alone[:5])),
         )
     seconds = (gains / gains.max()).tolist()
     log.warning("exposures were estimated, the longest called 1 s: %s", described(seconds))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ground.formats.pictures.view import FULL_SCALE, View, colours_of, read_image
+from obbgs_base.errors import counted
 
 log = logging.getLogger(__name__)
 DEPTHS = (8, 10, 12, 14, 16)  # bits that cameras have
@@ -121,7 +122,9 @@ def _full_scale(name: str, seen: _Seen) -> tuple[float, int]:
     """
     if name == "float32":
         log.warning(
-            "%d pictures hold floats: full scale is their largest value, %.6g", seen.pictures, seen.top
+            "%s with floats: full scale is their largest value, %.6g",
+            counted(seen.pictures, "picture"),
+            seen.top,
         )
         return seen.top or 1.0, 16
     top, most = int(seen.top), 255 if name == "uint8" else 65535

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ground.formats.pictures.files import FormatError, pictures_in
 from ground.formats.pictures.view import View
+from obbgs_base.errors import counted
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +27,7 @@ def with_masks(views: Sequence[View], folder: Path | None) -> list[View]:
         found = [by_name.get(view.image.name) or by_name.get(view.image.stem, []) for view in views]
         if missing := [view.image.name for view, paths in zip(views, found, strict=True) if not paths]:
             raise FormatError(
-                f"{folder}: {len(missing)} pictures have no mask there: {', '.join(missing[:5])}"
+                f"{folder}: no mask is there of {counted(len(missing), 'picture')}: {', '.join(missing[:5])}"
             )
         for view, paths in zip(views, found, strict=True):
             if len(paths) > 1:

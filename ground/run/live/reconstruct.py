@@ -23,7 +23,7 @@ from ground.run.reconstruct import KNOWN, finish_run
 from ground.run.runs import check_replaceable, run_folder, unfinished_folder, unfinished_run
 from ground.session.cameras import sensor_of
 from ground.session.folder import SessionError
-from obbgs_base.errors import Interrupted, reason
+from obbgs_base.errors import Interrupted, counted, reason
 from obbgs_core.compiled import Background
 from obbgs_core.errors import ReconstructionError, TooFewFrames
 from obbgs_core.frames import FEWEST_FRAMES
@@ -238,7 +238,8 @@ class LiveReconstruction:
                 raise SessionError(f"{self._over}: no frame came into {arrivals.folder}")
             return
         self._missing = (
-            f"{arrivals.received} frames received, {count} frames of {arrivals.brackets} brackets to train on "
+            f"{counted(arrivals.received, 'frame')} received, {counted(count, 'frame')} of "
+            f"{counted(arrivals.brackets, 'bracket')} to train on "
             f"({arrivals.eclipsed} in eclipse, {arrivals.untagged} without a valid pose or the Sun's direction, "
             f"{len(arrivals.damaged)} with a damaged picture, {len(arrivals.held_out)} held out)"
         )
@@ -368,7 +369,8 @@ class LiveReconstruction:
         """
         trainer, session = self.trainer, self.arrivals.session
         assert trainer is not None and session is not None  # the pass has ended with a training
-        result = trainer.result(f"{self._over}; {self.steps} steps while {self._joined} frames came")
+        work = f"{counted(self.steps, 'step')} while {counted(self._joined, 'frame')} came"
+        result = trainer.result(f"{self._over}; {work}")
         self.shown.offer(result.gaussians, self.steps, result.pose_estimate)
         self.report("finished", self._over)
         outputs = Outputs(self._part, should_stop)

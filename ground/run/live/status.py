@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from obbgs_base.errors import counted
 from obbgs_base.files import write_whole
 
 LIVE_STATUS = "status.json"
@@ -69,7 +70,7 @@ def line(facts: dict[str, Any]) -> str:
         return "its status cannot be read"
     if "step" not in facts:  # it has failed before it said anything
         return f"{facts['state']}; {facts['message']}"
-    frames = f"{facts['frames_trained']} of {facts['frames_received']} frames"
+    frames = f"{facts['frames_trained']} of {counted(facts['frames_received'], 'frame')}"
     text = f"{facts['state']}, {frames}, step {facts['step']} ({100 * facts['share']:.0f} % of the schedule)"
     if facts["gaussians"] is not None:
         text += f", {facts['gaussians']:,} Gaussians"
