@@ -13,6 +13,7 @@ from flightsw.icd.link.link_url import parse_link_url
 from flightsw.icd.mission import CameraSection, Mission
 from flightsw.icd.packet import TELEMETRY, pack_packet
 from flightsw.ports import Link, LinkError, open_link
+from flightsw.ports.serial_port import END_OTHER
 from flightsw.selftest.finding import Finding
 from obbgs_base.errors import counted
 
@@ -43,7 +44,7 @@ def check_link(url: str, loopback: bool, max_packet_bytes: int) -> list[Finding]
         link = open_link(url, FLIGHT_SIDE)
     except LinkError as error:
         advice = "look at the device's name (ls -l /dev, ip link) and give this user the group dialout"
-        return [Finding.failed("link", error.problem, error.remedy or advice)]
+        return [Finding.failed("link", error.problem, END_OTHER if error.remedy == END_OTHER else advice)]
     with link:
         if parsed.scheme == "serial":
             return [_looped(link, parsed.device, loopback, max_packet_bytes)]
