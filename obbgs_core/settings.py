@@ -7,6 +7,8 @@ import operator
 import typing
 from typing import Any, Literal
 
+from obbgs_base.values import as_items, names_like, plain
+
 
 def number(default: float, least: float = 0.0, most: float = math.inf) -> Any:
     """Return a field for a number from `least` to `most`, both allowed unless infinite."""
@@ -58,7 +60,7 @@ def changed(settings: Any, changes: dict[str, Any]) -> Any:
     """Return settings with some of them changed, by names such as `steps` or `growth.interval`.
 
     Raises:
-        ValueError: no such setting (the message names the known ones), or a value out of its range.
+        ValueError: no such setting (the message names the nearest), or a value of the wrong type or out of its range.
     """
     by_group: dict[str, dict[str, Any]] = {}
     for name, value in changes.items():
@@ -69,12 +71,36 @@ def changed(settings: Any, changes: dict[str, Any]) -> Any:
     for group, inner in by_group.items():
         current = getattr(settings, group, None)
         is_group = dataclasses.is_dataclass(current)
-        for rest in inner:
+        hints = typing.get_type_hints(type(current if is_group else settings))
+        for rest, value in inner.items():
             name = f"{group}.{rest}" if rest else group
             if name not in known:
-                raise ValueError(f"there is no setting {name}; expected one of {', '.join(known)}")
+                inside = [other for other in known if other.startswith(f"{group}.")]
+                raise ValueError(f"there is no setting {name}; {names_like(name, inside or known)}")
+            inner[rest] = _typed(value, hints[rest or group], name)
         values[group] = dataclasses.replace(current, **inner) if is_group else inner[""]  # pyright: ignore
     return dataclasses.replace(settings, **values)
+
+
+def _typed(value: Any, hint: Any, name: str) -> Any:
+    """Return a value as the type of its setting, see `plain`; lists become tuples.
+
+    Raises:
+        ValueError: names the setting, what is expected and what came.
+    """
+    try:
+        if typing.get_origin(hint) is not tuple:
+            return plain(value, hint)
+        items, hints = as_items(value), typing.get_args(hint)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+    if hints[-1] is Ellipsis:
+        hints = hints[:1] * len(items)
+    if len(items) != len(hints):  # the group itself says how many it wants
+        return tuple(items)
+    return tuple(
+        _typed(item, h, f"{name}[{i}]") for i, (item, h) in enumerate(zip(items, hints, strict=True))
+    )
 
 
 def flat(settings: Any) -> dict[str, Any]:

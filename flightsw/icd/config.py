@@ -3,27 +3,25 @@
 import collections
 import contextlib
 import dataclasses
-import difflib
 import json
 import math
 import re
-import reprlib
 import types
 import typing
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 
 from obbgs_base.errors import ObbgsError
+from obbgs_base.values import as_items, names_like, plain, told
 
 # of a file that a person writes; the largest that is shipped has 12 kB, and reading takes some 100 times its size
 MAX_YAML_BYTES = 256 * 1024
 MAX_JSON_BYTES = 64 * 1024 * 1024  # transforms.json names some 100,000 pictures in so many
 MAX_VALUES = 20_000  # of a YAML text with its aliases written out
-FEW_NAMES = 10  # that a message lists; of more it tells the nearest
 
 
 class ConfigError(ObbgsError, ValueError):
@@ -214,7 +212,7 @@ def build(section: type, tree: Any, path: str, **given: Any) -> Any:
     Raises:
         ConfigError: names the path of the first key that is wrong.
     """
-    require(isinstance(tree, dict), path, f"expected a mapping of keys, got {_describe(tree)}")
+    require(isinstance(tree, dict), path, f"expected a mapping of keys, got {told(tree)}")
     fields = {f.name: f for f in dataclasses.fields(section) if f.name not in given}
     for key in tree:
         require(key in fields, f"{path}.{key}", f"unknown key; {names_like(str(key), fields)}")
@@ -228,40 +226,13 @@ def build(section: type, tree: Any, path: str, **given: Any) -> Any:
     return section(**values)
 
 
-def names_like(given: str, known: Iterable[str]) -> str:
-    """Return what a wrong name could have been: `expected` with all names where they are few, else the nearest."""
-    names = list(known)
-    if len(names) <= FEW_NAMES:
-        return f"expected one of {', '.join(names)}"
-    nearest = difflib.get_close_matches(given, names, n=3, cutoff=0.5)
-    nearest += [name for name in names if name.endswith(f".{given}") and name not in nearest]
-    like = f"nearest to it: {', '.join(nearest)}" if nearest else f"such as {', '.join(names[:3])}"
-    return f"expected one of {len(names)} names, {like}"
-
-
-_SHORT = reprlib.Repr()  # without writing all of a large value first
-_SHORT.maxlevel = 3
-_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 12
-_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 200
-
-
-def _describe(value: Any) -> str:
-    return "nothing" if value is None else _SHORT.repr(value)[:80]
-
-
 def _convert(value: Any, hint: Any, path: str) -> Any:
     """Return `value` as the type of a field; no silent conversion but int to float and datetime to ISO text."""
     if dataclasses.is_dataclass(hint):
         return build(typing.cast(type, hint), value, path)
     origin = typing.get_origin(hint)
     if origin is dict:
-        require(isinstance(value, dict), path, f"expected a mapping of keys, got {_describe(value)}")
-        return value
-    if origin is Literal:
-        options = typing.get_args(hint)
-        require(
-            value in options, path, f"expected one of {', '.join(map(str, options))}, got {_describe(value)}"
-        )
+        require(isinstance(value, dict), path, f"expected a mapping of keys, got {told(value)}")
         return value
     if origin in (typing.Union, types.UnionType):
         wanted_list = isinstance(value, list)
@@ -269,25 +240,13 @@ def _convert(value: Any, hint: Any, path: str) -> Any:
         if value is None and type(None) in branches:
             return None
         return _convert(value, branches[-1] if wanted_list else branches[0], path)
-    if origin is tuple:
-        require(isinstance(value, list), path, f"expected a list, got {_describe(value)}")
-        item_hint = typing.get_args(hint)[0]
-        return tuple(_convert(item, item_hint, f"{path}[{i}]") for i, item in enumerate(value))
-    if hint is float:
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        require(number and abs(value) < 1e300, path, f"expected a number, got {_describe(value)}")
-        return float(value)
-    if hint is bool:
-        require(isinstance(value, bool), path, f"expected true or false, got {_describe(value)}")
-        return value
-    if hint is int:
-        require(
-            isinstance(value, int) and not isinstance(value, bool),
-            path,
-            f"expected a whole number, got {_describe(value)}",
-        )
-        return value
-    if isinstance(value, datetime):  # YAML reads an unquoted time stamp as a datetime
-        value = value.isoformat()
-    require(isinstance(value, str), path, f"expected text, got {_describe(value)}")
-    return value
+    if hint is str and isinstance(value, datetime):  # YAML reads an unquoted time stamp as a datetime
+        return value.isoformat()
+    try:
+        if origin is not tuple:
+            return plain(value, hint)
+        items = as_items(value)
+    except ValueError as error:
+        raise ConfigError(path, str(error)) from None
+    item_hint = typing.get_args(hint)[0]
+    return tuple(_convert(item, item_hint, f"{path}[{i}]") for i, item in enumerate(items))

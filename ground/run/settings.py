@@ -6,8 +6,9 @@ Changes are named as in `preset`: `steps`, or `growth.interval` for a setting of
 import operator
 from collections.abc import Sequence
 
-from flightsw.icd.config import assignment, keys_below, names_like
+from flightsw.icd.config import assignment, keys_below
 from flightsw.icd.mission import ConfigError, ReconstructSection, build
+from obbgs_base.values import names_like
 from obbgs_core.methods.config import MethodConfig
 from obbgs_core.methods.presets import budget_changes, preset, quality_changes
 from obbgs_core.settings import known_names

@@ -239,6 +239,13 @@ def test_a_wrong_configuration_is_named(wrong, key):
         DatasetConfig(**{"frames": 33, **wrong})
 
 
+def test_a_list_without_brackets_is_shown_as_it_is_written():
+    told = r"dataset.bracket_ms: expected a list such as \[0.1,0.2,0.4\], got '0.1,0.2,0.4'"
+    with pytest.raises(ConfigError, match=told):
+        load_dataset_config(None, ["bracket_ms=0.1,0.2,0.4"])
+    assert load_dataset_config(None, ["bracket_ms=[0.1,0.2,0.4]"]).bracket_ms == (0.1, 0.2, 0.4)
+
+
 def test_a_data_set_that_cannot_be_begun_is_refused_in_one_line(tmp_path):
     done = call("hil", "dataset", "--mesh", tmp_path / "none.glb", "--out", tmp_path / "out")
     assert done.returncode == 2 and done.stderr == f"hil: {tmp_path / 'none.glb'}: no such file\n"

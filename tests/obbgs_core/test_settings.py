@@ -1,9 +1,13 @@
 """The settings of the methods: presets as data, changes by name, and mistakes that are named."""
 
+import json
 import math
 
+import numpy as np
 import pytest
 
+from flightsw.icd.config import ConfigError
+from ground.run.settings import set_changes
 from obbgs_core.methods.presets import PRESETS, preset, quality_changes
 from obbgs_core.settings import changed
 
@@ -12,7 +16,6 @@ from obbgs_core.settings import changed
     ("name", "value", "message"),
     [
         ("rates.means", -1.0, "0 or more, got -1.0"),
-        ("rates.means", math.nan, "0 or more, got nan"),
         ("growth.interval", 0, "at least 1, got 0"),
         ("parsimony.prune_at", (0.5, 1.5), "from 0 to 1, got 1.5"),
         ("published.coarse", ((0.5, 12),), "triples of an image scale"),
@@ -23,6 +26,40 @@ from obbgs_core.settings import changed
 def test_settings_that_no_training_can_have_are_refused(name, value, message):
     with pytest.raises(ValueError, match=f"{name} must be .*{message}"):
         preset("obbgs", {name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("exposure_aware", "no", "true or false, got 'no'"),
+        ("exposure_aware", 1, "true or false, got 1"),
+        ("loss.edge_weight", "abc", "a number, got 'abc'"),
+        ("loss.edge_weight", True, "a number, got True"),
+        ("rates.means", math.nan, "a number, got nan"),
+        ("steps", 2.5, "a whole number, got 2.5"),
+        ("steps", "30", "a whole number, got '30'"),
+        ("steps", True, "a whole number, got True"),
+        ("steps", None, "a whole number, got nothing"),
+        ("parsimony.prune_at", 0.5, "a list such as [0.5], got 0.5"),
+        ("poses.refine", "sometimes", "one of never, always, auto, got 'sometimes'"),
+    ],
+)
+def test_values_of_another_type_are_refused_in_the_words_of_the_command_line(name, value, expected):
+    with pytest.raises(ValueError) as refused:
+        preset("3dgs", {name: value})
+    assert str(refused.value) == f"{name}: expected {expected}"
+    if value is not None and not (isinstance(value, float) and math.isnan(value)):
+        with pytest.raises(ConfigError) as by_command:
+            set_changes([f"{name}={json.dumps(value)}"])
+        assert str(by_command.value) == f"--set {refused.value}"
+
+
+def test_whole_numbers_lists_and_numbers_of_numpy_are_taken():
+    config = preset(
+        "obbgs", {"loss.edge_weight": 1, "steps": np.int64(30), "parsimony.prune_at": [np.float32(0.5)]}
+    )
+    assert config == preset("obbgs", {"loss.edge_weight": 1.0, "steps": 30, "parsimony.prune_at": (0.5,)})
+    assert type(config.loss.edge_weight) is float and type(config.steps) is int
 
 
 def test_quality_scales_steps_and_what_goes_with_them_and_unknown_ones_are_refused():
@@ -48,9 +85,11 @@ def test_presets_are_data_and_mistakes_are_named():
     with pytest.raises(ValueError, match="no method 'nerf'; expected one of 3dgs, "):
         preset("nerf")
     with pytest.raises(
-        ValueError, match=r"no setting magic; expected one of name, exposure_aware, .*growth\.interval"
+        ValueError, match=r"no setting magic; expected one of \d+ names, such as name, exposure_aware"
     ):
         preset("3dgs", {"magic": 1})
+    with pytest.raises(ValueError, match=r"no setting step; expected one of .* nearest to it: .*steps"):
+        preset("obbgs", {"step": 3})
     with pytest.raises(ValueError, match="steps must be at least 1"):
         preset("obbgs", {"steps": 0})
 
@@ -83,8 +122,12 @@ def test_a_group_is_changed_setting_by_setting_and_keeps_the_others():
         config.growth.grown_share == preset("obbgs").growth.grown_share
         and preset("obbgs").growth.interval == 24
     )
-    for wrong in ("growth", "growth.magic", "steps.magic"):
-        with pytest.raises(ValueError, match=f"no setting {wrong}; expected one of .*growth.begin"):
+    for wrong, like in (
+        ("growth", "growth.begin"),
+        ("growth.magic", "growth.begin"),
+        ("steps.magic", "steps"),
+    ):
+        with pytest.raises(ValueError, match=f"no setting {wrong}; expected one of .*{like}"):
             preset("obbgs", {wrong: 1})
-    with pytest.raises(ValueError, match=r"published\.loss must be l1_ssim or likelihood, got 'l2'"):
+    with pytest.raises(ValueError, match=r"published\.loss: expected one of l1_ssim, likelihood, got 'l2'"):
         preset("obbgs", {"published.loss": "l2"})

@@ -8,7 +8,8 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from flightsw.icd.config import ConfigError, names_like
+from flightsw.icd.config import ConfigError
+from obbgs_base.values import names_like
 
 MAX_NDM_BYTES = 64 * 1024 * 1024  # a state each second for a week has some 60 MB
 KINDS = ("OEM", "AEM", "OPM", "OMM")
